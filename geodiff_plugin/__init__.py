@@ -1,0 +1,1 @@
+"""Metric depth from a diffusion prior and a second view."""
