@@ -1,1 +1,59 @@
-"""Placeholder."""
+"""Data sets in their official layouts, one file each, one table.
+
+Hop: folder -> references -> ``StereoSample``.
+Paper: S5.1 (data sets of Tables 1 to 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.datasets.kitti2012 import KITTI2012
+from geodiff_plugin.evaluation.datasets.kitti2015 import KITTI2015
+from geodiff_plugin.evaluation.datasets.middlebury import ETH3D, MIDDEVAL3, MIDDLEBURY2014
+from geodiff_plugin.evaluation.datasets.mvsnet import MVSNET
+from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
+
+__all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load", "load_pairs"]
+
+DATASETS: dict[str, Dataset] = {
+    dataset.name: dataset for dataset in (KITTI2015, KITTI2012, MIDDLEBURY2014, MIDDEVAL3, ETH3D, MVSNET)
+}
+"""Every data set by name, in the order in which results are listed."""
+
+
+def load(ref: SampleRef) -> StereoSample:
+    """Read the sample that ``ref`` points to, with its data set's loader."""
+    return DATASETS[ref.dataset].load(ref)
+
+
+def find_pairs(root: str | Path, datasets: Iterable[str] | None = None) -> list[SampleRef]:
+    """References to every metric pair below ``root``, in the table's order.
+
+    Args:
+        root: folder that holds one or several data sets in their official layouts.
+        datasets: names to look for; all by default.
+
+    Returns:
+        References; nothing is read yet.
+
+    Raises:
+        ValueError: ``root`` is not a folder, or a name is not in ``DATASETS``.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        bad_value("root", "an existing folder", str(root))
+    refs = []
+    for name in DATASETS if datasets is None else datasets:
+        if name not in DATASETS:
+            bad_value("datasets", f"one of {', '.join(DATASETS)}", repr(name))
+        refs += DATASETS[name].find(root)
+    return refs
+
+
+def load_pairs(root: str | Path, datasets: Iterable[str] | None = None) -> Iterator[StereoSample]:
+    """Read every metric pair below ``root``, one at a time; arguments and errors as ``find_pairs``."""
+    for ref in find_pairs(root, datasets):
+        yield load(ref)

@@ -1,0 +1,66 @@
+"""What KITTI 2012 and 2015 share: 16-bit disparity PNGs and projection matrices.
+
+Hop: reference -> ``StereoSample``.
+Paper: S5.1; protocol as in the sets' own development kits (disparity * 256, 0 = unknown).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from geodiff_plugin.evaluation.datasets._files import check_size, read_png16, read_rgb
+from geodiff_plugin.evaluation.datasets._interim import read_calibration
+from geodiff_plugin.evaluation.datasets.sample import (
+    SampleRef,
+    StereoSample,
+    disparity_to_depth,
+    is_rectified,
+)
+
+__all__ = ["KITTI_CAP_M", "load_kitti"]
+
+KITTI_CAP_M = 80.0
+"""Truth beyond 80 m does not count, the range that monocular depth papers use on KITTI."""
+
+
+def load_kitti(ref: SampleRef) -> StereoSample:
+    """Read one KITTI pair.
+
+    Args:
+        ref: ``files`` holds ``left``, ``right``, ``disparity``, ``calibration`` (paths), ``cameras`` (two numbers of
+            ``P0`` .. ``P3``) and optionally ``noc``, the disparity of the pixels that are seen twice.
+
+    Returns:
+        The sample; ``occluded`` where both kinds of truth exist, ``notes["truth"]`` says which was read.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged, or its size is not the left image's.
+    """
+    files = ref.files
+    left, right = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
+    rig = read_calibration(files["calibration"], cameras=files["cameras"])
+    disparity = read_png16(files["disparity"], "true disparity")
+    check_size(files["disparity"], disparity.shape, left.shape)
+    valid = disparity > 0
+    occluded = None
+    if files.get("noc") is not None:
+        seen_twice = read_png16(files["noc"], "disparity of the pixels seen twice")
+        check_size(files["noc"], seen_twice.shape, left.shape)
+        occluded = valid & (seen_twice == 0)
+    depth_m = disparity_to_depth(disparity / 256.0, rig.K_left, rig.K_right, rig.E)
+    depth_m[~valid] = 0
+    return StereoSample(
+        dataset=ref.dataset,
+        name=ref.name,
+        left=left,
+        right=right,
+        K_left=rig.K_left,
+        K_right=rig.K_right,
+        E=rig.E,
+        depth_m=depth_m,
+        valid=valid,
+        occluded=occluded,
+        rectified=is_rectified(rig.K_left, rig.K_right, rig.E),
+        notes={"truth": Path(files["disparity"]).parent.name, "disparity_step_px": 1 / 256},
+    )

@@ -1,0 +1,129 @@
+"""Middlebury 2014, MiddEval3 and ETH3D two-view: three sets in one file format.
+
+Hop: folder -> references -> ``StereoSample``.
+Paper: S5.1, Table 3 (15 pairs). Depth in metres is ``f b / (d + doffs)``, with doffs in pixels and b from millimetres.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from geodiff_plugin.evaluation.datasets._files import check_size, folders, read_rgb
+from geodiff_plugin.evaluation.datasets._interim import read_calibration, read_pfm
+from geodiff_plugin.evaluation.datasets.sample import (
+    Dataset,
+    SampleRef,
+    StereoSample,
+    disparity_to_depth,
+    is_rectified,
+)
+
+__all__ = ["ETH3D", "MIDDEVAL3", "MIDDLEBURY2014", "find_scenes", "load_middlebury"]
+
+
+def find_scenes(root: Path) -> list[SampleRef]:
+    """References to every scene of the three sets below ``root``.
+
+    A scene is a folder with ``im0.png`` and ``calib.txt``. Its truth is ``disp0.pfm`` (2014), ``disp0GT.pfm`` beside
+    the images (MiddEval3), or ``disp0GT.pfm`` in ``two_view_training_gt/<scene>`` (ETH3D). Which of the three a
+    scene belongs to is told by the folder's name (``eth3d``, ``two_view``) and else by the truth's name.
+    """
+    refs = []
+    for folder in folders(root, 3):
+        if not ((folder / "im0.png").is_file() and (folder / "calib.txt").is_file()):
+            continue
+        below_root = (root.resolve().name, *folder.relative_to(root).parts)
+        beside = folder.parent.parent / "two_view_training_gt" / folder.name / "disp0GT.pfm"
+        candidates = (folder / "disp0.pfm", folder / "disp0GT.pfm", beside)
+        truth = next((path for path in candidates if path.is_file()), folder / "disp0.pfm")
+        if any("eth3d" in part.lower() or "two_view" in part for part in below_root):
+            dataset = "eth3d"
+        else:
+            dataset = "middeval3" if truth.name == "disp0GT.pfm" else "middlebury2014"
+        mask = truth.parent / "mask0nocc.png"
+        files = {
+            "left": folder / "im0.png",
+            "right": folder / "im1.png",
+            "calibration": folder / "calib.txt",
+            "disparity": truth,
+            "mask": mask if mask.is_file() else None,
+        }
+        refs.append(SampleRef(dataset, folder.name, files))
+    return refs
+
+
+def _step_px(disparity: np.ndarray) -> float:
+    """Coarseness of the truth: 1 px where every value is a whole number, else 0 (as good as continuous)."""
+    return 1.0 if disparity.size and np.allclose(disparity, np.round(disparity), atol=1e-3) else 0.0
+
+
+def load_middlebury(ref: SampleRef) -> StereoSample:
+    """Read one pair in Middlebury's format.
+
+    Args:
+        ref: ``files`` holds ``left``, ``right``, ``disparity``, ``calibration`` and optionally ``mask``
+            (``mask0nocc.png``: 255 seen twice, 128 hidden in the right view, 0 unknown).
+
+    Returns:
+        The sample; ``notes["disparity_step_px"]`` is 1 for truth from whole-pixel disparities.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged, or sizes disagree.
+    """
+    files = ref.files
+    left, right = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
+    rig = read_calibration(files["calibration"])
+    if rig.size_left is not None:
+        check_size(files["calibration"], (rig.size_left[1], rig.size_left[0]), left.shape)
+    disparity = read_pfm(files["disparity"])
+    check_size(files["disparity"], disparity.shape, left.shape)
+    valid = np.isfinite(disparity)
+    occluded = None
+    if files.get("mask") is not None:
+        mask = read_rgb(files["mask"], "mask of pixels seen twice")[..., 0]
+        check_size(files["mask"], mask.shape, left.shape)
+        occluded = valid & (mask == 128)
+    depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
+    return StereoSample(
+        dataset=ref.dataset,
+        name=ref.name,
+        left=left,
+        right=right,
+        K_left=rig.K_left,
+        K_right=rig.K_right,
+        E=rig.E,
+        depth_m=depth_m,
+        valid=valid & (depth_m > 0),
+        occluded=occluded,
+        rectified=is_rectified(rig.K_left, rig.K_right, rig.E),
+        notes={"truth": files["disparity"].name, "disparity_step_px": _step_px(disparity[valid])},
+    )
+
+
+def _one_set(name: str, obtain: str, full_count: int | None) -> Dataset:
+    def find(root: Path) -> list[SampleRef]:
+        return [ref for ref in find_scenes(root) if ref.dataset == name]
+
+    return Dataset(name=name, find=find, load=load_middlebury, cap_m=None, obtain=obtain, full_count=full_count)
+
+
+MIDDLEBURY2014 = _one_set(
+    "middlebury2014",
+    "scene folders from https://vision.middlebury.edu/stereo/data/scenes2014/ (free with citation).",
+    None,
+)
+MIDDEVAL3 = _one_set(
+    "middeval3",
+    "MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from https://vision.middlebury.edu/stereo/submit3/, "
+    "unpacked into one folder.",
+    15,
+)
+ETH3D = _one_set(
+    "eth3d",
+    "two_view_training.7z and two_view_training_gt.7z from https://www.eth3d.net/datasets (CC BY-NC-SA 4.0), "
+    "unpacked into two_view_training and two_view_training_gt.",
+    27,
+)
