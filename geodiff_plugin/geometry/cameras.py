@@ -1,0 +1,104 @@
+"""Pinhole cameras and rigid transforms: how K follows an image, how two poses become one transform.
+
+Hop: K and camera-to-world poses as given -> K of the grid in use and ``T_right_from_left``.
+Paper: S3.3, S7.2 Eq. 25 (eq:forward-warp_supp).
+"""
+
+from __future__ import annotations
+
+import torch
+
+__all__ = ["invert_rigid", "nearest_rotation", "pad_intrinsics", "relative_pose", "resize_intrinsics"]
+
+
+def resize_intrinsics(K: torch.Tensor, size_from: tuple[int, int], size_to: tuple[int, int]) -> torch.Tensor:
+    """Intrinsics after the image is resized, per axis and with the half-pixel shift.
+
+    Args:
+        K: ``(B, 3, 3)`` float, pixels of the image of ``size_from``.
+        size_from: ``(H, W)`` that ``K`` is for.
+        size_to: ``(H, W)`` after resizing.
+
+    Returns:
+        ``(B, 3, 3)`` of ``K``'s dtype, pixels of the resized image.
+
+    Convention:
+        An integer is a pixel centre, so an image keeps its outer edges at -0.5 and ``W - 0.5``:
+        ``cx = 319.5`` of 640 columns becomes 159.5 of 320.
+    """
+    scale = K.new_tensor([size_to[1] / size_from[1], size_to[0] / size_from[0], 1.0])
+    half = K.new_tensor([0.5, 0.5, 0.0])
+    resized = K * scale[:, None]
+    centre = (K[:, :, 2] + half) * scale - half
+    return torch.cat([resized[:, :, :2], centre[:, :, None]], dim=2)
+
+
+def pad_intrinsics(K: torch.Tensor, left: int = 0, top: int = 0) -> torch.Tensor:
+    """Intrinsics after columns and rows are added before the first ones (negative values crop).
+
+    Args:
+        K: ``(B, 3, 3)`` float, pixels.
+        left: columns added on the left.
+        top: rows added at the top.
+
+    Returns:
+        ``(B, 3, 3)`` of ``K``'s dtype.
+
+    Convention:
+        Padding on the right and at the bottom, as Marigold does, leaves ``K`` as it is;
+        4 columns on the left move ``cx`` by +4.
+    """
+    shift = K.new_zeros(3, 3)
+    shift[0, 2], shift[1, 2] = left, top
+    return K + shift
+
+
+def invert_rigid(T: torch.Tensor) -> torch.Tensor:
+    """Inverse of rigid transforms, from the transposed rotation.
+
+    Args:
+        T: ``(..., 4, 4)`` float, ``T_a_from_b`` with an orthonormal rotation and last row (0, 0, 0, 1).
+
+    Returns:
+        ``(..., 4, 4)``, ``T_b_from_a``; differentiable.
+    """
+    rotation = T[..., :3, :3].transpose(-1, -2)
+    translation = -(rotation @ T[..., :3, 3:])
+    return torch.cat([torch.cat([rotation, translation], dim=-1), T[..., 3:, :]], dim=-2)
+
+
+def relative_pose(E_left: torch.Tensor, E_right: torch.Tensor) -> torch.Tensor:
+    """The transform of points from the left camera's frame to the right one's.
+
+    Args:
+        E_left: ``(B, 4, 4)`` float, camera-to-world pose of the left camera, metres.
+        E_right: ``(B, 4, 4)``, the same of the right camera.
+
+    Returns:
+        ``T_right_from_left = inv(E_right) @ E_left``, ``(B, 4, 4)``; differentiable.
+
+    Convention:
+        A right camera 0.12 m to the right of the left one (``E_right[0, 3] = 0.12``, ``E_left = I``)
+        gives ``T_right_from_left[0, 3] = -0.12``.
+
+    Source: Eq. 25 (eq:forward-warp_supp). Eq. 26 (eq:back-warp_supp) prints ``E2 E1^-1``, which holds
+        for world-to-camera poses only (docs/paper-map.md, E1).
+    """
+    return invert_rigid(E_right) @ E_left
+
+
+def nearest_rotation(matrix: torch.Tensor) -> torch.Tensor:
+    """The proper rotation nearest to a matrix in the Frobenius norm.
+
+    Args:
+        matrix: ``(..., 3, 3)`` float, close to a rotation.
+
+    Returns:
+        ``(..., 3, 3)``, orthonormal with determinant +1.
+
+    Source: orthogonal Procrustes by the singular value decomposition.
+    """
+    u, _, vh = torch.linalg.svd(matrix)
+    sign = torch.ones_like(matrix[..., 0])
+    sign[..., 2] = torch.linalg.det(u @ vh).sign()
+    return (u * sign[..., None, :]) @ vh

@@ -1,0 +1,128 @@
+"""From pixels with a depth to points and back, for one camera and across two.
+
+Hop: depth map in metres + K -> points -> points of the other camera -> pixels of the other image.
+Paper: S3.3 Eq. 9 (eq:forward-warp), S7.2 Eq. 25 (eq:forward-warp_supp).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.camera import project_points
+from kornia.geometry.depth import depth_to_3d_v2, unproject_meshgrid
+from kornia.geometry.linalg import transform_points
+
+__all__ = ["NEAREST_M", "PlaneRays", "plane_rays", "project", "project_rays", "transform", "unproject"]
+
+# Nearer than this a point counts as behind the camera: its pixel would be a division by almost 0.
+NEAREST_M = 1e-4
+# Where such a point is put: finite, and outside of any image.
+_BEHIND_PX = -1e6
+
+
+class PlaneRays(NamedTuple):
+    """Where a left pixel goes in the right view, as a line in its depth: ``p = z * A + b``.
+
+    Attributes:
+        A: ``(B, 3, H * W)``, homogeneous right pixel of the left pixel's point at infinity.
+        b: ``(B, 3, 1)``, homogeneous right pixel of the left camera's centre (the epipole).
+    """
+
+    A: torch.Tensor
+    b: torch.Tensor
+
+
+def unproject(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
+    """Points of a depth map in the frame of its own camera.
+
+    Args:
+        depth_m: ``(B, 1, H, W)`` float, z in metres.
+        K: ``(B, 3, 3)`` float, pixels of the depth map's grid.
+
+    Returns:
+        ``(B, H, W, 3)`` metres, x right, y down, z forward; differentiable.
+
+    Convention:
+        The pixel at the principal point has ``x = y = 0``; one focal length to its right has ``x = z``.
+    """
+    return depth_to_3d_v2(depth_m[:, 0], K)
+
+
+def transform(points: torch.Tensor, T: torch.Tensor) -> torch.Tensor:
+    """Points in another frame.
+
+    Args:
+        points: ``(B, H, W, 3)`` float, frame b.
+        T: ``(B, 4, 4)`` float, ``T_a_from_b``.
+
+    Returns:
+        ``(B, H, W, 3)``, frame a; differentiable.
+    """
+    return transform_points(T, points.flatten(1, 2)).view_as(points)
+
+
+def _in_front(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mask of points in front of the camera, and a z that is safe to divide by everywhere."""
+    in_front = z > NEAREST_M
+    return in_front, torch.where(in_front, z, torch.ones_like(z))
+
+
+def project(points: torch.Tensor, K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pixels of points in a camera's frame.
+
+    Args:
+        points: ``(B, H, W, 3)`` float, metres, in the frame of the camera.
+        K: ``(B, 3, 3)`` float, pixels.
+
+    Returns:
+        ``uv`` ``(B, H, W, 2)`` pixels (column, row) and ``z`` ``(B, H, W)`` metres. At or behind the camera
+        (``z <= NEAREST_M``) ``uv`` is a finite place outside of any image, with zero gradient.
+    """
+    z = points[..., 2]
+    in_front, z_safe = _in_front(z)
+    uv = project_points(torch.cat([points[..., :2], z_safe[..., None]], dim=-1), K[:, None, None])
+    return torch.where(in_front[..., None], uv, torch.full_like(uv, _BEHIND_PX)), z
+
+
+def plane_rays(
+    K_left: torch.Tensor, K_right: torch.Tensor, T_right_from_left: torch.Tensor, size: tuple[int, int]
+) -> PlaneRays:
+    """Everything of the left-to-right projection that does not depend on depth.
+
+    Args:
+        K_left: ``(B, 3, 3)`` float, pixels of the left grid.
+        K_right: ``(B, 3, 3)``, pixels of the right image.
+        T_right_from_left: ``(B, 4, 4)``.
+        size: ``(H, W)`` of the left grid.
+
+    Returns:
+        ``PlaneRays``; the pixel with depth z has the homogeneous right pixel ``z * A + b``, whose third
+        component is its depth in the right view.
+
+    Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
+    """
+    grid = unproject_meshgrid(*size, K_left, device=K_left.device, dtype=K_left.dtype)  # (B, H, W, 3), z = 1
+    rays = grid.flatten(1, 2).transpose(1, 2)  # (B, 3, H * W)
+    A = (K_right @ T_right_from_left[:, :3, :3]) @ rays
+    b = K_right @ T_right_from_left[:, :3, 3:]
+    return PlaneRays(A, b)
+
+
+def project_rays(depth_m: torch.Tensor, rays: PlaneRays) -> tuple[torch.Tensor, torch.Tensor]:
+    """Right-view pixels of a left depth map: ``project(transform(unproject))`` by precomputed rays, cheaper.
+
+    Args:
+        depth_m: ``(B, 1, H, W)`` float, metres.
+        rays: what ``plane_rays`` gave for this grid.
+
+    Returns:
+        ``uv`` ``(B, H, W, 2)`` pixels of the right image and ``z_right`` ``(B, H, W)`` metres; behind the
+        right camera as ``project`` says. Differentiable in ``depth_m``.
+    """
+    height, width = depth_m.shape[-2:]
+    p = depth_m.flatten(2) * rays.A + rays.b  # (B, 3, H * W)
+    z = p[:, 2]
+    in_front, z_safe = _in_front(z)
+    uv = torch.where(in_front[:, None], p[:, :2] / z_safe[:, None], torch.full_like(p[:, :2], _BEHIND_PX))
+    return uv.transpose(1, 2).unflatten(1, (height, width)), z.unflatten(1, (height, width))

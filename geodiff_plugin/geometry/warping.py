@@ -1,0 +1,157 @@
+"""The right image seen from the left camera, and which left pixels the right camera does not see.
+
+Hop: right image + left depth in metres -> image on the left grid, validity mask.
+Paper: S3.3, S7.2 "Backward warping", P_{y2 -> y1}(x1, y2), Eq. 25 (eq:forward-warp_supp).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+
+from geodiff_plugin.geometry.projection import NEAREST_M, PlaneRays, plane_rays, project_rays
+
+__all__ = ["Warped", "hidden_in_right", "sample_at", "warp_right_to_left"]
+
+# Rounding of float32 at image edges: the last pixel centre itself must count as inside.
+_EDGE_PX = 1e-2
+
+
+@dataclass(frozen=True)
+class Warped:
+    """The right image on the left grid.
+
+    Attributes:
+        image: ``(B, C, H, W)``, the right image's values; its edge repeated where not visible.
+        visible: ``(B, 1, H, W)`` bool, in front of the right camera and within its pixel centres.
+        uv: ``(B, H, W, 2)`` pixels of the right image.
+        z_right: ``(B, H, W)`` metres, depth in the right view.
+    """
+
+    image: torch.Tensor
+    visible: torch.Tensor
+    uv: torch.Tensor
+    z_right: torch.Tensor
+
+
+def sample_at(image: torch.Tensor, uv: torch.Tensor, *, mode: str = "bilinear") -> torch.Tensor:
+    """Values of an image at pixel coordinates, its edge repeated outside.
+
+    Args:
+        image: ``(B, C, H, W)`` float.
+        uv: ``(B, h, w, 2)`` pixels (column, row); (0, 0) is the centre of the first pixel.
+        mode: ``"bilinear"`` or ``"nearest"``.
+
+    Returns:
+        ``(B, C, h, w)``; differentiable in ``image`` and, inside the image and bilinear, in ``uv``.
+
+    Convention:
+        A ``uv`` that grows by 1 in its first component reads one pixel further right.
+    """
+    height, width = image.shape[-2:]
+    # align_corners=True: -1 and 1 are the centres of the first and the last pixel, where uv counts from.
+    last = uv.new_tensor([max(width - 1, 1), max(height - 1, 1)])
+    grid = (2.0 * uv / last - 1.0).clamp(-2.0, 2.0)
+    return F.grid_sample(image, grid, mode=mode, padding_mode="border", align_corners=True)
+
+
+def _inside(uv: torch.Tensor, z: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """``(B, 1, H, W)`` bool: in front of the camera and within the pixel centres of an image of ``size``."""
+    u, v = uv[..., 0], uv[..., 1]
+    in_columns = (u >= -_EDGE_PX) & (u <= size[1] - 1 + _EDGE_PX)
+    in_rows = (v >= -_EDGE_PX) & (v <= size[0] - 1 + _EDGE_PX)
+    return (in_columns & in_rows & (z > NEAREST_M))[:, None]
+
+
+def warp_right_to_left(
+    right: torch.Tensor,
+    depth_m: torch.Tensor,
+    K_left: torch.Tensor,
+    K_right: torch.Tensor,
+    T_right_from_left: torch.Tensor,
+    *,
+    rays: PlaneRays | None = None,
+) -> Warped:
+    """Re-render the left image from the right one by the left depth (bilinear backward warp).
+
+    Args:
+        right: ``(B, C, Hr, Wr)`` float image, of any size.
+        depth_m: ``(B, 1, H, W)`` float, metres, on the left grid.
+        K_left: ``(B, 3, 3)`` float, pixels of the left grid.
+        K_right: ``(B, 3, 3)``, pixels of ``right``.
+        T_right_from_left: ``(B, 4, 4)``.
+        rays: ``plane_rays(K_left, K_right, T_right_from_left, (H, W))`` computed before, where the same
+            cameras are used again and again; the three matrices are then not read.
+
+    Returns:
+        ``Warped``. ``image`` is differentiable in ``depth_m`` and ``right``; its gradient in depth is zero
+        where not visible. ``visible`` has no gradient.
+
+    Convention:
+        A right camera ``b`` metres to the right (``T[0, 3] = -b``): the left pixel ``u`` with depth z reads
+        the right image at ``u - f * b / z``.
+
+    Source: S7.2, with the map of Eq. 25 (eq:forward-warp_supp); Eq. 26 (eq:back-warp_supp) has the poses
+        the wrong way round for camera-to-world matrices (docs/paper-map.md, E1).
+    """
+    if rays is None:
+        rays = plane_rays(K_left, K_right, T_right_from_left, (depth_m.shape[-2], depth_m.shape[-1]))
+    uv, z_right = project_rays(depth_m, rays)
+    visible = _inside(uv, z_right, (right.shape[-2], right.shape[-1]))
+    return Warped(sample_at(right, uv), visible, uv, z_right)
+
+
+@torch.no_grad()
+def hidden_in_right(
+    depth_m: torch.Tensor,
+    K_left: torch.Tensor,
+    K_right: torch.Tensor,
+    T_right_from_left: torch.Tensor,
+    size_right: tuple[int, int],
+    *,
+    margin: float = 0.05,
+    rays: PlaneRays | None = None,
+) -> torch.Tensor:
+    """Left pixels that another part of the left surface hides from the right camera.
+
+    The surface is splatted into a depth buffer of the right view; a pixel is hidden when the buffer at its
+    place is nearer than the pixel by more than ``margin``.
+
+    Args:
+        depth_m: ``(B, 1, H, W)`` float, metres, on the left grid.
+        K_left: ``(B, 3, 3)`` float, pixels of the left grid.
+        K_right: ``(B, 3, 3)``, pixels of the right image.
+        T_right_from_left: ``(B, 4, 4)``.
+        size_right: ``(Hr, Wr)`` that ``K_right`` is for.
+        margin: relative difference in depth that still counts as the same surface, > 0.
+        rays: as for ``warp_right_to_left``.
+
+    Returns:
+        ``(B, 1, H, W)`` bool, True where hidden; False outside of the right image. Not differentiable.
+    """
+    batch, _, height, width = depth_m.shape
+    if rays is None:
+        rays = plane_rays(K_left, K_right, T_right_from_left, (height, width))
+    uv, z = project_rays(depth_m, rays)
+    seen = _inside(uv, z, size_right)[:, 0]  # (B, H, W)
+    # No finer than the left grid, else the splatted surface has holes that show what is behind it.
+    rows, columns = min(size_right[0], height), min(size_right[1], width)
+    scale = uv.new_tensor([columns / size_right[1], rows / size_right[0]])
+    cell = (uv + 0.5) * scale - 0.5
+    far = torch.finfo(z.dtype).max
+    z_seen = torch.where(seen, z, torch.full_like(z, far))
+
+    def index(at: torch.Tensor) -> torch.Tensor:
+        column, row = at[..., 0].clamp(0, columns - 1).long(), at[..., 1].clamp(0, rows - 1).long()
+        return (row * columns + column).flatten(1)
+
+    buffer = z.new_full((batch, rows * columns), far)
+    for step in ((0, 0), (1, 0), (0, 1), (1, 1)):  # every cell within 3/4 px: slopes leave no holes
+        target = cell.floor() + cell.new_tensor(step)
+        near = ((target - cell).abs() <= 0.75).all(dim=-1)
+        z_splat = torch.where(near, z_seen, torch.full_like(z, far))
+        buffer.scatter_reduce_(1, index(target), z_splat.flatten(1), "amin")
+    nearest = buffer.gather(1, index(cell.round())).view(batch, height, width)
+    return ((z_seen > nearest * (1.0 + margin)) & seen)[:, None]

@@ -1,0 +1,86 @@
+"""Every line of docs/conventions.md that can be tested, one test a line."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from geodiff_plugin import geometry as g
+
+F, B, Z = 40.0, 0.12, 2.0
+K = torch.tensor([[[F, 0, 15.5], [0, F, 11.5], [0, 0, 1]]])
+SIZE = (24, 32)
+
+
+def rig(x=0.0, y=0.0, z=0.0):
+    E = torch.eye(4)[None]
+    E[0, :3, 3] = torch.tensor([x, y, z])
+    return g.relative_pose(torch.eye(4)[None], E)
+
+
+def uv_of(T, depth=Z, K_right=K):
+    return g.project_rays(torch.full((1, 1, *SIZE), depth), g.plane_rays(K, K_right, T, SIZE))
+
+
+def test_convention_camera_frame_is_x_right_y_down_z_forward():
+    points = g.unproject(torch.full((1, 1, *SIZE), Z), K)[0]
+    assert points[0, -1, 0] > 0 > points[0, 0, 0]
+    assert points[-1, 0, 1] > 0 > points[0, 0, 1]
+    assert (points[..., 2] == Z).all()
+
+
+def test_convention_depth_is_z_not_ray_length():
+    points = g.unproject(torch.full((1, 1, *SIZE), Z), K)[0]
+    assert points[0, 0].norm() > Z and points[0, 0, 2] == Z
+
+
+def test_convention_integer_pixel_is_the_centre_of_a_pixel():
+    image = torch.arange(12.0).view(1, 1, 3, 4)
+    assert g.sample_at(image, torch.tensor([[[[0.0, 0.0]]]])).item() == 0.0
+    assert g.sample_at(image, torch.tensor([[[[3.0, 2.0]]]])).item() == 11.0
+    assert g.sample_at(image, torch.tensor([[[[0.5, 0.0]]]])).item() == pytest.approx(0.5)
+
+
+def test_convention_intrinsics_follow_a_resize_with_the_half_pixel_shift():
+    K_640 = torch.tensor([[[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]])
+    K_320 = g.resize_intrinsics(K_640, (480, 640), (240, 320))
+    assert K_320[0, 0].tolist() == [250.0, 0.0, 159.5] and K_320[0, 1].tolist() == [0.0, 250.0, 119.5]
+
+
+def test_convention_padding_right_and_bottom_keeps_intrinsics():
+    assert torch.equal(g.pad_intrinsics(K), K)
+    assert g.pad_intrinsics(K, left=4)[0, 0, 2] == 19.5
+
+
+def test_convention_E_is_camera_to_world_and_T_maps_left_points_to_the_right_frame():
+    assert rig(x=B)[0, 0, 3].item() == pytest.approx(-B)
+    at_right_camera = g.transform(torch.tensor([[[[B, 0.0, 0.0]]]]), rig(x=B))
+    assert at_right_camera.abs().max() < 1e-7
+
+
+def test_convention_right_camera_at_plus_x_sees_content_shifted_left_by_f_b_over_z():
+    uv, _ = uv_of(rig(x=B))
+    u = torch.arange(SIZE[1], dtype=torch.float32).expand(SIZE)
+    torch.testing.assert_close(uv[0, ..., 0], u - F * B / Z)
+    # the same, seen in images: the left image's content lies f * b / z = 2.4 px further left in the right one
+    columns = torch.arange(SIZE[1], dtype=torch.float32).view(1, 1, 1, -1).expand(1, 1, *SIZE)
+    warped = g.warp_right_to_left(columns, torch.full((1, 1, *SIZE), Z), K, K, rig(x=B))
+    assert warped.image[0, 0, 5, 20].item() == pytest.approx(20 - 2.4, abs=1e-4)
+    assert not warped.visible[..., :2].any() and warped.visible[..., 3:].all()
+
+
+def test_convention_right_camera_below_sees_content_shifted_up():
+    uv, _ = uv_of(rig(y=B))
+    assert uv[0, 10, 5, 1].item() == pytest.approx(10 - F * B / Z, abs=1e-4)
+
+
+def test_convention_right_camera_ahead_sees_nearer_points():
+    _, z = uv_of(rig(z=0.5))
+    assert (z == Z - 0.5).all()
+
+
+def test_convention_doffs_is_the_difference_of_principal_points():
+    doffs = 3.0
+    uv, _ = uv_of(rig(x=B), K_right=g.pad_intrinsics(K, left=3))
+    disparity = 20 - uv[0, 5, 20, 0].item()
+    assert F * B / (disparity + doffs) == pytest.approx(Z, rel=1e-5)
