@@ -6,9 +6,25 @@ Paper: none.
 
 from __future__ import annotations
 
-from typing import NoReturn
+import warnings
+from typing import Any, NoReturn
 
-__all__ = ["bad_type", "bad_value"]
+import numpy as np
+
+__all__ = [
+    "bad_type",
+    "bad_value",
+    "check_baseline",
+    "check_choice",
+    "check_intrinsics",
+    "check_intrinsics_fit",
+    "check_number",
+    "check_pose",
+    "check_range",
+]
+
+#: A baseline longer than this is taken for millimetres that were meant as metres (with a warning).
+LONG_BASELINE_M = 20.0
 
 
 def _sentence(name: str, expected: str, got: object, cure: str) -> str:
@@ -23,3 +39,115 @@ def bad_value(name: str, expected: str, got: object, cure: str = "") -> NoReturn
 def bad_type(name: str, expected: str, got: object, cure: str = "") -> NoReturn:
     """Raise ``TypeError`` with the same sentence, naming the type of what came."""
     raise TypeError(_sentence(name, expected, f"{type(got).__name__}", cure))
+
+
+def _as_matrix(value: Any, name: str, shape: tuple[int, int], cure: str) -> np.ndarray:
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        bad_type(name, f"a {shape[0]}x{shape[1]} matrix of numbers", value, cure)
+    if matrix.shape != shape:
+        bad_value(name, f"a {shape[0]}x{shape[1]} matrix", f"shape {matrix.shape}", cure)
+    if not np.isfinite(matrix).all():
+        bad_value(name, "finite", "NaN or infinity in it", "Check the calibration file.")
+    return matrix
+
+
+def check_intrinsics(K: Any, name: str = "K") -> np.ndarray:
+    """A ``(3, 3)`` float64 camera matrix in pixels.
+
+    Raises:
+        TypeError, ValueError: not 3x3, not finite, zero or negative focal length, last row not (0, 0, 1).
+    """
+    cure = "K is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the image it comes with."
+    K = _as_matrix(K, name, (3, 3), cure)
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        bad_value(f"{name}[0, 0] and {name}[1, 1] (fx, fy)", "positive focal lengths in pixels", (K[0, 0], K[1, 1]), cure)
+    if not np.allclose(K[2], (0, 0, 1), atol=1e-6) or abs(K[1, 0]) > 1e-6:
+        bad_value(name, "upper triangular with last row (0, 0, 1)", K.tolist(), cure)
+    return K
+
+
+def check_intrinsics_fit(K: np.ndarray, width: int, height: int, name: str = "K", image: str = "the image") -> None:
+    """Refuse a camera matrix whose principal point lies outside the image that it comes with."""
+    cx, cy = K[0, 2], K[1, 2]
+    if not (0 <= cx <= width and 0 <= cy <= height):
+        bad_value(
+            name,
+            f"for {image} of {width}x{height} pixels",
+            f"principal point ({cx:.1f}, {cy:.1f}) outside of it",
+            "It probably belongs to another resolution: multiply fx, cx by new_width / old_width and fy, cy likewise.",
+        )
+
+
+def check_pose(E: Any, name: str = "E") -> np.ndarray:
+    """A ``(4, 4)`` float64 rigid transform; a rotation that is off by at most 1e-2 is projected to the nearest one.
+
+    Raises:
+        TypeError, ValueError: not 4x4, not finite, last row not (0, 0, 0, 1), rotation not orthogonal or mirrored.
+    """
+    cure = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t], [0, 1]], t in metres."
+    E = _as_matrix(E, name, (4, 4), cure)
+    if not np.allclose(E[3], (0, 0, 0, 1), atol=1e-6):
+        bad_value(name, "rigid with last row (0, 0, 0, 1)", f"last row {E[3].tolist()}", cure + " Is it transposed?")
+    R = E[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        bad_value(
+            name,
+            "rigid: its upper left 3x3 a rotation (orthogonal within 1e-2, determinant +1)",
+            f"determinant {np.linalg.det(R):.4f}, |R R^T - I| up to {np.abs(R @ R.T - np.eye(3)).max():.4f}",
+            cure,
+        )
+    U, _, Vt = np.linalg.svd(R)
+    E = E.copy()
+    E[:3, :3] = U @ Vt
+    return E
+
+
+def check_baseline(E: np.ndarray, name: str = "E") -> None:
+    """Refuse a relative pose without translation; warn of one that looks like millimetres."""
+    baseline = float(np.linalg.norm(E[:3, 3]))
+    if baseline < 1e-6:
+        bad_value(
+            name,
+            "a pose whose camera centre differs from the left one's (a baseline)",
+            f"a translation of {baseline:.1g} m",
+            "Without a baseline two views carry no scale; give the distance between the cameras in metres.",
+        )
+    if baseline > LONG_BASELINE_M:
+        warnings.warn(
+            f"{name} has a baseline of {baseline:.4g} m. If that is millimetres, divide the translation by 1000.",
+            stacklevel=3,
+        )
+
+
+def check_number(value: Any, name: str, low: float, high: float, *, integer: bool = False) -> Any:
+    """A finite number in ``[low, high]``, returned as it came."""
+    kinds = (int, np.integer) if integer else (int, float, np.integer, np.floating)
+    if isinstance(value, bool) or not isinstance(value, kinds):
+        bad_type(name, "an integer" if integer else "a number", value)
+    if not np.isfinite(value) or not low <= value <= high:
+        bad_value(name, f"between {low:g} and {high:g}", value)
+    return value
+
+
+def check_choice(value: Any, name: str, choices: Any) -> Any:
+    """One of ``choices``, returned as it came."""
+    if value not in choices:
+        bad_value(name, f"one of {sorted(map(str, choices))}", repr(value))
+    return value
+
+
+def check_range(value: Any, name: str) -> tuple[float, float] | None:
+    """``None`` or a pair ``0 < low < high``, as a tuple of floats."""
+    if value is None:
+        return None
+    try:
+        low, high = (float(v) for v in value)
+    except (TypeError, ValueError):
+        bad_type(name, "None or a pair of numbers (low, high)", value)
+    if not (0 < low < high < float("inf")):
+        bad_value(name, "a pair with 0 < low < high", (low, high))
+    return low, high

@@ -1,1 +1,72 @@
-"""Placeholder."""
+"""Adapters of diffusion depth priors, one a file, and how a prior is found by name.
+
+Hop: name or folder -> pipeline -> ``DepthPrior``.
+Paper: S4 (any diffusion-based depth model with iterative updates).
+
+A new prior is a new file and one line in ``PRIORS``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from diffusers import DiffusionPipeline
+from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError, RepositoryNotFoundError
+
+from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.marigold import MarigoldPrior
+
+__all__ = ["PRIORS", "DepthPrior", "find_adapter", "load_prior"]
+
+PRIORS: dict[str, type[DepthPrior]] = {
+    "marigold": MarigoldPrior,
+}
+
+BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
+
+
+def find_adapter(pipe: Any) -> type[DepthPrior]:
+    """The class in ``PRIORS`` that understands a pipeline.
+
+    Raises:
+        TypeError: none does.
+    """
+    for adapter in PRIORS.values():
+        if adapter.matches(pipe):
+            return adapter
+    bad_type("pipe", f"a pipeline with an adapter ({', '.join(PRIORS)})", pipe, "docs/extending.md shows how to write one.")
+
+
+def load_prior(
+    name: str | Path, device: str | torch.device | None = None, dtype: torch.dtype = torch.float32, **kwargs: Any
+) -> DiffusionPipeline:
+    """Load a pipeline that can be guided.
+
+    Args:
+        name: ``"bundled"``, a folder in diffusers' layout, or a hub id such as ``prs-eth/marigold-depth-v1-1``.
+        device: where to, CPU for ``None``.
+        dtype: of U-Net and VAE.
+        **kwargs: for ``from_pretrained`` (``revision``, ``variant``, ``token``, ``local_files_only``, ...).
+
+    Raises:
+        ValueError: it does not exist, or is neither cached nor can be fetched.
+        TypeError: it loads, but has no adapter.
+    """
+    source = str(BUNDLED_FOLDER) if str(name) == "bundled" else str(name)
+    if Path(source).is_dir():
+        if not (Path(source) / "model_index.json").is_file():
+            bad_value("prior", "a folder in diffusers' layout", f"{source} without model_index.json")
+        kwargs["local_files_only"] = True
+    try:
+        pipe = DiffusionPipeline.from_pretrained(source, torch_dtype=dtype, **kwargs)
+    except (LocalEntryNotFoundError, RepositoryNotFoundError, HFValidationError, OSError, ConnectionError) as error:
+        cure = "Fetch it once with `hf download ID` while online, give a folder, or use the bundled one: --prior bundled."
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(
+            f"prior must be 'bundled', a folder or a hub id that is cached or can be reached; got {str(name)!r} ({reason}). {cure}"
+        ) from error
+    find_adapter(pipe)
+    return pipe.to(device) if device is not None else pipe

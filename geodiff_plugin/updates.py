@@ -1,0 +1,73 @@
+"""Gradient rules: how far one gradient moves a tensor.
+
+Hop: gradient and its state -> a step to be added.
+Paper: Algorithm 1 (plain step); S5.1 (learning rate 1e-2, no optimiser named).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+__all__ = ["RULES", "Adam", "NormMatched", "Plain"]
+
+
+def _per_sample_norm(x: Tensor) -> Tensor:
+    norm = x.flatten(1).norm(dim=1) if x.ndim > 1 else x.abs()
+    return norm.view(-1, *([1] * (x.ndim - 1)))
+
+
+@dataclass
+class Plain:
+    """``-rate * gradient``: Algorithm 1 as printed."""
+
+    rate: float
+
+    def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
+        """The step for ``gradient`` (any shape, batch first); ``reference`` is not used."""
+        return -self.rate * gradient
+
+
+@dataclass
+class NormMatched:
+    """``-rate * gradient * |reference| / |gradient|`` per sample: a fixed share of the predicted noise."""
+
+    rate: float
+
+    def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
+        """The step for ``gradient`` (B, ...); ``reference`` (B, ...) sets its length, 1 without it.
+
+        A zero gradient gives a zero step.
+        """
+        length = _per_sample_norm(reference) if reference is not None else 1.0
+        return -self.rate * gradient * (length / _per_sample_norm(gradient).clamp_min(1e-12))
+
+
+@dataclass
+class Adam:
+    """Adam with bias correction; its moments live as long as the object, that is one trajectory.
+
+    Element-wise, so that samples of a batch do not see each other.
+    """
+
+    rate: float
+    betas: tuple[float, float] = (0.9, 0.99)
+    count: int = 0
+    moments: tuple[Tensor, Tensor] | None = field(default=None, repr=False)
+
+    def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
+        """The step for ``gradient`` (any shape, the same at every call); ``reference`` is not used."""
+        b1, b2 = self.betas
+        first, second = self.moments or (torch.zeros_like(gradient), torch.zeros_like(gradient))
+        self.count += 1
+        first = b1 * first + (1 - b1) * gradient
+        second = b2 * second + (1 - b2) * gradient * gradient
+        self.moments = (first, second)
+        corrected = second / (1 - b2**self.count)
+        return -self.rate * (first / (1 - b1**self.count)) / (corrected.sqrt() + 1e-10)
+
+
+#: Name in the configuration -> rule. A rule is made anew for every trajectory.
+RULES = {"plain": Plain, "adam": Adam, "norm": NormMatched}
