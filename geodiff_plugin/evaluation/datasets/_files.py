@@ -17,9 +17,11 @@ __all__ = ["check_size", "folders", "read_png16", "read_rgb", "require"]
 
 
 def require(path: Path, what: str) -> Path:
-    """Return ``path``; raise ``FileNotFoundError`` with its name and what it should hold where it is missing."""
+    """Return ``path``; raise ``FileNotFoundError`` with its name and what it should hold."""
     if not path.is_file():
-        raise FileNotFoundError(f"{what} is missing: {path} does not exist. Check that the download is complete.")
+        raise FileNotFoundError(
+            f"{what} is missing: {path} does not exist. Check that the download is complete."
+        )
     return path
 
 

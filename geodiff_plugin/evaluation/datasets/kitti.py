@@ -27,8 +27,9 @@ def load_kitti(ref: SampleRef) -> StereoSample:
     """Read one KITTI pair.
 
     Args:
-        ref: ``files`` holds ``left``, ``right``, ``disparity``, ``calibration`` (paths), ``cameras`` (two numbers of
-            ``P0`` .. ``P3``) and optionally ``noc``, the disparity of the pixels that are seen twice.
+        ref: ``files`` holds ``left``, ``right``, ``disparity``, ``calibration`` (paths), ``cameras`` (two
+            numbers of ``P0`` .. ``P3``) and optionally ``noc``, the disparity of the pixels that are seen
+            twice.
 
     Returns:
         The sample; ``occluded`` where both kinds of truth exist, ``notes["truth"]`` says which was read.

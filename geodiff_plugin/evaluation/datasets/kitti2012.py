@@ -49,7 +49,7 @@ KITTI2012 = Dataset(
     find=find_kitti2012,
     load=load_kitti,
     cap_m=KITTI_CAP_M,
-    obtain="data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php (CC BY-NC-SA 3.0), "
-    "unpacked into one folder.",
+    obtain="data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php "
+    "(CC BY-NC-SA 3.0), unpacked into one folder.",
     full_count=194,
 )

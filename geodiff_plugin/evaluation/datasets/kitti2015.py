@@ -40,7 +40,7 @@ KITTI2015 = Dataset(
     find=find_kitti2015,
     load=load_kitti,
     cap_m=KITTI_CAP_M,
-    obtain="data_scene_flow.zip and data_scene_flow_calib.zip from https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php "
-    "(CC BY-NC-SA 3.0), unpacked into one folder.",
+    obtain="data_scene_flow.zip and data_scene_flow_calib.zip from "
+    "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (CC BY-NC-SA 3.0), unpacked into one folder.",
     full_count=200,
 )

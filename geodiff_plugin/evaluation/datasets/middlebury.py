@@ -1,7 +1,8 @@
 """Middlebury 2014, MiddEval3 and ETH3D two-view: three sets in one file format.
 
 Hop: folder -> references -> ``StereoSample``.
-Paper: S5.1, Table 3 (15 pairs). Depth in metres is ``f b / (d + doffs)``, with doffs in pixels and b from millimetres.
+Paper: S5.1, Table 3 (15 pairs). Depth in metres is ``f b / (d + doffs)``, with doffs in pixels and b from
+millimetres.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ __all__ = ["ETH3D", "MIDDEVAL3", "MIDDLEBURY2014", "find_scenes", "load_middlebu
 def find_scenes(root: Path) -> list[SampleRef]:
     """References to every scene of the three sets below ``root``.
 
-    A scene is a folder with ``im0.png`` and ``calib.txt``. Its truth is ``disp0.pfm`` (2014), ``disp0GT.pfm`` beside
-    the images (MiddEval3), or ``disp0GT.pfm`` in ``two_view_training_gt/<scene>`` (ETH3D). Which of the three a
-    scene belongs to is told by the folder's name (``eth3d``, ``two_view``) and else by the truth's name.
+    A scene is a folder with ``im0.png`` and ``calib.txt``. Its truth is ``disp0.pfm`` (2014),
+    ``disp0GT.pfm`` beside the images (MiddEval3), or ``disp0GT.pfm`` in ``two_view_training_gt/<scene>``
+    (ETH3D). Which of the three a scene belongs to is told by the folder's name (``eth3d``, ``two_view``) and
+    else by the truth's name.
     """
     refs = []
     for folder in folders(root, 3):
@@ -55,8 +57,11 @@ def find_scenes(root: Path) -> list[SampleRef]:
 
 
 def _step_px(disparity: np.ndarray) -> float:
-    """Coarseness of the truth: 1 px where every value is a whole number, else 0 (as good as continuous)."""
-    return 1.0 if disparity.size and np.allclose(disparity, np.round(disparity), atol=1e-3) else 0.0
+    """Coarseness of the truth: gap between neighbouring values, 0 where as good as continuous."""
+    values = np.unique(disparity)
+    gaps = np.diff(values)
+    # Float truth has gaps far below a sixteenth of a pixel; truth that was made from 8-bit maps has none.
+    return float(gaps.min()) if gaps.size and gaps.min() > 1 / 16 else 0.0
 
 
 def load_middlebury(ref: SampleRef) -> StereoSample:
@@ -67,7 +72,8 @@ def load_middlebury(ref: SampleRef) -> StereoSample:
             (``mask0nocc.png``: 255 seen twice, 128 hidden in the right view, 0 unknown).
 
     Returns:
-        The sample; ``notes["disparity_step_px"]`` is 1 for truth from whole-pixel disparities.
+        The sample; ``notes["disparity_step_px"]`` says how coarse the truth is (Adirondack's quarter size: 1
+        px).
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -107,7 +113,9 @@ def _one_set(name: str, obtain: str, full_count: int | None) -> Dataset:
     def find(root: Path) -> list[SampleRef]:
         return [ref for ref in find_scenes(root) if ref.dataset == name]
 
-    return Dataset(name=name, find=find, load=load_middlebury, cap_m=None, obtain=obtain, full_count=full_count)
+    return Dataset(
+        name=name, find=find, load=load_middlebury, cap_m=None, obtain=obtain, full_count=full_count
+    )
 
 
 MIDDLEBURY2014 = _one_set(
@@ -117,8 +125,8 @@ MIDDLEBURY2014 = _one_set(
 )
 MIDDEVAL3 = _one_set(
     "middeval3",
-    "MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from https://vision.middlebury.edu/stereo/submit3/, "
-    "unpacked into one folder.",
+    "MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from "
+    "https://vision.middlebury.edu/stereo/submit3/, unpacked into one folder.",
     15,
 )
 ETH3D = _one_set(

@@ -38,9 +38,12 @@ def ordered_pairs(path: Path) -> list[tuple[int, int]]:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not the format of MVSNet: a count, then per view its number and a line of ``n id score ...``.
+        ValueError: not the format of MVSNet: a count, then per view its number and a line of ``n id score
+            ...``.
     """
-    lines = [line.split() for line in require(path, "list of view pairs").read_text().splitlines() if line.strip()]
+    lines = [
+        line.split() for line in require(path, "list of view pairs").read_text().splitlines() if line.strip()
+    ]
     try:
         count = int(lines[0][0])
         pairs = []
@@ -48,7 +51,9 @@ def ordered_pairs(path: Path) -> list[tuple[int, int]]:
             reference, sources = int(lines[1 + 2 * i][0]), lines[2 + 2 * i]
             pairs += [(reference, int(source)) for source in sources[1 : 1 + 2 * int(sources[0]) : 2]]
     except (IndexError, ValueError):
-        bad_value(str(path), "a pair.txt (count, then 'id' and 'n id score ...' lines per view)", "another format")
+        bad_value(
+            str(path), "a pair.txt (count, then 'id' and 'n id score ...' lines per view)", "another format"
+        )
     return pairs
 
 
@@ -57,7 +62,8 @@ def find_mvsnet(root: Path, pairs: str = "default", pixel_centre: float = 0.0) -
 
     Args:
         root: a group, or a folder of groups down to two levels.
-        pairs: ``"default"``: the first two views of each group; ``"all"``: every ordered pair of ``pair.txt``.
+        pairs: ``"default"``: the first two views of each group; ``"all"``: every ordered pair of
+            ``pair.txt``.
         pixel_centre: coordinate of the top-left pixel's centre in the cameras' convention; 0.5 for COLMAP's.
 
     Returns:
@@ -89,8 +95,8 @@ def load_mvsnet(ref: SampleRef) -> StereoSample:
     """Read one posed pair; the camera files' depth numbers are never used.
 
     Args:
-        ref: ``files`` holds ``group`` (folder), ``left``, ``right`` (view numbers), ``others`` (further views) and
-            ``pixel_centre``.
+        ref: ``files`` holds ``group`` (folder), ``left``, ``right`` (view numbers), ``others`` (further
+            views) and ``pixel_centre``.
 
     Returns:
         The sample; ``valid`` is False everywhere where the group has no depths.
@@ -137,6 +143,6 @@ MVSNET = Dataset(
     find=find_mvsnet,
     load=load_mvsnet,
     cap_m=None,
-    obtain="folders of images/, cams/ and pair.txt as MVSNet code circulates Tanks and Temples; for the numbers here also "
-    "depths/*.pfm in metres.",
+    obtain="folders of images/, cams/ and pair.txt as MVSNet code circulates Tanks and Temples; "
+    "for the numbers here also depths/*.pfm in metres.",
 )

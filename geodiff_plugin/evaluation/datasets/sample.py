@@ -15,7 +15,15 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["Dataset", "ExtraView", "SampleRef", "StereoSample", "depth_to_disparity", "disparity_to_depth", "is_rectified"]
+__all__ = [
+    "Dataset",
+    "ExtraView",
+    "SampleRef",
+    "StereoSample",
+    "depth_to_disparity",
+    "disparity_to_depth",
+    "is_rectified",
+]
 
 ExtraView = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -34,7 +42,8 @@ class StereoSample:
         E: ``(4, 4)`` float64, metres; pose of the right camera in the left camera's frame.
         depth_m: ``(H, W)`` float32, metres; 0 where the truth is unknown.
         valid: ``(H, W)`` bool, where the truth is known.
-        occluded: ``(H, W)`` bool, hidden in the right view or outside it; ``None`` where the set does not say.
+        occluded: ``(H, W)`` bool, hidden in the right view or outside it; ``None`` where the set does not
+            say.
         material: ``(H, W)`` uint8 material class; ``None`` where the set has none.
         rectified: whether rows are epipolar lines with equal focal lengths (``is_rectified``).
         notes: what a reader of the numbers should know, e.g. ``truth``, ``disparity_step_px``.
@@ -147,7 +156,9 @@ def disparity_to_depth(
     return depth_m.astype(np.float32)
 
 
-def depth_to_disparity(depth_m: np.ndarray, K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray) -> np.ndarray:
+def depth_to_disparity(
+    depth_m: np.ndarray, K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray
+) -> np.ndarray:
     """Inverse of ``disparity_to_depth`` for positive depth.
 
     Args:

@@ -1,0 +1,171 @@
+"""What a depth map is worth against the truth: errors in depth, in disparity, and of the uncertainty.
+
+Hop: predicted depth + truth + mask -> numbers, one image at a time.
+Paper: S5.1 (AbsRel, delta, RMSE; its printed RMSE lacks the root, docs/paper-map.md E5).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value
+
+__all__ = ["FLOOR_M", "ause", "counted", "evaluate_depth", "evaluate_disparity"]
+
+FLOOR_M = 1e-5
+"""Nearest truth that counts and nearest value of a prediction, metres (Marigold's evaluation of KITTI)."""
+
+
+def _check_maps(**maps: np.ndarray) -> None:
+    shapes = {name: np.shape(values) for name, values in maps.items()}
+    if len(set(shapes.values())) != 1:
+        bad_value(
+            "maps", "of one shape (H, W)", ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        )
+
+
+def counted(truth_m: np.ndarray, valid: np.ndarray, cap_m: float | None = None) -> np.ndarray:
+    """Pixels whose truth counts: known and strictly between ``FLOOR_M`` and the cap.
+
+    Args:
+        truth_m: ``(H, W)`` float, metres.
+        valid: ``(H, W)`` bool, where the truth is known.
+        cap_m: farthest truth that counts, metres; ``None`` for no limit.
+
+    Returns:
+        ``(H, W)`` bool.
+
+    Raises:
+        ValueError: shapes differ, or no pixel is left.
+    """
+    _check_maps(truth_m=truth_m, valid=valid)
+    with_truth = valid & np.isfinite(truth_m) & (truth_m > FLOOR_M)
+    kept = with_truth if cap_m is None else with_truth & (truth_m < cap_m)
+    if not kept.any():
+        bad_value("truth", "known for at least one pixel", "no valid pixel", "Check the mask and the cap.")
+    return kept
+
+
+def evaluate_depth(
+    pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, cap_m: float | None = None
+) -> dict[str, float]:
+    """Errors of one depth map.
+
+    Args:
+        pred_m: ``(H, W)`` float, metres; NaN, infinite or not positive where a method leaves a hole.
+        truth_m: ``(H, W)`` float, metres.
+        valid: ``(H, W)`` bool, where the truth is known.
+        cap_m: truth from here on is dropped and predictions are clipped to it, metres; ``None`` for no limit.
+
+    Returns:
+        ``abs_rel`` (mean of |p - t| / t), ``delta1`` .. ``delta3`` (share with max(p/t, t/p) < 1.25**k),
+        ``rmse`` (metres, rooted), ``log_rmse`` (natural logarithm), ``silog`` (100 times the standard
+        deviation of log p - log t), all over the pixels with both truth and prediction, NaN where there is
+        none; ``coverage`` (share of the truth's pixels with a prediction) and ``pixels`` (their number).
+
+    Raises:
+        ValueError: shapes differ, or no pixel has truth.
+
+    Source: S5.1; Marigold's evaluation code for clipping and SILog.
+    """
+    _check_maps(pred_m=pred_m, truth_m=truth_m, valid=valid)
+    kept = counted(truth_m, valid, cap_m)
+    pred, truth = np.asarray(pred_m, np.float64)[kept], np.asarray(truth_m, np.float64)[kept]
+    filled = np.isfinite(pred) & (pred > 0)
+    scores = {"coverage": float(filled.mean()), "pixels": float(kept.sum())}
+    pred, truth = np.clip(pred[filled], FLOOR_M, cap_m), truth[filled]
+    if not filled.any():
+        names = ("abs_rel", "delta1", "delta2", "delta3", "rmse", "log_rmse", "silog")
+        return dict.fromkeys(names, float("nan")) | scores
+    ratio = np.maximum(pred / truth, truth / pred)
+    log_error = np.log(pred) - np.log(truth)
+    return {
+        "abs_rel": float(np.mean(np.abs(pred - truth) / truth)),
+        "delta1": float(np.mean(ratio < 1.25)),
+        "delta2": float(np.mean(ratio < 1.25**2)),
+        "delta3": float(np.mean(ratio < 1.25**3)),
+        "rmse": float(np.sqrt(np.mean((pred - truth) ** 2))),
+        "log_rmse": float(np.sqrt(np.mean(log_error**2))),
+        "silog": float(100.0 * np.std(log_error)),
+    } | scores
+
+
+def evaluate_disparity(
+    pred_px: np.ndarray, truth_px: np.ndarray, valid: np.ndarray, step_px: float = 0.0
+) -> dict[str, float | None]:
+    """Errors of one disparity map.
+
+    Args:
+        pred_px: ``(H, W)`` float, pixels; not finite where a method leaves a hole.
+        truth_px: ``(H, W)`` float, pixels.
+        valid: ``(H, W)`` bool, where the truth counts.
+        step_px: distance between two neighbouring values that the truth can take, pixels.
+
+    Returns:
+        ``epe`` (mean of |p - t|), ``bad1`` .. ``bad3`` (share with an error above 1, 2, 3 px; ``None`` where
+        the truth's step is not finer than the threshold), ``d1`` (KITTI: error above 3 px and above 5 % of
+        the truth), over the pixels with both truth and prediction; NaN where there is none.
+
+    Raises:
+        ValueError: shapes differ, or no pixel has truth.
+
+    Source: KITTI 2015 development kit (D1), Middlebury (bad-k).
+    """
+    _check_maps(pred_px=pred_px, truth_px=truth_px, valid=valid)
+    if not valid.any():
+        bad_value("truth", "known for at least one pixel", "no valid pixel")
+    pred, truth = np.asarray(pred_px, np.float64)[valid], np.asarray(truth_px, np.float64)[valid]
+    filled = np.isfinite(pred)
+    error, truth = np.abs(pred[filled] - truth[filled]), truth[filled]
+
+    def share(wrong: np.ndarray) -> float:
+        return float(wrong.mean()) if wrong.size else float("nan")
+
+    scores: dict[str, float | None] = {"epe": share(error)}
+    for k in (1, 2, 3):
+        scores[f"bad{k}"] = share(error > k) if step_px < k else None
+    scores["d1"] = share((error > 3) & (error > 0.05 * np.abs(truth))) if step_px < 3 else None
+    return scores
+
+
+def ause(
+    pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, uncertainty: np.ndarray, steps: int = 100
+) -> float:
+    """Area under the sparsification error: how badly the uncertainty sorts pixels by their error.
+
+    The share ``k / steps`` of the least certain pixels is left out, the mean relative error of the rest is
+    compared with the same where the worst pixels are left out, and the difference is averaged over k.
+
+    Args:
+        pred_m: ``(H, W)`` float, metres.
+        truth_m: ``(H, W)`` float, metres.
+        valid: ``(H, W)`` bool, where the truth counts.
+        uncertainty: ``(H, W)`` float, any unit; larger is less certain.
+        steps: number of points on the curve, at least 1.
+
+    Returns:
+        In AbsRel's unit, at least 0; 0 where the order of the pixels is the order of their errors.
+
+    Raises:
+        ValueError: shapes differ, or no pixel has truth, prediction and uncertainty.
+
+    Source: Ilg et al., "Uncertainty Estimates and Multi-Hypotheses Networks for Optical Flow", S5; on AbsRel
+    here.
+    """
+    _check_maps(pred_m=pred_m, truth_m=truth_m, valid=valid, uncertainty=uncertainty)
+    kept = valid & np.isfinite(pred_m) & (pred_m > 0) & np.isfinite(uncertainty)
+    if not kept.any():
+        bad_value("uncertainty", "finite for at least one pixel with truth", "none")
+    truth = np.asarray(truth_m, np.float64)[kept]
+    error = np.abs(np.asarray(pred_m, np.float64)[kept] - truth) / truth
+    cut = (np.arange(steps) * error.size) // steps
+
+    def remaining(order: np.ndarray) -> np.ndarray:
+        """Mean error without the first ``cut`` pixels of the order."""
+        tail_sum = np.cumsum(error[order][::-1])[::-1]
+        return tail_sum[cut] / (error.size - cut)
+
+    # Stable sorts: pixels of equal uncertainty keep the image's order on every machine.
+    by_uncertainty = np.argsort(-np.asarray(uncertainty, np.float64)[kept], kind="stable")
+    by_error = np.argsort(-error, kind="stable")
+    return float(np.mean(remaining(by_uncertainty) - remaining(by_error)))
