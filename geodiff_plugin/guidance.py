@@ -229,6 +229,11 @@ class GeometryGuidance(ConfigMixin):
         """The calibrations as understood, one per right image."""
         return list(self._rigs)
 
+    @property
+    def rights(self) -> list[Tensor]:
+        """The right images, ``(3, H, W)`` float32 in [0, 1] each, native size."""
+        return list(self._rights)
+
     def prepare(self, lefts_01: Tensor) -> list[Evidence]:
         """Let the views speak: one cost volume (and its matches, if a term asks) per image.
 
@@ -250,8 +255,8 @@ class GeometryGuidance(ConfigMixin):
             check_intrinsics_fit(
                 rig.K_left, lefts_01.shape[-1], lefts_01.shape[-2], _label("K", i, self._rights), "the left image"
             )
-            T = np.linalg.inv(rig.E)
-            cameras = (torch.as_tensor(m, dtype=torch.float32, device=device) for m in (rig.K_left, rig.K_right, T))
+            matrices = (rig.K_left, rig.K_right, rig.T_right_from_left)
+            cameras = (torch.as_tensor(m, dtype=torch.float32, device=device) for m in matrices)
             evidence.append(
                 prepare_evidence(
                     lefts_01[i],

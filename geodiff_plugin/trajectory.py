@@ -38,6 +38,7 @@ class Trajectory:
     Attributes:
         affine: current scale, shift and g_s, ``(B,)`` each; ``None`` before the first search.
         history: one ``StepReport`` a step.
+        last_x: ``(B, 1, h, w)`` the relative map of the latest evaluation, no graph.
         on_edge: ``(B,)`` bool, whether the last search ended on the edge of its range.
     """
 
@@ -52,6 +53,7 @@ class Trajectory:
         self.affine_start: AffineState | None = None
         self.matches: MatchTarget | None = None
         self.on_edge: Tensor | None = None
+        self.last_x: Tensor | None = None
         self.history: list[StepReport] = []
 
     def is_active(self, fraction: float) -> bool:
@@ -189,6 +191,7 @@ def guided_step(
                 z = z.detach() + trajectory.latent_rule.step(grads[2], eps)
         if k == 0:
             first = loss
+    trajectory.last_x = x0.detach()
     trajectory.report(step, timestep, first)
     return (z - leaf).detach()
 

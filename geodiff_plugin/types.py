@@ -38,6 +38,11 @@ class Rig:
     size_right: tuple[int, int] | None = None
     source: str = "arguments"
 
+    @property
+    def T_right_from_left(self) -> np.ndarray:
+        """``(4, 4)`` float64, takes points from the left camera's frame to the right one's."""
+        return np.linalg.inv(self.E)
+
 
 @dataclass(frozen=True)
 class View:

@@ -1,0 +1,106 @@
+"""Assemble everything known about a guided call on the grid of its output.
+
+Hop: stock output in metres + ``GuidedRun`` -> ``MetricDepthOutput``.
+Paper: Eq. 14's re-rendered left image, as a per-pixel report.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from diffusers.pipelines.marigold import MarigoldDepthOutput
+from torch import Tensor
+
+from geodiff_plugin.geometry.cameras import resize_intrinsics
+from geodiff_plugin.geometry.warping import warp_right_to_left
+from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.integration.run import GuidedRun
+from geodiff_plugin.types import MetricDepthOutput
+
+__all__ = ["assemble_output"]
+
+#: A visible share below this is told to the user: scale then rests on little.
+LITTLE_OVERLAP = 0.3
+
+
+def assemble_output(
+    stock: MarigoldDepthOutput,
+    run: GuidedRun,
+    guidance: GeometryGuidance,
+    lefts_01: Tensor,
+    match_input_resolution: bool,
+    output_type: str,
+) -> MetricDepthOutput:
+    """Everything of ``MetricDepthOutput`` but ``latent``.
+
+    Args:
+        stock: output of the stock call, already in metres.
+        run: the finished run.
+        guidance: what was configured.
+        lefts_01: ``(N, 3, H, W)`` left images at native size.
+        match_input_resolution: whether the output grid is the input's.
+        output_type: ``"np"`` or ``"pt"``.
+    """
+    count, size = lefts_01.shape[0], tuple(lefts_01.shape[-2:])
+    depth_m = stock.prediction
+    if output_type == "np":
+        depth_m = torch.from_numpy(depth_m).permute(0, 3, 1, 2)
+    depth_m = depth_m.float().to(lefts_01.device)  # (N, 1, H, W) or the processing grid
+    grid = tuple(depth_m.shape[-2:])
+    lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
+    K = torch.stack([torch.as_tensor(rig.K_left, dtype=torch.float32, device=depth_m.device) for rig in guidance.rigs])
+    K = resize_intrinsics(K, size, grid)
+    visible, error = zip(*(_reprojection(guidance, i, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1]) for i in range(count)), strict=True)
+    relative = torch.cat(run.relative)
+    relative = relative.reshape(count, -1, *relative.shape[1:]).median(dim=1).values  # (N, 1, h, w)
+    if match_input_resolution:
+        relative = F.interpolate(relative, size, mode="bilinear", align_corners=False)
+    affine = [t.affine for t in run.trajectories]
+
+    def members(name: str) -> Tensor:
+        return torch.cat([getattr(a, name) for a in affine]).reshape(count, -1).cpu()
+
+    def out(x: Tensor) -> Any:
+        return x if output_type == "pt" else x.permute(0, 2, 3, 1).cpu().numpy()
+
+    visible_map = torch.cat(visible)
+    return MetricDepthOutput(
+        prediction=stock.prediction,
+        uncertainty=stock.uncertainty,
+        relative=out(relative),
+        scale=members("scale"),
+        shift=members("shift"),
+        global_scale=members("g_s"),
+        visible=out(visible_map),
+        photometric_error=out(torch.cat(error)),
+        K=K if output_type == "pt" else K.cpu().numpy(),
+        history=[report for t in run.trajectories for report in t.history],
+        warnings=_warnings(run, visible_map),
+    )
+
+
+def _reprojection(
+    guidance: GeometryGuidance, i: int, depth_m: Tensor, left_01: Tensor, K_left: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Visible mask and mean absolute error to the re-rendered left image, at the output's resolution."""
+    rig, right = guidance.rigs[i], guidance.rights[i]
+    matrices = (torch.as_tensor(m, dtype=torch.float32, device=depth_m.device)[None] for m in (rig.K_right, rig.T_right_from_left))
+    warped = warp_right_to_left(right[None].to(depth_m.device), depth_m, K_left, *matrices)
+    error = (warped.image - left_01).abs().mean(1, keepdim=True)
+    return warped.visible, error * warped.visible
+
+
+def _warnings(run: GuidedRun, visible: Tensor) -> list[str]:
+    found = []
+    if any(bool(t.on_edge.any()) for t in run.trajectories):
+        found.append(
+            "The search for the scale ended on the edge of its range: the depth may lie beyond it. "
+            "Check the calibration (units of the baseline, order of left and right) or widen depth_range."
+        )
+    share = visible.float().mean().item()
+    if share < LITTLE_OVERLAP:
+        found.append(f"Only {share:.0%} of the left image is seen by the right camera at this depth; scale rests on little.")
+    found.extend(e.warning for e in run.evidence if e.warning)
+    return found

@@ -1,0 +1,138 @@
+"""Fixtures: a tiny random Marigold, and a pair of analytic renderings of a tilted, textured plane."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, UNet2DConditionModel
+from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+
+SCHEDULER = {
+    "beta_schedule": "scaled_linear",
+    "beta_start": 0.00085,
+    "beta_end": 0.012,
+    "prediction_type": "v_prediction",
+    "timestep_spacing": "trailing",
+    "rescale_betas_zero_snr": True,
+    "clip_sample": False,
+    "set_alpha_to_one": False,
+}
+
+
+def make_unet(seed: int = 0) -> UNet2DConditionModel:
+    torch.manual_seed(seed)
+    return UNet2DConditionModel(
+        sample_size=16,
+        in_channels=8,
+        out_channels=4,
+        block_out_channels=(8, 16),
+        layers_per_block=1,
+        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
+        up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
+        cross_attention_dim=8,
+        attention_head_dim=4,
+        norm_num_groups=4,
+    )
+
+
+def make_vae(seed: int = 1) -> AutoencoderKL:
+    torch.manual_seed(seed)
+    return AutoencoderKL(
+        block_out_channels=(8, 16),
+        in_channels=3,
+        out_channels=3,
+        down_block_types=("DownEncoderBlock2D",) * 2,
+        up_block_types=("UpDecoderBlock2D",) * 2,
+        latent_channels=4,
+        norm_num_groups=4,
+        scaling_factor=0.5,
+    )
+
+
+@pytest.fixture(scope="session")
+def tokenizer(tmp_path_factory) -> CLIPTokenizer:
+    folder = tmp_path_factory.mktemp("tokenizer")
+    vocab = {"<|startoftext|>": 0, "<|endoftext|>": 1, "a</w>": 2, "a": 3}
+    (folder / "vocab.json").write_text(json.dumps(vocab))
+    (folder / "merges.txt").write_text("#version: 0.2\n")
+    return CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt"), model_max_length=77)
+
+
+@pytest.fixture
+def make_pipeline(tokenizer):
+    """Factory of tiny random Marigold pipelines; the same seed gives the same weights."""
+
+    def make(scheduler=None, prediction_type: str = "depth") -> MarigoldDepthPipeline:
+        torch.manual_seed(2)
+        text = CLIPTextModel(
+            CLIPTextConfig(
+                hidden_size=8, intermediate_size=8, num_attention_heads=2, num_hidden_layers=1, vocab_size=4
+            )
+        )
+        pipe = MarigoldDepthPipeline(
+            unet=make_unet(),
+            vae=make_vae(),
+            scheduler=scheduler or DDIMScheduler(**SCHEDULER),
+            text_encoder=text,
+            tokenizer=tokenizer,
+            prediction_type=prediction_type,
+            default_denoising_steps=2,
+            default_processing_resolution=64,
+        )
+        pipe.set_progress_bar_config(disable=True)
+        return pipe
+
+    return make
+
+
+@dataclass(frozen=True)
+class PlanePair:
+    left: np.ndarray  # (H, W, 3) uint8
+    right: np.ndarray
+    K: np.ndarray
+    E: np.ndarray
+    depth_m: np.ndarray  # (H, W)
+
+
+def textured(xy: np.ndarray, seed: int) -> np.ndarray:
+    """A smooth random texture on a plane: sums of plane waves, (..., 3) in [0, 1]."""
+    rng = np.random.default_rng(seed)
+    value = np.zeros((*xy.shape[:-1], 3))
+    for _ in range(24):
+        direction, phase = rng.normal(size=2) * rng.uniform(2.0, 14.0), rng.uniform(0, 2 * np.pi, 3)
+        value += np.sin((xy @ direction)[..., None] + phase)
+    return 0.5 + 0.5 * np.tanh(value / 4.0)
+
+
+def render_plane(K, camera_to_world, size, normal, offset, seed):
+    """Intersect pixel rays with ``normal . p = offset``; returns image and planar depth."""
+    height, width = size
+    v, u = np.mgrid[:height, :width].astype(np.float64)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T @ camera_to_world[:3, :3].T
+    origin = camera_to_world[:3, 3]
+    depth = (offset - normal @ origin) / (rays @ normal)
+    points = origin + rays * depth[..., None]
+    image = textured(points[..., :2], seed)
+    return (image * 255).round().astype(np.uint8), depth.astype(np.float32)
+
+
+def plane_pair(size=(48, 64), baseline=0.12, rotation_y=0.0, seed=0, focal=60.0) -> PlanePair:
+    K = np.array([[focal, 0, size[1] / 2 - 0.5], [0, focal, size[0] / 2 - 0.5], [0, 0, 1]])
+    E = np.eye(4)
+    c, s = np.cos(rotation_y), np.sin(rotation_y)
+    E[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    E[0, 3] = baseline
+    normal = np.array([0.25, -0.35, 1.0])
+    left, depth = render_plane(K, np.eye(4), size, normal, 2.0, seed)
+    right, _ = render_plane(K, E, size, normal, 2.0, seed)
+    return PlanePair(left, right, K, E, depth)
+
+
+@pytest.fixture(scope="session")
+def textured_plane() -> PlanePair:
+    """A rectified pair of a tilted plane between about 1.4 m and 3.4 m."""
+    return plane_pair()

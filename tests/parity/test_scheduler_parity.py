@@ -1,0 +1,136 @@
+"""Our arithmetic against every supported scheduler's own ``step``."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from diffusers import (
+    DDIMScheduler,
+    DDPMScheduler,
+    DPMSolverMultistepScheduler,
+    EulerDiscreteScheduler,
+    FlowMatchEulerDiscreteScheduler,
+    LCMScheduler,
+)
+
+from geodiff_plugin.denoising import noise_from, output_from, z0_from
+from geodiff_plugin.integration.schedulers import check_scheduler, noise_level, trailing_timesteps
+
+BETAS = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012}
+TYPES = ["epsilon", "v_prediction", "sample"]
+
+
+def ddim(**kwargs):
+    return DDIMScheduler(**BETAS, clip_sample=False, **kwargs)
+
+
+SCHEDULERS = {
+    **{f"ddim-trailing-{p}": lambda p=p: ddim(timestep_spacing="trailing", prediction_type=p) for p in TYPES},
+    **{f"ddim-leading-{p}": lambda p=p: ddim(timestep_spacing="leading", prediction_type=p) for p in TYPES},
+    "ddim-zero-snr": lambda: ddim(
+        timestep_spacing="trailing", prediction_type="v_prediction", rescale_betas_zero_snr=True
+    ),
+    "ddim-clip": lambda: DDIMScheduler(**BETAS, clip_sample=True, prediction_type="v_prediction"),
+    **{f"ddpm-{p}": lambda p=p: DDPMScheduler(**BETAS, clip_sample=False, prediction_type=p) for p in TYPES},
+    "lcm": lambda: LCMScheduler(**BETAS, prediction_type="v_prediction", original_inference_steps=50),
+    **{f"dpm-{p}": lambda p=p: DPMSolverMultistepScheduler(**BETAS, prediction_type=p) for p in TYPES},
+    "dpm-zero-snr": lambda: DPMSolverMultistepScheduler(
+        **BETAS, prediction_type="v_prediction", rescale_betas_zero_snr=True, timestep_spacing="trailing"
+    ),
+}
+
+
+def draw(seed):
+    g = torch.Generator().manual_seed(seed)
+    return torch.randn(2, 4, 3, 5, generator=g), 0.5 * torch.randn(2, 4, 3, 5, generator=g)
+
+
+def walk(make, edit=None, steps=4):
+    """Run a schedule on fixed network outputs; ``edit(z0)`` moves the clean latent. Yields z0_hat, z_{t-1}, own z0."""
+    scheduler = make()
+    scheduler.set_timesteps(steps)
+    z_t, _ = draw(0)
+    for i, t in enumerate(scheduler.timesteps):
+        output = draw(i + 1)[1]
+        level = noise_level(scheduler, t)
+        z0 = z0_from(output, z_t, level)
+        fed = (output, z_t)
+        if edit is not None:
+            fed = output_from(edit(z0), noise_from(output, z_t, level), level)
+        result = scheduler.step(fed[0], t, fed[1], generator=torch.Generator().manual_seed(i))
+        own = getattr(result, "pred_original_sample", getattr(result, "denoised", None))
+        z_t = result.prev_sample
+        yield z0, z_t, own
+
+
+@pytest.mark.parametrize("name", SCHEDULERS)
+def test_z0_hat_is_the_schedulers_own(name):
+    for z0, _, own in walk(SCHEDULERS[name]):
+        if own is None:
+            pytest.skip("this scheduler does not return its clean latent; the last-step test covers it")
+        torch.testing.assert_close(z0, own, atol=2e-5, rtol=2e-5)
+
+
+@pytest.mark.parametrize("name", SCHEDULERS)
+def test_round_trip_leaves_every_step_as_it_was(name):
+    """output_from(z0_from, noise_from) fed to step gives the z_{t-1} of the untouched call."""
+    if "clip" in name:
+        pytest.skip("a clipped clean latent and the unclipped noise do not make up z_t")
+    plain = [z for _, z, _ in walk(SCHEDULERS[name])]
+    rebuilt = [z for _, z, _ in walk(SCHEDULERS[name], edit=lambda z0: z0)]
+    for a, b in zip(plain, rebuilt, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", [n for n in SCHEDULERS if "clip" not in n])
+def test_an_edit_reaches_the_end(name):
+    """With the clean latent set to a constant at every step, the constant comes out at the end."""
+    target = torch.full((2, 4, 3, 5), 0.25)
+    *_, (_, last, _) = walk(SCHEDULERS[name], edit=lambda z0: target, steps=6)
+    torch.testing.assert_close(last, target, atol=0.12 if name.startswith("ddpm") else 1e-3, rtol=0)
+
+
+def test_a_changed_clean_latent_enters_the_multistep_history():
+    scheduler = SCHEDULERS["dpm-v_prediction"]()
+    scheduler.set_timesteps(6)
+    z_t, output = draw(0)
+    level = noise_level(scheduler, scheduler.timesteps[0])
+    edited = z0_from(output, z_t, level) + 1.0
+    scheduler.step(*_feed(edited, noise_from(output, z_t, level), level, scheduler.timesteps[0]))
+    torch.testing.assert_close(scheduler.model_outputs[-1], edited, atol=1e-4, rtol=1e-4)
+
+
+def _feed(z0, eps, level, t):
+    output, z_t = output_from(z0, eps, level)
+    return output, t, z_t
+
+
+def test_flow_matching_levels():
+    scheduler = FlowMatchEulerDiscreteScheduler()
+    scheduler.set_timesteps(4)
+    clean, noise = draw(0)
+    for t in scheduler.timesteps:
+        level = noise_level(scheduler, t)
+        output, z_t = output_from(clean, noise, level)
+        torch.testing.assert_close(z0_from(output, z_t, level), clean, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(noise_from(output, z_t, level), noise, atol=1e-5, rtol=1e-5)
+        following = scheduler.step(output, t, z_t).prev_sample
+    torch.testing.assert_close(following, clean, atol=1e-5, rtol=1e-5)
+
+
+def test_noise_prediction_with_zero_terminal_snr_is_refused():
+    with pytest.raises(ValueError, match="rescale_betas_zero_snr"):
+        check_scheduler(ddim(prediction_type="epsilon", rescale_betas_zero_snr=True))
+
+
+def test_a_scheduler_without_family_is_refused():
+    with pytest.raises(TypeError, match="pipe.scheduler"):
+        check_scheduler(EulerDiscreteScheduler())
+
+
+def test_leading_ddim_is_respaced_and_nothing_else():
+    leading = ddim(timestep_spacing="leading", steps_offset=1)
+    assert trailing_timesteps(leading, 4).tolist() == [999, 749, 499, 249]
+    assert trailing_timesteps(leading, 1).tolist() == [999]
+    assert trailing_timesteps(ddim(timestep_spacing="trailing"), 4) is None
+    assert trailing_timesteps(SCHEDULERS["lcm"](), 4) is None
