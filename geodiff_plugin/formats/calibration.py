@@ -1,0 +1,60 @@
+"""What a calibration format is: how its text is recognised, and how it becomes a rig.
+
+Hop: the text of one or two files -> ``Rig``.
+Paper: S3.3 (known cameras).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from geodiff_plugin.types import Rig
+
+__all__ = ["CalibrationFile", "CalibrationFormat", "CameraChoice"]
+
+
+@dataclass(frozen=True)
+class CalibrationFile:
+    """One file as it was read.
+
+    Attributes:
+        path: where it lies, for messages.
+        text: its content.
+    """
+
+    path: Path
+    text: str
+
+
+@dataclass(frozen=True)
+class CameraChoice:
+    """Which two cameras of a file with more than two.
+
+    Attributes:
+        cameras: numbers of the left and the right camera, or ``None`` to choose by the folder or the file.
+        image_folder_hint: name or path of the left image's folder (or of the image), or ``None``.
+    """
+
+    cameras: tuple[int, int] | None = None
+    image_folder_hint: str | None = None
+
+
+@dataclass(frozen=True)
+class CalibrationFormat:
+    """One entry of ``CALIBRATION_FORMATS``.
+
+    Attributes:
+        summary: the format and its mark, for the list in the error about an unknown one.
+        matches: ``(text, path) -> bool``; looks at the content, never needs the name of the file.
+        read: ``(files, choice) -> Rig``.
+        file_counts: how many files may describe one pair.
+        uses_cameras: whether a file may hold more than two cameras, so that ``cameras`` has a meaning.
+    """
+
+    summary: str
+    matches: Callable[[str, Path], bool]
+    read: Callable[[tuple[CalibrationFile, ...], CameraChoice], Rig]
+    file_counts: tuple[int, ...] = (1,)
+    uses_cameras: bool = False

@@ -1,0 +1,178 @@
+"""Depth and disparity maps in files: PFM, npy, 16-bit PNG in millimetres or KITTI's 1/256.
+
+Hop: file <-> float32 map and boolean mask.
+Paper: S5.1 (ground truth of the data sets).
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from PIL import Image
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.atomic import atomic_path
+from geodiff_plugin.formats.files import check_file
+
+__all__ = [
+    "read_depth_mm_png",
+    "read_disparity_kitti_png",
+    "read_pfm",
+    "write_depth_mm_png",
+    "write_depth_npy",
+    "write_pfm",
+]
+
+PathLike = str | os.PathLike[str]
+KITTI_STEP = 256.0
+LARGEST_MM = 65535
+
+
+def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
+    """Read a portable float map.
+
+    Args:
+        path: the file.
+        name: the argument that it came in, for messages.
+
+    Returns:
+        ``(H, W)`` or ``(H, W, 3)`` float32, top row first (the file has the bottom row first); infinity and
+        0, which data sets use for "unknown", stay as they are.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
+        ValueError: not a PFM, or cut off.
+    """
+    found = check_file(path, name, "a PFM file")
+    with open(found, "rb") as file:
+        kind = file.readline(8).strip()
+        try:
+            width, height = (int(word) for word in file.readline(64).split())
+            scale = float(file.readline(64))
+        except ValueError:
+            kind = b""
+        data = file.read()
+    if kind not in (b"Pf", b"PF") or min(width, height) < 1:
+        bad_value(
+            name,
+            "a PFM file (Pf or PF, size, scale)",
+            f"{found}, whose head is another",
+            "Is it a PNG or npy?",
+        )
+    shape = (height, width) if kind == b"Pf" else (height, width, 3)
+    count = int(np.prod(shape))
+    if len(data) < 4 * count:
+        bad_value(
+            name,
+            f"a whole PFM file of {4 * count} bytes of data",
+            f"{found} with {len(data)}",
+            "Is it cut off?",
+        )
+    values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4", count=count)
+    return np.flipud(values.reshape(shape)).astype(np.float32)
+
+
+def write_pfm(path: PathLike, values: np.ndarray) -> None:
+    """Write ``(H, W)`` or ``(H, W, 3)`` floats as a little-endian portable float map, whole or not at all.
+
+    Raises:
+        ValueError: another shape.
+        OSError: the folder does not exist or is not writable.
+    """
+    values = np.asarray(values, dtype="<f4")
+    if values.ndim != 2 and not (values.ndim == 3 and values.shape[-1] == 3):
+        bad_value("values", "of shape (H, W) or (H, W, 3)", f"shape {values.shape}")
+    kind = b"Pf" if values.ndim == 2 else b"PF"
+    with atomic_path(path) as temporary:
+        head = b"%s\n%d %d\n-1.0\n" % (kind, values.shape[1], values.shape[0])
+        temporary.write_bytes(head + np.flipud(values).tobytes())
+
+
+def _check_map(depth_m: np.ndarray) -> np.ndarray:
+    depth_m = np.asarray(depth_m, dtype=np.float32)
+    if depth_m.ndim != 2:
+        bad_value("depth_m", "of shape (H, W)", f"shape {depth_m.shape}", "Take one map: depth[0, ..., 0].")
+    return depth_m
+
+
+def write_depth_npy(path: PathLike, depth_m: np.ndarray) -> None:
+    """Write ``(H, W)`` metres as float32 ``.npy``, whole or not at all.
+
+    Raises:
+        ValueError: another shape.
+        OSError: the folder does not exist or is not writable.
+    """
+    depth_m = _check_map(depth_m)
+    # An open file, since numpy appends .npy to a name that lacks it.
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, depth_m, allow_pickle=False)
+
+
+def write_depth_mm_png(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None = None) -> int:
+    """Write depth as a 16-bit PNG in whole millimetres, whole or not at all.
+
+    Args:
+        path: the file.
+        depth_m: ``(H, W)`` metres.
+        valid: ``(H, W)`` boolean; ``None`` means everywhere.
+
+    Returns:
+        How many pixels are 0 in the file: not valid, not finite, under half a millimetre or beyond 65.535 m.
+
+    Raises:
+        ValueError: another shape.
+        OSError: the folder does not exist or is not writable.
+    """
+    depth_m = _check_map(depth_m)
+    keep = np.isfinite(depth_m) if valid is None else np.isfinite(depth_m) & np.asarray(valid, dtype=bool)
+    millimetres = np.rint(np.where(keep, depth_m, 0.0).astype(np.float64) * 1000.0)
+    millimetres[(millimetres < 0) | (millimetres > LARGEST_MM)] = 0
+    with atomic_path(path) as temporary:
+        Image.fromarray(millimetres.astype(np.uint16)).save(temporary, format="PNG")
+    return int((millimetres == 0).sum())
+
+
+def _read_png16(path: PathLike, name: str) -> np.ndarray:
+    found = check_file(path, name, "a 16-bit PNG file")
+    try:
+        with Image.open(found) as image:
+            image.load()
+            mode, values = image.mode, np.asarray(image)
+    except (OSError, SyntaxError, ValueError) as error:
+        bad_value(
+            name, "a whole 16-bit PNG file", f"{found}, which does not decode ({error})", "Is it cut off?"
+        )
+    if not mode.startswith("I"):
+        bad_value(
+            name, "a 16-bit grey PNG file", f"{found} of mode {mode}", "An 8-bit copy has lost the values."
+        )
+    return values.astype(np.float32)
+
+
+def read_disparity_kitti_png(path: PathLike, name: str = "disparity") -> tuple[np.ndarray, np.ndarray]:
+    """Read KITTI's 16-bit PNG of disparity * 256 (its depth files use the same step, in metres).
+
+    Returns:
+        ``(H, W)`` float32 pixels, and the ``(H, W)`` boolean mask of where it is known (not 0).
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
+        ValueError: not a 16-bit PNG, or cut off.
+    """
+    values = _read_png16(path, name)
+    return values / KITTI_STEP, values > 0
+
+
+def read_depth_mm_png(path: PathLike, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
+    """Read a 16-bit PNG of millimetres.
+
+    Returns:
+        ``(H, W)`` float32 metres, and the ``(H, W)`` boolean mask of where it is known (not 0).
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
+        ValueError: not a 16-bit PNG, or cut off.
+    """
+    values = _read_png16(path, name)
+    return values / 1000.0, values > 0

@@ -1,0 +1,209 @@
+"""Images from files and from memory.
+
+Hop: a file, PIL image, numpy or torch array -> floats in [0, 1].
+Paper: S3.3 (the two views).
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+import zlib
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageOps
+
+from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin.formats.files import check_file
+
+__all__ = ["MIN_SIDE", "as_image_01", "read_image"]
+
+#: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
+MIN_SIDE = 32
+#: Resampling may overshoot [0, 1] by a little; more than this is another range.
+OVERSHOOT = 1e-3
+EXIF_ORIENTATION = 0x0112
+TURNS = {
+    2: "mirrored left to right",
+    3: "turned by 180 degrees",
+    4: "mirrored top to bottom",
+    5: "mirrored and turned by 90 degrees",
+    6: "turned by 90 degrees clockwise",
+    7: "mirrored and turned by 90 degrees",
+    8: "turned by 90 degrees counter-clockwise",
+}
+ALPHA_DROPPED = "{name} has an alpha channel; it is dropped."
+DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError)
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+
+
+def _pil_to_array(image: Image.Image, name: str) -> np.ndarray:
+    """``(H, W, 3)`` float32 in [0, 1] of an upright image in any mode that Pillow has."""
+    if image.mode.startswith("I"):  # 16-bit grey: I;16, I;16B, or I in files that Pillow widens
+        grey = np.asarray(image).astype(np.float32)
+        if grey.min() < 0 or grey.max() > 65535:
+            bad_value(name, "an image of 8 or 16 bits", f"values from {grey.min():g} to {grey.max():g}")
+        return np.repeat(grey[..., None] / 65535.0, 3, axis=-1)
+    if image.mode == "F":
+        grey = np.asarray(image, dtype=np.float32)
+        return np.repeat(_check_floats(grey, name)[..., None], 3, axis=-1)
+    if _has_alpha(image):
+        image = image.convert("RGBA")
+    return np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
+
+
+def _check_floats(values: np.ndarray, name: str) -> np.ndarray:
+    if not np.isfinite(values).all():
+        bad_value(name, "finite", "NaN or infinity in it", "Mask or fill those pixels first.")
+    low, high = float(values.min()), float(values.max())
+    if low < -OVERSHOOT or high > 1 + OVERSHOOT:
+        cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
+        bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
+    return values.astype(np.float32).clip(0.0, 1.0)
+
+
+def _check_sides(height: int, width: int, name: str) -> None:
+    if min(height, width) < MIN_SIDE:
+        bad_value(
+            name,
+            f"at least {MIN_SIDE} pixels a side",
+            f"{width}x{height}",
+            "Is this a thumbnail or a latent?",
+        )
+
+
+def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.ndarray, list[str]]:
+    """Read an image file, upright.
+
+    Grey, palette, 16-bit and CMYK images work; alpha is dropped; of several frames the first is taken.
+
+    Args:
+        path: the file.
+        name: the argument that it came in, for messages.
+
+    Returns:
+        ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it: alpha dropped, or turned
+        as the EXIF orientation says. K must belong to the turned image.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
+        ValueError: not an image, cut off, or a side under 32 pixels.
+    """
+    found = check_file(path, name, "an image file")
+    try:
+        with Image.open(found) as image:
+            image.load()
+            turn = TURNS.get(image.getexif().get(EXIF_ORIENTATION))
+            upright = ImageOps.exif_transpose(image)
+            alpha = _has_alpha(image)
+    except Image.UnidentifiedImageError:
+        bad_value(
+            name, "an image file", f"{found}, which is none that Pillow knows", "Convert it to PNG or JPEG."
+        )
+    except DECODE_ERRORS as error:
+        bad_value(
+            name,
+            "a whole image file",
+            f"{found}, which does not decode ({error})",
+            "Is it cut off? Fetch it again.",
+        )
+    _check_sides(upright.height, upright.width, name)
+    notes = [ALPHA_DROPPED.format(name=name)] if alpha else []
+    if turn is not None:
+        notes.append(
+            f"{name} was {turn} to {upright.width}x{upright.height}, as its EXIF orientation says; "
+            "K must belong to the turned image."
+        )
+    return _pil_to_array(upright, name), notes
+
+
+def _array_to_hwc(value: np.ndarray, name: str) -> np.ndarray:
+    if value.ndim == 2:
+        return value[..., None]
+    if value.ndim != 3:
+        cure = "Take one image of the batch." if value.ndim == 4 else ""
+        bad_value(name, "an image of shape (H, W, 3) or (H, W)", f"shape {value.shape}", cure)
+    if value.shape[-1] not in (1, 3, 4):
+        cure = (
+            "numpy images end in channels: value.transpose(1, 2, 0)." if value.shape[0] in (1, 3, 4) else ""
+        )
+        bad_value(name, "an image with 1, 3 or 4 channels last", f"shape {value.shape}", cure)
+    return value
+
+
+def _tensor_to_hwc(value: torch.Tensor, name: str) -> np.ndarray:
+    if value.ndim != 3:
+        cure = (
+            "Take one image of the batch: value[0]."
+            if value.ndim == 4
+            else "Add a channel axis: value[None]."
+        )
+        bad_value(name, "an image of shape (3, H, W)", f"shape {tuple(value.shape)}", cure)
+    if value.shape[0] not in (1, 3, 4):
+        cure = (
+            "torch images start with channels: value.permute(2, 0, 1)."
+            if value.shape[-1] in (1, 3, 4)
+            else ""
+        )
+        bad_value(name, "an image with 1, 3 or 4 channels first", f"shape {tuple(value.shape)}", cure)
+    value = value.detach().cpu()
+    value = value.float() if value.dtype == torch.bfloat16 else value  # numpy has no bfloat16
+    return value.permute(1, 2, 0).numpy()
+
+
+def _scaled(value: np.ndarray, name: str) -> np.ndarray:
+    """Floats in [0, 1] of uint8, uint16 or floats."""
+    if value.dtype in (np.uint8, np.uint16):
+        return value.astype(np.float32) / np.iinfo(value.dtype).max
+    if value.dtype.kind == "f":
+        return _check_floats(value, name)
+    bad_value(
+        name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", "Convert it with astype('uint8')."
+    )
+
+
+def as_image_01(value: Any, name: str) -> torch.Tensor:
+    """An image from memory as a tensor.
+
+    A PIL image is taken as it lies in memory, as diffusers does; one that still carries an EXIF turn gets a
+    warning. A fourth channel is alpha and is dropped with a warning; one channel is repeated.
+
+    Args:
+        value: PIL image; numpy ``(H, W, C)`` or ``(H, W)``, or torch ``(C, H, W)``, of uint8, uint16 or
+            float in [0, 1].
+        name: the argument that it came in, for messages.
+
+    Returns:
+        ``(3, H, W)`` float32 in [0, 1] on the CPU; not differentiable.
+
+    Raises:
+        TypeError: none of these types.
+        ValueError: wrong rank or channels, NaN or infinity, floats outside [0, 1], a side under 32 pixels.
+    """
+    if isinstance(value, Image.Image):
+        if value.getexif().get(EXIF_ORIENTATION) in TURNS:
+            warnings.warn(
+                f"{name} carries an EXIF orientation that is not applied; "
+                "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image.",
+                stacklevel=3,
+            )
+        if _has_alpha(value):
+            warnings.warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
+        hwc = _pil_to_array(value, name)
+    elif isinstance(value, (np.ndarray, torch.Tensor)):
+        raw = _array_to_hwc(value, name) if isinstance(value, np.ndarray) else _tensor_to_hwc(value, name)
+        _check_sides(*raw.shape[:2], name)
+        if raw.shape[-1] == 4:
+            warnings.warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
+            raw = raw[..., :3]
+        hwc = _scaled(raw, name)
+    else:
+        bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
+    _check_sides(*hwc.shape[:2], name)
+    hwc = np.repeat(hwc, 3, axis=-1) if hwc.shape[-1] == 1 else hwc
+    return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))

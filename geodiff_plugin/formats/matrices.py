@@ -1,0 +1,80 @@
+"""K and E from files of numbers.
+
+Hop: whitespace text or ``.npy`` -> float64 matrix, unchecked for meaning.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.files import check_file, read_text
+
+__all__ = ["read_matrix"]
+
+SHAPES = ((3, 3), (4, 4))
+FLAT = {9: (3, 3), 16: (4, 4)}
+EXPECTED = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
+
+
+def _from_npy(path: Path, name: str) -> np.ndarray:
+    try:
+        value = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        bad_value(name, EXPECTED, f"{path}, which numpy cannot load ({error})", "Save it with numpy.save.")
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+        bad_value(
+            name, EXPECTED, f"{path} without an array of real numbers", "Save one matrix with numpy.save."
+        )
+    return value.astype(np.float64)
+
+
+def _from_text(path: Path, name: str) -> np.ndarray:
+    lines = [line.replace(",", " ").split() for line in read_text(path, name, EXPECTED).splitlines()]
+    rows = [words for words in lines if words and not words[0].startswith("#")]
+    try:
+        numbers = [[float(word) for word in words] for words in rows]
+    except ValueError:
+        bad_value(
+            name, EXPECTED, f"{path} with words in it", "A calibration file with words goes to --calib."
+        )
+    if len({len(row) for row in numbers}) > 1:
+        bad_value(
+            name, EXPECTED, f"{path} with rows of {[len(row) for row in numbers]} numbers", "Is it cut off?"
+        )
+    return np.array(numbers, dtype=np.float64)
+
+
+def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarray:
+    """A camera matrix or a pose from a file.
+
+    Rows of numbers, or all 9 or 16 in one row; commas count as blanks, lines that start with ``#`` are left
+    out. A 3x4 pose gets the row 0 0 0 1. Whether the matrix is a K or an E is checked where it is used.
+
+    Args:
+        path: a text file, or ``.npy`` (never unpickled).
+        name: the argument that it came in, for the message.
+
+    Returns:
+        ``(3, 3)`` or ``(4, 4)`` float64.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
+        ValueError: no matrix of such a shape, or not finite.
+    """
+    found = check_file(path, name, EXPECTED)
+    matrix = _from_npy(found, name) if found.suffix.lower() == ".npy" else _from_text(found, name)
+    matrix = np.squeeze(matrix)
+    if matrix.ndim == 1 and matrix.size in FLAT:
+        matrix = matrix.reshape(FLAT[matrix.size])
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
+    if matrix.shape not in SHAPES:
+        bad_value(name, EXPECTED, f"{path} of shape {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        bad_value(name, "finite", f"NaN or infinity in {path}")
+    return matrix
