@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from geodiff_plugin.metric import SPACES, AffineState, MetricMap, inverse_softplus, smooth_floor
+
+NEAR, FAR = torch.tensor([0.5, 4.0, 0.8]), torch.tensor([0.9, 80.0, 60.0])
+
+
+def ends(space):
+    return (NEAR, FAR) if space in ("depth", "log") else (FAR, NEAR)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_range_round_trip(space):
+    metric = MetricMap(space)
+    at_zero, at_one = ends(space)
+    back = metric.range_of(metric.from_range(at_zero, at_one))
+    torch.testing.assert_close(back, (at_zero, at_one), rtol=2e-3, atol=0)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_positive_monotone_and_linear_in_global_scale(space):
+    metric = MetricMap(space)
+    affine = metric.from_range(*ends(space))
+    x = torch.linspace(-1.0, 2.0, 50).view(1, 1, 5, 10).expand(3, -1, -1, -1)
+    depth = metric(x, affine)
+    assert (depth > 0).all()
+    steps = depth.flatten(1).diff(dim=1)
+    assert (steps > 0).all() if space in ("depth", "log") else (steps < 0).all()
+    doubled = metric(x, AffineState(affine.s_hat, affine.t_hat, 2 * affine.g_s))
+    torch.testing.assert_close(doubled, 2 * depth)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("raw", [-3.0, 0.0, 5.0])
+def test_gradients(space, raw):
+    metric = MetricMap(space)
+    x = torch.linspace(-0.4, 1.3, 12, dtype=torch.float64).view(2, 1, 2, 3).requires_grad_()
+    s = torch.tensor([raw, 0.3], dtype=torch.float64, requires_grad=True)
+    t = torch.tensor([0.2, raw], dtype=torch.float64, requires_grad=True)
+    g = torch.tensor([2.0, 0.5], dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda x, s, t: metric(x, AffineState(s, t, g)), (x, s, t))
+
+
+def test_floor_never_silences_a_gradient():
+    x = torch.tensor([-5.0, -0.5, 0.0, 0.5, 1.0], requires_grad=True)
+    y = smooth_floor(x)
+    (grad,) = torch.autograd.grad(y.sum(), x)
+    assert (y > 0).all()
+    assert (grad > 1e-7).all()
+    torch.testing.assert_close(y[3:], x[3:].detach(), atol=3e-4, rtol=0)
+
+
+def test_inverse_softplus():
+    y = torch.tensor([1e-4, 0.1, 1.0, 30.0])
+    torch.testing.assert_close(torch.nn.functional.softplus(inverse_softplus(y)), y)
+
+
+def test_unknown_space_names_the_known_ones():
+    with pytest.raises(ValueError, match="sqrt_disparity"):
+        MetricMap("inverse")
