@@ -1,1 +1,28 @@
-"""Placeholder."""
+"""Methods side by side, one file each, one table.
+
+Hop: ``StereoSample`` -> every method's ``Prediction``.
+Paper: S5.1 (compared methods), S5.3 (ablation).
+"""
+
+from __future__ import annotations
+
+from geodiff_plugin.evaluation.baselines.base import (
+    Method,
+    NotApplicable,
+    Prediction,
+    PriorCache,
+    Settings,
+)
+from geodiff_plugin.evaluation.baselines.guided import GUIDED
+from geodiff_plugin.evaluation.baselines.paper import PAPER
+from geodiff_plugin.evaluation.baselines.prior_aligned import PRIOR_ALIGNED
+from geodiff_plugin.evaluation.baselines.scale_shift_only import SCALE_SHIFT_ONLY
+from geodiff_plugin.evaluation.baselines.search_only import SEARCH_ONLY
+from geodiff_plugin.evaluation.baselines.sgbm import SGBM
+
+__all__ = ["METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
+
+METHODS: dict[str, Method] = {
+    method.name: method for method in (PRIOR_ALIGNED, SEARCH_ONLY, SCALE_SHIFT_ONLY, PAPER, GUIDED, SGBM)
+}
+"""Every method by name, in the order of the tables' columns."""

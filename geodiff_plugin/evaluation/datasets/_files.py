@@ -1,6 +1,6 @@
-"""Reading the files that several data sets share, with errors that name the file.
+"""What several data sets need around the readers of ``formats``.
 
-Hop: path -> array.
+Hop: path -> array of the left image's size.
 Paper: none.
 """
 
@@ -9,46 +9,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats import read_image
 
-__all__ = ["check_size", "folders", "read_png16", "read_rgb", "require"]
-
-
-def require(path: Path, what: str) -> Path:
-    """Return ``path``; raise ``FileNotFoundError`` with its name and what it should hold."""
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{what} is missing: {path} does not exist. Check that the download is complete."
-        )
-    return path
+__all__ = ["check_size", "folders", "read_rgb"]
 
 
-def _open(path: Path, what: str) -> Image.Image:
-    try:
-        image = Image.open(require(path, what))
-        image.load()
-    except (OSError, SyntaxError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
-        raise ValueError(
-            f"{path} must be a whole image file ({what}); got {error}. Download it again."
-        ) from error
-    return image
-
-
-def read_rgb(path: Path, what: str = "image") -> np.ndarray:
-    """``(H, W, 3)`` uint8 of an 8-bit image; grey is repeated three times."""
-    return np.asarray(_open(path, what).convert("RGB"))
-
-
-def read_png16(path: Path, what: str) -> np.ndarray:
-    """``(H, W)`` uint16 of a 16-bit PNG; ``ValueError`` for any other kind."""
-    values = np.asarray(_open(path, what))
-    if values.ndim != 2 or values.dtype not in (np.uint16, np.int32):
-        bad_value(str(path), "a one-channel 16-bit PNG", f"{values.dtype} {values.shape}")
-    return values.astype(np.uint16)
+def read_rgb(path: Path, name: str) -> np.ndarray:
+    """``(H, W, 3)`` uint8 of an image file, grey repeated; errors as ``formats.read_image``."""
+    image_01, _ = read_image(path, name)
+    return np.rint(image_01 * 255.0).astype(np.uint8)
 
 
 def check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...]) -> None:
@@ -56,7 +27,7 @@ def check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...]) -> N
     if tuple(got[:2]) != tuple(expected[:2]):
         bad_value(
             str(path),
-            f"{expected[1]} x {expected[0]} pixels as the left image",
+            f"for {expected[1]} x {expected[0]} pixels as the left image",
             f"{got[1]} x {got[0]}",
             "Image, calibration and truth must be of one resolution.",
         )

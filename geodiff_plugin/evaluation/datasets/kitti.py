@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from geodiff_plugin.evaluation.datasets._files import check_size, read_png16, read_rgb
-from geodiff_plugin.evaluation.datasets._interim import read_calibration
+from geodiff_plugin.evaluation.datasets._files import check_size, read_rgb
 from geodiff_plugin.evaluation.datasets.sample import (
     SampleRef,
     StereoSample,
     disparity_to_depth,
     is_rectified,
 )
+from geodiff_plugin.formats import read_calibration, read_disparity_kitti_png
 
 __all__ = ["KITTI_CAP_M", "load_kitti"]
 
@@ -41,15 +41,16 @@ def load_kitti(ref: SampleRef) -> StereoSample:
     files = ref.files
     left, right = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
     rig = read_calibration(files["calibration"], cameras=files["cameras"])
-    disparity = read_png16(files["disparity"], "true disparity")
+    if rig.size_left is not None:
+        check_size(files["calibration"], rig.size_left[::-1], left.shape)
+    disparity, valid = read_disparity_kitti_png(files["disparity"], "true disparity")
     check_size(files["disparity"], disparity.shape, left.shape)
-    valid = disparity > 0
     occluded = None
     if files.get("noc") is not None:
-        seen_twice = read_png16(files["noc"], "disparity of the pixels seen twice")
+        _, seen_twice = read_disparity_kitti_png(files["noc"], "disparity of the pixels seen twice")
         check_size(files["noc"], seen_twice.shape, left.shape)
-        occluded = valid & (seen_twice == 0)
-    depth_m = disparity_to_depth(disparity / 256.0, rig.K_left, rig.K_right, rig.E)
+        occluded = valid & ~seen_twice
+    depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
     depth_m[~valid] = 0
     return StereoSample(
         dataset=ref.dataset,

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin.evaluation.datasets._files import check_size, folders, read_rgb
-from geodiff_plugin.evaluation.datasets._interim import read_calibration, read_pfm
 from geodiff_plugin.evaluation.datasets.sample import (
     Dataset,
     SampleRef,
@@ -20,6 +19,7 @@ from geodiff_plugin.evaluation.datasets.sample import (
     disparity_to_depth,
     is_rectified,
 )
+from geodiff_plugin.formats import read_calibration, read_pfm
 
 __all__ = ["ETH3D", "MIDDEVAL3", "MIDDLEBURY2014", "find_scenes", "load_middlebury"]
 
@@ -83,8 +83,8 @@ def load_middlebury(ref: SampleRef) -> StereoSample:
     left, right = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
     rig = read_calibration(files["calibration"])
     if rig.size_left is not None:
-        check_size(files["calibration"], (rig.size_left[1], rig.size_left[0]), left.shape)
-    disparity = read_pfm(files["disparity"])
+        check_size(files["calibration"], rig.size_left[::-1], left.shape)
+    disparity = read_pfm(files["disparity"], "true disparity")
     check_size(files["disparity"], disparity.shape, left.shape)
     valid = np.isfinite(disparity)
     occluded = None

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.datasets._files import check_size, folders, read_rgb, require
-from geodiff_plugin.evaluation.datasets._interim import read_calibration, read_pfm
+from geodiff_plugin.evaluation.datasets._files import check_size, folders, read_rgb
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample, is_rectified
+from geodiff_plugin.formats import read_calibration, read_pfm, read_text
 
 __all__ = ["MVSNET", "find_mvsnet", "load_mvsnet", "ordered_pairs"]
 
@@ -41,9 +41,7 @@ def ordered_pairs(path: Path) -> list[tuple[int, int]]:
         ValueError: not the format of MVSNet: a count, then per view its number and a line of ``n id score
             ...``.
     """
-    lines = [
-        line.split() for line in require(path, "list of view pairs").read_text().splitlines() if line.strip()
-    ]
+    lines = [line.split() for line in read_text(path, "list of view pairs").splitlines() if line.strip()]
     try:
         count = int(lines[0][0])
         pairs = []
@@ -118,7 +116,7 @@ def load_mvsnet(ref: SampleRef) -> StereoSample:
         extra.append((read_rgb(other["image"], "further image"), pose.K_right - half, pose.E))
     depth_m, truth = np.zeros(left.shape[:2], np.float32), "none"
     if first["depth"].is_file():
-        raw = read_pfm(first["depth"])
+        raw = read_pfm(first["depth"], "true depth")
         check_size(first["depth"], raw.shape, left.shape)
         depth_m = np.where(np.isfinite(raw) & (raw > 0), raw, 0).astype(np.float32)
         truth = f"depths/{first['depth'].name}"

@@ -1,0 +1,94 @@
+"""The guided call that several methods share; they differ in one preset.
+
+Hop: ``StereoSample`` + preset -> ``GeometryGuidance`` -> pipeline -> ``Prediction``.
+Paper: Algorithm 1, S5.1, S5.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from geodiff_plugin.evaluation.baselines.base import Method, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.priors import find_adapter
+
+__all__ = ["call_arguments", "guided_method", "prior_space"]
+
+Preset = Callable[[Any, Any, Any], GeometryGuidance]
+
+
+def call_arguments(settings: Settings) -> dict[str, Any]:
+    """Keywords of the pipeline call that ``settings`` decide, seeded afresh."""
+    arguments: dict[str, Any] = {
+        "ensemble_size": settings.ensemble,
+        "generator": torch.Generator(settings.device).manual_seed(settings.seed),
+    }
+    if settings.steps is not None:
+        arguments["num_inference_steps"] = settings.steps
+    if settings.resolution is not None:
+        arguments["processing_resolution"] = settings.resolution
+    return arguments
+
+
+def prior_space(pipe: Any) -> str:
+    """Space in which the prior's output is affine, as its adapter says."""
+    return find_adapter(pipe)(pipe).space
+
+
+def _summary(out: Any) -> dict[str, Any]:
+    """Scale, shift and visibility of a guided result, as JSON values."""
+    notes: dict[str, Any] = {"warnings": list(out.warnings)}
+    for name in ("scale", "shift", "global_scale"):
+        values = getattr(out, name)
+        if values is not None:
+            notes[name] = [round(float(value), 6) for value in values.flatten()]
+    if out.visible is not None:
+        notes["visible"] = round(float(np.mean(out.visible)), 4)
+    return notes
+
+
+def guided_method(name: str, title: str, summary: str, preset: Preset) -> Method:
+    """A method that guides the prior under one preset.
+
+    Args:
+        name: key in ``METHODS``.
+        title: column heading.
+        summary: one sentence.
+        preset: ``(right, K, E)`` -> guidance.
+
+    Returns:
+        The method; its configuration is every hyperparameter of the guidance and every setting but the prior.
+    """
+
+    def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+        pipe = priors.get(settings)
+        guidance = preset(sample.right, (sample.K_left, sample.K_right), sample.E)
+        out = pipe(
+            Image.fromarray(sample.left),
+            guidance=guidance,
+            output_uncertainty=settings.ensemble > 1,
+            **call_arguments(settings),
+        )
+        return Prediction(
+            depth_m=out.prediction[0, ..., 0],
+            space="disparity" if prior_space(pipe) != "depth" else "depth",
+            uncertainty=None if out.uncertainty is None else out.uncertainty[0, ..., 0],
+            notes=_summary(out),
+        )
+
+    def configuration(settings: Settings) -> dict[str, Any]:
+        any_camera = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]])
+        to_the_right = np.eye(4)
+        to_the_right[0, 3] = 0.1
+        guidance = preset(np.zeros((32, 32, 3), np.uint8), any_camera, to_the_right)
+        chosen = {key: value for key, value in asdict(settings).items() if key != "prior"}
+        return chosen | {"guidance": dict(guidance.config)}
+
+    return Method(name, title, summary, run, configuration, uses_prior=True)

@@ -1,0 +1,151 @@
+"""What a method under test is, what it is given and what it hands back.
+
+Hop: ``StereoSample`` + ``Settings`` -> ``Prediction``.
+Paper: S5.1 (compared methods).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.evaluation.datasets.sample import StereoSample
+
+__all__ = ["Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
+
+_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
+
+class NotApplicable(Exception):
+    """A method cannot work on a sample; the message is the reason that the tables show."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the user chose for a run, the same for every method.
+
+    Attributes:
+        prior: ``"bundled"``, a hub id or a folder.
+        ensemble: ensemble members, at least 1.
+        seed: of the initial noise.
+        steps: denoising steps; ``None`` for the pipeline's default.
+        resolution: longer side that the prior works at, pixels; ``None`` for the pipeline's default.
+        device: torch device.
+        dtype: of U-Net and VAE: ``"float32"``, ``"bfloat16"`` or ``"float16"``.
+    """
+
+    prior: str = "bundled"
+    ensemble: int = 1
+    seed: int = 0
+    steps: int | None = None
+    resolution: int | None = None
+    device: str = "cpu"
+    dtype: str = "float32"
+
+    def __post_init__(self) -> None:
+        check_choice(self.dtype, "dtype", _DTYPES)
+        if self.ensemble < 1:
+            bad_value("ensemble", "at least 1", self.ensemble)
+        if self.steps is not None and self.steps < 1:
+            bad_value("steps", "at least 1", self.steps)
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """``dtype`` as torch names it."""
+        return _DTYPES[self.dtype]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """One method's answer for one sample, at the left image's resolution.
+
+    Attributes:
+        depth_m: ``(H, W)`` float, metres, not finite where the method leaves a hole; ``None`` where it knows
+            relative depth only.
+        relative: ``(H, W)`` float, affine in ``space``; ``None`` where only metres are known.
+        space: space for the oracle's alignment, see ``alignment.align``.
+        uncertainty: ``(H, W)`` float, larger is less certain; ``None`` where the method has none.
+        notes: what the method reports beside the map, JSON values only.
+    """
+
+    depth_m: np.ndarray | None
+    relative: np.ndarray | None = None
+    space: str = "depth"
+    uncertainty: np.ndarray | None = None
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+
+class PriorCache:
+    """Loads a prior once per run, ready to be guided."""
+
+    def __init__(self) -> None:
+        self._pipes: dict[tuple[str, str, str], Any] = {}
+        self._fingerprints: dict[tuple[str, str, str], str] = {}
+
+    def get(self, settings: Settings) -> Any:
+        """The pipeline of ``settings.prior`` with geometry guidance enabled.
+
+        Raises:
+            ValueError: it does not exist, or is neither cached nor can be fetched.
+            TypeError: it loads, but has no adapter.
+        """
+        key = (settings.prior, settings.device, settings.dtype)
+        if key not in self._pipes:
+            from geodiff_plugin.integration import enable_geometry_guidance
+            from geodiff_plugin.priors import load_prior
+
+            pipe = load_prior(settings.prior, device=settings.device, dtype=settings.torch_dtype)
+            pipe.set_progress_bar_config(disable=True)
+            enable_geometry_guidance(pipe)
+            self._pipes[key] = pipe
+        return self._pipes[key]
+
+    def fingerprint(self, settings: Settings) -> str:
+        """Short hash of the prior's configuration and of samples of its weights.
+
+        A prior that was trained further under the same name has another fingerprint, so that its old results
+        are not taken for its own.
+        """
+        key = (settings.prior, settings.device, settings.dtype)
+        if key not in self._fingerprints:
+            pipe, digest = self.get(settings), hashlib.sha256()
+            for name in sorted(pipe.components):
+                module = pipe.components[name]
+                config = getattr(module, "config", None)
+                digest.update(json.dumps([name, dict(config or {})], default=str, sort_keys=True).encode())
+                if isinstance(module, torch.nn.Module):
+                    for tensor_name, tensor in module.state_dict().items():
+                        sample = tensor.detach().flatten()[:4].double().cpu().numpy()
+                        digest.update(
+                            tensor_name.encode() + str(tuple(tensor.shape)).encode() + sample.tobytes()
+                        )
+            self._fingerprints[key] = digest.hexdigest()[:16]
+        return self._fingerprints[key]
+
+
+@dataclass(frozen=True)
+class Method:
+    """One entry of ``METHODS``.
+
+    Attributes:
+        name: key in ``METHODS``.
+        title: column heading.
+        summary: what it does, one sentence.
+        run: sample, settings, priors -> prediction; raises ``NotApplicable`` with a reason.
+        configuration: settings -> JSON values that change the method's result, beside the prior.
+        uses_prior: whether ``settings.prior`` matters.
+    """
+
+    name: str
+    title: str
+    summary: str
+    run: Callable[[StereoSample, Settings, PriorCache], Prediction]
+    configuration: Callable[[Settings], dict[str, Any]]
+    uses_prior: bool

@@ -1,0 +1,16 @@
+"""The default preset without gradient updates: what the search for the scale gives by itself.
+
+Hop: ``StereoSample`` -> pipeline, scale and shift from the search -> metres.
+Paper: S7.3 (the pre-selected g_s), extended to near and far.
+"""
+
+from __future__ import annotations
+
+from geodiff_plugin.evaluation.baselines._guidance import guided_method
+from geodiff_plugin.guidance import GeometryGuidance
+
+__all__ = ["SEARCH_ONLY"]
+
+SEARCH_ONLY = guided_method(
+    "search-only", "search only", "the same run without gradient updates", GeometryGuidance.search_only
+)

@@ -1,0 +1,116 @@
+"""Every number about one prediction for one sample, as JSON values.
+
+Hop: ``StereoSample`` + ``Prediction`` -> record.
+Paper: S5.1 (metrics, raw and aligned).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.alignment import align
+from geodiff_plugin.evaluation.baselines.base import Prediction
+from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
+from geodiff_plugin.evaluation.metrics import ause, counted, evaluate_depth, evaluate_disparity
+
+__all__ = ["out_of_view", "regions", "score"]
+
+
+def out_of_view(sample: StereoSample) -> np.ndarray:
+    """``(H, W)`` bool: pixels with truth that the true depth puts behind or beside the right image."""
+    height, width = sample.depth_m.shape
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    pixels = np.stack([columns, rows, np.ones_like(rows)], -1).reshape(-1, 3).T
+    points = np.linalg.inv(sample.K_left) @ pixels * sample.depth_m.reshape(1, -1)
+    T = np.linalg.inv(sample.E)
+    in_right = T[:3, :3] @ points + T[:3, 3:]
+    z = np.where(in_right[2] > 1e-6, in_right[2], np.nan)
+    u, v = (sample.K_right @ in_right)[:2] / z
+    right_height, right_width = sample.right.shape[:2]
+    inside = (u >= -0.5) & (u <= right_width - 0.5) & (v >= -0.5) & (v <= right_height - 0.5)
+    return sample.valid & ~inside.reshape(height, width)
+
+
+def regions(sample: StereoSample) -> dict[str, np.ndarray]:
+    """Masks by which AbsRel is split: what the right camera sees, what is hidden, what lies outside.
+
+    Returns:
+        ``out_of_view`` always; ``visible`` and ``occluded`` where the set says what is hidden; one
+        ``material_<class>`` per class where it has classes. All ``(H, W)`` bool, within ``sample.valid``.
+    """
+    outside = out_of_view(sample)
+    masks = {"out_of_view": outside}
+    if sample.occluded is not None:
+        hidden = sample.valid & sample.occluded & ~outside
+        masks |= {"occluded": hidden, "visible": sample.valid & ~hidden & ~outside}
+    if sample.material is not None:
+        for value in np.unique(sample.material[sample.valid]):
+            masks[f"material_{int(value)}"] = sample.valid & (sample.material == value)
+    return masks
+
+
+def _plain(scores: dict[str, float | None]) -> dict[str, float | None]:
+    """Rounded to 7 digits; NaN becomes ``None``, which JSON has a word for."""
+    return {k: None if v is None or math.isnan(v) else float(f"{v:.7g}") for k, v in scores.items()}
+
+
+def _split(depth_m: np.ndarray, sample: StereoSample, cap_m: float | None) -> dict[str, float | None]:
+    kept, scores = counted(sample.depth_m, sample.valid, cap_m), {}
+    for name, mask in regions(sample).items():
+        if (mask & kept).any():
+            scores[name] = evaluate_depth(depth_m, sample.depth_m, mask & kept, cap_m)["abs_rel"]
+    return _plain(scores)
+
+
+def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> dict[str, Any]:
+    """Score one prediction.
+
+    Args:
+        sample: images, cameras and truth.
+        prediction: a method's answer at the left image's resolution.
+        cap_m: farthest truth that counts in the data set's protocol, metres; ``None`` for no limit.
+
+    Returns:
+        ``all_pixels``: every pixel with truth, no cap, no alignment (``None`` for a method without metres);
+        ``raw``: the same under the cap; ``aligned``: least squares in the method's space, under the cap;
+        ``disparity``: for rectified pairs, without alignment; ``regions``: AbsRel by region, raw, under the
+        cap (aligned for a method without metres); ``ause``: of the uncertainty. ``None`` where it does not apply.
+
+    Raises:
+        ValueError: a map of the wrong shape, or a sample without truth.
+    """
+    truth, valid = sample.depth_m, sample.valid
+    for name in ("depth_m", "relative", "uncertainty"):
+        values = getattr(prediction, name)
+        if values is not None and values.shape != truth.shape:
+            bad_value(f"prediction.{name}", f"of the left image's shape {truth.shape}", values.shape)
+    if not valid.any():
+        bad_value(f"the truth of {sample.label}", "known for at least one pixel", "none")
+    kept, depth_m = counted(truth, valid, cap_m), prediction.depth_m
+    record: dict[str, Any] = {"all_pixels": None, "raw": None, "disparity": None, "ause": None}
+    values = prediction.relative
+    if values is None:
+        values = depth_m
+        if prediction.space == "disparity":
+            values = 1.0 / np.where(np.nan_to_num(depth_m) > 0, depth_m, np.nan)
+    aligned_m = align(values, truth, kept, prediction.space)
+    record["aligned"] = _plain(evaluate_depth(aligned_m, truth, valid, cap_m))
+    if depth_m is not None:
+        record["all_pixels"] = _plain(evaluate_depth(depth_m, truth, valid))
+        record["raw"] = _plain(evaluate_depth(depth_m, truth, valid, cap_m))
+        if sample.rectified:
+            positive = np.where(np.nan_to_num(depth_m) > 0, depth_m, np.nan)
+            cameras = (sample.K_left, sample.K_right, sample.E)
+            true_px = depth_to_disparity(np.where(valid, truth, 1.0), *cameras)
+            step_px = float(sample.notes.get("disparity_step_px", 0.0))
+            record["disparity"] = _plain(
+                evaluate_disparity(depth_to_disparity(positive, *cameras), true_px, valid, step_px)
+            )
+        if prediction.uncertainty is not None:
+            record["ause"] = _plain({"ause": ause(depth_m, truth, kept, prediction.uncertainty)})["ause"]
+    record["regions"] = _split(aligned_m if depth_m is None else depth_m, sample, cap_m)
+    return record
