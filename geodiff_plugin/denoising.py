@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
@@ -51,9 +50,8 @@ def z0_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
         level: noise level and prediction type.
 
     Returns:
-        ``(B, C, h, w)`` float32; differentiable in both tensors (not where the scheduler clips).
+        ``(B, C, h, w)`` of their dtype; differentiable in both tensors (not where the scheduler clips).
     """
-    output, z_t = output.float(), z_t.float()
     if level.prediction_type == "sample":
         z0 = output
     elif level.prediction_type == "epsilon":
@@ -66,8 +64,7 @@ def z0_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
 
 
 def noise_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
-    """The noise that a network output implies; shapes as ``z0_from``, float32."""
-    output, z_t = output.float(), z_t.float()
+    """The noise that a network output implies; shapes and dtype as ``z0_from``."""
     if level.prediction_type == "epsilon":
         return output
     if level.prediction_type == "sample":
@@ -84,12 +81,12 @@ def output_from(z0: Tensor, eps: Tensor, level: NoiseLevel) -> tuple[Tensor, Ten
     history and stochastic ones included, without a second formula for z_{t-1}.
 
     Args:
-        z0: ``(B, C, h, w)`` float32.
-        eps: ``(B, C, h, w)`` float32.
+        z0: ``(B, C, h, w)`` clean latent.
+        eps: ``(B, C, h, w)`` noise.
         level: noise level and prediction type.
 
     Returns:
-        ``(output, z_t)``, both ``(B, C, h, w)`` float32, inverse of ``z0_from`` and ``noise_from``.
+        ``(output, z_t)``, both ``(B, C, h, w)``, inverse of ``z0_from`` and ``noise_from``.
     """
     z_t = level.alpha * z0 + level.sigma * eps
     if level.prediction_type == "epsilon":
@@ -100,7 +97,3 @@ def output_from(z0: Tensor, eps: Tensor, level: NoiseLevel) -> tuple[Tensor, Ten
         return level.alpha * eps - level.sigma * z0, z_t
     return eps - z0, z_t
 
-
-def is_blind(level: NoiseLevel) -> bool:
-    """Whether the clean latent cannot be told: noise prediction where no signal is left (0 / 0)."""
-    return level.prediction_type == "epsilon" and bool(torch.as_tensor(level.alpha) < 1e-6)

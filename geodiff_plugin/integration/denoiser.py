@@ -59,7 +59,7 @@ class DenoiserTap:
         """The hooked forward: same result, detached; the graph is kept until ``release``."""
         condition, depth_latent = self._split(model_input)
         with torch.enable_grad():
-            leaf = depth_latent.detach().float().requires_grad_()
+            leaf = depth_latent.detach().to(torch.promote_types(depth_latent.dtype, torch.float32)).requires_grad_()
             joined = torch.cat([condition.detach(), leaf.to(condition.dtype)], dim=1)
             result = forward(joined, *args, **kwargs)
         self.leaf = leaf

@@ -115,15 +115,17 @@ class GuidedRun:
 
     def _on_step(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         level = noise_level(self.pipe.scheduler, timestep)
-        eps = noise_from(output, z_t, level)
+        wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
+        wide_output, wide_z_t = output.to(wide), z_t.to(wide)
+        eps = noise_from(wide_output, wide_z_t, level)
         full = self._tap is not None
         if full:
             leaf = self._tap.leaf
 
             def z0_of(z: Tensor) -> Tensor:
-                return z0_from(self._tap.output_at(z), z, level)
+                return z0_from(self._tap.output_at(z).to(wide), z, level)
         else:
-            leaf, z0_of = z0_from(output, z_t, level), _identity
+            leaf, z0_of = z0_from(wide_output, wide_z_t, level), _identity
         move = guided_step(
             self.trajectories[-1],
             leaf,

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from geodiff_plugin.metric import AffineState
+from geodiff_plugin.terms import TERMS, Estimate, MatchTarget, masked_mean
+from geodiff_plugin.terms.matches import CLAMP_PLANES
+from geodiff_plugin.terms.photometric import photometric, photometric_map
+
+
+def estimate(**changes):
+    left = torch.rand(2, 3, 32, 40, generator=torch.Generator().manual_seed(0))
+    affine = AffineState(torch.tensor([0.3, -2.0]), torch.tensor([1.0, 0.5]), torch.tensor([2.0, 9.0]))
+    values = {
+        "depth_m": torch.full((2, 1, 32, 40), 2.0),
+        "left_01": left,
+        "warped_01": left.clone(),
+        "visible": torch.ones(2, 1, 32, 40, dtype=torch.bool),
+        "affine": affine,
+        "affine_start": affine,
+        "z0": torch.zeros(2, 4, 8, 10),
+        "z0_prior": torch.zeros(2, 4, 8, 10),
+        "matches": MatchTarget(torch.full((2, 1, 32, 40), 0.5), torch.ones(2, 1, 32, 40), torch.tensor([0.01, 0.02])),
+    }
+    return Estimate(**(values | changes))
+
+
+@pytest.mark.parametrize("name", [n for n in TERMS if n != "prior_pull"])
+def test_a_perfect_estimate_costs_nothing(name):
+    term = TERMS[name]
+    value = term.function(estimate(), **{"eta": 0.85, "pyramid_levels": 3}) if term.options else term.function(estimate())
+    torch.testing.assert_close(value, torch.zeros(2), atol=1e-5, rtol=0)
+
+
+def test_photometric_ignores_what_is_not_visible():
+    warped = estimate().left_01.clone()
+    warped[:, :, :, 20:] = 0.0
+    seen = torch.zeros(2, 1, 32, 40, dtype=torch.bool)
+    seen[..., :18] = True  # SSIM looks one pixel around
+    masked = photometric(estimate(warped_01=warped, visible=seen), pyramid_levels=1)
+    torch.testing.assert_close(masked, torch.zeros(2), atol=1e-5, rtol=0)
+    assert (photometric(estimate(warped_01=warped), pyramid_levels=1) > 0.1).all()
+
+
+def test_photometric_without_ssim_is_l1():
+    left = estimate().left_01
+    warped = (left + 0.1).clamp(0, 1)
+    torch.testing.assert_close(photometric_map(left, warped, eta=0.0), (left - warped).abs())
+
+
+def test_photometric_gradient_in_float64():
+    g = torch.Generator().manual_seed(3)
+    left, warped = (torch.rand(1, 3, 26, 25, generator=g, dtype=torch.float64) for _ in range(2))
+    base = estimate(left_01=left, visible=torch.ones(1, 1, 26, 25, dtype=torch.bool))
+
+    def loss(w):
+        return photometric(Estimate(**{**base.__dict__, "warped_01": w}), pyramid_levels=2)
+
+    warped.requires_grad_()
+    (grad,) = torch.autograd.grad(loss(warped).sum(), warped)
+    direction = torch.randn(warped.shape, generator=g, dtype=torch.float64)
+    h = 1e-6
+    with torch.no_grad():
+        numeric = (loss(warped + h * direction) - loss(warped - h * direction)).sum() / (2 * h)
+    torch.testing.assert_close((grad * direction).sum(), numeric, rtol=1e-5, atol=1e-9)
+
+
+def test_matches_in_planes_and_clamped():
+    near = estimate(depth_m=torch.full((2, 1, 32, 40), 1 / 0.53))
+    expected = torch.sqrt(1 + torch.tensor([3.0, 1.5]) ** 2) - 1
+    torch.testing.assert_close(TERMS["matches"].function(near), expected, rtol=1e-4, atol=0)
+    far_off = estimate(depth_m=torch.full((2, 1, 32, 40), 0.01, requires_grad=True))
+    value = TERMS["matches"].function(far_off)
+    torch.testing.assert_close(value.detach(), torch.full((2,), (1 + CLAMP_PLANES**2) ** 0.5 - 1))
+    (grad,) = torch.autograd.grad(value.sum(), far_off.depth_m)
+    assert grad.abs().max() == 0
+
+
+def test_no_matches_cost_nothing_and_pull_nothing():
+    target = estimate().matches
+    empty = MatchTarget(target.inverse_depth, torch.zeros_like(target.confidence), target.plane_step)
+    depth = torch.full((2, 1, 32, 40), 7.0, requires_grad=True)
+    value = TERMS["matches"].function(estimate(depth_m=depth, matches=empty))
+    assert value.abs().max() == 0
+    (grad,) = torch.autograd.grad(value.sum(), depth)
+    assert torch.isfinite(grad).all() and grad.abs().max() == 0
+
+
+def test_prior_pull_anchors():
+    pull = TERMS["prior_pull"].function
+    torch.testing.assert_close(pull(estimate(), pull_to="start"), torch.zeros(2))
+    torch.testing.assert_close(pull(estimate(), pull_to="zero"), torch.tensor([0.09 + 1.0, 4.0 + 0.25]))
+
+
+def test_anchor_is_a_mean_square():
+    torch.testing.assert_close(TERMS["anchor"].function(estimate(z0=torch.full((2, 4, 8, 10), 3.0))), torch.full((2,), 9.0))
+
+
+def test_masked_mean():
+    value = torch.arange(6.0).view(1, 1, 2, 3)
+    weight = torch.tensor([[1, 0, 1], [0, 0, 0]], dtype=torch.bool).view(1, 1, 2, 3)
+    assert masked_mean(value, weight).item() == 1.0
+    assert masked_mean(value, torch.zeros_like(weight)).item() == 0.0
