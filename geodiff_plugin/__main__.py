@@ -1,0 +1,10 @@
+"""``python -m geodiff_plugin`` is the ``geodiff`` command (for ``accelerate launch`` and ``torchrun``).
+
+Hop: argv -> ``geodiff_plugin.cli.main``.
+Paper: none.
+"""
+
+from geodiff_plugin.cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""The ``geodiff`` command: every subcommand with its options and their help.
+
+Hop: argv -> a function of ``geodiff_plugin.commands`` -> exit code 0, 2 (bad input) or 130 (Ctrl-C).
+Paper: none.
+
+Torch and diffusers are imported inside the commands, so that ``--help`` and ``--version`` answer at once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from geodiff_plugin.commands.voice import DoorGroup
+
+__all__ = ["app", "main"]
+
+CAMERAS, RUN, OUTPUT = "Cameras", "Prior and run", "Output"
+
+app = typer.Typer(
+    cls=DoorGroup,
+    help="Two photographs and their cameras to depth in metres, by any Marigold-style diffusion prior.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"geodiff-plugin {version('geodiff-plugin')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Two photographs and their cameras to depth in metres, by any Marigold-style diffusion prior."""
+
+
+def _option(help_text: str, panel: str, *names: str) -> Any:
+    return typer.Option(*names, help=help_text, rich_help_panel=panel, show_default=True)
+
+
+@app.command()
+def depth(
+    left: Annotated[Path, typer.Argument(help="Left image, which gets the depth. EXIF orientation is applied.")],
+    right: Annotated[Path, typer.Argument(help="Right image, of any size; K belongs to the image as turned.")],
+    calib: Annotated[
+        list[Path] | None,
+        _option("Calibration file, format told by its content; twice for one file a view.", CAMERAS, "--calib"),
+    ] = None,
+    cameras: Annotated[
+        str | None, _option("Left and right camera of a KITTI file, as 2,3.", CAMERAS, "--cameras")
+    ] = None,
+    fx: Annotated[float | None, _option("Focal length, pixels.", CAMERAS, "--fx")] = None,
+    fy: Annotated[float | None, _option("Focal length, pixels.", CAMERAS, "--fy")] = None,
+    cx: Annotated[float | None, _option("Principal point, pixels.", CAMERAS, "--cx")] = None,
+    cy: Annotated[float | None, _option("Principal point, pixels.", CAMERAS, "--cy")] = None,
+    baseline: Annotated[
+        float | None, _option("Distance of the cameras, metres; the right one is to the right.", CAMERAS, "--baseline")
+    ] = None,
+    k: Annotated[Path | None, _option("3x3 intrinsics, text or .npy.", CAMERAS, "--K")] = None,
+    e: Annotated[
+        Path | None, _option("4x4 pose of the right camera in the left one's frame, metres.", CAMERAS, "--E")
+    ] = None,
+    k_right: Annotated[
+        Path | None, _option("3x3 intrinsics of the right image, if they differ.", CAMERAS, "--K-right")
+    ] = None,
+    prior: Annotated[str, _option("'bundled', a hub id or a folder.", RUN, "--prior")] = "bundled",
+    steps: Annotated[int | None, _option("Denoising steps; the prior's own by default.", RUN, "--steps")] = None,
+    ensemble: Annotated[
+        int, _option("Members; from 2 on their spread is written as uncertainty.", RUN, "--ensemble")
+    ] = 1,
+    resolution: Annotated[
+        int | None,
+        _option("Longer side that the prior works at; 0 for the image's own; the prior's by default.", RUN, "--resolution"),
+    ] = None,
+    near: Annotated[float | None, _option("Nearest depth to search, metres.", RUN, "--near")] = None,
+    far: Annotated[float | None, _option("Farthest depth to search, metres.", RUN, "--far")] = None,
+    seed: Annotated[int, _option("Seed of the noise.", RUN, "--seed")] = 0,
+    device: Annotated[str, _option("auto, cpu, cuda, cuda:N or mps.", RUN, "--device")] = "auto",
+    dtype: Annotated[str, _option("float32, float16 or bfloat16.", RUN, "--dtype")] = "float32",
+    preset: Annotated[str, _option("default, or paper (Algorithm 1 as printed).", RUN, "--preset")] = "default",
+    out: Annotated[Path, _option("Folder for the results.", OUTPUT, "--out", "-o")] = Path("geodiff-out"),
+    overwrite: Annotated[bool, _option("Write into a folder that holds files.", OUTPUT, "--overwrite")] = False,
+    quiet: Annotated[bool, _option("No progress bar, no summary.", OUTPUT, "--quiet", "-q")] = False,
+    json: Annotated[bool, _option("Print the report instead of the summary.", OUTPUT, "--json")] = False,
+) -> None:
+    """Estimate the metric depth of LEFT with RIGHT as its guide."""
+    typed = locals()
+    from geodiff_plugin.commands.arguments import DepthArguments
+    from geodiff_plugin.commands.depth import run_depth
+
+    run_depth(DepthArguments(**typed | {"calib": tuple(calib or ())}))
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, _option("Folder for the results.", OUTPUT, "--out", "-o")] = Path("geodiff-demo"),
+    quiet: Annotated[bool, _option("No progress bar.", OUTPUT, "--quiet", "-q")] = False,
+) -> None:
+    """Run on a rendered pair that ships with the package, offline, and print how good it is."""
+    from geodiff_plugin.commands.demo import run_demo
+
+    run_demo(out, quiet)
+
+
+@app.command()
+def info(
+    prior: Annotated[str | None, _option("Tell of this prior as well.", RUN, "--prior")] = None,
+) -> None:
+    """Print versions, devices, priors and what is cached."""
+    from geodiff_plugin.commands.info import run_info
+
+    run_info(prior)
+
+
+@app.command()
+def bench(
+    full_size: Annotated[
+        bool, _option("Marigold v1-1's configuration with random weights instead of the bundled prior.", RUN, "--full-size")
+    ] = False,
+    device: Annotated[str, _option("auto, cpu, cuda, cuda:N or mps.", RUN, "--device")] = "auto",
+) -> None:
+    """Measure what guidance costs: seconds and peak memory, guided / plain, for both gradients."""
+    from geodiff_plugin.commands.bench import run_bench
+
+    run_bench(full_size, device)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the command line and leave by ``SystemExit``.
+
+    Args:
+        argv: arguments without the program's name; ``None`` for those of the process.
+    """
+    app(args=argv, prog_name="geodiff")

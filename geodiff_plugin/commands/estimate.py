@@ -1,0 +1,76 @@
+"""One guided call with a progress bar, timed by stage.
+
+Hop: ``Inputs`` -> a prior -> ``MetricDepthOutput`` with the seconds of every stage.
+Paper: Algorithm 1, run by the pipeline.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from geodiff_plugin.commands.arguments import DepthArguments, Settings
+from geodiff_plugin.commands.inputs import Inputs
+from geodiff_plugin.pipeline import enable_geometry_guidance
+from geodiff_plugin.priors import load_prior
+from geodiff_plugin.types import MetricDepthOutput
+
+__all__ = ["StopWatch", "guided_call", "load_guided_prior"]
+
+
+class StopWatch:
+    """Wall-clock seconds by stage, in the order of the stages."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what is inside."""
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - started
+
+
+def load_guided_prior(arguments: DepthArguments, settings: Settings) -> Any:
+    """The prior of ``--prior``, with guidance enabled and its own progress bars off.
+
+    Raises:
+        ValueError: no such prior, not cached, or no adapter for its class.
+    """
+    pipe = load_prior(arguments.prior, device=settings.device, dtype=settings.dtype)
+    pipe.set_progress_bar_config(disable=True)
+    enable_geometry_guidance(pipe)
+    return pipe
+
+
+def guided_call(pipe: Any, inputs: Inputs, arguments: DepthArguments) -> MetricDepthOutput:
+    """Call the pipeline as the options say; unless ``--quiet``, with the loss in a progress bar on stderr.
+
+    Raises:
+        ValueError: what only both views together show, such as no overlap.
+    """
+    steps = arguments.steps or pipe.config.get("default_denoising_steps")
+    total = steps * arguments.ensemble if steps else None
+    options = {
+        "num_inference_steps": arguments.steps,
+        "processing_resolution": arguments.resolution,
+        "ensemble_size": arguments.ensemble,
+        "output_uncertainty": arguments.ensemble > 1,
+        "generator": torch.Generator("cpu").manual_seed(arguments.seed),
+    }
+    with tqdm(total=total, desc="guided steps", disable=arguments.quiet, file=sys.stderr, leave=False) as bar:
+
+        def show(_pipe: Any, _step: int, _timestep: Any, now: dict[str, Any]) -> dict[str, Any]:
+            bar.update(1)
+            bar.set_postfix(loss=f"{float(torch.as_tensor(now['loss']).mean()):.4f}")
+            return {}
+
+        callback = {} if arguments.quiet else {"callback_on_step_end": show}
+        return pipe(inputs.left, guidance=inputs.guidance, **options, **callback)

@@ -1,0 +1,160 @@
+"""Opens and checks what ``geodiff depth`` was given, before any weights load.
+
+Hop: ``DepthArguments`` -> two images, a ``Rig`` and the ``GeometryGuidance`` made of them.
+Paper: S3.3 (two views with known cameras).
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value, check_intrinsics, check_intrinsics_fit, check_pose
+from geodiff_plugin.commands.arguments import DepthArguments, Settings
+from geodiff_plugin.formats import read_calibration, read_image, read_matrix, rig_from_parameters
+from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.types import Rig
+
+__all__ = ["Inputs", "read_inputs", "read_rig"]
+
+CALIBRATION_WAYS = "--calib FILE, or --fx --fy --cx --cy --baseline, or --K FILE --E FILE"
+PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Two views, ready to be guided by.
+
+    Attributes:
+        left: ``(H, W, 3)`` float32 in [0, 1], EXIF orientation applied.
+        right: likewise, of its own size.
+        rig: cameras of both, in pixels of these images.
+        guidance: the right view with the settings of the preset.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    rig: Rig
+    guidance: GeometryGuidance
+
+
+def _size(image: np.ndarray) -> tuple[int, int]:
+    """``(width, height)``."""
+    return image.shape[1], image.shape[0]
+
+
+def _read_view(path: Path, name: str) -> np.ndarray:
+    image, notes = read_image(path, name)
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
+    return image
+
+
+def _check_one_calibration(arguments: DepthArguments) -> str:
+    """Which of the three ways was taken: ``"file"``, ``"parameters"`` or ``"matrices"``."""
+    ways = {
+        "file": bool(arguments.calib),
+        "parameters": any(getattr(arguments, name) is not None for name in PARAMETERS),
+        "matrices": any(path is not None for path in (arguments.k, arguments.e, arguments.k_right)),
+    }
+    taken = [way for way, is_taken in ways.items() if is_taken]
+    if not taken:
+        bad_value(
+            "calibration", f"given: {CALIBRATION_WAYS}", "none", "Without cameras two images carry no metres."
+        )
+    if len(taken) > 1:
+        bad_value("calibration", f"given in one way: {CALIBRATION_WAYS}", " and ".join(taken), "Drop the others.")
+    if arguments.cameras is not None and taken != ["file"]:
+        bad_value("--cameras", "given with --calib only", "no --calib", "It chooses among the cameras of a file.")
+    return taken[0]
+
+
+def _rig_from_options(arguments: DepthArguments, size: tuple[int, int]) -> Rig:
+    values = {name: getattr(arguments, name) for name in PARAMETERS}
+    missing = [f"--{name}" for name, value in values.items() if value is None]
+    if missing:
+        centre = ((size[0] - 1) / 2, (size[1] - 1) / 2)
+        bad_value(
+            " ".join(missing),
+            "given as well, with " + " ".join(f"--{name}" for name in PARAMETERS if f"--{name}" not in missing),
+            "nothing",
+            f"--fy is --fx where pixels are square; --cx and --cy are near the image's centre, here {centre[0]:g} "
+            f"and {centre[1]:g}; --baseline is the distance of the cameras in metres.",
+        )
+    if values["baseline"] == 0:
+        bad_value("--baseline", "the distance of the cameras in metres", 0, "Without one two views carry no scale.")
+    return rig_from_parameters(*values.values())
+
+
+def _rig_from_matrices(arguments: DepthArguments) -> Rig:
+    for option, path in (("--K", arguments.k), ("--E", arguments.e)):
+        if path is None:
+            bad_value(option, "given as well", "nothing", "--K and --E go together; --K-right is optional.")
+    K = check_intrinsics(read_matrix(arguments.k, "--K"), f"--K {arguments.k}")
+    K_right = K
+    if arguments.k_right is not None:
+        K_right = check_intrinsics(read_matrix(arguments.k_right, "--K-right"), f"--K-right {arguments.k_right}")
+    return Rig(K, K_right, check_pose(read_matrix(arguments.e, "--E"), f"--E {arguments.e}"), source=str(arguments.k))
+
+
+def read_rig(
+    arguments: DepthArguments,
+    cameras: tuple[int, int] | None,
+    left_size: tuple[int, int],
+    right_size: tuple[int, int],
+) -> Rig:
+    """The cameras, from whichever of the three ways was taken, for images of these sizes.
+
+    Args:
+        arguments: the options.
+        cameras: numbers of the left and the right camera of the calibration, or ``None``.
+        left_size: ``(width, height)`` of the left image.
+        right_size: ``(width, height)`` of the right image.
+
+    Raises:
+        OSError, TypeError, ValueError: no calibration or more than one, a file that is none, K for images
+            of another size.
+    """
+    way = _check_one_calibration(arguments)
+    if way == "file":
+        rig = read_calibration(arguments.calib, cameras, str(arguments.left))
+    else:
+        rig = _rig_from_options(arguments, left_size) if way == "parameters" else _rig_from_matrices(arguments)
+    views = (
+        ("left", rig.K_left, rig.size_left, left_size, arguments.left),
+        ("right", rig.K_right, rig.size_right, right_size, arguments.right),
+    )
+    for side, K, calibrated_size, size, path in views:
+        if calibrated_size is not None and tuple(calibrated_size) != size:
+            bad_value(
+                f"the {side} image {path}",
+                "of {}x{} pixels, as {} says".format(*calibrated_size, rig.source),
+                "{}x{}".format(*size),
+                "Use the images that the calibration is for, or scale K with them and give --fx --fy --cx --cy.",
+            )
+        check_intrinsics_fit(K, *size, f"K of the {side} camera ({rig.source})", f"the {side} image {path}")
+    return replace(rig, size_left=left_size, size_right=right_size)
+
+
+def _make_guidance(arguments: DepthArguments, settings: Settings, right: np.ndarray, rig: Rig) -> GeometryGuidance:
+    cameras = (right, (rig.K_left, rig.K_right), rig.E)
+    if arguments.preset == "paper":
+        bounds = {} if settings.depth_range is None else {"g_s_range": settings.depth_range}
+        return GeometryGuidance.paper(*cameras, **bounds)
+    return GeometryGuidance(*cameras, depth_range=settings.depth_range)
+
+
+def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:
+    """Read both images and the calibration, and see that they fit each other.
+
+    Raises:
+        OSError, TypeError, ValueError: naming the option or the file.
+    """
+    left, right = _read_view(arguments.left, "LEFT"), _read_view(arguments.right, "RIGHT")
+    if arguments.left.samefile(arguments.right):
+        bad_value("RIGHT", "another photograph than LEFT", f"{arguments.right} for both")
+    rig = read_rig(arguments, settings.cameras, _size(left), _size(right))
+    return Inputs(left, right, rig, _make_guidance(arguments, settings, right, rig))

@@ -1,0 +1,153 @@
+"""Every number of a guided call as one JSON document.
+
+Hop: inputs, ``MetricDepthOutput``, options, seconds -> ``dict`` for ``report.json`` and ``--json``.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+import torch
+
+from geodiff_plugin.commands.arguments import DepthArguments, Settings
+from geodiff_plugin.commands.inputs import Inputs
+from geodiff_plugin.types import MetricDepthOutput
+
+__all__ = ["build_report", "depth_summary", "single_map", "summary_line", "versions"]
+
+PACKAGES = ("geodiff-plugin", "torch", "diffusers", "transformers", "accelerate", "kornia", "numpy", "pillow")
+
+
+def versions() -> dict[str, str]:
+    """Version of Python and of every package that a result depends on."""
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def single_map(value: Any) -> np.ndarray:
+    """The ``(H, W)`` map of the one image of a call."""
+    return np.asarray(value)[0, ..., 0]
+
+
+def depth_summary(depth_m: np.ndarray, visible: np.ndarray) -> dict[str, Any]:
+    """Near, far, median in metres over valid pixels; shares and counts over all.
+
+    Args:
+        depth_m: ``(H, W)`` metres.
+        visible: ``(H, W)`` bool.
+    """
+    valid = np.isfinite(depth_m) & (depth_m > 0)
+    kept = depth_m[valid]
+    names = ("min_m", "median_m", "mean_m", "max_m")
+    values = (kept.min(), np.median(kept), kept.mean(), kept.max()) if kept.size else (math.nan,) * 4
+    return {name: float(value) for name, value in zip(names, values, strict=True)} | {
+        "width": depth_m.shape[1],
+        "height": depth_m.shape[0],
+        "invalid_pixels": int((~valid).sum()),
+        "visible_fraction": float(visible.mean()),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Tensors and arrays as lists, numbers that JSON has no name for as ``None``."""
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, torch.Tensor):
+        return _plain(value.detach().cpu().tolist())
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _history(output: MetricDepthOutput) -> list[dict[str, Any]]:
+    return [
+        {
+            "step": entry.step,
+            "timestep": float(entry.timestep),
+            "loss": entry.loss,
+            "terms": entry.terms,
+            "s_hat": entry.s_hat,
+            "t_hat": entry.t_hat,
+            "g_s": entry.g_s,
+            "visible_fraction": entry.visible_fraction,
+        }
+        for entry in output.history
+    ]
+
+
+def build_report(
+    inputs: Inputs,
+    output: MetricDepthOutput,
+    pipe: Any,
+    arguments: DepthArguments,
+    settings: Settings,
+    warnings: list[str],
+) -> dict[str, Any]:
+    """The report without seconds and files, which are known when everything else is written.
+
+    Args:
+        inputs: the views and cameras.
+        output: of the guided call.
+        pipe: the pipeline that made it.
+        arguments: options as typed.
+        settings: what was understood of them.
+        warnings: sentences, those of the output included.
+    """
+    rig = inputs.rig
+    visible, error = single_map(output.visible), single_map(output.photometric_error)
+    report = {
+        "depth": depth_summary(single_map(output.prediction), visible),
+        "photometric_error_mean": float(error[visible].mean()) if visible.any() else math.nan,
+        "uncertainty_median_m": None if output.uncertainty is None else np.median(single_map(output.uncertainty)),
+        "K": output.K,
+        "scale": output.scale,
+        "shift": output.shift,
+        "global_scale": output.global_scale,
+        "history": _history(output),
+        "warnings": warnings,
+        "inputs": {
+            "left_size": rig.size_left,
+            "right_size": rig.size_right,
+            "calibration": rig.source,
+            "K_left": rig.K_left,
+            "K_right": rig.K_right,
+            "E": rig.E,
+            "baseline_m": float(np.linalg.norm(rig.E[:3, 3])),
+        },
+        "prior": {
+            "name": arguments.prior,
+            "pipeline": type(pipe).__name__,
+            "scheduler": type(pipe.scheduler).__name__,
+            "device": str(settings.device),
+            "dtype": arguments.dtype,
+        },
+        "guidance": {k: v for k, v in inputs.guidance.config.items() if not k.startswith("_")},
+        "arguments": arguments.as_json(),
+        "versions": versions(),
+    }
+    return _plain(report)
+
+
+def summary_line(report: dict[str, Any], where: str) -> str:
+    """One line for people: near, far, median, visible share, seconds, folder."""
+    depth, seconds = report["depth"], sum(report["seconds"].values())
+    if depth["median_m"] is None:
+        return f"no valid depth; {seconds:.1f} s -> {where}"
+    return (
+        f"{depth['min_m']:.2f} m to {depth['max_m']:.2f} m, median {depth['median_m']:.2f} m; "
+        f"{100 * depth['visible_fraction']:.0f} % visible; {seconds:.1f} s -> {where}"
+    )
