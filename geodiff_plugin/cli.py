@@ -40,7 +40,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it and exit.")
     ] = False,
 ) -> None:
     """Two photographs and their cameras to depth in metres, by any Marigold-style diffusion prior."""
@@ -52,11 +52,13 @@ def _option(help_text: str, panel: str, *names: str) -> Any:
 
 @app.command()
 def depth(
-    left: Annotated[Path, typer.Argument(help="Left image, which gets the depth. EXIF orientation is applied.")],
-    right: Annotated[Path, typer.Argument(help="Right image, of any size; K belongs to the image as turned.")],
+    left: Annotated[Path, typer.Argument(help="Left image; it gets the depth. EXIF turns are applied.")],
+    right: Annotated[Path, typer.Argument(help="Right image, of any size.")],
     calib: Annotated[
         list[Path] | None,
-        _option("Calibration file, format told by its content; twice for one file a view.", CAMERAS, "--calib"),
+        _option(
+            "Calibration file, format told by its content; twice for one file a view.", CAMERAS, "--calib"
+        ),
     ] = None,
     cameras: Annotated[
         str | None, _option("Left and right camera of a KITTI file, as 2,3.", CAMERAS, "--cameras")
@@ -66,7 +68,8 @@ def depth(
     cx: Annotated[float | None, _option("Principal point, pixels.", CAMERAS, "--cx")] = None,
     cy: Annotated[float | None, _option("Principal point, pixels.", CAMERAS, "--cy")] = None,
     baseline: Annotated[
-        float | None, _option("Distance of the cameras, metres; the right one is to the right.", CAMERAS, "--baseline")
+        float | None,
+        _option("Distance of the cameras, metres; right one to the right.", CAMERAS, "--baseline"),
     ] = None,
     k: Annotated[Path | None, _option("3x3 intrinsics, text or .npy.", CAMERAS, "--K")] = None,
     e: Annotated[
@@ -76,22 +79,28 @@ def depth(
         Path | None, _option("3x3 intrinsics of the right image, if they differ.", CAMERAS, "--K-right")
     ] = None,
     prior: Annotated[str, _option("'bundled', a hub id or a folder.", RUN, "--prior")] = "bundled",
-    steps: Annotated[int | None, _option("Denoising steps; the prior's own by default.", RUN, "--steps")] = None,
+    steps: Annotated[
+        int | None, _option("Denoising steps; the prior's own by default.", RUN, "--steps")
+    ] = None,
     ensemble: Annotated[
         int, _option("Members; from 2 on their spread is written as uncertainty.", RUN, "--ensemble")
     ] = 1,
     resolution: Annotated[
         int | None,
-        _option("Longer side that the prior works at; 0 for the image's own; the prior's by default.", RUN, "--resolution"),
+        _option("Longer side for the prior, pixels; 0: as the image.", RUN, "--resolution"),
     ] = None,
     near: Annotated[float | None, _option("Nearest depth to search, metres.", RUN, "--near")] = None,
     far: Annotated[float | None, _option("Farthest depth to search, metres.", RUN, "--far")] = None,
     seed: Annotated[int, _option("Seed of the noise.", RUN, "--seed")] = 0,
     device: Annotated[str, _option("auto, cpu, cuda, cuda:N or mps.", RUN, "--device")] = "auto",
     dtype: Annotated[str, _option("float32, float16 or bfloat16.", RUN, "--dtype")] = "float32",
-    preset: Annotated[str, _option("default, or paper (Algorithm 1 as printed).", RUN, "--preset")] = "default",
+    preset: Annotated[
+        str, _option("default, or paper (Algorithm 1 as printed).", RUN, "--preset")
+    ] = "default",
     out: Annotated[Path, _option("Folder for the results.", OUTPUT, "--out", "-o")] = Path("geodiff-out"),
-    overwrite: Annotated[bool, _option("Write into a folder that holds files.", OUTPUT, "--overwrite")] = False,
+    overwrite: Annotated[
+        bool, _option("Write into a folder that holds files.", OUTPUT, "--overwrite")
+    ] = False,
     quiet: Annotated[bool, _option("No progress bar, no summary.", OUTPUT, "--quiet", "-q")] = False,
     json: Annotated[bool, _option("Print the report instead of the summary.", OUTPUT, "--json")] = False,
 ) -> None:
@@ -127,7 +136,7 @@ def info(
 @app.command()
 def bench(
     full_size: Annotated[
-        bool, _option("Marigold v1-1's configuration with random weights instead of the bundled prior.", RUN, "--full-size")
+        bool, _option("Marigold v1-1 with random weights, not the bundled prior.", RUN, "--full-size")
     ] = False,
     device: Annotated[str, _option("auto, cpu, cuda, cuda:N or mps.", RUN, "--device")] = "auto",
 ) -> None:

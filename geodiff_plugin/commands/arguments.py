@@ -56,7 +56,9 @@ class DepthArguments:
 
     def as_json(self) -> dict[str, Any]:
         """The options as JSON can hold them."""
-        plain = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()}
+        plain = {
+            name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()
+        }
         return plain | {"calib": [str(path) for path in self.calib]}
 
 
@@ -98,7 +100,9 @@ def pick_device(name: str) -> torch.device:
     if not here[device.type]:
         bad_value("--device", "a device of this machine", repr(name), f"PyTorch finds no {device.type} here.")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        bad_value("--device", f"one of the {torch.cuda.device_count()} CUDA devices of this machine", repr(name))
+        bad_value(
+            "--device", f"one of the {torch.cuda.device_count()} CUDA devices of this machine", repr(name)
+        )
     return device
 
 
@@ -119,7 +123,7 @@ def _check_depth_range(near: float | None, far: float | None) -> tuple[float, fl
         return None
     if near is None or far is None:
         missing, given = ("--near", "--far") if near is None else ("--far", "--near")
-        bad_value(missing, f"given together with {given}", "none", "The two bound the search for the scale, in metres.")
+        bad_value(missing, f"given together with {given}", "none", "Both in metres.")
     check_number(near, "--near", 1e-6, 1e6)
     check_number(far, "--far", 1e-6, 1e6)
     if near >= far:
@@ -132,7 +136,7 @@ def _check_out(out: Path, overwrite: bool) -> None:
         bad_value("--out", "a folder", f"the file {out}")
     if out.is_dir() and any(out.iterdir()) and not overwrite:
         bad_value(
-            "--out", "a new or empty folder", f"{out}, which holds files", "Name another one, or add --overwrite."
+            "--out", "a new or empty folder", f"{out}, which holds files", "Name another, or add --overwrite."
         )
 
 

@@ -64,7 +64,9 @@ def estimate_and_write(arguments: DepthArguments) -> DepthRun:
         with staged_folder(arguments.out) as folder:
             with watch.stage("write"):
                 report["files"] = write_maps(folder, output, inputs.left)
-            report["files"]["names"] = [name for name in OUTPUT_FILES if (folder / name).exists()] + ["report.json"]
+            report["files"]["names"] = [name for name in OUTPUT_FILES if (folder / name).exists()] + [
+                "report.json"
+            ]
             report["seconds"] = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
             report_text = write_report(folder, report)
     return DepthRun(inputs, output, pipe, settings, report, report_text)

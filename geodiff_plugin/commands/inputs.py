@@ -66,9 +66,13 @@ def _check_one_calibration(arguments: DepthArguments) -> str:
             "calibration", f"given: {CALIBRATION_WAYS}", "none", "Without cameras two images carry no metres."
         )
     if len(taken) > 1:
-        bad_value("calibration", f"given in one way: {CALIBRATION_WAYS}", " and ".join(taken), "Drop the others.")
+        bad_value(
+            "calibration", f"given in one way: {CALIBRATION_WAYS}", " and ".join(taken), "Drop the others."
+        )
     if arguments.cameras is not None and taken != ["file"]:
-        bad_value("--cameras", "given with --calib only", "no --calib", "It chooses among the cameras of a file.")
+        bad_value(
+            "--cameras", "given with --calib only", "no --calib", "It chooses among the cameras of a file."
+        )
     return taken[0]
 
 
@@ -79,13 +83,16 @@ def _rig_from_options(arguments: DepthArguments, size: tuple[int, int]) -> Rig:
         centre = ((size[0] - 1) / 2, (size[1] - 1) / 2)
         bad_value(
             " ".join(missing),
-            "given as well, with " + " ".join(f"--{name}" for name in PARAMETERS if f"--{name}" not in missing),
+            "given as well, with "
+            + " ".join(f"--{name}" for name in PARAMETERS if f"--{name}" not in missing),
             "nothing",
-            f"--fy is --fx where pixels are square; --cx and --cy are near the image's centre, here {centre[0]:g} "
-            f"and {centre[1]:g}; --baseline is the distance of the cameras in metres.",
+            f"--fy is --fx where pixels are square; --cx, --cy are near the image's centre, {centre[0]:g} and "
+            f"{centre[1]:g} here; --baseline is the distance of the cameras in metres.",
         )
     if values["baseline"] == 0:
-        bad_value("--baseline", "the distance of the cameras in metres", 0, "Without one two views carry no scale.")
+        bad_value(
+            "--baseline", "the distance of the cameras in metres", 0, "Without one two views carry no scale."
+        )
     return rig_from_parameters(*values.values())
 
 
@@ -96,8 +103,12 @@ def _rig_from_matrices(arguments: DepthArguments) -> Rig:
     K = check_intrinsics(read_matrix(arguments.k, "--K"), f"--K {arguments.k}")
     K_right = K
     if arguments.k_right is not None:
-        K_right = check_intrinsics(read_matrix(arguments.k_right, "--K-right"), f"--K-right {arguments.k_right}")
-    return Rig(K, K_right, check_pose(read_matrix(arguments.e, "--E"), f"--E {arguments.e}"), source=str(arguments.k))
+        K_right = check_intrinsics(
+            read_matrix(arguments.k_right, "--K-right"), f"--K-right {arguments.k_right}"
+        )
+    return Rig(
+        K, K_right, check_pose(read_matrix(arguments.e, "--E"), f"--E {arguments.e}"), source=str(arguments.k)
+    )
 
 
 def read_rig(
@@ -122,7 +133,9 @@ def read_rig(
     if way == "file":
         rig = read_calibration(arguments.calib, cameras, str(arguments.left))
     else:
-        rig = _rig_from_options(arguments, left_size) if way == "parameters" else _rig_from_matrices(arguments)
+        rig = (
+            _rig_from_options(arguments, left_size) if way == "parameters" else _rig_from_matrices(arguments)
+        )
     views = (
         ("left", rig.K_left, rig.size_left, left_size, arguments.left),
         ("right", rig.K_right, rig.size_right, right_size, arguments.right),
@@ -133,13 +146,15 @@ def read_rig(
                 f"the {side} image {path}",
                 "of {}x{} pixels, as {} says".format(*calibrated_size, rig.source),
                 "{}x{}".format(*size),
-                "Use the images that the calibration is for, or scale K with them and give --fx --fy --cx --cy.",
+                "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy.",
             )
         check_intrinsics_fit(K, *size, f"K of the {side} camera ({rig.source})", f"the {side} image {path}")
     return replace(rig, size_left=left_size, size_right=right_size)
 
 
-def _make_guidance(arguments: DepthArguments, settings: Settings, right: np.ndarray, rig: Rig) -> GeometryGuidance:
+def _make_guidance(
+    arguments: DepthArguments, settings: Settings, right: np.ndarray, rig: Rig
+) -> GeometryGuidance:
     cameras = (right, (rig.K_left, rig.K_right), rig.E)
     if arguments.preset == "paper":
         bounds = {} if settings.depth_range is None else {"g_s_range": settings.depth_range}

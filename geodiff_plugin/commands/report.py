@@ -112,7 +112,9 @@ def build_report(
     report = {
         "depth": depth_summary(single_map(output.prediction), visible),
         "photometric_error_mean": float(error[visible].mean()) if visible.any() else math.nan,
-        "uncertainty_median_m": None if output.uncertainty is None else np.median(single_map(output.uncertainty)),
+        "uncertainty_median_m": None
+        if output.uncertainty is None
+        else np.median(single_map(output.uncertainty)),
         "K": output.K,
         "scale": output.scale,
         "shift": output.shift,
