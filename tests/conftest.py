@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, UNet2DConditionModel
+from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, ModelMixin, UNet2DConditionModel
+from diffusers.configuration_utils import ConfigMixin, register_to_config
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
 SCHEDULER = {
@@ -136,3 +138,64 @@ def plane_pair(size=(48, 64), baseline=0.12, rotation_y=0.0, seed=0, focal=60.0)
 def textured_plane() -> PlanePair:
     """A rectified pair of a tilted plane between about 1.4 m and 3.4 m."""
     return plane_pair()
+
+
+class OracleVAE(ModelMixin, ConfigMixin):
+    """Latent = map: channel 0 holds the relative depth, no compression."""
+
+    @register_to_config
+    def __init__(self, block_out_channels=(1,), latent_channels=4, scaling_factor=1.0):
+        super().__init__()
+        self.unit = torch.nn.Parameter(torch.ones(()))
+
+    def encode(self, x):
+        latent = torch.cat([x, torch.zeros_like(x[:, :1])], dim=1) * self.unit
+        return SimpleNamespace(latent_dist=SimpleNamespace(mode=lambda: latent))
+
+    def decode(self, z, return_dict=False):
+        return ((2.0 * z[:, :1] - 1.0).repeat(1, 3, 1, 1) * self.unit,)
+
+
+class OracleUNet(ModelMixin, ConfigMixin):
+    """Predicts the clean latent of a known relative depth ("sample" prediction)."""
+
+    @register_to_config
+    def __init__(self):
+        super().__init__()
+        self.unit = torch.nn.Parameter(torch.ones(()))
+        self.relative = None  # (1, 1, H, W)
+
+    def forward(self, sample, t, encoder_hidden_states=None, return_dict=False):
+        z0 = self.relative.to(sample).expand(sample.shape[0], 4, -1, -1)
+        return (z0 * self.unit + 0.0 * sample[:, 4:],)
+
+
+@pytest.fixture
+def make_oracle(tokenizer):
+    """Factory of a Marigold whose denoiser knows the relative depth ``(H, W)`` up to an affine map."""
+
+    def make(relative: np.ndarray, prediction_type: str = "depth") -> MarigoldDepthPipeline:
+        unet = OracleUNet()
+        unet.relative = torch.from_numpy(relative)[None, None].float()
+        text = CLIPTextModel(
+            CLIPTextConfig(
+                hidden_size=8, intermediate_size=8, num_attention_heads=2, num_hidden_layers=1, vocab_size=4
+            )
+        )
+        scheduler = DDIMScheduler(
+            **{**SCHEDULER, "prediction_type": "sample", "rescale_betas_zero_snr": False, "set_alpha_to_one": True}
+        )
+        pipe = MarigoldDepthPipeline(
+            unet=unet,
+            vae=OracleVAE(),
+            scheduler=scheduler,
+            text_encoder=text,
+            tokenizer=tokenizer,
+            prediction_type=prediction_type,
+            default_denoising_steps=2,
+            default_processing_resolution=0,
+        )
+        pipe.set_progress_bar_config(disable=True)
+        return pipe
+
+    return make

@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from geodiff_plugin import GeometryGuidance
+
+K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+E = np.eye(4)
+E[0, 3] = 0.12
+RIGHT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+HYPERPARAMETERS = {"gradient", "rule", "step_latents", "inner_steps", "weights", "depth_range", "g_s_range", "gate"}
+
+
+def test_positional_construction_registers_hyperparameters_and_only_them():
+    guidance = GeometryGuidance(RIGHT, K, E)
+    assert HYPERPARAMETERS <= set(guidance.config)
+    assert not {"right", "K", "E"} & set(guidance.config)
+    assert guidance.config.gradient == "denoised"
+    json.loads(guidance.to_json_string())
+
+
+def test_save_and_load(tmp_path):
+    guidance = GeometryGuidance(RIGHT, K, E, inner_steps=3, depth_range=(0.5, 9.0), weights={"photometric": 2.0})
+    guidance.save_config(tmp_path)
+    config = GeometryGuidance.load_config(tmp_path)
+    again = GeometryGuidance.from_config(config, right=RIGHT, K=K, E=E)
+    assert again.config.inner_steps == 3
+    assert again.config.depth_range == (0.5, 9.0)
+    assert again.config.weights == {"photometric": 2.0}
+    overridden = GeometryGuidance.from_config(config, right=RIGHT, K=K, E=E, inner_steps=5)
+    assert overridden.config.inner_steps == 5
+
+
+@pytest.mark.parametrize(
+    "right",
+    [
+        RIGHT,
+        RIGHT.astype(np.float32) / 255,
+        RIGHT.astype(np.uint16) * 257,
+        Image.fromarray(RIGHT),
+        torch.from_numpy(RIGHT).permute(2, 0, 1),
+        torch.from_numpy(RIGHT).permute(2, 0, 1) / 255,
+    ],
+    ids=["uint8", "float", "uint16", "pil", "torch-uint8", "torch-float"],
+)
+def test_right_image_of_any_kind(right):
+    (image,) = GeometryGuidance(right, K, E).rights
+    assert image.shape == (3, 48, 64) and image.dtype == torch.float32
+    torch.testing.assert_close(image, torch.from_numpy(RIGHT).permute(2, 0, 1) / 255, atol=1e-5, rtol=0)
+
+
+def test_baseline_constructor_pins_the_sign():
+    guidance = GeometryGuidance.from_baseline(RIGHT, K, 0.12)
+    assert guidance.rigs[0].E[0, 3] == pytest.approx(0.12)
+    assert guidance.rigs[0].T_right_from_left[0, 3] == pytest.approx(-0.12)
+
+
+def test_pair_of_poses_is_composed():
+    left = np.eye(4)
+    left[:3, 3] = 3.0
+    guidance = GeometryGuidance(RIGHT, K, (left, left @ E))
+    np.testing.assert_allclose(guidance.rigs[0].E, E, atol=1e-12)
+
+
+def test_pair_of_intrinsics():
+    K_right = K.copy()
+    K_right[0, 2] += 5
+    rig = GeometryGuidance(RIGHT, (K, K_right), E).rigs[0]
+    assert rig.K_left[0, 2] == 31.5 and rig.K_right[0, 2] == 36.5
+
+
+def test_lists_have_one_entry_per_image():
+    E2 = E.copy()
+    E2[0, 3] = 0.2
+    guidance = GeometryGuidance([RIGHT, RIGHT], [K, (K, K)], [E, E2])
+    assert [rig.E[0, 3] for rig in guidance.rigs] == [0.12, 0.2]
+    with pytest.raises(ValueError, match="E must be a list of 2 entries"):
+        GeometryGuidance([RIGHT, RIGHT], K, [E])
+
+
+def test_nested_lists_are_matrices():
+    rig = GeometryGuidance(RIGHT, K.tolist(), E.tolist()).rigs[0]
+    np.testing.assert_array_equal(rig.K_left, K)
+
+
+def test_nearly_rigid_pose_is_projected():
+    E2 = E.copy()
+    E2[:3, :3] *= 1.0004
+    R = GeometryGuidance(RIGHT, K, E2).rigs[0].E[:3, :3]
+    np.testing.assert_allclose(R, np.eye(3), atol=1e-9)
+
+
+def bad(**changes):
+    return {"right": RIGHT, "K": K, "E": E} | changes
+
+
+def changed(matrix, index, value):
+    matrix = matrix.copy()
+    matrix[index] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (bad(K=np.eye(4)), ValueError, "K must be a 3x3"),
+        (bad(K=np.zeros((2, 3, 3))), ValueError, "K must be a 3x3"),
+        (bad(K="calib.txt"), (TypeError, ValueError), "K"),
+        (bad(K=changed(K, (0, 0), 0.0)), ValueError, "focal"),
+        (bad(K=changed(K, (0, 2), 900.0)), ValueError, "another resolution"),
+        (bad(K=changed(K, (1, 1), np.nan)), ValueError, "finite"),
+        (bad(E=np.eye(3)), ValueError, "E must be a 4x4"),
+        (bad(E=np.eye(4)), ValueError, "baseline"),
+        (bad(E=changed(E, (0, 0), 2.0)), ValueError, "rigid"),
+        (bad(E=changed(E, (0, 0), -1.0)), ValueError, "rigid"),
+        (bad(E=changed(E, (3, 0), 0.1)), ValueError, "last row"),
+        (bad(E=changed(E, (1, 3), np.inf)), ValueError, "finite"),
+        (bad(right=RIGHT.astype(np.float32)), ValueError, "right"),
+        (bad(right=[]), ValueError, "right"),
+        (bad(gradient="half"), ValueError, "gradient"),
+        (bad(rule="sgd"), ValueError, "rule"),
+        (bad(inner_steps=1.5), TypeError, "inner_steps"),
+        (bad(inner_steps=-1), ValueError, "inner_steps"),
+        (bad(start=0.8, stop=0.2), ValueError, "start"),
+        (bad(depth_range=(3.0, 1.0)), ValueError, "depth_range"),
+        (bad(weights={"smooth": 1.0}), ValueError, "weights"),
+        (bad(weights={"photometric": -1.0}), ValueError, "photometric"),
+    ],
+)
+def test_bad_input_names_the_argument(arguments, error, message):
+    with pytest.raises(error, match=message):
+        GeometryGuidance(**arguments)
+
+
+def test_millimetres_are_suspected():
+    with pytest.warns(UserWarning, match="millimetres"):
+        GeometryGuidance.from_baseline(RIGHT, K, 120.0)
+
+
+def test_paper_preset_is_the_paper():
+    config = GeometryGuidance.paper(RIGHT, K, E).config
+    assert (config.gradient, config.rule, config.affine_rule) == ("full", "plain", "plain")
+    assert config.step_latents == config.step_affine == 1e-2
+    assert config.weights == {"photometric": 1.0, "prior_pull": 1e-2}
+    assert (config.eta, config.inner_steps, config.pull_to) == (0.85, 1, "zero")
+    assert (config.search, config.g_s_range) == ("one-number", (1.0, 80.0))
