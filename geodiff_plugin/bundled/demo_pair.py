@@ -1,0 +1,51 @@
+"""The stereo pair of ``geodiff demo``: rendered by this package, with exact depth.
+
+Hop: ``bundled/pair/`` -> images, ``Rig``, depth.
+Paper: none; it stands in for the photographs of S5, which may not be shipped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from geodiff_plugin.formats import read_calibration, read_depth_mm_png, read_image
+from geodiff_plugin.types import Rig
+
+__all__ = ["DEMO_PAIR_FOLDER", "DemoPair", "read_demo_pair"]
+
+#: ``left.png``, ``right.png``, ``calib.txt`` (Middlebury's format), ``depth_mm.png``.
+DEMO_PAIR_FOLDER = Path(__file__).resolve().parent / "pair"
+
+
+@dataclass(frozen=True)
+class DemoPair:
+    """Two views with the truth.
+
+    Attributes:
+        left: ``(H, W, 3)`` float32 in [0, 1].
+        right: likewise.
+        rig: cameras of both.
+        depth_m: ``(H, W)`` float32 metres, to the millimetre.
+        valid: ``(H, W)`` bool, where the truth is known.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    rig: Rig
+    depth_m: np.ndarray
+    valid: np.ndarray
+
+
+def read_demo_pair() -> DemoPair:
+    """Read the pair that ships with the package."""
+    depth_m, valid = read_depth_mm_png(DEMO_PAIR_FOLDER / "depth_mm.png")
+    return DemoPair(
+        left=read_image(DEMO_PAIR_FOLDER / "left.png")[0],
+        right=read_image(DEMO_PAIR_FOLDER / "right.png")[0],
+        rig=read_calibration(DEMO_PAIR_FOLDER / "calib.txt"),
+        depth_m=depth_m,
+        valid=valid,
+    )
