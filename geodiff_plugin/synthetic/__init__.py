@@ -1,1 +1,27 @@
-"""Placeholder."""
+"""Procedural stereo scenes with exact depth: rooms, streets, table tops, corridors, terrain.
+
+Hop: a seed -> ``Scene`` -> ``RenderedView``, ``SyntheticPair`` or a training batch.
+Paper: stands in for the rendered training sets of S5.1; mirrors and glass are the hard cases of S5.2.
+"""
+
+from __future__ import annotations
+
+from geodiff_plugin.synthetic.effects import CameraEffects
+from geodiff_plugin.synthetic.layouts import KINDS, sample_scene
+from geodiff_plugin.synthetic.pairs import SyntheticPair, render_mono, render_pair
+from geodiff_plugin.synthetic.render import render_views
+from geodiff_plugin.synthetic.scene import Camera, Material, RenderedView, Scene
+
+__all__ = [
+    "KINDS",
+    "Camera",
+    "CameraEffects",
+    "Material",
+    "RenderedView",
+    "Scene",
+    "SyntheticPair",
+    "render_mono",
+    "render_pair",
+    "render_views",
+    "sample_scene",
+]
