@@ -66,6 +66,32 @@ def _split(depth_m: np.ndarray, sample: StereoSample, cap_m: float | None) -> di
     return _plain(scores)
 
 
+def _positive(depth_m: np.ndarray) -> np.ndarray:
+    """The map with NaN where it is not a positive number."""
+    return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
+
+
+def _both(
+    sample: StereoSample, depth_m: np.ndarray | None, values: np.ndarray, space: str, cap_m: float | None
+) -> dict[str, dict[str, float | None] | None]:
+    """Errors without alignment (``None`` without metres) and after the oracle's, under one cap."""
+    truth, valid = sample.depth_m, sample.valid
+    aligned_m = align(values, truth, counted(truth, valid, cap_m), space)
+    return {
+        "raw": None if depth_m is None else _plain(evaluate_depth(depth_m, truth, valid, cap_m)),
+        "aligned": _plain(evaluate_depth(aligned_m, truth, valid, cap_m)),
+    }
+
+
+def _disparity(sample: StereoSample, depth_m: np.ndarray) -> dict[str, float | None]:
+    """Disparity errors of a rectified sample."""
+    cameras = (sample.K_left, sample.K_right, sample.E)
+    true_px = depth_to_disparity(np.where(sample.valid, sample.depth_m, 1.0), *cameras)
+    pred_px = depth_to_disparity(_positive(depth_m), *cameras)
+    step_px = float(sample.notes.get("disparity_step_px", 0.0))
+    return _plain(evaluate_disparity(pred_px, true_px, sample.valid, step_px))
+
+
 def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> dict[str, Any]:
     """Score one prediction.
 
@@ -75,10 +101,10 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
         cap_m: farthest truth that counts in the data set's protocol, metres; ``None`` for no limit.
 
     Returns:
-        ``all_pixels``: every pixel with truth, no cap, no alignment (``None`` for a method without metres);
-        ``raw``: the same under the cap; ``aligned``: least squares in the method's space, under the cap;
-        ``disparity``: for rectified pairs, without alignment; ``regions``: AbsRel by region, raw, under the
-        cap (aligned for a method without metres); ``ause``: of the uncertainty. ``None`` where it does not apply.
+        ``all_pixels``: ``raw`` and ``aligned`` errors over every pixel with truth, without a cap; ``capped``:
+        the same two under the cap; ``disparity``: for rectified pairs, not aligned; ``regions``: AbsRel by
+        region under the cap, not aligned (aligned for a method without metres); ``ause`` of the uncertainty.
+        ``None`` where it does not apply.
 
     Raises:
         ValueError: a map of the wrong shape, or a sample without truth.
@@ -90,27 +116,21 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
             bad_value(f"prediction.{name}", f"of the left image's shape {truth.shape}", values.shape)
     if not valid.any():
         bad_value(f"the truth of {sample.label}", "known for at least one pixel", "none")
-    kept, depth_m = counted(truth, valid, cap_m), prediction.depth_m
-    record: dict[str, Any] = {"all_pixels": None, "raw": None, "disparity": None, "ause": None}
-    values = prediction.relative
+    values, depth_m = prediction.relative, prediction.depth_m
     if values is None:
         values = depth_m
         if prediction.space == "disparity":
-            values = 1.0 / np.where(np.nan_to_num(depth_m) > 0, depth_m, np.nan)
-    aligned_m = align(values, truth, kept, prediction.space)
-    record["aligned"] = _plain(evaluate_depth(aligned_m, truth, valid, cap_m))
-    if depth_m is not None:
-        record["all_pixels"] = _plain(evaluate_depth(depth_m, truth, valid))
-        record["raw"] = _plain(evaluate_depth(depth_m, truth, valid, cap_m))
-        if sample.rectified:
-            positive = np.where(np.nan_to_num(depth_m) > 0, depth_m, np.nan)
-            cameras = (sample.K_left, sample.K_right, sample.E)
-            true_px = depth_to_disparity(np.where(valid, truth, 1.0), *cameras)
-            step_px = float(sample.notes.get("disparity_step_px", 0.0))
-            record["disparity"] = _plain(
-                evaluate_disparity(depth_to_disparity(positive, *cameras), true_px, valid, step_px)
-            )
-        if prediction.uncertainty is not None:
-            record["ause"] = _plain({"ause": ause(depth_m, truth, kept, prediction.uncertainty)})["ause"]
-    record["regions"] = _split(aligned_m if depth_m is None else depth_m, sample, cap_m)
+            values = 1.0 / _positive(depth_m)
+    record: dict[str, Any] = {"all_pixels": _both(sample, depth_m, values, prediction.space, None)}
+    capped = record["all_pixels"]
+    if cap_m is not None:
+        capped = _both(sample, depth_m, values, prediction.space, cap_m)
+    record |= {"capped": capped, "disparity": None, "ause": None}
+    kept = counted(truth, valid, cap_m)
+    shown_m = align(values, truth, kept, prediction.space) if depth_m is None else depth_m
+    if depth_m is not None and sample.rectified:
+        record["disparity"] = _disparity(sample, depth_m)
+    if depth_m is not None and prediction.uncertainty is not None:
+        record["ause"] = _plain({"ause": ause(depth_m, truth, kept, prediction.uncertainty)})["ause"]
+    record["regions"] = _split(shown_m, sample, cap_m)
     return record

@@ -17,6 +17,8 @@ import torch
 
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.pipeline import enable_geometry_guidance
+from geodiff_plugin.priors import load_prior
 
 __all__ = ["Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
 
@@ -98,9 +100,6 @@ class PriorCache:
         """
         key = (settings.prior, settings.device, settings.dtype)
         if key not in self._pipes:
-            from geodiff_plugin.integration import enable_geometry_guidance
-            from geodiff_plugin.priors import load_prior
-
             pipe = load_prior(settings.prior, device=settings.device, dtype=settings.torch_dtype)
             pipe.set_progress_bar_config(disable=True)
             enable_geometry_guidance(pipe)

@@ -10,6 +10,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.datasets.booster import BOOSTER
+from geodiff_plugin.evaluation.datasets.folder import FOLDER
 from geodiff_plugin.evaluation.datasets.kitti2012 import KITTI2012
 from geodiff_plugin.evaluation.datasets.kitti2015 import KITTI2015
 from geodiff_plugin.evaluation.datasets.middlebury import ETH3D, MIDDEVAL3, MIDDLEBURY2014
@@ -19,7 +21,8 @@ from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, Stereo
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load", "load_pairs"]
 
 DATASETS: dict[str, Dataset] = {
-    dataset.name: dataset for dataset in (KITTI2015, KITTI2012, MIDDLEBURY2014, MIDDEVAL3, ETH3D, MVSNET)
+    dataset.name: dataset
+    for dataset in (KITTI2015, KITTI2012, MIDDLEBURY2014, MIDDEVAL3, ETH3D, BOOSTER, MVSNET, FOLDER)
 }
 """Every data set by name, in the order in which results are listed."""
 

@@ -23,7 +23,7 @@ def find_kitti2012(root: Path) -> list[SampleRef]:
     The truth of a pair is ``disp_occ`` (all pixels) where it exists, else ``disp_noc`` (pixels seen twice).
     """
     refs = []
-    for folder in folders(root, 2):
+    for folder in folders(root, 3):
         if not ((folder / "disp_occ").is_dir() or (folder / "disp_noc").is_dir()):
             continue
         for left_name, right_name, cameras in _IMAGES:

@@ -18,7 +18,7 @@ __all__ = ["KITTI2015", "find_kitti2015"]
 def find_kitti2015(root: Path) -> list[SampleRef]:
     """References to the pairs below ``root`` (the folder ``training``, its parent, or the parent of that)."""
     refs = []
-    for folder in folders(root, 2):
+    for folder in folders(root, 3):
         if not ((folder / "image_2").is_dir() and (folder / "disp_occ_0").is_dir()):
             continue
         for left in sorted((folder / "image_2").glob("*_10.png")):

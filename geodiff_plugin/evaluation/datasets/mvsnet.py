@@ -29,10 +29,6 @@ def _view_files(group: Path, view: int) -> dict[str, Path]:
     }
 
 
-def _views(group: Path) -> list[int]:
-    return sorted(int(path.stem[:8]) for path in (group / "cams").glob("*_cam.txt"))
-
-
 def ordered_pairs(path: Path) -> list[tuple[int, int]]:
     """Every ordered pair (reference, source) of a ``pair.txt``, in the file's order.
 
@@ -76,11 +72,9 @@ def find_mvsnet(root: Path, pairs: str = "default", pixel_centre: float = 0.0) -
     for group in folders(root, 2):
         if not ((group / "cams").is_dir() and (group / "images").is_dir() and (group / "pair.txt").is_file()):
             continue
-        views = _views(group)
-        if pairs == "all":
-            chosen = ordered_pairs(group / "pair.txt")
-        else:
-            chosen = [(views[0], views[1])] if len(views) > 1 else []
+        listed = ordered_pairs(group / "pair.txt")
+        views = sorted({view for pair in listed for view in pair})
+        chosen = listed if pairs == "all" else [(views[0], views[1])] if listed else []
         for i, j in chosen:
             name = group.name if pairs == "default" else f"{group.name}-{i}-{j}"
             others = tuple(view for view in views if view not in (i, j))

@@ -1,0 +1,154 @@
+"""What the ``geodiff eval`` commands do once their options are read.
+
+Hop: options -> references -> records -> tables.
+Paper: S5 (experiments).
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from accelerate import PartialState
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.baselines import METHODS, Settings
+from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
+from geodiff_plugin.evaluation.datasets.sample import SampleRef
+from geodiff_plugin.evaluation.report import run_facts, write_tables, write_text
+from geodiff_plugin.evaluation.runner import run
+from geodiff_plugin.evaluation.tables import pairs_tables
+
+__all__ = ["PAIRS_METHODS", "PairsOptions", "run_list", "run_pairs", "select"]
+
+PAIRS_METHODS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
+
+
+@dataclass(frozen=True)
+class PairsOptions:
+    """Options of ``geodiff eval pairs``; names as on the command line.
+
+    Attributes:
+        data: folder that holds data sets in their official layouts.
+        methods: names in ``METHODS``.
+        datasets: names in ``DATASETS``, empty for all.
+        scenes: parts of sample names to keep, empty for all.
+        limit: at most so many samples; ``None`` for all.
+        settings: what every method is given.
+        out: folder of the records and tables.
+        results: Markdown page to write beside; ``None`` for none.
+        skip_broken: go on after a broken sample.
+        save_depth: write depth maps.
+        quiet: no bar, no table on the screen.
+    """
+
+    data: Path
+    methods: tuple[str, ...]
+    datasets: tuple[str, ...]
+    scenes: tuple[str, ...]
+    limit: int | None
+    settings: Settings
+    out: Path
+    results: Path | None
+    skip_broken: bool
+    save_depth: bool
+    quiet: bool
+
+
+def select(
+    refs: Sequence[SampleRef], scenes: Sequence[str], limit: int | None, data: Path
+) -> list[SampleRef]:
+    """Keep the samples whose label contains one of ``scenes`` (all where empty), at most ``limit``.
+
+    Raises:
+        ValueError: nothing is left, or ``limit`` is below 1.
+    """
+    if limit is not None and limit < 1:
+        bad_value("limit", "at least 1", limit)
+    kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
+    if not kept:
+        found = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
+        wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
+        bad_value("DIR", f"a folder with a sample{wanted}", f"{data} with {found}", "See: geodiff eval list.")
+    return kept[:limit]
+
+
+def _command(options: PairsOptions) -> str:
+    """The command line that gives these options, defaults left out."""
+    words = ["geodiff", "eval", "pairs", str(options.data)]
+    if options.methods != PAIRS_METHODS:
+        words += ["--methods", ",".join(options.methods)]
+    for name in ("datasets", "scenes"):
+        if getattr(options, name):
+            words += [f"--{name}", ",".join(getattr(options, name))]
+    if options.limit is not None:
+        words += ["--limit", str(options.limit)]
+    for field in fields(Settings):
+        value: Any = getattr(options.settings, field.name)
+        if value != field.default:
+            words += [f"--{field.name}", str(value)]
+    return shlex.join(words)
+
+
+def _remarks(records: Sequence[dict[str, Any]], settings: Settings) -> list[str]:
+    remarks = [f"Prior {settings.prior}, seed {settings.seed}, ensemble {settings.ensemble}."]
+    reasons: dict[tuple[str, str], int] = {}
+    for record in records:
+        if record["status"] == "not applicable":
+            key = (METHODS[record["method"]].title, record["reason"])
+            reasons[key] = reasons.get(key, 0) + 1
+    remarks += [f"{title}: '-' for {n} pairs, {reason}." for (title, reason), n in reasons.items()]
+    broken = [record for record in records if record["status"] == "broken"]
+    if broken:
+        remarks.append(f"{len({(r['dataset'], r['sample']) for r in broken})} broken samples were skipped:")
+        remarks += [f"- {r['dataset']}/{r['sample']} ({r['method']}): {r['error']}" for r in broken]
+    return remarks
+
+
+def run_pairs(options: PairsOptions) -> None:
+    """Measure methods on pairs, write and print the tables.
+
+    Raises:
+        ValueError: bad options, no samples, or a broken sample without ``skip_broken``.
+        OSError: missing or unreadable files without ``skip_broken``.
+    """
+    refs = find_pairs(options.data, options.datasets or None)
+    refs = select(refs, options.scenes, options.limit, options.data)
+    records = run(
+        refs,
+        options.methods,
+        options.settings,
+        options.out,
+        skip_broken=options.skip_broken,
+        save_depth=options.save_depth,
+        progress=not options.quiet,
+    )
+    if not PartialState().is_main_process:
+        return
+    facts, remarks = run_facts(_command(options)), _remarks(records, options.settings)
+    page = write_tables(options.out, "Results", facts, pairs_tables(records), remarks)
+    if options.results is not None:
+        write_text(options.results, page)
+    if not options.quiet:
+        sys.stdout.write(page)
+
+
+def run_list(data: Path | None) -> None:
+    """Print for every data set whether ``data`` has it, how many samples, and how to obtain it.
+
+    Raises:
+        ValueError: ``data`` is given and is not a folder.
+    """
+    lines = []
+    for name, dataset in DATASETS.items():
+        count = 0 if data is None else len(find_pairs(data, [name]))
+        found = f"{count} samples" if count else "not found" if data is not None else "no --data given"
+        full = f" of {dataset.full_count}" if count and dataset.full_count else ""
+        lines.append(f"{name:<15} {found}{full}\n{'':<15} {dataset.obtain}")
+    lines.append("")
+    lines += [f"{name:<17} {method.summary}" for name, method in METHODS.items()]
+    sys.stdout.write("\n".join(lines) + "\n")

@@ -1,0 +1,111 @@
+"""Own pairs: a folder a pair, with left, right, calibration and, to be scored, depth.
+
+Hop: folder -> references -> ``StereoSample``.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from geodiff_plugin.evaluation.datasets._files import check_size, folders, read_npy, read_rgb
+from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample, is_rectified
+from geodiff_plugin.formats import read_calibration, read_depth_mm_png, read_pfm
+
+__all__ = ["FOLDER", "find_folder", "load_folder"]
+
+_IMAGES = (".png", ".jpg", ".jpeg")
+_DEPTHS = (".npy", ".pfm", ".png")
+
+
+def _first(folder: Path, stem: str, suffixes: tuple[str, ...]) -> Path | None:
+    return next(
+        (folder / (stem + suffix) for suffix in suffixes if (folder / (stem + suffix)).is_file()), None
+    )
+
+
+def find_folder(root: Path) -> list[SampleRef]:
+    """References to ``root`` and the folders right below it with ``left.*``, ``right.*`` and ``calib.*``.
+
+    The calibration is one file of any known format, or ``calib_left.*`` and ``calib_right.*``. Depth, if
+    there, is ``depth.npy`` or ``depth.pfm`` (metres) or ``depth.png`` (16 bit, millimetres); 0, NaN and
+    infinity are unknown.
+    """
+    refs = []
+    for folder in folders(root, 1):
+        left, right = _first(folder, "left", _IMAGES), _first(folder, "right", _IMAGES)
+        single = sorted(folder.glob("calib.*"))
+        pair = [*sorted(folder.glob("calib_left.*"))[:1], *sorted(folder.glob("calib_right.*"))[:1]]
+        if left is None or right is None or not (single or len(pair) == 2):
+            continue
+        files = {
+            "left": left,
+            "right": right,
+            "calibration": single[0] if single else pair[0],
+            "calibration_right": None if single else pair[1],
+            "depth": _first(folder, "depth", _DEPTHS),
+        }
+        refs.append(SampleRef("folder", folder.resolve().name, files))
+    return refs
+
+
+def _read_depth(path: Path) -> np.ndarray:
+    """``(H, W)`` float32 metres, 0 where unknown."""
+    if path.suffix == ".png":
+        depth_m, _ = read_depth_mm_png(path)
+    elif path.suffix == ".pfm":
+        depth_m = read_pfm(path, "depth")
+    else:
+        depth_m = read_npy(path, "depth")
+    return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
+
+
+def load_folder(ref: SampleRef) -> StereoSample:
+    """Read one own pair.
+
+    Args:
+        ref: ``files`` holds ``left``, ``right``, ``calibration``, and ``calibration_right`` and ``depth`` or
+            ``None``.
+
+    Returns:
+        The sample; ``valid`` is False everywhere without depth.
+
+    Raises:
+        OSError: a file is missing.
+        ValueError: a file is damaged, or sizes disagree.
+    """
+    files = ref.files
+    left, right = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
+    first, second = files["calibration"], files["calibration_right"]
+    rig = read_calibration(first if second is None else (first, second))
+    if rig.size_left is not None:
+        check_size(first, rig.size_left[::-1], left.shape)
+    depth_m, truth = np.zeros(left.shape[:2], np.float32), "none"
+    if files["depth"] is not None:
+        depth_m, truth = _read_depth(files["depth"]), files["depth"].name
+        check_size(files["depth"], depth_m.shape, left.shape)
+    return StereoSample(
+        dataset=ref.dataset,
+        name=ref.name,
+        left=left,
+        right=right,
+        K_left=rig.K_left,
+        K_right=rig.K_right,
+        E=rig.E,
+        depth_m=depth_m,
+        valid=depth_m > 0,
+        rectified=is_rectified(rig.K_left, rig.K_right, rig.E),
+        notes={"truth": truth},
+    )
+
+
+FOLDER = Dataset(
+    name="folder",
+    find=find_folder,
+    load=load_folder,
+    cap_m=None,
+    obtain="your own: <pair>/left.png, right.png, calib.* (any known format) and "
+    "depth.npy, .pfm (metres) or .png (mm).",
+)

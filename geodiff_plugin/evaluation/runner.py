@@ -1,0 +1,148 @@
+"""Run methods over samples, resumably, in one process or several.
+
+Hop: references + methods + settings -> records in ``samples.jsonl``.
+Paper: S5.1.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from accelerate import PartialState
+from tqdm import tqdm
+
+from geodiff_plugin import __version__
+from geodiff_plugin._checks import check_choice
+from geodiff_plugin.evaluation.baselines import METHODS
+from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.datasets import DATASETS, load
+from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
+from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
+from geodiff_plugin.evaluation.scoring import score
+from geodiff_plugin.formats import write_depth_npy
+
+__all__ = ["RECORDS_NAME", "headline", "run"]
+
+RECORDS_NAME = "samples.jsonl"
+_BROKEN = (OSError, ValueError)
+
+
+def headline(record: dict[str, Any]) -> float | None:
+    """AbsRel over all pixels with truth: not aligned, or aligned for a method without metres."""
+    if record["status"] != "ok":
+        return None
+    both = record["all_pixels"]
+    return (both["raw"] or both["aligned"])["abs_rel"]
+
+
+def _keys(
+    refs: Sequence[SampleRef], methods: Iterable[Method], settings: Settings, priors: PriorCache
+) -> dict:
+    """``(label, method)`` -> key of its record."""
+    keys = {}
+    for method in methods:
+        prior = f"{settings.prior} {priors.fingerprint(settings)}" if method.uses_prior else ""
+        configuration = method.configuration(settings)
+        for ref in refs:
+            keys[ref.label, method.name] = record_key(ref, method.name, configuration, prior, __version__)
+    return keys
+
+
+def _measure(
+    method: Method, sample: StereoSample, settings: Settings, priors: PriorCache
+) -> tuple[dict[str, Any], Prediction | None]:
+    """Run and score one method on one sample."""
+    start = time.perf_counter()
+    try:
+        prediction = method.run(sample, settings, priors)
+    except NotApplicable as reason:
+        return {"status": "not applicable", "reason": str(reason)}, None
+    seconds = time.perf_counter() - start
+    scores = score(sample, prediction, DATASETS[sample.dataset].cap_m)
+    notes = {"sample": dict(sample.notes), "method": dict(prediction.notes)}
+    return {"status": "ok", "seconds": round(seconds, 3), **scores, "notes": notes}, prediction
+
+
+def _save(folder: Path, label: str, method: str, depth_m: np.ndarray | None) -> None:
+    if depth_m is not None:
+        target = folder / method / f"{label.replace('/', '_')}.npy"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_depth_npy(target, depth_m)
+
+
+def run(
+    refs: Sequence[SampleRef],
+    methods: Sequence[str],
+    settings: Settings,
+    out: str | Path,
+    *,
+    skip_broken: bool = False,
+    save_depth: bool = False,
+    progress: bool = True,
+) -> list[dict[str, Any]]:
+    """Run every method on every sample, but for what ``out`` already holds.
+
+    Started by ``torchrun`` or ``accelerate launch``, the processes share the samples among them.
+
+    Args:
+        refs: samples.
+        methods: names in ``METHODS``.
+        settings: the user's choices, the same for every method.
+        out: folder of ``samples.jsonl``; made where missing.
+        skip_broken: go on after a sample that cannot be read or measured; its record says why.
+        save_depth: write each metric depth map to ``out/depth/<method>/<sample>.npy``.
+        progress: show a bar with each method's running AbsRel.
+
+    Returns:
+        The records of these samples and methods, in the order of ``refs`` and ``methods``: ``status`` is
+        ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"`` (``error``); for the numbers see
+        ``scoring.score``.
+
+    Raises:
+        ValueError: an unknown method, no samples, or a broken sample without ``skip_broken``.
+        OSError: a missing or unreadable file without ``skip_broken``.
+    """
+    chosen = [METHODS[check_choice(name, "methods", METHODS)] for name in methods]
+    state, priors, out = PartialState(), PriorCache(), Path(out)
+    path = out / RECORDS_NAME
+    if state.is_main_process:
+        out.mkdir(parents=True, exist_ok=True)
+        clean_records(path)
+    state.wait_for_everyone()
+    keys = _keys(refs, chosen, settings, priors)
+    finished = {record["key"]: record for record in read_records(path) if "key" in record}
+    mine = list(refs)[state.process_index :: state.num_processes]
+    means: dict[str, list[float]] = {}
+    bar = tqdm(total=len(mine) * len(chosen), disable=not (progress and state.is_main_process), unit="run")
+    with bar:
+        for ref in mine:
+            sample = None
+            for method in chosen:
+                key = keys[ref.label, method.name]
+                record = finished.get(key)
+                if record is None:
+                    head = {"key": key, "dataset": ref.dataset, "sample": ref.name, "method": method.name}
+                    try:
+                        sample = load(ref) if sample is None else sample
+                        body, prediction = _measure(method, sample, settings, priors)
+                    except _BROKEN as error:
+                        if not skip_broken:
+                            raise
+                        body, prediction = {"status": "broken", "error": str(error)}, None
+                    if save_depth and prediction is not None:
+                        _save(out / "depth", ref.label, method.name, prediction.depth_m)
+                    rectified = {} if sample is None else {"rectified": sample.rectified}
+                    record = head | rectified | body
+                    append_record(path, record)
+                value = headline(record)
+                if value is not None:
+                    means.setdefault(method.name, []).append(value)
+                    bar.set_postfix({name: f"{np.mean(values):.3f}" for name, values in means.items()})
+                bar.update()
+    state.wait_for_everyone()
+    written = {record["key"]: record for record in read_records(path)}
+    return [written[keys[ref.label, method.name]] for ref in refs for method in chosen]

@@ -1,0 +1,208 @@
+"""Records to tables: Markdown, LaTeX, JSON.
+
+Hop: records -> ``Table`` -> text.
+Paper: Tables 1 to 3 in layout; intervals and paired differences are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from geodiff_plugin.evaluation.baselines import METHODS
+from geodiff_plugin.evaluation.runner import headline
+from geodiff_plugin.evaluation.statistics import Mean, mean_with_interval, paired_difference
+
+__all__ = ["Table", "groups", "pairs_tables", "per_pair_table", "summary_table", "versus_table"]
+
+_SUMMARY = ("abs_rel", "delta1", "delta2", "delta3", "rmse", "log_rmse", "silog")
+_HEADINGS = {
+    "abs_rel": "AbsRel",
+    "delta1": "δ1",
+    "delta2": "δ2",
+    "delta3": "δ3",
+    "rmse": "RMSE m",
+    "log_rmse": "log RMSE",
+    "silog": "SILog",
+}
+_LATEX = str.maketrans({"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "δ": r"$\delta$", "±": r"$\pm$"})
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as they are printed.
+
+    Attributes:
+        title: heading, one line.
+        header: column headings; the first column names the row.
+        rows: as long as the header each.
+        note: what a reader needs beside it, or empty.
+    """
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+    def markdown(self) -> str:
+        """A heading, the note and a pipe table."""
+        lines = [f"## {self.title}", ""]
+        if self.note:
+            lines += [self.note, ""]
+        lines += ["| " + " | ".join(self.header) + " |", "| --- |" + " ---: |" * (len(self.header) - 1)]
+        lines += ["| " + " | ".join(row) + " |" for row in self.rows]
+        return "\n".join(lines) + "\n"
+
+    def latex(self) -> str:
+        """A ``tabular`` with booktabs rules, its title as a comment."""
+        body = [" & ".join(cell.translate(_LATEX) for cell in row) + r" \\" for row in self.rows]
+        head = " & ".join(cell.translate(_LATEX) for cell in self.header) + r" \\"
+        columns = "l" + "r" * (len(self.header) - 1)
+        rule = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", head, r"\midrule"]
+        return "\n".join([f"% {self.title}", *rule, *body, r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+    def as_json(self) -> dict[str, Any]:
+        """The same as plain values."""
+        return {"title": self.title, "note": self.note, "header": list(self.header), "rows": list(self.rows)}
+
+
+def _cell(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _with_interval(mean: Mean, digits: int = 3, signed: bool = False) -> str:
+    if mean.count == 0:
+        return "-"
+    sign = "+" if signed else ""
+    text = f"{mean.value:{sign}.{digits}f}"
+    if mean.low is not None:
+        text += f" [{mean.low:{sign}.{digits}f}, {mean.high:{sign}.{digits}f}]"
+    return text
+
+
+def _label(record: dict[str, Any]) -> str:
+    return f"{record['dataset']}/{record['sample']}"
+
+
+def groups(records: Sequence[dict[str, Any]]) -> dict[str, set[str]]:
+    """Labels of all samples, and of the rectified and the posed ones where both kinds are there."""
+    rectified = {_label(r) for r in records if r.get("rectified") is True}
+    posed = {_label(r) for r in records if r.get("rectified") is False}
+    everything = {f"all {len(rectified | posed)}": rectified | posed}
+    if rectified and posed:
+        everything |= {f"{len(rectified)} rectified": rectified, f"{len(posed)} posed": posed}
+    return everything
+
+
+def _by_method(
+    records: Sequence[dict[str, Any]], value_of: Callable[[dict[str, Any]], float | None]
+) -> dict[str, dict[str, float]]:
+    """``method -> label -> value`` over the finished records that have one."""
+    values: dict[str, dict[str, float]] = {}
+    for record in records:
+        by_label = values.setdefault(record["method"], {})
+        value = value_of(record) if record["status"] == "ok" else None
+        if value is not None:
+            by_label[_label(record)] = value
+    return values
+
+
+def per_pair_table(
+    records: Sequence[dict[str, Any]],
+    title: str,
+    value_of: Callable[[dict[str, Any]], float | None],
+    digits: int,
+    note: str,
+) -> Table:
+    """One row per sample, one column per method, then the means of every group.
+
+    A mean stands only where the method has a number for every sample of the group.
+    """
+    values = _by_method(records, value_of)
+    labels = list(dict.fromkeys(_label(record) for record in records))
+    rows = [(label, *(_cell(values[m].get(label), digits) for m in values)) for label in labels]
+    for group, members in groups(records).items():
+        means = (
+            mean_with_interval([values[m][x] for x in members]).value if members <= values[m].keys() else None
+            for m in values
+        )
+        if members:
+            rows.append((f"mean of {group}", *(_cell(mean, digits) for mean in means)))
+    return Table(title, ("pair", *(METHODS[m].title for m in values)), tuple(rows), note)
+
+
+def summary_table(records: Sequence[dict[str, Any]], column: str, members: set[str], title: str) -> Table:
+    """One row per method, one column per metric: mean over images and its 95 % interval.
+
+    Args:
+        records: of a run.
+        column: ``"raw"`` or ``"aligned"``.
+        members: labels of the samples that count.
+        title: heading.
+    """
+    rows = []
+    for method in dict.fromkeys(record["method"] for record in records):
+        own = [
+            record["capped"][column]
+            for record in records
+            if record["method"] == method and record["status"] == "ok" and _label(record) in members
+        ]
+        own = [scores for scores in own if scores is not None]
+        if own:
+            cells = [
+                _with_interval(mean_with_interval([s[metric] for s in own if s[metric] is not None]))
+                for metric in _SUMMARY
+            ]
+            coverage = mean_with_interval([s["coverage"] for s in own]).value
+            rows.append((METHODS[method].title, str(len(own)), *cells, _cell(coverage)))
+    header = ("method", "pairs", *(_HEADINGS[metric] for metric in _SUMMARY), "coverage")
+    return Table(title, header, tuple(rows))
+
+
+def versus_table(records: Sequence[dict[str, Any]], reference: str) -> Table:
+    """Paired differences in AbsRel, all pixels, as ``headline``: the reference minus each other method."""
+    values = _by_method(records, headline)
+    rows = []
+    for method in values:
+        if method != reference and values[method] and values.get(reference):
+            difference = paired_difference(values[reference], values[method])
+            wins = sum(
+                values[reference][x] < values[method][x] for x in values[reference] if x in values[method]
+            )
+            rows.append(
+                (
+                    METHODS[method].title,
+                    str(difference.count),
+                    _with_interval(difference, signed=True),
+                    f"{wins} of {difference.count}",
+                )
+            )
+    return Table(
+        f"{METHODS[reference].title} against each other method, AbsRel",
+        ("method", "pairs", "mean difference [95 %]", "pairs won"),
+        tuple(rows),
+        "Negative: fewer errors. An interval without 0 tells the two apart.",
+    )
+
+
+def pairs_tables(records: Sequence[dict[str, Any]]) -> list[Table]:
+    """The tables of ``geodiff eval pairs``."""
+    count = len({_label(record) for record in records})
+    tables = [
+        per_pair_table(
+            records,
+            f"AbsRel of {count} pairs",
+            headline,
+            3,
+            "All pixels with truth, no cap; metres as they come out, without any alignment, but for the "
+            "columns of methods that know relative depth only ('oracle'): scale and shift come from the truth.",
+        ),
+        per_pair_table(records, "Seconds", lambda record: record["seconds"], 1, ""),
+    ]
+    if any(record["method"] == "guided" for record in records):
+        tables.append(versus_table(records, "guided"))
+    for group, members in groups(records).items():
+        tables.append(summary_table(records, "raw", members, f"Not aligned, {group}"))
+        tables.append(summary_table(records, "aligned", members, f"Aligned by least squares, {group}"))
+    return [table for table in tables if table.rows]
