@@ -24,18 +24,24 @@ VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("gr
 
 
 def flying_points(
-    depth_m: np.ndarray, valid: np.ndarray | None = None, *, relative_step: float = RELATIVE_STEP
+    depth_m: np.ndarray,
+    valid: np.ndarray | None = None,
+    *,
+    relative_step: float = RELATIVE_STEP,
+    reach: int = 1,
 ) -> np.ndarray:
     """Points that hang in the air between a near and a far surface.
 
     A pixel flies when fewer than three of its eight neighbours have its depth, within ``relative_step`` of
     the nearer of the two. Both sides of a clean edge stay. Things one pixel wide and surfaces seen at a
-    grazing angle (a road near the horizon) go too.
+    grazing angle (a road near the horizon) go too. A map that was enlarged has wider ramps: give the
+    enlargement as ``reach``.
 
     Args:
         depth_m: ``(H, W)`` metres.
         valid: ``(H, W)`` boolean; pixels that are not valid or not above 0 support no neighbour.
         relative_step: allowed depth change between neighbours, > 0.
+        reach: distance of the eight neighbours in pixels, >= 1.
 
     Returns:
         ``(H, W)`` boolean, True where a valid pixel flies.
@@ -45,10 +51,11 @@ def flying_points(
     use = use if valid is None else use & np.asarray(valid, dtype=bool)
     height, width = depth_m.shape
     # NaN compares false with everything, so what is unknown or outside the image supports nobody.
-    padded = np.pad(np.where(use, depth_m, np.nan), 1, constant_values=np.nan)
-    centre = padded[1:-1, 1:-1]
+    padded = np.pad(np.where(use, depth_m, np.nan), reach, constant_values=np.nan)
+    centre = padded[reach : reach + height, reach : reach + width]
     support = np.zeros(depth_m.shape, dtype=np.int8)
-    for dy, dx in ((dy, dx) for dy in (0, 1, 2) for dx in (0, 1, 2) if (dy, dx) != (1, 1)):
+    shifts = (0, reach, 2 * reach)
+    for dy, dx in ((dy, dx) for dy in shifts for dx in shifts if (dy, dx) != (reach, reach)):
         neighbour = padded[dy : dy + height, dx : dx + width]
         support += np.abs(centre - neighbour) <= relative_step * np.minimum(centre, neighbour)
     return use & (support < FEWEST_NEIGHBOURS)

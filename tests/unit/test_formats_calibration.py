@@ -1,0 +1,486 @@
+"""What is special in each calibration format, and the door's errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geodiff_plugin.formats import read_calibration, read_matrix, rig_from_parameters
+
+K_TEXT = "[700 0 300; 0 700 200; 0 0 1]"
+
+
+def put(tmp_path, text, name="calib.txt"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+def rotation(axis, degrees):
+    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    W, a = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.deg2rad(degrees)
+    return np.eye(3) + np.sin(a) * W + (1 - np.cos(a)) * W @ W
+
+
+def check_rig_maps_like(rig, P_left, P_right, points_world):
+    """Pixels of the rig's two cameras against two 3x4 projections of world points, without shared code."""
+    homogeneous = np.vstack([points_world, np.ones(points_world.shape[1])])
+    uv = [P @ homogeneous for P in (P_left, P_right)]
+    uv_left, uv_right = (p[:2] / p[2] for p in uv)
+    z = uv[0][2]
+    p_left = np.linalg.inv(rig.K_left) @ np.vstack([uv_left, np.ones_like(z)]) * z
+    p_right = rig.K_right @ (np.linalg.inv(rig.E) @ np.vstack([p_left, np.ones_like(z)]))[:3]
+    np.testing.assert_allclose(p_right[:2] / p_right[2], uv_right, atol=1e-6)
+
+
+# ---- Middlebury
+
+
+def test_convention_doffs_moves_cx_of_the_right_image(tmp_path):
+    rig = read_calibration(
+        put(tmp_path, f"cam0={K_TEXT}\ncam1={K_TEXT.replace('300', '352.3')}\ndoffs=52.3\nbaseline=80\n")
+    )
+    assert rig.K_right[0, 2] - rig.K_left[0, 2] == pytest.approx(52.3)
+    assert rig.E[0, 3] == pytest.approx(0.08)
+    assert rig.size_left is None
+
+
+def test_convention_depth_from_disparity_and_doffs(tmp_path):
+    """Z = baseline * f / (d + doffs), the data set's own formula, is what K, K_right and E give."""
+    rig = read_calibration(
+        put(tmp_path, f"cam0={K_TEXT}\ncam1={K_TEXT.replace('300', '340')}\ndoffs=40\nbaseline=80\n")
+    )
+    disparity, u = 16.0, 310.0
+    z = 0.08 * 700 / (disparity + 40)
+    x_right = (u - 300) / 700 * z - rig.E[0, 3]
+    assert u - (rig.K_right[0, 0] * x_right / z + rig.K_right[0, 2]) == pytest.approx(disparity)
+
+
+@pytest.mark.parametrize("cam1", [f"cam1={K_TEXT}\n", ""])
+def test_doffs_wins_over_cam1_with_a_warning(tmp_path, cam1):
+    path = put(tmp_path, f"cam0={K_TEXT}\n{cam1}doffs=31\nbaseline=80\n")
+    with pytest.warns(UserWarning, match=r"calib\.txt: cam1 .* 331 px"):
+        rig = read_calibration(path)
+    assert rig.K_right[0, 2] == 331 and rig.K_left[0, 2] == 300
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (f"cam0={K_TEXT}\ncam1={K_TEXT}\ndoffs=0\n", "baseline"),
+        (f"cam0={K_TEXT}\nbaseline=80\n", "doffs"),
+        (f"cam0={K_TEXT}\ncam1=[700 0 300; 0 700\nbaseline=80\n", "cam1"),
+        (f"cam0={K_TEXT}\ncam1={K_TEXT}\ndoffs=\nbaseline=80\n", "doffs"),
+        (f"cam0={K_TEXT}\ncam1={K_TEXT}\ndoffs=0\nbaseline=0\n", "baseline"),
+        (f"cam0={K_TEXT}\ncam1={K_TEXT}\ndoffs=0\nbaseline=80\nwidth=x\nheight=4\n", "width"),
+        (f"cam0={K_TEXT.replace('700', '0')}\ncam1={K_TEXT}\ndoffs=0\nbaseline=80\n", "focal"),
+    ],
+)
+def test_middlebury_errors_name_the_entry(tmp_path, text, what):
+    with pytest.raises(ValueError, match=rf"(?s){what}.*"):
+        read_calibration(put(tmp_path, text))
+
+
+# ---- KITTI
+
+
+def kitti_four():
+    rows = []
+    for camera, offset in ((0, 0.0), (1, -380.0), (2, 45.0), (3, -340.0)):
+        y, z = (0.0, 0.0) if camera < 2 else (0.2 * camera, 0.0027 + 1e-5 * camera)
+        rows.append((camera, f"721.5 0 609.6 {offset} 0 721.5 172.9 {y} 0 0 1 {z}"))
+    return rows
+
+
+@pytest.mark.parametrize("key", ["P{}", "P_rect_{:02d}"])
+@pytest.mark.parametrize(
+    ("cameras", "hint", "expected"),
+    [
+        ((0, 1), None, (0, 1)),
+        ((2, 3), "image_0", (2, 3)),
+        (None, "data/training/image_0/000000_10.png", (0, 1)),
+        (None, "image_1", (0, 1)),
+        (None, "image_02/data", (2, 3)),
+        (None, "image_3", (2, 3)),
+        (None, "colored_0", (2, 3)),
+        ((3, 2), None, (3, 2)),
+    ],
+)
+def test_kitti_cameras(tmp_path, key, cameras, hint, expected):
+    rows = dict(kitti_four())
+    path = put(tmp_path, "\n".join(f"{key.format(camera)}: {row}" for camera, row in rows.items()))
+    rig = read_calibration(path, cameras=cameras, image_folder_hint=hint)
+    P_left, P_right = (np.array(rows[camera].split(), dtype=float).reshape(3, 4) for camera in expected)
+    points = np.array([[1.0, -2.0, 0.3], [0.5, 1.0, -1.0], [8.0, 20.0, 5.0]])
+    # The file's frame is camera 0's; the rig's is the left camera's: the pixels must not know.
+    homogeneous = np.vstack([points, np.ones(3)])
+    shift = np.linalg.inv(P_left[:, :3]) @ P_left[:, 3]
+    p_left = points + shift[:, None]
+    uv_left = P_left @ homogeneous
+    np.testing.assert_allclose(rig.K_left @ p_left, uv_left, atol=1e-9)
+    p_right = np.linalg.inv(rig.E) @ np.vstack([p_left, np.ones(3)])
+    np.testing.assert_allclose(rig.K_right @ p_right[:3], P_right @ homogeneous, atol=1e-8)
+
+
+def test_kitti_baseline_is_bf_over_f(tmp_path):
+    rows = "\n".join(f"P{camera}: {row}" for camera, row in kitti_four())
+    rig = read_calibration(put(tmp_path, rows), cameras=(2, 3))
+    assert rig.E[0, 3] == pytest.approx((45.0 + 340.0) / 721.5, rel=1e-3)
+
+
+def test_kitti_with_both_pairs_and_no_hint_takes_colour_with_a_warning(tmp_path):
+    path = put(tmp_path, "\n".join(f"P{camera}: {row}" for camera, row in kitti_four()))
+    with pytest.warns(UserWarning, match="taking 2,3"):
+        rig = read_calibration(path, image_folder_hint="my/photos")
+    assert rig.E[0, 3] == pytest.approx(385.0 / 721.5, rel=1e-3)
+
+
+def test_kitti_hint_for_a_pair_that_is_not_there_falls_back_to_the_file(tmp_path):
+    path = put(tmp_path, "\n".join(f"P{camera}: {row}" for camera, row in kitti_four()[:2]))
+    assert read_calibration(path, image_folder_hint="image_2").E[0, 3] == pytest.approx(380.0 / 721.5)
+
+
+def test_kitti_errors(tmp_path):
+    two = put(tmp_path, "\n".join(f"P{camera}: {row}" for camera, row in kitti_four()[:2]))
+    for cameras in ((2, 3), (0, 0)):
+        with pytest.raises(
+            ValueError, match=r"cameras must be two different cameras of .*calib.txt \(0, 1\)"
+        ):
+            read_calibration(two, cameras=cameras)
+    with pytest.raises(ValueError, match="pair of camera numbers"):
+        read_calibration(two, cameras=("0", "1"))
+    one = put(tmp_path, f"P0: {kitti_four()[0][1]}\n", "one.txt")
+    with pytest.raises(ValueError, match="two cameras"):
+        read_calibration(one)
+    other = put(tmp_path, "700 0 300 0 700 200 0 0 1\n0.1\n", "K.txt")
+    with pytest.raises(ValueError, match="cameras must be left out"):
+        read_calibration(other, cameras=(0, 1))
+
+
+def test_kitti_cameras_with_three_digits_as_drivingstereo_writes_them(tmp_path):
+    rows = {
+        101: "1003.5 0 455.7 0 0 1003.5 197.7 0 0 0 1 0",
+        103: "1003.5 0 455.7 -1093.1 0 1003.5 197.7 0 0 0 1 0",
+    }
+    text = "".join(f"S_rect_{c}: 8.81e+2 4.0e+2\nP_rect_{c}: {row}\n" for c, row in rows.items())
+    rig = read_calibration(put(tmp_path, text))
+    assert rig.E[0, 3] == pytest.approx(1093.1 / 1003.5) and rig.size_right == (881, 400)
+
+
+# ---- K.txt, stereodemo
+
+
+@pytest.mark.parametrize(
+    "text", ["700 0 300 0 700 200 0 0 1\n", "700, 0, 300, 0, 700, 200, 0, 0, 1, 0.1, 5", "1 2 3"]
+)
+def test_k_txt_needs_ten_numbers(tmp_path, text):
+    with pytest.raises(ValueError, match="9 numbers of K and the baseline in metres.*numbers.*--K"):
+        read_calibration(put(tmp_path, text, "K.txt"))
+
+
+def test_stereodemo_two_principal_points_and_size(tmp_path):
+    text = """{"width": 881, "height": 400, "fx": 1003, "fy": 1002,
+        "cx0": 455, "cx1": 470, "cy": 197, "baseline_meters": 0.5}"""
+    rig = read_calibration(put(tmp_path, text, "x.json"))
+    assert (rig.K_left[0, 2], rig.K_right[0, 2], rig.K_left[1, 1]) == (455, 470, 1002)
+    assert rig.size_left == rig.size_right == (881, 400)
+    old = text.replace('"cx0": 455, "cx1": 470', '"cx": 455')
+    assert read_calibration(put(tmp_path, old, "x.json")).K_right[0, 2] == 455
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "match"),
+    [
+        ('"baseline_meters": 0.5', '"other": 1', "no baseline_meters"),
+        ('"fx": 1003', '"fx": "a"', "fx in .* a number"),
+        ('"fx": 1003', '"fx": NaN', "finite"),
+        ('"baseline_meters": 0.5', '"baseline_meters": -1', "above 0"),
+    ],
+)
+def test_stereodemo_errors(tmp_path, a, b, match):
+    text = '{"fx": 1003, "fy": 1002, "cx0": 455, "cx1": 470, "cy": 197, "baseline_meters": 0.5}'
+    with pytest.raises(ValueError, match=match):
+        read_calibration(put(tmp_path, text.replace(a, b), "x.json"))
+
+
+# ---- OpenCV and Booster
+
+
+def storage(cv2, path, **entries):
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in entries.items():
+        file.write(name, value)
+    file.release()
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml"])
+def test_opencv_reads_what_opencv_rectified(tmp_path, suffix):
+    cv2 = pytest.importorskip("cv2")
+    K1 = np.array([[700.0, 0, 320], [0, 702, 240], [0, 0, 1]])
+    K2 = np.array([[710.0, 0, 330], [0, 709, 236], [0, 0, 1]])
+    D = np.array([[-0.2, 0.1, 0.001, 0.0, 0.0]])
+    R, T = rotation((0.2, 1, 0.1), 2.0), np.array([[-0.12], [0.002], [0.004]])
+    _, _, P1, P2, Q, *_ = cv2.stereoRectify(K1, D, K2, D, (640, 480), R, T, flags=0, alpha=0)
+    path = storage(
+        cv2,
+        tmp_path / f"stereo.{suffix}",
+        M1=K1,
+        D1=D,
+        M2=K2,
+        D2=D,
+        R=R,
+        T=T,
+        P1=P1,
+        P2=P2,
+        Q=Q,
+        image_width=640,
+        image_height=480,
+        note="rectified",
+        nothing=np.array([[np.nan, np.inf]]),
+    )
+    rig = read_calibration(path)
+    np.testing.assert_allclose(rig.K_left, P1[:, :3])
+    assert rig.E[0, 3] == pytest.approx(np.linalg.norm(T), rel=1e-6)
+    assert rig.size_left == (640, 480)
+    points = np.array([[0.1, -0.4, 0.3], [0.2, 0.1, -0.3], [2.0, 5.0, 1.0]])
+    check_rig_maps_like(rig, P1, P2, points)
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml"])
+def test_opencv_without_projections_takes_intrinsics_and_pose(tmp_path, suffix):
+    cv2 = pytest.importorskip("cv2")
+    K1 = np.array([[700.0, 0, 320], [0, 702, 240], [0, 0, 1]])
+    K2 = np.array([[710.0, 0, 330], [0, 709, 236], [0, 0, 1]])
+    R, T = rotation((0.2, 1, 0.1), 12.0), np.array([[-0.12], [0.02], [0.04]])
+    zero = np.zeros((1, 5))
+    intrinsics = storage(cv2, tmp_path / f"intrinsics.{suffix}", M1=K1, D1=zero, M2=K2, D2=zero)
+    extrinsics = storage(cv2, tmp_path / f"extrinsics.{suffix}", R=R, T=T)
+    points = np.array([[0.1, -0.4, 0.3], [0.2, 0.1, -0.3], [2.0, 5.0, 1.0]])
+    for pair in ((intrinsics, extrinsics), (extrinsics, intrinsics)):
+        rig = read_calibration(pair)
+        check_rig_maps_like(rig, K1 @ np.eye(3, 4), K2 @ np.hstack([R, T]), points)
+    with pytest.raises(ValueError, match="no R, T.*give both"):
+        read_calibration(intrinsics)
+
+
+def test_opencv_vertical_rig(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    P1, P2 = K @ np.eye(3, 4), K @ np.hstack([np.eye(3), [[0], [-0.2], [0]]])
+    rig = read_calibration(storage(cv2, tmp_path / "s.yml", P1=P1, P2=P2))
+    np.testing.assert_allclose(rig.E[:3, 3], (0, 0.2, 0), atol=1e-12)
+
+
+def test_lens_distortion_is_refused_with_the_cure(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    K, T = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]), np.array([[-0.12], [0], [0]])
+    D = np.array([[-0.2, 0.1, 0, 0, 0]])
+    path = storage(cv2, tmp_path / "s.yml", K1=K, D1=np.zeros((1, 5)), K2=K, D2=D, R=np.eye(3), T=T)
+    with pytest.raises(ValueError, match=r"(?s)Lens distortion D2 in .*s\.yml must be zero.*-0\.2.*rectify"):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("entries", "match"),
+    [
+        ({"R": np.eye(3) * 1.5}, "rotation"),
+        ({"R": np.diag([1.0, 1.0, -1.0])}, "rotation"),
+        ({"T": np.zeros((2, 1))}, r"T in .*\(3,\)"),
+        ({"M1": np.eye(4)}, "M1 in"),
+        ({"P1": np.eye(3), "P2": np.eye(3)}, "P1 in"),
+        (
+            {"P1": np.array([[1.0, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 1]]), "P2": np.eye(3, 4)},
+            "K of the left camera",
+        ),
+    ],
+)
+def test_opencv_malformed_matrices(tmp_path, entries, match):
+    cv2 = pytest.importorskip("cv2")
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    good = {"M1": K, "M2": K, "R": np.eye(3), "T": np.array([[-0.12], [0], [0]])}
+    with pytest.raises(ValueError, match=match):
+        read_calibration(storage(cv2, tmp_path / "s.yml", **(good | entries)))
+
+
+def test_two_single_camera_files_are_no_rig(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    left, right = (storage(cv2, tmp_path / f"{i}.yml", M1=K * np.array([[i], [i], [1]])) for i in (1, 2))
+    with pytest.raises(ValueError, match="different m1"):
+        read_calibration((left, right))
+
+
+def test_xml_with_entities_is_refused(tmp_path):
+    text = '<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage><P1>&a;</P1></opencv_storage>'
+    with pytest.raises(ValueError, match="entities"):
+        read_calibration(put(tmp_path, text))
+
+
+def test_booster_baseline_in_millimetres_and_own_cx(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    P1 = np.array([[7000.0, 0, 2000, 0], [0, 7000, 1500, 0], [0, 0, 1, 0]])
+    P2 = P1 + np.array([[0, 0, 25.0, -560000], [0] * 4, [0] * 4])
+    good = {"proj_matL": P1, "proj_matR": P2, "baselineLR": 80.0, "distL": np.array([[0.3, 0.1, 0, 0, 0]])}
+    rig = read_calibration(storage(cv2, tmp_path / "calib_00-02.xml", **good))
+    assert rig.E[0, 3] == pytest.approx(0.08) and rig.K_right[0, 2] == 2025
+    del good["baselineLR"]
+    with pytest.raises(ValueError, match="no baselineLR"):
+        read_calibration(storage(cv2, tmp_path / "calib_00-02.xml", **good))
+
+
+# ---- MVSNet
+
+
+def cam_text(T, K):
+    rows = "\n".join(" ".join(f"{v:.9g}" for v in row) for row in T)
+    return (
+        f"extrinsic\n{rows}\n\nintrinsic\n"
+        + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in K)
+        + "\n\n1 0.1\n"
+    )
+
+
+def world_to_camera(axis, degrees, t):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation(axis, degrees), t
+    return T
+
+
+def test_mvsnet_pair_of_any_pose(tmp_path):
+    K1 = np.array([[700.0, 0, 320], [0, 702, 240], [0, 0, 1]])
+    K2 = np.array([[500.0, 0, 330], [0, 509, 236], [0, 0, 1]])
+    T1, T2 = world_to_camera((1, 2, 3), 40, (0.3, -0.2, 1)), world_to_camera((1, 2, 2), 55, (0.1, -0.1, 1.2))
+    pair = (put(tmp_path, cam_text(T1, K1), "a.txt"), put(tmp_path, cam_text(T2, K2), "b.txt"))
+    rig = read_calibration(pair)
+    points = np.array([[0.1, -0.4, 0.3], [0.2, 0.1, -0.3], [3.0, 5.0, 2.0]])
+    check_rig_maps_like(rig, K1 @ T1[:3], K2 @ T2[:3], points)
+    back = read_calibration(pair[::-1])
+    np.testing.assert_allclose(back.E @ rig.E, np.eye(4), atol=1e-8)
+
+
+def test_mvsnet_rotations_rigid_to_print_precision_become_rotations(tmp_path):
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    T = world_to_camera((1, 2, 3), 40, (0.3, -0.2, 1))
+    sheared = T.copy()
+    sheared[:3, :3] += 4e-4 * np.array([[1, -1, 1], [0, 1, -1], [1, 0, -1]])
+    rig = read_calibration(
+        (put(tmp_path, cam_text(np.eye(4), K), "a.txt"), put(tmp_path, cam_text(sheared, K), "b.txt"))
+    )
+    R = rig.E[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1)
+    np.testing.assert_allclose(rig.E, np.linalg.inv(T), atol=2e-3)
+
+
+def test_mvsnet_refuses_what_is_no_rotation_and_a_single_file(tmp_path):
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    good = put(tmp_path, cam_text(np.eye(4), K), "a.txt")
+    for T in (np.diag([1.1, 1.1, 1.1, 1]), np.diag([1.0, 1, -1, 1]), np.eye(4).T + np.eye(4, k=-3)):
+        with pytest.raises(ValueError, match=r"extrinsic in .*b\.txt must be a rigid transform"):
+            read_calibration((good, put(tmp_path, cam_text(T, K), "b.txt")))
+    for single in (good, (good, good)):
+        with pytest.raises(ValueError, match=r"two files .*got .*a\.txt\. Give --calib twice"):
+            read_calibration(single)
+
+
+# ---- the door
+
+
+def test_door_errors(tmp_path):
+    with pytest.raises(
+        FileNotFoundError,
+        match="calibration must be a calibration file; got .*nope.txt, which does not exist",
+    ):
+        read_calibration(tmp_path / "nope.txt")
+    with pytest.raises(IsADirectoryError, match="folder"):
+        read_calibration(tmp_path)
+    with pytest.raises(ValueError, match="empty"):
+        read_calibration(put(tmp_path, ""))
+    with pytest.raises(ValueError, match="blanks"):
+        read_calibration(put(tmp_path, " \n\n"))
+    (tmp_path / "b.bin").write_bytes(b"\x89PNG\0\0\0")
+    with pytest.raises(ValueError, match="binary"):
+        read_calibration(tmp_path / "b.bin")
+    with pytest.raises(ValueError, match=r"known format \(Middlebury.*MVSNet.*which is none of them.*fx, fy"):
+        read_calibration(put(tmp_path, "hello: world\n"))
+    for wrong in (3, (1, 2), None):
+        with pytest.raises(TypeError, match="calibration must be a path"):
+            read_calibration(wrong)
+    with pytest.raises(ValueError, match="3 files"):
+        read_calibration(("a", "b", "c"))
+
+
+def test_door_pairs(tmp_path):
+    K = put(tmp_path, "700 0 300 0 700 200 0 0 1\n0.1\n", "K.txt")
+    other = put(tmp_path, "700 0 300 0 700 200 0 0 1\n0.2\n", "K2.txt")
+    assert read_calibration((K, K)).E[0, 3] == 0.1  # the same file twice is that file
+    with pytest.raises(ValueError, match="describes both cameras"):
+        read_calibration((K, other))
+    with pytest.raises(ValueError, match="two files of one format; got foundation_stereo and middlebury"):
+        read_calibration((K, put(tmp_path, f"cam0={K_TEXT}\n")))
+
+
+# ---- parameters and matrix files
+
+
+def test_rig_from_parameters():
+    rig = rig_from_parameters(700, 701, 320, 240, 0.12, size=(640, 480))
+    np.testing.assert_array_equal(rig.K_left, [[700, 0, 320], [0, 701, 240], [0, 0, 1]])
+    np.testing.assert_array_equal(rig.K_right, rig.K_left)
+    assert rig.E[0, 3] == 0.12 and rig.size_right == (640, 480)
+    assert rig_from_parameters(700, 701, 320, 240, 0.12, cx_right=350).K_right[0, 2] == 350
+
+
+@pytest.mark.parametrize(
+    ("position", "value", "name"),
+    [
+        (0, 0, "fx"),
+        (1, -5.0, "fy"),
+        (2, float("nan"), "cx"),
+        (4, 0, "baseline"),
+        (4, float("inf"), "baseline"),
+    ],
+)
+def test_rig_from_parameters_errors(position, value, name):
+    arguments = [700, 701, 320, 240, 0.12]
+    arguments[position] = value
+    with pytest.raises(ValueError, match=name):
+        rig_from_parameters(*arguments)
+
+
+def test_read_matrix_text_and_npy(tmp_path):
+    K = np.array([[700.5, 0, 320], [0, 700.5, 240], [0, 0, 1]])
+    E = np.eye(4)
+    E[0, 3] = 0.12
+    np.savetxt(tmp_path / "K.txt", K, header="camera matrix")
+    np.savetxt(tmp_path / "flat.csv", E.reshape(1, -1), delimiter=",")
+    np.savetxt(tmp_path / "E34.txt", E[:3])
+    np.save(tmp_path / "K.npy", K.astype(np.float32))
+    np.save(tmp_path / "E.npy", E[None])
+    for name, expected in (("K.txt", K), ("flat.csv", E), ("E34.txt", E), ("K.npy", K), ("E.npy", E)):
+        matrix = read_matrix(tmp_path / name, "K")
+        assert matrix.dtype == np.float64
+        np.testing.assert_array_equal(matrix, expected)
+
+
+def test_read_matrix_errors(tmp_path):
+    with pytest.raises(FileNotFoundError, match="E must be .* does not exist"):
+        read_matrix(tmp_path / "nope", "E")
+    with pytest.raises(ValueError, match="K must be .*words"):
+        read_matrix(put(tmp_path, "P0: 1 2 3"), "K")
+    with pytest.raises(ValueError, match=r"rows of \[3, 2\] numbers.*cut off"):
+        read_matrix(put(tmp_path, "1 2 3\n4 5\n"), "K")
+    with pytest.raises(ValueError, match=r"shape \(2, 3\)"):
+        read_matrix(put(tmp_path, "1 2 3\n4 5 6\n"), "K")
+    with pytest.raises(ValueError, match="finite"):
+        read_matrix(put(tmp_path, "1 2 3\n4 nan 6\n7 8 9"), "K")
+    np.save(tmp_path / "pickled.npy", np.array([{"a": 1}]), allow_pickle=True)
+    with pytest.raises(ValueError, match="numpy cannot load"):
+        read_matrix(tmp_path / "pickled.npy", "K")
+    np.save(tmp_path / "words.npy", np.array(["a"]))
+    with pytest.raises(ValueError, match="real numbers"):
+        read_matrix(tmp_path / "words.npy", "K")
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "words.npy").read_bytes()[:40])
+    with pytest.raises(ValueError, match="numpy cannot load"):
+        read_matrix(tmp_path / "cut.npy", "K")

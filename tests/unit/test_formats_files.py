@@ -1,0 +1,225 @@
+"""Depth maps, point clouds and the atomic rename."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from geodiff_plugin.formats import (
+    atomic_path,
+    flying_points,
+    read_depth_mm_png,
+    read_disparity_kitti_png,
+    read_pfm,
+    write_depth_mm_png,
+    write_depth_npy,
+    write_pfm,
+    write_ply,
+)
+
+
+def names(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+# ---- atomic
+
+
+def test_atomic_path_appears_whole(tmp_path):
+    with atomic_path(tmp_path / "a.png") as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".png"
+        temporary.write_text("new")
+        assert not (tmp_path / "a.png").exists()
+    assert names(tmp_path) == ["a.png"] and (tmp_path / "a.png").read_text() == "new"
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
+def test_atomic_path_leaves_the_old_file_on_any_error(tmp_path, error):
+    (tmp_path / "a.txt").write_text("old")
+    with pytest.raises(error), atomic_path(tmp_path / "a.txt") as temporary:
+        temporary.write_text("half")
+        raise error
+    assert names(tmp_path) == ["a.txt"] and (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_atomic_path_has_the_permissions_of_a_plain_file(tmp_path):
+    (tmp_path / "plain").write_text("x")
+    with atomic_path(tmp_path / "a.txt") as temporary:
+        temporary.write_text("x")
+    assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_atomic_path_errors(tmp_path):
+    with pytest.raises(IsADirectoryError, match="folder"), atomic_path(tmp_path):
+        pass
+    with pytest.raises(FileNotFoundError, match="existing folder"), atomic_path(tmp_path / "no" / "a.txt"):
+        pass
+
+
+# ---- depth and disparity
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3)])
+def test_pfm_round_trip(tmp_path, shape):
+    values = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    values[0, 0] = np.inf
+    write_pfm(tmp_path / "a.pfm", values)
+    np.testing.assert_array_equal(read_pfm(tmp_path / "a.pfm"), values)
+
+
+def test_pfm_layout_is_bottom_row_first_in_both_byte_orders(tmp_path):
+    rows = np.array([[1.0, 2.0], [3.0, 4.0]])
+    for scale, kind in (("-1.0", "<f4"), ("1.0", ">f4")):
+        bytes_ = b"Pf\n2 2\n" + scale.encode() + b"\n" + rows[::-1].astype(kind).tobytes()
+        (tmp_path / "a.pfm").write_bytes(bytes_)
+        np.testing.assert_array_equal(read_pfm(tmp_path / "a.pfm"), rows)
+
+
+def test_pfm_agrees_with_opencv(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    values = np.random.default_rng(1).random((6, 9)).astype(np.float32)
+    write_pfm(tmp_path / "ours.pfm", values)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "ours.pfm"), cv2.IMREAD_UNCHANGED), values)
+    cv2.imwrite(str(tmp_path / "theirs.pfm"), values)
+    np.testing.assert_array_equal(read_pfm(tmp_path / "theirs.pfm"), values)
+
+
+@pytest.mark.parametrize(
+    "content", [b"Pf\n2 2\n-1.0\n1234", b"P5\n2 2\n255\n1234", b"Pf\n2\n-1\n", b"Pf\nab cd\n-1\n"]
+)
+def test_pfm_errors(tmp_path, content):
+    (tmp_path / "a.pfm").write_bytes(content)
+    with pytest.raises(ValueError, match=r"disp must be .*PFM.*a\.pfm"):
+        read_pfm(tmp_path / "a.pfm", "disp")
+
+
+def test_depth_npy(tmp_path):
+    write_depth_npy(tmp_path / "depth.npy", np.arange(6.0).reshape(2, 3))
+    read = np.load(tmp_path / "depth.npy", allow_pickle=False)
+    assert read.dtype == np.float32 and read[1, 2] == 5 and names(tmp_path) == ["depth.npy"]
+    with pytest.raises(ValueError, match="shape"):
+        write_depth_npy(tmp_path / "b.npy", np.zeros((1, 2, 3)))
+    assert names(tmp_path) == ["depth.npy"]
+
+
+def test_depth_mm_png_round_trip_and_zero_count(tmp_path):
+    depth = np.array([[0.0004, 1.2344, 65.535], [65.536, np.nan, 2.0], [np.inf, -1.0, 0.001]])
+    valid = np.ones((3, 3), dtype=bool)
+    valid[1, 2] = False
+    zeros = write_depth_mm_png(tmp_path / "d.png", depth, valid)
+    read, known = read_depth_mm_png(tmp_path / "d.png")
+    np.testing.assert_allclose(read, [[0, 1.234, 65.535], [0, 0, 0], [0, 0, 0.001]], atol=1e-6)
+    np.testing.assert_array_equal(known, read > 0)
+    assert zeros == 6 == int((~known).sum())
+    with Image.open(tmp_path / "d.png") as image:
+        assert image.mode.startswith("I;16")
+    assert write_depth_mm_png(tmp_path / "e.png", np.full((2, 2), 3.0)) == 0
+
+
+def test_kitti_disparity_png(tmp_path):
+    Image.fromarray(np.array([[0, 256], [384, 65535]], dtype=np.uint16)).save(tmp_path / "d.png")
+    disparity, known = read_disparity_kitti_png(tmp_path / "d.png")
+    np.testing.assert_array_equal(disparity, np.float32([[0, 1], [1.5, 65535 / 256]]))
+    np.testing.assert_array_equal(known, [[False, True], [True, True]])
+
+
+def test_png_errors(tmp_path):
+    Image.new("L", (4, 4)).save(tmp_path / "eight.png")
+    with pytest.raises(ValueError, match="16-bit grey.*mode L.*lost"):
+        read_disparity_kitti_png(tmp_path / "eight.png")
+    Image.fromarray(np.random.default_rng(0).integers(0, 9999, (64, 64), dtype=np.uint16)).save(
+        tmp_path / "w.png"
+    )
+    (tmp_path / "cut.png").write_bytes((tmp_path / "w.png").read_bytes()[:600])
+    with pytest.raises(ValueError, match="cut off"):
+        read_depth_mm_png(tmp_path / "cut.png")
+    with pytest.raises(FileNotFoundError, match="disparity"):
+        read_disparity_kitti_png(tmp_path / "nope.png")
+
+
+# ---- point cloud
+
+
+def read_ply(path):
+    raw = path.read_bytes()
+    head, _, body = raw.partition(b"end_header\n")
+    lines = head.decode("ascii").split("\n")
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = int(next(line for line in lines if line.startswith("element vertex")).split()[-1])
+    properties = [tuple(line.split()[1:]) for line in lines if line.startswith("property")]
+    kinds = {"float": "<f4", "uchar": "u1"}
+    dtype = np.dtype([(name, kinds[kind]) for kind, name in properties])
+    assert len(body) == count * dtype.itemsize
+    return np.frombuffer(body, dtype=dtype)
+
+
+def test_convention_ply_camera_frame(tmp_path):
+    """x right, y down, z forward, metres, and back through K to the pixel it came from."""
+    K = np.array([[10.0, 0, 2], [0, 20.0, 1], [0, 0, 1]])
+    depth = np.linspace(1, 3, 12).reshape(3, 4)
+    image = np.random.default_rng(0).random((3, 4, 3))
+    valid = np.ones((3, 4), dtype=bool)
+    valid[0, 0] = False
+    depth[2, 3] = np.nan
+    depth[2, 2] = 0
+    assert write_ply(tmp_path / "c.ply", depth, image, K, valid) == 9
+    points = read_ply(tmp_path / "c.ply")
+    u, v = points["x"] / points["z"] * 10 + 2, points["y"] / points["z"] * 20 + 1
+    rows, columns = np.rint(v).astype(int), np.rint(u).astype(int)
+    np.testing.assert_allclose(np.stack([u, v]), np.stack([columns, rows]), atol=1e-5)
+    np.testing.assert_allclose(points["z"], depth[rows, columns], rtol=1e-6)
+    np.testing.assert_array_equal(points["red"], np.rint(image[rows, columns, 0] * 255))
+    np.testing.assert_array_equal(points["blue"], np.rint(image[rows, columns, 2] * 255))
+    centre = points[(rows == 1) & (columns == 2)]
+    assert (centre["x"][0], centre["y"][0]) == (0, 0)
+
+
+def test_ply_without_points_and_errors(tmp_path):
+    K = np.eye(3)
+    assert write_ply(tmp_path / "c.ply", np.zeros((3, 4)), np.zeros((3, 4, 3)), K) == 0
+    assert len(read_ply(tmp_path / "c.ply")) == 0
+    with pytest.raises(ValueError, match="image_01"):
+        write_ply(tmp_path / "d.ply", np.ones((3, 4)), np.zeros((4, 3, 3)), K)
+    with pytest.raises(ValueError, match="focal"):
+        write_ply(tmp_path / "d.ply", np.ones((3, 4)), np.zeros((3, 4, 3)), np.zeros((3, 3)))
+    assert names(tmp_path) == ["c.ply"]
+
+
+def test_flying_points_keep_planes_and_clean_edges():
+    v, u = np.mgrid[0:30, 0:40]
+    tilted = 1.0 / (0.5 - 0.004 * u - 0.003 * v)
+    assert not flying_points(tilted).any()
+    step = np.where(u < 20, 1.0, 3.0)
+    assert not flying_points(step).any()
+    box = np.where((u > 10) & (u < 25) & (v > 8) & (v < 20), 1.0, 3.0)
+    assert not flying_points(box).any()
+
+
+@pytest.mark.parametrize("angle", [0, 30, 45, 70, 90])
+def test_flying_points_find_a_ramp_between_two_surfaces(angle):
+    v, u = np.mgrid[0:60, 0:60]
+    across = np.cos(np.deg2rad(angle)) * (u - 30) + np.sin(np.deg2rad(angle)) * (v - 30)
+    depth = np.interp(across, [-1.5, 1.5], [1.0, 4.0])
+    flying = flying_points(depth)
+    middle = np.abs(across) < 1.4
+    assert flying[middle].mean() > 0.95
+    assert not flying[np.abs(across) > 3].any()
+
+
+def test_flying_points_reach_follows_an_enlarged_map():
+    u = np.mgrid[0:60, 0:60][1]
+    depth = np.interp(u, [24, 36], [1.0, 1.4])
+    middle = np.abs(u - 30) < 5
+    assert not flying_points(depth).any()
+    assert flying_points(depth, reach=6)[middle].mean() > 0.95
+
+
+def test_flying_points_ignore_what_is_not_valid():
+    depth = np.full((10, 10), 2.0)
+    depth[4, 4], depth[0, 0], depth[7, 7] = 5.0, np.nan, 0.0
+    flying = flying_points(depth)
+    assert flying[4, 4] and flying.sum() == 1
+    valid = np.ones((10, 10), dtype=bool)
+    valid[4, 4] = False
+    assert not flying_points(depth, valid).any()

@@ -1,0 +1,148 @@
+"""Pictures: colours, legend, contact sheet."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from geodiff_plugin.plotting import colour_depth, depth_figure, depth_range, grid, ticks
+
+
+def test_near_is_yellow_far_is_blue_unknown_is_grey():
+    depth = np.array([[1.0, 2.0, 4.0, np.inf], [np.nan, 0.0, -1.0, 2.0]])
+    valid = np.ones((2, 4), dtype=bool)
+    valid[1, 3] = False
+    picture = colour_depth(depth, valid, near=1, far=4)
+    assert picture.dtype == np.uint8 and picture.shape == (2, 4, 3)
+    assert tuple(picture[0, 0]) == (0xF0, 0xF9, 0x21)
+    assert tuple(picture[0, 2]) == (0x0D, 0x08, 0x87)
+    for pixel in (picture[0, 3], *picture[1]):
+        assert tuple(pixel) == (128, 128, 128)
+
+
+def test_colours_are_matplotlibs_plasma():
+    matplotlib = pytest.importorskip("matplotlib")
+    depth = np.geomspace(1, 50, 256)[None]
+    expected = matplotlib.colormaps["plasma"](np.linspace(1, 0, 256))[:, :3] * 255
+    difference = np.abs(colour_depth(depth, near=1, far=50)[0].astype(float) - expected)
+    assert difference.max() < 6 and difference.mean() < 1
+
+
+def test_lightness_falls_with_depth():
+    rgb = colour_depth(np.geomspace(1, 9, 100)[None], near=1, far=9)[0] / 255.0
+    lightness = rgb @ (0.2126, 0.7152, 0.0722)
+    assert (np.diff(lightness) <= 0.004).all() and lightness[0] - lightness[-1] > 0.7
+
+
+def test_percentiles_ignore_invalid_and_outliers():
+    depth = np.linspace(2.0, 3.0, 1000).reshape(10, 100)
+    depth[0, 0], depth[0, 1] = 1e6, np.inf
+    near, far = depth_range(depth)
+    assert 2.0 < near < 2.05 and 2.95 < far < 3.05
+    assert depth_range(depth, near=1.0) == (1.0, far)
+
+
+@pytest.mark.parametrize("depth", [np.full((4, 4), 2.0), np.full((4, 4), np.nan), np.zeros((4, 4))])
+def test_flat_and_empty_maps_have_a_range(depth):
+    near, far = depth_range(depth)
+    assert 0 < near < far
+    assert colour_depth(depth).shape == (4, 4, 3)
+    assert depth_figure(depth).height >= 256
+
+
+def test_ends_beyond_the_data_still_make_a_range():
+    depth = np.linspace(2.0, 3.0, 100).reshape(10, 10)
+    for ends in ({"near": 10.0}, {"far": 0.5}):
+        near, far = depth_range(depth, **ends)
+        assert near < far
+        colour_depth(depth, **ends)
+
+
+def test_torch_and_extra_axes():
+    depth = torch.linspace(1, 2, 12).reshape(1, 1, 3, 4)
+    np.testing.assert_array_equal(colour_depth(depth, depth > 0), colour_depth(depth[0, 0].numpy()))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"near": 0}, "near"),
+        ({"far": float("inf")}, "far"),
+        ({"near": 3, "far": 2}, "near < far"),
+        ({"valid": np.ones((2, 2), dtype=bool)}, "valid"),
+    ],
+)
+def test_colour_errors(arguments, match):
+    with pytest.raises(ValueError, match=match):
+        colour_depth(np.ones((3, 4)), **arguments)
+    with pytest.raises(ValueError, match="depth_m"):
+        colour_depth(np.ones((2, 3, 4)))
+
+
+@pytest.mark.parametrize("near", [0.001, 0.3, 2.0, 47.0])
+@pytest.mark.parametrize("ratio", [1.001, 1.1, 1.9, 5.0, 30.0, 1e4])
+def test_ticks_are_few_rising_inside_and_round(near, ratio):
+    found = ticks(near, near * ratio)
+    assert 2 <= len(found) <= 8
+    assert near * (1 - 1e-6) <= found[0] and found[-1] <= near * ratio * (1 + 1e-6)
+    assert (np.diff(found) > 0).all()
+    assert len({f"{value:g}" for value in found}) == len(found)
+
+
+def test_figure_is_map_beside_legend():
+    depth = np.tile(np.geomspace(1, 20, 300), (260, 1))
+    figure = depth_figure(depth, title="depth")
+    plain = depth_figure(depth)
+    assert figure.mode == "RGB" and figure.height > plain.height == 260
+    pixels = np.asarray(plain)
+    np.testing.assert_array_equal(pixels[:, :300], colour_depth(depth))
+    legend = pixels[:, 300:]
+    # The bar runs from the far colour on top to the near one at the bottom; labels are black on white.
+    column = legend[:, 12].astype(int)
+    inside = np.flatnonzero((column.max(axis=1) - column.min(axis=1)) > 60)
+    assert column[inside[1], 2] > column[inside[1], 0] and column[inside[-2], 0] > column[inside[-2], 2]
+    assert (legend == 0).all(axis=-1).sum() > 100
+    assert not (pixels == 128).all(axis=-1).any()
+    holes = depth.copy()
+    holes[:50, :50] = np.nan
+    assert (np.asarray(depth_figure(holes))[:, 300:] == 128).all(axis=-1).any()
+
+
+def test_small_maps_are_enlarged_by_a_whole_factor():
+    depth = np.array([[1.0, 2.0], [3.0, 4.0]])
+    figure = np.asarray(depth_figure(depth, near=1, far=4))
+    assert figure.shape[0] == 256
+    np.testing.assert_array_equal(figure[::128, :256:128], colour_depth(depth, near=1, far=4))
+
+
+def test_grid_places_cells_and_titles():
+    red = np.zeros((20, 40, 3), dtype=np.uint8)
+    red[..., 0] = 255
+    pictures = [
+        red,
+        np.zeros((40, 40)),
+        np.ones((20, 40), dtype=bool),
+        Image.new("L", (10, 5), 77),
+        red / 255.0,
+    ]
+    sheet = grid(
+        pictures, ["a", "b", "c", "d", "a title much too long for its cell" * 3], columns=2, cell_width=80
+    )
+    pixels = np.asarray(sheet)
+    assert sheet.width == 6 + 2 * 86
+    assert tuple(pixels[6 + 24 + 5, 6 + 40]) == (255, 0, 0)
+    assert (pixels == 77).all(axis=-1).any()
+    assert grid(pictures, columns=2, cell_width=80).height == sheet.height - 3 * 24
+
+
+def test_grid_errors():
+    with pytest.raises(ValueError, match="images"):
+        grid([])
+    with pytest.raises(ValueError, match="titles"):
+        grid([np.zeros((2, 2))], ["a", "b"])
+    with pytest.raises(ValueError, match="images"):
+        grid([np.zeros((2, 2, 4))])
+    with pytest.raises(ValueError, match="columns"):
+        grid([np.zeros((2, 2))], columns=0)
