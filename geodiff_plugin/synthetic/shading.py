@@ -15,12 +15,9 @@ from geodiff_plugin.synthetic.patterns import LAYERS
 from geodiff_plugin.synthetic.primitives import surface
 from geodiff_plugin.synthetic.scene import Material, Scene
 from geodiff_plugin.synthetic.textures import Atlas, sample_atlas
-from geodiff_plugin.synthetic.tracing import Bundles, World, blocked
+from geodiff_plugin.synthetic.tracing import Bundles, World, blocked, openness
 
 __all__ = ["Lighting", "Shaded", "shade", "sky_radiance"]
-
-# Four directions that spread evenly; added to the normal they sample the hemisphere by its cosine.
-_SPREAD = ((0.577, -0.577, 0.577), (-0.577, -0.577, -0.577), (-0.577, 0.577, 0.577), (0.577, 0.577, -0.577))
 
 
 @dataclass(frozen=True)
@@ -125,49 +122,45 @@ def _albedo(atlas: Atlas, row: torch.Tensor, uv_m: torch.Tensor, footprint_m: to
     return colour, texel[2]
 
 
-def _direct(world, light, scene, point, normal, view, prim, live, shine, gloss, shadows):
+def _direct(world, light, scene, point, normal, view, prim, live, shine, gloss):
     """Diffuse light ``(3, B, P)`` and highlights ``(3, B, P)`` of all lamps and suns."""
     diffuse, highlight = torch.zeros_like(point), torch.zeros_like(point)
     for k in range(light.position.shape[1]):
         position = light.position[scene, k].t()[..., None]  # (3, B, 1)
-        sun = light.directional[scene, k][:, None]
         colour = light.colour[scene, k].t()[..., None]
-        if bool(light.directional[:, k].all()):
+        some_sun, all_sun = bool(light.directional[:, k].any()), bool(light.directional[:, k].all())
+        if all_sun:
             towards = _unit(position)
-            ray, strength = towards * 500.0, 1.0
+            origin, ray, strength = point, towards * 500.0, 1.0
         else:
-            offset = position - point * (~sun)
+            sun = light.directional[scene, k][:, None]
+            offset = position - point
             d2 = (offset * offset).sum(0)
-            towards = _unit(offset)
-            ray = torch.where(sun, towards * 500.0, offset)
-            strength = torch.where(sun, torch.ones_like(d2), 1.0 / (0.4 + d2))
+            # From the lamp to the surface where all lights are lamps: an exact apex culls best.
+            origin, ray, strength, towards = position, -offset, 1.0 / (0.4 + d2), offset * d2.clamp_min(1e-12).rsqrt()
+            if some_sun:
+                towards = torch.where(sun, _unit(position), towards)
+                origin, ray = point, torch.where(sun, towards * 500.0, offset)
+                strength = torch.where(sun, torch.ones_like(d2), strength)
         cosine = (normal * towards).sum(0).clamp_min(0)
-        amount = cosine * strength
-        if shadows:
-            wanted = live & (cosine > 0) & (colour.sum(0) > 0)
-            rays = Bundles(scene, point, ray, wanted.to(point.dtype) * 0.999, prim)
-            amount = amount * (1 - blocked(world, rays))
-        diffuse += colour * amount
+        wanted = live & (cosine > 0) & (colour.sum(0) > 0)
+        shadow = blocked(world, Bundles(scene, origin, ray, wanted.to(point.dtype) * 0.999, prim))
+        amount = cosine * strength * (1 - shadow)
         half = _unit(towards - view)
         peak = (normal * half).sum(0).clamp_min(0).pow(shine) * gloss
         highlight += colour * (amount * peak * (0.5 + shine * 0.06))
     return diffuse, highlight
 
 
-def _ambient(world, light, scene, point, normal, prim, live, occlude):
+def _ambient(world, light, scene, point, normal, live, occlude):
     """Ambient light ``(3, B, P)``: more from above, less where something is near."""
     params = light.ambient[scene]
     above, below = params[:, :3].t()[..., None], params[:, 3:].t()[..., None]
     value = below + (above - below) * (0.5 - 0.5 * normal[1])
     if not occlude:
         return value * 0.8
-    closed = torch.zeros_like(normal[0])
-    length = light.ao_length[scene][:, None]
-    for offset in _SPREAD:
-        toward = normal * 1.05 + normal.new_tensor(offset)[:, None, None]
-        rays = Bundles(scene, point, _unit(toward), live * length, prim)
-        closed += blocked(world, rays, fade=True)
-    return value * (1 - 0.22 * closed)
+    free = openness(world, scene, point, normal, live, light.ao_length[scene])
+    return value * (0.25 + 0.75 * free)
 
 
 def shade(
@@ -213,8 +206,8 @@ def shade(
     material = row[18].reshape(t.shape)
     gloss = torch.maximum(row[33], pane).reshape(t.shape)
     shine = 6 + 90 * gloss * gloss
-    diffuse, highlight = _direct(world, light, scene, point, normal, direction, prim, live, shine, gloss, True)
-    ambient = _ambient(world, light, scene, point, normal, prim, live, first)
+    diffuse, highlight = _direct(world, light, scene, point, normal, direction, prim, live, shine, gloss)
+    ambient = _ambient(world, light, scene, point, normal, live, first)
     radiance = albedo * (diffuse + ambient + row[35].reshape(t.shape)) + highlight * 0.25
     # Fog pulls towards its colour; the sky keeps its own.
     fog = light.fog[scene]

@@ -14,7 +14,7 @@ import torch
 from geodiff_plugin.synthetic.primitives import INTERSECT
 from geodiff_plugin.synthetic.scene import Material, Scene, Shape
 
-__all__ = ["Bundles", "World", "blocked", "nearest"]
+__all__ = ["Bundles", "World", "blocked", "nearest", "openness"]
 
 _PAIR_ELEMENTS = {"cpu": 1 << 17, "cuda": 1 << 25}
 
@@ -32,6 +32,8 @@ class World:
         centre: ``(S, N, 3)``; ``radius`` ``(S, N)``.
         radius: bounding spheres.
         opaque: ``(S, N)`` bool, casts shadows.
+        turn: ``(S * N, 3, 4)`` world to local in metres (rotation and offset only).
+        core: ``(S * N, 3)`` half extents in metres of the box (or ellipsoid) that stands for it near other things.
         table: ``(F, S * N)`` float parameters for shading, rows as in ``shading.ROWS``.
     """
 
@@ -43,6 +45,8 @@ class World:
     centre: torch.Tensor
     radius: torch.Tensor
     opaque: torch.Tensor
+    turn: torch.Tensor
+    core: torch.Tensor
     table: torch.Tensor
 
     @classmethod
@@ -70,9 +74,17 @@ class World:
             stack(lambda s: s.emission)[..., None],
         ], -1).flatten(0, 1).t().contiguous()
         opaque = stack(lambda s: (s.material != Material.GLASS) & (s.emission <= 0), False)
+        half, taper = stack(lambda s: s.half, 1.0), stack(lambda s: s.taper)
+        turn = matrix * half[..., None]
+        slim = torch.stack([1 - taper[..., 0], torch.ones_like(taper[..., 0]), 1 - taper[..., 1]], -1)
+        round_ = torch.tensor([0.7, 1.0, 0.7]) * torch.stack([(1 + taper[..., 0]) / 2, torch.ones_like(taper[..., 0]), (1 + taper[..., 0]) / 2], -1)
+        core = half * extent
+        core = torch.where((shape == Shape.TAPER)[..., None], core * slim.clamp_min(0), core)
+        core = torch.where((shape == Shape.FRUSTUM)[..., None], core * round_, core)
         flat = [x.flatten(0, 1).to(device) for x in (shape, matrix, extent, stack(lambda s: s.taper))]
         return cls(len(scenes), *flat, stack(lambda s: s.centre).to(device),
-                   stack(lambda s: s.radius, -1e6).to(device), opaque.to(device), table.to(device))
+                   stack(lambda s: s.radius, -1e6).to(device), opaque.to(device),
+                   turn.flatten(0, 1).to(device), core.flatten(0, 1).to(device), table.to(device))
 
 
 @dataclass(frozen=True)
@@ -120,22 +132,33 @@ def _cone(rays: Bundles) -> tuple[torch.Tensor, ...]:
     return apex, spread, axis, cos, sin, length
 
 
+def _offsets(world: World, scene: torch.Tensor, apex: torch.Tensor, axis: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
+    """Squared distance of every primitive's centre from each apex and its length along the axis, radius, opacity."""
+    if world.scenes == 1:
+        centre, radius, opaque = world.centre, world.radius, world.opaque  # broadcast over bundles
+    else:
+        centre, radius, opaque = world.centre[scene], world.radius[scene], world.opaque[scene]
+    v = [centre[..., k] - apex[k][:, None] for k in range(3)]
+    d2 = torch.addcmul(torch.addcmul(v[0] * v[0], v[1], v[1]), v[2], v[2])
+    if axis is None:
+        return d2, d2, radius, opaque
+    along = torch.addcmul(torch.addcmul(v[0] * axis[0][:, None], v[1], axis[1][:, None]), v[2], axis[2][:, None])
+    return d2, along, radius, opaque
+
+
 def _pairs(world: World, rays: Bundles, casters: bool) -> tuple[torch.Tensor, torch.Tensor]:
     """Bundles and primitives (global indices) that may meet."""
     apex, spread, axis, cos, sin, length = _cone(rays)
-    centre = world.centre[rays.scene]  # (B, N, 3)
-    radius = world.radius[rays.scene] + spread[:, None]
-    vx, vy, vz = (centre[..., k] - apex[k][:, None] for k in range(3))
-    d2 = vx * vx + vy * vy + vz * vz
-    along = vx * axis[0][:, None] + vy * axis[1][:, None] + vz * axis[2][:, None]
-    across = (d2 - along * along).clamp_min(0).sqrt()
+    d2, along, radius, opaque = _offsets(world, rays.scene, apex, axis)
+    radius = radius + spread[:, None]
+    across = (d2 - along * along).clamp_min_(0).sqrt_()
     cos_, sin_ = cos[:, None], sin[:, None]
     keep = (across * cos_ - along * sin_ <= radius) & (along * cos_ + across * sin_ > -radius)
     keep &= along <= length[:, None] + radius
     keep |= d2 <= radius * radius
     keep &= (radius > 0) & (length > 0)[:, None]
     if casters:
-        keep &= world.opaque[rays.scene]
+        keep &= opaque
     b, n = keep.nonzero(as_tuple=True)
     # Second look: the cone's axis against the oriented box, inflated by the cone's width at the far side.
     prim = rays.scene[b] * world.centre.shape[1] + n
@@ -163,6 +186,75 @@ def _local(matrix: torch.Tensor, v: torch.Tensor, with_offset: bool) -> tuple[to
         c = torch.addcmul(c, matrix[:, k, 2, None], v[2])
         out.append(c + matrix[:, k, 3, None] if with_offset else c)
     return tuple(out)
+
+
+def openness(
+    world: World,
+    scene: torch.Tensor,
+    point: torch.Tensor,
+    normal: torch.Tensor,
+    live: torch.Tensor,
+    length: torch.Tensor,
+) -> torch.Tensor:
+    """How free the space above a surface is, from the distances to what stands near.
+
+    Looks at two points above the surface, at 0.25 and 0.8 of ``length``: in the open, each is as far from everything
+    as from its own surface; near a wall or under a table it is closer to something else. Smooth and free of noise.
+
+    Args:
+        world: primitives.
+        scene: ``(B,)`` int64.
+        point: ``(3, B, P)`` on the surface.
+        normal: ``(3, B, P)`` unit.
+        live: ``(B, P)`` bool.
+        length: ``(B,)`` metres, reach of the effect.
+
+    Returns:
+        ``(B, P)`` in [0, 1], 1 in the open.
+    """
+    weight = live.to(point.dtype)
+    middle = (point * weight).sum(-1) / weight.sum(-1).clamp_min(1)
+    away = point - middle[..., None]
+    spread = ((away * away).sum(0) * weight).amax(-1).sqrt() + 1.6 * length
+    d2, _, radius, opaque = _offsets(world, scene, middle, None)
+    reach = radius + spread[:, None]
+    keep = (d2 <= reach * reach) & (radius > 0) & opaque & live.any(-1)[:, None]
+    b, n = keep.nonzero(as_tuple=True)
+    prim = scene[b] * world.centre.shape[1] + n
+    turn = world.turn[prim]  # (pairs, 3, 4) world to local, in metres
+    gap = (turn[:, :, :3] * middle.t()[b][:, None]).sum(-1).add_(turn[:, :, 3]).abs_().sub_(world.core[prim]).clamp_min_(0)
+    near = gap.square().sum(-1) <= spread[b].square()
+    b, prim = b[near], prim[near]
+    ball = world.shape[prim] == int(Shape.SPHERE)
+    heights = [k * length[:, None] for k in (0.25, 0.8)]
+    distance = [h.expand_as(weight).clone() for h in heights]
+    step = max(1, _PAIR_ELEMENTS.get(point.device.type, 1 << 20) // point.shape[2])
+    for mask, measure in ((~ball, _box_distance), (ball, _ellipsoid_distance)):
+        bundle, which = b[mask], prim[mask]
+        for start in range(0, bundle.shape[0], step):
+            bc, pc = bundle[start : start + step], which[start : start + step]
+            turn, core = world.turn[pc], world.core[pc]
+            base = _local(turn, point.index_select(1, bc), True)
+            rise = _local(turn, normal.index_select(1, bc), False)
+            for k, h in enumerate(heights):
+                d = measure([torch.addcmul(o, r, h[bc]) for o, r in zip(base, rise, strict=True)], core)
+                distance[k].scatter_reduce_(0, bc[:, None].expand_as(d), d, "amin")
+    free = [(d / h).clamp(0, 1) for d, h in zip(distance, heights, strict=True)]
+    return 0.5 * (free[0] + free[1])
+
+
+def _box_distance(p: list[torch.Tensor], half: torch.Tensor) -> torch.Tensor:
+    q = [x.abs_().sub_(half[:, k, None]).clamp_min_(0) for k, x in enumerate(p)]
+    return torch.addcmul(torch.addcmul(q[0] * q[0], q[1], q[1]), q[2], q[2]).sqrt_()
+
+
+def _ellipsoid_distance(p: list[torch.Tensor], half: torch.Tensor) -> torch.Tensor:
+    """First-order distance to an ellipsoid: exact at the surface and for balls."""
+    q = [x / half[:, k, None] for k, x in enumerate(p)]
+    r = [x / half[:, k, None] for k, x in enumerate(q)]
+    k0 = (q[0] * q[0] + q[1] * q[1] + q[2] * q[2]).sqrt_()
+    k1 = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]).sqrt_().clamp_min_(1e-9)
+    return k0 * (k0 - 1) / k1
 
 
 def _hits(world: World, rays: Bundles, casters: bool) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
@@ -203,20 +295,9 @@ def nearest(world: World, rays: Bundles) -> tuple[torch.Tensor, torch.Tensor]:
     return best, who.long()
 
 
-def blocked(world: World, rays: Bundles, fade: bool = False) -> torch.Tensor:
-    """How strongly opaque primitives block each ray.
-
-    Args:
-        world: the primitives.
-        rays: the rays.
-        fade: weight a hit by ``1 - t / t_max`` (ambient occlusion) instead of counting it in full.
-
-    Returns:
-        ``(B, P)`` in [0, 1].
-    """
+def blocked(world: World, rays: Bundles) -> torch.Tensor:
+    """Whether something opaque stands in the way of each ray: ``(B, P)`` float, 0 or 1."""
     total = torch.zeros_like(rays.t_max)
-    scale = rays.t_max.clamp_min(1e-9).reciprocal() if fade else None
     for b, _, t in _hits(world, rays, casters=True):
-        weight = (1 - t * scale.index_select(0, b)).clamp_min_(0) if fade else (t < float("inf")).to(t.dtype)
-        total.index_add_(0, b, weight)
+        total.index_add_(0, b, (t < float("inf")).to(t.dtype))
     return total.clamp_max_(1)
