@@ -1,0 +1,185 @@
+"""Rendered scenes on disk, and the target that depth becomes.
+
+Hop: seeds -> ``synthetic.render_mono`` -> shards (uint8 images, float16 depth in metres) -> [-1, 1] targets.
+Paper: none; the target is Marigold's (depth normalised by its 2 % and 98 % quantiles).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+
+__all__ = [
+    "FAR_M",
+    "HELD_OUT_SEED",
+    "SHARD",
+    "SHAPES",
+    "held_out",
+    "jitter",
+    "normalise_depth",
+    "read_shard",
+    "render_shards",
+    "shards",
+    "shard_size",
+    "train_seeds",
+]
+
+SHARD = 16
+"""Scenes in one shard; all of one shape."""
+
+SHAPES = ((192, 256), (128, 416), (192, 256), (192, 192), (192, 256), (256, 192), (160, 288))
+"""Image sizes (H, W) that shards cycle through: landscape mostly, KITTI's 3.3:1, square, portrait, 16:9."""
+
+HELD_OUT_SEED = 1
+"""Held-out scenes have the seeds 1, 2, ...; training scenes start at one million."""
+
+FAR_M = 80.0
+"""Depth is cut here, metres, in targets and in the held-out score: as far as outdoor ground truth reaches."""
+
+_TRAIN_SEED = 1_000_000
+
+
+def shard_size(index: int) -> tuple[int, int]:
+    """Image size (H, W) of a shard."""
+    return SHAPES[index % len(SHAPES)]
+
+
+def train_seeds(index: int) -> list[int]:
+    """Scene seeds of a training shard."""
+    return [_TRAIN_SEED + index * SHARD + i for i in range(SHARD)]
+
+
+def held_out(
+    count: int, size: tuple[int, int] = (192, 256), device: str = "cpu"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scenes that training never sees.
+
+    Args:
+        count: number of scenes, >= 1.
+        size: image size (H, W).
+        device: where to render.
+
+    Returns:
+        Images ``(N, 3, H, W)`` float32 in [0, 1] and depth ``(N, 1, H, W)`` float32 in metres, inf for sky;
+        on the CPU.
+    """
+    from geodiff_plugin.synthetic.pairs import render_mono
+
+    images, depths = [], []
+    for start in range(0, count, SHARD):
+        seeds = [HELD_OUT_SEED + i for i in range(start, min(start + SHARD, count))]
+        image, depth = render_mono(seeds, size=size, device=device, augment=True)
+        images.append(image.cpu())
+        depths.append(depth.cpu())
+    return torch.cat(images), torch.cat(depths)
+
+
+def normalise_depth(depth_m: torch.Tensor) -> torch.Tensor:
+    """Depth as the prior is trained on it.
+
+    Args:
+        depth_m: ``(N, 1, H, W)`` metres, inf for sky.
+
+    Returns:
+        ``(N, 1, H, W)`` float32 in [-1, 1]: of the depth cut at ``FAR_M``, the 2 % quantile is -1, the 98 %
+        quantile and the sky are 1; a scene without spread is 0.
+    """
+    cut = torch.where(depth_m.isfinite(), depth_m.float().clamp(max=FAR_M), depth_m.float())
+    ordered = cut.flatten(1).sort(dim=1).values  # inf goes last, so finite values fill the front
+    count = ordered.isfinite().sum(dim=1, keepdim=True)
+    low = ordered.gather(1, (0.02 * (count - 1)).long().clamp(min=0))[..., None, None]
+    high = ordered.gather(1, (0.98 * (count - 1)).long().clamp(min=0))[..., None, None]
+    spread = high - low
+    unit = ((cut - low) / spread.clamp(min=1e-6)).clamp(0.0, 1.0)
+    usable = (count[..., None, None] > 0) & (spread > 1e-4)
+    return torch.where(usable, 2.0 * unit - 1.0, torch.zeros(()).to(unit))
+
+
+def jitter(images_01: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Change colour and exposure of each image at random; one in four turns grey.
+
+    Args:
+        images_01: ``(N, 3, H, W)`` in [0, 1].
+        generator: CPU generator; all draws are made on the CPU.
+
+    Returns:
+        The same shape and device, in [0, 1].
+    """
+    n = images_01.shape[0]
+
+    def draw(low: float, high: float, width: int = 1) -> torch.Tensor:
+        return (low + (high - low) * torch.rand(n, width, 1, 1, generator=generator)).to(images_01.device)
+
+    grey = images_01.mean(dim=1, keepdim=True)
+    saturation = torch.where(draw(0.0, 1.0) < 0.25, torch.zeros_like(draw(0, 1)), draw(0.4, 1.5))
+    x = grey + saturation * (images_01 - grey)
+    x = x * torch.where(saturation > 0, draw(0.85, 1.18, 3), torch.ones_like(draw(0, 1))) * draw(0.75, 1.3)
+    x = x.clamp(0.0, 1.0) ** draw(0.7, 1.45)
+    middle = x.mean(dim=(1, 2, 3), keepdim=True)
+    return (middle + draw(0.7, 1.3) * (x - middle)).clamp(0.0, 1.0)
+
+
+def shards(cache: Path) -> list[int]:
+    """Indices of the shards that are complete in the cache, in order."""
+    return sorted(int(path.stem) for path in Path(cache).glob("scenes/*.safetensors"))
+
+
+def read_shard(cache: Path, index: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """One shard: images ``(16, 3, H, W)`` float32 in [0, 1], depth ``(16, 1, H, W)`` float32 metres."""
+    parts = load_file(Path(cache) / "scenes" / f"{index:06d}.safetensors")
+    return parts["images"].float() / 255.0, parts["depth"].float()
+
+
+def render_shards(cache: Path, first: int, stop: int, step: int = 1, device: str = "cpu") -> Iterator[int]:
+    """Render the training shards ``first, first + step, ...`` below ``stop`` that the cache lacks.
+
+    Args:
+        cache: folder; shards go to ``scenes/``, each written whole or not at all.
+        first: index of the first shard.
+        stop: end of the range.
+        step: stride, for several workers.
+        device: where to render.
+
+    Yields:
+        The index of each new shard.
+    """
+    from geodiff_plugin.synthetic.pairs import render_mono
+
+    folder = Path(cache) / "scenes"
+    folder.mkdir(parents=True, exist_ok=True)
+    for index in range(first, stop, step):
+        path = folder / f"{index:06d}.safetensors"
+        if path.exists():
+            continue
+        images, depth = render_mono(train_seeds(index), size=shard_size(index), device=device, augment=True)
+        part = path.with_suffix(f".part{os.getpid()}")
+        pixels = (images.clamp(0, 1) * 255.0).round().to(torch.uint8)
+        save_file({"images": pixels.cpu().contiguous(), "depth": depth.half().cpu().contiguous()}, part)
+        part.replace(path)
+        yield index
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Fill a cache: ``python -m geodiff_plugin.bundled.data --cache DIR --stop 1000``."""
+    parser = argparse.ArgumentParser(description="Render training scenes into a cache.")
+    parser.add_argument("--cache", type=Path, required=True)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--stop", type=int, default=1000, help="end of the shard range; 16 scenes a shard")
+    parser.add_argument("--step", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--parent", type=int, help="stop when this process is no longer the parent")
+    options = parser.parse_args(argv)
+    torch.set_num_threads(options.threads)
+    for _ in render_shards(options.cache, options.first, options.stop, options.step, options.device):
+        if options.parent is not None and os.getppid() != options.parent:
+            break
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,199 @@
+"""Train the small prior: ``python -m geodiff_plugin.bundled.train --out DIR --hours 6``.
+
+Hop: rendered scenes -> autoencoder, then U-Net -> pipeline folder ``DIR/prior``; a killed run continues.
+Paper: none; the recipe is Marigold's in small (README.md beside the weights).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+from accelerate import Accelerator
+from accelerate.utils import set_seed
+from tqdm import tqdm
+
+from geodiff_plugin.bundled.data import shards
+from geodiff_plugin.bundled.latents import LatentStore
+from geodiff_plugin.bundled.models import assemble, build_scheduler, build_text, build_unet, open_pipeline
+from geodiff_plugin.bundled.report import Reporter
+from geodiff_plugin.bundled.schedule import diffusion_loss, draw_timesteps, learning_rate, stage_at
+from geodiff_plugin.bundled.state import Average, Progress, restore, store
+from geodiff_plugin.bundled.train_vae import save_vae, train_vae
+
+__all__ = ["main", "parse", "run"]
+
+
+def parse(argv: list[str] | None = None) -> argparse.Namespace:
+    """The command line; see ``--help``."""
+    parser = argparse.ArgumentParser(prog="python -m geodiff_plugin.bundled.train", description=__doc__)
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of the run; give it again to continue"
+    )
+    parser.add_argument("--cache", type=Path, help="rendered scenes; default OUT/cache")
+    parser.add_argument("--hours", type=float, default=6.0, help="wall-clock of the U-Net's training")
+    parser.add_argument("--vae-minutes", type=float, default=8.0)
+    parser.add_argument(
+        "--device", default="cpu", help="cpu or cuda; several devices through accelerate launch"
+    )
+    parser.add_argument(
+        "--init-from", type=Path, help="prior folder to continue from; its autoencoder is kept"
+    )
+    parser.add_argument("--batch", type=int, default=16, help="scenes per process and step at low resolution")
+    parser.add_argument("--rate", type=float, default=1e-3, help="top learning rate")
+    parser.add_argument("--average", type=float, default=0.999, help="decay of the moving average")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=0, help="of this process; torch's choice for 0")
+    parser.add_argument("--renderers", type=int, default=1, help="processes that fill the cache meanwhile")
+    parser.add_argument("--scenes", type=int, default=20_000, help="scenes in the cache, at most")
+    parser.add_argument("--first-scenes", type=int, default=256, help="wait for so many before the start")
+    parser.add_argument(
+        "--fresh", action="store_true", help="render every batch on the device, keep none (GPU)"
+    )
+    parser.add_argument("--validate-minutes", type=float, default=8.0)
+    parser.add_argument("--validation-scenes", type=int, default=48)
+    parser.add_argument("--steps", type=int, help="a fixed number of U-Net steps instead of the hours")
+    parser.add_argument("--vae-steps", type=int, help="a fixed number of autoencoder steps")
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Command line of the training."""
+    run(parse(argv))
+
+
+def run(options: argparse.Namespace) -> Progress:
+    """Train or continue, and write ``OUT/prior``.
+
+    Args:
+        options: from ``parse``.
+
+    Returns:
+        Counters at the end.
+    """
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    accelerator = Accelerator(mixed_precision="bf16", cpu=options.device == "cpu")
+    options.cache = options.cache or options.out / "cache"
+    options.out.mkdir(parents=True, exist_ok=True)
+    workers = _start_renderers(options) if accelerator.is_main_process else []
+    try:
+        return _train(options, accelerator)
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.wait()
+
+
+def _start_renderers(options: argparse.Namespace) -> list[subprocess.Popen]:
+    """Background processes that fill the cache; they stop when this process is gone."""
+    command = [sys.executable, "-m", "geodiff_plugin.bundled.data", "--cache", str(options.cache)]
+    command += ["--stop", str(-(-options.scenes // 16)), "--step", str(options.renderers)]
+    command += ["--parent", str(os.getpid())]
+    return [subprocess.Popen([*command, "--first", str(k)]) for k in range(options.renderers)]
+
+
+def _prepare_models(options: argparse.Namespace, accelerator: Accelerator):
+    """Autoencoder (trained first, on the main process), U-Net, text embedding, text parts."""
+    set_seed(options.seed)
+    if options.init_from:
+        start = open_pipeline(options.init_from)
+        vae, unet, text = start.vae, start.unet.train(), (start.text_encoder, start.tokenizer)
+        vae.requires_grad_(False)
+        if accelerator.is_main_process:
+            save_vae(vae, options.out / "vae.safetensors")
+        return vae.to(accelerator.device), unet, text
+    text, unet = build_text(), build_unet()
+    device = accelerator.device
+    if accelerator.is_main_process:
+        minutes = options.vae_minutes
+        train_vae(
+            options.out, options.cache, 60 * minutes, device, options.seed, iterations=options.vae_steps
+        )
+    accelerator.wait_for_everyone()
+    return train_vae(options.out, options.cache, 0.0, device, options.seed), unet, text
+
+
+def _wait_for_scenes(options: argparse.Namespace) -> None:
+    while 16 * len(shards(options.cache)) < min(options.first_scenes, options.scenes):
+        time.sleep(0.5)
+
+
+def _train(options: argparse.Namespace, accelerator: Accelerator) -> Progress:
+    _wait_for_scenes(options)
+    vae, unet, text = _prepare_models(options, accelerator)
+    average = Average(unet.to(accelerator.device), options.average)
+    optimiser = torch.optim.AdamW(unet.parameters(), lr=options.rate, betas=(0.9, 0.99), weight_decay=1e-3)
+    progress = restore(options.out, unet, average, optimiser) or Progress(seed=options.seed)
+    network, prepared = accelerator.prepare(unet, optimiser)
+    embedding = _embed(text).to(accelerator.device)
+    scheduler = build_scheduler()
+    scheduler.alphas_cumprod = scheduler.alphas_cumprod.to(accelerator.device)
+    reporter = Reporter(options, assemble(vae, build_unet().to(accelerator.device).eval(), text))
+    started, base = time.monotonic(), progress.seconds
+    generator = torch.Generator().manual_seed(options.seed + 7919 * progress.step + accelerator.process_index)
+    pool, bar, main_process = (
+        None,
+        tqdm(total=1000, unit="permille", mininterval=10, disable=not accelerator.is_main_process),
+        False,
+    )
+    while True:
+        progress.seconds = base + time.monotonic() - started
+        spent = progress.step / options.steps if options.steps else progress.seconds / (3600 * options.hours)
+        fraction = float(accelerator.reduce(torch.tensor(spent, device=accelerator.device), "mean"))
+        main_process = accelerator.is_main_process
+        if main_process and (fraction >= 1 or reporter.due(progress)):
+            store(options.out, unet, average, optimiser, progress)
+            reporter.report(progress, average, last=fraction >= 1)
+        if fraction >= 1:
+            break
+        stage = stage_at(fraction, continued=options.init_from is not None)
+        pool = _pool_for(stage.divisor, pool, options, vae, accelerator)
+        if progress.step % 50 == 0 or not len(pool):
+            pool.refresh(4 if len(pool) else 8)
+        size = max(options.batch // (1 if stage.divisor == 2 else 2), 1)
+        image, depth = (x.to(accelerator.device) for x in pool.batch(size, generator))
+        noise = torch.randn(depth.shape, generator=generator).to(depth.device)
+        timesteps = draw_timesteps(size, stage.last, generator).to(depth.device)
+        loss = diffusion_loss(network, scheduler, image, depth, embedding, timesteps, noise)
+        for group in optimiser.param_groups:
+            group["lr"] = learning_rate(options.rate, fraction, progress.step)
+        accelerator.backward(loss)
+        accelerator.clip_grad_norm_(network.parameters(), 1.0)
+        prepared.step()
+        prepared.zero_grad(set_to_none=True)
+        average.update(unet, progress.step)
+        progress.step += 1
+        progress.samples += size * accelerator.num_processes
+        reporter.loss(loss)
+        if main_process and progress.step % 20 == 0:
+            bar.update(int(1000 * fraction) - bar.n)
+            bar.set_postfix(step=progress.step, loss=f"{reporter.mean_loss:.4f}", scenes=len(pool))
+    bar.close()
+    accelerator.wait_for_everyone()
+    return progress
+
+
+def _pool_for(divisor: int, pool: LatentStore | None, options, vae, accelerator: Accelerator) -> LatentStore:
+    """The store of the stage's resolution; the other one is dropped at a switch."""
+    if pool is not None and pool.divisor == divisor:
+        return pool
+    rank, world = accelerator.process_index, accelerator.num_processes
+    variants = 2 if divisor == 2 else 1
+    return LatentStore(options.cache, vae, divisor, variants, rank, world, fresh=options.fresh)
+
+
+@torch.no_grad()
+def _embed(text) -> torch.Tensor:
+    encoder, tokenizer = text
+    ids = tokenizer("", padding="do_not_pad", max_length=77, truncation=True, return_tensors="pt").input_ids
+    return encoder.float()(ids)[0]
+
+
+if __name__ == "__main__":
+    main()
