@@ -64,7 +64,8 @@ def check_intrinsics(K: Any, name: str = "K") -> np.ndarray:
     cure = "K is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the image it comes with."
     K = _as_matrix(K, name, (3, 3), cure)
     if K[0, 0] <= 0 or K[1, 1] <= 0:
-        bad_value(f"{name}[0, 0] and {name}[1, 1] (fx, fy)", "positive focal lengths in pixels", (K[0, 0], K[1, 1]), cure)
+        got = f"{K[0, 0]:g} and {K[1, 1]:g}"
+        bad_value(f"{name}[0, 0] and {name}[1, 1] (fx, fy)", "positive focal lengths in pixels", got, cure)
     if not np.allclose(K[2], (0, 0, 1), atol=1e-6) or abs(K[1, 0]) > 1e-6:
         bad_value(name, "upper triangular with last row (0, 0, 1)", K.tolist(), cure)
     return K

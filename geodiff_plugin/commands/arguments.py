@@ -6,6 +6,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,15 @@ import torch
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 
-__all__ = ["DTYPES", "PRESETS", "DepthArguments", "Settings", "check_arguments", "pick_device"]
+__all__ = [
+    "DTYPES",
+    "PRESETS",
+    "DepthArguments",
+    "Settings",
+    "check_arguments",
+    "check_positive",
+    "pick_device",
+]
 
 DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 PRESETS = ("default", "paper")
@@ -79,6 +88,16 @@ class Settings:
     cameras: tuple[int, int] | None
 
 
+def check_positive(value: float, name: str, unit: str, cure: str = "") -> None:
+    """Refuse what is not a finite number above 0.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not (math.isfinite(value) and value > 0):
+        bad_value(name, f"a finite number of {unit} above 0", value, cure)
+
+
 def pick_device(name: str) -> torch.device:
     """The device of that name; ``"auto"`` takes CUDA, then MPS, then the CPU.
 
@@ -124,8 +143,8 @@ def _check_depth_range(near: float | None, far: float | None) -> tuple[float, fl
     if near is None or far is None:
         missing, given = ("--near", "--far") if near is None else ("--far", "--near")
         bad_value(missing, f"given together with {given}", "none", "Both in metres.")
-    check_number(near, "--near", 1e-6, 1e6)
-    check_number(far, "--far", 1e-6, 1e6)
+    check_positive(near, "--near", "metres")
+    check_positive(far, "--far", "metres")
     if near >= far:
         bad_value("--near", "less than --far", f"{near:g} and {far:g}", "Both are metres from the camera.")
     return near, far

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value, check_intrinsics, check_intrinsics_fit, check_pose
-from geodiff_plugin.commands.arguments import DepthArguments, Settings
+from geodiff_plugin._checks import bad_value, check_intrinsics, check_intrinsics_fit, check_number, check_pose
+from geodiff_plugin.commands.arguments import DepthArguments, Settings, check_positive
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, rig_from_parameters
 from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
@@ -21,6 +21,7 @@ from geodiff_plugin.types import Rig
 __all__ = ["Inputs", "read_inputs", "read_rig"]
 
 CALIBRATION_WAYS = "--calib FILE, or --fx --fy --cx --cy --baseline, or --K FILE --E FILE"
+MOST_PIXELS = 1e6
 PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
 
 
@@ -86,13 +87,15 @@ def _rig_from_options(arguments: DepthArguments, size: tuple[int, int]) -> Rig:
             "given as well, with "
             + " ".join(f"--{name}" for name in PARAMETERS if f"--{name}" not in missing),
             "nothing",
-            f"--fy is --fx where pixels are square; --cx, --cy are near the image's centre, {centre[0]:g} and "
-            f"{centre[1]:g} here; --baseline is the distance of the cameras in metres.",
+            f"--fy is --fx where pixels are square; --cx, --cy are near the centre, here {centre[0]:g} and "
+            f"{centre[1]:g}; --baseline is the distance of the cameras in metres.",
         )
-    if values["baseline"] == 0:
-        bad_value(
-            "--baseline", "the distance of the cameras in metres", 0, "Without one two views carry no scale."
-        )
+    check_positive(values["fx"], "--fx", "pixels")
+    check_positive(values["fy"], "--fy", "pixels")
+    check_number(values["cx"], "--cx", -MOST_PIXELS, MOST_PIXELS)
+    check_number(values["cy"], "--cy", -MOST_PIXELS, MOST_PIXELS)
+    cure = "Two views from one place carry no scale; if the right camera is the left one, swap the images."
+    check_positive(values["baseline"], "--baseline", "metres", cure)
     return rig_from_parameters(*values.values())
 
 
@@ -100,15 +103,11 @@ def _rig_from_matrices(arguments: DepthArguments) -> Rig:
     for option, path in (("--K", arguments.k), ("--E", arguments.e)):
         if path is None:
             bad_value(option, "given as well", "nothing", "--K and --E go together; --K-right is optional.")
-    K = check_intrinsics(read_matrix(arguments.k, "--K"), f"--K {arguments.k}")
+    K = check_intrinsics(read_matrix(arguments.k, "--K"), "--K")
     K_right = K
     if arguments.k_right is not None:
-        K_right = check_intrinsics(
-            read_matrix(arguments.k_right, "--K-right"), f"--K-right {arguments.k_right}"
-        )
-    return Rig(
-        K, K_right, check_pose(read_matrix(arguments.e, "--E"), f"--E {arguments.e}"), source=str(arguments.k)
-    )
+        K_right = check_intrinsics(read_matrix(arguments.k_right, "--K-right"), "--K-right")
+    return Rig(K, K_right, check_pose(read_matrix(arguments.e, "--E"), "--E"), source=str(arguments.k))
 
 
 def read_rig(

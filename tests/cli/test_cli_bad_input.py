@@ -1,4 +1,4 @@
-"""Every kind of bad input ends with one line that names it, exit code 2, no weights loaded, nothing written."""
+"""Bad input ends with one line that names it and exit code 2; no weights load, nothing is written."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def refused(geodiff, pair_files):
         (["--steps", 0], ["--steps", "between 1", "0"]),
         (["--steps", -3], ["--steps", "-3"]),
         (["--ensemble", 0], ["--ensemble"]),
-        (["--resolution", 100], ["--resolution", "multiple of 8", "104"]),
+        (["--resolution", 100], ["--resolution", "multiple of 8", "Try 96"]),
         (["--resolution", 8], ["--resolution", "32"]),
         (["--near", 5, "--far", 2], ["--near", "--far", "5", "2"]),
         (["--near", 2, "--far", 2], ["--near"]),
@@ -103,13 +103,14 @@ def test_parameters(refused, pair_files, changes, words):
 
 
 def test_missing_file(refused, pair_files):
+    calib = ["--calib", pair_files.calib]
     refused(
         ["depth", "nothing.png", pair_files.right, "--calib", pair_files.calib],
         "LEFT",
         "nothing.png",
         "exist",
     )
-    refused(["depth", pair_files.left, "nothing.png", "--calib", pair_files.calib], "RIGHT", "nothing.png")
+    refused(["depth", pair_files.left, "nothing.png", *calib], "RIGHT", "nothing.png")
     refused([*pair_files.images, "--calib", "nothing.txt"], "calibration", "nothing.txt")
 
 
