@@ -186,8 +186,8 @@ def versus_table(records: Sequence[dict[str, Any]], reference: str) -> Table:
     )
 
 
-def pairs_tables(records: Sequence[dict[str, Any]]) -> list[Table]:
-    """The tables of ``geodiff eval pairs``."""
+def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -> list[Table]:
+    """The tables of ``geodiff eval pairs``; ``reference`` is the method that the others are compared with."""
     count = len({_label(record) for record in records})
     tables = [
         per_pair_table(
@@ -195,13 +195,13 @@ def pairs_tables(records: Sequence[dict[str, Any]]) -> list[Table]:
             f"AbsRel of {count} pairs",
             headline,
             3,
-            "All pixels with truth, no cap; metres as they come out, without any alignment, but for the "
-            "columns of methods that know relative depth only ('oracle'): scale and shift come from the truth.",
+            "All pixels with truth, no cap; metres as they come out, not aligned, but for the columns of "
+            "methods that know relative depth only ('oracle'), which get scale and shift from the truth.",
         ),
         per_pair_table(records, "Seconds", lambda record: record["seconds"], 1, ""),
     ]
-    if any(record["method"] == "guided" for record in records):
-        tables.append(versus_table(records, "guided"))
+    if any(record["method"] == reference for record in records):
+        tables.append(versus_table(records, reference))
     for group, members in groups(records).items():
         tables.append(summary_table(records, "raw", members, f"Not aligned, {group}"))
         tables.append(summary_table(records, "aligned", members, f"Aligned by least squares, {group}"))

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.evaluation.datasets import DATASETS, StereoSample, find_pairs, load, load_pairs
+from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, find_pairs, load, load_pairs
 from geodiff_plugin.evaluation.datasets.mvsnet import find_mvsnet
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.formats import write_depth_mm_png, write_pfm
@@ -368,10 +368,24 @@ def test_folder_takes_depth_in_three_formats(tmp_path):
 
 
 def test_root_must_be_a_folder(tmp_path):
-    with pytest.raises(ValueError, match="root must be an existing folder"):
+    with pytest.raises(ValueError, match="root must be an existing folder or synthetic:N"):
         find_pairs(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="datasets must be one of kitti2015"):
         find_pairs(tmp_path, ["kitty"])
+
+
+def test_synthetic_pairs_are_seeded_and_alternate(tmp_path):
+    refs = find_pairs(Path("synthetic:3+4"))
+    assert [ref.files["seed"] for ref in refs] == [4, 5, 6]
+    assert find_pairs(tmp_path, ["synthetic"]) == []
+    small = [SampleRef(ref.dataset, ref.name, ref.files | {"size": (48, 64)}) for ref in refs[:2]]
+    rectified, posed = (load(ref) for ref in small)
+    assert rectified.rectified and not posed.rectified
+    for sample in (rectified, posed):
+        assert sample.left.dtype == np.uint8 and sample.left.shape == (48, 64, 3)
+        assert sample.valid.any() and (sample.depth_m[sample.valid] > 0).all()
+        assert sample.occluded.shape == sample.material.shape == (48, 64)
+    np.testing.assert_array_equal(load(small[0]).left, rectified.left)
 
 
 REAL = Path(os.environ.get("GEODIFF_TEST_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
@@ -382,7 +396,7 @@ def real_refs():
 
 
 def photometric_error(sample, factor):
-    """Mean absolute difference between the left image and the right one warped by ``factor`` times the truth."""
+    """Mean absolute difference to the left image of the right one, warped by ``factor`` times the truth."""
     from geodiff_plugin.geometry.warping import warp_right_to_left
 
     left, right = (

@@ -17,12 +17,23 @@ from geodiff_plugin.evaluation.datasets.kitti2015 import KITTI2015
 from geodiff_plugin.evaluation.datasets.middlebury import ETH3D, MIDDEVAL3, MIDDLEBURY2014
 from geodiff_plugin.evaluation.datasets.mvsnet import MVSNET
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
+from geodiff_plugin.evaluation.datasets.synthetic import SYNTHETIC
 
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load", "load_pairs"]
 
 DATASETS: dict[str, Dataset] = {
     dataset.name: dataset
-    for dataset in (KITTI2015, KITTI2012, MIDDLEBURY2014, MIDDEVAL3, ETH3D, BOOSTER, MVSNET, FOLDER)
+    for dataset in (
+        KITTI2015,
+        KITTI2012,
+        MIDDLEBURY2014,
+        MIDDEVAL3,
+        ETH3D,
+        BOOSTER,
+        MVSNET,
+        FOLDER,
+        SYNTHETIC,
+    )
 }
 """Every data set by name, in the order in which results are listed."""
 
@@ -36,7 +47,7 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None) -> list[
     """References to every metric pair below ``root``, in the table's order.
 
     Args:
-        root: folder that holds one or several data sets in their official layouts.
+        root: folder that holds one or several data sets in their official layouts, or ``synthetic:N``.
         datasets: names to look for; all by default.
 
     Returns:
@@ -46,13 +57,13 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None) -> list[
         ValueError: ``root`` is not a folder, or a name is not in ``DATASETS``.
     """
     root = Path(root)
-    if not root.is_dir():
-        bad_value("root", "an existing folder", str(root))
     refs = []
     for name in DATASETS if datasets is None else datasets:
         if name not in DATASETS:
             bad_value("datasets", f"one of {', '.join(DATASETS)}", repr(name))
         refs += DATASETS[name].find(root)
+    if not refs and not root.is_dir():
+        bad_value("root", "an existing folder or synthetic:N", str(root))
     return refs
 
 

@@ -1,0 +1,83 @@
+"""Our own renderer as a data set: unlimited, seeded, with exact depth, occlusion and material.
+
+Hop: seeds -> references -> ``StereoSample``.
+Paper: stands in where its data sets cannot be shown (S5.2, S5.3).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample, is_rectified
+from geodiff_plugin.synthetic import render_pair
+
+__all__ = ["SYNTHETIC", "find_synthetic", "load_synthetic"]
+
+SIZE = (384, 512)
+_ROOT = re.compile(r"synthetic:(\d+)(?:\+(\d+))?")
+
+
+def find_synthetic(root: Path) -> list[SampleRef]:
+    """References to rendered pairs.
+
+    Args:
+        root: ``synthetic:N`` for N pairs from seed 0 on, ``synthetic:N+S`` for N from seed S on; any other
+            path holds none. Even seeds give rectified pairs, odd ones a general pose.
+    """
+    asked = _ROOT.fullmatch(str(root))
+    if asked is None:
+        return []
+    first = int(asked[2] or 0)
+    return [
+        SampleRef("synthetic", f"seed{seed:04d}", {"seed": seed, "posed": seed % 2 == 1, "size": SIZE})
+        for seed in range(first, first + int(asked[1]))
+    ]
+
+
+def _image(image_01: torch.Tensor) -> np.ndarray:
+    return np.rint(image_01.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+
+
+def load_synthetic(ref: SampleRef) -> StereoSample:
+    """Render one pair.
+
+    Args:
+        ref: ``files`` holds ``seed``, ``posed`` and ``size`` (H, W).
+
+    Returns:
+        The sample, with camera effects and different exposures; ``material`` has Booster's meaning of 2 and 3
+        (mirror, glass).
+    """
+    pair = render_pair(
+        ref.files["seed"], size=ref.files["size"], posed=ref.files["posed"], exposure=True, effects=True
+    )
+    valid = pair.left.valid[0].numpy()
+    K_left, K_right, E = (matrix.numpy() for matrix in (pair.K_left, pair.K_right, pair.E))
+    return StereoSample(
+        dataset=ref.dataset,
+        name=ref.name,
+        left=_image(pair.left.image_01),
+        right=_image(pair.right.image_01),
+        K_left=K_left,
+        K_right=K_right,
+        E=E,
+        depth_m=np.where(valid, pair.left.depth_m[0].numpy(), 0).astype(np.float32),
+        valid=valid,
+        occluded=valid & pair.occluded[0].numpy(),
+        material=pair.left.material[0].numpy().astype(np.uint8),
+        rectified=is_rectified(K_left, K_right, E),
+        notes={"truth": "exact", "kind": pair.kind},
+    )
+
+
+SYNTHETIC = Dataset(
+    name="synthetic",
+    find=find_synthetic,
+    load=load_synthetic,
+    cap_m=None,
+    obtain="rendered by this package, offline: give synthetic:N (or synthetic:N+FIRST_SEED) as DIR.",
+)

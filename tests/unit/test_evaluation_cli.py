@@ -1,0 +1,80 @@
+"""The eval commands on own images in Middlebury's layout, with the method that needs no prior."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from geodiff_plugin.evaluation.cli import eval_app
+from geodiff_plugin.formats import write_pfm
+
+SHIFT = 8
+
+
+@pytest.fixture
+def data(tmp_path):
+    """Two scenes of a fronto-parallel textured wall, 8 px of disparity, 1.25 m away."""
+    for seed, name in enumerate(("one", "two")):
+        scene = tmp_path / "data" / name
+        scene.mkdir(parents=True)
+        wide = np.random.default_rng(seed).integers(0, 256, (48, 160, 3), dtype=np.uint8)
+        Image.fromarray(wide[:, :144]).save(scene / "im0.png")
+        Image.fromarray(wide[:, SHIFT : SHIFT + 144]).save(scene / "im1.png")
+        write_pfm(scene / "disp0.pfm", np.full((48, 144), SHIFT, np.float32))
+        (scene / "calib.txt").write_text(
+            "cam0=[100 0 72; 0 100 24; 0 0 1]\ncam1=[100 0 72; 0 100 24; 0 0 1]\ndoffs=0\nbaseline=100\n"
+            "width=144\nheight=48\nndisp=16\n"
+        )
+    return tmp_path / "data"
+
+
+def invoke(*words):
+    return CliRunner().invoke(eval_app, [str(word) for word in words], catch_exceptions=False)
+
+
+def test_pairs_writes_every_table_and_prints_it(data, tmp_path):
+    out, page = tmp_path / "out", tmp_path / "docs" / "results.md"
+    result = invoke("pairs", data, "--methods", "sgbm", "--out", out, "--results", page)
+    assert result.exit_code == 0
+    assert "| middlebury2014/one |" in result.stdout and "mean of all 2" in result.stdout
+    assert page.read_text() == (out / "table.md").read_text()
+    assert f"geodiff eval pairs {data} --methods sgbm" in page.read_text()
+    assert r"\toprule" in (out / "table.tex").read_text()
+    facts = json.loads((out / "table.json").read_text())
+    assert facts["versions"]["torch"] and facts["tables"][0]["header"] == ["pair", "SGBM + fill"]
+    lines = [json.loads(line) for line in (out / "samples.jsonl").read_text().splitlines()]
+    assert [line["sample"] for line in lines] == ["one", "two"]
+    assert all(line["all_pixels"]["raw"]["abs_rel"] < 0.05 for line in lines)
+
+
+def test_pairs_selects_scenes(data, tmp_path):
+    result = invoke("pairs", data, "--methods", "sgbm", "--scenes", "two", "-o", tmp_path / "out", "-q")
+    assert result.exit_code == 0 and result.stdout == ""
+    assert len((tmp_path / "out" / "samples.jsonl").read_text().splitlines()) == 1
+    with pytest.raises(ValueError, match="a sample with three in its name"):
+        invoke("pairs", data, "--methods", "sgbm", "--scenes", "three", "-o", tmp_path / "out")
+
+
+def test_pairs_names_bad_options(data, tmp_path):
+    with pytest.raises(ValueError, match="methods"):
+        invoke("pairs", data, "--methods", "magic", "-o", tmp_path / "out")
+    with pytest.raises(ValueError, match="limit must be at least 1"):
+        invoke("pairs", data, "--methods", "sgbm", "--limit", 0, "-o", tmp_path / "out")
+
+
+def test_pairs_goes_on_after_a_broken_sample_on_request(data, tmp_path):
+    (data / "one" / "im1.png").unlink()
+    words = ("pairs", data, "--methods", "sgbm", "-o", tmp_path / "out")
+    with pytest.raises(FileNotFoundError, match=r"im1\.png"):
+        invoke(*words)
+    result = invoke(*words, "--skip-broken")
+    assert "1 broken samples were skipped" in result.stdout and "im1.png" in result.stdout
+
+
+def test_list_tells_what_is_there(data):
+    found = invoke("list", "--data", data).stdout
+    assert "middlebury2014  2 samples" in found and "kitti2015       not found" in found
+    assert "https://" in found and "guided" in found
+    assert "no --data given" in invoke("list").stdout

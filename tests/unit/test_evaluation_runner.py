@@ -1,0 +1,263 @@
+"""Scoring, resuming, statistics and tables, with methods that cost nothing."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geodiff_plugin.evaluation import runner
+from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, Settings
+from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
+from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
+from geodiff_plugin.evaluation.runner import headline, run
+from geodiff_plugin.evaluation.scoring import out_of_view, regions, score
+from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
+from geodiff_plugin.evaluation.tables import pairs_tables
+
+SHAPE = (6, 8)
+K = np.array([[10.0, 0, 3.5], [0, 10.0, 2.5], [0, 0, 1]])
+
+
+def make_sample(name="a", rectified=True, **changes) -> StereoSample:
+    E = np.eye(4)
+    E[0, 3] = 0.5
+    image = np.zeros((*SHAPE, 3), np.uint8)
+    depth_m = np.full(SHAPE, 2.0, np.float32)
+    depth_m[:, :2] = 5.0
+    given = {
+        "K_left": K,
+        "K_right": K,
+        "E": E,
+        "depth_m": depth_m,
+        "valid": depth_m > 0,
+        "rectified": rectified,
+    }
+    return StereoSample("middlebury2014", name, image, image, **(given | changes))
+
+
+def make_method(name, answer, calls, configuration=None):
+    def measure(sample, settings, priors):
+        calls.append((name, sample.name))
+        return answer(sample)
+
+    return Method(name, name, name, measure, lambda settings: configuration or {}, uses_prior=False)
+
+
+@pytest.fixture
+def bench(monkeypatch, tmp_path):
+    """Two methods, three samples (the last one posed); returns ``go(**keywords)`` and the list of calls."""
+    calls = []
+
+    def rectified_only(sample):
+        if not sample.rectified:
+            raise NotApplicable("not rectified")
+        return Prediction(depth_m=2 * sample.depth_m)
+
+    methods = {
+        "exact": make_method("exact", lambda s: Prediction(depth_m=s.depth_m.astype(float)), calls),
+        "double": make_method("double", rectified_only, calls),
+    }
+    samples = {name: make_sample(name, name != "c") for name in "abc"}
+    monkeypatch.setattr(runner, "METHODS", methods)
+    monkeypatch.setattr("geodiff_plugin.evaluation.tables.METHODS", methods)
+    monkeypatch.setattr(runner, "load", lambda ref: samples[ref.name])
+    refs = [SampleRef("middlebury2014", name, {"left": Path(name)}) for name in samples]
+
+    def go(**keywords):
+        calls.clear()
+        return run(refs, ["exact", "double"], Settings(), tmp_path, progress=False, **keywords)
+
+    return go, calls, methods, samples, tmp_path / runner.RECORDS_NAME
+
+
+def test_score_of_a_perfect_map_and_its_double():
+    sample = make_sample()
+    exact = score(sample, Prediction(depth_m=sample.depth_m), cap_m=None)
+    assert exact["all_pixels"]["raw"]["abs_rel"] == 0 and exact["disparity"]["epe"] == pytest.approx(
+        0, abs=1e-6
+    )
+    double = score(sample, Prediction(depth_m=2 * sample.depth_m), cap_m=None)
+    assert double["all_pixels"]["raw"]["abs_rel"] == pytest.approx(1)
+    assert double["capped"]["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6)
+
+
+def test_score_keeps_capped_and_all_pixels_apart():
+    sample = make_sample()
+    record = score(sample, Prediction(depth_m=np.full(SHAPE, 4.0)), cap_m=3.0)
+    assert record["all_pixels"]["raw"]["pixels"] == 48 and record["capped"]["raw"]["pixels"] == 36
+    assert record["capped"]["raw"]["abs_rel"] == pytest.approx(0.5)  # clipped from 4 to the cap of 3
+
+
+def test_score_of_relative_depth_has_no_raw_column():
+    sample = make_sample()
+    record = score(sample, Prediction(None, relative=0.1 * sample.depth_m + 0.3), cap_m=None)
+    assert record["all_pixels"]["raw"] is None and record["disparity"] is None
+    assert record["all_pixels"]["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6)
+    assert headline({"status": "ok"} | record) == pytest.approx(0, abs=1e-6)
+
+
+def test_score_refuses_a_map_of_another_shape_and_a_sample_without_truth():
+    with pytest.raises(ValueError, match="prediction.depth_m must be of the left image's shape"):
+        score(make_sample(), Prediction(depth_m=np.ones((3, 3))), None)
+    blind = make_sample(valid=np.zeros(SHAPE, bool))
+    with pytest.raises(ValueError, match="the truth of middlebury2014/a"):
+        score(blind, Prediction(depth_m=np.ones(SHAPE)), None)
+
+
+def test_regions_split_what_the_right_camera_sees():
+    occluded = np.zeros(SHAPE, bool)
+    occluded[2, 5] = True
+    material = np.zeros(SHAPE, np.uint8)
+    material[:, 6:] = 3
+    sample = make_sample(occluded=occluded, material=material)
+    # Shift f b / z: 1 px at 5 m (columns 0, 1), 2.5 px at 2 m: column 0 leaves, and column 2 falls on -0.5.
+    assert out_of_view(sample)[0].tolist() == [True] + [False] * 7
+    masks = regions(sample)
+    assert masks["occluded"].sum() == 1 and masks["visible"].sum() == 48 - 6 - 1
+    assert masks["material_3"].sum() == 12
+    assert set(score(sample, Prediction(depth_m=sample.depth_m), None)["regions"]) == set(masks)
+
+
+def test_uncertainty_is_scored():
+    sample = make_sample()
+    pred = sample.depth_m + np.arange(48).reshape(SHAPE) / 100
+    record = score(sample, Prediction(depth_m=pred, uncertainty=np.abs(pred / sample.depth_m - 1)), None)
+    assert record["ause"] == pytest.approx(0, abs=1e-9)
+
+
+def test_run_measures_everything_once_and_resumes(bench):
+    go, calls, _, _, path = bench
+    first = go()
+    assert len(calls) == 6 and [r["status"] for r in first].count("not applicable") == 1
+    assert go() == first and calls == []
+    assert len(read_records(path)) == 6
+
+
+@pytest.mark.parametrize("cut", [2, 40, 400])
+def test_killed_run_does_only_what_is_missing(bench, cut):
+    go, calls, _, _, path = bench
+    first = go()
+    os.truncate(path, path.stat().st_size - cut)
+    whole = path.read_bytes().count(b"\n")
+    again = go()
+    assert len(calls) == 6 - whole
+    drop = {"seconds"}
+    assert [{k: v for k, v in r.items() if k not in drop} for r in again] == [
+        {k: v for k, v in r.items() if k not in drop} for r in first
+    ]
+    assert all(json.loads(line) for line in path.read_text().splitlines())
+
+
+def test_another_configuration_is_another_result(bench):
+    go, calls, methods, _, _ = bench
+    go()
+    methods["double"] = make_method("double", lambda s: Prediction(3 * s.depth_m), calls, {"factor": 3})
+    records = go()
+    assert {name for name, _ in calls} == {"double"} and len(calls) == 3
+    assert headline(records[1]) == pytest.approx(2)
+
+
+def test_broken_sample_stops_or_is_counted_and_tried_again(bench, monkeypatch):
+    go, calls, _, samples, path = bench
+
+    def fails(ref):
+        if ref.name == "b":
+            raise FileNotFoundError("left.png is missing")
+        return samples[ref.name]
+
+    monkeypatch.setattr(runner, "load", fails)
+    with pytest.raises(FileNotFoundError, match=r"left\.png"):
+        go()
+    records = go(skip_broken=True)
+    assert [r["status"] for r in records] == ["ok", "ok", "broken", "broken", "ok", "not applicable"]
+    assert records[2]["error"] == "left.png is missing"
+    monkeypatch.setattr(runner, "load", lambda ref: samples[ref.name])
+    assert [r["status"] for r in go()] == ["ok"] * 5 + ["not applicable"]
+    assert {name for _, name in calls} == {"b"}
+    assert all(record["status"] != "broken" for record in read_records(path))
+
+
+def test_depth_maps_are_saved_on_request(bench):
+    go, _, _, samples, path = bench
+    go(save_depth=True)
+    saved = np.load(path.parent / "depth" / "double" / "middlebury2014_a.npy")
+    np.testing.assert_array_equal(saved, 2 * samples["a"].depth_m)
+    assert not (path.parent / "depth" / "double" / "middlebury2014_c.npy").exists()
+
+
+def test_tables_hold_pairs_means_and_differences(bench):
+    pairs, seconds, versus, *summaries = pairs_tables_of(bench[0]())
+    assert pairs.header == ("pair", "exact", "double")
+    assert pairs.rows[0] == ("middlebury2014/a", "0.000", "1.000")
+    assert pairs.rows[2] == ("middlebury2014/c", "0.000", "-")
+    means = {row[0]: row[1:] for row in pairs.rows[3:]}
+    assert means["mean of all 3"] == ("0.000", "-")
+    assert means["mean of 2 rectified"] == ("0.000", "1.000") and means["mean of 1 posed"] == ("0.000", "-")
+    assert versus.rows == (("double", "2", "-1.000", "2 of 2"),)
+    assert "| middlebury2014/a | 0.000 | 1.000 |" in pairs.markdown()
+    assert r"middlebury2014/a & 0.000 & 1.000 \\" in pairs.latex()
+    assert any("Aligned" in table.title for table in summaries)
+
+
+def pairs_tables_of(records):
+    return pairs_tables(records, reference="exact")
+
+
+def test_key_depends_on_everything_but_where_the_files_lie():
+    ref = SampleRef("mvsnet", "scan", {"group": Path("/here/scan"), "left": 0, "right": 1})
+    moved = SampleRef("mvsnet", "scan", {"group": Path("/there/scan"), "left": 0, "right": 1})
+    base = (ref, "guided", {"seed": 0}, "bundled 12", "0.1.0")
+    key = record_key(*base)
+    assert key == record_key(moved, *base[1:])
+    others = [
+        (SampleRef("mvsnet", "scan", ref.files | {"right": 2}), *base[1:]),
+        (ref, "paper", *base[2:]),
+        (ref, "guided", {"seed": 1}, *base[3:]),
+        (*base[:3], "bundled 13", "0.1.0"),
+        (*base[:4], "0.2.0"),
+    ]
+    assert len({key, *(record_key(*other) for other in others)}) == 6
+
+
+def test_cleaning_leaves_a_clean_file_alone(tmp_path):
+    path = tmp_path / "samples.jsonl"
+    clean_records(path)
+    assert not path.exists()
+    append_record(path, {"key": "1"})
+    before = path.stat().st_mtime_ns
+    clean_records(path)
+    assert path.stat().st_mtime_ns == before
+    append_record(path, {"key": "2", "status": "broken"})
+    with open(path, "a") as file:
+        file.write('{"key": "3", "torn')
+    clean_records(path)
+    assert path.read_text() == '{"key": "1"}\n'
+
+
+def test_interval_covers_the_mean_and_needs_five():
+    assert mean_with_interval([1, 2, 3, 4]).low is None
+    mean = mean_with_interval([1, 2, 3, 4, 5])
+    assert mean.low < mean.value == 3 < mean.high
+    assert mean == mean_with_interval([1, 2, 3, 4, 5])
+    same = mean_with_interval([2.0] * 6)
+    assert (same.low, same.value, same.high) == (2, 2, 2)
+
+
+def test_interval_width_is_that_of_the_normal_theory():
+    values = np.random.default_rng(3).normal(size=400)
+    mean = mean_with_interval(values)
+    assert mean.high - mean.low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
+
+
+def test_paired_difference_uses_the_shared_images_only():
+    difference = paired_difference({"a": 1.0, "b": 3.0}, {"b": 1.0, "c": 9.0})
+    assert (difference.value, difference.count) == (2, 1)
+
+
+def test_settings_are_checked():
+    with pytest.raises(ValueError, match="ensemble must be at least 1"):
+        Settings(ensemble=0)
+    with pytest.raises(ValueError, match="dtype"):
+        Settings(dtype="int8")
