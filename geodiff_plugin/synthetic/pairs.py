@@ -63,9 +63,7 @@ def _clear_of(scene: Scene, point: torch.Tensor, gap: float) -> Scene:
     local = ((linear @ point.float()) + offset) * scene.half
     outside = (local.abs() - scene.half).clamp_min(0).square().sum(-1).sqrt()
     keep = scene.fixed | (outside > gap)
-    n = scene.shape.shape[0]
-    fields = {k: v[keep] for k, v in vars(scene).items() if torch.is_tensor(v) and v.dim() and v.shape[0] == n and k in _PER_PRIMITIVE}
-    return replace(scene, **fields)
+    return _select(scene, keep)
 
 
 _PER_PRIMITIVE = frozenset({"shape", "world_to_local", "half", "taper", "centre", "radius", "material", "layer", "tile_m",
@@ -88,6 +86,24 @@ def _relative_pose(rng: np.random.Generator, baseline: float, rotation_deg: floa
         angle = np.linalg.norm(axis)
         pose[:3, :3] = pose[:3, :3] @ (np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross)
     return pose
+
+
+def _select(scene: Scene, keep: torch.Tensor) -> Scene:
+    """The scene with only some of its primitives."""
+    return replace(scene, **{name: getattr(scene, name)[keep] for name in _PER_PRIMITIVE})
+
+
+def _in_sight(scene: Scene, size: tuple[int, int], K: torch.Tensor, margin_m: float) -> Scene:
+    """Leave out movable primitives outside of the view by more than a margin: they only cast shadows or mirror."""
+    pose = scene.T_world_from_camera
+    p = (scene.centre - pose[:3, 3]) @ pose[:3, :3]
+    reach = scene.radius + margin_m
+    keep = p[:, 2] > -reach
+    for axis in (0, 1):
+        tangent = float((size[1 - axis] / 2 + 1) / K[axis, axis])
+        # Distance to the side planes of the frustum.
+        keep &= (p[:, axis].abs() - tangent * p[:, 2]) / (1 + tangent**2) ** 0.5 < reach
+    return _select(scene, keep | scene.fixed)
 
 
 @torch.no_grad()
@@ -203,6 +219,7 @@ def _pair_effects(rng, effects, exposure: bool) -> tuple[CameraEffects, CameraEf
     return left, replace(right, gain=right.gain * drift) if exposure else right
 
 
+_SIGHT_MARGIN_M = 1.5
 _CHUNK = {"cpu": 2, "cuda": 32}
 
 
@@ -239,6 +256,7 @@ def render_mono(
         for scene, rng in zip(scenes, rngs, strict=True):
             fov = float(np.clip(scene.fov_deg * np.exp(rng.normal(0, 0.12)), 30, 95))
             cameras.append(Camera(intrinsics(size, fov), scene.T_world_from_camera))
+        scenes = [_in_sight(s, size, c.K, _SIGHT_MARGIN_M) for s, c in zip(scenes, cameras, strict=True)]
         linear = render_linear(scenes, cameras, list(range(len(part))), size, device)
         effects = [sample_effects(rng) if augment else CameraEffects() for rng in rngs]
         _, gain = expose(linear.radiance)

@@ -70,17 +70,17 @@ def _bounce(world: World, light: Lighting, table: Atlas, rays: Bundles, hit: Sha
     base = hit.radiance * (1 - hit.mirror - hit.through)
     direction = rays.direction * rays.direction.square().sum(0).rsqrt()
     mirrored = direction - 2 * (direction * hit.normal).sum(0) * hit.normal
-    extra = torch.zeros_like(base)
-    for weight, way in ((hit.mirror, mirrored), (hit.through, direction)):
-        (some,) = (weight > 0).any(-1).nonzero(as_tuple=True)
-        if some.numel() == 0:
-            continue
-        w = weight[some]
-        part = Bundles(rays.scene[some], hit.point[:, some], way[:, some], (w > 0) * _FAR, prim[some])
-        t, other = nearest(world, part)
-        seen = shade(world, light, table, part, t, other, pixel[some] * 3, first=False)
-        extra[:, some] += seen.radiance * w
-    return base + extra
+    (reflects,) = (hit.mirror > 0).any(-1).nonzero(as_tuple=True)
+    (passes,) = (hit.through > 0).any(-1).nonzero(as_tuple=True)
+    some = torch.cat([reflects, passes])
+    if some.numel() == 0:
+        return base
+    weight = torch.cat([hit.mirror[reflects], hit.through[passes]])
+    way = torch.cat([mirrored[:, reflects], direction[:, passes]], 1)
+    part = Bundles(rays.scene[some], hit.point[:, some], way, (weight > 0) * _FAR, prim[some])
+    t, other = nearest(world, part)
+    seen = shade(world, light, table, part, t, other, pixel[some] * 3, first=False)
+    return base.index_add_(1, some, seen.radiance * weight)
 
 
 def _untile(x: torch.Tensor, views: int, size: tuple[int, int]) -> torch.Tensor:

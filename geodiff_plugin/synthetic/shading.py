@@ -122,7 +122,7 @@ def _albedo(atlas: Atlas, row: torch.Tensor, uv_m: torch.Tensor, footprint_m: to
     return colour, texel[2]
 
 
-def _direct(world, light, scene, point, normal, view, prim, live, shine, gloss):
+def _direct(world, light, scene, point, normal, view, prim, live, shine, gloss, shadows):
     """Diffuse light ``(3, B, P)`` and highlights ``(3, B, P)`` of all lamps and suns."""
     diffuse, highlight = torch.zeros_like(point), torch.zeros_like(point)
     for k in range(light.position.shape[1]):
@@ -144,8 +144,10 @@ def _direct(world, light, scene, point, normal, view, prim, live, shine, gloss):
                 strength = torch.where(sun, torch.ones_like(d2), strength)
         cosine = (normal * towards).sum(0).clamp_min(0)
         wanted = live & (cosine > 0) & (colour.sum(0) > 0)
-        shadow = blocked(world, Bundles(scene, origin, ray, wanted.to(point.dtype) * 0.999, prim))
-        amount = cosine * strength * (1 - shadow)
+        amount = cosine * strength
+        if k < shadows:
+            rays = Bundles(scene, origin, ray, wanted.to(point.dtype) * 0.999, prim)
+            amount = amount * (1 - blocked(world, rays))
         half = _unit(towards - view)
         peak = (normal * half).sum(0).clamp_min(0).pow(shine) * gloss
         highlight += colour * (amount * peak * (0.5 + shine * 0.06))
@@ -206,15 +208,17 @@ def shade(
     material = row[18].reshape(t.shape)
     gloss = torch.maximum(row[33], pane).reshape(t.shape)
     shine = 6 + 90 * gloss * gloss
-    diffuse, highlight = _direct(world, light, scene, point, normal, direction, prim, live, shine, gloss)
+    diffuse, highlight = _direct(world, light, scene, point, normal, direction, prim, live, shine, gloss, 99 if first else 1)
     ambient = _ambient(world, light, scene, point, normal, live, first)
     radiance = albedo * (diffuse + ambient + row[35].reshape(t.shape)) + highlight * 0.25
     # Fog pulls towards its colour; the sky keeps its own.
     fog = light.fog[scene]
     clear = torch.exp(-fog[:, 3, None] * t0 * rays.direction.square().sum(0).sqrt())
     radiance = fog[:, :3].t()[..., None] * (1 - clear) + radiance * clear
-    if not bool(live.all()):
-        radiance = torch.where(live, radiance, sky_radiance(light, atlas, scene, direction))
+    (open_,) = (~live).any(-1).nonzero(as_tuple=True)
+    if open_.numel():
+        sky = sky_radiance(light, atlas, scene[open_], direction[:, open_])
+        radiance[:, open_] = torch.where(live[open_], radiance[:, open_], sky)
     mirror, through = torch.zeros_like(t0), torch.zeros_like(t0)
     if first:
         fresnel = (1 - cosine).pow(4)

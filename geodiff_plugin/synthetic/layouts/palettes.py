@@ -35,18 +35,23 @@ _FAMILIES = {
 }
 
 
+def _linear(h: float, s: float, v: float) -> tuple[float, ...]:
+    clip = (min(max(s, 0.0), 1.0), min(max(v, 0.0), 1.0))
+    return tuple(c**2.2 for c in colorsys.hsv_to_rgb(h % 1.0, *clip))
+
+
 def colour(h: float, s: float, v: float) -> np.ndarray:
     """Linear RGB of an HSV colour given in sRGB values."""
-    return np.array(colorsys.hsv_to_rgb(h % 1.0, min(max(s, 0), 1), min(max(v, 0), 1))) ** 2.2
+    return np.array(_linear(h, s, v))
 
 
 def palette(rng: np.random.Generator, family: str) -> np.ndarray:
     """Base, second tone and accent, ``(3, 3)`` linear."""
     (h0, h1), (s0, s1), (v0, v1), shift = _FAMILIES[family]
-    h, s, v = rng.uniform(h0, h1), rng.uniform(s0, s1), rng.uniform(v0, v1)
-    second = colour(h + rng.normal(0, 0.015), s * rng.uniform(0.6, 1.2), v + shift * rng.uniform(0.4, 1.3))
-    accent = colour(rng.random(), rng.uniform(0, 0.8), rng.uniform(0.1, 0.95))
-    return np.stack([colour(h, s, v), second, accent])
+    r = rng.random(9).tolist()
+    h, s, v = h0 + (h1 - h0) * r[0], s0 + (s1 - s0) * r[1], v0 + (v1 - v0) * r[2]
+    second = _linear(h + 0.05 * (r[3] - 0.5), s * (0.6 + 0.6 * r[4]), v + shift * (0.4 + 0.9 * r[5]))
+    return np.array((_linear(h, s, v), second, _linear(r[6], 0.8 * r[7], 0.1 + 0.85 * r[8])))
 
 
 def pick(rng: np.random.Generator, *options):
