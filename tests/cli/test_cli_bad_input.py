@@ -170,15 +170,19 @@ def test_zero_baseline_in_a_file(refused, pair_files, textured_plane):
 
 def test_distortion(refused, pair_files):
     """A file of an unrectified rig: the images need undistorting first."""
-    pair_files.calib.write_text(
-        "%YAML:1.0\n---\n"
-        "M1: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]\n"
-        "D1: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n   data: [-0.3, 0.1, 0, 0, 0]\n"
-        "M2: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]\n"
-        "D2: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n   data: [-0.3, 0.1, 0, 0, 0]\n"
-        "R: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n"
-        "T: !!opencv-matrix\n   rows: 3\n   cols: 1\n   dt: d\n   data: [-0.12, 0, 0]\n"
+    entries = {
+        "M1": (3, 3, "60, 0, 31.5, 0, 60, 23.5, 0, 0, 1"),
+        "D1": (1, 5, "-0.3, 0.1, 0, 0, 0"),
+        "M2": (3, 3, "60, 0, 31.5, 0, 60, 23.5, 0, 0, 1"),
+        "D2": (1, 5, "-0.3, 0.1, 0, 0, 0"),
+        "R": (3, 3, "1, 0, 0, 0, 1, 0, 0, 0, 1"),
+        "T": (3, 1, "-0.12, 0, 0"),
+    }
+    text = "".join(
+        f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [{numbers}]\n"
+        for name, (rows, columns, numbers) in entries.items()
     )
+    pair_files.calib.write_text("%YAML:1.0\n---\n" + text)
     refused(pair_files.command, "ndistort")
 
 
