@@ -39,6 +39,13 @@ def pairs(
     ] = None,
     scenes: Annotated[str | None, typer.Option(help="Comma-separated parts of sample names to keep.")] = None,
     limit: Annotated[int | None, typer.Option(help="At most so many samples.")] = None,
+    sample: Annotated[int | None, typer.Option(help="Draw so many samples with the seed.")] = None,
+    view_pairs: Annotated[
+        str, typer.Option("--pairs", help="Of a group of posed views: default (the first two) or all.")
+    ] = "default",
+    pixel_centre: Annotated[
+        float, typer.Option(help="First pixel's centre in posed cameras; 0.5 for COLMAP's.")
+    ] = 0.0,
     prior: Annotated[str, typer.Option(help="'bundled', a hub id or a folder.")] = "bundled",
     ensemble: Annotated[int, typer.Option(help="Ensemble members.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
@@ -69,6 +76,9 @@ def pairs(
             datasets=_names(datasets),
             scenes=_names(scenes),
             limit=limit,
+            sample=sample,
+            pairs=view_pairs,
+            pixel_centre=pixel_centre,
             settings=settings,
             out=out,
             results=results,

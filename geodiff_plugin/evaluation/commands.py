@@ -6,6 +6,7 @@ Paper: S5 (experiments).
 
 from __future__ import annotations
 
+import random
 import shlex
 import sys
 from collections.abc import Sequence
@@ -38,6 +39,9 @@ class PairsOptions:
         datasets: names in ``DATASETS``, empty for all.
         scenes: parts of sample names to keep, empty for all.
         limit: at most so many samples; ``None`` for all.
+        sample: so many samples drawn at random with the settings' seed; ``None`` for all.
+        pairs: which pairs of a group of posed views, ``"default"`` or ``"all"``.
+        pixel_centre: coordinate of the first pixel's centre in posed cameras; 0.5 for COLMAP's.
         settings: what every method is given.
         out: folder of the records and tables.
         results: Markdown page to write beside; ``None`` for none.
@@ -51,6 +55,9 @@ class PairsOptions:
     datasets: tuple[str, ...]
     scenes: tuple[str, ...]
     limit: int | None
+    sample: int | None
+    pairs: str
+    pixel_centre: float
     settings: Settings
     out: Path
     results: Path | None
@@ -59,22 +66,31 @@ class PairsOptions:
     quiet: bool
 
 
-def select(
-    refs: Sequence[SampleRef], scenes: Sequence[str], limit: int | None, data: Path
-) -> list[SampleRef]:
-    """Keep the samples whose label contains one of ``scenes`` (all where empty), at most ``limit``.
+def select(refs: Sequence[SampleRef], options: PairsOptions) -> list[SampleRef]:
+    """Keep the samples whose label contains one of ``scenes``, draw ``sample``, keep the first ``limit``.
+
+    Returns:
+        References in the order of ``refs``.
 
     Raises:
-        ValueError: nothing is left, or ``limit`` is below 1.
+        ValueError: nothing is left, more are to be drawn than there are, or a number is below 1.
     """
-    if limit is not None and limit < 1:
-        bad_value("limit", "at least 1", limit)
+    scenes, data = options.scenes, options.data
+    for name in ("limit", "sample"):
+        count = getattr(options, name)
+        if count is not None and count < 1:
+            bad_value(name, "at least 1", count)
     kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
     if not kept:
         found = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
         wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
         bad_value("DIR", f"a folder with a sample{wanted}", f"{data} with {found}", "See: geodiff eval list.")
-    return kept[:limit]
+    if options.sample is not None:
+        if options.sample > len(kept):
+            bad_value("sample", f"at most {len(kept)}, the number of samples found", options.sample)
+        drawn = random.Random(options.settings.seed).sample(range(len(kept)), options.sample)
+        kept = [kept[i] for i in sorted(drawn)]
+    return kept[: options.limit]
 
 
 def _command(options: PairsOptions) -> str:
@@ -85,8 +101,9 @@ def _command(options: PairsOptions) -> str:
     for name in ("datasets", "scenes"):
         if getattr(options, name):
             words += [f"--{name}", ",".join(getattr(options, name))]
-    if options.limit is not None:
-        words += ["--limit", str(options.limit)]
+    for name, default in (("limit", None), ("sample", None), ("pairs", "default"), ("pixel_centre", 0.0)):
+        if getattr(options, name) != default:
+            words += [f"--{name.replace('_', '-')}", str(getattr(options, name))]
     for field in fields(Settings):
         value: Any = getattr(options.settings, field.name)
         if value != field.default:
@@ -116,8 +133,8 @@ def run_pairs(options: PairsOptions) -> None:
         ValueError: bad options, no samples, or a broken sample without ``skip_broken``.
         OSError: missing or unreadable files without ``skip_broken``.
     """
-    refs = find_pairs(options.data, options.datasets or None)
-    refs = select(refs, options.scenes, options.limit, options.data)
+    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
+    refs = select(find_pairs(options.data, options.datasets or None, **posed), options)
     records = run(
         refs,
         options.methods,

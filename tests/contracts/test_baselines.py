@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings
-from geodiff_plugin.evaluation.baselines.sgbm import fill_background, sgbm_shift
+from geodiff_plugin.evaluation.baselines._fill import fill_background
+from geodiff_plugin.evaluation.baselines.sgbm import sgbm_shift
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, is_rectified
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.pipeline import enable_geometry_guidance

@@ -64,6 +64,14 @@ def test_pairs_names_bad_options(data, tmp_path):
         invoke("pairs", data, "--methods", "sgbm", "--limit", 0, "-o", tmp_path / "out")
 
 
+def test_pairs_draws_a_seeded_sample(data, tmp_path):
+    words = ("pairs", data, "--methods", "sgbm", "-o", tmp_path / "out", "--sample")
+    picked = ["middlebury2014/two" in invoke(*words, 1, "--seed", seed).stdout for seed in (0, 1, 2, 3, 4, 0)]
+    assert picked[0] == picked[-1] and set(picked) == {True, False}
+    with pytest.raises(ValueError, match="sample must be at most 2"):
+        invoke(*words, 3)
+
+
 def test_pairs_goes_on_after_a_broken_sample_on_request(data, tmp_path):
     (data / "one" / "im1.png").unlink()
     words = ("pairs", data, "--methods", "sgbm", "-o", tmp_path / "out")

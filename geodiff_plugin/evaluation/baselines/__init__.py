@@ -15,14 +15,26 @@ from geodiff_plugin.evaluation.baselines.base import (
 )
 from geodiff_plugin.evaluation.baselines.guided import GUIDED
 from geodiff_plugin.evaluation.baselines.paper import PAPER
+from geodiff_plugin.evaluation.baselines.plane_sweep import PLANE_SWEEP
 from geodiff_plugin.evaluation.baselines.prior_aligned import PRIOR_ALIGNED
 from geodiff_plugin.evaluation.baselines.scale_shift_only import SCALE_SHIFT_ONLY
 from geodiff_plugin.evaluation.baselines.search_only import SEARCH_ONLY
 from geodiff_plugin.evaluation.baselines.sgbm import SGBM
+from geodiff_plugin.evaluation.baselines.sweep_sgm import SWEEP_SGM
 
 __all__ = ["METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
 
 METHODS: dict[str, Method] = {
-    method.name: method for method in (PRIOR_ALIGNED, SEARCH_ONLY, SCALE_SHIFT_ONLY, PAPER, GUIDED, SGBM)
+    method.name: method
+    for method in (
+        PRIOR_ALIGNED,
+        SEARCH_ONLY,
+        SCALE_SHIFT_ONLY,
+        PAPER,
+        GUIDED,
+        SGBM,
+        PLANE_SWEEP,
+        SWEEP_SGM,
+    )
 }
 """Every method by name, in the order of the tables' columns."""

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from geodiff_plugin.evaluation.baselines._fill import fill_background
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 
-__all__ = ["SGBM", "fill_background", "sgbm_shift"]
+__all__ = ["SGBM", "sgbm_shift"]
 
 #: Largest shift that is tried, as a share of the image width.
 MAX_SHIFT = 0.25
@@ -73,31 +74,6 @@ def sgbm_shift(sample: StereoSample) -> np.ndarray:
     shift = raw.astype(np.float32) / 16.0 + np.float32(sample.K_right[0, 2] - sample.K_left[0, 2])
     shift[(raw <= 16 * (lowest - 1)) | (shift < MIN_SHIFT_PX)] = np.nan
     return shift
-
-
-def fill_background(shift: np.ndarray) -> np.ndarray:
-    """Fill holes with the farther of the two neighbours in the row, as KITTI's development kit does.
-
-    Args:
-        shift: ``(H, W)`` float, pixels, NaN in holes.
-
-    Returns:
-        ``(H, W)`` without holes: within a row the smaller of the nearest known values to either side, the
-        only one at the row's ends; an empty row copies the nearest filled one above, else below. All NaN
-        where nothing is known.
-    """
-    known = np.isfinite(shift)
-    columns = np.arange(shift.shape[1])[None]
-    from_left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
-    from_right = np.minimum.accumulate(np.where(known, columns, shift.shape[1])[:, ::-1], axis=1)[:, ::-1]
-    rows = np.arange(shift.shape[0])[:, None]
-    padded = np.pad(np.where(known, shift, np.inf), ((0, 0), (1, 1)), constant_values=np.inf)
-    filled = np.minimum(padded[rows, from_left + 1], padded[rows, from_right + 1])
-    full_rows = np.flatnonzero(known.any(axis=1))
-    if full_rows.size == 0:
-        return np.full_like(shift, np.nan)
-    above = np.searchsorted(full_rows, rows[:, 0], side="right") - 1
-    return filled[full_rows[np.maximum(above, 0)]].astype(shift.dtype)
 
 
 def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:

@@ -43,12 +43,13 @@ def load(ref: SampleRef) -> StereoSample:
     return DATASETS[ref.dataset].load(ref)
 
 
-def find_pairs(root: str | Path, datasets: Iterable[str] | None = None) -> list[SampleRef]:
+def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **options: object) -> list[SampleRef]:
     """References to every metric pair below ``root``, in the table's order.
 
     Args:
         root: folder that holds one or several data sets in their official layouts, or ``synthetic:N``.
         datasets: names to look for; all by default.
+        **options: for the data sets that know them: ``pairs`` and ``pixel_centre`` (mvsnet).
 
     Returns:
         References; nothing is read yet.
@@ -61,7 +62,8 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None) -> list[
     for name in DATASETS if datasets is None else datasets:
         if name not in DATASETS:
             bad_value("datasets", f"one of {', '.join(DATASETS)}", repr(name))
-        refs += DATASETS[name].find(root)
+        dataset = DATASETS[name]
+        refs += dataset.find(root, **{key: options[key] for key in dataset.options if key in options})
     if not refs and not root.is_dir():
         bad_value("root", "an existing folder or synthetic:N", str(root))
     return refs

@@ -137,4 +137,5 @@ MVSNET = Dataset(
     cap_m=None,
     obtain="folders of images/, cams/ and pair.txt as MVSNet code circulates Tanks and Temples; "
     "for the numbers here also depths/*.pfm in metres.",
+    options=("pairs", "pixel_centre"),
 )

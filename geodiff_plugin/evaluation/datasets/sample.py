@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,14 +100,16 @@ class Dataset:
         load: reference -> sample.
         cap_m: farthest truth that counts in the set's own protocol, metres; ``None`` for no limit.
         obtain: how to get the set, one sentence with its address and licence.
+        options: keywords that ``find`` takes beside the folder.
         full_count: number of pairs in the set as the paper used it; ``None`` where it does not apply.
     """
 
     name: str
-    find: Callable[[Path], list[SampleRef]]
+    find: Callable[..., list[SampleRef]]
     load: Callable[[SampleRef], StereoSample]
     cap_m: float | None
     obtain: str
+    options: tuple[str, ...] = ()
     full_count: int | None = None
 
 
