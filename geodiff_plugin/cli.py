@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from geodiff_plugin.commands.voice import DoorGroup
+from geodiff_plugin.evaluation.cli import eval_app
 
 __all__ = ["app", "main"]
 
@@ -27,6 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+app.add_typer(eval_app, name="eval")
 
 
 def _print_version(wanted: bool) -> None:
@@ -52,8 +54,10 @@ def _option(help_text: str, panel: str, *names: str) -> Any:
 
 @app.command()
 def depth(
-    left: Annotated[Path, typer.Argument(help="Left image; it gets the depth. EXIF turns are applied.")],
-    right: Annotated[Path, typer.Argument(help="Right image, of any size.")],
+    left: Annotated[
+        Path, typer.Argument(metavar="LEFT", help="Left image; it gets the depth. EXIF turns are applied.")
+    ],
+    right: Annotated[Path, typer.Argument(metavar="RIGHT", help="Right image, of any size.")],
     calib: Annotated[
         list[Path] | None,
         _option(
