@@ -1,0 +1,163 @@
+"""Two or more views as the user gave them -> a volume that spans the scene, and its matches.
+
+Hop: images, K's, T's -> grid, span of inverse depth -> ``CostVolume`` -> ``Matches``.
+Paper: S7.3 ("a predefined depth range"); here the views find the range by themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.geometry import plane_rays, resize_intrinsics
+from geodiff_plugin.matching.census import grey
+from geodiff_plugin.matching.consistency import Matches, match_volume
+from geodiff_plugin.matching.plane_sweep import (
+    CostVolume,
+    RightView,
+    inverse_depth_at_shift,
+    median_shift,
+    sweep_planes,
+)
+
+__all__ = ["build_cost_volume", "find_matches"]
+
+# The first, coarse sweep: longer side in pixels, and how far it looks in fractions of the width.
+_PILOT_SIDE = 256
+_PILOT_SHIFT = 0.4
+# Fewer planes than this make no parabola worth the name.
+_FEWEST_PLANES = 24
+
+
+def _shrink(image_01: torch.Tensor, K: torch.Tensor, factor: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Image and K, smaller by ``factor`` < 1 (antialiased); as they are for 1 and above."""
+    if factor >= 1.0:
+        return image_01, K
+    size = (image_01.shape[-2], image_01.shape[-1])
+    size_to = (max(1, round(size[0] * factor)), max(1, round(size[1] * factor)))
+    small = F.interpolate(image_01[None], size_to, mode="bilinear", align_corners=False, antialias=True)[0]
+    return small, resize_intrinsics(K[None], size, size_to)[0]
+
+
+def _to_grid(
+    left: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, side: int
+) -> tuple[torch.Tensor, tuple[RightView, ...], torch.Tensor]:
+    """Shrink the left view to ``side``, the right ones to as many pixels per radian so that none aliases."""
+    left, K = _shrink(left, K_left, side / max(left.shape[-2:]))
+    small = tuple((*_shrink(image, K_r, float(K[0, 0] / K_r[0, 0])), T) for image, K_r, T in rights)
+    return left, small, K
+
+
+def _even_planes(
+    span: tuple[torch.Tensor, torch.Tensor],
+    size: tuple[int, int],
+    rights: Sequence[RightView],
+    K: torch.Tensor,
+    step_px: float,
+    most: int,
+) -> torch.Tensor:
+    """Inverse depths over ``span``, so many that one moves the median pixel by ``step_px``."""
+    ends = torch.stack(list(span))
+    shifts = [median_shift(plane_rays(K[None], K_r[None], T[None], size), ends) for _, K_r, T in rights]
+    moved = max(float(shift[1] - shift[0]) for shift in shifts)
+    wanted = most if moved == float("inf") else round(moved / step_px) + 1
+    steps = torch.linspace(0.0, 1.0, min(max(wanted, _FEWEST_PLANES), most), device=ends.device)
+    return ends[0] + (ends[1] - ends[0]) * steps
+
+
+def _nearest_inverse_depth(
+    left: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, max_shift: float
+) -> torch.Tensor:
+    """The inverse depth that a coarse sweep says nothing is nearer than."""
+    left, rights, K = _to_grid(left, rights, K_left, _PILOT_SIDE)
+    size = (left.shape[-2], left.shape[-1])
+    all_rays = [plane_rays(K[None], K_r[None], T[None], size) for _, K_r, T in rights]
+    limit = torch.stack([inverse_depth_at_shift(rays, max_shift * size[1]) for rays in all_rays]).amin()
+    span = (torch.zeros_like(limit), limit)
+    volume = sweep_planes(left, rights, K, _even_planes(span, size, rights, K, 1.0, 160))
+    matches = match_volume(volume)
+    believed = matches.inverse_depth[matches.confidence > 0.5]
+    least = torch.stack([inverse_depth_at_shift(rays, 0.03 * size[1]) for rays in all_rays]).amin()
+    if believed.numel() < 100:
+        return limit  # nothing to go by: the search must see everything
+    return (1.25 * torch.quantile(believed[:: max(1, believed.numel() // 100_000)], 0.995)).clamp(
+        least, limit
+    )
+
+
+@torch.no_grad()
+def build_cost_volume(
+    left_01: torch.Tensor,
+    rights: Sequence[RightView],
+    K_left: torch.Tensor,
+    *,
+    planes: int = 160,
+    depth_range: tuple[float, float] | None = None,
+    max_side: int = 828,
+    step_px: float = 0.75,
+) -> CostVolume:
+    """Sweep planes through the left view and compare it with the right views.
+
+    Args:
+        left_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1].
+        rights: one or several ``(image_01, K_right (3, 3), T_right_from_left (4, 4))``, images of any size.
+            Costs are averaged over the views that see a pixel.
+        K_left: ``(3, 3)`` pixels of ``left_01``.
+        planes: the most planes, >= 24.
+        depth_range: ``(near, far)`` metres, 0 < near < far, that the planes span. By default they reach from
+            infinity to a quarter nearer than anything that a coarse sweep (up to a shift of 40 % of the
+            width) is sure of, so that a street gets finer planes than a table top.
+        max_side: longer side of the volume's grid; larger images are shrunk to it, right ones to as many
+            pixels per radian.
+        step_px: how far the median pixel moves in the right view from one plane to the next, if ``planes``
+            allows.
+
+    Returns:
+        ``CostVolume``; not differentiable.
+
+    Raises:
+        ValueError: ``depth_range`` not ascending, the views do not overlap, or both cameras stand at one
+            place.
+    """
+    if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
+        bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
+    views = tuple((grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
+    left, small, K = _to_grid(grey(left_01), views, K_left.float(), max_side)
+    if depth_range is None:
+        nearest = _nearest_inverse_depth(left, small, K, _PILOT_SHIFT)
+        span = (torch.zeros_like(nearest), nearest)
+    else:
+        span = (K.new_tensor(1.0 / depth_range[1]), K.new_tensor(1.0 / depth_range[0]))
+    size = (left.shape[-2], left.shape[-1])
+    return sweep_planes(left, small, K, _even_planes(span, size, small, K, step_px, planes))
+
+
+def find_matches(
+    left_01: torch.Tensor,
+    rights: Sequence[RightView],
+    K_left: torch.Tensor,
+    *,
+    volume: CostVolume | None = None,
+    depth_range: tuple[float, float] | None = None,
+) -> Matches:
+    """What the views alone say about depth.
+
+    Args:
+        left_01: ``(3, H, W)`` float in [0, 1]; not read where ``volume`` is given.
+        rights: as for ``build_cost_volume``.
+        K_left: ``(3, 3)`` pixels of ``left_01``.
+        volume: what ``build_cost_volume`` gave for the same views, if it was called already.
+        depth_range: as for ``build_cost_volume``.
+
+    Returns:
+        ``Matches`` on the volume's grid.
+
+    Raises:
+        ValueError: as ``build_cost_volume``.
+    """
+    if volume is None:
+        volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range)
+    return match_volume(volume)

@@ -1,0 +1,157 @@
+"""How well each inverse depth explains each pixel: a plane sweep for any pose and any number of views.
+
+Hop: left view + right views (grey image, K, pose) + inverse depths -> ``CostVolume``.
+Paper: S7.3, which calls its search for g_s a variant of the plane sweep volume.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.geometry import NEAREST_M, PlaneRays, plane_rays, sample_at
+from geodiff_plugin.matching.census import census, census_cost
+
+__all__ = ["UNSEEN_COST", "CostVolume", "RightView", "inverse_depth_at_shift", "median_shift", "sweep_planes"]
+
+RightView = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+"""``(image_01 (C, Hr, Wr), K_right (3, 3), T_right_from_left (4, 4))``, C = 3 or 1."""
+
+UNSEEN_COST = 0.35
+"""Cost of a plane on which no right view sees the pixel: that of unrelated texture, neither good nor bad."""
+
+_CHUNK_PIXELS = 1_000_000
+
+
+@dataclass(frozen=True)
+class CostVolume:
+    """Costs of fronto-parallel planes in the left view, uniform in inverse depth.
+
+    Attributes:
+        cost: ``(D, H, W)`` float32 in [0, 1], mean census difference to the right views that see the pixel;
+            ``UNSEEN_COST`` where none does.
+        in_view: ``(D, H, W)`` bool, at least one right view sees the pixel on this plane.
+        inverse_depth: ``(D,)`` float32, 1/m, ascending and evenly spaced.
+        K: ``(3, 3)`` pixels of this grid.
+        left_01: ``(1, H, W)`` grey left image on this grid.
+        rights: the right views at the resolution that was used, ``(1, Hr, Wr)`` grey, with their K and T.
+    """
+
+    cost: torch.Tensor
+    in_view: torch.Tensor
+    inverse_depth: torch.Tensor
+    K: torch.Tensor
+    left_01: torch.Tensor
+    rights: tuple[RightView, ...]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(H, W)`` of the grid."""
+        return self.cost.shape[1], self.cost.shape[2]
+
+    @property
+    def plane_step(self) -> torch.Tensor:
+        """``()`` float32, 1/m between neighbouring planes."""
+        return self.inverse_depth[1] - self.inverse_depth[0]
+
+
+def _plane_uv(rays: PlaneRays, inverse_depth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Right pixels ``(D, 2, N)`` of every left pixel on every plane, and ``(D, N)`` if it is in front."""
+    p = rays.A + inverse_depth[:, None, None] * rays.b  # z * A + b, divided by z
+    in_front = p[:, 2] > NEAREST_M
+    return p[:, :2] / torch.where(in_front, p[:, 2], torch.ones_like(p[:, 2]))[:, None], in_front
+
+
+def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor) -> torch.Tensor:
+    """How far the median pixel lies, in the right view, from where it would be at infinity.
+
+    Args:
+        rays: ``plane_rays`` of any grid of left pixels, batch of 1.
+        inverse_depth: ``(N,)`` 1/m, >= 0.
+
+    Returns:
+        ``(N,)`` pixels of the right view; infinite where the plane passes behind the right camera. Measured
+        from infinity, so that a rotation, which moves all depths alike, does not count.
+
+    Raises:
+        ValueError: no pixel's point at infinity is in front of the right camera.
+    """
+    stride = max(1, rays.A.shape[-1] // 1024)
+    some = PlaneRays(rays.A[..., ::stride], rays.b)
+    at_infinity, ahead = _plane_uv(some, rays.A.new_zeros(1))
+    if not ahead.any():
+        bad_value("E", "a pose under which the views overlap", "a right camera that looks the other way")
+    uv, in_front = _plane_uv(some, inverse_depth)
+    shift = (uv - at_infinity).norm(dim=1)
+    shift = torch.where(in_front, shift, torch.full_like(shift, torch.inf))
+    return shift[:, ahead[0]].median(dim=1).values
+
+
+def inverse_depth_at_shift(rays: PlaneRays, shift_px: float) -> torch.Tensor:
+    """The inverse depth at which ``median_shift`` reaches so many pixels.
+
+    Args:
+        rays: ``plane_rays`` of any grid of left pixels, batch of 1.
+        shift_px: pixels of the right view, > 0.
+
+    Returns:
+        ``()`` float32, 1/m, within 1 %.
+
+    Raises:
+        ValueError: the views do not overlap, or both cameras stand at one place.
+    """
+    candidates = torch.logspace(-8, 5, 3001, device=rays.A.device, dtype=rays.A.dtype)
+    reached = torch.cat([median_shift(rays, part) for part in candidates.split(256)]) >= shift_px
+    if not reached.any():
+        bad_value("E", "a pose with a baseline", "both cameras at one place")
+    return candidates[reached.int().argmax()]
+
+
+def _one_view(
+    bits: torch.Tensor, right_grey: torch.Tensor, rays: PlaneRays, inverse_depth: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Cost ``(D, H, W)`` of some planes against one right view, and where that view sees them."""
+    height, width = bits.shape[-2:]
+    uv, in_front = _plane_uv(rays, inverse_depth)
+    last = uv.new_tensor([right_grey.shape[-1] - 1, right_grey.shape[-2] - 1])[:, None]
+    seen = in_front & ((uv >= 0) & (uv <= last)).all(dim=1)
+    uv = uv.transpose(1, 2).reshape(1, -1, width, 2)  # all planes below one another: one call of the sampler
+    warped = sample_at(right_grey[None], uv)[0, 0].view(-1, height, width)
+    return census_cost(bits, warped), seen.view(-1, height, width)
+
+
+@torch.no_grad()
+def sweep_planes(
+    left_01: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, inverse_depth: torch.Tensor
+) -> CostVolume:
+    """Compare the left view with the right views warped by every plane, at the resolution as given.
+
+    Args:
+        left_01: ``(1, H, W)`` float32 grey in [0, 1].
+        rights: one or several ``(grey (1, Hr, Wr), K_right (3, 3), T_right_from_left (4, 4))``, of about as
+            many pixels per radian as the left view. Costs are averaged over the views that see a pixel.
+        K_left: ``(3, 3)`` pixels of ``left_01``.
+        inverse_depth: ``(D,)`` 1/m, ascending, evenly spaced, D >= 2.
+
+    Returns:
+        ``CostVolume``; not differentiable. Planes go in chunks, so memory is that of the result.
+    """
+    size = (left_01.shape[-2], left_01.shape[-1])
+    all_rays = [plane_rays(K_left[None], K_right[None], T[None], size) for _, K_right, T in rights]
+    bits = census(left_01)[0]
+    cost = left_01.new_empty(len(inverse_depth), *size)
+    in_view = torch.empty_like(cost, dtype=torch.bool)
+    chunk = max(1, _CHUNK_PIXELS // (size[0] * size[1]))
+    for start in range(0, len(inverse_depth), chunk):
+        at = slice(start, start + chunk)
+        total, count = torch.zeros_like(cost[at]), torch.zeros_like(cost[at])
+        for (right, _, _), rays in zip(rights, all_rays, strict=True):
+            one, seen = _one_view(bits, right, rays, inverse_depth[at])
+            total += one.mul_(seen)
+            count += seen
+        in_view[at] = count > 0
+        cost[at] = torch.where(in_view[at], total / count.clamp_min(1.0), torch.full_like(total, UNSEEN_COST))
+    return CostVolume(cost, in_view, inverse_depth, K_left, left_01, tuple(rights))
