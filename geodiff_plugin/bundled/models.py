@@ -7,11 +7,15 @@ Paper: S3.1 (a latent diffusion prior of affine-invariant depth); sizes are ours
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, UNet2DConditionModel
+from diffusers.utils import logging as diffusers_logging
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+from transformers.utils import logging as transformers_logging
 
 __all__ = [
     "LATENT_SCALE",
@@ -156,7 +160,8 @@ def open_pipeline(
     Returns:
         A new stock pipeline without a progress bar.
     """
-    pipeline = MarigoldDepthPipeline.from_pretrained(str(folder), dtype=dtype, local_files_only=True)
+    with _no_bars():
+        pipeline = MarigoldDepthPipeline.from_pretrained(str(folder), dtype=dtype, local_files_only=True)
     pipeline.set_progress_bar_config(disable=True)
     return pipeline.to("cpu" if device is None else device)
 
@@ -179,7 +184,8 @@ def save_prior(pipeline: MarigoldDepthPipeline, folder: str | Path) -> Path:
     settings = {
         key: value for key, value in pipeline.config.items() if not key.startswith("_") and key not in parts
     }
-    MarigoldDepthPipeline(**parts, **settings).save_pretrained(fresh, safe_serialization=True)
+    with _no_bars():
+        MarigoldDepthPipeline(**parts, **settings).save_pretrained(fresh, safe_serialization=True)
     if folder.is_dir():
         for extra in folder.glob("*.md"):
             shutil.copy2(extra, fresh / extra.name)
@@ -187,6 +193,19 @@ def save_prior(pipeline: MarigoldDepthPipeline, folder: str | Path) -> Path:
     fresh.rename(folder)
     shutil.rmtree(stale, ignore_errors=True)
     return folder
+
+
+@contextmanager
+def _no_bars() -> Iterator[None]:
+    """Switch off the progress bars of both hosts, for files this small, and put them back after."""
+    shown = [log for log in (diffusers_logging, transformers_logging) if log.is_progress_bar_enabled()]
+    for log in shown:
+        log.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for log in shown:
+            log.enable_progress_bar()
 
 
 def _half_copy(part: object) -> object:

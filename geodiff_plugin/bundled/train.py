@@ -38,6 +38,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--cache", type=Path, help="rendered scenes; default OUT/cache")
     parser.add_argument("--hours", type=float, default=6.0, help="wall-clock of the U-Net's training")
     parser.add_argument("--vae-minutes", type=float, default=8.0)
+    parser.add_argument("--vae-batch", type=int, default=4, help="crops per process and autoencoder step")
     parser.add_argument(
         "--device", default="cpu", help="cpu or cuda; several devices through accelerate launch"
     )
@@ -99,7 +100,7 @@ def _start_renderers(options: argparse.Namespace) -> list[subprocess.Popen]:
 
 
 def _prepare_models(options: argparse.Namespace, accelerator: Accelerator):
-    """Autoencoder (trained first, on the main process), U-Net, text embedding, text parts."""
+    """Autoencoder (trained first), U-Net, text encoder and tokenizer."""
     set_seed(options.seed)
     if options.init_from:
         start = open_pipeline(options.init_from)
@@ -108,15 +109,12 @@ def _prepare_models(options: argparse.Namespace, accelerator: Accelerator):
         if accelerator.is_main_process:
             save_vae(vae, options.out / "vae.safetensors")
         return vae.to(accelerator.device), unet, text
-    text, unet = build_text(), build_unet()
-    device = accelerator.device
-    if accelerator.is_main_process:
-        minutes = options.vae_minutes
-        train_vae(
-            options.out, options.cache, 60 * minutes, device, options.seed, iterations=options.vae_steps
-        )
-    accelerator.wait_for_everyone()
-    return train_vae(options.out, options.cache, 0.0, device, options.seed), unet, text
+    seconds, batch = 60 * options.vae_minutes, options.vae_batch
+    vae = train_vae(
+        options.out, options.cache, accelerator, seconds, options.seed, batch, iterations=options.vae_steps
+    )
+    set_seed(options.seed)
+    return vae, build_unet(), build_text()
 
 
 def _wait_for_scenes(options: argparse.Namespace) -> None:

@@ -6,23 +6,23 @@ Paper: none (the paper takes Stable Diffusion's autoencoder as it is).
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from accelerate import Accelerator
 from diffusers import AutoencoderKL
 from safetensors.torch import load_file, save_file
 from tqdm import tqdm
 
 from geodiff_plugin.bundled.data import jitter, normalise_depth, read_shard, shards
 from geodiff_plugin.bundled.models import build_vae
+from geodiff_plugin.bundled.schedule import learning_rate
 
 __all__ = ["finish_vae", "load_vae", "save_vae", "train_vae", "vae_loss"]
 
-_KL = 3e-5
+_KL = 2e-4
 _EDGE = 0.5
 
 
@@ -83,65 +83,86 @@ def vae_loss(vae: AutoencoderKL, x: torch.Tensor, generator: torch.Generator | N
     return error.mean() + (y - x).square().mean() + _EDGE * sum(slopes) + _KL * kl
 
 
+class _Loss(torch.nn.Module):
+    """``vae_loss`` as a module's forward, which is what several processes can share."""
+
+    def __init__(self, vae: AutoencoderKL) -> None:
+        super().__init__()
+        self.vae = vae
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Loss of a batch ``(N, 3, H, W)``."""
+        return vae_loss(self.vae, x)
+
+
 def train_vae(
     folder: Path,
     cache: Path,
+    accelerator: Accelerator,
     seconds: float,
-    device: torch.device,
     seed: int,
-    batch: int = 8,
+    batch: int = 4,
     rate: float = 2e-3,
     iterations: int | None = None,
-    say: Callable[[str], None] = lambda line: None,
 ) -> AutoencoderKL:
-    """Train the autoencoder, or load it when the run has finished it before.
+    """Train the autoencoder, continue it, or load it when the run has finished it before.
 
     Args:
         folder: the run's folder; the result is ``vae.safetensors`` there.
         cache: rendered shards.
+        accelerator: device, precision and processes.
         seconds: wall-clock budget.
-        device: where to train.
         seed: of crops and weights.
-        batch: crops in a batch.
+        batch: crops in a batch of one process.
         rate: top learning rate.
         iterations: a fixed number of iterations instead of the budget.
-        say: takes a progress line.
 
     Returns:
         Frozen autoencoder with its ``scaling_factor`` set from the spread of depth latents.
     """
-    path = folder / "vae.safetensors"
+    path, device = folder / "vae.safetensors", accelerator.device
     if path.exists():
         return load_vae(path, device)
+    unfinished = folder / "vae-unfinished.safetensors"
     torch.manual_seed(seed)
-    vae = build_vae().to(device).train()
-    generator = torch.Generator().manual_seed(seed)
+    vae = load_vae(unfinished, device) if unfinished.exists() else build_vae().to(device)
+    base = float(vae.config.get("seconds", 0.0))
+    vae.train().requires_grad_(True)
+    generator = torch.Generator().manual_seed(seed + 7919 * int(base) + accelerator.process_index)
     crops = _Crops(cache)
     optimiser = torch.optim.AdamW(vae.parameters(), lr=rate, betas=(0.9, 0.99), weight_decay=1e-4)
-    start, step, done = time.monotonic(), 0, 0.0
-    bar = tqdm(total=1000, desc="VAE", unit="permille", mininterval=10)
-    while done < 1.0:
+    network, prepared = accelerator.prepare(_Loss(vae), optimiser)
+    start, step, done, saved = time.monotonic(), 0, 0.0, 0.0
+    first = accelerator.is_main_process
+    bar = tqdm(total=1000, desc="VAE", unit="permille", mininterval=10, disable=not first)
+    while True:
+        spent = base + time.monotonic() - start
+        share = torch.tensor(step / iterations if iterations else spent / max(seconds, 1e-6), device=device)
+        done = float(accelerator.reduce(share, "mean"))
+        if done >= 1.0:
+            break
         for group in optimiser.param_groups:
-            group["lr"] = (
-                rate * min(1.0, (step + 1) / 100) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
-            )
-        side = 64 if done < 0.75 else 128
-        x = crops.draw(batch if side == 64 else max(batch // 3, 2), side, generator).to(device)
-        with torch.autocast(device.type, dtype=torch.bfloat16):
-            loss = vae_loss(vae, x)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(vae.parameters(), 1.0)
-        optimiser.step()
+            group["lr"] = learning_rate(rate, done, step, warm_up=100)
+        side = 64 if done < 0.8 else 128
+        x = crops.draw(batch if side == 64 else max(batch // 2, 2), side, generator).to(device)
+        loss = network(x)
+        accelerator.backward(loss)
+        accelerator.clip_grad_norm_(network.parameters(), 1.0)
+        prepared.step()
+        prepared.zero_grad(set_to_none=True)
         step += 1
-        done = min(1.0, step / iterations if iterations else (time.monotonic() - start) / max(seconds, 1e-6))
-        bar.update(int(1000 * done) - bar.n)
-        if step % 100 == 0:
+        if first and step % 100 == 0:
+            bar.update(int(1000 * done) - bar.n)
             bar.set_postfix(loss=f"{loss.item():.4f}", step=step)
-            say(f"vae step {step} loss {loss.item():.4f}")
+        if first and spent - saved > 60.0:
+            save_vae(vae, unfinished, spent)
+            saved = spent
     bar.close()
-    finish_vae(vae, cache)
-    save_vae(vae, path)
+    if first:
+        finish_vae(vae, cache)
+        save_vae(vae, path)
+        unfinished.unlink(missing_ok=True)
+    accelerator.wait_for_everyone()
     return load_vae(path, device)
 
 
@@ -167,20 +188,21 @@ def finish_vae(vae: AutoencoderKL, cache: Path, most: int = 8) -> float:
     return factor
 
 
-def save_vae(vae: AutoencoderKL, path: Path) -> None:
-    """Write weights and scaling factor to one safetensors file, whole or not at all."""
+def save_vae(vae: AutoencoderKL, path: Path, seconds: float = 0.0) -> None:
+    """Write weights, scaling factor and seconds trained to one safetensors file, whole or not at all."""
     part = path.with_suffix(".part")
+    numbers = {"scaling_factor": vae.config.scaling_factor, "seconds": seconds}
     tensors = {name: value.detach().cpu().contiguous() for name, value in vae.state_dict().items()}
-    save_file(
-        tensors | {"scaling_factor": torch.tensor(vae.config.scaling_factor, dtype=torch.float64)}, part
-    )
+    save_file(tensors | {k: torch.tensor(v, dtype=torch.float64) for k, v in numbers.items()}, part)
     part.replace(path)
 
 
 def load_vae(path: Path, device: torch.device) -> AutoencoderKL:
-    """Read what ``save_vae`` wrote; frozen, in eval mode."""
+    """Read what ``save_vae`` wrote; frozen, in eval mode; the seconds are in its config."""
     tensors = load_file(path)
     vae = build_vae()
-    vae.register_to_config(scaling_factor=float(tensors.pop("scaling_factor")))
+    vae.register_to_config(
+        scaling_factor=float(tensors.pop("scaling_factor")), seconds=float(tensors.pop("seconds"))
+    )
     vae.load_state_dict(tensors)
     return vae.to(device).eval().requires_grad_(False)
