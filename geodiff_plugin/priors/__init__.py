@@ -58,10 +58,11 @@ def load_prior(
     source = str(BUNDLED_FOLDER) if str(name) == "bundled" else str(name)
     if Path(source).is_dir():
         if not (Path(source) / "model_index.json").is_file():
-            bad_value("prior", "a folder in diffusers' layout", f"{source} without model_index.json")
+            cure = "Name the folder that save_pretrained wrote, or use the bundled prior: --prior bundled."
+            bad_value("prior", "a folder in diffusers' layout", f"{source} without model_index.json", cure)
         kwargs["local_files_only"] = True
     try:
-        pipe = DiffusionPipeline.from_pretrained(source, torch_dtype=dtype, **kwargs)
+        pipe = DiffusionPipeline.from_pretrained(source, dtype=dtype, **kwargs)
     except (LocalEntryNotFoundError, RepositoryNotFoundError, HFValidationError, OSError, ConnectionError) as error:
         cure = "Fetch it once with `hf download ID` while online, give a folder, or use the bundled one: --prior bundled."
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
