@@ -1,0 +1,187 @@
+"""The command end to end on a tiny random prior: files, report, silence, Ctrl-C, the demo."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+FILES = {
+    "depth.npy",
+    "depth_mm.png",
+    "depth.png",
+    "visible.png",
+    "photometric_error.npy",
+    "cloud.ply",
+    "report.json",
+}
+
+
+@pytest.fixture
+def prior(make_pipeline, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("prior")
+    make_pipeline().save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture
+def command(pair_files, prior):
+    return [*pair_files.command, "--prior", prior, "--device", "cpu"]
+
+
+def test_writes_everything(geodiff, command, pair_files):
+    answer = geodiff(*command)
+    assert answer.code == 0, answer.err
+    out = pair_files.folder / "geodiff-out"
+    assert {path.name for path in out.iterdir()} == FILES
+    assert answer.out.count("\n") == 1 and " m to " in answer.out and "geodiff-out/" in answer.out
+    assert "loss=" in answer.err
+
+    depth_m = np.load(out / "depth.npy")
+    assert depth_m.dtype == np.float32 and depth_m.shape == (48, 64) and (depth_m > 0).all()
+    millimetres = np.asarray(Image.open(out / "depth_mm.png"))
+    near = depth_m < 65.5
+    np.testing.assert_allclose(millimetres[near] / 1000, depth_m[near], atol=5.1e-4)
+    assert (millimetres[depth_m > 65.536] == 0).all()
+    visible = np.asarray(Image.open(out / "visible.png"))
+    assert visible.shape == (48, 64) and set(np.unique(visible)) <= {0, 255}
+    assert np.load(out / "photometric_error.npy").shape == (48, 64)
+    assert Image.open(out / "depth.png").width > 64
+
+    report = json.loads((out / "report.json").read_text())
+    assert set(report["files"]["names"]) == FILES
+    assert report["depth"]["median_m"] == pytest.approx(float(np.median(depth_m)))
+    assert report["depth"]["visible_fraction"] == pytest.approx((visible > 0).mean())
+    assert report["files"]["depth_mm_zero_pixels"] == (millimetres == 0).sum()
+    assert set(report["seconds"]) == {"calibration", "load", "guided call", "write"}
+    assert len(report["history"]) == 2 and report["inputs"]["baseline_m"] == pytest.approx(0.12)
+    assert report["arguments"]["seed"] == 0 and report["versions"]["torch"]
+
+    cloud = (out / "cloud.ply").read_bytes()
+    assert cloud.startswith(b"ply\nformat binary_little_endian")
+    assert f"element vertex {report['files']['cloud_points']}\n".encode() in cloud
+
+
+def test_json_and_quiet(geodiff, command, pair_files):
+    answer = geodiff(*command, "--json", "--quiet", "--ensemble", 2, "--steps", 1, "--resolution", 32)
+    assert (answer.code, answer.err) == (0, "")
+    report = json.loads(answer.out)
+    assert report == json.loads((pair_files.folder / "geodiff-out" / "report.json").read_text())
+    assert report["uncertainty_median_m"] >= 0 and len(report["scale"][0]) == 2
+    assert np.load(pair_files.folder / "geodiff-out" / "uncertainty.npy").shape == (48, 64)
+    again = geodiff(*command, "--quiet", "--overwrite", "--steps", 1)
+    assert (again.code, again.out, again.err) == (0, "", "")
+    assert {path.name for path in (pair_files.folder / "geodiff-out").iterdir()} == FILES
+
+
+def test_same_seed_same_depth(geodiff, command, pair_files):
+    for out, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert geodiff(*command, "--quiet", "--steps", 1, "--seed", seed, "--out", out).code == 0
+    a, b, c = (np.load(pair_files.folder / out / "depth.npy") for out in "abc")
+    np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(a, c)
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_presets_and_range(geodiff, command, pair_files, preset):
+    answer = geodiff(*command, "--quiet", "--json", "--steps", 1, "--preset", preset, "--near", 1, "--far", 5)
+    guidance = json.loads(answer.out)["guidance"]
+    assert guidance["gradient"] == ("full" if preset == "paper" else "denoised")
+    assert guidance["g_s_range" if preset == "paper" else "depth_range"] == [1.0, 5.0]
+
+
+def test_images_of_different_kind_and_size(geodiff, prior, pair_files, textured_plane):
+    """A grey 16-bit left image and a right one of twice the size with a K of its own."""
+    grey = textured_plane.left.mean(-1) / 255 * 65535
+    Image.fromarray(grey.astype(np.uint16)).save(pair_files.left)
+    Image.open(pair_files.right).resize((128, 96)).save(pair_files.right)
+    K_right = textured_plane.K.copy()
+    K_right[:2, :2] *= 2
+    K_right[:2, 2] = K_right[:2, 2] * 2 + 0.5
+    for name, matrix in (("K", textured_plane.K), ("Kr", K_right), ("E", textured_plane.E)):
+        np.savetxt(pair_files.folder / f"{name}.txt", matrix)
+    cameras = ["--K", "K.txt", "--K-right", "Kr.txt", "--E", "E.txt"]
+    answer = geodiff(*pair_files.images, *cameras, "--prior", prior, "--steps", 1, "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    assert json.loads(answer.out)["inputs"]["right_size"] == [128, 96]
+
+
+@pytest.mark.parametrize("prior_name", ["no/such-prior", "no such folder/at all", "./empty"])
+def test_prior_that_is_not_there(geodiff, pair_files, prior_name, monkeypatch):
+    (pair_files.folder / "empty").mkdir()
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    answer = geodiff(*pair_files.command, "--prior", prior_name)
+    assert answer.code == 2
+    assert len(answer.err.splitlines()) == 1 and "bundled" in answer.err
+    assert not (pair_files.folder / "geodiff-out").exists()
+
+
+def test_failing_call_writes_nothing(geodiff, command, pair_files, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("in the middle")
+
+    monkeypatch.setattr("geodiff_plugin.commands.depth.write_maps", broken)
+    before = sorted(path.name for path in pair_files.folder.iterdir())
+    with pytest.raises(RuntimeError, match="in the middle"):
+        geodiff(*command, "--quiet", "--steps", 1)
+    assert sorted(path.name for path in pair_files.folder.iterdir()) == before
+
+
+def test_interrupt_of_a_running_process(command, pair_files):
+    """Ctrl-C while it denoises: exit code 130, no traceback, nothing written."""
+    before = sorted(path.name for path in pair_files.folder.iterdir())
+    process = subprocess.Popen(
+        [sys.executable, "-m", "geodiff_plugin", *map(str, command), "--steps", "1000"],
+        cwd=pair_files.folder,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    heard = b""
+    deadline = time.monotonic() + 120
+    while b"guided steps" not in heard and time.monotonic() < deadline:
+        heard += os.read(process.stderr.fileno(), 4096)
+    process.send_signal(signal.SIGINT)
+    rest = process.communicate(timeout=60)[1]
+    assert process.returncode == 130, heard + rest
+    assert b"Traceback" not in rest and rest.rstrip().endswith(b"geodiff: interrupted")
+    assert sorted(path.name for path in pair_files.folder.iterdir()) == before
+
+
+def test_help_and_version_do_not_import_torch():
+    code = (
+        "import sys\nfrom geodiff_plugin.cli import main\n"
+        "try:\n    main([sys.argv[1]])\nexcept SystemExit:\n    pass\n"
+        "assert 'torch' not in sys.modules and 'diffusers' not in sys.modules"
+    )
+    for option in ("--version", "--help"):
+        answer = subprocess.run([sys.executable, "-c", code, option], capture_output=True, text=True)
+        assert answer.returncode == 0, answer.stderr
+    assert "depth" in answer.stdout and "demo" in answer.stdout
+
+
+def test_info(geodiff, prior, monkeypatch, tmp_path):
+    answer = geodiff("info", "--prior", prior)
+    assert answer.code == 0
+    for word in ("torch", "cpu", "marigold", "cached", "MarigoldDepthPipeline", "DDIMScheduler"):
+        assert word in answer.out
+    missing = geodiff("info", "--prior", tmp_path / "nothing")
+    assert missing.code == 2 and len(missing.err.splitlines()) == 1
+
+
+def test_demo(geodiff, prior, pair_files, monkeypatch):
+    """Twice over the same folder; the tiny prior stands in for the bundled one."""
+    monkeypatch.setattr("geodiff_plugin.priors.BUNDLED_FOLDER", prior)
+    for _ in range(2):
+        answer = geodiff("demo", "--quiet")
+        assert answer.code == 0, answer.err
+    assert "AbsRel" in answer.out and "delta1" in answer.out and "guided" in answer.out
+    out = pair_files.folder / "geodiff-demo"
+    assert {path.name for path in out.iterdir()} == FILES | {"overview.png"}
+    assert np.load(out / "depth.npy").shape == (336, 448)
