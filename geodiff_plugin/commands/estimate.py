@@ -9,11 +9,14 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import torch
+from diffusers.utils import logging as diffusers_logging
 from tqdm import tqdm
+from transformers.utils import logging as transformers_logging
 
 from geodiff_plugin.commands.arguments import DepthArguments, Settings
 from geodiff_plugin.commands.inputs import Inputs
@@ -38,13 +41,31 @@ class StopWatch:
         self.seconds[name] = time.perf_counter() - started
 
 
+@contextmanager
+def _no_loading_bars() -> Iterator[None]:
+    """Switch off the bars of diffusers and transformers, which show seconds of reading from disk."""
+    shown = [
+        library for library in (diffusers_logging, transformers_logging) if library.is_progress_bar_enabled()
+    ]
+    for library in shown:
+        library.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for library in shown:
+            library.enable_progress_bar()
+
+
 def load_guided_prior(arguments: DepthArguments, settings: Settings) -> Any:
     """The prior of ``--prior``, with guidance enabled and its own progress bars off.
 
     Raises:
         ValueError: no such prior, not cached, or no adapter for its class.
     """
-    pipe = load_prior(arguments.prior, device=settings.device, dtype=settings.dtype)
+    # A download is worth a bar, reading a folder is not.
+    on_disk = arguments.prior == "bundled" or Path(arguments.prior).is_dir()
+    with _no_loading_bars() if on_disk or arguments.quiet else nullcontext():
+        pipe = load_prior(arguments.prior, device=settings.device, dtype=settings.dtype)
     pipe.set_progress_bar_config(disable=True)
     enable_geometry_guidance(pipe)
     return pipe

@@ -61,6 +61,8 @@ def load_prior(
             cure = "Name the folder that save_pretrained wrote, or use the bundled prior: --prior bundled."
             bad_value("prior", "a folder in diffusers' layout", f"{source} without model_index.json", cure)
         kwargs["local_files_only"] = True
+    elif source.count("/") > 1 or source.startswith((".", "/", "~")):
+        bad_value("prior", "'bundled', a folder that is there, or a hub id", repr(source), "Check the path.")
     try:
         pipe = DiffusionPipeline.from_pretrained(source, dtype=dtype, **kwargs)
     except (LocalEntryNotFoundError, RepositoryNotFoundError, HFValidationError, OSError, ConnectionError) as error:
