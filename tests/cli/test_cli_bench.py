@@ -1,0 +1,80 @@
+"""What ``geodiff bench`` measures with, and the configuration of its full-size prior."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from diffusers import AutoencoderKL, UNet2DConditionModel
+
+from geodiff_plugin.commands.bench import Cost, PeakMemory, measure, run_bench
+from geodiff_plugin.commands.full_size import UNET, VAE
+
+
+def test_peak_memory_sees_what_is_freed_again():
+    with PeakMemory(torch.device("cpu")) as memory:
+        block = np.ones(25_000_000)  # 200 MB, touched
+        time.sleep(0.2)
+        del block
+    assert 150e6 < memory.peak_bytes < 400e6
+
+
+def test_full_size_is_marigold_v1_1():
+    with torch.device("meta"):
+        unet, vae = UNet2DConditionModel(**UNET), AutoencoderKL(**VAE)
+    millions = [round(sum(p.numel() for p in model.parameters()) / 1e6) for model in (unet, vae)]
+    assert millions == [866, 84]
+
+
+@pytest.mark.parametrize("gradient", [None, "denoised", "full"])
+def test_measure(make_pipeline, tmp_path, monkeypatch, gradient):
+    make_pipeline().save_pretrained(tmp_path)
+    monkeypatch.setattr("geodiff_plugin.priors.BUNDLED_FOLDER", tmp_path)
+    cost = measure(gradient, False, "cpu")
+    assert cost.seconds > 0 and cost.peak_bytes >= 0
+
+
+def test_table(monkeypatch, capsys):
+    class Inline:
+        """Stands in for the executor: the same calls, in this process, with made-up costs."""
+
+        def __init__(self, **_):
+            self.cost = None
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def submit(self, function, gradient, *_):
+            assert function is measure
+            cost = {
+                None: Cost(1.0, 100_000_000),
+                "denoised": Cost(2.0, 150_000_000),
+                "full": Cost(3.0, 400_000_000),
+            }
+            self.cost = cost[gradient]
+            return self
+
+        def result(self):
+            return self.cost
+
+    monkeypatch.setattr("geodiff_plugin.commands.bench.ProcessPoolExecutor", Inline)
+    run_bench(False, "cpu")
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[-4:] for row in rows] == [
+        ["1.00", "100", "1.00", "1.00"],
+        ["2.00", "150", "2.00", "1.50"],
+        ["3.00", "400", "3.00", "4.00"],
+    ]
+
+
+@pytest.mark.slow
+def test_full_size_bench(geodiff):
+    """866 M and 84 M parameters, one step at 256 px, plain and both gradients."""
+    answer = geodiff("bench", "--full-size", "--device", "cpu")
+    assert answer.code == 0
+    assert len(answer.out.splitlines()) == 5
