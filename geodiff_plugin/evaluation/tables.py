@@ -89,9 +89,9 @@ def groups(records: Sequence[dict[str, Any]]) -> dict[str, set[str]]:
     """Labels of all samples, and of the rectified and the posed ones where both kinds are there."""
     rectified = {_label(r) for r in records if r.get("rectified") is True}
     posed = {_label(r) for r in records if r.get("rectified") is False}
-    everything = {f"all {len(rectified | posed)}": rectified | posed}
+    everything = {f"{len(rectified | posed)} pairs": rectified | posed}
     if rectified and posed:
-        everything |= {f"{len(rectified)} rectified": rectified, f"{len(posed)} posed": posed}
+        everything |= {f"{len(rectified)} rectified pairs": rectified, f"{len(posed)} posed pairs": posed}
     return everything
 
 
@@ -132,32 +132,37 @@ def per_pair_table(
     return Table(title, ("pair", *(METHODS[m].title for m in values)), tuple(rows), note)
 
 
-def summary_table(records: Sequence[dict[str, Any]], column: str, members: set[str], title: str) -> Table:
-    """One row per method, one column per metric: mean over images and its 95 % interval.
+def _summary_cells(scores: Sequence[dict[str, float | None]]) -> tuple[str, ...]:
+    """Mean and interval of every metric, then the mean coverage."""
+    means = [mean_with_interval([s[metric] for s in scores if s[metric] is not None]) for metric in _SUMMARY]
+    coverage = mean_with_interval([s["coverage"] for s in scores])
+    return (*(_with_interval(mean) for mean in means), _cell(coverage.value))
+
+
+def summary_table(records: Sequence[dict[str, Any]], members: set[str], title: str) -> Table:
+    """Mean over images and its interval of every metric, a row per method as it comes out and one aligned.
 
     Args:
         records: of a run.
-        column: ``"raw"`` or ``"aligned"``.
         members: labels of the samples that count.
         title: heading.
     """
     rows = []
     for method in dict.fromkeys(record["method"] for record in records):
         own = [
-            record["capped"][column]
+            record["capped"]
             for record in records
             if record["method"] == method and record["status"] == "ok" and _label(record) in members
         ]
-        own = [scores for scores in own if scores is not None]
-        if own:
-            cells = [
-                _with_interval(mean_with_interval([s[metric] for s in own if s[metric] is not None]))
-                for metric in _SUMMARY
-            ]
-            coverage = mean_with_interval([s["coverage"] for s in own]).value
-            rows.append((METHODS[method].title, str(len(own)), *cells, _cell(coverage)))
+        for column, name in (
+            ("raw", METHODS[method].title),
+            ("aligned", f"{METHODS[method].title}, aligned"),
+        ):
+            scores = [both[column] for both in own if both[column] is not None]
+            if scores:
+                rows.append((name, str(len(scores)), *_summary_cells(scores)))
     header = ("method", "pairs", *(_HEADINGS[metric] for metric in _SUMMARY), "coverage")
-    return Table(title, header, tuple(rows))
+    return Table(title, header, tuple(rows), "Capped at 80 m for KITTI and 10 m for Booster; mean [95 %].")
 
 
 def versus_table(records: Sequence[dict[str, Any]], reference: str) -> Table:
@@ -203,6 +208,5 @@ def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -
     if any(record["method"] == reference for record in records):
         tables.append(versus_table(records, reference))
     for group, members in groups(records).items():
-        tables.append(summary_table(records, "raw", members, f"Not aligned, {group}"))
-        tables.append(summary_table(records, "aligned", members, f"Aligned by least squares, {group}"))
+        tables.append(summary_table(records, members, f"All metrics, {group}"))
     return [table for table in tables if table.rows]

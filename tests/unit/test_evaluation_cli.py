@@ -38,7 +38,7 @@ def test_pairs_writes_every_table_and_prints_it(data, tmp_path):
     out, page = tmp_path / "out", tmp_path / "docs" / "results.md"
     result = invoke("pairs", data, "--methods", "sgbm", "--out", out, "--results", page)
     assert result.exit_code == 0
-    assert "| middlebury2014/one |" in result.stdout and "mean of all 2" in result.stdout
+    assert "| middlebury2014/one |" in result.stdout and "mean of 2 pairs" in result.stdout
     assert page.read_text() == (out / "table.md").read_text()
     assert f"geodiff eval pairs {data} --methods sgbm" in page.read_text()
     assert r"\toprule" in (out / "table.tex").read_text()

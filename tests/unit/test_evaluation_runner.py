@@ -193,12 +193,20 @@ def test_tables_hold_pairs_means_and_differences(bench):
     assert pairs.rows[0] == ("middlebury2014/a", "0.000", "1.000")
     assert pairs.rows[2] == ("middlebury2014/c", "0.000", "-")
     means = {row[0]: row[1:] for row in pairs.rows[3:]}
-    assert means["mean of all 3"] == ("0.000", "-")
-    assert means["mean of 2 rectified"] == ("0.000", "1.000") and means["mean of 1 posed"] == ("0.000", "-")
+    assert means["mean of 3 pairs"] == ("0.000", "-")
+    assert means["mean of 2 rectified pairs"] == ("0.000", "1.000") and means["mean of 1 posed pairs"] == (
+        "0.000",
+        "-",
+    )
     assert versus.rows == (("double", "2", "-1.000", "2 of 2"),)
     assert "| middlebury2014/a | 0.000 | 1.000 |" in pairs.markdown()
     assert r"middlebury2014/a & 0.000 & 1.000 \\" in pairs.latex()
-    assert any("Aligned" in table.title for table in summaries)
+    assert [table.title for table in summaries] == [
+        "All metrics, 3 pairs",
+        "All metrics, 2 rectified pairs",
+        "All metrics, 1 posed pairs",
+    ]
+    assert [row[0] for row in summaries[0].rows] == ["exact", "exact, aligned", "double", "double, aligned"]
 
 
 def pairs_tables_of(records):
