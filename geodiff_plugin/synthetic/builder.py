@@ -6,6 +6,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -44,7 +45,8 @@ class Look:
         gloss: strength of highlights and reflections in [0, 1].
         macro: large-scale variation in [0, 1].
         emission: radiance in units of the albedo.
-        origin: draws the texture's offset; None for a random one.
+        origin: the texture's offset in tiles; None for a random one.
+        row: the same as flat numbers.
     """
 
     layer: str
@@ -55,6 +57,21 @@ class Look:
     macro: float = 0.25
     emission: float = 0.0
     origin: tuple[float, float] | None = None
+    row: tuple[float, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # One look serves many primitives, so its share of a primitive's row is made once.
+        row = (
+            int(self.material),
+            LAYERS[self.layer],
+            *(self.tile or (TILE_M[self.layer],) * 2),
+            *(self.origin or (math.nan, math.nan)),
+            *np.asarray(self.palette, dtype=float).ravel().tolist(),
+            self.gloss,
+            self.macro,
+            self.emission,
+        )
+        object.__setattr__(self, "row", row)
 
 
 @dataclass
@@ -65,16 +82,24 @@ class Builder:
     rows: list = field(default_factory=list)
     lights: list = field(default_factory=list)
 
-    def add(self, shape: Shape, centre, half, look: Look, yaw=0.0, pitch=0.0, roll=0.0, taper=(1.0, 0.0), fixed=False):
+    def add(
+        self,
+        shape: Shape,
+        centre,
+        half,
+        look: Look,
+        yaw=0.0,
+        pitch=0.0,
+        roll=0.0,
+        taper=(1.0, 0.0),
+        fixed=False,
+    ):
         """Append a primitive; ``fixed`` ones stay even if the camera is near."""
-        tile = look.tile or (TILE_M[look.layer],) * 2
-        origin = look.origin if look.origin is not None else tuple(self.rng.random(2))
-        self.rows.append((int(shape), *centre, *half, yaw, pitch, roll, *taper, int(look.material), LAYERS[look.layer],
-                          *tile, *origin, *np.asarray(look.palette).ravel(), look.gloss, look.macro, look.emission, float(fixed)))
+        self.rows.append((int(shape), *centre, *half, yaw, pitch, roll, *taper, *look.row, float(fixed)))
 
     def box(self, centre, size, look, **turn):
         """Box by full size (x, y, z)."""
-        self.add(Shape.BOX, centre, np.asarray(size) / 2, look, **turn)
+        self.add(Shape.BOX, centre, (size[0] / 2, size[1] / 2, size[2] / 2), look, **turn)
 
     def standing(self, x, z, ground, size, look, **turn):
         """Box whose bottom is at height ``ground`` (y down)."""
@@ -83,14 +108,6 @@ class Builder:
     def ball(self, centre, half, look, **turn):
         """Ellipsoid by half axes."""
         self.add(Shape.SPHERE, centre, np.broadcast_to(half, 3), look, **turn)
-
-    def column(self, x, z, ground, radius, height, look, top=1.0, **turn):
-        """Upright cylinder (``top`` 1) or cone (``top`` 0) on the ground."""
-        self.add(Shape.FRUSTUM, (x, ground - height / 2, z), (radius, height / 2, radius), look, taper=(top, 0.0), **turn)
-
-    def wedge(self, x, z, ground, size, look, taper, **turn):
-        """Box with a narrower top, bottom on the ground."""
-        self.add(Shape.TAPER, (x, ground - size[1] / 2, z), np.asarray(size) / 2, look, taper=taper, **turn)
 
     def quad(self, centre, half_u, half_v, look, **turn):
         """Flat rectangle in its local x-z plane."""
@@ -103,6 +120,7 @@ class Builder:
     def finish(self, camera: np.ndarray, clearance: float, **rest) -> Scene:
         """Pack everything, leaving out what stands nearer to the camera than the clearance."""
         a = np.array(self.rows, dtype=np.float64)
+        a[:, 16:18] = np.where(np.isnan(a[:, 16:18]), self.rng.random((len(a), 2)), a[:, 16:18])
         shape, centre, half = a[:, 0].astype(int), a[:, 1:4], a[:, 4:7]
         r = rotation(a[:, 7], a[:, 8], a[:, 9])  # world from local
         eye = camera[:3, 3]

@@ -55,10 +55,10 @@ def sample_effects(rng: np.random.Generator, grey: float = 0.2) -> CameraEffects
     """
     tint = 1 + rng.normal(0, 0.05, 3) if rng.random() < 0.7 else np.ones(3)
     return CameraEffects(
-        gain=float(np.exp(rng.normal(0, 0.25))),
+        gain=float(np.exp(rng.normal(0, 0.3))),
         white_balance=tuple(float(x) for x in np.clip(tint / tint.mean(), 0.8, 1.25)),
         gamma=float(np.exp(rng.normal(0, 0.12))),
-        contrast=float(rng.uniform(0.8, 1.25)),
+        contrast=float(rng.uniform(0.85, 1.25) if rng.random() < 0.6 else rng.uniform(1.1, 1.8)),
         saturation=0.0 if rng.random() < grey else float(rng.uniform(0.4, 1.25)),
         vignette=float(rng.uniform(0, 0.35)) if rng.random() < 0.4 else 0.0,
         blur_px=float(rng.uniform(0.3, 1.1)) if rng.random() < 0.65 else 0.0,

@@ -152,6 +152,8 @@ def surface(
         cap = torch.copysign(one, y)
         ny = torch.where(ball, y, torch.where(side, -slope * radius, torch.where(round_, cap, ny)))
         latitude = torch.asin(y.clamp(-1, 1)) * hy
-        u = torch.where(side, angle * hx, torch.where(round_, x * hx, u))
-        v = torch.where(side, torch.where(ball, latitude, y * hy), torch.where(round_, z * hz, v))
+        # Flat balls (hills, cushions) take their texture from above, the others around the y axis.
+        wrapped = side & ~(ball & (hy < 0.4 * hx))
+        u = torch.where(wrapped, angle * hx, torch.where(round_, x * hx, u))
+        v = torch.where(wrapped, torch.where(ball, latitude, y * hy), torch.where(round_, z * hz, v))
     return torch.stack([nx, ny, nz]), torch.stack([u, v])

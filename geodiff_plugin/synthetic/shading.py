@@ -115,7 +115,7 @@ def _albedo(atlas: Atlas, row: torch.Tensor, uv_m: torch.Tensor, footprint_m: to
     colour = colour + (c - colour) * texel[1]
     shade = texel[3] * (1 + row[34] * (broad - 0.5) * 1.6)
     colour = colour * shade
-    if atlas.photo_from < int(1e9):
+    if atlas.photographs:
         photo = layer >= atlas.photo_from
         colour = torch.where(photo, texel[:3] * (0.4 + 1.2 * a), colour)
         return colour, torch.where(photo, torch.zeros_like(shade), texel[2])
@@ -148,6 +148,7 @@ def _direct(world, light, scene, point, normal, view, prim, live, shine, gloss, 
         if k < shadows:
             rays = Bundles(scene, origin, ray, wanted.to(point.dtype) * 0.999, prim)
             amount = amount * (1 - blocked(world, rays))
+        diffuse += colour * amount
         half = _unit(towards - view)
         peak = (normal * half).sum(0).clamp_min(0).pow(shine) * gloss
         highlight += colour * (amount * peak * (0.5 + shine * 0.06))

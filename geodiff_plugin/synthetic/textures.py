@@ -26,12 +26,14 @@ class Atlas:
         level_start: ``(levels,)`` int64, first row of each mip level.
         levels: number of mip levels; level ``k`` has ``TEXELS >> k`` texels a side.
         photo_from: layers from this index on are photographs.
+        photographs: there are any.
     """
 
     texels: torch.Tensor
     level_start: torch.Tensor
     levels: int
     photo_from: int
+    photographs: bool
 
 
 def _pyramid(base: np.ndarray) -> list[np.ndarray]:
@@ -58,9 +60,8 @@ def atlas(device: str = "cpu", photographs: bool = False) -> Atlas:
     levels = _pyramid(np.stack(layers).astype(np.float32))
     flat = np.concatenate([x.reshape(-1, 4) for x in levels])
     start = np.cumsum([0] + [x.shape[0] * x.shape[1] * x.shape[2] for x in levels[:-1]])
-    return Atlas(
-        torch.from_numpy(flat).to(device), torch.from_numpy(start).to(device), len(levels), len(LAYERS)
-    )
+    rows, starts = torch.from_numpy(flat).to(device), torch.from_numpy(start).to(device)
+    return Atlas(rows, starts, len(levels), len(LAYERS), photographs)
 
 
 def sample_atlas(table: Atlas, layer: torch.Tensor, uv: torch.Tensor, footprint: torch.Tensor) -> torch.Tensor:

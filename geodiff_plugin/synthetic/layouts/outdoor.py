@@ -20,8 +20,8 @@ __all__ = ["building", "daylight", "facade_look", "house"]
 def daylight(b: Builder, kind: str, seed: int, fov: float, baseline: tuple[float, float]) -> dict:
     """Add the sun (weak and soft under cloud) and return sky, ambient light, haze and the rest of the fields."""
     rng = b.rng
-    overcast = rng.random() < 0.35
-    azimuth, height = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(18, 70))
+    overcast = rng.random() < 0.3
+    azimuth, height = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(12, 65))
     warm = colour(0.1, 0.25 * (1 - height), 1.0)
     strength = rng.uniform(0.15, 0.5) if overcast else rng.uniform(1.5, 4.5)
     # An overcast sun is a wide patch: three directions give it a soft edge.
@@ -47,7 +47,7 @@ def daylight(b: Builder, kind: str, seed: int, fov: float, baseline: tuple[float
         ao_length_m=float(rng.uniform(1.0, 2.5)),
         sky=t([zenith, bright * horizon, np.full(3, 1.15 * bright)]),
         sky_clouds=float(rng.uniform(0, 1.2)),
-        fog_density=float(rng.choice(haze, p=[0.35, 0.53, 0.12])),
+        fog_density=float(rng.choice(haze, p=[0.5, 0.42, 0.08])),
         fog_colour=t(bright * horizon * 0.85),
         fov_deg=float(fov),
         baseline_m=float(rng.uniform(*baseline)),

@@ -57,12 +57,12 @@ def palette(rng: np.random.Generator, family: str) -> np.ndarray:
 
 def pick(rng: np.random.Generator, *options):
     """One of the options."""
-    return options[int(rng.integers(len(options)))]
+    return options[int(rng.random() * len(options))]
 
 
 def surface_look(rng: np.random.Generator, layer: str, family: str, scale: tuple[float, float] = (0.8, 1.25), **rest) -> Look:
     """A layer at about its natural size in colours of a family."""
-    k = rng.uniform(*scale)
+    k = scale[0] + (scale[1] - scale[0]) * rng.random()
     return Look(layer, palette(rng, family), (TILE_M[layer] * k,) * 2, **rest)
 
 

@@ -18,7 +18,7 @@ __all__ = ["bush", "leaf_look", "pot_plant", "rock", "tree", "tree_line"]
 
 def leaf_look(rng: np.random.Generator, scale: tuple[float, float] = (0.8, 1.6)) -> Look:
     """Foliage, green or dry."""
-    family = pick(rng, "leaf", "leaf", "leaf", "moss", "dry")
+    family = pick(rng, "leaf", "leaf", "leaf", "moss", "moss", "moss", "dry")
     return surface_look(rng, pick(rng, "leaves", "hedge"), family, scale, macro=0.5)
 
 

@@ -6,6 +6,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +50,7 @@ class Spot:
 
     def at(self, lx: float, lz: float) -> tuple[float, float]:
         """World x and z of a local position."""
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
         return self.x + c * lx + s * lz, self.z - s * lx + c * lz
 
     def moved(self, lx: float, lz: float, turn: float = 0.0, up: float = 0.0) -> Spot:
@@ -66,7 +67,7 @@ class Spot:
         """Box with a narrower top, its bottom at a height."""
         x, z = self.at(lx, lz)
         centre = (x, self.ground - bottom - size[1] / 2, z)
-        self.b.add(Shape.TAPER, centre, np.asarray(size) / 2, look, yaw=self.yaw, taper=taper, **rest)
+        self.b.add(Shape.TAPER, centre, (size[0] / 2, size[1] / 2, size[2] / 2), look, yaw=self.yaw, taper=taper, **rest)
 
     def column(self, lx, lz, bottom, radius, height, look, top=1.0):
         """Upright round column; ``top`` is the upper radius in parts of the lower."""
