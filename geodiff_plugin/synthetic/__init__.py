@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from geodiff_plugin.synthetic.effects import CameraEffects
 from geodiff_plugin.synthetic.layouts import KINDS, sample_scene
-from geodiff_plugin.synthetic.pairs import SyntheticPair, render_mono, render_pair
+from geodiff_plugin.synthetic.mono import render_mono
+from geodiff_plugin.synthetic.pairs import SyntheticPair, render_pair
 from geodiff_plugin.synthetic.render import render_views
 from geodiff_plugin.synthetic.scene import Camera, Material, RenderedView, Scene
 

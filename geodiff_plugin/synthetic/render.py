@@ -1,4 +1,4 @@
-"""Rendering: cameras to ray bundles, nearest hits, light, one bounce, exposure.
+"""Rendering: cameras to ray bundles, nearest hits, light, one bounce, smooth edges, exposure.
 
 Hop: ``Scene`` + ``Camera`` -> ``RenderedView``.
 Paper: none.
@@ -7,20 +7,25 @@ Paper: none.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.synthetic.cameras import TILE, camera_rays, tile, untile
+from geodiff_plugin.synthetic.lighting import Lighting, unit
 from geodiff_plugin.synthetic.scene import Camera, RenderedView, Scene
-from geodiff_plugin.synthetic.shading import Lighting, Shaded, shade
+from geodiff_plugin.synthetic.shading import Shaded, shade
 from geodiff_plugin.synthetic.textures import Atlas, atlas
-from geodiff_plugin.synthetic.tracing import Bundles, World, nearest
+from geodiff_plugin.synthetic.tracing import Bundles, nearest
+from geodiff_plugin.synthetic.world import World
 
-__all__ = ["LinearViews", "as_views", "expose", "render_linear", "render_views"]
+__all__ = ["LinearViews", "as_views", "expose", "render_linear", "render_views", "soften"]
 
-_TILE = 8
 _FAR = 1e4
+# Rotated grid: four samples with four different rows and columns of the pixel.
+_SUBPIXELS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 
 
 @dataclass(frozen=True)
@@ -31,63 +36,78 @@ class LinearViews:
         radiance: ``(V, 3, H, W)`` linear.
         depth_m: ``(V, 1, H, W)``, inf for the sky.
         material: ``(V, 1, H, W)`` int64.
+        edges: ``(V, 1, H, W)`` bool, pixels beside one of another primitive.
     """
 
     radiance: torch.Tensor
     depth_m: torch.Tensor
     material: torch.Tensor
+    edges: torch.Tensor
 
 
-def _camera_rays(cameras: Sequence[Camera], owner: torch.Tensor, size: tuple[int, int], device) -> tuple[Bundles, torch.Tensor]:
-    """Bundles of 8x8 pixels; ``t`` of a ray is planar depth. Also metres a pixel covers at depth 1."""
-    height, width = -(-size[0] // _TILE) * _TILE, -(-size[1] // _TILE) * _TILE
-    K = torch.stack([c.K for c in cameras]).double()
-    pose = torch.stack([c.T_world_from_camera for c in cameras]).to(device, torch.float32)
-    # Pixel -> camera direction with z = 1, then the world.
-    inverse = torch.linalg.inv(K).to(device, torch.float32)
-    x = torch.arange(width, device=device, dtype=torch.float32)
-    y = torch.arange(height, device=device, dtype=torch.float32)
-    row, column = y.view(-1, _TILE), x.view(-1, _TILE)
-    th, tw = row.shape[0], column.shape[0]
-    px = column[None, :, None, :].expand(th, tw, _TILE, _TILE).reshape(1, th * tw, _TILE * _TILE)
-    py = row[:, None, :, None].expand(th, tw, _TILE, _TILE).reshape(1, th * tw, _TILE * _TILE)
-    matrix = pose[:, :3, :3] @ inverse  # (V, 3, 3)
-    direction = torch.stack([
-        matrix[:, k, 0, None, None] * px + matrix[:, k, 1, None, None] * py + matrix[:, k, 2, None, None] for k in range(3)
-    ]).flatten(1, 2)
-    bundles = th * tw
-    origin = pose[:, :3, 3].t().repeat_interleave(bundles, 1)[..., None]
-    scene = owner.to(device).repeat_interleave(bundles)
-    shape = direction.shape[1:]
-    t_max = torch.full(shape, _FAR, device=device)
-    skip = torch.full(shape, -1, device=device, dtype=torch.int64)
-    pixel = inverse[:, 0, 0].repeat_interleave(bundles)[:, None].expand(shape)
-    return Bundles(scene, origin, direction, t_max, skip), pixel
+@dataclass(frozen=True)
+class _Stage:
+    """Everything that rays meet."""
+
+    world: World
+    light: Lighting
+    atlas: Atlas
 
 
-def _bounce(world: World, light: Lighting, table: Atlas, rays: Bundles, hit: Shaded, prim, pixel) -> torch.Tensor:
+def _bounce(stage: _Stage, rays: Bundles, hit: Shaded, prim: torch.Tensor, pixel: torch.Tensor) -> torch.Tensor:
     """Add one reflection and what is seen through glass."""
     base = hit.radiance * (1 - hit.mirror - hit.through)
-    direction = rays.direction * rays.direction.square().sum(0).rsqrt()
-    mirrored = direction - 2 * (direction * hit.normal).sum(0) * hit.normal
     (reflects,) = (hit.mirror > 0).any(-1).nonzero(as_tuple=True)
     (passes,) = (hit.through > 0).any(-1).nonzero(as_tuple=True)
     some = torch.cat([reflects, passes])
     if some.numel() == 0:
         return base
+    direction = unit(rays.direction)
+    mirrored = direction - 2 * (direction * hit.normal).sum(0) * hit.normal
     weight = torch.cat([hit.mirror[reflects], hit.through[passes]])
     way = torch.cat([mirrored[:, reflects], direction[:, passes]], 1)
     part = Bundles(rays.scene[some], hit.point[:, some], way, (weight > 0) * _FAR, prim[some])
-    t, other = nearest(world, part)
-    seen = shade(world, light, table, part, t, other, pixel[some] * 3, first=False)
+    t, other = nearest(stage.world, part)
+    seen = shade(stage.world, stage.light, stage.atlas, part, t, other, pixel[some] * 3, first=False)
     return base.index_add_(1, some, seen.radiance * weight)
 
 
-def _untile(x: torch.Tensor, views: int, size: tuple[int, int]) -> torch.Tensor:
-    """``(C, V * tiles, 64)`` -> ``(V, C, H, W)``."""
-    th, tw = -(-size[0] // _TILE), -(-size[1] // _TILE)
-    x = x.reshape(x.shape[0], views, th, tw, _TILE, _TILE).permute(1, 0, 2, 4, 3, 5)
-    return x.reshape(views, -1, th * _TILE, tw * _TILE)[:, :, : size[0], : size[1]].contiguous()
+def _follow(stage: _Stage, rays: Bundles, pixel: torch.Tensor):
+    """Radiance ``(3, B, P)``, ``t``, primitive and material of primary rays."""
+    t, prim = nearest(stage.world, rays)
+    hit = shade(stage.world, stage.light, stage.atlas, rays, t, prim, pixel, first=True)
+    return _bounce(stage, rays, hit, prim, pixel), t, prim, hit.material
+
+
+def _find_edges(prim: torch.Tensor) -> torch.Tensor:
+    """Pixels whose right, left, upper or lower neighbour shows another primitive."""
+    across = prim[..., 1:] != prim[..., :-1]
+    down = prim[..., 1:, :] != prim[..., :-1, :]
+    edges = F.pad(across, (0, 1)) | F.pad(across, (1, 0))
+    return edges | F.pad(down, (0, 0, 0, 1)) | F.pad(down, (0, 0, 1, 0))
+
+
+def _supersample(stage: _Stage, rays: Bundles, steps: torch.Tensor, pixel: torch.Tensor, chosen: torch.Tensor):
+    """Mean radiance ``(3, n)`` over four samples of the chosen pixels (flat indices) of one scene."""
+    count = chosen.shape[0]
+    padded = torch.cat([chosen, chosen[-1:].expand(-count % (TILE * TILE))])
+    shape = (padded.shape[0] // (TILE * TILE), TILE * TILE)
+    bundle = padded // rays.t_max.shape[1]
+    centre = rays.direction.flatten(1)[:, padded]
+    along_x, along_y = steps[:, :, 0].t()[:, bundle], steps[:, :, 1].t()[:, bundle]
+    part = Bundles(
+        rays.scene[:1].expand(shape[0]),
+        rays.origin[:, :1].expand(3, shape[0], 1),
+        centre.reshape(3, *shape),
+        rays.t_max.new_full(shape, _FAR),
+        rays.skip.new_full(shape, -1),
+    )
+    width = pixel.flatten()[padded].reshape(shape)
+    total = 0
+    for dx, dy in _SUBPIXELS:
+        moved = (centre + dx * along_x + dy * along_y).reshape(3, *shape)
+        total = total + _follow(stage, replace(part, direction=moved), width)[0]
+    return total.flatten(1)[:, :count] / len(_SUBPIXELS)
 
 
 @torch.no_grad()
@@ -98,6 +118,7 @@ def render_linear(
     size: tuple[int, int],
     device: str | torch.device = "cpu",
     photographs: bool = False,
+    antialias: bool = False,
 ) -> LinearViews:
     """Radiance and depth of a batch of views.
 
@@ -108,17 +129,24 @@ def render_linear(
         size: ``(H, W)`` pixels, the same for all.
         device: where to render.
         photographs: the scenes use photographs as textures.
+        antialias: shade pixels on outlines four times. Depth is always that of the pixel's centre.
     """
-    world, light = World.gather(scenes, device), Lighting.gather(scenes, device)
-    table = atlas(str(device), photographs)
-    rays, pixel = _camera_rays(cameras, torch.as_tensor(owner), size, device)
-    t, prim = nearest(world, rays)
-    hit = shade(world, light, table, rays, t, prim, pixel, first=True)
-    radiance = _bounce(world, light, table, rays, hit, prim, pixel)
+    stage = _Stage(World.gather(scenes, device), Lighting.gather(scenes, device), atlas(str(device), photographs))
+    rays, pixel, steps = camera_rays(cameras, torch.as_tensor(owner), size, device, _FAR)
+    radiance, t, prim, material = _follow(stage, rays, pixel)
     views = len(cameras)
-    return LinearViews(
-        _untile(radiance, views, size), _untile(t[None], views, size), _untile(hit.material[None], views, size)
-    )
+    edges = _find_edges(untile(prim[None], views, size))
+    if antialias:
+        per_view = rays.scene.shape[0] // views
+        flags = tile(edges)[0].flatten(1)
+        for v in range(views):
+            some = slice(v * per_view, (v + 1) * per_view)
+            (chosen,) = flags[some].flatten().nonzero(as_tuple=True)
+            if chosen.numel():
+                mine = Bundles(rays.scene[some], rays.origin[:, some], rays.direction[:, some], rays.t_max[some], rays.skip[some])
+                mean = _supersample(stage, mine, steps[some], pixel[some], chosen)
+                radiance[:, some] = radiance[:, some].flatten(1).index_copy(1, chosen, mean).reshape(3, per_view, -1)
+    return LinearViews(untile(radiance, views, size), untile(t[None], views, size), untile(material[None], views, size), edges)
 
 
 def expose(radiance: torch.Tensor, gain: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
@@ -140,8 +168,33 @@ def expose(radiance: torch.Tensor, gain: torch.Tensor | None = None) -> tuple[to
     return image.clamp(0, 1), gain
 
 
+def soften(image_01: torch.Tensor, edges: torch.Tensor) -> torch.Tensor:
+    """Cheap antialiasing: outlines, and only they, take the binomial mean of their neighbourhood.
+
+    Args:
+        image_01: ``(V, 3, H, W)``.
+        edges: ``(V, 1, H, W)`` bool.
+    """
+    x = F.pad(image_01, (1, 1, 1, 1), mode="replicate")
+    x = (x[..., :-2] + 2 * x[..., 1:-1] + x[..., 2:]) / 4
+    x = (x[..., :-2, :] + 2 * x[..., 1:-1, :] + x[..., 2:, :]) / 4
+    return torch.where(edges, x, image_01)
+
+
+def as_views(image: torch.Tensor, linear: LinearViews) -> list[RenderedView]:
+    """Split a batch into records."""
+    return [
+        RenderedView(i, d, torch.isfinite(d), m)
+        for i, d, m in zip(image, linear.depth_m, linear.material, strict=True)
+    ]
+
+
 def render_views(
-    scene: Scene, views: list[Camera], size: tuple[int, int] = (192, 256), device: str | torch.device = "cpu"
+    scene: Scene,
+    views: list[Camera],
+    size: tuple[int, int] = (192, 256),
+    device: str | torch.device = "cpu",
+    antialias: bool = True,
 ) -> list[RenderedView]:
     """Render a scene from several cameras, all with the exposure of the first.
 
@@ -150,6 +203,7 @@ def render_views(
         views: at least one camera.
         size: ``(H, W)`` pixels of every view.
         device: where to render.
+        antialias: shade pixels on outlines four times.
 
     Returns:
         One view a camera, on the device.
@@ -161,16 +215,7 @@ def render_views(
         bad_value("views", "a list of at least one Camera", "an empty list")
     if min(size) < 1:
         bad_value("size", "(H, W) in pixels", size)
-    linear = render_linear([scene], views, [0] * len(views), size, device)
+    linear = render_linear([scene], views, [0] * len(views), size, device, antialias=antialias)
     _, gain = expose(linear.radiance[:1])
     image, _ = expose(linear.radiance, gain.expand(len(views)))
     return as_views(image, linear)
-
-
-def as_views(image: torch.Tensor, linear: LinearViews) -> list[RenderedView]:
-    """Split a batch into records."""
-    return [
-        RenderedView(i, d, torch.isfinite(d), m)
-        for i, d, m in zip(image, linear.depth_m, linear.material, strict=True)
-    ]
-

@@ -146,7 +146,7 @@ def _furnish(b: Builder, s: int, plan: _Plan) -> None:
             tree(spot, rng.uniform(4, 8), 11 if k < 3 else 5)
         elif row < 0.7:
             pole(spot, rng.uniform(5, 8), rng.uniform(0.8, 2.0))
-    if 0.6 < row < 0.8:
+    if 0.7 < row < 0.82:
         wires(Spot(b, s * inner, 0.0), 120, rng.uniform(6, 8), int(rng.integers(1, 4)))
     wide = max(plan.walk, 0.8)
     for _ in range(int(rng.integers(0, 4))):
