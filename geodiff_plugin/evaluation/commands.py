@@ -14,14 +14,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from accelerate import PartialState
-
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import METHODS, Settings
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.report import run_facts, write_tables, write_text
-from geodiff_plugin.evaluation.runner import run
+from geodiff_plugin.evaluation.runner import processes, run
 from geodiff_plugin.evaluation.tables import pairs_tables
 
 __all__ = ["PAIRS_METHODS", "PairsOptions", "run_list", "run_pairs", "select"]
@@ -144,9 +142,12 @@ def run_pairs(options: PairsOptions) -> None:
         save_depth=options.save_depth,
         progress=not options.quiet,
     )
-    if not PartialState().is_main_process:
+    state = processes(options.settings)
+    if not state.is_main_process:
         return
     facts, remarks = run_facts(_command(options)), _remarks(records, options.settings)
+    if state.num_processes > 1:
+        remarks.append(f"Run by {state.num_processes} processes.")
     page = write_tables(options.out, "Results", facts, pairs_tables(records), remarks)
     if options.results is not None:
         write_text(options.results, page)

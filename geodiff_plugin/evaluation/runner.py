@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from accelerate import PartialState
 from tqdm import tqdm
 
@@ -25,10 +27,18 @@ from geodiff_plugin.evaluation.records import append_record, clean_records, read
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_npy
 
-__all__ = ["RECORDS_NAME", "headline", "run"]
+__all__ = ["RECORDS_NAME", "headline", "processes", "run"]
 
 RECORDS_NAME = "samples.jsonl"
 _BROKEN = (OSError, ValueError)
+
+
+def processes(settings: Settings) -> PartialState:
+    """The processes of this run, one or as many as ``torchrun`` or ``accelerate launch`` started.
+
+    On the CPU accelerate must be told so, or it takes several processes for several runs of one.
+    """
+    return PartialState(cpu=torch.device(settings.device).type == "cpu")
 
 
 def headline(record: dict[str, Any]) -> float | None:
@@ -40,12 +50,12 @@ def headline(record: dict[str, Any]) -> float | None:
 
 
 def _keys(
-    refs: Sequence[SampleRef], methods: Iterable[Method], settings: Settings, priors: PriorCache
-) -> dict:
-    """``(label, method)`` -> key of its record."""
+    refs: Sequence[SampleRef], methods: Iterable[Method], settings: Settings, fingerprint: str
+) -> dict[tuple[str, str], str]:
+    """``(label, method)`` -> key of its record; the fingerprint is the prior's."""
     keys = {}
     for method in methods:
-        prior = f"{settings.prior} {priors.fingerprint(settings)}" if method.uses_prior else ""
+        prior = f"{settings.prior} {fingerprint}" if method.uses_prior else ""
         configuration = method.configuration(settings)
         for ref in refs:
             keys[ref.label, method.name] = record_key(ref, method.name, configuration, prior, __version__)
@@ -67,11 +77,49 @@ def _measure(
     return {"status": "ok", "seconds": round(seconds, 3), **scores, "notes": notes}, prediction
 
 
-def _save(folder: Path, label: str, method: str, depth_m: np.ndarray | None) -> None:
-    if depth_m is not None:
-        target = folder / method / f"{label.replace('/', '_')}.npy"
+def _finish(
+    ref: SampleRef,
+    method: Method,
+    sample: StereoSample | None,
+    settings: Settings,
+    priors: PriorCache,
+    skip_broken: bool,
+    depth_folder: Path | None,
+) -> tuple[dict[str, Any], StereoSample | None]:
+    """Body of one record, and the sample, which is read only once; errors as ``run``."""
+    try:
+        sample = load(ref) if sample is None else sample
+        body, prediction = _measure(method, sample, settings, priors)
+    except _BROKEN as error:
+        if not skip_broken:
+            raise
+        return {"status": "broken", "error": str(error)}, sample
+    if depth_folder is not None and prediction is not None and prediction.depth_m is not None:
+        target = depth_folder / method.name / f"{ref.label.replace('/', '_')}.npy"
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_depth_npy(target, depth_m)
+        write_depth_npy(target, prediction.depth_m)
+    return {"rectified": sample.rectified} | body, sample
+
+
+class _RunningMeans:
+    """A progress bar that shows each method's AbsRel so far."""
+
+    def __init__(self, total: int, shown: bool) -> None:
+        self._bar = tqdm(total=total, disable=not shown, unit="run")
+        self._values: dict[str, list[float]] = {}
+
+    def __enter__(self) -> _RunningMeans:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._bar.close()
+
+    def add(self, record: dict[str, Any]) -> None:
+        value = headline(record)
+        if value is not None:
+            self._values.setdefault(record["method"], []).append(value)
+            self._bar.set_postfix({name: f"{np.mean(own):.3f}" for name, own in self._values.items()})
+        self._bar.update()
 
 
 def run(
@@ -107,42 +155,33 @@ def run(
         OSError: a missing or unreadable file without ``skip_broken``.
     """
     chosen = [METHODS[check_choice(name, "methods", METHODS)] for name in methods]
-    state, priors, out = PartialState(), PriorCache(), Path(out)
+    state, priors, out = processes(settings), PriorCache(), Path(out)
     path = out / RECORDS_NAME
     if state.is_main_process:
         out.mkdir(parents=True, exist_ok=True)
         clean_records(path)
     state.wait_for_everyone()
-    keys = _keys(refs, chosen, settings, priors)
+    local = settings
+    if state.num_processes > 1 and settings.device == "cuda":
+        local = replace(settings, device=str(state.device))
+    keys = _keys(
+        refs, chosen, settings, priors.fingerprint(local) if any(m.uses_prior for m in chosen) else ""
+    )
     finished = {record["key"]: record for record in read_records(path) if "key" in record}
     mine = list(refs)[state.process_index :: state.num_processes]
-    means: dict[str, list[float]] = {}
-    bar = tqdm(total=len(mine) * len(chosen), disable=not (progress and state.is_main_process), unit="run")
-    with bar:
+    depth_folder = out / "depth" if save_depth else None
+    with _RunningMeans(len(mine) * len(chosen), progress and state.is_main_process) as bar:
         for ref in mine:
             sample = None
             for method in chosen:
                 key = keys[ref.label, method.name]
                 record = finished.get(key)
                 if record is None:
+                    body, sample = _finish(ref, method, sample, local, priors, skip_broken, depth_folder)
                     head = {"key": key, "dataset": ref.dataset, "sample": ref.name, "method": method.name}
-                    try:
-                        sample = load(ref) if sample is None else sample
-                        body, prediction = _measure(method, sample, settings, priors)
-                    except _BROKEN as error:
-                        if not skip_broken:
-                            raise
-                        body, prediction = {"status": "broken", "error": str(error)}, None
-                    if save_depth and prediction is not None:
-                        _save(out / "depth", ref.label, method.name, prediction.depth_m)
-                    rectified = {} if sample is None else {"rectified": sample.rectified}
-                    record = head | rectified | body
+                    record = head | body | {"process": state.process_index}
                     append_record(path, record)
-                value = headline(record)
-                if value is not None:
-                    means.setdefault(method.name, []).append(value)
-                    bar.set_postfix({name: f"{np.mean(values):.3f}" for name, values in means.items()})
-                bar.update()
+                bar.add(record)
     state.wait_for_everyone()
     written = {record["key"]: record for record in read_records(path)}
     return [written[keys[ref.label, method.name]] for ref in refs for method in chosen]

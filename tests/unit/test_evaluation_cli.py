@@ -1,6 +1,9 @@
 """The eval commands on own images in Middlebury's layout, with the method that needs no prior."""
 
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -86,3 +89,25 @@ def test_list_tells_what_is_there(data):
     assert "middlebury2014  2 samples" in found and "kitti2015       not found" in found
     assert "https://" in found and "guided" in found
     assert "no --data given" in invoke("list").stdout
+
+
+def test_two_processes_share_the_samples(data, tmp_path):
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command += [
+        "-m",
+        "geodiff_plugin",
+        "eval",
+        "pairs",
+        str(data),
+        "--methods",
+        "sgbm",
+        "-o",
+        str(tmp_path / "out"),
+    ]
+    environment = os.environ | {"ACCELERATE_USE_CPU": "true", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert "2 processes" in done.stdout
+    lines = [json.loads(line) for line in (tmp_path / "out" / "samples.jsonl").read_text().splitlines()]
+    assert sorted(line["sample"] for line in lines) == ["one", "two"]
+    assert {line["process"] for line in lines} == {0, 1}
