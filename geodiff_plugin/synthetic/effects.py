@@ -46,23 +46,25 @@ class CameraEffects:
     seed: int = 0
 
 
-def sample_effects(rng: np.random.Generator, grey: float = 0.2) -> CameraEffects:
+def sample_effects(rng: np.random.Generator, size: tuple[int, int], grey: float = 0.2) -> CameraEffects:
     """Draw plausible imperfections.
 
     Args:
         rng: source of randomness.
+        size: ``(H, W)``; a small image is a photograph scaled down, with less blur and noise left.
         grey: share of grey images.
     """
+    scale = min(1.0, max(size) / 320)
     tint = 1 + rng.normal(0, 0.05, 3) if rng.random() < 0.7 else np.ones(3)
     return CameraEffects(
-        gain=float(np.exp(rng.normal(0, 0.3))),
+        gain=float(np.exp(rng.normal(0, 0.25))),
         white_balance=tuple(float(x) for x in np.clip(tint / tint.mean(), 0.8, 1.25)),
         gamma=float(np.exp(rng.normal(0, 0.12))),
-        contrast=float(rng.uniform(0.85, 1.25) if rng.random() < 0.6 else rng.uniform(1.1, 1.8)),
+        contrast=float(rng.uniform(0.85, 1.25) if rng.random() < 0.6 else rng.uniform(1.1, 1.6)),
         saturation=0.0 if rng.random() < grey else float(rng.uniform(0.4, 1.25)),
         vignette=float(rng.uniform(0, 0.35)) if rng.random() < 0.4 else 0.0,
-        blur_px=float(rng.uniform(0.3, 1.1)) if rng.random() < 0.65 else 0.0,
-        noise=float(rng.uniform(0.002, 0.03)) if rng.random() < 0.7 else 0.0,
+        blur_px=scale * float(rng.uniform(0.3, 1.2)) if rng.random() < 0.65 else 0.0,
+        noise=scale * float(rng.uniform(0.002, 0.04)) if rng.random() < 0.7 else 0.0,
         jpeg_quality=int(rng.integers(35, 95)) if rng.random() < 0.35 else 0,
         seed=int(rng.integers(1 << 31)),
     )

@@ -60,7 +60,7 @@ def render_mono(
             cameras.append(Camera(intrinsics(size, fov), scene.T_world_from_camera))
         scenes = [in_sight(s, size, c.K, _SIGHT_MARGIN_M) for s, c in zip(scenes, cameras, strict=True)]
         linear = render_linear(scenes, cameras, list(range(len(part))), size, device)
-        effects = [sample_effects(rng) if augment else CameraEffects() for rng in rngs]
+        effects = [sample_effects(rng, size) if augment else CameraEffects() for rng in rngs]
         _, gain = expose(linear.radiance)
         gain = gain * torch.tensor([e.gain for e in effects], device=gain.device)
         image, _ = expose(linear.radiance, gain)

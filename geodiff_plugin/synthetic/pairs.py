@@ -126,7 +126,7 @@ def render_pair(
     scene = clear_of(scene, world_from_right[:3, 3], scene.clearance_m * 0.6)
     first = render_linear([scene], [Camera(left_K, scene.T_world_from_camera)], [0], size, device, antialias=True)
     second = render_linear([scene], [Camera(right_K, world_from_right)], [0], size_right, device, antialias=True)
-    pair_effects = _pair_effects(rng, effects, exposure)
+    pair_effects = _pair_effects(rng, effects, exposure, size)
     _, gain = expose(first.radiance)
     left_image, _ = expose(first.radiance, gain * pair_effects[0].gain)
     right_image, _ = expose(second.radiance, gain * pair_effects[1].gain)
@@ -136,12 +136,12 @@ def render_pair(
     return SyntheticPair(left, right, left_K, right_K, E_, occluded, in_view, scene.kind, int(seed))
 
 
-def _pair_effects(rng, effects, exposure: bool) -> tuple[CameraEffects, CameraEffects]:
+def _pair_effects(rng, effects, exposure: bool, size) -> tuple[CameraEffects, CameraEffects]:
     drift = float(np.exp(rng.uniform(-0.18, 0.18)))
     if isinstance(effects, tuple):
         left, right = effects
     elif effects:
-        left = sample_effects(rng)
+        left = sample_effects(rng, size)
         # The same camera model twice: its own noise, otherwise alike.
         right = replace(left, seed=left.seed + 1, blur_px=left.blur_px * float(rng.uniform(0.8, 1.2)))
     else:

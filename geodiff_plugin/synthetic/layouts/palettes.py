@@ -35,6 +35,8 @@ _FAMILIES = {
     "asphalt": ((0.55, 0.7), (0.0, 0.07), (0.25, 0.5), 0.12),
 }
 
+_NATURAL = frozenset({"leaf", "moss", "dry", "soil", "stone", "asphalt", "brick"})
+
 
 def _linear(h: float, s: float, v: float) -> tuple[float, ...]:
     clip = (min(max(s, 0.0), 1.0), min(max(v, 0.0), 1.0))
@@ -52,7 +54,11 @@ def palette(rng: np.random.Generator, family: str) -> np.ndarray:
     r = rng.random(9).tolist()
     h, s, v = h0 + (h1 - h0) * r[0], s0 + (s1 - s0) * r[1], v0 + (v1 - v0) * r[2]
     second = _linear(h + 0.05 * (r[3] - 0.5), s * (0.6 + 0.6 * r[4]), v + shift * (0.4 + 0.9 * r[5]))
-    return np.array((_linear(h, s, v), second, _linear(r[6], 0.8 * r[7], 0.1 + 0.85 * r[8])))
+    if family in _NATURAL:  # patches and dirt of about the same hue
+        accent = _linear(h + 0.08 * (r[6] - 0.5), s * (0.4 + r[7]), v * (0.5 + 0.8 * r[8]))
+    else:
+        accent = _linear(r[6], 0.8 * r[7], 0.1 + 0.85 * r[8])
+    return np.array((_linear(h, s, v), second, accent))
 
 
 def pick(rng: np.random.Generator, *options):
