@@ -32,7 +32,7 @@ __all__ = [
 SHARD = 16
 """Scenes in one shard; all of one shape."""
 
-SHAPES = ((192, 256), (128, 416), (192, 256), (192, 192), (192, 256), (256, 192), (160, 288))
+SHAPES = ((192, 256), (128, 416), (192, 256), (192, 192), (192, 256), (128, 416), (256, 192), (160, 288))
 """Image sizes (H, W) that shards cycle through: landscape mostly, KITTI's 3.3:1, square, portrait, 16:9."""
 
 HELD_OUT_SEED = 1
@@ -68,7 +68,7 @@ def held_out(
         Images ``(N, 3, H, W)`` float32 in [0, 1] and depth ``(N, 1, H, W)`` float32 in metres, inf for sky;
         on the CPU.
     """
-    from geodiff_plugin.synthetic.pairs import render_mono
+    from geodiff_plugin.synthetic import render_mono
 
     images, depths = [], []
     for start in range(0, count, SHARD):
@@ -148,7 +148,7 @@ def render_shards(cache: Path, first: int, stop: int, step: int = 1, device: str
     Yields:
         The index of each new shard.
     """
-    from geodiff_plugin.synthetic.pairs import render_mono
+    from geodiff_plugin.synthetic import render_mono
 
     folder = Path(cache) / "scenes"
     folder.mkdir(parents=True, exist_ok=True)

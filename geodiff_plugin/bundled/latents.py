@@ -94,16 +94,22 @@ class LatentStore:
         return SHARD * len(self._items) // self.variants
 
     def refresh(self, most: int) -> int:
-        """Take in up to ``most`` new shards of the cache.
+        """Take in new shards of the cache: all that are encoded already, and encode up to ``most`` others.
 
         Returns:
             How many were taken in.
         """
-        mine = [i for i in shards(self.cache) if i % self.world == self.rank and i not in self._known]
-        for index in mine[:most]:
+        before = len(self._known)
+        for index in shards(self.cache):
+            if index % self.world != self.rank or index in self._known:
+                continue
+            if not self._path(index).exists():
+                if most == 0:
+                    continue
+                most -= 1
             self._known.add(index)
             self._items += self._encoded(index)
-        return len(mine[:most])
+        return len(self._known) - before
 
     def batch(self, size: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw image and depth latents ``(size, 4, h, w)`` float32, all of one shape."""
@@ -116,8 +122,11 @@ class LatentStore:
         picked = [(same[a][0][b], same[a][1][b]) for a, b in zip(shard, scene, strict=True)]
         return tuple(torch.stack(part).float() for part in zip(*picked, strict=True))
 
+    def _path(self, index: int) -> Path:
+        return self._folder / f"{index:06d}.safetensors"
+
     def _encoded(self, index: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        path = self._folder / f"{index:06d}.safetensors"
+        path = self._path(index)
         if not path.exists():
             self._folder.mkdir(parents=True, exist_ok=True)
             images, depth = resize_scenes(*read_shard(self.cache, index), self.divisor)
@@ -135,7 +144,7 @@ class LatentStore:
 
     def _render(self, size: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         from geodiff_plugin.bundled.data import shard_size, train_seeds
-        from geodiff_plugin.synthetic.pairs import render_mono
+        from geodiff_plugin.synthetic import render_mono
 
         index = int(torch.randint(2**24, (), generator=generator))
         seeds = [seed for k in range(-(-size // SHARD)) for seed in train_seeds(index + k)][:size]

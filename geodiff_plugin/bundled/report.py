@@ -49,12 +49,15 @@ class Reporter:
             self._next = progress.seconds + every
         return progress.seconds >= self._next
 
-    def report(self, progress: Progress, average: Average, last: bool = False) -> dict[str, float]:
+    def report(
+        self, progress: Progress, average: Average, divisor: int, last: bool = False
+    ) -> dict[str, float]:
         """Score the averaged weights, write them and the contact sheet.
 
         Args:
             progress: counters for the log.
             average: weights to judge.
+            divisor: of the stage; scenes are processed at the size that it trains on.
             last: also try several steps.
 
         Returns:
@@ -63,18 +66,18 @@ class Reporter:
         out = self._options.out
         average.copy_to(self._pipeline.unet)
         images, depth = self._scenes()
+        resolution = max(images.shape[-2:]) // divisor
         line = asdict(progress) | {"loss": self.mean_loss}
         for steps in (1, 2, 4) if last else (1,):
-            line[f"abs_rel_{steps}"], line[f"delta1_{steps}"] = score_scenes(
-                self._pipeline, images, depth, steps, 0
-            )
+            scores = score_scenes(self._pipeline, images, depth, steps, resolution)
+            line[f"abs_rel_{steps}"], line[f"delta1_{steps}"] = scores
+        self._pipeline.register_to_config(default_processing_resolution=resolution)
         save_prior(self._pipeline, out / "prior")
         with (out / "log.jsonl").open("a") as log:
             log.write(json.dumps({key: round(value, 5) for key, value in line.items()}) + "\n")
         shown = slice(0, _SHEET)
-        contact_sheet(
-            images[shown], depth[shown], predict(self._pipeline, images[shown], 1, 0), out / "contact.png"
-        )
+        predictions = predict(self._pipeline, images[shown], 1, resolution)
+        contact_sheet(images[shown], depth[shown], predictions, out / "contact.png")
         self._next = progress.seconds + 60 * self._options.validate_minutes
         return line
 

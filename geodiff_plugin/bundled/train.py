@@ -28,6 +28,8 @@ from geodiff_plugin.bundled.train_vae import save_vae, train_vae
 
 __all__ = ["main", "parse", "run"]
 
+_AVERAGE_EVERY = 4
+
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """The command line; see ``--help``."""
@@ -125,8 +127,9 @@ def _wait_for_scenes(options: argparse.Namespace) -> None:
 def _train(options: argparse.Namespace, accelerator: Accelerator) -> Progress:
     _wait_for_scenes(options)
     vae, unet, text = _prepare_models(options, accelerator)
-    average = Average(unet.to(accelerator.device), options.average)
-    optimiser = torch.optim.AdamW(unet.parameters(), lr=options.rate, betas=(0.9, 0.99), weight_decay=1e-3)
+    average = Average(unet.to(accelerator.device), options.average**_AVERAGE_EVERY)
+    settings = {"lr": options.rate, "betas": (0.9, 0.99), "weight_decay": 1e-3, "fused": True}
+    optimiser = torch.optim.AdamW(unet.parameters(), **settings)
     progress = restore(options.out, unet, average, optimiser) or Progress(seed=options.seed)
     network, prepared = accelerator.prepare(unet, optimiser)
     embedding = _embed(text).to(accelerator.device)
@@ -145,12 +148,12 @@ def _train(options: argparse.Namespace, accelerator: Accelerator) -> Progress:
         spent = progress.step / options.steps if options.steps else progress.seconds / (3600 * options.hours)
         fraction = float(accelerator.reduce(torch.tensor(spent, device=accelerator.device), "mean"))
         main_process = accelerator.is_main_process
+        stage = stage_at(fraction, continued=options.init_from is not None)
         if main_process and (fraction >= 1 or reporter.due(progress)):
             store(options.out, unet, average, optimiser, progress)
-            reporter.report(progress, average, last=fraction >= 1)
+            reporter.report(progress, average, stage.divisor, last=fraction >= 1)
         if fraction >= 1:
             break
-        stage = stage_at(fraction, continued=options.init_from is not None)
         pool = _pool_for(stage.divisor, pool, options, vae, accelerator)
         if progress.step % 50 == 0 or not len(pool):
             pool.refresh(4 if len(pool) else 8)
@@ -165,7 +168,8 @@ def _train(options: argparse.Namespace, accelerator: Accelerator) -> Progress:
         accelerator.clip_grad_norm_(network.parameters(), 1.0)
         prepared.step()
         prepared.zero_grad(set_to_none=True)
-        average.update(unet, progress.step)
+        if progress.step % _AVERAGE_EVERY == 0:
+            average.update(unet, progress.step // _AVERAGE_EVERY)
         progress.step += 1
         progress.samples += size * accelerator.num_processes
         reporter.loss(loss)

@@ -126,7 +126,7 @@ def train_vae(
     unfinished = folder / "vae-unfinished.safetensors"
     torch.manual_seed(seed)
     vae = load_vae(unfinished, device) if unfinished.exists() else build_vae().to(device)
-    base = float(vae.config.get("seconds", 0.0))
+    base = float(load_file(unfinished)["seconds"]) if unfinished.exists() else 0.0
     vae.train().requires_grad_(True)
     generator = torch.Generator().manual_seed(seed + 7919 * int(base) + accelerator.process_index)
     crops = _Crops(cache)
@@ -198,11 +198,10 @@ def save_vae(vae: AutoencoderKL, path: Path, seconds: float = 0.0) -> None:
 
 
 def load_vae(path: Path, device: torch.device) -> AutoencoderKL:
-    """Read what ``save_vae`` wrote; frozen, in eval mode; the seconds are in its config."""
+    """Read what ``save_vae`` wrote; frozen, in eval mode."""
     tensors = load_file(path)
     vae = build_vae()
-    vae.register_to_config(
-        scaling_factor=float(tensors.pop("scaling_factor")), seconds=float(tensors.pop("seconds"))
-    )
+    vae.register_to_config(scaling_factor=float(tensors.pop("scaling_factor")))
+    tensors.pop("seconds")
     vae.load_state_dict(tensors)
     return vae.to(device).eval().requires_grad_(False)
