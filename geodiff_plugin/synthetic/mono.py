@@ -15,14 +15,32 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.synthetic.cameras import intrinsics
 from geodiff_plugin.synthetic.effects import CameraEffects, apply_effects, sample_effects
 from geodiff_plugin.synthetic.layouts import sample_scene
+from geodiff_plugin.synthetic.photographs import cover_with_photographs
 from geodiff_plugin.synthetic.render import expose, render_linear, soften
-from geodiff_plugin.synthetic.scene import Camera
+from geodiff_plugin.synthetic.scene import Camera, Scene
 from geodiff_plugin.synthetic.visibility import in_sight
 
 __all__ = ["render_mono"]
 
 _SIGHT_MARGIN_M = 1.5
-_CHUNK = {"cpu": 2, "cuda": 32}
+
+
+def _chunk(size: tuple[int, int], device: torch.device) -> int:
+    """Scenes to render at once: a GPU wants many, a CPU's cache wants few."""
+    if device.type == "cpu":
+        return 2 if size[0] * size[1] < 20_000 else 1
+    return max(1, (1 << 21) // (size[0] * size[1]))
+
+
+def _draw(seed: int, kind: str | None, size: tuple[int, int], photographs: float) -> tuple[Scene, Camera, np.random.Generator]:
+    """A scene without what the camera cannot see, a camera with a drawn lens, and the rest of the randomness."""
+    scene, rng = sample_scene(seed, kind), np.random.default_rng([seed, 22])
+    fov = float(np.clip(scene.fov_deg * np.exp(rng.normal(0, 0.12)), 30, 95))
+    camera = Camera(intrinsics(size, fov), scene.T_world_from_camera)
+    scene = in_sight(scene, [(camera, size)], _SIGHT_MARGIN_M)
+    if photographs > 0 and rng.random() < 0.5:
+        scene = cover_with_photographs(scene, rng, photographs)
+    return scene, camera, rng
 
 
 def render_mono(
@@ -30,6 +48,8 @@ def render_mono(
     size: tuple[int, int] = (192, 256),
     device: str | torch.device = "cpu",
     augment: bool = True,
+    kind: str | None = None,
+    photographs: float = 0.0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Render one view of each seed's scene: a training batch.
 
@@ -38,32 +58,28 @@ def render_mono(
         size: ``(H, W)``; any aspect ratio.
         device: where to render and where the result lives.
         augment: apply drawn camera effects (exposure, noise, blur, JPEG, grey and so on).
+        kind: one of ``KINDS`` for all; None draws one for each seed.
+        photographs: share of the surfaces that show a photograph, in half of the scenes; needs scikit-image.
 
     Returns:
         images ``(N, 3, H, W)`` float32 in [0, 1] and depth ``(N, 1, H, W)`` metres, ``inf`` for the sky.
 
     Raises:
-        ValueError: no seeds, or a negative one.
+        ValueError: no seeds, a negative one, or an unknown kind.
+        ImportError: photographs without scikit-image.
     """
     seeds = [int(s) for s in seeds]
     if not seeds:
         bad_value("seeds", "at least one integer", "none")
-    chunk = _CHUNK.get(torch.device(device).type, 8)
+    chunk = _chunk(size, torch.device(device))
     images, depths = [], []
     for start in range(0, len(seeds), chunk):
         part = seeds[start : start + chunk]
-        scenes = [sample_scene(s) for s in part]
-        rngs = [np.random.default_rng([s, 22]) for s in part]
-        cameras = []
-        for scene, rng in zip(scenes, rngs, strict=True):
-            fov = float(np.clip(scene.fov_deg * np.exp(rng.normal(0, 0.12)), 30, 95))
-            cameras.append(Camera(intrinsics(size, fov), scene.T_world_from_camera))
-        scenes = [in_sight(s, size, c.K, _SIGHT_MARGIN_M) for s, c in zip(scenes, cameras, strict=True)]
-        linear = render_linear(scenes, cameras, list(range(len(part))), size, device)
+        scenes, cameras, rngs = zip(*(_draw(s, kind, size, photographs) for s in part), strict=True)
+        linear = render_linear(scenes, cameras, range(len(part)), size, device, photographs > 0)
         effects = [sample_effects(rng, size) if augment else CameraEffects() for rng in rngs]
         _, gain = expose(linear.radiance)
-        gain = gain * torch.tensor([e.gain for e in effects], device=gain.device)
-        image, _ = expose(linear.radiance, gain)
+        image, _ = expose(linear.radiance, gain * torch.tensor([e.gain for e in effects], device=gain.device))
         image = soften(image, linear.edges)
         images += [apply_effects(x, e) for x, e in zip(image, effects, strict=True)]
         depths.append(linear.depth_m)

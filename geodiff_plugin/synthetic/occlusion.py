@@ -14,6 +14,8 @@ from geodiff_plugin.synthetic.world import World
 
 __all__ = ["openness"]
 
+_HEIGHTS = (0.25, 0.8)
+
 
 def openness(
     world: World,
@@ -40,9 +42,12 @@ def openness(
         ``(B, P)`` in [0, 1], 1 in the open.
     """
     weight = live.to(point.dtype)
-    middle = (point * weight).sum(-1) / weight.sum(-1).clamp_min(1)
-    away = point - middle[..., None]
-    spread = ((away * away).sum(0) * weight).amax(-1).sqrt() + 1.6 * length
+    heights = [k * length[:, None] for k in _HEIGHTS]
+    # Only what is inside the ball of the upper point's height around it can matter: to the lower point as well.
+    upper = torch.addcmul(point, normal, heights[1])
+    middle = (upper * weight).sum(-1) / weight.sum(-1).clamp_min(1)
+    away = upper - middle[..., None]
+    spread = ((away * away).sum(0) * weight).amax(-1).sqrt() + heights[1][:, 0]
     d2, _, radius, opaque = candidates(world, scene, middle, None)
     reach = radius + spread[:, None]
     keep = (d2 <= reach * reach) & (radius > 0) & opaque & live.any(-1)[:, None]
@@ -53,7 +58,6 @@ def openness(
     near = gap.square().sum(-1) <= spread[b].square()
     b, prim = b[near], prim[near]
     ball = world.shape[prim] == int(Shape.SPHERE)
-    heights = [k * length[:, None] for k in (0.25, 0.8)]
     distance = [h.expand_as(weight).clone() for h in heights]
     step = chunk_pairs(weight)
     for mask, measure in ((~ball, _box_distance), (ball, _ellipsoid_distance)):

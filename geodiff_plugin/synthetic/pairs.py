@@ -18,9 +18,11 @@ from geodiff_plugin.synthetic.effects import CameraEffects, apply_effects, sampl
 from geodiff_plugin.synthetic.layouts import sample_scene
 from geodiff_plugin.synthetic.render import as_views, expose, render_linear
 from geodiff_plugin.synthetic.scene import Camera, RenderedView
-from geodiff_plugin.synthetic.visibility import clear_of, hidden_from_right
+from geodiff_plugin.synthetic.visibility import clear_of, hidden_from_right, in_sight
 
 __all__ = ["SyntheticPair", "render_pair"]
+
+_SIGHT_MARGIN_M = 3.0
 
 
 @dataclass(frozen=True)
@@ -124,8 +126,9 @@ def render_pair(
         left_K.clone() if size_right == size else intrinsics(size_right, scene.fov_deg))
     world_from_right = scene.T_world_from_camera.double() @ E_
     scene = clear_of(scene, world_from_right[:3, 3], scene.clearance_m * 0.6)
-    first = render_linear([scene], [Camera(left_K, scene.T_world_from_camera)], [0], size, device, antialias=True)
-    second = render_linear([scene], [Camera(right_K, world_from_right)], [0], size_right, device, antialias=True)
+    views = (Camera(left_K, scene.T_world_from_camera), size), (Camera(right_K, world_from_right), size_right)
+    scene = in_sight(scene, views, _SIGHT_MARGIN_M)
+    first, second = (render_linear([scene], [c], [0], s, device, antialias=True) for c, s in views)
     pair_effects = _pair_effects(rng, effects, exposure, size)
     _, gain = expose(first.radiance)
     left_image, _ = expose(first.radiance, gain * pair_effects[0].gain)

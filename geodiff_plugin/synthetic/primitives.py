@@ -18,8 +18,8 @@ _Rays = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 def _nonzero(x: torch.Tensor) -> torch.Tensor:
-    """Keep the sign, keep away from zero."""
-    return x + torch.copysign(torch.full_like(x, _TINY), x)
+    """Keep away from zero: a ray parallel to a face must not divide by it."""
+    return x + _TINY
 
 
 def hit_box(o: _Rays, d: _Rays, taper: torch.Tensor) -> torch.Tensor:

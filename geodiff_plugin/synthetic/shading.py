@@ -85,7 +85,7 @@ def _specular(material: torch.Tensor, gloss: torch.Tensor, cosine: torch.Tensor,
     """Shares of the radiance that a reflection and what lies behind glass contribute."""
     fresnel = (1 - cosine).pow(4)
     is_mirror, is_glass = material == int(Material.MIRROR), material == int(Material.GLASS)
-    mirror = ((gloss - 0.3).clamp_min(0) * (0.15 + 0.7 * fresnel) - 0.02).clamp_min(0)
+    mirror = ((gloss - 0.3).clamp_min(0) * (0.15 + 0.7 * fresnel) - 0.035).clamp_min(0)
     mirror = torch.where(is_glass, 0.08 + 0.7 * fresnel, mirror).masked_fill(is_mirror, 0.9)
     return mirror * live, is_glass * (1 - mirror) * 0.85 * live
 

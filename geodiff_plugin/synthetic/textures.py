@@ -56,7 +56,7 @@ def atlas(device: str = "cpu", photographs: bool = False) -> Atlas:
     if photographs:
         from geodiff_plugin.synthetic.photographs import photograph_layers
 
-        layers += photograph_layers()
+        layers += list(photograph_layers())
     levels = _pyramid(np.stack(layers).astype(np.float32))
     flat = np.concatenate([x.reshape(-1, 4) for x in levels])
     start = np.cumsum([0] + [x.shape[0] * x.shape[1] * x.shape[2] for x in levels[:-1]])

@@ -16,7 +16,7 @@ from geodiff_plugin.synthetic.world import World
 
 __all__ = ["Bundles", "blocked", "candidates", "chunk_pairs", "nearest", "to_local"]
 
-_PAIR_ELEMENTS = {"cpu": 1 << 17, "cuda": 1 << 25}
+_PAIR_ELEMENTS = {"cpu": 1 << 16, "cuda": 1 << 25}
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ Paper: S3.3 (pixels that only one view sees).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 
-from geodiff_plugin.synthetic.scene import RenderedView, Scene, Shape
+from geodiff_plugin.synthetic.scene import Camera, RenderedView, Scene, Shape
 from geodiff_plugin.synthetic.tracing import Bundles, nearest
 from geodiff_plugin.synthetic.world import World
 
@@ -36,17 +37,27 @@ def _select(scene: Scene, keep: torch.Tensor) -> Scene:
     return replace(scene, **{name: getattr(scene, name)[keep] for name in _PER_PRIMITIVE})
 
 
-def in_sight(scene: Scene, size: tuple[int, int], K: torch.Tensor, margin_m: float) -> Scene:
-    """Leave out movable primitives outside of the view by more than a margin: they only cast shadows or mirror."""
-    pose = scene.T_world_from_camera
-    p = (scene.centre - pose[:3, 3]) @ pose[:3, :3]
+def in_sight(scene: Scene, views: Sequence[tuple[Camera, tuple[int, int]]], margin_m: float) -> Scene:
+    """Leave out movable primitives outside of every view by more than a margin: they only cast shadows or mirror.
+
+    Args:
+        scene: any scene.
+        views: cameras and their image sizes ``(H, W)``.
+        margin_m: how far outside of the pyramid of view something may be and still be kept.
+    """
+    keep = scene.fixed
     reach = scene.radius + margin_m
-    keep = p[:, 2] > -reach
-    for axis in (0, 1):
-        tangent = float((size[1 - axis] / 2 + 1) / K[axis, axis])
-        # Distance to the side planes of the frustum.
-        keep &= (p[:, axis].abs() - tangent * p[:, 2]) / (1 + tangent**2) ** 0.5 < reach
-    return _select(scene, keep | scene.fixed)
+    for camera, (height, width) in views:
+        pose, K = camera.T_world_from_camera.float(), camera.K
+        p = (scene.centre - pose[:3, 3]) @ pose[:3, :3]
+        inside = p[:, 2] > -reach
+        for axis, pixels in ((0, width), (1, height)):
+            focal, centre = float(K[axis, axis]), float(K[axis, 2])
+            # Distance to the two side planes, which need not be symmetric.
+            for sign, tangent in ((-1, (centre + 0.5) / focal), (1, (pixels - 0.5 - centre) / focal)):
+                inside &= (sign * p[:, axis] - tangent * p[:, 2]) / (1 + tangent**2) ** 0.5 < reach
+        keep = keep | inside
+    return _select(scene, keep)
 
 
 @torch.no_grad()
