@@ -85,13 +85,17 @@ def _label(record: dict[str, Any]) -> str:
     return f"{record['dataset']}/{record['sample']}"
 
 
+def _pairs(count: int, kind: str = "") -> str:
+    return f"{count} {kind}{'pair' if count == 1 else 'pairs'}"
+
+
 def groups(records: Sequence[dict[str, Any]]) -> dict[str, set[str]]:
     """Labels of all samples, and of the rectified and the posed ones where both kinds are there."""
     rectified = {_label(r) for r in records if r.get("rectified") is True}
     posed = {_label(r) for r in records if r.get("rectified") is False}
-    everything = {f"{len(rectified | posed)} pairs": rectified | posed}
+    everything = {_pairs(len(rectified | posed)): rectified | posed}
     if rectified and posed:
-        everything |= {f"{len(rectified)} rectified pairs": rectified, f"{len(posed)} posed pairs": posed}
+        everything |= {_pairs(len(rectified), "rectified "): rectified, _pairs(len(posed), "posed "): posed}
     return everything
 
 
@@ -197,7 +201,7 @@ def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -
     tables = [
         per_pair_table(
             records,
-            f"AbsRel of {count} pairs",
+            f"AbsRel of {_pairs(count)}",
             headline,
             3,
             "All pixels with truth, no cap; metres as they come out, not aligned, but for the columns of "

@@ -194,7 +194,7 @@ def test_tables_hold_pairs_means_and_differences(bench):
     assert pairs.rows[2] == ("middlebury2014/c", "0.000", "-")
     means = {row[0]: row[1:] for row in pairs.rows[3:]}
     assert means["mean of 3 pairs"] == ("0.000", "-")
-    assert means["mean of 2 rectified pairs"] == ("0.000", "1.000") and means["mean of 1 posed pairs"] == (
+    assert means["mean of 2 rectified pairs"] == ("0.000", "1.000") and means["mean of 1 posed pair"] == (
         "0.000",
         "-",
     )
@@ -204,7 +204,7 @@ def test_tables_hold_pairs_means_and_differences(bench):
     assert [table.title for table in summaries] == [
         "All metrics, 3 pairs",
         "All metrics, 2 rectified pairs",
-        "All metrics, 1 posed pairs",
+        "All metrics, 1 posed pair",
     ]
     assert [row[0] for row in summaries[0].rows] == ["exact", "exact, aligned", "double", "double, aligned"]
 
