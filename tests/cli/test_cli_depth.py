@@ -24,6 +24,10 @@ FILES = {
 }
 
 
+#: One update of one step: for tests of everything but the depth.
+QUICK = ["--steps", 1, "--preset", "paper"]
+
+
 @pytest.fixture
 def prior(make_pipeline, tmp_path_factory):
     folder = tmp_path_factory.mktemp("prior")
@@ -53,7 +57,8 @@ def test_writes_everything(geodiff, command, pair_files):
     visible = np.asarray(Image.open(out / "visible.png"))
     assert visible.shape == (48, 64) and set(np.unique(visible)) <= {0, 255}
     assert np.load(out / "photometric_error.npy").shape == (48, 64)
-    assert Image.open(out / "depth.png").width > 64
+    with Image.open(out / "depth.png") as figure:
+        assert figure.width > 64
 
     report = json.loads((out / "report.json").read_text())
     assert set(report["files"]["names"]) == FILES
@@ -76,14 +81,14 @@ def test_json_and_quiet(geodiff, command, pair_files):
     assert report == json.loads((pair_files.folder / "geodiff-out" / "report.json").read_text())
     assert report["uncertainty_median_m"] >= 0 and len(report["scale"][0]) == 2
     assert np.load(pair_files.folder / "geodiff-out" / "uncertainty.npy").shape == (48, 64)
-    again = geodiff(*command, "--quiet", "--overwrite", "--steps", 1)
+    again = geodiff(*command, "--quiet", "--overwrite", *QUICK)
     assert (again.code, again.out, again.err) == (0, "", "")
     assert {path.name for path in (pair_files.folder / "geodiff-out").iterdir()} == FILES
 
 
 def test_same_seed_same_depth(geodiff, command, pair_files):
     for out, seed in (("a", 1), ("b", 1), ("c", 2)):
-        assert geodiff(*command, "--quiet", "--steps", 1, "--seed", seed, "--out", out).code == 0
+        assert geodiff(*command, "--quiet", *QUICK, "--seed", seed, "--out", out).code == 0
     a, b, c = (np.load(pair_files.folder / out / "depth.npy") for out in "abc")
     np.testing.assert_array_equal(a, b)
     assert not np.array_equal(a, c)
@@ -108,7 +113,7 @@ def test_images_of_different_kind_and_size(geodiff, prior, pair_files, textured_
     for name, matrix in (("K", textured_plane.K), ("Kr", K_right), ("E", textured_plane.E)):
         np.savetxt(pair_files.folder / f"{name}.txt", matrix)
     cameras = ["--K", "K.txt", "--K-right", "Kr.txt", "--E", "E.txt"]
-    answer = geodiff(*pair_files.images, *cameras, "--prior", prior, "--steps", 1, "--quiet", "--json")
+    answer = geodiff(*pair_files.images, *cameras, "--prior", prior, *QUICK, "--quiet", "--json")
     assert answer.code == 0, answer.err
     assert json.loads(answer.out)["inputs"]["right_size"] == [128, 96]
 
@@ -130,7 +135,7 @@ def test_failing_call_writes_nothing(geodiff, command, pair_files, monkeypatch):
     monkeypatch.setattr("geodiff_plugin.commands.depth.write_maps", broken)
     before = sorted(path.name for path in pair_files.folder.iterdir())
     with pytest.raises(RuntimeError, match="in the middle"):
-        geodiff(*command, "--quiet", "--steps", 1)
+        geodiff(*command, "--quiet", *QUICK)
     assert sorted(path.name for path in pair_files.folder.iterdir()) == before
 
 
@@ -176,12 +181,15 @@ def test_info(geodiff, prior, monkeypatch, tmp_path):
 
 
 def test_demo(geodiff, prior, pair_files, monkeypatch):
-    """Twice over the same folder; the tiny prior stands in for the bundled one."""
+    """Over the folder of an earlier run; the tiny prior stands in for the bundled one."""
     monkeypatch.setattr("geodiff_plugin.priors.BUNDLED_FOLDER", prior)
-    for _ in range(2):
-        answer = geodiff("demo", "--quiet")
-        assert answer.code == 0, answer.err
-    assert "AbsRel" in answer.out and "delta1" in answer.out and "guided" in answer.out
     out = pair_files.folder / "geodiff-demo"
-    assert {path.name for path in out.iterdir()} == FILES | {"overview.png"}
+    out.mkdir()
+    (out / "depth.npy").write_text("of an earlier run")
+    (out / "uncertainty.npy").write_text("of an earlier run")
+    (out / "notes.txt").write_text("somebody's own")
+    answer = geodiff("demo", "--quiet")
+    assert answer.code == 0, answer.err
+    assert "AbsRel" in answer.out and "delta1" in answer.out and "guided" in answer.out
+    assert {path.name for path in out.iterdir()} == FILES | {"overview.png", "notes.txt"}
     assert np.load(out / "depth.npy").shape == (336, 448)
