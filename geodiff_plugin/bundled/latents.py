@@ -94,13 +94,18 @@ class LatentStore:
         return SHARD * len(self._items) // self.variants
 
     def refresh(self, most: int) -> int:
-        """Take in new shards of the cache: all that are encoded already, and encode up to ``most`` others.
+        """Take in new shards of the cache, newest first: the encoded ones at once, ``most`` others encoded now.
+
+        Args:
+            most: shards to encode, >= 0.
 
         Returns:
             How many were taken in.
         """
+        if self.fresh:
+            return 0
         before = len(self._known)
-        for index in shards(self.cache):
+        for index in reversed(shards(self.cache)):
             if index % self.world != self.rank or index in self._known:
                 continue
             if not self._path(index).exists():

@@ -22,7 +22,13 @@ from geodiff_plugin.bundled.data import shards
 from geodiff_plugin.bundled.latents import LatentStore
 from geodiff_plugin.bundled.models import assemble, build_scheduler, build_text, build_unet, open_pipeline
 from geodiff_plugin.bundled.report import Reporter
-from geodiff_plugin.bundled.schedule import diffusion_loss, draw_timesteps, learning_rate, stage_at
+from geodiff_plugin.bundled.schedule import (
+    Stage,
+    diffusion_loss,
+    draw_timesteps,
+    learning_rate,
+    stage_at,
+)
 from geodiff_plugin.bundled.state import Average, Progress, restore, store
 from geodiff_plugin.bundled.train_vae import save_vae, train_vae
 
@@ -125,60 +131,84 @@ def _wait_for_scenes(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace, accelerator: Accelerator) -> Progress:
+    """Both stages; returns the counters at the end."""
     _wait_for_scenes(options)
     vae, unet, text = _prepare_models(options, accelerator)
-    average = Average(unet.to(accelerator.device), options.average**_AVERAGE_EVERY)
+    device = accelerator.device
+    average = Average(unet.to(device), options.average**_AVERAGE_EVERY)
     settings = {"lr": options.rate, "betas": (0.9, 0.99), "weight_decay": 1e-3, "fused": True}
     optimiser = torch.optim.AdamW(unet.parameters(), **settings)
     progress = restore(options.out, unet, average, optimiser) or Progress(seed=options.seed)
     network, prepared = accelerator.prepare(unet, optimiser)
-    embedding = _embed(text).to(accelerator.device)
-    scheduler = build_scheduler()
-    scheduler.alphas_cumprod = scheduler.alphas_cumprod.to(accelerator.device)
-    reporter = Reporter(options, assemble(vae, build_unet().to(accelerator.device).eval(), text))
-    started, base = time.monotonic(), progress.seconds
-    generator = torch.Generator().manual_seed(options.seed + 7919 * progress.step + accelerator.process_index)
-    pool, bar, main_process = (
-        None,
-        tqdm(total=1000, unit="permille", mininterval=10, disable=not accelerator.is_main_process),
-        False,
-    )
+    reporter = Reporter(options, assemble(vae, build_unet().to(device).eval(), text))
+    step_of = _Step(network, _embed(text).to(device), options, accelerator, progress.step)
+    started, base, pool = time.monotonic(), progress.seconds, None
+    bar = tqdm(total=1000, unit="permille", mininterval=10, disable=not accelerator.is_main_process)
     while True:
         progress.seconds = base + time.monotonic() - started
         spent = progress.step / options.steps if options.steps else progress.seconds / (3600 * options.hours)
-        fraction = float(accelerator.reduce(torch.tensor(spent, device=accelerator.device), "mean"))
-        main_process = accelerator.is_main_process
+        fraction = float(accelerator.reduce(torch.tensor(spent, device=device), "mean"))
         stage = stage_at(fraction, continued=options.init_from is not None)
-        if main_process and (fraction >= 1 or reporter.due(progress)):
+        if accelerator.is_main_process and (fraction >= 1 or reporter.due(progress)):
             store(options.out, unet, average, optimiser, progress)
             reporter.report(progress, average, stage.divisor, last=fraction >= 1)
         if fraction >= 1:
             break
         pool = _pool_for(stage.divisor, pool, options, vae, accelerator)
         if progress.step % 50 == 0 or not len(pool):
-            pool.refresh(4 if len(pool) else 8)
-        size = max(options.batch // (1 if stage.divisor == 2 else 2), 1)
-        image, depth = (x.to(accelerator.device) for x in pool.batch(size, generator))
-        noise = torch.randn(depth.shape, generator=generator).to(depth.device)
-        timesteps = draw_timesteps(size, stage.last, generator).to(depth.device)
-        loss = diffusion_loss(network, scheduler, image, depth, embedding, timesteps, noise)
+            pool.refresh(8)
         for group in optimiser.param_groups:
             group["lr"] = learning_rate(options.rate, fraction, progress.step)
-        accelerator.backward(loss)
-        accelerator.clip_grad_norm_(network.parameters(), 1.0)
-        prepared.step()
-        prepared.zero_grad(set_to_none=True)
+        loss, size = step_of(pool, stage, prepared)
         if progress.step % _AVERAGE_EVERY == 0:
             average.update(unet, progress.step // _AVERAGE_EVERY)
         progress.step += 1
         progress.samples += size * accelerator.num_processes
         reporter.loss(loss)
-        if main_process and progress.step % 20 == 0:
+        if progress.step % 20 == 0:
             bar.update(int(1000 * fraction) - bar.n)
             bar.set_postfix(step=progress.step, loss=f"{reporter.mean_loss:.4f}", scenes=len(pool))
     bar.close()
     accelerator.wait_for_everyone()
     return progress
+
+
+class _Step:
+    """One optimiser step: draw a batch, its noise and timesteps, go down the gradient.
+
+    Args:
+        network: the denoiser as prepared by accelerate.
+        text: empty-prompt embedding ``(1, L, C)``.
+        options: of ``parse``.
+        accelerator: device and processes.
+        step: of the run so far, so that a continued run draws anew.
+    """
+
+    def __init__(
+        self,
+        network: torch.nn.Module,
+        text: torch.Tensor,
+        options: argparse.Namespace,
+        accelerator: Accelerator,
+        step: int,
+    ) -> None:
+        self.network, self.text, self.batch, self.accelerator = network, text, options.batch, accelerator
+        self.generator = torch.Generator().manual_seed(options.seed + 7919 * step + accelerator.process_index)
+        self.scheduler = build_scheduler()
+        self.scheduler.alphas_cumprod = self.scheduler.alphas_cumprod.to(accelerator.device)
+
+    def __call__(self, pool: LatentStore, stage: Stage, optimiser) -> tuple[torch.Tensor, int]:
+        """The loss and the number of scenes; half as many at full size as at low resolution."""
+        size = max(self.batch // (1 if stage.divisor == 2 else 2), 1)
+        image, depth = (x.to(self.text.device) for x in pool.batch(size, self.generator))
+        noise = torch.randn(depth.shape, generator=self.generator).to(depth.device)
+        timesteps = draw_timesteps(size, stage.last, self.generator).to(depth.device)
+        loss = diffusion_loss(self.network, self.scheduler, image, depth, self.text, timesteps, noise)
+        self.accelerator.backward(loss)
+        self.accelerator.clip_grad_norm_(self.network.parameters(), 1.0)
+        optimiser.step()
+        optimiser.zero_grad(set_to_none=True)
+        return loss, size
 
 
 def _pool_for(divisor: int, pool: LatentStore | None, options, vae, accelerator: Accelerator) -> LatentStore:
