@@ -15,8 +15,11 @@ from torch import Tensor
 
 from geodiff_plugin.geometry.cameras import resize_intrinsics
 from geodiff_plugin.geometry.projection import plane_rays
-from geodiff_plugin.matching import CostVolume, Matches, build_cost_volume, find_matches
+from geodiff_plugin.matching import CostVolume, Matches, RightView, build_cost_volume, find_matches
 from geodiff_plugin.objective import Views
+
+#: The check for swapped views is a coarse sweep: pixels of the longer side, planes, and how much cheaper it must be.
+SWAP_CHECK_SIDE, SWAP_CHECK_PLANES, SWAP_MARGIN = 192, 48, 0.85
 
 __all__ = ["Evidence", "chunk_views", "prepare_evidence", "resize_long_edge"]
 
@@ -33,6 +36,7 @@ class Evidence:
         T_right_from_left: ``(4, 4)`` metres.
         volume: plane-sweep costs, or ``None`` where the configuration does not search it.
         matches: aggregated, left-right checked, or ``None`` where no term asks.
+        warning: a sentence for the user, or empty.
     """
 
     left_01: Tensor
@@ -42,6 +46,7 @@ class Evidence:
     T_right_from_left: Tensor
     volume: CostVolume | None
     matches: Matches | None
+    warning: str = ""
 
 
 def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tensor, Tensor]:
@@ -94,13 +99,39 @@ def prepare_evidence(
     ratio = float(K_left[0, 0] / K_right[0, 0])
     long_edge = round(max(right_01.shape[-2:]) * min(1.0, ratio))
     right, K_right = resize_long_edge(right_01, K_right, long_edge)
-    volume = matches = None
+    volume, matches, warning = None, None, ""
     rights = [(right, K_right, T_right_from_left)]
     if needs_volume or needs_matches:
         volume = build_cost_volume(left, rights, K_left, depth_range=depth_range)
     if needs_matches:
-        matches = find_matches(left, rights, K_left, volume=volume)
-    return Evidence(left, right, K_left, K_right, T_right_from_left, volume, matches)
+        matches = _on_grid(find_matches(left, rights, K_left, volume=volume), left, K_left)
+    if volume is not None and _mirrored_pose_fits_better(left, rights, K_left):
+        warning = (
+            "The mirrored pose explains the views better than the given one: are left and right swapped, "
+            "or is the sign of the baseline wrong?"
+        )
+    return Evidence(left, right, K_left, K_right, T_right_from_left, volume, matches, warning)
+
+
+def _mirrored_pose_fits_better(left_01: Tensor, rights: Sequence[RightView], K_left: Tensor) -> bool:
+    """Whether a coarse sweep of the pose with its camera centre mirrored finds clearly cheaper planes."""
+    costs = []
+    for sign in (1.0, -1.0):
+        mirrored = [(image, K, torch.cat([T[:, :3], T[:, 3:] * T.new_tensor([[sign]] * 3 + [[1.0]])], 1)) for image, K, T in rights]
+        volume = build_cost_volume(left_01, mirrored, K_left, max_side=SWAP_CHECK_SIDE, planes=SWAP_CHECK_PLANES)
+        smooth = F.avg_pool2d(volume.cost[1:], 5, stride=2)  # without the plane at infinity, where both poses agree
+        costs.append(smooth.amin(dim=0).mean())
+    return bool(costs[1] < SWAP_MARGIN * costs[0])
+
+
+def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
+    """Matches on the loss grid, where the sweep's own grid was bounded to a smaller one."""
+    size = (left_01.shape[-2], left_01.shape[-1])
+    if matches.size == size:
+        return matches
+    # Nearest: a mean of two inverse depths across an edge is the depth of neither surface.
+    maps = (F.interpolate(m[None], size, mode="nearest")[0] for m in (matches.inverse_depth, matches.confidence))
+    return Matches(*maps, matches.plane_step, K_left, size)
 
 
 def chunk_views(evidence: Sequence[Evidence], owners: Sequence[int]) -> Views:

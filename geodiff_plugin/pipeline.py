@@ -95,7 +95,7 @@ class _GuidedCall:
         self._guided_run = run
         try:
             with run:
-                stock = super().__call__(*bound.args, **{**bound.kwargs, "return_dict": True, "output_latent": True})
+                stock = super().__call__(**{**call, "return_dict": True, "output_latent": True})
         finally:
             del self._guided_run
         output = assemble_output(stock, run, guidance, lefts_01, call["match_input_resolution"], call["output_type"])

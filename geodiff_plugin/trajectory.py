@@ -172,7 +172,8 @@ def guided_step(
     updates = config.inner_steps if trajectory.is_active(fraction) else 0
     for k in range(max(updates, 1)):
         with torch.set_grad_enabled(updates > 0):
-            z = z.detach().requires_grad_(config.optimize_latents and updates > 0)
+            if not z.requires_grad and config.optimize_latents and updates:
+                z = z.detach().requires_grad_()
             z0_hat = z0_of(z)  # (B, C, h, w), Tweedie
             x0 = decode(z0_hat)  # (B, 1, h', w'), D(z0_hat)
             if k == 0:
@@ -181,9 +182,10 @@ def guided_step(
             s_hat, t_hat = (v.detach().requires_grad_(updates > 0) for v in _raw(trajectory.affine))
             affine = AffineState(s_hat, t_hat, trajectory.affine.g_s)
             loss = trajectory.objective(x0, affine, trajectory.affine_start, z0_hat, z0_prior, trajectory.matches)
+            total = loss.total.sum()  # samples do not mix, so the gradient of the sum is each one's own
         if updates:
             inputs = (s_hat, t_hat, z) if config.optimize_latents else (s_hat, t_hat)
-            grads = torch.autograd.grad(loss.total.sum(), inputs)  # samples do not mix, so the sum is each one's own
+            grads = torch.autograd.grad(total, inputs)
             s_hat = s_hat.detach() + trajectory.scale_rule.step(grads[0])
             t_hat = t_hat.detach() + trajectory.shift_rule.step(grads[1])
             trajectory.affine = AffineState(s_hat, t_hat, affine.g_s)

@@ -68,7 +68,7 @@ class GuidedRun:
         check_offloading(self.pipe, self.config.gradient)
         with ExitStack() as stack:
             stack.enter_context(_frozen_weights(self.pipe))
-            if self.config.gradient == "full":
+            if self.config.gradient == "full" and self.config.optimize_latents and self.config.inner_steps:
                 self._tap = stack.enter_context(DenoiserTap(self.prior.denoiser(), self.prior.split_input))
             stack.enter_context(
                 GuidedScheduler(

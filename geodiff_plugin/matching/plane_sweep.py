@@ -85,7 +85,8 @@ def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor) -> torch.Tensor:
     if not ahead.any():
         bad_value("E", "a pose under which the views overlap", "a right camera that looks the other way")
     uv, in_front = _plane_uv(some, inverse_depth)
-    shift = (uv - at_infinity).norm(dim=1)
+    dx, dy = (uv - at_infinity).unbind(dim=1)
+    shift = torch.hypot(dx, dy)  # a norm over a dimension of 2 takes most of a sweep's time
     shift = torch.where(in_front, shift, torch.full_like(shift, torch.inf))
     return shift[:, ahead[0]].median(dim=1).values
 
@@ -103,11 +104,14 @@ def inverse_depth_at_shift(rays: PlaneRays, shift_px: float) -> torch.Tensor:
     Raises:
         ValueError: the views do not overlap, or both cameras stand at one place.
     """
-    candidates = torch.logspace(-8, 5, 3001, device=rays.A.device, dtype=rays.A.dtype)
-    reached = torch.cat([median_shift(rays, part) for part in candidates.split(256)]) >= shift_px
-    if not reached.any():
+    exponents = rays.A.new_tensor([-8.0, 5.0])
+    if float(median_shift(rays, 10.0 ** exponents[1:])) < shift_px:
         bad_value("E", "a pose with a baseline", "both cameras at one place")
-    return candidates[reached.int().argmax()]
+    for _ in range(16):  # the shift grows with inverse depth, so bisection of 13 decades reaches 0.05 %
+        middle = exponents.mean()
+        reached = median_shift(rays, 10.0 ** middle[None])[0] >= shift_px
+        exponents = torch.where(reached, torch.stack([exponents[0], middle]), torch.stack([middle, exponents[1]]))
+    return 10.0 ** exponents[1]
 
 
 def _one_view(

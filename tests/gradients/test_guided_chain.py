@@ -1,0 +1,73 @@
+"""Finite differences through the whole chain: z_t -> U-Net -> z0_hat -> decoder -> metres -> warp -> L_geo."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from geodiff_plugin.denoising import NoiseLevel, noise_from, output_from, z0_from
+from geodiff_plugin.geometry.projection import plane_rays
+from geodiff_plugin.metric import AffineState, MetricMap
+from geodiff_plugin.objective import Objective, Views
+from geodiff_plugin.priors.marigold import MarigoldPrior
+from geodiff_plugin.terms import MatchTarget
+
+OPTIONS = {"eta": 0.85, "pyramid_levels": 2, "pull_to": "zero"}
+WEIGHTS = {"photometric": 1.0, "matches": 0.3, "prior_pull": 0.01, "anchor": 0.2}
+
+
+def double(x):
+    return torch.as_tensor(x, dtype=torch.float64)
+
+
+def views_of(pair):
+    left, right = (double(image).permute(2, 0, 1)[None] / 255 for image in (pair.left, pair.right))
+    K, T = double(pair.K)[None], torch.linalg.inv(double(pair.E))[None]
+    return Views(left, right, K, K, T, plane_rays(K, K, T, (48, 64)))
+
+
+@pytest.mark.parametrize("space", ["depth", "disparity", "log", "sqrt_disparity"])
+def test_whole_chain_against_finite_differences(make_pipeline, textured_plane, space):
+    pipe = make_pipeline().to(torch.float64)
+    prior = MarigoldPrior(pipe)
+    objective = Objective(views_of(textured_plane), MetricMap(space), WEIGHTS, OPTIONS, 0.0)
+    generator = torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+    condition, z_t = draw(1, 4, 24, 32), draw(1, 4, 24, 32)
+    text = draw(1, 2, 8)
+    level = NoiseLevel(double(0.6), double(0.8), "v_prediction")
+    near, far = torch.tensor([1.3]), torch.tensor([3.1])
+    start = objective.metric.from_range(*((near, far) if space in ("depth", "log") else (far, near)))
+    start = AffineState(double(start.s_hat), double(start.t_hat), double(start.g_s))
+    matches = MatchTarget(
+        1.0 / double(textured_plane.depth_m)[None, None], torch.ones(1, 1, 48, 64, dtype=torch.float64), double([0.02])
+    )
+    anchor = draw(1, 4, 24, 32)
+
+    def loss(z, s_hat, t_hat):
+        output = pipe.unet(torch.cat([condition, z], 1), 500, encoder_hidden_states=text, return_dict=False)[0]
+        z0 = z0_from(output, z, level)
+        affine = AffineState(s_hat, t_hat, start.g_s)
+        return objective(prior.decode(z0), affine, start, z0, anchor, matches).total.sum()
+
+    inputs = [z_t.requires_grad_(), start.s_hat.clone().requires_grad_(), start.t_hat.clone().requires_grad_()]
+    grads = torch.autograd.grad(loss(*inputs), inputs)
+    for i, grad in enumerate(grads):
+        assert torch.isfinite(grad).all() and grad.abs().max() > 0
+        direction, h = draw(*grad.shape), 1e-6
+        moved = [[x.detach() + sign * h * direction if j == i else x.detach() for j, x in enumerate(inputs)] for sign in (1, -1)]
+        with torch.no_grad():
+            numeric = (loss(*moved[0]) - loss(*moved[1])) / (2 * h)
+        # Bilinear sampling is piecewise smooth: a few of 3072 pixels may cross a centre within h.
+        torch.testing.assert_close((grad * direction).sum(), numeric, rtol=1e-3, atol=1e-7)
+
+
+@pytest.mark.parametrize("prediction_type", ["epsilon", "v_prediction", "sample", "flow_prediction"])
+def test_denoising_arithmetic_gradcheck_and_inverse(prediction_type):
+    generator = torch.Generator().manual_seed(1)
+    output, z_t = (torch.randn(1, 2, 2, 3, generator=generator, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    alpha, sigma = (0.6, 0.8) if prediction_type != "flow_prediction" else (0.6, 0.4)
+    level = NoiseLevel(double(alpha), double(sigma), prediction_type)
+    assert torch.autograd.gradcheck(lambda o, z: z0_from(o, z, level), (output, z_t))
+    rebuilt = output_from(z0_from(output, z_t, level), noise_from(output, z_t, level), level)
+    torch.testing.assert_close(rebuilt, (output, z_t))
