@@ -94,7 +94,7 @@ class LatentStore:
         return SHARD * len(self._items) // self.variants
 
     def refresh(self, most: int) -> int:
-        """Take in new shards of the cache, newest first: the encoded ones at once, ``most`` others encoded now.
+        """Take in new shards of the cache, newest first; encoded ones are only read.
 
         Args:
             most: shards to encode, >= 0.
