@@ -9,8 +9,10 @@ import pytest
 import torch
 from diffusers import AutoencoderKL, UNet2DConditionModel
 
+from geodiff_plugin.bundled.demo_pair import DemoPair
 from geodiff_plugin.commands.bench import Cost, PeakMemory, measure, run_bench
 from geodiff_plugin.commands.full_size import UNET, VAE
+from geodiff_plugin.types import Rig
 
 
 def test_peak_memory_sees_what_is_freed_again():
@@ -29,8 +31,13 @@ def test_full_size_is_marigold_v1_1():
 
 
 @pytest.mark.parametrize("gradient", [None, "denoised", "full"])
-def test_measure(make_pipeline, tmp_path, monkeypatch, gradient):
+def test_measure(make_pipeline, textured_plane, tmp_path, monkeypatch, gradient):
     make_pipeline().save_pretrained(tmp_path)
+    left, right = (image / np.float32(255) for image in (textured_plane.left, textured_plane.right))
+    depth_m = textured_plane.depth_m
+    rig = Rig(textured_plane.K, textured_plane.K, textured_plane.E)
+    pair = DemoPair(left, right, rig, depth_m, depth_m > 0)
+    monkeypatch.setattr("geodiff_plugin.commands.bench.read_demo_pair", lambda: pair)
     monkeypatch.setattr("geodiff_plugin.priors.BUNDLED_FOLDER", tmp_path)
     cost = measure(gradient, False, "cpu")
     assert cost.seconds > 0 and cost.peak_bytes >= 0
