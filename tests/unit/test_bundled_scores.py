@@ -55,7 +55,8 @@ def test_contact_sheet_has_three_pictures_a_scene(tmp_path):
     images, predictions = depth.repeat(1, 3, 1, 1) / 30.0, depth[:, 0].numpy().copy()
     depth[0, 0, 0, :] = float("inf")
     validate.contact_sheet(images, depth, predictions, tmp_path / "sheet.png", columns=3)
-    assert Image.open(tmp_path / "sheet.png").size == (3 * 3 * 18, 2 * 12)
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        assert sheet.size == (3 * 3 * 18, 2 * 12)
 
 
 def test_seconds_are_positive():
