@@ -52,7 +52,7 @@ def _limits(grey: torch.Tensor, p1: float, p2: float, contrast: float) -> tuple[
 
 @torch.no_grad()
 def aggregate(
-    cost: torch.Tensor, grey: torch.Tensor, *, p1: float = 0.1, p2: float = 0.8, contrast: float = 0.1
+    cost: torch.Tensor, grey: torch.Tensor, *, p1: float = 0.15, p2: float = 1.2, contrast: float = 0.1
 ) -> torch.Tensor:
     """Semi-global aggregation along four paths.
 

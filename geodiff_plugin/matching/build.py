@@ -25,8 +25,8 @@ from geodiff_plugin.matching.plane_sweep import (
 
 __all__ = ["build_cost_volume", "find_matches"]
 
-# The first, coarse sweep: longer side in pixels, and how far it looks in fractions of the width.
-_PILOT_SIDE = 256
+# The first, coarse sweep: pixels of its grid, and how far it looks in fractions of the width.
+_PILOT_PIXELS = 40_000
 _PILOT_SHIFT = 0.4
 # Fewer planes than this make no parabola worth the name.
 _FEWEST_PLANES = 24
@@ -43,10 +43,11 @@ def _shrink(image_01: torch.Tensor, K: torch.Tensor, factor: float) -> tuple[tor
 
 
 def _to_grid(
-    left: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, side: int
+    left: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, side: int, pixels: int
 ) -> tuple[torch.Tensor, tuple[RightView, ...], torch.Tensor]:
-    """Shrink the left view to ``side``, the right ones to as many pixels per radian so that none aliases."""
-    left, K = _shrink(left, K_left, side / max(left.shape[-2:]))
+    """Shrink the left view to its bounds, right ones to as many pixels per radian, so that none aliases."""
+    height, width = left.shape[-2:]
+    left, K = _shrink(left, K_left, min(side / max(height, width), (pixels / (height * width)) ** 0.5))
     small = tuple((*_shrink(image, K_r, float(K[0, 0] / K_r[0, 0])), T) for image, K_r, T in rights)
     return left, small, K
 
@@ -72,14 +73,14 @@ def _nearest_inverse_depth(
     left: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, max_shift: float
 ) -> torch.Tensor:
     """The inverse depth that a coarse sweep says nothing is nearer than."""
-    left, rights, K = _to_grid(left, rights, K_left, _PILOT_SIDE)
+    left, rights, K = _to_grid(left, rights, K_left, _PILOT_PIXELS, _PILOT_PIXELS)
     size = (left.shape[-2], left.shape[-1])
     all_rays = [plane_rays(K[None], K_r[None], T[None], size) for _, K_r, T in rights]
     limit = torch.stack([inverse_depth_at_shift(rays, max_shift * size[1]) for rays in all_rays]).amin()
     span = (torch.zeros_like(limit), limit)
     volume = sweep_planes(left, rights, K, _even_planes(span, size, rights, K, 1.0, 160))
     matches = match_volume(volume)
-    believed = matches.inverse_depth[matches.confidence > 0.5]
+    believed = matches.inverse_depth[matches.confidence > 0.8]
     least = torch.stack([inverse_depth_at_shift(rays, 0.03 * size[1]) for rays in all_rays]).amin()
     if believed.numel() < 100:
         return limit  # nothing to go by: the search must see everything
@@ -97,6 +98,7 @@ def build_cost_volume(
     planes: int = 160,
     depth_range: tuple[float, float] | None = None,
     max_side: int = 828,
+    max_pixels: int = 210_000,
     step_px: float = 0.75,
 ) -> CostVolume:
     """Sweep planes through the left view and compare it with the right views.
@@ -112,6 +114,7 @@ def build_cost_volume(
             width) is sure of, so that a street gets finer planes than a table top.
         max_side: longer side of the volume's grid; larger images are shrunk to it, right ones to as many
             pixels per radian.
+        max_pixels: the same for the number of its pixels: 828 x 250 for KITTI, 530 x 397 for 4:3.
         step_px: how far the median pixel moves in the right view from one plane to the next, if ``planes``
             allows.
 
@@ -125,7 +128,7 @@ def build_cost_volume(
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
     views = tuple((grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
-    left, small, K = _to_grid(grey(left_01), views, K_left.float(), max_side)
+    left, small, K = _to_grid(grey(left_01), views, K_left.float(), max_side, max_pixels)
     if depth_range is None:
         nearest = _nearest_inverse_depth(left, small, K, _PILOT_SHIFT)
         span = (torch.zeros_like(nearest), nearest)

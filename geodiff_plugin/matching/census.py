@@ -15,7 +15,7 @@ __all__ = ["census", "census_cost", "grey"]
 _OFFSETS = [(row, column) for row in (-3, -1, 1, 3) for column in (-3, -1, 1, 3)]
 # A difference in brightness of this counts as certain; below it the vote is proportional, so that noise on
 # flat surfaces hardly votes.
-_CONTRAST = 4.0 / 255.0
+_CONTRAST = 6.0 / 255.0
 
 
 def grey(image_01: torch.Tensor) -> torch.Tensor:

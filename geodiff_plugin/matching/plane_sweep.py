@@ -110,7 +110,9 @@ def inverse_depth_at_shift(rays: PlaneRays, shift_px: float) -> torch.Tensor:
     for _ in range(16):  # the shift grows with inverse depth, so bisection of 13 decades reaches 0.05 %
         middle = exponents.mean()
         reached = median_shift(rays, 10.0 ** middle[None])[0] >= shift_px
-        exponents = torch.where(reached, torch.stack([exponents[0], middle]), torch.stack([middle, exponents[1]]))
+        exponents = torch.where(
+            reached, torch.stack([exponents[0], middle]), torch.stack([middle, exponents[1]])
+        )
     return 10.0 ** exponents[1]
 
 
