@@ -31,7 +31,9 @@ def _rate(work, count: int, device: str) -> float:
     return count / (time.perf_counter() - start)
 
 
-def measure(size: tuple[int, int], device: str = "cpu", scenes: int = 20, kind: str | None = None) -> dict[str, float]:
+def measure(
+    size: tuple[int, int], device: str = "cpu", scenes: int = 20, kind: str | None = None
+) -> dict[str, float]:
     """Scenes per second: geometry alone, single views as for training, stereo pairs with antialiasing and masks.
 
     Args:
@@ -52,7 +54,9 @@ def measure(size: tuple[int, int], device: str = "cpu", scenes: int = 20, kind: 
     return {
         "sample_scene": _rate(lambda n: [sample_scene(s, kind) for s in range(n)], scenes, "cpu"),
         "render_mono": _rate(lambda n: render_mono(range(n), size, device, kind=kind), scenes, device),
-        "render_pair": _rate(lambda n: [render_pair(s, kind, size, device=device) for s in range(n)], scenes // 4, device),
+        "render_pair": _rate(
+            lambda n: [render_pair(s, kind, size, device=device) for s in range(n)], scenes // 4, device
+        ),
     }
 
 
@@ -62,7 +66,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--sizes", nargs="+", default=["96x128", "192x256"], metavar="HxW")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--scenes", type=int, default=24)
-    parser.add_argument("--kind", choices=KINDS, default=None, help="one kind of scene instead of the mixture")
+    parser.add_argument(
+        "--kind", choices=KINDS, default=None, help="one kind of scene instead of the mixture"
+    )
     parser.add_argument("--threads", type=int, default=1, help="CPU threads")
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)

@@ -21,7 +21,14 @@ __all__ = ["Builder", "Look", "rotation"]
 def rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
     """``R_world_from_local = R_y(yaw) R_x(pitch) R_z(roll)`` in radians; positive pitch tips z down (y grows)."""
     yaw, pitch, roll = np.broadcast_arrays(yaw, pitch, roll)
-    cy, sy, cp, sp, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+    cy, sy, cp, sp, cr, sr = (
+        np.cos(yaw),
+        np.sin(yaw),
+        np.cos(pitch),
+        np.sin(pitch),
+        np.cos(roll),
+        np.sin(roll),
+    )
     one, zero = np.ones_like(cy), np.zeros_like(cy)
 
     def matrix(*rows):
@@ -137,10 +144,25 @@ class Builder:
         i = lambda x: torch.from_numpy(np.ascontiguousarray(x)).long()  # noqa: E731
         lights = np.array(self.lights or [(0, -1, 0, 0, 0, 0, 1)], dtype=np.float64)
         return Scene(
-            shape=i(shape), world_to_local=f(matrix), half=f(half), taper=f(a[:, 10:12]), centre=f(centre), radius=f(radius),
-            material=i(a[:, 12]), layer=i(a[:, 13]), tile_m=f(a[:, 14:16]), tile_offset=f(a[:, 16:18]),
-            palette=f(a[:, 18:27].reshape(-1, 3, 3)), gloss=f(a[:, 27]), macro=f(a[:, 28]), emission=f(a[:, 29]),
+            shape=i(shape),
+            world_to_local=f(matrix),
+            half=f(half),
+            taper=f(a[:, 10:12]),
+            centre=f(centre),
+            radius=f(radius),
+            material=i(a[:, 12]),
+            layer=i(a[:, 13]),
+            tile_m=f(a[:, 14:16]),
+            tile_offset=f(a[:, 16:18]),
+            palette=f(a[:, 18:27].reshape(-1, 3, 3)),
+            gloss=f(a[:, 27]),
+            macro=f(a[:, 28]),
+            emission=f(a[:, 29]),
             fixed=torch.from_numpy(a[:, 30] > 0),
-            light_position=f(lights[:, :3]), light_colour=f(lights[:, 3:6]), light_directional=torch.from_numpy(lights[:, 6] > 0),
-            T_world_from_camera=f(camera), clearance_m=clearance, **rest,
+            light_position=f(lights[:, :3]),
+            light_colour=f(lights[:, 3:6]),
+            light_directional=torch.from_numpy(lights[:, 6] > 0),
+            T_world_from_camera=f(camera),
+            clearance_m=clearance,
+            **rest,
         )

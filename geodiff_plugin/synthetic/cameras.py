@@ -68,7 +68,10 @@ def camera_rays(
     px = x[None, :, None, :].expand(th, tw, TILE, TILE).reshape(1, th * tw, TILE * TILE)
     py = y[:, None, :, None].expand(th, tw, TILE, TILE).reshape(1, th * tw, TILE * TILE)
     direction = torch.stack(
-        [matrix[:, k, 0, None, None] * px + matrix[:, k, 1, None, None] * py + matrix[:, k, 2, None, None] for k in range(3)]
+        [
+            matrix[:, k, 0, None, None] * px + matrix[:, k, 1, None, None] * py + matrix[:, k, 2, None, None]
+            for k in range(3)
+        ]
     ).flatten(1, 2)
     bundles, shape = th * tw, direction.shape[1:]
     rays = Bundles(

@@ -63,8 +63,12 @@ class Lighting:
             torch.stack([pad(s.light_directional) for s in scenes]).to(device),
             torch.stack([pad(s.light_colour) for s in scenes]).to(device),
             torch.stack([torch.cat([s.ambient_up, s.ambient_down]) for s in scenes]).to(device),
-            torch.stack([torch.cat([s.sky.flatten(), torch.tensor([s.sky_clouds])]) for s in scenes]).to(device),
-            torch.stack([torch.cat([s.fog_colour, torch.tensor([s.fog_density])]) for s in scenes]).to(device),
+            torch.stack([torch.cat([s.sky.flatten(), torch.tensor([s.sky_clouds])]) for s in scenes]).to(
+                device
+            ),
+            torch.stack([torch.cat([s.fog_colour, torch.tensor([s.fog_density])]) for s in scenes]).to(
+                device
+            ),
             torch.tensor([s.ao_length_m for s in scenes]).to(device),
         )
 

@@ -54,7 +54,14 @@ def openness(
     b, n = keep.nonzero(as_tuple=True)
     prim = scene[b] * world.centre.shape[1] + n
     turn = world.turn[prim]  # (pairs, 3, 4) world to local, in metres
-    gap = (turn[:, :, :3] * middle.t()[b][:, None]).sum(-1).add_(turn[:, :, 3]).abs_().sub_(world.core[prim]).clamp_min_(0)
+    gap = (
+        (turn[:, :, :3] * middle.t()[b][:, None])
+        .sum(-1)
+        .add_(turn[:, :, 3])
+        .abs_()
+        .sub_(world.core[prim])
+        .clamp_min_(0)
+    )
     near = gap.square().sum(-1) <= spread[b].square()
     b, prim = b[near], prim[near]
     ball = world.shape[prim] == int(Shape.SPHERE)

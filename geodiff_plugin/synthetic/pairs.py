@@ -66,7 +66,9 @@ def _relative_pose(rng: np.random.Generator, baseline: float, rotation_deg: floa
         axis = axis / np.linalg.norm(axis) * np.radians(rotation_deg)
         cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
         angle = np.linalg.norm(axis)
-        pose[:3, :3] = pose[:3, :3] @ (np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross)
+        pose[:3, :3] = pose[:3, :3] @ (
+            np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
+        )
     return pose
 
 
@@ -122,8 +124,11 @@ def render_pair(
     E_ = torch.from_numpy(pose)
     size_right = size_right or size
     left_K = intrinsics(size, scene.fov_deg) if K_left is None else torch.as_tensor(K_left).double()
-    right_K = torch.as_tensor(K_right).double() if K_right is not None else (
-        left_K.clone() if size_right == size else intrinsics(size_right, scene.fov_deg))
+    right_K = (
+        torch.as_tensor(K_right).double()
+        if K_right is not None
+        else (left_K.clone() if size_right == size else intrinsics(size_right, scene.fov_deg))
+    )
     world_from_right = scene.T_world_from_camera.double() @ E_
     scene = clear_of(scene, world_from_right[:3, 3], scene.clearance_m * 0.6)
     views = (Camera(left_K, scene.T_world_from_camera), size), (Camera(right_K, world_from_right), size_right)

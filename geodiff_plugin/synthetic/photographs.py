@@ -76,7 +76,9 @@ def cover_with_photographs(scene: Scene, rng: np.random.Generator, share: float)
     # A photograph covers about the whole face of a small thing and repeats every two metres on a large one.
     size = (2 * scene.half.median(1).values[:, None]).clamp(0.1, 2.0) * 2
     palette = scene.palette.clone()
-    palette[:, 0] = torch.where(chosen[:, None], torch.from_numpy(rng.uniform(0.4, 1.2, (count, 1))).float(), palette[:, 0])
+    palette[:, 0] = torch.where(
+        chosen[:, None], torch.from_numpy(rng.uniform(0.4, 1.2, (count, 1))).float(), palette[:, 0]
+    )
     return replace(
         scene,
         layer=torch.where(chosen, layer, scene.layer),

@@ -148,7 +148,10 @@ def surface(
         ball = shape == Shape.SPHERE
         side = round_ & (ball | ((x * x + z * z).sqrt() >= radius - 1e-3))
         angle = torch.atan2(x, -z)
-        nx, nz = torch.where(side, x, torch.where(round_, zero, nx)), torch.where(side, z, torch.where(round_, zero, nz))
+        nx, nz = (
+            torch.where(side, x, torch.where(round_, zero, nx)),
+            torch.where(side, z, torch.where(round_, zero, nz)),
+        )
         cap = torch.copysign(one, y)
         ny = torch.where(ball, y, torch.where(side, -slope * radius, torch.where(round_, cap, ny)))
         latitude = torch.asin(y.clamp(-1, 1)) * hy

@@ -54,7 +54,9 @@ class _Stage:
     atlas: Atlas
 
 
-def _bounce(stage: _Stage, rays: Bundles, hit: Shaded, prim: torch.Tensor, pixel: torch.Tensor) -> torch.Tensor:
+def _bounce(
+    stage: _Stage, rays: Bundles, hit: Shaded, prim: torch.Tensor, pixel: torch.Tensor
+) -> torch.Tensor:
     """Add one reflection and what is seen through glass."""
     base = hit.radiance * (1 - hit.mirror - hit.through)
     (reflects,) = (hit.mirror > 0).any(-1).nonzero(as_tuple=True)
@@ -87,7 +89,9 @@ def _find_edges(prim: torch.Tensor) -> torch.Tensor:
     return edges | F.pad(down, (0, 0, 0, 1)) | F.pad(down, (0, 0, 1, 0))
 
 
-def _supersample(stage: _Stage, rays: Bundles, steps: torch.Tensor, pixel: torch.Tensor, chosen: torch.Tensor):
+def _supersample(
+    stage: _Stage, rays: Bundles, steps: torch.Tensor, pixel: torch.Tensor, chosen: torch.Tensor
+):
     """Mean radiance ``(3, n)`` over four samples of the chosen pixels (flat indices) of one scene."""
     count = chosen.shape[0]
     padded = torch.cat([chosen, chosen[-1:].expand(-count % (TILE * TILE))])
@@ -131,7 +135,9 @@ def render_linear(
         photographs: the scenes use photographs as textures.
         antialias: shade pixels on outlines four times. Depth is always that of the pixel's centre.
     """
-    stage = _Stage(World.gather(scenes, device), Lighting.gather(scenes, device), atlas(str(device), photographs))
+    stage = _Stage(
+        World.gather(scenes, device), Lighting.gather(scenes, device), atlas(str(device), photographs)
+    )
     rays, pixel, steps = camera_rays(cameras, torch.as_tensor(owner), size, device, _FAR)
     radiance, t, prim, material = _follow(stage, rays, pixel)
     views = len(cameras)
@@ -143,10 +149,23 @@ def render_linear(
             some = slice(v * per_view, (v + 1) * per_view)
             (chosen,) = flags[some].flatten().nonzero(as_tuple=True)
             if chosen.numel():
-                mine = Bundles(rays.scene[some], rays.origin[:, some], rays.direction[:, some], rays.t_max[some], rays.skip[some])
+                mine = Bundles(
+                    rays.scene[some],
+                    rays.origin[:, some],
+                    rays.direction[:, some],
+                    rays.t_max[some],
+                    rays.skip[some],
+                )
                 mean = _supersample(stage, mine, steps[some], pixel[some], chosen)
-                radiance[:, some] = radiance[:, some].flatten(1).index_copy(1, chosen, mean).reshape(3, per_view, -1)
-    return LinearViews(untile(radiance, views, size), untile(t[None], views, size), untile(material[None], views, size), edges)
+                radiance[:, some] = (
+                    radiance[:, some].flatten(1).index_copy(1, chosen, mean).reshape(3, per_view, -1)
+                )
+    return LinearViews(
+        untile(radiance, views, size),
+        untile(t[None], views, size),
+        untile(material[None], views, size),
+        edges,
+    )
 
 
 def expose(radiance: torch.Tensor, gain: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
@@ -164,7 +183,9 @@ def expose(radiance: torch.Tensor, gain: torch.Tensor | None = None) -> tuple[to
         gain = 0.26 / luminance.log().mean((1, 2)).exp()
         gain = torch.minimum(gain, 0.75 / luminance.mean((1, 2)).clamp_min(1e-4))
     linear = 1 - torch.exp(-1.25 * radiance * gain[:, None, None, None])
-    image = torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(1e-6).pow(1 / 2.4) - 0.055)
+    image = torch.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(1e-6).pow(1 / 2.4) - 0.055
+    )
     return image.clamp(0, 1), gain
 
 

@@ -74,7 +74,9 @@ def _surface_rows(world: World, prim: torch.Tensor, point: torch.Tensor, directi
     """Parameter rows ``(F, n)`` of the hits, unit normals towards the viewer ``(3, B, P)``, metres along u and v."""
     row = world.table.index_select(1, prim.clamp_min(0).flatten())
     flat = point.reshape(3, -1)
-    local = torch.stack([row[k] * flat[0] + row[k + 1] * flat[1] + row[k + 2] * flat[2] + row[k + 3] for k in (1, 5, 9)])
+    local = torch.stack(
+        [row[k] * flat[0] + row[k + 1] * flat[1] + row[k + 2] * flat[2] + row[k + 3] for k in (1, 5, 9)]
+    )
     n, uv_m = surface(row[0].long(), local, row[13:16], row[16:18])
     normal = torch.stack([row[1 + k] * n[0] + row[5 + k] * n[1] + row[9 + k] * n[2] for k in range(3)])
     normal = unit(normal).reshape(point.shape)

@@ -64,7 +64,9 @@ def atlas(device: str = "cpu", photographs: bool = False) -> Atlas:
     return Atlas(rows, starts, len(levels), len(LAYERS), photographs)
 
 
-def sample_atlas(table: Atlas, layer: torch.Tensor, uv: torch.Tensor, footprint: torch.Tensor) -> torch.Tensor:
+def sample_atlas(
+    table: Atlas, layer: torch.Tensor, uv: torch.Tensor, footprint: torch.Tensor
+) -> torch.Tensor:
     """Bilinear lookup at the nearest mip level, wrapping around.
 
     Args:

@@ -64,7 +64,9 @@ def _cone(rays: Bundles) -> tuple[torch.Tensor, ...]:
     return apex, spread, axis, cos, sin, length
 
 
-def candidates(world: World, scene: torch.Tensor, apex: torch.Tensor, axis: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
+def candidates(
+    world: World, scene: torch.Tensor, apex: torch.Tensor, axis: torch.Tensor | None
+) -> tuple[torch.Tensor, ...]:
     """Squared distance of every primitive's centre from each apex and its length along the axis, radius, opacity."""
     if world.scenes == 1:
         centre, radius, opaque = world.centre, world.radius, world.opaque  # broadcast over bundles
@@ -74,7 +76,9 @@ def candidates(world: World, scene: torch.Tensor, apex: torch.Tensor, axis: torc
     d2 = torch.addcmul(torch.addcmul(v[0] * v[0], v[1], v[1]), v[2], v[2])
     if axis is None:
         return d2, d2, radius, opaque
-    along = torch.addcmul(torch.addcmul(v[0] * axis[0][:, None], v[1], axis[1][:, None]), v[2], axis[2][:, None])
+    along = torch.addcmul(
+        torch.addcmul(v[0] * axis[0][:, None], v[1], axis[1][:, None]), v[2], axis[2][:, None]
+    )
     return d2, along, radius, opaque
 
 
@@ -125,7 +129,9 @@ def to_local(matrix: torch.Tensor, v: torch.Tensor, with_offset: bool) -> tuple[
     return tuple(out)
 
 
-def _hits(world: World, rays: Bundles, casters: bool) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+def _hits(
+    world: World, rays: Bundles, casters: bool
+) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
     """Chunks of ``bundle (n,), primitive (n,), t (n, P)``; ``t`` is inf where it does not count."""
     bundle, prim = _pairs(world, rays, casters)
     kinds = world.shape[prim]

@@ -17,9 +17,25 @@ from geodiff_plugin.synthetic.world import World
 
 __all__ = ["clear_of", "hidden_from_right", "in_sight"]
 
-_PER_PRIMITIVE = frozenset({"shape", "world_to_local", "half", "taper", "centre", "radius", "material", "layer", "tile_m",
-                            "tile_offset", "palette", "gloss", "macro", "emission", "fixed"})
-
+_PER_PRIMITIVE = frozenset(
+    {
+        "shape",
+        "world_to_local",
+        "half",
+        "taper",
+        "centre",
+        "radius",
+        "material",
+        "layer",
+        "tile_m",
+        "tile_offset",
+        "palette",
+        "gloss",
+        "macro",
+        "emission",
+        "fixed",
+    }
+)
 
 
 def clear_of(scene: Scene, point: torch.Tensor, gap: float) -> Scene:
@@ -61,7 +77,9 @@ def in_sight(scene: Scene, views: Sequence[tuple[Camera, tuple[int, int]]], marg
 
 
 @torch.no_grad()
-def hidden_from_right(scene: Scene, left: RenderedView, K_left, K_right, E, right_size, device) -> tuple[torch.Tensor, torch.Tensor]:
+def hidden_from_right(
+    scene: Scene, left: RenderedView, K_left, K_right, E, right_size, device
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Cast a ray from the right camera to every left pixel's point: occluded, and inside the right image."""
     height, width = left.depth_m.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -85,8 +103,13 @@ def hidden_from_right(scene: Scene, left: RenderedView, K_left, K_right, E, righ
     shape = (tiles, 64)
     # A hit clearly before the point hides it; for the sky (a point at 1e7) any hit does.
     tolerance = 2e-3
-    rays = Bundles(torch.zeros(tiles, dtype=torch.int64, device=device), origin, direction,
-                   torch.full(shape, 1 - tolerance, device=device), torch.full(shape, -1, device=device))
+    rays = Bundles(
+        torch.zeros(tiles, dtype=torch.int64, device=device),
+        origin,
+        direction,
+        torch.full(shape, 1 - tolerance, device=device),
+        torch.full(shape, -1, device=device),
+    )
     t, _ = nearest(World.gather([scene], device), rays)
     hidden = torch.isfinite(t).reshape(-1)[:count].reshape(1, height, width)
     return hidden, in_view.reshape(1, height, width).to(device)

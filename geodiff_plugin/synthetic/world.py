@@ -60,25 +60,52 @@ class World:
             return torch.stack(rows)
 
         shape = stack(lambda s: s.shape, 0)
-        extent = stack(lambda s: torch.stack(
-            [torch.ones(len(s.shape)), (s.shape != Shape.QUAD).float(), torch.ones(len(s.shape))], 1))
+        extent = stack(
+            lambda s: torch.stack(
+                [torch.ones(len(s.shape)), (s.shape != Shape.QUAD).float(), torch.ones(len(s.shape))], 1
+            )
+        )
         matrix = stack(lambda s: s.world_to_local)
-        table = torch.cat([
-            shape[..., None].float(), matrix.flatten(2), stack(lambda s: s.half), stack(lambda s: s.taper),
-            stack(lambda s: s.material)[..., None].float(), stack(lambda s: s.layer)[..., None].float(),
-            stack(lambda s: s.tile_m, 1.0), stack(lambda s: s.tile_offset), stack(lambda s: s.palette).flatten(2),
-            stack(lambda s: s.gloss)[..., None], stack(lambda s: s.macro)[..., None],
-            stack(lambda s: s.emission)[..., None],
-        ], -1).flatten(0, 1).t().contiguous()
+        table = (
+            torch.cat(
+                [
+                    shape[..., None].float(),
+                    matrix.flatten(2),
+                    stack(lambda s: s.half),
+                    stack(lambda s: s.taper),
+                    stack(lambda s: s.material)[..., None].float(),
+                    stack(lambda s: s.layer)[..., None].float(),
+                    stack(lambda s: s.tile_m, 1.0),
+                    stack(lambda s: s.tile_offset),
+                    stack(lambda s: s.palette).flatten(2),
+                    stack(lambda s: s.gloss)[..., None],
+                    stack(lambda s: s.macro)[..., None],
+                    stack(lambda s: s.emission)[..., None],
+                ],
+                -1,
+            )
+            .flatten(0, 1)
+            .t()
+            .contiguous()
+        )
         opaque = stack(lambda s: (s.material != Material.GLASS) & (s.emission <= 0), False)
         half, taper = stack(lambda s: s.half, 1.0), stack(lambda s: s.taper)
         turn = matrix * half[..., None]
         slim = torch.stack([1 - taper[..., 0], torch.ones_like(taper[..., 0]), 1 - taper[..., 1]], -1)
-        round_ = torch.tensor([0.7, 1.0, 0.7]) * torch.stack([(1 + taper[..., 0]) / 2, torch.ones_like(taper[..., 0]), (1 + taper[..., 0]) / 2], -1)
+        round_ = torch.tensor([0.7, 1.0, 0.7]) * torch.stack(
+            [(1 + taper[..., 0]) / 2, torch.ones_like(taper[..., 0]), (1 + taper[..., 0]) / 2], -1
+        )
         core = half * extent
         core = torch.where((shape == Shape.TAPER)[..., None], core * slim.clamp_min(0), core)
         core = torch.where((shape == Shape.FRUSTUM)[..., None], core * round_, core)
         flat = [x.flatten(0, 1).to(device) for x in (shape, matrix, extent, stack(lambda s: s.taper))]
-        return cls(len(scenes), *flat, stack(lambda s: s.centre).to(device),
-                   stack(lambda s: s.radius, -1e6).to(device), opaque.to(device),
-                   turn.flatten(0, 1).to(device), core.flatten(0, 1).to(device), table.to(device))
+        return cls(
+            len(scenes),
+            *flat,
+            stack(lambda s: s.centre).to(device),
+            stack(lambda s: s.radius, -1e6).to(device),
+            opaque.to(device),
+            turn.flatten(0, 1).to(device),
+            core.flatten(0, 1).to(device),
+            table.to(device),
+        )

@@ -93,7 +93,9 @@ def _upright(spot: Spot, size: float) -> None:
 def _basket(spot: Spot, size: float) -> None:
     """A bowl or crate with balls in it."""
     rng = spot.rng
-    look = surface_look(rng, pick(rng, "fabric", "wood", "plain"), pick(rng, "wood", "vivid", "dark", "white"))
+    look = surface_look(
+        rng, pick(rng, "fabric", "wood", "plain"), pick(rng, "wood", "vivid", "dark", "white")
+    )
     if rng.random() < 0.5:
         spot.column(0, 0, 0, size * 0.4, size * 0.35, look, top=1.35)
     else:
@@ -126,8 +128,18 @@ def magazine(spot: Spot) -> None:
 def cloth(spot: Spot, size: float) -> None:
     """Crumpled fabric: overlapping flat ellipsoids at random orientations."""
     rng = spot.rng
-    look = surface_look(rng, pick(rng, "fabric", "plain", "stripes", "dots"), pick(rng, "any", "vivid", "painted"))
+    look = surface_look(
+        rng, pick(rng, "fabric", "plain", "stripes", "dots"), pick(rng, "any", "vivid", "painted")
+    )
     for _ in range(int(rng.integers(5, 10))):
         a, d = rng.uniform(-np.pi, np.pi), size * rng.uniform(0, 0.35)
         half = size * rng.uniform(0.12, 0.4, 3) * (1, 0.35, 1)
-        spot.ball(np.cos(a) * d, np.sin(a) * d, half[1], half, look, pitch=rng.normal(0, 0.5), roll=rng.normal(0, 0.5))
+        spot.ball(
+            np.cos(a) * d,
+            np.sin(a) * d,
+            half[1],
+            half,
+            look,
+            pitch=rng.normal(0, 0.5),
+            roll=rng.normal(0, 0.5),
+        )

@@ -62,7 +62,9 @@ def corridor(rng: np.random.Generator, seed: int) -> Scene:
         spot = Spot(b, x, depth / 2, yaw)
         _side(spot, depth, height, door)
         if rng.random() < 0.4:  # a panel on the lower wall, a rail above it
-            panel = surface_look(rng, pick(rng, "tiles", "planks", "plain"), pick(rng, "painted", "wood", "grey"))
+            panel = surface_look(
+                rng, pick(rng, "tiles", "planks", "plain"), pick(rng, "painted", "wood", "grey")
+            )
             spot.box(0, -0.002, 0, (depth, 1.0, 0.01), panel)
             spot.box(0, -0.02, 1.0, (depth, 0.05, 0.04), panel)
     end = Spot(b, 0, depth)

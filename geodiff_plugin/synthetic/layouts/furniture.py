@@ -14,7 +14,18 @@ from geodiff_plugin.synthetic.layouts.palettes import object_look, palette, pick
 from geodiff_plugin.synthetic.layouts.spot import Spot
 from geodiff_plugin.synthetic.scene import Material
 
-__all__ = ["bench", "cabinet", "chair", "counter", "desk_things", "lounger", "monitor", "shelf", "sofa", "table"]
+__all__ = [
+    "bench",
+    "cabinet",
+    "chair",
+    "counter",
+    "desk_things",
+    "lounger",
+    "monitor",
+    "shelf",
+    "sofa",
+    "table",
+]
 
 
 def table(spot: Spot, width: float, depth: float, height: float, look: Look, legs: str = "posts") -> None:
@@ -28,7 +39,9 @@ def table(spot: Spot, width: float, depth: float, height: float, look: Look, leg
         for sx in (-1, 1):
             for sz in (-1, 1):
                 x, z = sx * (width / 2 - leg), sz * (depth / 2 - leg)
-                spot.box(x, z, 0, (leg, height - top, leg), pick(rng, metal, look) if sx + sz == -2 else metal)
+                spot.box(
+                    x, z, 0, (leg, height - top, leg), pick(rng, metal, look) if sx + sz == -2 else metal
+                )
     elif legs == "sides":
         for sx in (-1, 1):
             spot.box(sx * (width / 2 - 0.02), 0, 0, (0.03, height - top, depth * 0.9), look)
@@ -59,14 +72,18 @@ def monitor(spot: Spot, scale: float = 1.0) -> None:
     spot.box(0, 0.03, 0.13, (w * 0.98, h * 0.96, 0.03), dark)
 
 
-def desk_things(spot: Spot, width: float, depth: float, height: float, count: int, office: float = 0.7) -> None:
+def desk_things(
+    spot: Spot, width: float, depth: float, height: float, count: int, office: float = 0.7
+) -> None:
     """Monitor, keyboard, papers, cups, lamp and clutter on a table; ``office`` is the chance of a computer."""
     rng = spot.rng
     top = spot.moved(0, 0, 0, height)
     if rng.random() < office:
         monitor(top.moved(rng.uniform(-0.25, 0.25) * width, depth * 0.18, rng.normal(0, 0.2)))
         if rng.random() < 0.7:
-            keys = Look("keyboard", palette(rng, pick(rng, "dark", "grey", "white")), (0.45, 0.16), origin=(0.5, 0.5))
+            keys = Look(
+                "keyboard", palette(rng, pick(rng, "dark", "grey", "white")), (0.45, 0.16), origin=(0.5, 0.5)
+            )
             place = (rng.uniform(-0.2, 0.2) * width, -depth * 0.25, 0)
             top.box(*place, (0.44, 0.025, 0.15), keys, turn=rng.normal(0, 0.15))
         if rng.random() < 0.4:
@@ -77,9 +94,17 @@ def desk_things(spot: Spot, width: float, depth: float, height: float, count: in
         place = rng.uniform(-0.4, 0.4) * width, rng.uniform(-0.4, 0.4) * depth
         magazine(top.moved(*place, rng.uniform(-np.pi, np.pi)))
     for _ in range(count):
-        thing(top, rng.uniform(-0.45, 0.45) * width, rng.uniform(-0.45, 0.45) * depth, 0, rng.uniform(0.06, 0.28))
+        thing(
+            top,
+            rng.uniform(-0.45, 0.45) * width,
+            rng.uniform(-0.45, 0.45) * depth,
+            0,
+            rng.uniform(0.06, 0.28),
+        )
     if rng.random() < 0.15:
-        cloth(top.moved(rng.uniform(-0.4, 0.4) * width, rng.uniform(-0.4, 0.4) * depth), rng.uniform(0.2, 0.5))
+        cloth(
+            top.moved(rng.uniform(-0.4, 0.4) * width, rng.uniform(-0.4, 0.4) * depth), rng.uniform(0.2, 0.5)
+        )
 
 
 def _desk_lamp(spot: Spot) -> None:
@@ -93,7 +118,9 @@ def _desk_lamp(spot: Spot) -> None:
 def chair(spot: Spot) -> None:
     """Chair facing local -z: with four legs, on castors, or a wooden one with a slatted back."""
     rng = spot.rng
-    seat = surface_look(rng, pick(rng, "fabric", "wood", "plain", "stripes"), pick(rng, "any", "dark", "wood", "vivid"))
+    seat = surface_look(
+        rng, pick(rng, "fabric", "wood", "plain", "stripes"), pick(rng, "any", "dark", "wood", "vivid")
+    )
     leg = surface_look(rng, "plain", pick(rng, "grey", "dark", "wood"), gloss=0.3)
     kind = rng.random()
     if kind < 0.35:
@@ -114,7 +141,9 @@ def chair(spot: Spot) -> None:
             spot.box(s * 0.2, 0.2, 0.42, (0.045, 0.5, 0.04), wood)
         count = int(rng.integers(2, 5))
         for k in range(count):
-            spot.box(0, 0.2, 0.55 + 0.34 * k / max(1, count - 1), (0.38, rng.uniform(0.04, 0.08), 0.025), wood)
+            spot.box(
+                0, 0.2, 0.55 + 0.34 * k / max(1, count - 1), (0.38, rng.uniform(0.04, 0.08), 0.025), wood
+            )
 
 
 def _legs(spot: Spot, spread: float, height: float, look: Look) -> None:
@@ -141,7 +170,9 @@ def lounger(spot: Spot) -> None:
 
 def bench(spot: Spot, width: float) -> None:
     """Bench of slats, facing local -z."""
-    wood = surface_look(spot.rng, pick(spot.rng, "wood", "plain"), pick(spot.rng, "wood", "grey", "painted", "white"))
+    wood = surface_look(
+        spot.rng, pick(spot.rng, "wood", "plain"), pick(spot.rng, "wood", "grey", "painted", "white")
+    )
     for k in range(4):
         spot.box(0, -0.15 + 0.1 * k, 0.43, (width, 0.025, 0.08), wood)
         spot.box(0, 0.22, 0.52 + 0.1 * k, (width, 0.075, 0.025), wood)
@@ -196,8 +227,16 @@ def counter(spot: Spot, width: float) -> None:
         gloss=rng.uniform(0.1, 0.6), origin=(rng.random(), 0.5),
     )  # fmt: skip
     spot.box(0, 0, 0, (width, 0.86, 0.58), front)
-    spot.box(0, -0.01, 0.86, (width, 0.04, 0.62), surface_look(rng, pick(rng, "speckle", "wood", "marble", "plain"), "grey"))
-    splash = surface_look(rng, pick(rng, "mosaic", "tiles", "plain"), pick(rng, "white", "painted", "grey"), (0.3, 0.6))
+    spot.box(
+        0,
+        -0.01,
+        0.86,
+        (width, 0.04, 0.62),
+        surface_look(rng, pick(rng, "speckle", "wood", "marble", "plain"), "grey"),
+    )
+    splash = surface_look(
+        rng, pick(rng, "mosaic", "tiles", "plain"), pick(rng, "white", "painted", "grey"), (0.3, 0.6)
+    )
     spot.box(0, 0.29, 0.9, (width, 0.55, 0.012), splash)
     for _ in range(int(rng.integers(2, 8))):
         place = spot.moved(rng.uniform(-0.46, 0.46) * width, rng.uniform(0.0, 0.2), rng.normal(0, 0.25), 0.9)
@@ -206,7 +245,9 @@ def counter(spot: Spot, width: float) -> None:
         else:
             thing(place, 0, 0, 0, rng.uniform(0.1, 0.3))
     if rng.random() < 0.5:
-        above = Look(front.layer, front.palette if rng.random() < 0.6 else palette(rng, "white"), (0.9, 0.7), gloss=0.2)
+        above = Look(
+            front.layer, front.palette if rng.random() < 0.6 else palette(rng, "white"), (0.9, 0.7), gloss=0.2
+        )
         spot.box(0, 0.12, 1.5, (width * rng.uniform(0.5, 1), 0.7, 0.33), above)
     elif rng.random() < 0.5:
         monitor(spot.moved(rng.uniform(-0.3, 0.3) * width, 0.2, 0, 1.35), 1.4)

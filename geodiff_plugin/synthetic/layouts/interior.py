@@ -16,7 +16,18 @@ from geodiff_plugin.synthetic.scene import Material
 
 __all__ = ["area_light", "door_look", "indoor_rest", "shell", "wall_decor"]
 
-_FLOORS = ("planks", "parquet", "tiles", "carpet", "carpet", "concrete", "checker", "marble", "plain", "pinstripes")
+_FLOORS = (
+    "planks",
+    "parquet",
+    "tiles",
+    "carpet",
+    "carpet",
+    "concrete",
+    "checker",
+    "marble",
+    "plain",
+    "pinstripes",
+)
 _FLOOR_FAMILY = {"planks": "wood", "parquet": "wood", "tiles": "stone", "carpet": "any", "marble": "stone"}
 
 
@@ -31,7 +42,9 @@ def shell(b: Builder, width: float, depth: float, height: float) -> None:
     b.quad((0, -height, depth / 2), width / 2, depth / 2, ceiling, fixed=True)
     layer = pick(rng, "plain", "plaster", "plaster", "wallpaper", "pinstripes", "brick", "blocks")
     wall = surface_look(rng, layer, pick(rng, "wall", "wall", "white", "painted"), macro=0.15)
-    other = surface_look(rng, pick(rng, "plain", "plaster", "wallpaper"), pick(rng, "wall", "painted", "white", "vivid"))
+    other = surface_look(
+        rng, pick(rng, "plain", "plaster", "wallpaper"), pick(rng, "wall", "painted", "white", "vivid")
+    )
     half = np.pi / 2
     for x, yaw, look in ((-width / 2, -half, wall), (width / 2, half, pick(rng, wall, other))):
         b.quad((x, -height / 2, depth / 2), depth / 2, height / 2, look, yaw=yaw, pitch=half, fixed=True)
@@ -47,7 +60,10 @@ def shell(b: Builder, width: float, depth: float, height: float) -> None:
 def door_look(rng: np.random.Generator, width: float, height: float) -> Look:
     """A panelled door leaf."""
     return Look(
-        "door", palette(rng, pick(rng, "wood", "white", "grey", "dark", "painted")), (width, height), origin=(0.5, 0.5)
+        "door",
+        palette(rng, pick(rng, "wood", "white", "grey", "dark", "painted")),
+        (width, height),
+        origin=(0.5, 0.5),
     )
 
 
@@ -85,7 +101,13 @@ def _window(spot: Spot, w: float, h: float, up: float, frame: Look) -> None:
     pal = np.stack([colour(0.08, 0.03, 0.95), sky, colour(0.08, 0.05, 0.95)])
     tile = (w / max(1, round(w)), h)
     glow = rng.uniform(0.8, 4.0)
-    spot.box(0, -0.01, up - h / 2, (w, h, 0.03), Look("window", pal, tile, emission=glow, origin=(0.5, 0.5), macro=0, gloss=0.3))
+    spot.box(
+        0,
+        -0.01,
+        up - h / 2,
+        (w, h, 0.03),
+        Look("window", pal, tile, emission=glow, origin=(0.5, 0.5), macro=0, gloss=0.3),
+    )
     spot.box(0, -0.06, up - h / 2 - 0.04, (w + 0.15, 0.04, 0.16), frame)
     dressing = rng.random()
     if dressing < 0.35:

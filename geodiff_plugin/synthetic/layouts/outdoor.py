@@ -114,12 +114,16 @@ def house(spot: Spot) -> None:
     taper = pick(rng, (0.98, 0.0), (0.0, 0.98), (0.95, 0.5))
     spot.wedge(0, 0, h, (w + 0.8, rng.uniform(2, 4.5), d + 0.8), roof, taper)
     spot.box(rng.uniform(-0.25, 0.25) * w, 0, h, (0.6, 4.2, 0.6), surface_look(rng, "brick", "brick"))
-    face = Look("door", palette(rng, pick(rng, "wood", "dark", "vivid", "white")), (1.1, 2.1), origin=(0.5, 0.5))
+    face = Look(
+        "door", palette(rng, pick(rng, "wood", "dark", "vivid", "white")), (1.1, 2.1), origin=(0.5, 0.5)
+    )
     spot.box(rng.uniform(-0.3, 0.3) * w, -d / 2, 0, (1.1, 2.1, 0.2), face)
     if rng.random() < 0.5:
         side = pick(rng, -1, 1)
         doors = Look("pinstripes", palette(rng, pick(rng, "white", "grey", "painted")), (0.5, 0.5))
         for k in range(int(rng.integers(1, 4))):
             lx = side * (w / 2 + 1.7 + 3.2 * k)
-            spot.box(lx, -d * 0.3, 0, (3.2, 2.6, 5.0), surface_look(rng, "plaster", pick(rng, "white", "wall")))
+            spot.box(
+                lx, -d * 0.3, 0, (3.2, 2.6, 5.0), surface_look(rng, "plaster", pick(rng, "white", "wall"))
+            )
             spot.box(lx, -d * 0.3 - 2.5, 0, (2.5, 2.1, 0.06), doors)

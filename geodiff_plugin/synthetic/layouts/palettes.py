@@ -66,14 +66,36 @@ def pick(rng: np.random.Generator, *options):
     return options[int(rng.random() * len(options))]
 
 
-def surface_look(rng: np.random.Generator, layer: str, family: str, scale: tuple[float, float] = (0.8, 1.25), **rest) -> Look:
+def surface_look(
+    rng: np.random.Generator, layer: str, family: str, scale: tuple[float, float] = (0.8, 1.25), **rest
+) -> Look:
     """A layer at about its natural size in colours of a family."""
     k = scale[0] + (scale[1] - scale[0]) * rng.random()
     return Look(layer, palette(rng, family), (TILE_M[layer] * k,) * 2, **rest)
 
 
-_OBJECT_LAYERS = ("plain", "plain", "plaster", "fbm", "speckle", "wood", "marble", "stripes", "pinstripes", "diagonal", "dots",
-                  "fine_checker", "label_a", "label_b", "fabric", "poster_a", "poster_b", "document", "wallpaper", "mosaic")
+_OBJECT_LAYERS = (
+    "plain",
+    "plain",
+    "plaster",
+    "fbm",
+    "speckle",
+    "wood",
+    "marble",
+    "stripes",
+    "pinstripes",
+    "diagonal",
+    "dots",
+    "fine_checker",
+    "label_a",
+    "label_b",
+    "fabric",
+    "poster_a",
+    "poster_b",
+    "document",
+    "wallpaper",
+    "mosaic",
+)
 
 
 def object_look(rng: np.random.Generator, size: float, special: float = 0.06) -> Look:
@@ -88,5 +110,12 @@ def object_look(rng: np.random.Generator, size: float, special: float = 0.06) ->
     family = pick(rng, "vivid", "any", "any", "painted", "grey", "white", "wood", "dark")
     fit = layer in ("label_a", "label_b", "poster_a", "poster_b", "document")
     tile = (size, size) if fit else (TILE_M[layer] * rng.uniform(0.3, 1.0),) * 2
-    return Look(layer, palette(rng, family), tile, Material.GLOSSY if gloss > 0.45 else Material.DIFFUSE, gloss, 0.15,
-                origin=(0.5, 0.5) if fit else None)
+    return Look(
+        layer,
+        palette(rng, family),
+        tile,
+        Material.GLOSSY if gloss > 0.45 else Material.DIFFUSE,
+        gloss,
+        0.15,
+        origin=(0.5, 0.5) if fit else None,
+    )

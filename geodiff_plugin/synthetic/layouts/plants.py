@@ -34,7 +34,9 @@ def pot_plant(spot: Spot, height: float) -> None:
         at = (np.cos(a) * r * 0.9, np.sin(a) * r * 0.9, height * rng.uniform(0.4, 0.95))
         if long_leaves:
             half = height * np.array([0.03, rng.uniform(0.12, 0.25), 0.01])
-            spot.moved(*at[:2], a).ball(0, 0, at[2], half, leaf, pitch=rng.normal(0, 0.6), roll=rng.normal(0, 0.6))
+            spot.moved(*at[:2], a).ball(
+                0, 0, at[2], half, leaf, pitch=rng.normal(0, 0.6), roll=rng.normal(0, 0.6)
+            )
         else:
             spot.ball(*at, height * rng.uniform(0.05, 0.18, 3), leaf)
 
@@ -60,10 +62,24 @@ def tree(spot: Spot, height: float, blobs: int) -> None:
         a, part = k * 2.4 + rng.normal(0, 0.4), np.sqrt((k + 0.5) / blobs)
         up = low + (1 - low) * rng.uniform(0.1, 0.92)
         # Narrow at the bottom and at the top, wide in the middle.
-        d = height * 0.24 * wide * part * np.sqrt(max(0.05, 1 - (2 * (up - low) / (1 - low) - 0.9) ** 2 * 0.8))
+        d = (
+            height
+            * 0.24
+            * wide
+            * part
+            * np.sqrt(max(0.05, 1 - (2 * (up - low) / (1 - low) - 0.9) ** 2 * 0.8))
+        )
         size = height * rng.uniform(0.07, 0.19) * (6 / (blobs + 2)) ** 0.25
         half = size * np.array([wide, rng.uniform(0.55, 1.0), wide])
-        spot.ball(np.cos(a) * d, np.sin(a) * d, height * up, half, leaf, pitch=rng.normal(0, 0.3), roll=rng.normal(0, 0.3))
+        spot.ball(
+            np.cos(a) * d,
+            np.sin(a) * d,
+            height * up,
+            half,
+            leaf,
+            pitch=rng.normal(0, 0.3),
+            roll=rng.normal(0, 0.3),
+        )
 
 
 def tree_line(spot: Spot, width: float, height: float, count: int) -> None:

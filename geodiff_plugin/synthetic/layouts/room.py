@@ -32,7 +32,12 @@ __all__ = ["room"]
 def _desk(spot: Spot, width: float) -> float:
     rng = spot.rng
     d, h = rng.uniform(0.6, 0.8), rng.uniform(0.68, 0.78)
-    look = surface_look(rng, pick(rng, "wood", "plain", "plain"), pick(rng, "wood", "white", "grey"), gloss=pick(rng, 0.05, 0.3))
+    look = surface_look(
+        rng,
+        pick(rng, "wood", "plain", "plain"),
+        pick(rng, "wood", "white", "grey"),
+        gloss=pick(rng, 0.05, 0.3),
+    )
     desk = spot.moved(0, -d / 2 - 0.02)
     table(desk, width, d, h, look, pick(rng, "posts", "sides", "posts"))
     desk_things(desk, width, d, h, int(rng.integers(2, 8)))
@@ -66,7 +71,9 @@ def _piece(spot: Spot, left: float, height: float) -> tuple[float, float]:
         sofa(spot.moved(w / 2, -0.47), w)
         return w, 1.2
     if kind < 0.78:
-        spot.box(0.45, -0.005, 0, (1.0, 2.12, 0.06), surface_look(rng, "plain", pick(rng, "white", "wood", "grey")))
+        spot.box(
+            0.45, -0.005, 0, (1.0, 2.12, 0.06), surface_look(rng, "plain", pick(rng, "white", "wood", "grey"))
+        )
         spot.box(0.45, -0.03, 0, (0.86, 2.05, 0.04), door_look(rng, 0.86, 2.05))
         return 0.95, height
     if kind < 0.87:
@@ -102,7 +109,11 @@ def _near_table(eye: Spot) -> None:
     desk_things(spot, w, d, h, int(rng.integers(2, 12)), office=0.45)
     for _ in range(int(rng.integers(0, 3))):
         side = pick(rng, 0.0, np.pi / 2, -np.pi / 2)
-        chair(spot.moved(0, 0, side).moved(rng.uniform(-0.3, 0.3), d / 2 + rng.uniform(0.05, 0.4), rng.normal(0, 0.3)))
+        chair(
+            spot.moved(0, 0, side).moved(
+                rng.uniform(-0.3, 0.3), d / 2 + rng.uniform(0.05, 0.4), rng.normal(0, 0.3)
+            )
+        )
 
 
 def _middle(b: Builder, width: float, depth: float) -> None:
@@ -159,11 +170,26 @@ def room(rng: np.random.Generator, seed: int) -> Scene:
     elif rng.random() < 0.75:
         _middle(b, width, depth)
     for _ in range(int(rng.integers(0, 5))):
-        thing(Spot(b, rng.uniform(-0.45, 0.45) * width, rng.uniform(0.3, 0.95) * depth), 0, 0, 0, rng.uniform(0.15, 0.5))
+        thing(
+            Spot(b, rng.uniform(-0.45, 0.45) * width, rng.uniform(0.3, 0.95) * depth),
+            0,
+            0,
+            0,
+            rng.uniform(0.15, 0.5),
+        )
     if rng.random() < 0.2:  # a post, screen or door edge close to one side of the camera
         near = Spot(b, x, z, yaw).moved(pick(rng, -1, 1) * rng.uniform(0.5, 0.9), rng.uniform(0.8, 1.4))
-        look = surface_look(rng, pick(rng, "plain", "wood", "poster_a", "plaster"), pick(rng, "wall", "dark", "any", "white"))
-        near.box(0, 0, 0, (rng.uniform(0.1, 0.6), rng.uniform(1.6, height), rng.uniform(0.03, 0.2)), look, turn=rng.normal(0, 0.6))
+        look = surface_look(
+            rng, pick(rng, "plain", "wood", "poster_a", "plaster"), pick(rng, "wall", "dark", "any", "white")
+        )
+        near.box(
+            0,
+            0,
+            0,
+            (rng.uniform(0.1, 0.6), rng.uniform(1.6, height), rng.uniform(0.03, 0.2)),
+            look,
+            turn=rng.normal(0, 0.6),
+        )
     if rng.random() < 0.3:
         b.quad((x, -0.006, z + 1.5), rng.uniform(0.6, 1.2), rng.uniform(0.8, 1.6),
                surface_look(rng, pick(rng, "carpet", "stripes", "wallpaper", "checker"), "any"), yaw=yaw)  # fmt: skip

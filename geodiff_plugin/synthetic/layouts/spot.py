@@ -67,7 +67,15 @@ class Spot:
         """Box with a narrower top, its bottom at a height."""
         x, z = self.at(lx, lz)
         centre = (x, self.ground - bottom - size[1] / 2, z)
-        self.b.add(Shape.TAPER, centre, (size[0] / 2, size[1] / 2, size[2] / 2), look, yaw=self.yaw, taper=taper, **rest)
+        self.b.add(
+            Shape.TAPER,
+            centre,
+            (size[0] / 2, size[1] / 2, size[2] / 2),
+            look,
+            yaw=self.yaw,
+            taper=taper,
+            **rest,
+        )
 
     def column(self, lx, lz, bottom, radius, height, look, top=1.0):
         """Upright round column; ``top`` is the upper radius in parts of the lower."""
@@ -80,7 +88,13 @@ class Spot:
         x, z = self.at(lx, lz)
         half = (radius, length / 2, radius)
         self.b.add(
-            Shape.FRUSTUM, (x, self.ground - height, z), half, look, yaw=self.yaw + turn, pitch=pitch, roll=roll
+            Shape.FRUSTUM,
+            (x, self.ground - height, z),
+            half,
+            look,
+            yaw=self.yaw + turn,
+            pitch=pitch,
+            roll=roll,
         )
 
     def ball(self, lx, lz, centre, half, look, **rest):

@@ -39,7 +39,12 @@ class _Plan:
 
 def _ground(b: Builder, plan: _Plan, marked: float) -> None:
     rng = b.rng
-    verge = surface_look(rng, pick(rng, "grass", "grass", "soil", "paving"), pick(rng, "leaf", "moss", "dry", "stone"), macro=0.5)
+    verge = surface_look(
+        rng,
+        pick(rng, "grass", "grass", "soil", "paving"),
+        pick(rng, "leaf", "moss", "dry", "stone"),
+        macro=0.5,
+    )
     b.quad((0, 0.02, 150), 300, 300, verge, fixed=True)
     pal = palette(rng, "asphalt")
     pal[2] = palette(rng, "white")[0]
@@ -51,7 +56,9 @@ def _ground(b: Builder, plan: _Plan, marked: float) -> None:
     b.quad((0, 0, 150), plan.half_road, 250, road, fixed=True)
     if plan.walk == 0:
         return
-    pave = surface_look(rng, pick(rng, "paving", "flagstones", "concrete", "tiles"), pick(rng, "stone", "grey"), macro=0.3)
+    pave = surface_look(
+        rng, pick(rng, "paving", "flagstones", "concrete", "tiles"), pick(rng, "stone", "grey"), macro=0.3
+    )
     stone = surface_look(rng, "concrete", "stone")
     for s in (-1, 1):
         y, tall = -plan.kerb / 2 + 0.05, plan.kerb + 0.1
@@ -64,7 +71,13 @@ def _fence(spot: Spot, length: float) -> None:
     rng = spot.rng
     layer = pick(rng, "hedge", "leaves", "brick", "planks", "blocks")
     family = {"brick": "brick", "planks": "wood", "blocks": "stone"}.get(layer, pick(rng, "leaf", "moss"))
-    spot.box(0, 0, 0, (rng.uniform(0.2, 1.0), rng.uniform(0.6, 2.2), length), surface_look(rng, layer, family, macro=0.4))
+    spot.box(
+        0,
+        0,
+        0,
+        (rng.uniform(0.2, 1.0), rng.uniform(0.6, 2.2), length),
+        surface_look(rng, layer, family, macro=0.4),
+    )
 
 
 def _trees(b: Builder, s: int, low: float, high: float, z: float, length: float, count: int) -> None:
@@ -110,9 +123,15 @@ def _suburb_side(b: Builder, s: int, plan: _Plan) -> None:
             house(Spot(b, s * back, z + length / 2, s * np.pi / 2 + rng.normal(0, 0.08)))
         _trees(b, s, plan.edge + 1, back + 6, z, length, int(rng.integers(1, 4)))
         for _ in range(int(rng.integers(0, 4))):
-            bush(Spot(b, s * (plan.edge + rng.uniform(0.5, 5)), z + rng.uniform(0, length)), rng.uniform(0.5, 1.8))
+            bush(
+                Spot(b, s * (plan.edge + rng.uniform(0.5, 5)), z + rng.uniform(0, length)),
+                rng.uniform(0.5, 1.8),
+            )
         if rng.random() < 0.65:
-            _fence(Spot(b, s * (plan.edge + rng.uniform(0.4, 0.9)), z + length / 2), length * rng.uniform(0.5, 0.95))
+            _fence(
+                Spot(b, s * (plan.edge + rng.uniform(0.4, 0.9)), z + length / 2),
+                length * rng.uniform(0.5, 0.95),
+            )
         z += length
 
 
@@ -124,14 +143,27 @@ def _country_side(b: Builder, s: int, plan: _Plan) -> None:
     _trees(b, s, plan.edge + 1.5, plan.edge + 25, 4, plan.end, int(rng.integers(0, 7)))
     if rng.random() < 0.6:  # a bank or a wood beside the road
         away, long_ = plan.edge + rng.uniform(2.5, 20), rng.uniform(15, 60)
-        tree_line(Spot(b, s * away, rng.uniform(5, 20) + long_ / 2, np.pi / 2), long_, rng.uniform(3, 10), int(long_ / 3.5))
+        tree_line(
+            Spot(b, s * away, rng.uniform(5, 20) + long_ / 2, np.pi / 2),
+            long_,
+            rng.uniform(3, 10),
+            int(long_ / 3.5),
+        )
     if rng.random() < 0.5:
         half = (rng.uniform(8, 25), rng.uniform(0.5, 2.5), rng.uniform(15, 50))
         grass = surface_look(rng, "grass", pick(rng, "leaf", "dry", "moss"), macro=0.7)
         b.ball((s * (plan.edge + half[0] + 0.5), 0.05, rng.uniform(10, 60)), half, grass, fixed=True)
     for _ in range(int(rng.integers(0, 3))):
         x, z = s * (plan.edge + rng.uniform(15, 50)), rng.uniform(30, 110)
-        building(b, x, z, (rng.uniform(8, 25), rng.uniform(3.5, 9), rng.uniform(8, 20)), 0.0, rng.normal(0, 0.3), -s)
+        building(
+            b,
+            x,
+            z,
+            (rng.uniform(8, 25), rng.uniform(3.5, 9), rng.uniform(8, 20)),
+            0.0,
+            rng.normal(0, 0.3),
+            -s,
+        )
     tree_line(Spot(b, s * 35, plan.end + rng.uniform(0, 30), rng.normal(0, 0.2)), 70, rng.uniform(4, 12), 14)
 
 
@@ -153,7 +185,13 @@ def _furnish(b: Builder, s: int, plan: _Plan) -> None:
         spot = Spot(b, s * (plan.half_road + 0.3 + rng.uniform(0, wide)), rng.uniform(4, 30), 0, -plan.kerb)
         pole(spot, rng.uniform(2.0, 3.2), sign=True)
     for _ in range(int(rng.integers(0, 3))):
-        spot = Spot(b, s * (plan.half_road + 0.4 + rng.uniform(0, wide)), rng.uniform(4, 30), rng.uniform(-3, 3), -plan.kerb)
+        spot = Spot(
+            b,
+            s * (plan.half_road + 0.4 + rng.uniform(0, wide)),
+            rng.uniform(4, 30),
+            rng.uniform(-3, 3),
+            -plan.kerb,
+        )
         person(spot)
 
 
@@ -178,7 +216,12 @@ def _close_view(b: Builder, plan: _Plan) -> None:
         size = (rng.uniform(14, 40), rng.uniform(6, 16), 10)
         building(b, rng.normal(0, 6), plan.end + 8, size, 0.0)
     else:
-        tree_line(Spot(b, rng.normal(0, 6), plan.end + rng.uniform(3, 20)), rng.uniform(25, 70), rng.uniform(5, 13), 12)
+        tree_line(
+            Spot(b, rng.normal(0, 6), plan.end + rng.uniform(3, 20)),
+            rng.uniform(25, 70),
+            rng.uniform(5, 13),
+            12,
+        )
 
 
 def street(rng: np.random.Generator, seed: int) -> Scene:

@@ -25,14 +25,24 @@ def _still_life(spot: Spot, w: float, d: float) -> None:
     b = spot.b
     size = rng.uniform(0.1, 0.3)
     for _ in range(int(rng.integers(6, 28))):
-        thing(spot, rng.uniform(-0.46, 0.46) * w, rng.uniform(-0.46, 0.46) * d, 0, size * rng.uniform(0.4, 1.7))
+        thing(
+            spot, rng.uniform(-0.46, 0.46) * w, rng.uniform(-0.46, 0.46) * d, 0, size * rng.uniform(0.4, 1.7)
+        )
     for _ in range(int(rng.integers(0, 3))):  # a board or a book that leans back
         x, z = spot.at(rng.uniform(-0.4, 0.4) * w, d / 2 - 0.06)
         tall = rng.uniform(0.3, 0.8)
         turn = dict(yaw=spot.yaw, pitch=rng.uniform(0.05, 0.25))
-        b.box((x, spot.ground - tall / 2, z), (rng.uniform(0.2, 0.6), tall, 0.03), object_look(rng, tall), **turn)
+        b.box(
+            (x, spot.ground - tall / 2, z),
+            (rng.uniform(0.2, 0.6), tall, 0.03),
+            object_look(rng, tall),
+            **turn,
+        )
     for _ in range(int(rng.integers(0, 3))):
-        leaflet(spot.moved(rng.uniform(-0.4, 0.4) * w, rng.uniform(0, 0.45) * d, rng.normal(0, 0.4)), rng.uniform(0.2, 0.35))
+        leaflet(
+            spot.moved(rng.uniform(-0.4, 0.4) * w, rng.uniform(0, 0.45) * d, rng.normal(0, 0.4)),
+            rng.uniform(0.2, 0.35),
+        )
     if rng.random() < 0.3:
         cloth(spot.moved(rng.uniform(-0.4, 0.4) * w, rng.uniform(-0.4, 0.4) * d), rng.uniform(0.25, 0.6))
 
@@ -53,7 +63,14 @@ def tabletop(rng: np.random.Generator, seed: int) -> Scene:
     else:
         layer = pick(rng, "wood", "wood", "plain", "marble", "planks", "fabric", "checker", "tiles")
         family = pick(rng, "wood", "wood", "white", "grey", "any")
-        table(centre, w, d, h, surface_look(rng, layer, family, gloss=pick(rng, 0.0, 0.1, 0.5)), pick(rng, "posts", "sides", "foot"))
+        table(
+            centre,
+            w,
+            d,
+            h,
+            surface_look(rng, layer, family, gloss=pick(rng, 0.0, 0.1, 0.5)),
+            pick(rng, "posts", "sides", "foot"),
+        )
         if rng.random() < 0.3:
             desk_things(centre, w, d, h, 3)
     _still_life(centre.moved(0, 0, 0, h), w, d)

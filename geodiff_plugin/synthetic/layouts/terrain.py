@@ -44,7 +44,14 @@ def _wild(b: Builder) -> tuple[float, float, float]:
         b.ball((x, 0, far), (a, h, a), surface_look(rng, layer, family, macro=0.8), fixed=True)
     if rng.random() < 0.4:  # a path
         path = surface_look(rng, pick(rng, "gravel", "soil", "asphalt"), "stone", macro=0.5)
-        b.quad((rng.normal(0, 1), -0.01, 60), rng.uniform(0.6, 1.6), 80, path, yaw=rng.normal(0, 0.15), fixed=True)
+        b.quad(
+            (rng.normal(0, 1), -0.01, 60),
+            rng.uniform(0.6, 1.6),
+            80,
+            path,
+            yaw=rng.normal(0, 0.15),
+            fixed=True,
+        )
     for _ in range(int(rng.integers(4, 24))):
         z = 2.0 + rng.exponential(14)
         x = rng.normal(0, 0.5) * (z + 3)
@@ -57,7 +64,9 @@ def _wild(b: Builder) -> tuple[float, float, float]:
         elif z > 5:
             tree(spot, rng.uniform(3, 11), int(rng.integers(9, 16)) if z < 30 else 5)
     if rng.random() < 0.5:
-        tree_line(Spot(b, rng.normal(0, 15), rng.uniform(25, 90), rng.normal(0, 0.3)), 80, rng.uniform(4, 14), 16)
+        tree_line(
+            Spot(b, rng.normal(0, 15), rng.uniform(25, 90), rng.normal(0, 0.3)), 80, rng.uniform(4, 14), 16
+        )
     for _ in range(int(rng.integers(0, 3))):
         z = rng.uniform(20, 90)
         x = rng.normal(0, 0.4) * z
@@ -100,7 +109,13 @@ def _terrace_piece(spot: Spot, stone) -> None:
         pot_plant(spot, rng.uniform(0.6, 1.8))
     elif kind < 0.45:
         w, d = rng.uniform(0.8, 1.6), 0.8
-        table(spot, w, d, 0.74, surface_look(rng, pick(rng, "planks", "plain", "marble"), pick(rng, "wood", "white", "grey")))
+        table(
+            spot,
+            w,
+            d,
+            0.74,
+            surface_look(rng, pick(rng, "planks", "plain", "marble"), pick(rng, "wood", "white", "grey")),
+        )
         for k in range(int(rng.integers(0, 4))):
             chair(spot.moved(0, 0, k * np.pi / 2).moved(0, d / 2 + rng.uniform(0.1, 0.5), rng.normal(0, 0.4)))
     elif kind < 0.55:
@@ -118,7 +133,13 @@ def _terrace_piece(spot: Spot, stone) -> None:
 def _terrace(b: Builder) -> tuple[float, float, float]:
     """A paved terrace with a house on one side or behind; returns the camera's x, ground height and z."""
     rng = b.rng
-    b.quad((0, 1.5, 150), 400, 400, surface_look(rng, pick(rng, "grass", "soil"), pick(rng, "leaf", "dry"), macro=0.6), fixed=True)
+    b.quad(
+        (0, 1.5, 150),
+        400,
+        400,
+        surface_look(rng, pick(rng, "grass", "soil"), pick(rng, "leaf", "dry"), macro=0.6),
+        fixed=True,
+    )
     layer = pick(rng, "paving", "flagstones", "tiles", "planks", "cobbles", "concrete")
     pave = surface_look(rng, layer, pick(rng, "stone", "grey", "brick"), macro=0.3)
     depth, side = rng.uniform(4, 18), rng.uniform(3, 9)
@@ -130,7 +151,9 @@ def _terrace(b: Builder) -> tuple[float, float, float]:
     wall = facade_look(rng, 9.0) if rng.random() < 0.6 else stone
     if rng.random() < 0.6:
         s = pick(rng, -1, 1)
-        b.standing(s * (side + 3), depth * 0.5, 1.5, (6, rng.uniform(5, 11), depth + rng.uniform(4, 20)), wall)
+        b.standing(
+            s * (side + 3), depth * 0.5, 1.5, (6, rng.uniform(5, 11), depth + rng.uniform(4, 20)), wall
+        )
     if rng.random() < 0.45:  # the house closes the view, a bench along it
         b.standing(0, depth + 7, 1.5, (2 * side + 4, rng.uniform(4, 11), 6), wall)
         bench(Spot(b, rng.uniform(-0.3, 0.3) * side, depth + 3.5), rng.uniform(1.5, side))
@@ -142,7 +165,9 @@ def _terrace(b: Builder) -> tuple[float, float, float]:
             size = (rng.uniform(8, 20), rng.uniform(6, 12), 10)
             building(b, rng.normal(0, 12), depth + rng.uniform(18, 50), size, 1.5, rng.uniform(-0.5, 0.5))
     for _ in range(int(rng.integers(3, 12))):
-        _terrace_piece(Spot(b, rng.uniform(-0.85, 0.85) * side, rng.uniform(1.5, depth + 3), rng.uniform(-3, 3)), stone)
+        _terrace_piece(
+            Spot(b, rng.uniform(-0.85, 0.85) * side, rng.uniform(1.5, depth + 3), rng.uniform(-3, 3)), stone
+        )
     return rng.uniform(-0.5, 0.5) * side, 0.0, 0.0
 
 
@@ -151,7 +176,9 @@ def terrain(rng: np.random.Generator, seed: int) -> Scene:
     b = Builder(rng)
     x, ground, z = _terrace(b) if rng.random() < 0.55 else _wild(b)
     for _ in range(int(rng.integers(0, 3))):
-        Spot(b, rng.normal(0, 3), rng.uniform(2, 8), 0, ground).box(0, 0, 0, rng.uniform(0.2, 1.0, 3), object_look(rng, 0.6))
+        Spot(b, rng.normal(0, 3), rng.uniform(2, 8), 0, ground).box(
+            0, 0, 0, rng.uniform(0.2, 1.0, 3), object_look(rng, 0.6)
+        )
     rest = daylight(b, "terrain", seed, rng.uniform(48, 80), (0.12, 0.4))
     pitch, roll = np.radians(rng.uniform(-4, 18)), np.radians(rng.normal(0, 1.5))
     pose = camera_pose(x, ground - rng.uniform(0.9, 2.0), z, rng.normal(0, 0.2), pitch, roll)

@@ -19,8 +19,15 @@ __all__ = ["car", "person", "pole", "wires"]
 def car(spot: Spot) -> None:
     """Car or van along local z, its back towards local -z."""
     rng = spot.rng
-    paint = Look("plain", palette(rng, pick(rng, "grey", "dark", "white", "vivid", "grey")), gloss=rng.uniform(0.4, 0.75), macro=0.05)
-    glass = Look("plain", np.full((3, 3), rng.uniform(0.01, 0.05)), gloss=0.9, macro=0, material=Material.GLOSSY)
+    paint = Look(
+        "plain",
+        palette(rng, pick(rng, "grey", "dark", "white", "vivid", "grey")),
+        gloss=rng.uniform(0.4, 0.75),
+        macro=0.05,
+    )
+    glass = Look(
+        "plain", np.full((3, 3), rng.uniform(0.01, 0.05)), gloss=0.9, macro=0, material=Material.GLOSSY
+    )
     length, width, height = rng.uniform(3.6, 4.8), rng.uniform(1.62, 1.85), rng.uniform(1.38, 1.6)
     kind = rng.random()
     if kind < 0.15:  # van
@@ -34,7 +41,14 @@ def car(spot: Spot) -> None:
         slope = 0.24 if estate else 0.42
         roof = height - 0.82
         spot.wedge(0, shift * length, 0.82, (width * 0.94, roof, length * long_), glass, (0.2, slope))
-        spot.wedge(0, shift * length, height - 0.07, (width * 0.77, 0.06, length * long_ * (1.03 - slope)), paint, (0.1, 0.05))
+        spot.wedge(
+            0,
+            shift * length,
+            height - 0.07,
+            (width * 0.77, 0.06, length * long_ * (1.03 - slope)),
+            paint,
+            (0.1, 0.05),
+        )
         for part in (-0.48, 0.0, 0.46):  # pillars between the windows
             lz = (shift + part * long_ * (1 - slope * 0.5)) * length
             spot.wedge(0, lz, 0.82, (width * 0.945, roof, 0.07), paint, (0.2, 0.0))
