@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any
 
-import numpy as np
 import psutil  # comes with accelerate
 import torch
 
@@ -30,7 +29,7 @@ __all__ = ["Cost", "PeakMemory", "measure", "run_bench"]
 #: Name in the table -> gradient of the guidance, ``None`` for the plain pipeline.
 VARIANTS = {"plain": None, "guided, denoised gradient": "denoised", "guided, full gradient": "full"}
 SAMPLING_INTERVAL_S = 0.05
-TIMED_CALLS = 3
+TIMED_CALLS = 2
 FULL_SIZE_RESOLUTION = 256
 
 
@@ -115,7 +114,7 @@ def measure(gradient: str | None, full_size: bool, device_name: str) -> Cost:
     with PeakMemory(device) as memory:
         seconds = _timed(call, device)
     if not full_size:
-        seconds = float(np.median([_timed(call, device) for _ in range(TIMED_CALLS)]))
+        seconds = min(_timed(call, device) for _ in range(TIMED_CALLS))
     return Cost(seconds, memory.peak_bytes)
 
 

@@ -39,6 +39,7 @@ def test_measure(make_pipeline, textured_plane, tmp_path, monkeypatch, gradient)
     pair = DemoPair(left, right, rig, depth_m, depth_m > 0)
     monkeypatch.setattr("geodiff_plugin.commands.bench.read_demo_pair", lambda: pair)
     monkeypatch.setattr("geodiff_plugin.priors.BUNDLED_FOLDER", tmp_path)
+    monkeypatch.setattr("geodiff_plugin.commands.bench.TIMED_CALLS", 1)
     cost = measure(gradient, False, "cpu")
     assert cost.seconds > 0 and cost.peak_bytes >= 0
 
