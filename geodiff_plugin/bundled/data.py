@@ -17,6 +17,7 @@ from safetensors.torch import load_file, save_file
 __all__ = [
     "FAR_M",
     "HELD_OUT_SEED",
+    "SCORED_M",
     "SHARD",
     "SHAPES",
     "held_out",
@@ -38,8 +39,16 @@ SHAPES = ((192, 256), (128, 416), (192, 256), (192, 192), (192, 256), (128, 416)
 HELD_OUT_SEED = 1
 """Held-out scenes have the seeds 1, 2, ...; training scenes start at one million."""
 
-FAR_M = 80.0
-"""Depth is cut here, metres, in targets and in the held-out score: as far as outdoor ground truth reaches."""
+FAR_M = 60.0
+"""Depth is cut here, metres, in targets.
+
+With an error of 10 to 20 % of the range, a farther cut costs more near by than it gains far away: KITTI's truth,
+cut at 80, 60 and 40 m and disturbed by smooth noise of 0.1 (0.2) in [-1, 1], has an aligned AbsRel of .24 (.40),
+.20 (.32) and .17 (.30), while the cut alone costs .00, .02 and .08.
+"""
+
+SCORED_M = 80.0
+"""Held-out scenes are scored up to here, metres: as far as outdoor ground truth reaches."""
 
 _TRAIN_SEED = 1_000_000
 

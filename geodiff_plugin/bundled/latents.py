@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from diffusers import AutoencoderKL
 from safetensors.torch import load_file, save_file
 
-from geodiff_plugin.bundled.data import SHARD, jitter, normalise_depth, read_shard, shards
+from geodiff_plugin.bundled.data import FAR_M, SHARD, jitter, normalise_depth, read_shard, shards
 
 __all__ = ["LatentStore", "encode_scenes", "resize_scenes"]
 
@@ -85,7 +85,7 @@ class LatentStore:
     ) -> None:
         self.cache, self.vae, self.divisor, self.variants = Path(cache), vae, divisor, variants
         self.rank, self.world, self.fresh = rank, world, fresh
-        self._folder = self.cache / f"latents-{_fingerprint(vae)}-{divisor}"
+        self._folder = self.cache / f"latents-{_fingerprint(vae)}-{divisor}-{FAR_M:.0f}m"
         self._items: list[tuple[torch.Tensor, torch.Tensor]] = []
         self._known: set[int] = set()
 

@@ -13,7 +13,7 @@ import torch
 from diffusers import MarigoldDepthPipeline
 from PIL import Image
 
-from geodiff_plugin.bundled.data import FAR_M
+from geodiff_plugin.bundled.data import SCORED_M
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 
@@ -47,7 +47,7 @@ def score_scenes(
     steps: int | None = None,
     resolution: int | None = None,
 ) -> tuple[float, float]:
-    """Mean aligned AbsRel and delta1 over rendered scenes; sky and what is beyond ``FAR_M`` is left out.
+    """Mean aligned AbsRel and delta1 over rendered scenes; sky and what is beyond ``SCORED_M`` is left out.
 
     Args:
         pipeline: the prior.
@@ -61,7 +61,7 @@ def score_scenes(
     """
     predictions, scores = predict(pipeline, images_01, steps, resolution), []
     for prediction, depth in zip(predictions, depth_m[:, 0].numpy(), strict=True):
-        valid = depth < FAR_M
+        valid = depth < SCORED_M
         if valid.sum() > 100:
             found = evaluate_depth(align(prediction, depth, valid), depth, valid)
             scores.append((found["abs_rel"], found["delta1"]))
@@ -86,7 +86,7 @@ def contact_sheet(
     """
     tiles = []
     for image, depth, prediction in zip(images_01, depth_m[:, 0].numpy(), predictions, strict=True):
-        valid = depth < FAR_M
+        valid = depth < SCORED_M
         low, high = np.quantile(depth[valid], [0.02, 0.98]) if valid.any() else (0.0, 1.0)
         fitted = align(prediction, depth, valid) if valid.sum() > 1 else prediction
         maps = [np.where(valid, depth, high), fitted]
