@@ -34,7 +34,7 @@ def _rate(work, count: int, device: str) -> float:
 def measure(
     size: tuple[int, int], device: str = "cpu", scenes: int = 20, kind: str | None = None
 ) -> dict[str, float]:
-    """Scenes per second: geometry alone, single views as for training, stereo pairs with antialiasing and masks.
+    """Scenes per second: geometry alone, single views as for training, antialiased stereo pairs.
 
     Args:
         size: ``(H, W)`` pixels.

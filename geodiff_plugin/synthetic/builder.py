@@ -19,7 +19,7 @@ __all__ = ["Builder", "Look", "rotation"]
 
 
 def rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """``R_world_from_local = R_y(yaw) R_x(pitch) R_z(roll)`` in radians; positive pitch tips z down (y grows)."""
+    """``R_world_from_local = R_y(yaw) R_x(pitch) R_z(roll)``; positive pitch tips z down."""
     yaw, pitch, roll = np.broadcast_arrays(yaw, pitch, roll)
     cy, sy, cp, sp, cr, sr = (
         np.cos(yaw),

@@ -53,8 +53,8 @@ def camera_rays(
         far: how far to follow them, metres.
 
     Returns:
-        bundles view by view, ``(B, P)`` metres that a pixel covers at depth 1, and ``(B, 3, 2)`` by how much the
-        direction changes from a pixel to the next along x and y.
+        bundles view by view, ``(B, P)`` metres that a pixel covers at depth 1, and ``(B, 3, 2)``
+        by how much the direction changes from a pixel to the next along x and y.
     """
     height, width = -(-size[0] // TILE) * TILE, -(-size[1] // TILE) * TILE
     # Inverted in double on the CPU: every device gets the same rays.

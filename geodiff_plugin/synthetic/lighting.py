@@ -33,9 +33,9 @@ class Lighting:
     """Lights, sky and fog of a batch of ``S`` scenes.
 
     Attributes:
-        position: ``(S, L, 3)``; ``directional`` ``(S, L)`` bool; ``colour`` ``(S, L, 3)``, black for unused slots.
-        directional: see ``position``.
-        colour: see ``position``.
+        position: ``(S, L, 3)`` position, or direction towards a directional light.
+        directional: ``(S, L)`` bool.
+        colour: ``(S, L, 3)``, black for unused slots.
         ambient: ``(S, 6)`` light from above and from below.
         sky: ``(S, 10)`` zenith, horizon, cloud colours and the cloud amount.
         fog: ``(S, 4)`` colour and density.
@@ -74,7 +74,7 @@ class Lighting:
 
 
 def sky_radiance(light: Lighting, atlas: Atlas, scene: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-    """Sky seen along unit directions ``(3, B, P)``: brighter at the top or at the horizon as the scene says, clouds."""
+    """Sky along unit directions ``(3, B, P)``: from horizon to zenith, with clouds."""
     up = (-direction[1]).clamp_min(0)
     params = light.sky[scene]  # (B, 10)
     mix = 1 - (1 - up).pow(3)

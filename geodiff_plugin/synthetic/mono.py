@@ -35,7 +35,7 @@ def _chunk(size: tuple[int, int], device: torch.device) -> int:
 def _draw(
     seed: int, kind: str | None, size: tuple[int, int], photographs: float
 ) -> tuple[Scene, Camera, np.random.Generator]:
-    """A scene without what the camera cannot see, a camera with a drawn lens, and the rest of the randomness."""
+    """A scene without what is out of sight, a camera with a drawn lens, the rest of the randomness."""
     scene, rng = sample_scene(seed, kind), np.random.default_rng([seed, 22])
     fov = float(np.clip(scene.fov_deg * np.exp(rng.normal(0, 0.12)), 30, 95))
     camera = Camera(intrinsics(size, fov), scene.T_world_from_camera)

@@ -27,8 +27,8 @@ def openness(
 ) -> torch.Tensor:
     """How free the space above a surface is, from the distances to what stands near.
 
-    Looks at two points above the surface, at 0.25 and 0.8 of ``length``: in the open, each is as far from everything
-    as from its own surface; near a wall or under a table it is closer to something else. Smooth and free of noise.
+    Looks at two points above the surface, at 0.25 and 0.8 of ``length``: in the open, each is as far from
+    everything as from its own surface; near a wall or under a table it is closer to something else.
 
     Args:
         world: primitives.
@@ -43,7 +43,7 @@ def openness(
     """
     weight = live.to(point.dtype)
     heights = [k * length[:, None] for k in _HEIGHTS]
-    # Only what is inside the ball of the upper point's height around it can matter: to the lower point as well.
+    # Only what is in the ball of the upper point's height around it can matter, to the lower point as well.
     upper = torch.addcmul(point, normal, heights[1])
     middle = (upper * weight).sum(-1) / weight.sum(-1).clamp_min(1)
     away = upper - middle[..., None]

@@ -35,7 +35,7 @@ class SyntheticPair:
         K_left: ``(3, 3)`` float64, pixels of the left image.
         K_right: ``(3, 3)`` float64, pixels of the right image.
         E: ``(4, 4)`` float64, metres; pose of the right camera in the left camera's frame.
-        occluded: ``(1, H, W)`` bool, left pixels whose surface point is hidden from the right camera by something else.
+        occluded: ``(1, H, W)`` bool, left pixels whose point something hides from the right camera.
         in_view: ``(1, H, W)`` bool, left pixels whose point projects into the right image, hidden or not.
         kind: kind of scene.
         seed: what it was drawn from.

@@ -1,6 +1,6 @@
 """Photographs as textures, only on request and only for training: those that scikit-image bundles.
 
-Hop: image files of the installed scikit-image -> atlas layers; a ``Scene`` -> the same with some surfaces re-covered.
+Hop: files of the installed scikit-image -> atlas layers; a ``Scene`` -> some surfaces re-covered.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Ray intersections with the canonical shapes, in each primitive's local coordinates.
 
-Hop: rays in local coordinates -> distance along the ray (``inf`` for a miss); a hit point -> normal and surface coordinates.
+Hop: local rays -> distance along the ray (``inf`` for a miss); a hit -> normal, surface coordinates.
 Paper: none.
 """
 
@@ -119,7 +119,8 @@ def surface(
         taper: ``(2, n)``.
 
     Returns:
-        ``(3, n)`` normal for the transposed map to the world, ``(2, n)`` metres along u and v (v down on walls).
+        ``(3, n)`` normal for the transposed map to the world; ``(2, n)`` metres along u and v (v down
+        on walls).
     """
     x, y, z = p
     round_ = (shape == Shape.SPHERE) | (shape == Shape.FRUSTUM)

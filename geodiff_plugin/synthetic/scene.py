@@ -17,10 +17,10 @@ __all__ = ["Camera", "Material", "RenderedView", "Scene", "Shape"]
 class Shape(IntEnum):
     """Canonical convex shapes; every primitive is one of them under an affine map.
 
-    Local coordinates run over [-1, 1] on each axis, y down as in the world: ``BOX`` the cube, ``SPHERE`` the unit
-    ball, ``FRUSTUM`` a round column along y of radius 1 at the bottom and ``taper[0]`` at the top (1 a cylinder,
-    0 a cone), ``TAPER`` a cube whose top is narrower by ``taper`` along x and z (1 a gable or a pyramid),
-    ``QUAD`` the flat square y = 0.
+    Local coordinates run over [-1, 1] on each axis, y down as in the world: ``BOX`` the cube, ``SPHERE`` the
+    unit ball, ``FRUSTUM`` a round column along y of radius 1 at the bottom and ``taper[0]`` at the top (1 a
+    cylinder, 0 a cone), ``TAPER`` a cube whose top is narrower by ``taper`` along x and z (1 a gable or a
+    pyramid), ``QUAD`` the flat square y = 0.
     """
 
     BOX = 0

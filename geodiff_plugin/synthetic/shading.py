@@ -71,7 +71,7 @@ def _albedo(atlas: Atlas, row: torch.Tensor, uv_m: torch.Tensor, footprint_m: to
 
 
 def _surface_rows(world: World, prim: torch.Tensor, point: torch.Tensor, direction: torch.Tensor):
-    """Parameter rows ``(F, n)`` of the hits, unit normals towards the viewer ``(3, B, P)``, metres along u and v."""
+    """Parameter rows ``(F, n)`` of the hits, normals towards the viewer, metres along u and v."""
     row = world.table.index_select(1, prim.clamp_min(0).flatten())
     flat = point.reshape(3, -1)
     local = torch.stack(

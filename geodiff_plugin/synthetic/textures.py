@@ -6,6 +6,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -22,7 +23,7 @@ class Atlas:
     """All layers and mip levels in one flat table.
 
     Attributes:
-        texels: ``(M, 4)`` float32; tone between colours A and B, accent, gloss, shade. For photographs r, g, b, 1.
+        texels: ``(M, 4)`` float32: tone between colours A and B, accent, gloss, shade; or r, g, b, 1.
         level_start: ``(levels,)`` int64, first row of each mip level.
         levels: number of mip levels; level ``k`` has ``TEXELS >> k`` texels a side.
         photo_from: layers from this index on are photographs.
@@ -79,7 +80,7 @@ def sample_atlas(
         ``(n, 4)`` float32 channels.
     """
     level = (footprint * TEXELS).clamp_min(1e-6).log2_().add_(0.25).round_().clamp_(0, table.levels - 1)
-    side_f = torch.exp2(8.0 - level)
+    side_f = torch.exp2(math.log2(TEXELS) - level)
     level, side = level.long(), side_f.long()
     xy = (uv - uv.floor()) * side_f - 0.5
     low = xy.floor()

@@ -1,4 +1,4 @@
-"""Ray casting: rays in bundles, primitives culled per bundle by a cone, exact intersections for the pairs that remain.
+"""Ray casting: bundles of rays, primitives culled by a cone around each bundle, then exact intersections.
 
 Hop: ray bundles + primitives -> nearest hit, or how strongly something blocks the way.
 Paper: none.
@@ -67,7 +67,7 @@ def _cone(rays: Bundles) -> tuple[torch.Tensor, ...]:
 def candidates(
     world: World, scene: torch.Tensor, apex: torch.Tensor, axis: torch.Tensor | None
 ) -> tuple[torch.Tensor, ...]:
-    """Squared distance of every primitive's centre from each apex and its length along the axis, radius, opacity."""
+    """Squared distance of every centre from each apex, its length along the axis, radius, opacity."""
     if world.scenes == 1:
         centre, radius, opaque = world.centre, world.radius, world.opaque  # broadcast over bundles
     else:

@@ -54,7 +54,7 @@ def _select(scene: Scene, keep: torch.Tensor) -> Scene:
 
 
 def in_sight(scene: Scene, views: Sequence[tuple[Camera, tuple[int, int]]], margin_m: float) -> Scene:
-    """Leave out movable primitives outside of every view by more than a margin: they only cast shadows or mirror.
+    """Leave out movable primitives outside of every view by more than a margin (they may cast shadows).
 
     Args:
         scene: any scene.

@@ -30,7 +30,7 @@ class World:
         radius: bounding spheres.
         opaque: ``(S, N)`` bool, casts shadows.
         turn: ``(S * N, 3, 4)`` world to local in metres (rotation and offset only).
-        core: ``(S * N, 3)`` half extents in metres of the box (or ellipsoid) that stands for it near other things.
+        core: ``(S * N, 3)`` half extents in metres of the box or ellipsoid that stands for it in occlusion.
         table: ``(F, S * N)`` float parameters for shading, rows as in ``shading.ROWS``.
     """
 

@@ -159,3 +159,14 @@ def test_training_batches_are_seeded_and_shaped():
     assert not torch.equal(plain[0], images[0])
     tall, _ = render_mono([4], (48, 32), kind="street")
     assert tall.shape == (1, 3, 48, 32)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("kind", ["room", "street"])
+def test_gpu_and_cpu_agree(kind):
+    here, there = (render_pair(2, kind, SIZE, posed=True, device=d) for d in ("cpu", "cuda"))
+    close = (here.left.depth_m / there.left.depth_m.cpu() - 1).abs() < 1e-4
+    assert (close | ~here.left.valid).float().mean() > 0.999
+    assert ((here.left.image_01 - there.left.image_01.cpu()).abs() < 1e-3).float().mean() > 0.995
+    assert torch.equal(here.E, there.E)

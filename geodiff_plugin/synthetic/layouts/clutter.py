@@ -1,4 +1,4 @@
-"""Small things that lie and stand around: boxes, books, papers, cups, bottles, balls, leaflets, baskets, cloth.
+"""Small things that lie and stand around: boxes, books, papers, cups, bottles, leaflets, cloth.
 
 Hop: a place and a size -> primitives in a ``Builder``.
 Paper: none.

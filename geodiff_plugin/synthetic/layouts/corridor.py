@@ -10,10 +10,11 @@ import numpy as np
 
 from geodiff_plugin.synthetic.builder import Builder, Look
 from geodiff_plugin.synthetic.layouts.clutter import thing
-from geodiff_plugin.synthetic.layouts.furniture import bench, cabinet
+from geodiff_plugin.synthetic.layouts.furniture import cabinet
 from geodiff_plugin.synthetic.layouts.interior import door_look, indoor_rest, shell, wall_decor
 from geodiff_plugin.synthetic.layouts.palettes import colour, pick, surface_look
 from geodiff_plugin.synthetic.layouts.plants import pot_plant
+from geodiff_plugin.synthetic.layouts.seats import bench
 from geodiff_plugin.synthetic.layouts.spot import Spot, camera_pose
 from geodiff_plugin.synthetic.scene import Scene
 

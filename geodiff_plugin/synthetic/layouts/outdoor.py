@@ -18,7 +18,7 @@ __all__ = ["building", "daylight", "facade_look", "house"]
 
 
 def daylight(b: Builder, kind: str, seed: int, fov: float, baseline: tuple[float, float]) -> dict:
-    """Add the sun (weak and soft under cloud) and return sky, ambient light, haze and the rest of the fields."""
+    """Add the sun (weak and soft under cloud); returns sky, ambient light, haze and the other fields."""
     rng = b.rng
     overcast = rng.random() < 0.3
     azimuth, height = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(12, 65))
@@ -75,7 +75,7 @@ def building(
     yaw: float = 0.0,
     door_side: float = -1.0,
 ) -> None:
-    """Block with windows, perhaps a shop below and a roof above; ``door_side`` is the street's side along x."""
+    """Block with windows, perhaps a shop and a roof; ``door_side`` is the street's side along x."""
     rng = b.rng
     spot = Spot(b, x, z, yaw, ground)
     w, h, d = size

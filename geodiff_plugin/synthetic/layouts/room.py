@@ -10,19 +10,11 @@ import numpy as np
 
 from geodiff_plugin.synthetic.builder import Builder, Look
 from geodiff_plugin.synthetic.layouts.clutter import thing
-from geodiff_plugin.synthetic.layouts.furniture import (
-    cabinet,
-    chair,
-    counter,
-    desk_things,
-    lounger,
-    shelf,
-    sofa,
-    table,
-)
+from geodiff_plugin.synthetic.layouts.furniture import cabinet, counter, desk_things, shelf, table
 from geodiff_plugin.synthetic.layouts.interior import area_light, door_look, indoor_rest, shell, wall_decor
 from geodiff_plugin.synthetic.layouts.palettes import colour, pick, surface_look
 from geodiff_plugin.synthetic.layouts.plants import pot_plant
+from geodiff_plugin.synthetic.layouts.seats import chair, lounger, sofa
 from geodiff_plugin.synthetic.layouts.spot import Spot, camera_pose
 from geodiff_plugin.synthetic.scene import Scene
 
@@ -47,7 +39,7 @@ def _desk(spot: Spot, width: float) -> float:
 
 
 def _piece(spot: Spot, left: float, height: float) -> tuple[float, float]:
-    """One piece of furniture from the spot to the right; its width, and the height above which the wall is free."""
+    """One piece of furniture from the spot to the right; its width, and where the free wall begins."""
     rng = spot.rng
     kind = rng.random()
     if kind < 0.18 and left > 0.7:
@@ -100,10 +92,9 @@ def _near_table(eye: Spot) -> None:
     """A table with things in front of the camera, and a chair at it."""
     rng = eye.rng
     w, d, h = rng.uniform(1.0, 2.2), rng.uniform(0.6, 1.0), rng.uniform(0.6, 0.78)
-    look = surface_look(
-        rng, pick(rng, "wood", "wood", "plain", "marble", "planks"), pick(rng, "wood", "wood", "white", "grey", "dark"),
-        gloss=pick(rng, 0.05, 0.3),
-    )  # fmt: skip
+    layer = pick(rng, "wood", "wood", "plain", "marble", "planks")
+    family = pick(rng, "wood", "wood", "white", "grey", "dark")
+    look = surface_look(rng, layer, family, gloss=pick(rng, 0.05, 0.3))
     spot = eye.moved(rng.normal(0, 0.25), d / 2 + rng.uniform(0.45, 1.1), rng.normal(0, 0.35))
     table(spot, w, d, h, look, pick(rng, "posts", "posts", "sides", "foot"))
     desk_things(spot, w, d, h, int(rng.integers(2, 12)), office=0.45)
@@ -191,8 +182,8 @@ def room(rng: np.random.Generator, seed: int) -> Scene:
             turn=rng.normal(0, 0.6),
         )
     if rng.random() < 0.3:
-        b.quad((x, -0.006, z + 1.5), rng.uniform(0.6, 1.2), rng.uniform(0.8, 1.6),
-               surface_look(rng, pick(rng, "carpet", "stripes", "wallpaper", "checker"), "any"), yaw=yaw)  # fmt: skip
+        rug = surface_look(rng, pick(rng, "carpet", "stripes", "wallpaper", "checker"), "any")
+        b.quad((x, -0.006, z + 1.5), rng.uniform(0.6, 1.2), rng.uniform(0.8, 1.6), rug, yaw=yaw)
     _lamps(b, width, depth, height)
     tall = min(rng.uniform(1.0, 1.9), height - 0.3)
     rest = indoor_rest(rng, "room", seed, rng.uniform(48, 80), (0.06, 0.2))

@@ -18,7 +18,7 @@ __all__ = ["Spot", "camera_pose"]
 
 
 def camera_pose(x: float, y: float, z: float, yaw: float, pitch: float, roll: float) -> np.ndarray:
-    """``(4, 4)`` world-from-camera; angles in radians, positive yaw looks right, positive pitch looks down."""
+    """``(4, 4)`` world-from-camera; radians, positive yaw looks right, positive pitch looks down."""
     pose = np.eye(4)
     pose[:3, :3] = rotation(np.float64(yaw), np.float64(pitch), np.float64(roll))
     pose[:3, 3] = x, y, z
@@ -27,7 +27,7 @@ def camera_pose(x: float, y: float, z: float, yaw: float, pitch: float, roll: fl
 
 @dataclass(frozen=True)
 class Spot:
-    """A place on the ground with a heading; local x to the right, z to the back, heights upwards from the ground.
+    """A place on the ground with a heading; local x to the right, z to the back, heights upwards.
 
     Attributes:
         b: where primitives go.

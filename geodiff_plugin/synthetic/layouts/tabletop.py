@@ -10,9 +10,10 @@ import numpy as np
 
 from geodiff_plugin.synthetic.builder import Builder
 from geodiff_plugin.synthetic.layouts.clutter import cloth, leaflet, thing
-from geodiff_plugin.synthetic.layouts.furniture import chair, desk_things, lounger, table
+from geodiff_plugin.synthetic.layouts.furniture import desk_things, table
 from geodiff_plugin.synthetic.layouts.interior import area_light, indoor_rest, shell, wall_decor
 from geodiff_plugin.synthetic.layouts.palettes import colour, object_look, pick, surface_look
+from geodiff_plugin.synthetic.layouts.seats import chair, lounger
 from geodiff_plugin.synthetic.layouts.spot import Spot, camera_pose
 from geodiff_plugin.synthetic.scene import Scene
 
@@ -20,7 +21,7 @@ __all__ = ["tabletop"]
 
 
 def _still_life(spot: Spot, w: float, d: float) -> None:
-    """Things over an area of ``w`` by ``d`` metres around the spot, whose ground is the surface they stand on."""
+    """Things over ``w`` by ``d`` metres around the spot, whose ground is the surface they stand on."""
     rng = spot.rng
     b = spot.b
     size = rng.uniform(0.1, 0.3)

@@ -10,10 +10,11 @@ import numpy as np
 
 from geodiff_plugin.synthetic.builder import Builder
 from geodiff_plugin.synthetic.layouts.clutter import thing
-from geodiff_plugin.synthetic.layouts.furniture import bench, chair, lounger, table
+from geodiff_plugin.synthetic.layouts.furniture import table
 from geodiff_plugin.synthetic.layouts.outdoor import building, daylight, facade_look, house
 from geodiff_plugin.synthetic.layouts.palettes import object_look, pick, surface_look
 from geodiff_plugin.synthetic.layouts.plants import bush, pot_plant, rock, tree, tree_line
+from geodiff_plugin.synthetic.layouts.seats import bench, chair, lounger
 from geodiff_plugin.synthetic.layouts.spot import Spot, camera_pose
 from geodiff_plugin.synthetic.scene import Scene
 
@@ -21,7 +22,7 @@ __all__ = ["terrain"]
 
 
 def _relief_y(hills: list[tuple[float, float, float, float]], x: float, z: float) -> float:
-    """World y of the ground; hills are ellipsoids ``(x, z, radius, height)`` with their centres in the plane."""
+    """World y of the ground; hills ``(x, z, radius, height)`` are ellipsoids centred in the plane."""
     top = 0.0
     for hx, hz, a, h in hills:
         r = ((x - hx) ** 2 + (z - hz) ** 2) / a**2
@@ -143,7 +144,7 @@ def _terrace(b: Builder) -> tuple[float, float, float]:
     layer = pick(rng, "paving", "flagstones", "tiles", "planks", "cobbles", "concrete")
     pave = surface_look(rng, layer, pick(rng, "stone", "grey", "brick"), macro=0.3)
     depth, side = rng.uniform(4, 18), rng.uniform(3, 9)
-    b.box((0, 0.75, depth / 2 - 4), (2 * side, 1.5, depth + 8), pave, fixed=True)
+    b.box((0, 0.75, depth / 2 - 2), (2 * side, 1.5, depth + 12), pave, fixed=True)
     layer = pick(rng, "ashlar", "brick", "blocks", "plaster", "rock")
     stone = surface_look(rng, layer, pick(rng, "stone", "brick", "wall"), macro=0.4)
     if rng.random() < 0.6:

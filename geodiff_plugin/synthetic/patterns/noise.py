@@ -86,7 +86,7 @@ def grid(columns: float, rows: float, gap_u: float, gap_v: float, stagger: float
 
 
 def noise(beta: float, low=1.0, high=128.0, stretch=1.0, contrast=1.0, dirt=0.0) -> Bake:
-    """Noise with a spectrum between two frequencies: plaster, concrete, asphalt, soil; ``dirt`` adds accent patches."""
+    """Noise between two frequencies: plaster, asphalt, soil; ``dirt`` adds patches of accent."""
 
     def bake(rng):
         tone = np.clip(0.5 + contrast * (spectral(rng, beta, low, high, stretch) - 0.5), 0, 1)
