@@ -18,8 +18,8 @@ from geodiff_plugin.geometry.projection import plane_rays
 from geodiff_plugin.matching import CostVolume, Matches, RightView, build_cost_volume, find_matches
 from geodiff_plugin.objective import Views
 
-#: The check for swapped views is a coarse sweep: pixels of the longer side, planes, and how much cheaper it must be.
-SWAP_CHECK_SIDE, SWAP_CHECK_PLANES, SWAP_MARGIN = 192, 48, 0.85
+#: The check for swapped views is a coarse sweep: its pixels, far / near, and how much cheaper it must be.
+SWAP_CHECK_PIXELS, SWAP_CHECK_DEPTHS, SWAP_MARGIN = 16_000, 30.0, 0.85
 
 __all__ = ["Evidence", "chunk_views", "prepare_evidence", "resize_long_edge"]
 
@@ -94,38 +94,45 @@ def prepare_evidence(
         needs_volume: build the cost volume.
         needs_matches: aggregate and check it.
     """
-    left, K_left = resize_long_edge(left_01, K_left, loss_resolution)
+    left, K_loss = resize_long_edge(left_01, K_left, loss_resolution)
     # The right view is brought to the same pixels per radian, so that neither aliases in the other.
-    ratio = float(K_left[0, 0] / K_right[0, 0])
+    ratio = float(K_loss[0, 0] / K_right[0, 0])
     long_edge = round(max(right_01.shape[-2:]) * min(1.0, ratio))
-    right, K_right = resize_long_edge(right_01, K_right, long_edge)
+    right, K_right_loss = resize_long_edge(right_01, K_right, long_edge)
     volume, matches, warning = None, None, ""
-    rights = [(right, K_right, T_right_from_left)]
     if needs_volume or needs_matches:
-        volume = build_cost_volume(left, rights, K_left, depth_range=depth_range)
+        # The sweep chooses its own grid, finer than that of the losses for wide images.
+        rights = [(right_01, K_right, T_right_from_left)]
+        volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range)
+        if _mirrored_pose_fits_better(left_01, rights, K_left, volume):
+            warning = (
+                "The mirrored pose explains the views better than the given one: are left and right swapped, "
+                "or is the sign of the baseline wrong?"
+            )
     if needs_matches:
-        matches = _on_grid(find_matches(left, rights, K_left, volume=volume), left, K_left)
-    if volume is not None and _mirrored_pose_fits_better(left, rights, K_left):
-        warning = (
-            "The mirrored pose explains the views better than the given one: are left and right swapped, "
-            "or is the sign of the baseline wrong?"
-        )
-    return Evidence(left, right, K_left, K_right, T_right_from_left, volume, matches, warning)
+        matches = _on_grid(find_matches(left_01, rights, K_left, volume=volume), left, K_loss)
+    return Evidence(left, right, K_loss, K_right_loss, T_right_from_left, volume, matches, warning)
 
 
-def _mirrored_pose_fits_better(left_01: Tensor, rights: Sequence[RightView], K_left: Tensor) -> bool:
+def _mirrored_pose_fits_better(
+    left_01: Tensor, rights: Sequence[RightView], K_left: Tensor, volume: CostVolume
+) -> bool:
     """Whether a coarse sweep of the pose with its camera centre mirrored finds clearly cheaper planes."""
+    near = 1.0 / float(volume.inverse_depth[-1])
+    mirror = left_01.new_tensor([[1.0, 1.0, 1.0, -1.0]] * 3 + [[1.0] * 4])
     costs = []
-    for sign in (1.0, -1.0):
-        mirrored = [(image, K, torch.cat([T[:, :3], T[:, 3:] * T.new_tensor([[sign]] * 3 + [[1.0]])], 1)) for image, K, T in rights]
-        volume = build_cost_volume(left_01, mirrored, K_left, max_side=SWAP_CHECK_SIDE, planes=SWAP_CHECK_PLANES)
-        smooth = F.avg_pool2d(volume.cost[1:], 5, stride=2)  # without the plane at infinity, where both poses agree
+    for sign in (torch.ones_like(mirror), mirror):
+        views = [(image, K, T * sign) for image, K, T in rights]
+        coarse = build_cost_volume(
+            left_01, views, K_left, max_pixels=SWAP_CHECK_PIXELS, depth_range=(near, near * SWAP_CHECK_DEPTHS)
+        )
+        smooth = F.avg_pool2d(coarse.cost, 5, stride=2)
         costs.append(smooth.amin(dim=0).mean())
     return bool(costs[1] < SWAP_MARGIN * costs[0])
 
 
 def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
-    """Matches on the loss grid, where the sweep's own grid was bounded to a smaller one."""
+    """Matches of the sweep's grid on that of the losses."""
     size = (left_01.shape[-2], left_01.shape[-1])
     if matches.size == size:
         return matches
