@@ -272,7 +272,7 @@ def test_saved_while_enabled_it_is_a_stock_pipeline(make_pipeline, tmp_path, lef
     again = DiffusionPipeline.from_pretrained(tmp_path / "p")
     again.set_progress_bar_config(disable=True)
     assert type(again).__name__ == "MarigoldDepthPipeline"
-    assert_same(stock(again, left), reference)
+    np.testing.assert_allclose(stock(again, left).prediction, reference.prediction, rtol=1e-4)
     guided = GuidedMarigoldDepthPipeline.from_pretrained(tmp_path / "p")
     assert isinstance(guided, GuidedMarigoldDepthPipeline)
 
@@ -300,6 +300,7 @@ def test_a_pipeline_without_adapter_is_refused():
         enable_geometry_guidance(object())
 
 
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # dynamo asks every tensor for it
 @pytest.mark.parametrize("gradient", ["denoised", "full"])
 def test_compiled_unet(make_pipeline, textured_plane, left, gradient):
     pipe, compiled = enable_geometry_guidance(make_pipeline()), enable_geometry_guidance(make_pipeline())
