@@ -64,7 +64,7 @@ def sample_effects(rng: np.random.Generator, size: tuple[int, int], grey: float 
         saturation=0.0 if rng.random() < grey else float(rng.uniform(0.4, 1.25)),
         vignette=float(rng.uniform(0, 0.35)) if rng.random() < 0.4 else 0.0,
         blur_px=scale * float(rng.uniform(0.3, 1.2)) if rng.random() < 0.65 else 0.0,
-        noise=scale * float(rng.uniform(0.002, 0.04)) if rng.random() < 0.7 else 0.0,
+        noise=scale * float(0.002 + 0.038 * rng.random() ** 2) if rng.random() < 0.7 else 0.0,
         jpeg_quality=int(rng.integers(35, 95)) if rng.random() < 0.35 else 0,
         seed=int(rng.integers(1 << 31)),
     )
