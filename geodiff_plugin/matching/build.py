@@ -23,11 +23,13 @@ from geodiff_plugin.matching.plane_sweep import (
     sweep_planes,
 )
 
-__all__ = ["build_cost_volume", "find_matches"]
+__all__ = ["build_cost_volume", "find_matches", "pilot_volume"]
 
 # The first, coarse sweep: pixels of its grid, and how far it looks in fractions of the width.
 _PILOT_PIXELS = 40_000
 _PILOT_SHIFT = 0.4
+# Planes reach this factor nearer than anything that the coarse sweep is sure of, and at least to this shift.
+_HEADROOM, _LEAST_SHIFT = 1.25, 0.03
 # Fewer planes than this make no parabola worth the name.
 _FEWEST_PLANES = 24
 
@@ -69,24 +71,49 @@ def _even_planes(
     return ends[0] + (ends[1] - ends[0]) * steps
 
 
-def _nearest_inverse_depth(
-    left: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, max_shift: float
-) -> torch.Tensor:
-    """The inverse depth that a coarse sweep says nothing is nearer than."""
-    left, rights, K = _to_grid(left, rights, K_left, _PILOT_PIXELS, _PILOT_PIXELS)
+@torch.no_grad()
+def pilot_volume(
+    left_01: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, pixels: int = _PILOT_PIXELS
+) -> CostVolume:
+    """A coarse sweep of all depths from infinity to a shift of 40 % of the width.
+
+    Args:
+        left_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1].
+        rights: as for ``build_cost_volume``.
+        K_left: ``(3, 3)`` pixels of ``left_01``.
+        pixels: bound on the grid's size.
+
+    Returns:
+        ``CostVolume``.
+
+    Raises:
+        ValueError: the views do not overlap, or both cameras stand at one place.
+    """
+    views = tuple((grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
+    left, small, K = _to_grid(grey(left_01), views, K_left.float(), pixels, pixels)
     size = (left.shape[-2], left.shape[-1])
+    limit = _at_shift(small, K, size, _PILOT_SHIFT)
+    planes = _even_planes((torch.zeros_like(limit), limit), size, small, K, 1.0, 160)
+    return sweep_planes(left, small, K, planes)
+
+
+def _at_shift(
+    rights: Sequence[RightView], K: torch.Tensor, size: tuple[int, int], fraction: float
+) -> torch.Tensor:
+    """Inverse depth at which the view that moves most has moved by this fraction of the width."""
     all_rays = [plane_rays(K[None], K_r[None], T[None], size) for _, K_r, T in rights]
-    limit = torch.stack([inverse_depth_at_shift(rays, max_shift * size[1]) for rays in all_rays]).amin()
-    span = (torch.zeros_like(limit), limit)
-    volume = sweep_planes(left, rights, K, _even_planes(span, size, rights, K, 1.0, 160))
-    matches = match_volume(volume)
+    return torch.stack([inverse_depth_at_shift(rays, fraction * size[1]) for rays in all_rays]).amin()
+
+
+def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
+    """The inverse depth that a coarse sweep says nothing is nearer than."""
+    matches = match_volume(pilot)
     believed = matches.inverse_depth[matches.confidence > 0.8]
-    least = torch.stack([inverse_depth_at_shift(rays, 0.03 * size[1]) for rays in all_rays]).amin()
-    if believed.numel() < 100:
+    limit = pilot.inverse_depth[-1]
+    if believed.numel() < 0.03 * pilot.cost[0].numel():
         return limit  # nothing to go by: the search must see everything
-    return (1.25 * torch.quantile(believed[:: max(1, believed.numel() // 100_000)], 0.995)).clamp(
-        least, limit
-    )
+    least = _at_shift(pilot.rights, pilot.K, pilot.size, _LEAST_SHIFT)
+    return (_HEADROOM * torch.quantile(believed, 0.995)).clamp(least, limit)
 
 
 @torch.no_grad()
@@ -130,7 +157,7 @@ def build_cost_volume(
     views = tuple((grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
     left, small, K = _to_grid(grey(left_01), views, K_left.float(), max_side, max_pixels)
     if depth_range is None:
-        nearest = _nearest_inverse_depth(left, small, K, _PILOT_SHIFT)
+        nearest = _nearest_inverse_depth(pilot_volume(left, small, K))
         span = (torch.zeros_like(nearest), nearest)
     else:
         span = (K.new_tensor(1.0 / depth_range[1]), K.new_tensor(1.0 / depth_range[0]))

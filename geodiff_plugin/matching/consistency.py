@@ -18,9 +18,12 @@ __all__ = ["Matches", "gate_matches", "match_volume"]
 
 # Left and right may differ by this many planes.
 _TOLERANCE = 1.5
-# Log-odds that a checked match is within 3 planes of the truth: constant, log of second-best to best cost,
-# best cost, left-right difference. Fitted on real pairs; what one half of them gives holds on the other.
-_LOG_ODDS = (3.1, 1.8, -4.6, -0.64)
+# Log-odds that a checked match is within 3 planes of the truth: constant, log of the margin (0.03 + second
+# best cost - best cost), best cost, left-right difference. Fitted on real pairs; what one half of them gives
+# holds on the other.
+_LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
+# A margin below this is no evidence at all: a blank wall fits every plane.
+_LEAST_MARGIN = 0.02
 
 
 @dataclass(frozen=True)
@@ -93,10 +96,11 @@ def _disagreement(volume: CostVolume, winner: _Winner, right: RightView) -> torc
 
 def _confidence(winner: _Winner, difference: torch.Tensor) -> torch.Tensor:
     """Probability ``(H, W)`` that the winner is right, given the left-right difference in planes."""
-    constant, by_ratio, by_cost, by_difference = _LOG_ODDS
-    ratio = ((winner.second + 0.02) / (winner.cost + 0.02)).clamp(1.0, 20.0).log()
-    odds = constant + by_ratio * ratio + by_cost * winner.cost.clamp(0.0, 0.8)
+    constant, by_margin, by_cost, by_difference = _LOG_ODDS
+    margin = (winner.second - winner.cost).clamp(0.0, 0.5)
+    odds = constant + by_margin * (margin + 0.03).log() + by_cost * winner.cost.clamp(0.0, 0.8)
     probability = torch.sigmoid(odds + by_difference * difference.clamp_max(_TOLERANCE))
+    probability = probability * (margin / _LEAST_MARGIN).clamp_max(1.0)
     return torch.where(difference <= _TOLERANCE, probability, torch.zeros_like(probability))
 
 

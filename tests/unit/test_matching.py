@@ -1,0 +1,274 @@
+"""Plane sweep, aggregation, left-right check: closed forms on made-up pairs."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from geodiff_plugin import geometry as g
+from geodiff_plugin import matching as m
+from geodiff_plugin.matching.benchmark import main as benchmark_main
+from geodiff_plugin.matching.benchmark import textured_pair
+from geodiff_plugin.matching.build import pilot_volume
+from geodiff_plugin.matching.census import census, census_cost
+from geodiff_plugin.matching.plane_sweep import UNSEEN_COST, inverse_depth_at_shift, median_shift
+
+SIZE = (96, 144)
+
+
+def scene(turn=0.0, at=(0.3, 0.0, 0.0), size=SIZE, seed=0, focal=None):
+    """A right texture, seen from the left at a known depth, for any pose; all on the CPU."""
+    _, (texture, K, _), _, depth = textured_pair(size, seed=seed)
+    E = torch.eye(4)
+    E[0, 0] = E[2, 2] = math.cos(turn)
+    E[0, 2], E[2, 0] = math.sin(turn), -math.sin(turn)
+    E[:3, 3] = torch.tensor(at)
+    T = g.relative_pose(torch.eye(4)[None], E[None])[0]
+    warped = g.warp_right_to_left(texture[None], depth[None], K[None], K[None], T[None])
+    return warped.image[0], (texture, K, T), K, depth, warped.visible[0]
+
+
+@pytest.fixture(scope="module")
+def rectified():
+    left, right, K, depth, visible = scene()
+    volume = m.build_cost_volume(left, [right], K)
+    return left, right, K, depth, visible, volume, m.match_volume(volume)
+
+
+def relative_errors(matches, depth, mask):
+    mask = mask & (matches.confidence > 0.5)
+    return ((matches.inverse_depth - 1 / depth).abs() / matches.plane_step)[mask]
+
+
+def test_census_ignores_exposure():
+    image = torch.rand(1, 20, 30, generator=torch.Generator().manual_seed(0)) * 0.4
+    bits = census(image)
+    assert bits.shape == (1, 16, 20, 30) and bits.abs().max() <= 1
+    torch.testing.assert_close(census(image + 0.3), bits, atol=1e-4, rtol=0)
+    assert census_cost(bits[0], image).abs().max() == 0
+    assert census_cost(bits[0], 1.3 * image + 0.05).mean() < 0.02
+    other = torch.rand(1, 20, 30, generator=torch.Generator().manual_seed(1))
+    assert 0.4 < census_cost(bits[0], other).mean() < 0.6  # pure noise; real texture that differs: about 0.35
+
+
+def test_median_shift_is_f_b_over_z_and_does_not_count_rotation():
+    _, (_, K, T), _, _, _ = scene()
+    expected = K[0, 0] * 0.3 * torch.tensor([0.0, 0.25, 1.0])
+    rays = g.plane_rays(K[None], K[None], T[None], SIZE)
+    torch.testing.assert_close(
+        median_shift(rays, torch.tensor([0.0, 0.25, 1.0])), expected, atol=1e-2, rtol=1e-3
+    )
+    assert float(inverse_depth_at_shift(rays, 10.0) * K[0, 0] * 0.3) == pytest.approx(10.0, rel=0.01)
+    _, (_, _, turned), _, _, _ = scene(turn=0.2)
+    shifts = median_shift(g.plane_rays(K[None], K[None], turned[None], SIZE), torch.tensor([0.0, 0.25]))
+    assert shifts[0] == 0 and shifts[1] == pytest.approx(float(expected[1]), rel=0.3)
+
+
+def test_volume_fields(rectified):
+    left, right, K, depth, _, volume, _ = rectified
+    planes = len(volume.inverse_depth)
+    assert volume.cost.shape == volume.in_view.shape == (planes, *SIZE) and volume.size == SIZE
+    assert volume.cost.dtype == torch.float32 and torch.isfinite(volume.cost).all()
+    assert volume.cost.min() >= 0 and volume.cost.max() <= 1
+    steps = volume.inverse_depth.diff()
+    assert volume.inverse_depth[0] == 0 and (steps > 0).all()
+    torch.testing.assert_close(steps, volume.plane_step.expand_as(steps), atol=1e-5, rtol=1e-3)
+    assert (volume.cost[~volume.in_view] == UNSEEN_COST).all() and volume.in_view.any()
+
+
+def test_planes_reach_what_is_there_and_not_much_further(rectified):
+    _, _, _, depth, visible, volume, _ = rectified
+    nearest = 1 / depth[visible].min()
+    assert nearest < volume.inverse_depth[-1] < 2.5 * nearest
+
+
+def test_true_depth_has_the_least_cost(rectified):
+    _, _, _, depth, visible, volume, _ = rectified
+    true_plane = ((1 / depth) / volume.plane_step).round().long()
+    at_truth = volume.cost.gather(0, true_plane)[visible]
+    assert at_truth.mean() < 0.5 * volume.cost[volume.in_view].mean()
+
+
+@pytest.mark.parametrize(
+    ("turn", "at"),
+    [(0.0, (0.3, 0.0, 0.0)), (0.0, (-0.3, 0.0, 0.0)), (0.06, (0.25, 0.1, 0.15)), (0.0, (0.0, 0.3, 0.0))],
+)
+def test_matches_in_any_pose(turn, at):
+    left, right, K, depth, visible = scene(turn, at)
+    matches = m.find_matches(left, [right], K)
+    errors = relative_errors(matches, depth, visible)
+    assert errors.numel() > 0.4 * visible.sum()
+    assert errors.median() < 0.4 and (errors > 3).float().mean() < 0.06
+    assert matches.confidence.min() >= 0 and matches.confidence.max() <= 1
+    assert torch.isfinite(matches.inverse_depth).all()
+
+
+def test_what_the_right_view_does_not_see_has_no_confidence(rectified):
+    _, _, _, depth, visible, _, matches = rectified
+    unseen = ~visible & (depth < 6)  # off the left edge of the right image by pixels, not by a rounding error
+    assert unseen.any()
+    assert (matches.confidence[unseen] > 0.5).float().mean() < 0.25
+    assert (matches.confidence[visible] > 0.5).float().mean() > 0.6
+
+
+def test_noise_has_few_matches():
+    generator = torch.Generator().manual_seed(0)
+    left, right = torch.rand(2, 3, *SIZE, generator=generator)
+    _, (_, K, T), _, _, _ = scene()
+    matches = m.find_matches(left, [(right, K, T)], K)
+    assert matches.confidence.mean() < 0.2
+
+
+def test_other_size_and_intrinsics_of_the_right_view():
+    left, (texture, K, T), _, depth, visible = scene()
+    large = torch.nn.functional.interpolate(texture[None], scale_factor=2, mode="bicubic")[0].clamp(0, 1)
+    K_large = g.resize_intrinsics(K[None], SIZE, (2 * SIZE[0], 2 * SIZE[1]))[0]
+    matches = m.find_matches(left, [(large, K_large, T)], K)
+    errors = relative_errors(matches, depth, visible)
+    assert errors.numel() > 0.4 * visible.sum() and errors.median() < 0.5
+
+
+def test_large_images_are_shrunk_and_K_with_them():
+    left, (texture, K, T), _, _, _ = scene()
+    volume = m.build_cost_volume(left, [(texture, K, T)], K, max_side=72)
+    assert volume.size == (48, 72) and volume.left_01.shape == (1, 48, 72)
+    torch.testing.assert_close(volume.K, g.resize_intrinsics(K[None], SIZE, (48, 72))[0])
+    assert volume.rights[0][0].shape == (1, 48, 72)
+    bounded = m.build_cost_volume(left, [(texture, K, T)], K, max_pixels=4000)
+    assert bounded.size[0] * bounded.size[1] <= 4100
+
+
+def test_depth_range_and_number_of_planes():
+    left, right, K, _, _ = scene()
+    volume = m.build_cost_volume(left, [right], K, depth_range=(1.0, 20.0), planes=40, step_px=0.1)
+    assert len(volume.inverse_depth) == 40
+    assert volume.inverse_depth[0] == pytest.approx(0.05) and volume.inverse_depth[-1] == pytest.approx(1.0)
+
+
+def test_a_third_view_sees_what_the_second_does_not():
+    """Left and right of the left camera: together they cover both edges."""
+    _, (texture, K, _), _, depth = textured_pair(SIZE)
+    pairs = [scene(at=(x, 0.0, 0.0)) for x in (0.3, -0.3)]
+    # one left image for both: re-render each right view from it where it is seen, noise elsewhere
+    left = pairs[0][0]
+    right = pairs[0][1]
+    T_other = pairs[1][1][2]
+    other = forward_view(left, depth, K, T_other)
+    two = m.find_matches(left, [right], K)
+    three = m.find_matches(left, [right, (other, K, T_other)], K)
+    unseen = ~pairs[0][4] & (depth < 6)
+    assert (three.confidence[unseen] > 0.5).float().mean() > (
+        two.confidence[unseen] > 0.5
+    ).float().mean() + 0.2
+    errors = relative_errors(three, depth, torch.ones_like(unseen))
+    assert errors.median() < 0.5 and (errors > 3).float().mean() < 0.1
+
+
+def forward_view(left, depth, K, T):
+    """Nearest-pixel splat of the left image into another view, far to near; noise in the holes."""
+    uv, z = g.project_rays(depth[None], g.plane_rays(K[None], K[None], T[None], SIZE))
+    image = torch.rand(3, SIZE[0] * SIZE[1], generator=torch.Generator().manual_seed(9))
+    order = z.flatten().argsort(descending=True)
+    column, row = uv[0].round().long().flatten(0, 1)[order].unbind(-1)
+    inside = (column >= 0) & (column < SIZE[1]) & (row >= 0) & (row < SIZE[0])
+    for at, source in zip((row * SIZE[1] + column)[inside].tolist(), order[inside].tolist(), strict=True):
+        image[:, at] = left.flatten(1)[:, source]
+    return image.view(3, *SIZE)
+
+
+def test_gate_drops_what_the_depth_contradicts(rectified):
+    _, _, _, depth, _, _, matches = rectified
+    depths = torch.stack([depth, depth * 3.0])  # (2, 1, H, W)
+    gated = m.gate_matches(matches, depths, 1.5)
+    assert gated.shape == (2, 1, *SIZE)
+    ratio = matches.inverse_depth * depth
+    close = (ratio < 1.4) & (ratio > 1 / 1.4)
+    assert torch.equal(gated[0][close], matches.confidence[close])
+    assert (gated[1][close] == 0).all()
+
+
+def test_aggregation_fills_a_gap_from_its_neighbours():
+    """One plane is right everywhere but in a patch that says nothing; the paths carry it across."""
+    cost = torch.full((9, 20, 24), 0.4)
+    cost[4] = 0.0
+    cost[:, 8:12, 10:14] = 0.2
+    out = m.aggregate(cost, torch.full((20, 24), 0.5))
+    assert out.shape == cost.shape and (out.argmin(dim=0) == 4).all()
+    assert torch.isfinite(out).all()
+
+
+def test_aggregation_against_a_plain_loop():
+    """Hirschmueller's recursion written out pixel by pixel."""
+    generator = torch.Generator().manual_seed(0)
+    cost = torch.rand(5, 4, 6, generator=generator)
+    p1, p2 = 0.1, 0.3
+    expected = torch.zeros_like(cost)
+    for rows, columns in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        path = torch.zeros_like(cost)
+        ys = range(4) if rows >= 0 else range(3, -1, -1)
+        xs = range(6) if columns >= 0 else range(5, -1, -1)
+        for y in ys:
+            for x in xs:
+                py, px = y - rows, x - columns
+                path[:, y, x] = cost[:, y, x]
+                if not (0 <= py < 4 and 0 <= px < 6):
+                    continue
+                before = path[:, py, px]
+                for d in range(5):
+                    options = [before[d], before.min() + p2]
+                    options += [before[e] + p1 for e in (d - 1, d + 1) if 0 <= e < 5]
+                    path[d, y, x] += min(options) - before.min()
+        expected += path / 4
+    flat = torch.full((4, 6), 0.5)
+    torch.testing.assert_close(m.aggregate(cost, flat, p1=p1, p2=p2), expected)
+
+
+def test_an_edge_makes_a_jump_cheap():
+    cost = torch.full((6, 1, 20), 0.3)
+    cost[1, :, :10] = 0.1
+    cost[4, :, 10:12] = 0.1  # a thin thing behind an edge
+    cost[1, :, 12:] = 0.1
+    edge = torch.zeros(1, 20)
+    edge[:, 10:12] = 1.0
+    with_edge = m.aggregate(cost, edge, p1=0.05, p2=0.6)[:, 0, 10:12].argmin(0)
+    without = m.aggregate(cost, torch.zeros(1, 20), p1=0.05, p2=0.6)[:, 0, 10:12].argmin(0)
+    assert (with_edge == 4).all() and (without == 1).all()
+
+
+@pytest.mark.parametrize(("turn", "at"), [(0.0, (0.3, 0.0, 0.0)), (0.06, (0.25, 0.1, 0.1))])
+def test_swapped_views_and_inverted_poses_are_told(turn, at):
+    left, (texture, K, T), _, _, _ = scene(turn, at)
+    assert not m.mirrored_pose_preferred(left, [(texture, K, T)], K).preferred
+    inverse = g.invert_rigid(T)
+    assert m.mirrored_pose_preferred(left, [(texture, K, inverse)], K).preferred
+    assert m.mirrored_pose_preferred(texture, [(left, K, T)], K).preferred
+
+
+def test_errors_name_the_argument():
+    left, (texture, K, T), _, _, _ = scene()
+    with pytest.raises(ValueError, match="E must be a pose with a baseline"):
+        m.build_cost_volume(left, [(texture, K, torch.eye(4))], K)
+    away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    away[0, 3] = 0.1
+    with pytest.raises(ValueError, match="E must be a pose under which the views overlap"):
+        m.build_cost_volume(left, [(texture, K, away)], K)
+    with pytest.raises(ValueError, match="depth_range"):
+        m.build_cost_volume(left, [(texture, K, T)], K, depth_range=(3.0, 1.0))
+
+
+def test_blank_images_fall_back_to_the_whole_range():
+    _, (_, K, T), _, _, _ = scene()
+    blank = torch.full((3, *SIZE), 0.5)
+    volume = m.build_cost_volume(blank, [(blank, K, T)], K)
+    whole = pilot_volume(blank, [(blank, K, T)], K)
+    assert volume.inverse_depth[-1] == pytest.approx(float(whole.inverse_depth[-1]), rel=0.02)
+    matches = m.match_volume(volume)
+    assert torch.isfinite(matches.inverse_depth).all() and (matches.confidence > 0.9).float().mean() < 0.1
+
+
+def test_benchmark_prints_its_stages(capsys):
+    benchmark_main(["--size", "48", "96"])
+    printed = capsys.readouterr().out
+    assert all(stage in printed for stage in ("volume", "one aggregation", "matches"))
