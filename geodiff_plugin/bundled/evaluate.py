@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> None:
         "--steps", type=int, nargs="*", help="denoising steps to try; the default ones if left out"
     )
     parser.add_argument("--resolution", type=int, nargs="*", help="processing resolutions to try")
-    parser.add_argument("--sheet", type=Path, help="PNG of a dozen held-out scenes to write")
+    parser.add_argument("--sheet", type=Path, help="PNG of six held-out scenes to write")
     parser.add_argument("--threads", type=int, default=0, help="torch's choice for 0")
     options = parser.parse_args(argv)
     if options.threads:
@@ -122,8 +122,8 @@ def main(argv: list[str] | None = None) -> None:
                 abs_rel, delta1 = score_scenes(pipeline, images, depth, steps, resolution)
                 print(f"{options.scenes} held-out scenes: AbsRel {abs_rel:.3f}, delta1 {delta1:.3f}")
     if options.sheet:
-        images, depth = held_out(12)
-        contact_sheet(images, depth, predict(pipeline, images), options.sheet, columns=2)
+        images, depth = held_out(6)
+        contact_sheet(images, depth, predict(pipeline, images), options.sheet, columns=1)
 
 
 if __name__ == "__main__":

@@ -212,6 +212,12 @@ def _half_copy(part: object) -> object:
     """A float16 copy of a module on the CPU; anything else as it is."""
     if not isinstance(part, torch.nn.Module):
         return part
-    copy = type(part)(part.config) if isinstance(part, CLIPTextModel) else type(part).from_config(part.config)
+    if isinstance(part, CLIPTextModel):
+        copy = type(part)(part.config)
+    else:
+        # from_config falls back to the class's default for what was a default when the module was built
+        # (scaling_factor), so the configuration is written once more.
+        copy = type(part).from_config(part.config)
+        copy.register_to_config(**{key: value for key, value in part.config.items() if key[0] != "_"})
     copy.load_state_dict({name: value.detach().cpu() for name, value in part.state_dict().items()})
     return copy.half().eval()

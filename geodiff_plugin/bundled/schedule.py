@@ -30,7 +30,7 @@ class Stage:
     last: float
 
 
-SCRATCH = (Stage(0.4, 2, 0.9), Stage(0.6, 2, 0.5), Stage(1.0, 1, 0.5))
+SCRATCH = (Stage(0.45, 2, 0.9), Stage(0.65, 2, 0.5), Stage(1.0, 1, 0.5))
 CONTINUED = (Stage(0.25, 2, 0.5), Stage(1.0, 1, 0.5))
 
 

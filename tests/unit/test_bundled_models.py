@@ -57,9 +57,7 @@ def test_loss_vanishes_for_the_true_velocity():
         assert x.shape == (2, 8, 3, 3) and encoder_hidden_states.shape == (2, 2, 32)
         return (truth,)
 
-    loss = schedule.diffusion_loss(
-        network, scheduler, image, depth, torch.zeros(1, 2, 32), timesteps, noise
-    )
+    loss = schedule.diffusion_loss(network, scheduler, image, depth, torch.zeros(1, 2, 32), timesteps, noise)
     assert loss == 0.0
 
 
@@ -97,7 +95,9 @@ def test_average_follows_quickly_at_first():
 
 def test_saved_folder_loads_silently_and_keeps_its_card(tmp_path, capfd):
     torch.manual_seed(0)
-    pipeline = models.assemble(models.build_vae(), models.build_unet(), models.build_text(), 2, 96)
+    vae = models.build_vae()
+    vae.register_to_config(scaling_factor=0.25)
+    pipeline = models.assemble(vae, models.build_unet(), models.build_text(), 2, 96)
     folder = models.save_prior(pipeline, tmp_path / "prior")
     (folder / "README.md").write_text("card")
     models.save_prior(pipeline, folder)
@@ -105,6 +105,7 @@ def test_saved_folder_loads_silently_and_keeps_its_card(tmp_path, capfd):
     assert (folder / "README.md").read_text() == "card"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["prior"]
     assert (again.default_denoising_steps, again.default_processing_resolution) == (2, 96)
+    assert again.vae.config.scaling_factor == 0.25
     assert again.config.prediction_type == "depth" and again.dtype == torch.float32
     torch.testing.assert_close(
         again.unet.conv_in.weight, pipeline.unet.conv_in.weight.half().float(), rtol=0, atol=0
