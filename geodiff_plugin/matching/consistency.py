@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 
 from geodiff_plugin.geometry import invert_rigid, plane_rays, sample_at, warp_right_to_left
 from geodiff_plugin.matching.aggregation import aggregate
@@ -22,8 +23,9 @@ _TOLERANCE = 1.5
 # best cost - best cost), best cost, left-right difference. Fitted on real pairs; what one half of them gives
 # holds on the other.
 _LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
-# A margin below this is no evidence at all: a blank wall fits every plane.
-_LEAST_MARGIN = 0.02
+# Aggregation carries matches over blank walls for ever. Where, within this window, the best planes are no
+# better than the average plane by this much, there is no evidence.
+_WINDOW_PX, _LEAST_CONTRAST = 31, 0.03
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,24 @@ class Matches:
 
 @dataclass(frozen=True)
 class _Winner:
-    """Per pixel ``(H, W)``: inverse depth, its cost, and the least cost at least two planes away."""
+    """Per pixel ``(H, W)``: inverse depth, its cost, the least cost two planes away, and ``_contrast``."""
 
     inverse_depth: torch.Tensor
     cost: torch.Tensor
     second: torch.Tensor
+    contrast: torch.Tensor
+
+
+def _contrast(volume: CostVolume, index: torch.Tensor) -> torch.Tensor:
+    """How much better than the mean plane the chosen one is, before aggregation, averaged over a window."""
+    total = torch.zeros_like(volume.cost[0])
+    for cost, in_view in zip(
+        volume.cost, volume.in_view, strict=True
+    ):  # one plane at a time: no second volume
+        total += cost * in_view
+    mean = total / volume.in_view.sum(dim=0).clamp_min(1)
+    gain = (mean - volume.cost.gather(0, index[None])[0]).clamp_min(0.0)
+    return F.avg_pool2d(gain[None], _WINDOW_PX, 1, _WINDOW_PX // 2, count_include_pad=False)[0]
 
 
 def _winner(volume: CostVolume) -> _Winner:
@@ -66,7 +81,8 @@ def _winner(volume: CostVolume) -> _Winner:
     position = index + torch.where(inner, offset.clamp(-0.5, 0.5), torch.zeros_like(offset))
     near = (index[None] + torch.arange(-1, 2, device=index.device)[:, None, None]).clamp(0, last)
     second = aggregated.scatter_(0, near, torch.inf).amin(dim=0)
-    return _Winner(volume.inverse_depth[0] + position * volume.plane_step, best, second)
+    inverse_depth = volume.inverse_depth[0] + position * volume.plane_step
+    return _Winner(inverse_depth, best, second, _contrast(volume, index))
 
 
 def _seen_from_right(volume: CostVolume, right: RightView) -> CostVolume:
@@ -100,7 +116,7 @@ def _confidence(winner: _Winner, difference: torch.Tensor) -> torch.Tensor:
     margin = (winner.second - winner.cost).clamp(0.0, 0.5)
     odds = constant + by_margin * (margin + 0.03).log() + by_cost * winner.cost.clamp(0.0, 0.8)
     probability = torch.sigmoid(odds + by_difference * difference.clamp_max(_TOLERANCE))
-    probability = probability * (margin / _LEAST_MARGIN).clamp_max(1.0)
+    probability = probability * (winner.contrast / _LEAST_CONTRAST).clamp_max(1.0)
     return torch.where(difference <= _TOLERANCE, probability, torch.zeros_like(probability))
 
 
