@@ -34,7 +34,7 @@ class _Crops:
         self._held: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
 
     def draw(self, batch: int, side: int, generator: torch.Generator) -> torch.Tensor:
-        """``(batch, 3, side, side)`` in [-1, 1]."""
+        """``(batch, 3, side, side)`` in [-1, 1]; the side is at most the scene's."""
         have = shards(self._cache)
         fresh = [i for i in have if i not in self._held]
         if fresh and (len(self._held) < self._keep or torch.rand((), generator=generator) < 0.02):
@@ -45,6 +45,7 @@ class _Crops:
             self._held[index] = (images, normalise_depth(depth))
         names = list(self._held)
         images, depth = self._held[names[int(torch.randint(len(names), (), generator=generator))]]
+        side = min(side, *images.shape[-2:])
         zoom = int(torch.randint(1, 3, (), generator=generator))
         zoom = zoom if min(images.shape[-2:]) >= zoom * side else 1
         pieces = []
