@@ -30,6 +30,9 @@ COARSE = 48  # 1128 pairs near < far
 FINE = 13
 #: A current state this close to the best cost found stays: re-anchoring restarts the affine updates.
 KEEP_MARGIN = 2e-3
+#: Fit to matches: width of the Cauchy weight in planes, how far near and far may move (log factor), what counts
+#: as a sure match, how many of them a quantile needs, and which quantile the prior calls 0.
+CAUCHY_PLANES, LOG_NEAREST, LOG_FARTHEST, SURE, MIN_SURE, NEAR_QUANTILE = 8.0, 1.4, 0.7, 0.5, 50, 0.02
 #: Least share of the pixels that must stay in the right image.
 MIN_SEEN_RECTIFIED, MIN_SEEN_POSED = 0.6, 0.25
 
@@ -175,7 +178,7 @@ def search_scale(
 
 @torch.no_grad()
 def refine_to_matches(
-    x: Tensor, matches: Matches, near_m: Tensor, far_m: Tensor, space: str, *, iterations: int = 12
+    x: Tensor, matches: Matches, near_m: Tensor, far_m: Tensor, space: str, *, iterations: int = 8
 ) -> tuple[Tensor, Tensor]:
     """Robust fit of the two ends of a relative map to matches, started from the search's result.
 
@@ -188,33 +191,61 @@ def refine_to_matches(
         iterations: of reweighted Gauss-Newton on (log near, log far).
 
     Returns:
-        ``near_m, far_m``, each within a factor of 2 of the start: matches alone have outliers, so they refine
+        ``near_m, far_m``, far within a factor of 2 of the start: matches alone have outliers, so they refine
         what the lookup found and never replace it. Residuals are inverse depths in planes with Cauchy weights.
+        Near is at most the 2 % quantile of the matched depths (priors are trained on that normalisation): no
+        value of the map can be nearer than its own zero, so a zero that lies too far away would hold the
+        nearest surfaces back for good.
     """
     height, width = matches.size
     at = _sample_positions(height, width, x.device)
-    weight = matches.confidence.flatten()[at]
-    target = matches.inverse_depth.flatten()[at]
+    weight, target = matches.confidence.flatten()[at], matches.inverse_depth.flatten()[at]
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
     start = torch.stack([near_m, far_m], 1).log()
-    p = start.clone()
-    limit = torch.log(torch.tensor(2.0))
-    width_planes = 8.0
+    fit = start
     for _ in range(iterations):
-        def residual(q: Tensor) -> Tensor:
-            depth = _depth_at(values, q[:, :1].exp(), q[:, 1:].exp(), space)
-            return (1.0 / depth - target) / matches.plane_step
-        e = residual(p)
-        h = 1e-3
-        J = torch.stack([(residual(p + h * d) - e) / h for d in torch.eye(2, device=x.device)], -1)  # (B, P, 2)
-        w = weight / (1.0 + (e / width_planes) ** 2)
-        A = torch.einsum("bpi,bp,bpj->bij", J, w, J)
-        A = A + (1e-3 * A.diagonal(dim1=1, dim2=2).mean(1) + 1e-6)[:, None, None] * torch.eye(2, device=x.device)
-        g = torch.einsum("bpi,bp,bp->bi", J, w, e)
-        p = p - torch.linalg.solve(A, g).clamp(-0.3, 0.3)
-        p = torch.maximum(torch.minimum(p, start + limit), start - limit)
-    near, far = p.exp().unbind(1)
+        fit = _refine_once(fit, start, values, target, weight, matches.plane_step, space, (True, True))
+    sure = weight > SURE
+    if int(sure.sum()) < MIN_SURE:
+        return _ordered(fit)
+    nearest = -torch.quantile(target[sure], 1.0 - NEAR_QUANTILE).log()
+    fit = torch.stack([torch.minimum(fit[:, 0], torch.maximum(nearest, start[:, 0] - LOG_NEAREST)), fit[:, 1]], 1)
+    for _ in range(iterations):
+        fit = _refine_once(fit, start, values, target, weight, matches.plane_step, space, (False, True))
+    return _ordered(fit)
+
+
+def _ordered(fit: Tensor) -> tuple[Tensor, Tensor]:
+    near, far = fit.exp().unbind(1)
     return torch.minimum(near, far * 0.98), far
+
+
+def _refine_once(
+    fit: Tensor,
+    start: Tensor,
+    values: Tensor,
+    target: Tensor,
+    weight: Tensor,
+    plane_step: Tensor,
+    space: str,
+    free: tuple[bool, bool],
+) -> Tensor:
+    """One reweighted Gauss-Newton step on ``fit (B, 2)``, log metres; a parameter that is not ``free`` stays."""
+
+    def residual(p: Tensor) -> Tensor:
+        return (1.0 / _depth_at(values, p[:, :1].exp(), p[:, 1:].exp(), space) - target) / plane_step
+
+    e, h = residual(fit), 1e-3
+    mask = fit.new_tensor(free)
+    J = torch.stack([(residual(fit + h * d) - e) / h for d in torch.eye(2, device=fit.device)], -1) * mask
+    w = weight / (1.0 + (e / CAUCHY_PLANES) ** 2)
+    normal = torch.einsum("bpi,bp,bpj->bij", J, w, J)
+    damping = 1e-3 * normal.diagonal(dim1=1, dim2=2).sum(1) + 1e-6
+    normal = normal + damping[:, None, None] * torch.eye(2, device=fit.device)
+    gradient = torch.einsum("bpi,bp,bp->bi", J, w, e)
+    step = torch.linalg.solve(normal, gradient).clamp(-0.3, 0.3) * mask
+    limit = fit.new_tensor([LOG_NEAREST, LOG_FARTHEST])
+    return torch.maximum(torch.minimum(fit - step, start + limit), start - limit)
 
 
 def argmin_over(candidates: Tensor, cost: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:

@@ -13,8 +13,9 @@ from geodiff_plugin.terms.base import Estimate, masked_mean
 
 __all__ = ["matches"]
 
-#: Residuals beyond this many planes count alike: a wrong match must not pull for ever.
-CLAMP_PLANES = 20.0
+#: Residual in planes from which the pull falls: a wrong match must not win against its neighbours, but a surface
+#: that the prior put far away must still feel where it is (a clamp would leave it there).
+CAUCHY_PLANES = 5.0
 
 
 def matches(estimate: Estimate) -> Tensor:
@@ -24,11 +25,11 @@ def matches(estimate: Estimate) -> Tensor:
         estimate: needs ``depth_m`` and ``matches``.
 
     Returns:
-        ``(B,)`` float: confidence-weighted mean of ``sqrt(1 + e^2) - 1`` with ``e`` clamped at 20
-        planes; far and near pixels weigh alike because one plane is one step of shift in the right
-        image. 0 where a sample has no match. No gradient from residuals beyond the clamp.
+        ``(B,)`` float: confidence-weighted mean of ``c^2 / 2 log(1 + (e / c)^2)`` with ``e`` in planes and
+        ``c = 5``; far and near pixels weigh alike because one plane is one step of shift in the right image.
+        0 where a sample has no match. The gradient falls as 1 / e and is never zero.
     """
     target = estimate.matches
     e = (1.0 / estimate.depth_m - target.inverse_depth) / target.plane_step.view(-1, 1, 1, 1)
-    e = e.clamp(-CLAMP_PLANES, CLAMP_PLANES)
-    return masked_mean(torch.sqrt(1.0 + e * e) - 1.0, target.confidence)
+    c2 = CAUCHY_PLANES**2
+    return masked_mean(0.5 * c2 * torch.log1p(e * e / c2), target.confidence)
