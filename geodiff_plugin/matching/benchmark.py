@@ -48,7 +48,7 @@ def textured_pair(
     K = torch.tensor([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]])
     rows = torch.arange(height).view(1, 1, height, 1).expand(1, 1, height, width)
     floor = 1.2 * focal / (rows - 0.45 * height).clamp_min(1.0)
-    depth_m = floor.clamp_max(12.0)
+    depth_m = floor.clamp_max(6.0)
     depth_m[..., int(0.3 * height) : int(0.8 * height), int(0.55 * width) : int(0.75 * width)] = 3.0
     T = torch.eye(4)
     T[0, 3] = -0.3

@@ -1,0 +1,191 @@
+"""The search for metres: on made-up pairs with a known answer, and (slow) on real ones."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from geodiff_plugin import geometry as g
+from geodiff_plugin import matching as m
+from geodiff_plugin.matching.benchmark import textured_pair
+from geodiff_plugin.scale_search import argmin_over, refine_to_matches, search_scale
+
+SPACES = {
+    "depth": lambda z: z,
+    "disparity": lambda z: 1 / z,
+    "log": torch.log,
+    "sqrt_disparity": lambda z: z**-0.5,
+}
+NEAR_IS_ONE = ("disparity", "sqrt_disparity")
+SIZE = (96, 144)
+REAL = Path(os.environ.get("GEODIFF_TEST_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+
+
+def relative(depth: torch.Tensor, space: str, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
+    """The map a perfect prior would give: affine in its space, two quantiles at 0 and 1."""
+    value = SPACES[space](depth)
+    ends = torch.quantile(value.flatten()[:: max(1, value.numel() // 100_000)], torch.tensor([low, high]))
+    return ((value - ends[0]) / (ends[1] - ends[0])).clamp(0, 1)[None]
+
+
+def metres(x: torch.Tensor, near: float, far: float, space: str) -> torch.Tensor:
+    """Depth of a relative map between two ends, written independently of the package."""
+    to = SPACES[space]
+    at_zero, at_one = (far, near) if space in NEAR_IS_ONE else (near, far)
+    value = to(torch.tensor(at_zero)) + (to(torch.tensor(at_one)) - to(torch.tensor(at_zero))) * x
+    back = {
+        "depth": lambda v: v,
+        "disparity": lambda v: 1 / v,
+        "log": torch.exp,
+        "sqrt_disparity": lambda v: v**-2,
+    }
+    return back[space](value)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    left, right, K, depth = textured_pair(SIZE)
+    return m.build_cost_volume(left, [right], K), depth
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_true_relative_map_gives_the_true_metres(scene, space):
+    volume, depth = scene
+    x = relative(depth, space)
+    found = search_scale(volume, x, space)
+    estimate = metres(x[0], float(found.near_m), float(found.far_m), space)
+    assert ((estimate - depth).abs() / depth).mean() < 0.03
+    assert float(found.near_m) == pytest.approx(float(depth.min()), rel=0.05)
+    assert found.near_m.shape == found.far_m.shape == found.cost.shape == found.on_edge.shape == (1,)
+    assert 0 <= found.cost < 0.15
+
+
+def test_each_sample_of_a_batch_has_its_own_answer(scene):
+    volume, depth = scene
+    x = relative(depth, "depth")
+    squeezed = 0.05 + 0.9 * x  # the same scene, so another (near, far)
+    both = search_scale(volume, torch.cat([x, squeezed]), "depth")
+    alone = search_scale(volume, squeezed, "depth")
+    torch.testing.assert_close(both.near_m[1], alone.near_m[0])
+    torch.testing.assert_close(both.far_m[1], alone.far_m[0])
+    estimate = metres(squeezed[0], float(alone.near_m), float(alone.far_m), "depth")
+    assert ((estimate - depth).abs() / depth).mean() < 0.05
+    assert both.near_m[1] < both.near_m[0] and both.far_m[1] > both.far_m[0]
+
+
+def test_map_of_another_size(scene):
+    volume, depth = scene
+    x = torch.nn.functional.interpolate(relative(depth, "depth"), (48, 72), mode="area")
+    found = search_scale(volume, x, "depth")
+    assert float(found.near_m) == pytest.approx(float(depth.min()), rel=0.12)
+
+
+@pytest.mark.parametrize("turn", [0.05, -0.05])
+def test_general_pose(turn):
+    _, (texture, K, _), _, depth = textured_pair(SIZE)
+    E = torch.eye(4)
+    E[0, 0] = E[2, 2] = np.cos(turn)
+    E[0, 2], E[2, 0] = np.sin(turn), -np.sin(turn)
+    E[:3, 3] = torch.tensor([0.25, 0.1, 0.1])
+    T = g.relative_pose(torch.eye(4)[None], E[None])
+    left = g.warp_right_to_left(texture[None], depth[None], K[None], K[None], T).image[0]
+    volume = m.build_cost_volume(left, [(texture, K, T[0])], K)
+    x = relative(depth, "disparity")
+    found = search_scale(volume, x, "disparity")
+    estimate = metres(x[0], float(found.near_m), float(found.far_m), "disparity")
+    assert ((estimate - depth).abs() / depth).mean() < 0.05
+
+
+def test_range_that_excludes_the_answer_is_reported(scene):
+    volume, depth = scene
+    x = relative(depth, "depth")
+    inside = search_scale(volume, x, "depth", depth_range=(1.0, 40.0))
+    outside = search_scale(volume, x, "depth", depth_range=(3.2, 40.0))
+    assert not inside.on_edge and outside.on_edge
+    assert outside.near_m >= 3.2 * 0.999 and outside.far_m <= 40.0 * 1.001
+    assert outside.cost > inside.cost + 0.02
+
+
+@pytest.mark.parametrize("space", ["depth", "disparity"])
+def test_current_state_stays_unless_something_better_shows_up(scene, space):
+    volume, depth = scene
+    x = relative(depth, space)
+    found = search_scale(volume, x, space)
+    ends = (found.far_m, found.near_m) if space in NEAR_IS_ONE else (found.near_m, found.far_m)
+    again = search_scale(volume, x, space, current=ends)
+    assert again.kept and torch.equal(again.near_m, found.near_m) and torch.equal(again.far_m, found.far_m)
+    wrong = search_scale(volume, x, space, current=tuple(3.0 * end for end in ends))
+    assert not wrong.kept and float(wrong.near_m) == pytest.approx(float(found.near_m), rel=1e-4)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_refinement_finds_the_truth_among_outliers(scene, space):
+    volume, depth = scene
+    x = relative(depth, space, 0.02, 0.98)
+    generator = torch.Generator().manual_seed(0)
+    target = 1 / depth
+    wrong = torch.rand(depth.shape, generator=generator) < 0.1
+    span = volume.inverse_depth[-1]
+    target = torch.where(wrong, span * torch.rand(depth.shape, generator=generator), target)
+    matches = m.Matches(target, torch.ones_like(depth), volume.plane_step / 4, volume.K, volume.size)
+    ends = torch.quantile(depth.flatten(), torch.tensor([0.02, 0.98]))
+    start = (ends[:1] * 1.08, ends[1:] * 0.9)
+    before = metres(x[0], float(start[0]), float(start[1]), space)
+    near, far = refine_to_matches(x, matches, *start, space)
+    after = metres(x[0], float(near), float(far), space)
+    error_before, error_after = (float(((d - depth).abs() / depth).mean()) for d in (before, after))
+    assert error_after < 0.5 * error_before and error_after < 0.06
+
+
+def test_refinement_without_matches_changes_nothing(scene):
+    volume, depth = scene
+    x = relative(depth, "depth")
+    nothing = m.Matches(1 / depth, torch.zeros_like(depth), volume.plane_step, volume.K, volume.size)
+    start = (torch.tensor([2.0]), torch.tensor([9.0]))
+    near, far = refine_to_matches(x, nothing, *start, "depth")
+    torch.testing.assert_close((near, far), start)
+
+
+def test_argmin_over_is_per_sample_and_tells_edges():
+    candidates = torch.linspace(1, 9, 9)
+    targets = torch.tensor([3.2, 0.0, 12.0])
+    best, on_edge = argmin_over(candidates, lambda g_s: (g_s - targets) ** 2)
+    assert best.tolist() == [3.0, 1.0, 9.0] and on_edge.tolist() == [False, True, True]
+
+
+def fill(depth: np.ndarray, valid: np.ndarray) -> torch.Tensor:
+    from scipy.ndimage import distance_transform_edt
+
+    rows, columns = distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    return torch.from_numpy(depth[rows, columns]).float()[None]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real pairs are not on this machine")
+def test_search_alone_is_within_5_percent_on_every_real_pair():
+    """The truth, normalised by its 2 and 98 % quantiles, as relative depth: the search gives the metres."""
+    from geodiff_plugin.evaluation.datasets import load_pairs
+
+    errors = {}
+    for pair in load_pairs(REAL):
+        left, right = (
+            torch.from_numpy(i.copy()).permute(2, 0, 1).float() / 255 for i in (pair.left, pair.right)
+        )
+        K_left, K_right, E = (torch.from_numpy(a).float() for a in (pair.K_left, pair.K_right, pair.E))
+        volume = m.build_cost_volume(left, [(right, K_right, torch.linalg.inv(E))], K_left)
+        depth = fill(pair.depth_m, pair.valid)
+        known = torch.from_numpy(pair.depth_m[pair.valid])
+        low, high = (float(np.quantile(known.numpy(), q)) for q in (0.02, 0.98))
+        x = ((depth - low) / (high - low)).clamp(0, 1)[None]
+        found = search_scale(volume, x, "depth")
+        estimate = metres(x[0, 0], float(found.near_m), float(found.far_m), "depth")
+        errors[pair.label] = float(
+            ((estimate - depth[0]).abs() / depth[0])[torch.from_numpy(pair.valid)].mean()
+        )
+        print(f"{pair.label}: {errors[pair.label]:.4f}")
+    assert len(errors) >= 13
+    assert all(error < 0.05 for error in errors.values()), errors
