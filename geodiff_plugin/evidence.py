@@ -15,11 +15,13 @@ from torch import Tensor
 
 from geodiff_plugin.geometry.cameras import resize_intrinsics
 from geodiff_plugin.geometry.projection import plane_rays
-from geodiff_plugin.matching import CostVolume, Matches, RightView, build_cost_volume, find_matches
+from geodiff_plugin.matching import CostVolume, Matches, build_cost_volume, find_matches, mirrored_pose_preferred
 from geodiff_plugin.objective import Views
 
-#: The check for swapped views is a coarse sweep: its pixels, far / near, and how much cheaper it must be.
-SWAP_CHECK_PIXELS, SWAP_CHECK_DEPTHS, SWAP_MARGIN = 16_000, 30.0, 0.85
+SWAPPED = (
+    "The inverse pose explains the views better than the given one: are left and right swapped, is the sign of the "
+    "baseline wrong, or is E world-to-camera?"
+)
 
 __all__ = ["Evidence", "chunk_views", "prepare_evidence", "resize_long_edge"]
 
@@ -104,31 +106,11 @@ def prepare_evidence(
         # The sweep chooses its own grid, finer than that of the losses for wide images.
         rights = [(right_01, K_right, T_right_from_left)]
         volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range)
-        if _mirrored_pose_fits_better(left_01, rights, K_left, volume):
-            warning = (
-                "The mirrored pose explains the views better than the given one: are left and right swapped, "
-                "or is the sign of the baseline wrong?"
-            )
+        if mirrored_pose_preferred(left_01, rights, K_left).preferred:
+            warning = SWAPPED
     if needs_matches:
         matches = _on_grid(find_matches(left_01, rights, K_left, volume=volume), left, K_loss)
     return Evidence(left, right, K_loss, K_right_loss, T_right_from_left, volume, matches, warning)
-
-
-def _mirrored_pose_fits_better(
-    left_01: Tensor, rights: Sequence[RightView], K_left: Tensor, volume: CostVolume
-) -> bool:
-    """Whether a coarse sweep of the pose with its camera centre mirrored finds clearly cheaper planes."""
-    near = 1.0 / float(volume.inverse_depth[-1])
-    mirror = left_01.new_tensor([[1.0, 1.0, 1.0, -1.0]] * 3 + [[1.0] * 4])
-    costs = []
-    for sign in (torch.ones_like(mirror), mirror):
-        views = [(image, K, T * sign) for image, K, T in rights]
-        coarse = build_cost_volume(
-            left_01, views, K_left, max_pixels=SWAP_CHECK_PIXELS, depth_range=(near, near * SWAP_CHECK_DEPTHS)
-        )
-        smooth = F.avg_pool2d(coarse.cost, 5, stride=2)
-        costs.append(smooth.amin(dim=0).mean())
-    return bool(costs[1] < SWAP_MARGIN * costs[0])
 
 
 def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:

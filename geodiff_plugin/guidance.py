@@ -34,7 +34,7 @@ from geodiff_plugin.updates import RULES
 __all__ = ["GeometryGuidance"]
 
 #: Weights of the default preset; how flat the optimum around each is: docs/knobs.md.
-DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "prior_pull": 0.01, "anchor": 0.5}
+DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "prior_pull": 0.01, "anchor": 1.0}
 PAPER_WEIGHTS = {"photometric": 1.0, "prior_pull": 0.01}
 GRADIENTS = ("denoised", "full")
 SEARCHES = ("volume", "one-number")
@@ -58,6 +58,8 @@ class GeometryGuidance(ConfigMixin):
         step_latents: step size of ``rule``.
         step_affine: step size of ``affine_rule`` on the raw scale and shift.
         inner_steps: updates per denoising step; 0 leaves only the search for the scale.
+        min_steps: denoising steps that a guided call takes at least when ``num_inference_steps`` is not given;
+            a pipeline's own default may be 1, which leaves nothing for the guidance to come back to.
         optimize_latents: ``False`` learns scale and shift only (S5.3, Table 4), latents stay untouched.
         start: fraction of the schedule before which nothing is updated, [0, 1).
         stop: fraction after which nothing is updated, (0, 1].
@@ -95,7 +97,8 @@ class GeometryGuidance(ConfigMixin):
         affine_rule: str = "adam",
         step_latents: float = 0.1,
         step_affine: float = 0.01,
-        inner_steps: int = 20,
+        inner_steps: int = 40,
+        min_steps: int = 4,
         optimize_latents: bool = True,
         start: float = 0.0,
         stop: float = 1.0,
@@ -107,7 +110,7 @@ class GeometryGuidance(ConfigMixin):
         search: str = "volume",
         g_s_range: tuple[float, float] = (1.0, 80.0),
         depth_range: tuple[float, float] | None = None,
-        gate: tuple[float, float] = (2.2, 1.2),
+        gate: tuple[float, float] = (20.0, 3.0),
         loss_resolution: int = 640,
         respace: bool = True,
     ) -> None:
@@ -125,6 +128,7 @@ class GeometryGuidance(ConfigMixin):
             step_latents=check_number(step_latents, "step_latents", 0.0, 1e6),
             step_affine=check_number(step_affine, "step_affine", 0.0, 1e6),
             inner_steps=check_number(inner_steps, "inner_steps", 0, 10_000, integer=True),
+            min_steps=check_number(min_steps, "min_steps", 1, 1000, integer=True),
             optimize_latents=bool(optimize_latents),
             start=check_number(start, "start", 0.0, stop),
             stop=stop,
@@ -203,6 +207,7 @@ class GeometryGuidance(ConfigMixin):
             "step_latents": 1e-2,
             "step_affine": 1e-2,
             "inner_steps": 1,
+            "min_steps": 10,
             "weights": PAPER_WEIGHTS,
             "eta": 0.85,
             "pyramid_levels": 1,

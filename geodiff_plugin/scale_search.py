@@ -199,7 +199,9 @@ def refine_to_matches(
     """
     height, width = matches.size
     at = _sample_positions(height, width, x.device)
-    weight, target = matches.confidence.flatten()[at], matches.inverse_depth.flatten()[at]
+    target = matches.inverse_depth.flatten()[at]
+    # A match at infinity constrains nothing, and a wrong one would push far without end.
+    weight = matches.confidence.flatten()[at] * (target > matches.plane_step)
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
     start = torch.stack([near_m, far_m], 1).log()
     fit = start

@@ -6,20 +6,29 @@ Paper: none; the proximal form of one diffusion posterior step (S3.2 takes a sin
 
 from __future__ import annotations
 
+import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.terms.base import Estimate
 
 __all__ = ["anchor"]
 
+#: Pull that remains where every pixel is matched, as a share of the pull where none is.
+LEAST = 0.05
+
 
 def anchor(estimate: Estimate) -> Tensor:
-    """Mean squared distance of the clean latent from the network's own.
+    """Mean squared distance of the clean latent from the network's own, where the views say nothing.
 
     Args:
-        estimate: needs ``z0`` and ``z0_prior``.
+        estimate: needs ``z0`` and ``z0_prior``; with ``matches`` the pull falls as their confidence rises.
 
     Returns:
-        ``(B,)`` float. With several inner updates it is what keeps unmatched regions with the prior.
+        ``(B,)`` float. With several inner updates it is what keeps unmatched regions with the prior,
+        and leaves matched ones to the matches.
     """
-    return (estimate.z0 - estimate.z0_prior).flatten(1).pow(2).mean(1)
+    square = (estimate.z0 - estimate.z0_prior).pow(2).mean(1, keepdim=True)  # (B, 1, h, w)
+    if estimate.matches is not None:
+        known = F.interpolate(estimate.matches.confidence, square.shape[-2:], mode="area")
+        square = square * (1.0 - known).clamp_min(LEAST)
+    return square.flatten(1).mean(1)

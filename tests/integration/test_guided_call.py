@@ -18,7 +18,7 @@ from geodiff_plugin import (
 )
 from tests.conftest import SCHEDULER
 
-FAST = {"inner_steps": 2, "loss_resolution": 64}
+FAST = {"inner_steps": 2, "min_steps": 1, "loss_resolution": 64}
 
 
 def seeded(seed=0):
@@ -191,6 +191,12 @@ def test_stock_arguments_keep_their_meaning(make_pipeline, textured_plane, left)
     assert small.K[0, 0, 0] == pytest.approx(30.0) and small.K[0, 0, 2] == pytest.approx(15.5)
     parts = pipe(left, guidance=guidance, return_dict=False, generator=seeded())
     assert isinstance(parts, tuple) and len(parts) == 3 and parts[1] is None and parts[2] is None
+
+
+def test_a_one_step_default_is_not_enough_for_guidance(make_pipeline, textured_plane, left):
+    pipe = enable_geometry_guidance(make_pipeline())  # its own default is 2
+    steps = [len(pipe(left, guidance=guidance_for(textured_plane, min_steps=n)).history) for n in (1, 3)]
+    assert steps == [2, 3]
 
 
 def test_padding_is_not_part_of_the_result(make_pipeline, textured_plane):

@@ -5,6 +5,7 @@ import torch
 
 from geodiff_plugin.metric import AffineState
 from geodiff_plugin.terms import TERMS, Estimate, MatchTarget, masked_mean
+from geodiff_plugin.terms.anchor import LEAST
 from geodiff_plugin.terms.matches import CAUCHY_PLANES
 from geodiff_plugin.terms.photometric import photometric, photometric_map
 
@@ -95,8 +96,16 @@ def test_prior_pull_anchors():
     torch.testing.assert_close(pull(estimate(), pull_to="zero"), torch.tensor([0.09 + 1.0, 4.0 + 0.25]))
 
 
-def test_anchor_is_a_mean_square():
-    torch.testing.assert_close(TERMS["anchor"].function(estimate(z0=torch.full((2, 4, 8, 10), 3.0))), torch.full((2,), 9.0))
+def test_anchor_holds_what_no_match_holds():
+    moved = torch.full((2, 4, 8, 10), 3.0)
+    value = TERMS["anchor"].function(estimate(z0=moved, matches=None))
+    torch.testing.assert_close(value, torch.full((2,), 9.0))
+    target = estimate().matches
+    half = target.confidence.clone()
+    half[..., :20] = 0.0
+    half = MatchTarget(target.inverse_depth, half, target.plane_step)
+    value = TERMS["anchor"].function(estimate(z0=moved, matches=half))
+    torch.testing.assert_close(value, torch.full((2,), 9.0 * (1.0 + LEAST) / 2.0))
 
 
 def test_masked_mean():
