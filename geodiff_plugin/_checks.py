@@ -71,7 +71,9 @@ def check_intrinsics(K: Any, name: str = "K") -> np.ndarray:
     return K
 
 
-def check_intrinsics_fit(K: np.ndarray, width: int, height: int, name: str = "K", image: str = "the image") -> None:
+def check_intrinsics_fit(
+    K: np.ndarray, width: int, height: int, name: str = "K", image: str = "the image"
+) -> None:
     """Refuse a camera matrix whose principal point lies outside the image that it comes with."""
     cx, cy = K[0, 2], K[1, 2]
     if not (0 <= cx <= width and 0 <= cy <= height):
@@ -79,20 +81,23 @@ def check_intrinsics_fit(K: np.ndarray, width: int, height: int, name: str = "K"
             name,
             f"for {image} of {width}x{height} pixels",
             f"principal point ({cx:.1f}, {cy:.1f}) outside of it",
-            "It probably belongs to another resolution: multiply fx, cx by new_width / old_width and fy, cy likewise.",
+            "It probably belongs to another resolution: "
+            "multiply fx, cx by new_width / old_width and fy, cy likewise.",
         )
 
 
 def check_pose(E: Any, name: str = "E") -> np.ndarray:
-    """A ``(4, 4)`` float64 rigid transform; a rotation that is off by at most 1e-2 is projected to the nearest one.
+    """A ``(4, 4)`` float64 rigid transform; a rotation off by at most 1e-2 is projected to the nearest one.
 
     Raises:
-        TypeError, ValueError: not 4x4, not finite, last row not (0, 0, 0, 1), rotation not orthogonal or mirrored.
+        TypeError, ValueError: not 4x4, not finite, last row not (0, 0, 0, 1), no rotation, mirrored.
     """
     cure = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t], [0, 1]], t in metres."
     E = _as_matrix(E, name, (4, 4), cure)
     if not np.allclose(E[3], (0, 0, 0, 1), atol=1e-6):
-        bad_value(name, "rigid with last row (0, 0, 0, 1)", f"last row {E[3].tolist()}", cure + " Is it transposed?")
+        bad_value(
+            name, "rigid with last row (0, 0, 0, 1)", f"last row {E[3].tolist()}", cure + " Is it transposed?"
+        )
     R = E[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         bad_value(
@@ -119,7 +124,8 @@ def check_baseline(E: np.ndarray, name: str = "E") -> None:
         )
     if baseline > LONG_BASELINE_M:
         warnings.warn(
-            f"{name} has a baseline of {baseline:.4g} m. If that is millimetres, divide the translation by 1000.",
+            f"{name} has a baseline of {baseline:.4g} m. "
+            "If that is millimetres, divide the translation by 1000.",
             stacklevel=3,
         )
 

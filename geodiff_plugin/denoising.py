@@ -38,7 +38,9 @@ class NoiseLevel:
 
     def __post_init__(self) -> None:
         if self.prediction_type not in PREDICTION_TYPES:
-            bad_value("the scheduler's prediction_type", f"one of {PREDICTION_TYPES}", repr(self.prediction_type))
+            bad_value(
+                "the scheduler's prediction_type", f"one of {PREDICTION_TYPES}", repr(self.prediction_type)
+            )
 
 
 def z0_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
@@ -96,4 +98,3 @@ def output_from(z0: Tensor, eps: Tensor, level: NoiseLevel) -> tuple[Tensor, Ten
     if level.prediction_type == "v_prediction":
         return level.alpha * eps - level.sigma * z0, z_t
     return eps - z0, z_t
-

@@ -8,7 +8,6 @@ Marigold's own ``ensemble_depth`` renormalises to [0, 1], which would throw the 
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from geodiff_plugin._checks import check_choice

@@ -15,12 +15,18 @@ from torch import Tensor
 
 from geodiff_plugin.geometry.cameras import resize_intrinsics
 from geodiff_plugin.geometry.projection import plane_rays
-from geodiff_plugin.matching import CostVolume, Matches, build_cost_volume, find_matches, mirrored_pose_preferred
+from geodiff_plugin.matching import (
+    CostVolume,
+    Matches,
+    build_cost_volume,
+    find_matches,
+    mirrored_pose_preferred,
+)
 from geodiff_plugin.objective import Views
 
 SWAPPED = (
-    "The inverse pose explains the views better than the given one: are left and right swapped, is the sign of the "
-    "baseline wrong, or is E world-to-camera?"
+    "The inverse pose explains the views better than the given one: are left and right swapped, "
+    "is the sign of the baseline wrong, or is E world-to-camera?"
 )
 
 __all__ = ["Evidence", "chunk_views", "prepare_evidence", "resize_long_edge"]
@@ -119,7 +125,9 @@ def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
     if matches.size == size:
         return matches
     # Nearest: a mean of two inverse depths across an edge is the depth of neither surface.
-    maps = (F.interpolate(m[None], size, mode="nearest")[0] for m in (matches.inverse_depth, matches.confidence))
+    maps = (
+        F.interpolate(m[None], size, mode="nearest")[0] for m in (matches.inverse_depth, matches.confidence)
+    )
     return Matches(*maps, matches.plane_step, K_left, size)
 
 

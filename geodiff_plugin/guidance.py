@@ -58,7 +58,7 @@ class GeometryGuidance(ConfigMixin):
         step_latents: step size of ``rule``.
         step_affine: step size of ``affine_rule`` on the raw scale and shift.
         inner_steps: updates per denoising step; 0 leaves only the search for the scale.
-        min_steps: denoising steps that a guided call takes at least when ``num_inference_steps`` is not given;
+        min_steps: denoising steps that a guided call takes at least when it names no ``num_inference_steps``;
             a pipeline's own default may be 1, which leaves nothing for the guidance to come back to.
         optimize_latents: ``False`` learns scale and shift only (S5.3, Table 4), latents stay untouched.
         start: fraction of the schedule before which nothing is updated, [0, 1).
@@ -68,7 +68,8 @@ class GeometryGuidance(ConfigMixin):
         pyramid_levels: image pyramid of the photometric term; 1 is the paper's.
         min_visible: visible share below which the photometric term is off, [0, 1].
         pull_to: what ``prior_pull`` pulls scale and shift towards, ``"start"`` or ``"zero"``.
-        search: ``"volume"`` looks up (near, far) in a plane-sweep volume; ``"one-number"`` is the paper's g_s search.
+        search: ``"volume"`` looks up (near, far) in a plane-sweep volume; ``"one-number"`` is the paper's
+            g_s search.
         g_s_range: metres, the candidates of the one-number search.
         depth_range: ``(near, far)`` metres that bound the search, or ``None``.
         gate: factors around the estimate within which matches are believed, at the first and last step.
@@ -150,7 +151,12 @@ class GeometryGuidance(ConfigMixin):
         if count == 0:
             bad_value("right", "an image or a list with one image per left image", "an empty list")
         self._rigs = [
-            _rig(_entry(K, "K", i, count), _entry(E, "E", i, count), _label("K", i, rights), _label("E", i, rights))
+            _rig(
+                _entry(K, "K", i, count),
+                _entry(E, "E", i, count),
+                _label("K", i, rights),
+                _label("E", i, rights),
+            )
             for i in range(count)
         ]
         for i, (image, rig) in enumerate(zip(self._rights, self._rigs, strict=True)):
@@ -158,7 +164,9 @@ class GeometryGuidance(ConfigMixin):
             check_intrinsics_fit(rig.K_right, image.shape[-1], image.shape[-2], name, "the right image")
 
     @classmethod
-    def from_baseline(cls, right: Any, K: Any, baseline_m: float, K_right: Any = None, **kwargs: Any) -> GeometryGuidance:
+    def from_baseline(
+        cls, right: Any, K: Any, baseline_m: float, K_right: Any = None, **kwargs: Any
+    ) -> GeometryGuidance:
         """A rectified rig: the right camera sits ``baseline_m`` metres to the right, looking the same way.
 
         Args:
@@ -194,7 +202,9 @@ class GeometryGuidance(ConfigMixin):
         """Algorithm 1 as printed: full gradient, plain steps of 1e-2, gamma 1e-2 towards 0, one-number g_s.
 
         Args:
-            right, K, E: as in the constructor.
+            right: as in the constructor.
+            K: as in the constructor.
+            E: as in the constructor.
             g_s_range: metres, the paper's "predefined depth range".
             **kwargs: hyperparameters that shall differ from the paper.
 
@@ -223,7 +233,9 @@ class GeometryGuidance(ConfigMixin):
         """The default without gradient updates: only the scale and shift that the search finds.
 
         Args:
-            right, K, E: as in the constructor.
+            right: as in the constructor.
+            K: as in the constructor.
+            E: as in the constructor.
             **kwargs: hyperparameters.
         """
         preset: dict[str, Any] = {"inner_steps": 0, "weights": {"photometric": 1.0}}
@@ -258,7 +270,11 @@ class GeometryGuidance(ConfigMixin):
         matched = bool(config.weights.get("matches")) and config.inner_steps > 0
         for i, rig in enumerate(self._rigs):
             check_intrinsics_fit(
-                rig.K_left, lefts_01.shape[-1], lefts_01.shape[-2], _label("K", i, self._rights), "the left image"
+                rig.K_left,
+                lefts_01.shape[-1],
+                lefts_01.shape[-2],
+                _label("K", i, self._rights),
+                "the left image",
             )
             matrices = (rig.K_left, rig.K_right, rig.T_right_from_left)
             cameras = (torch.as_tensor(m, dtype=torch.float32, device=device) for m in matrices)
@@ -295,7 +311,10 @@ def _rig(K: Any, E: Any, K_name: str, E_name: str) -> Rig:
     if isinstance(K, tuple):
         if len(K) != 2:
             bad_type(K_name, "a 3x3 matrix or a tuple (K_left, K_right)", K)
-        K_left, K_right = check_intrinsics(K[0], f"{K_name}[left]"), check_intrinsics(K[1], f"{K_name}[right]")
+        K_left, K_right = (
+            check_intrinsics(K[0], f"{K_name}[left]"),
+            check_intrinsics(K[1], f"{K_name}[right]"),
+        )
     else:
         K_left = K_right = check_intrinsics(K, K_name)
     if isinstance(E, tuple):

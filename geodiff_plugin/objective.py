@@ -77,7 +77,7 @@ class Objective:
     min_visible: float
 
     def metric_depth(self, x: Tensor, affine: AffineState) -> Tensor:
-        """Metric depth on the loss grid: ``x (B, 1, h, w)`` upsampled, then Eq. 16; ``(B, 1, H, W)`` metres."""
+        """``x (B, 1, h, w)`` upsampled to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""
         if x.shape[-2:] != self.views.size:
             x = F.interpolate(x, self.views.size, mode="bilinear", align_corners=False)
         return self.metric(x, affine)
@@ -110,7 +110,9 @@ class Objective:
         v = self.views
         needs_warp = any(TERMS[name].needs_warp for name in active)
         with torch.set_grad_enabled(torch.is_grad_enabled() and needs_warp):
-            warped = warp_right_to_left(v.right_01, depth_m, v.K_left, v.K_right, v.T_right_from_left, rays=v.rays)
+            warped = warp_right_to_left(
+                v.right_01, depth_m, v.K_left, v.K_right, v.T_right_from_left, rays=v.rays
+            )
         estimate = Estimate(
             depth_m, v.left_01, warped.image, warped.visible, affine, affine_start, z0, z0_prior, matches
         )

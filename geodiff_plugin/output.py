@@ -50,9 +50,17 @@ def assemble_output(
     depth_m = depth_m.float().to(lefts_01.device)  # (N, 1, H, W) or the processing grid
     grid = tuple(depth_m.shape[-2:])
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
-    K = torch.stack([torch.as_tensor(rig.K_left, dtype=torch.float32, device=depth_m.device) for rig in guidance.rigs])
+    K = torch.stack(
+        [torch.as_tensor(rig.K_left, dtype=torch.float32, device=depth_m.device) for rig in guidance.rigs]
+    )
     K = resize_intrinsics(K, size, grid)
-    visible, error = zip(*(_reprojection(guidance, i, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1]) for i in range(count)), strict=True)
+    visible, error = zip(
+        *(
+            _reprojection(guidance, i, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1])
+            for i in range(count)
+        ),
+        strict=True,
+    )
     relative = torch.cat(run.relative)
     relative = relative.reshape(count, -1, *relative.shape[1:]).median(dim=1).values  # (N, 1, h, w)
     if match_input_resolution:
@@ -86,7 +94,10 @@ def _reprojection(
 ) -> tuple[Tensor, Tensor]:
     """Visible mask and mean absolute error to the re-rendered left image, at the output's resolution."""
     rig, right = guidance.rigs[i], guidance.rights[i]
-    matrices = (torch.as_tensor(m, dtype=torch.float32, device=depth_m.device)[None] for m in (rig.K_right, rig.T_right_from_left))
+    matrices = (
+        torch.as_tensor(m, dtype=torch.float32, device=depth_m.device)[None]
+        for m in (rig.K_right, rig.T_right_from_left)
+    )
     warped = warp_right_to_left(right[None].to(depth_m.device), depth_m, K_left, *matrices)
     error = (warped.image - left_01).abs().mean(1, keepdim=True)
     return warped.visible, error * warped.visible
@@ -101,6 +112,9 @@ def _warnings(run: GuidedRun, visible: Tensor) -> list[str]:
         )
     share = visible.float().mean().item()
     if share < LITTLE_OVERLAP:
-        found.append(f"Only {share:.0%} of the left image is seen by the right camera at this depth; scale rests on little.")
+        found.append(
+            f"Only {share:.0%} of the left image is seen by the right camera at this depth; "
+            "scale rests on little."
+        )
     found.extend(e.warning for e in run.evidence if e.warning)
     return found

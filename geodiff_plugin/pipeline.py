@@ -21,13 +21,12 @@ from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.integration.run import GuidedRun
 from geodiff_plugin.output import assemble_output
 from geodiff_plugin.priors import find_adapter
-from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["GuidedMarigoldDepthPipeline", "disable_geometry_guidance", "enable_geometry_guidance"]
 
 
 class _GuidedCall:
-    """What a pipeline class gains: a ``__call__`` that takes ``guidance``, and metric ensembling while guided.
+    """What a pipeline class gains: a ``__call__`` that takes ``guidance``, metric ensembling while guided.
 
     Mixed in before the stock class, whose call does all the rest: preprocessing, latents, loop, resizing.
     """
@@ -54,11 +53,12 @@ class _GuidedCall:
             **kwargs: as the stock call takes them.
 
         Returns:
-            ``MetricDepthOutput``, or with ``return_dict=False`` the stock tuple (prediction, uncertainty, latent).
+            ``MetricDepthOutput``, or with ``return_dict=False`` the stock tuple (prediction, uncertainty,
+            latent).
 
         Raises:
             TypeError: ``guidance`` is no ``GeometryGuidance``; a scheduler that cannot be guided.
-            ValueError: inputs that do not fit each other; a pipeline that cannot be guided as it is offloaded.
+            ValueError: inputs that do not fit each other; offloading that forbids guidance.
             RuntimeError: called inside ``torch.inference_mode()``.
         """
         if guidance is None:
@@ -69,7 +69,8 @@ class _GuidedCall:
             bad_type("guidance", "a GeometryGuidance", guidance, "GeometryGuidance(right, K, E)")
         if torch.is_inference_mode_enabled():
             raise RuntimeError(
-                "A guided call needs gradients, which torch.inference_mode() forbids; use torch.no_grad() or nothing."
+                "A guided call needs gradients, which torch.inference_mode() forbids; "
+                "use torch.no_grad() or nothing."
             )
         bound = inspect.signature(super().__call__).bind(image, *args, **kwargs)
         bound.apply_defaults()
@@ -100,7 +101,9 @@ class _GuidedCall:
                 stock = super().__call__(**{**call, "return_dict": True, "output_latent": True})
         finally:
             del self._guided_run
-        output = assemble_output(stock, run, guidance, lefts_01, call["match_input_resolution"], call["output_type"])
+        output = assemble_output(
+            stock, run, guidance, lefts_01, call["match_input_resolution"], call["output_type"]
+        )
         output.latent = stock.latent if wants_latent else None
         return output if wants_dict else (output.prediction, output.uncertainty, output.latent)
 
@@ -139,7 +142,9 @@ def _stock_class(guided: type) -> type:
 def _guided_class(stock: type) -> type:
     if stock is MarigoldDepthPipeline:
         return GuidedMarigoldDepthPipeline
-    return type(f"Guided{stock.__name__}", (_GuidedCall, stock), {"__doc__": GuidedMarigoldDepthPipeline.__doc__})
+    return type(
+        f"Guided{stock.__name__}", (_GuidedCall, stock), {"__doc__": GuidedMarigoldDepthPipeline.__doc__}
+    )
 
 
 def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:

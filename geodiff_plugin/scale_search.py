@@ -30,8 +30,8 @@ COARSE = 48  # 1128 pairs near < far
 FINE = 13
 #: A current state this close to the best cost found stays: re-anchoring restarts the affine updates.
 KEEP_MARGIN = 2e-3
-#: Fit to matches: width of the Cauchy weight in planes, how far near and far may move (log factor), what counts
-#: as a sure match, how many of them a quantile needs, and which quantile the prior calls 0.
+#: Fit to matches: width of the Cauchy weight in planes, how far near and far may move (log factor), what
+#: counts as a sure match, how many of them a quantile needs, and which quantile the prior calls 0.
 CAUCHY_PLANES, LOG_NEAREST, LOG_FARTHEST, SURE, MIN_SURE, NEAR_QUANTILE = 8.0, 1.4, 0.7, 0.5, 50, 0.02
 #: Least share of the pixels that must stay in the right image.
 MIN_SEEN_RECTIFIED, MIN_SEEN_POSED = 0.6, 0.25
@@ -75,7 +75,9 @@ def _depth_at(x: Tensor, near: Tensor, far: Tensor, space: str) -> Tensor:
     return (low + (high - low) * x) ** (-1.0 / power)
 
 
-def _lookup(volume_cost: Tensor, seen: Tensor, inverse_depth: Tensor, depth_m: Tensor) -> tuple[Tensor, Tensor]:
+def _lookup(
+    volume_cost: Tensor, seen: Tensor, inverse_depth: Tensor, depth_m: Tensor
+) -> tuple[Tensor, Tensor]:
     """Mean clamped cost and seen share ``(M,)`` of candidate depths ``(M, P)``, linear between planes."""
     planes = inverse_depth.shape[0]
     step = (inverse_depth[-1] - inverse_depth[0]) / (planes - 1)
@@ -84,7 +86,9 @@ def _lookup(volume_cost: Tensor, seen: Tensor, inverse_depth: Tensor, depth_m: T
     position = position.clamp(0, planes - 1)
     below = position.floor().clamp_max(planes - 2).long()
     weight = position - below
-    cost = torch.lerp(volume_cost.gather(0, below), volume_cost.gather(0, below + 1), weight).clamp_max(COST_CLAMP)
+    cost = torch.lerp(volume_cost.gather(0, below), volume_cost.gather(0, below + 1), weight).clamp_max(
+        COST_CLAMP
+    )
     # Beyond the nearest plane nothing is known: as bad as an outlier, and not out of view.
     cost = torch.where(inside, cost, torch.full_like(cost, COST_CLAMP))
     visible = seen.gather(0, below) | ~inside
@@ -94,7 +98,10 @@ def _lookup(volume_cost: Tensor, seen: Tensor, inverse_depth: Tensor, depth_m: T
 
 def _is_rectified(volume: CostVolume) -> bool:
     return all(
-        bool(((T[:3, :3] - torch.eye(3, device=T.device)).abs().amax() < 5e-3) & (T[1:3, 3].norm() < 0.02 * T[0, 3].abs()))
+        bool(
+            ((T[:3, :3] - torch.eye(3, device=T.device)).abs().amax() < 5e-3)
+            & (T[1:3, 3].norm() < 0.02 * T[0, 3].abs())
+        )
         for _, _, T in volume.rights
     )
 
@@ -171,7 +178,9 @@ def search_scale(
             a, c = (v[b : b + 1] for v in current)
             now = best_of(torch.minimum(a, c), torch.maximum(a, c))
             kept = now[2] <= mean + KEEP_MARGIN
-            near, far, mean = (torch.where(kept, old, new) for old, new in zip(now, (near, far, mean), strict=True))
+            near, far, mean = (
+                torch.where(kept, old, new) for old, new in zip(now, (near, far, mean), strict=True)
+            )
         found.append((near, far, mean, on_edge, kept))
     return ScaleSearch(*(torch.stack(column) for column in zip(*found, strict=True)))
 
@@ -191,8 +200,8 @@ def refine_to_matches(
         iterations: of reweighted Gauss-Newton on (log near, log far).
 
     Returns:
-        ``near_m, far_m``, far within a factor of 2 of the start: matches alone have outliers, so they refine
-        what the lookup found and never replace it. Residuals are inverse depths in planes with Cauchy weights.
+        ``near_m, far_m``, far within a factor of 2 of the start: matches alone have outliers, so they
+        refine what the lookup found and never replace it. Residuals are in planes, with Cauchy weights.
         Near is at most the 2 % quantile of the matched depths (priors are trained on that normalisation): no
         value of the map can be nearer than its own zero, so a zero that lies too far away would hold the
         nearest surfaces back for good.
@@ -211,7 +220,9 @@ def refine_to_matches(
     if int(sure.sum()) < MIN_SURE:
         return _ordered(fit)
     nearest = -torch.quantile(target[sure], 1.0 - NEAR_QUANTILE).log()
-    fit = torch.stack([torch.minimum(fit[:, 0], torch.maximum(nearest, start[:, 0] - LOG_NEAREST)), fit[:, 1]], 1)
+    fit = torch.stack(
+        [torch.minimum(fit[:, 0], torch.maximum(nearest, start[:, 0] - LOG_NEAREST)), fit[:, 1]], 1
+    )
     for _ in range(iterations):
         fit = _refine_once(fit, start, values, target, weight, matches.plane_step, space, (False, True))
     return _ordered(fit)
@@ -232,7 +243,7 @@ def _refine_once(
     space: str,
     free: tuple[bool, bool],
 ) -> Tensor:
-    """One reweighted Gauss-Newton step on ``fit (B, 2)``, log metres; a parameter that is not ``free`` stays."""
+    """One reweighted Gauss-Newton step on ``fit (B, 2)``, log metres; what is not ``free`` stays."""
 
     def residual(p: Tensor) -> Tensor:
         return (1.0 / _depth_at(values, p[:, :1].exp(), p[:, 1:].exp(), space) - target) / plane_step

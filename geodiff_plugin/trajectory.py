@@ -45,7 +45,9 @@ class Trajectory:
     def __init__(self, config: Any, evidence: Sequence[Evidence], owners: Sequence[int], space: str) -> None:
         self.config, self.evidence, self.owners = config, evidence, list(owners)
         self.metric = MetricMap(space)
-        self.objective = Objective(chunk_views(evidence, owners), self.metric, config.weights, config, config.min_visible)
+        self.objective = Objective(
+            chunk_views(evidence, owners), self.metric, config.weights, config, config.min_visible
+        )
         self.latent_rule = RULES[config.rule](config.step_latents)
         self.scale_rule = RULES[config.affine_rule](config.step_affine)
         self.shift_rule = RULES[config.affine_rule](config.step_affine)
@@ -82,7 +84,9 @@ class Trajectory:
 
         def cost(g_s: Tensor) -> Tensor:
             affine = AffineState(zero, zero, g_s.expand_as(zero))
-            return self.objective(x, affine, affine, zero.view(-1, 1), zero.view(-1, 1), None).terms["photometric"]
+            return self.objective(x, affine, affine, zero.view(-1, 1), zero.view(-1, 1), None).terms[
+                "photometric"
+            ]
 
         best, self.on_edge = argmin_over(candidates, cost)
         self.affine = self.affine_start = AffineState(zero, zero, best)
@@ -107,7 +111,9 @@ class Trajectory:
             )
             near_to_far = (found.near_m, found.far_m)
             if evidence.matches is not None:
-                near_to_far = refine_to_matches(floored[members], evidence.matches, *near_to_far, self.metric.space)
+                near_to_far = refine_to_matches(
+                    floored[members], evidence.matches, *near_to_far, self.metric.space
+                )
             increasing = self.metric.space in ("depth", "log")
             at_zero[members], at_one[members] = near_to_far if increasing else near_to_far[::-1]
             on_edge[members] = found.on_edge
@@ -115,7 +121,7 @@ class Trajectory:
         self.affine = self.affine_start = self.metric.from_range(at_zero, at_one)
 
     def _gate_matches(self, x: Tensor, factor: float) -> None:
-        """Believe matches within a factor of the estimate only: one that the prior contradicts is an outlier."""
+        """Believe matches within a factor of the estimate only: others are outliers."""
         own = [self.evidence[i].matches for i in self.owners]
         if own[0] is None:
             return
@@ -181,7 +187,9 @@ def guided_step(
                 trajectory.settle_scale(x0.detach(), fraction)  # g_s*, S7.3
             s_hat, t_hat = (v.detach().requires_grad_(updates > 0) for v in _raw(trajectory.affine))
             affine = AffineState(s_hat, t_hat, trajectory.affine.g_s)
-            loss = trajectory.objective(x0, affine, trajectory.affine_start, z0_hat, z0_prior, trajectory.matches)
+            loss = trajectory.objective(
+                x0, affine, trajectory.affine_start, z0_hat, z0_prior, trajectory.matches
+            )
             total = loss.total.sum()  # samples do not mix, so the gradient of the sum is each one's own
         if updates:
             inputs = (s_hat, t_hat, z) if config.optimize_latents else (s_hat, t_hat)

@@ -96,7 +96,8 @@ class MetricDepthOutput(BaseOutput):
 
     Attributes:
         prediction: metres; ``(N, H, W, 1)`` numpy or ``(N, 1, H, W)`` torch, as ``output_type`` says.
-        uncertainty: metres (median absolute deviation of the members), shaped as ``prediction``; ``None`` for one member.
+        uncertainty: metres (median absolute deviation of the members), shaped as ``prediction``; ``None``
+            for one member.
         latent: ``(N * E, 4, h, w)`` final latents, with ``output_latent=True``.
         relative: median unclipped relative depth, about [0, 1], shaped as ``prediction``.
         scale: ``(N, E)`` softplus of the learnt scale.

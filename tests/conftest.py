@@ -183,7 +183,12 @@ def make_oracle(tokenizer):
             )
         )
         scheduler = DDIMScheduler(
-            **{**SCHEDULER, "prediction_type": "sample", "rescale_betas_zero_snr": False, "set_alpha_to_one": True}
+            **{
+                **SCHEDULER,
+                "prediction_type": "sample",
+                "rescale_betas_zero_snr": False,
+                "set_alpha_to_one": True,
+            }
         )
         pipe = MarigoldDepthPipeline(
             unet=unet,

@@ -37,7 +37,9 @@ class DenoiserTap:
     Used as a context manager: the hook is gone afterwards, whatever happened.
     """
 
-    def __init__(self, module: torch.nn.Module, split_input: Callable[[Tensor], tuple[Tensor, Tensor]]) -> None:
+    def __init__(
+        self, module: torch.nn.Module, split_input: Callable[[Tensor], tuple[Tensor, Tensor]]
+    ) -> None:
         self._module, self._split = module, split_input
         self._call: tuple[Callable[..., Any], Tensor, tuple, dict] | None = None
         self.leaf: Tensor | None = None
@@ -59,7 +61,11 @@ class DenoiserTap:
         """The hooked forward: same result, detached; the graph is kept until ``release``."""
         condition, depth_latent = self._split(model_input)
         with torch.enable_grad():
-            leaf = depth_latent.detach().to(torch.promote_types(depth_latent.dtype, torch.float32)).requires_grad_()
+            leaf = (
+                depth_latent.detach()
+                .to(torch.promote_types(depth_latent.dtype, torch.float32))
+                .requires_grad_()
+            )
             joined = torch.cat([condition.detach(), leaf.to(condition.dtype)], dim=1)
             result = forward(joined, *args, **kwargs)
         self.leaf = leaf

@@ -27,8 +27,8 @@ class GuidedScheduler:
     Args:
         scheduler: the pipeline's.
         on_trajectory: called at ``set_timesteps`` with the timesteps; Marigold does so for every chunk.
-        on_step: ``(model_output, timestep, z_t) -> (model_output, z_t, shift)``: what the scheduler's own step
-            shall be given, and what to add to its ``z_{t-1}`` (``None`` for nothing).
+        on_step: ``(model_output, timestep, z_t) -> (model_output, z_t, shift)``: what the scheduler's own
+            step shall be given, and what to add to its ``z_{t-1}`` (``None`` for nothing).
         on_done: ``(timestep, z_{t-1}) -> z_{t-1}``, after the step.
         respace: run a leading DDIM as trailing.
     """

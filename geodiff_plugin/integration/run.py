@@ -72,7 +72,11 @@ class GuidedRun:
                 self._tap = stack.enter_context(DenoiserTap(self.prior.denoiser(), self.prior.split_input))
             stack.enter_context(
                 GuidedScheduler(
-                    self.pipe.scheduler, self._on_trajectory, self._on_step, self._on_done, self.config.respace
+                    self.pipe.scheduler,
+                    self._on_trajectory,
+                    self._on_step,
+                    self._on_done,
+                    self.config.respace,
                 )
             )
             self._stack = stack.pop_all()
@@ -157,7 +161,9 @@ class GuidedRun:
                 "scale": affine.scale,
                 "shift": affine.shift,
             }
-            latents = (self.callback(self.pipe, self.step_index, timestep, values) or {}).get("latents", latents)
+            latents = (self.callback(self.pipe, self.step_index, timestep, values) or {}).get(
+                "latents", latents
+            )
         self.step_index += 1
         return latents
 
@@ -167,7 +173,7 @@ def _identity(z: Tensor) -> Tensor:
 
 
 class _frozen_weights:  # noqa: N801 - a context manager, used like a function
-    """``requires_grad`` off on every weight (a graph would be kept for 950 M of them), and back afterwards."""
+    """``requires_grad`` off on every weight (else a graph is kept for 950 M of them), back afterwards."""
 
     def __init__(self, pipe: Any) -> None:
         modules = [m for m in pipe.components.values() if isinstance(m, torch.nn.Module)]
@@ -210,5 +216,6 @@ def check_offloading(pipe: Any, gradient: str) -> None:
             "gradient",
             "'denoised' with enable_model_cpu_offload()",
             "'full'",
-            "Decoding pushes the U-Net to the CPU before its backward pass; use gradient='denoised' or pipe.to(device).",
+            "Decoding pushes the U-Net to the CPU before its backward pass; "
+            "use gradient='denoised' or pipe.to(device).",
         )

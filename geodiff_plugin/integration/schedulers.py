@@ -38,7 +38,9 @@ def _discrete(scheduler: Any, timestep: Tensor) -> NoiseLevel:
     # Indexed where the table lies: on CUDA the timestep is there too, and nothing waits for it.
     table = scheduler.alphas_cumprod
     alpha_bar = table[timestep.to(table.device)].float()
-    return NoiseLevel(alpha_bar.sqrt(), (1.0 - alpha_bar).sqrt(), scheduler.config.prediction_type, _clip(scheduler))
+    return NoiseLevel(
+        alpha_bar.sqrt(), (1.0 - alpha_bar).sqrt(), scheduler.config.prediction_type, _clip(scheduler)
+    )
 
 
 def _sigmas_vp(scheduler: Any, timestep: Tensor) -> NoiseLevel:
@@ -80,7 +82,10 @@ def noise_level(scheduler: Any, timestep: Tensor) -> NoiseLevel:
             return family(scheduler, torch.as_tensor(timestep))
     names = ", ".join(cls.__name__ for cls in FAMILIES)
     bad_type(
-        "pipe.scheduler", f"one of {names}", scheduler, "Use pipe.scheduler = DDIMScheduler.from_config(pipe.scheduler.config)."
+        "pipe.scheduler",
+        f"one of {names}",
+        scheduler,
+        "Use pipe.scheduler = DDIMScheduler.from_config(pipe.scheduler.config).",
     )
 
 
@@ -93,12 +98,16 @@ def check_scheduler(scheduler: Any) -> None:
     """
     if not isinstance(scheduler, tuple(FAMILIES)):
         noise_level(scheduler, torch.tensor(0))
-    if getattr(scheduler.config, "rescale_betas_zero_snr", False) and scheduler.config.prediction_type == "epsilon":
+    if (
+        getattr(scheduler.config, "rescale_betas_zero_snr", False)
+        and scheduler.config.prediction_type == "epsilon"
+    ):
         bad_value(
             "pipe.scheduler",
             "able to tell the clean latent from the network's output at every step",
             f"{type(scheduler).__name__} with prediction_type='epsilon' and rescale_betas_zero_snr=True",
-            "With no signal left a noise prediction says nothing; set rescale_betas_zero_snr=False or use v_prediction.",
+            "With no signal left a noise prediction says nothing; "
+            "set rescale_betas_zero_snr=False or use v_prediction.",
         )
 
 

@@ -37,16 +37,24 @@ def find_adapter(pipe: Any) -> type[DepthPrior]:
     for adapter in PRIORS.values():
         if adapter.matches(pipe):
             return adapter
-    bad_type("pipe", f"a pipeline with an adapter ({', '.join(PRIORS)})", pipe, "docs/extending.md shows how to write one.")
+    bad_type(
+        "pipe",
+        f"a pipeline with an adapter ({', '.join(PRIORS)})",
+        pipe,
+        "docs/extending.md shows how to write one.",
+    )
 
 
 def load_prior(
-    name: str | Path, device: str | torch.device | None = None, dtype: torch.dtype = torch.float32, **kwargs: Any
+    name: str | Path,
+    device: str | torch.device | None = None,
+    dtype: torch.dtype = torch.float32,
+    **kwargs: Any,
 ) -> DiffusionPipeline:
     """Load a pipeline that can be guided.
 
     Args:
-        name: ``"bundled"``, a folder in diffusers' layout, or a hub id such as ``prs-eth/marigold-depth-v1-1``.
+        name: ``"bundled"``, a folder in diffusers' layout, or a hub id (``prs-eth/marigold-depth-v1-1``).
         device: where to, CPU for ``None``.
         dtype: of U-Net and VAE.
         **kwargs: for ``from_pretrained`` (``revision``, ``variant``, ``token``, ``local_files_only``, ...).
@@ -65,11 +73,18 @@ def load_prior(
         bad_value("prior", "'bundled', a folder that is there, or a hub id", repr(source), "Check the path.")
     try:
         pipe = DiffusionPipeline.from_pretrained(source, dtype=dtype, **kwargs)
-    except (LocalEntryNotFoundError, RepositoryNotFoundError, HFValidationError, OSError, ConnectionError) as error:
-        cure = "Fetch it once with `hf download ID` while online, give a folder, or use the bundled one: --prior bundled."
+    except (
+        LocalEntryNotFoundError,
+        RepositoryNotFoundError,
+        HFValidationError,
+        OSError,
+        ConnectionError,
+    ) as error:
+        cure = "Fetch it once with `hf download ID` while online, give a folder, or use --prior bundled."
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(
-            f"prior must be 'bundled', a folder or a hub id that is cached or can be reached; got {str(name)!r} ({reason}). {cure}"
+            "prior must be 'bundled', a folder or a hub id that is cached or can be reached; "
+            f"got {str(name)!r} ({reason}). {cure}"
         ) from error
     find_adapter(pipe)
     return pipe.to(device) if device is not None else pipe

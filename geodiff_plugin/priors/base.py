@@ -36,4 +36,4 @@ class DepthPrior(Protocol):
         """Condition and depth latent of the denoiser's input, in the order in which it concatenates them."""
 
     def decode(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map ``(B, 1, H, W)`` float32, about [0, 1], of ``(B, C, h, w)`` latents, with its graph."""
+        """Unclipped relative map ``(B, 1, H, W)`` float32, about [0, 1], with the graph of the latents."""

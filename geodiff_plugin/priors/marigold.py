@@ -54,6 +54,8 @@ class MarigoldPrior:
         The pipeline's own ``decode_prediction`` clips, which silences the gradient exactly at near and far.
         """
         vae = self._pipe.vae
-        decoded = vae.decode((z0 / vae.config.scaling_factor).to(vae.dtype), return_dict=False)[0]  # (B, 3, H, W)
+        decoded = vae.decode((z0 / vae.config.scaling_factor).to(vae.dtype), return_dict=False)[
+            0
+        ]  # (B, 3, H, W)
         wide = torch.promote_types(decoded.dtype, torch.float32)  # half precision ends here
         return (decoded.to(wide).mean(dim=1, keepdim=True) + 1.0) / 2.0

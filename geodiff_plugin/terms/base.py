@@ -37,7 +37,7 @@ class Estimate:
     Attributes:
         depth_m: ``(B, 1, H, W)`` metres, carries the graph.
         left_01: ``(B, 3, H, W)`` the left image.
-        warped_01: ``(B, 3, H, W)`` the right image seen from the left through ``depth_m``, or ``None`` if no term asks.
+        warped_01: ``(B, 3, H, W)`` the right image seen from the left through ``depth_m``.
         visible: ``(B, 1, H, W)`` bool: real (not padded), and seen by the right camera.
         affine: current scale, shift, g_s; carries the graph.
         affine_start: where the search put them; no graph.
@@ -48,7 +48,7 @@ class Estimate:
 
     depth_m: Tensor
     left_01: Tensor
-    warped_01: Tensor | None
+    warped_01: Tensor
     visible: Tensor
     affine: AffineState
     affine_start: AffineState

@@ -13,8 +13,8 @@ from geodiff_plugin.terms.base import Estimate, masked_mean
 
 __all__ = ["matches"]
 
-#: Residual in planes from which the pull falls: a wrong match must not win against its neighbours, but a surface
-#: that the prior put far away must still feel where it is (a clamp would leave it there).
+#: Residual in planes from which the pull falls: a wrong match must not win against its neighbours, but a
+#: surface that the prior put far away must still feel where it is (a clamp would leave it there).
 CAUCHY_PLANES = 5.0
 
 

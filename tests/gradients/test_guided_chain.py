@@ -1,4 +1,4 @@
-"""Finite differences through the whole chain: z_t -> U-Net -> z0_hat -> decoder -> metres -> warp -> L_geo."""
+"""Finite differences through the whole chain: z_t, U-Net, z0_hat, decoder, metres, warp, L_geo."""
 
 from __future__ import annotations
 
@@ -40,22 +40,33 @@ def test_whole_chain_against_finite_differences(make_pipeline, textured_plane, s
     start = objective.metric.from_range(*((near, far) if space in ("depth", "log") else (far, near)))
     start = AffineState(double(start.s_hat), double(start.t_hat), double(start.g_s))
     matches = MatchTarget(
-        1.0 / double(textured_plane.depth_m)[None, None], torch.ones(1, 1, 48, 64, dtype=torch.float64), double([0.02])
+        1.0 / double(textured_plane.depth_m)[None, None],
+        torch.ones(1, 1, 48, 64, dtype=torch.float64),
+        double([0.02]),
     )
     anchor = draw(1, 4, 24, 32)
 
     def loss(z, s_hat, t_hat):
-        output = pipe.unet(torch.cat([condition, z], 1), 500, encoder_hidden_states=text, return_dict=False)[0]
+        output = pipe.unet(torch.cat([condition, z], 1), 500, encoder_hidden_states=text, return_dict=False)[
+            0
+        ]
         z0 = z0_from(output, z, level)
         affine = AffineState(s_hat, t_hat, start.g_s)
         return objective(prior.decode(z0), affine, start, z0, anchor, matches).total.sum()
 
-    inputs = [z_t.requires_grad_(), start.s_hat.clone().requires_grad_(), start.t_hat.clone().requires_grad_()]
+    inputs = [
+        z_t.requires_grad_(),
+        start.s_hat.clone().requires_grad_(),
+        start.t_hat.clone().requires_grad_(),
+    ]
     grads = torch.autograd.grad(loss(*inputs), inputs)
     for i, grad in enumerate(grads):
         assert torch.isfinite(grad).all() and grad.abs().max() > 0
         direction, h = draw(*grad.shape), 1e-6
-        moved = [[x.detach() + sign * h * direction if j == i else x.detach() for j, x in enumerate(inputs)] for sign in (1, -1)]
+        moved = [
+            [x.detach() + sign * h * direction if j == i else x.detach() for j, x in enumerate(inputs)]
+            for sign in (1, -1)
+        ]
         with torch.no_grad():
             numeric = (loss(*moved[0]) - loss(*moved[1])) / (2 * h)
         # Bilinear sampling is piecewise smooth: a few of 3072 pixels may cross a centre within h.
@@ -65,7 +76,10 @@ def test_whole_chain_against_finite_differences(make_pipeline, textured_plane, s
 @pytest.mark.parametrize("prediction_type", ["epsilon", "v_prediction", "sample", "flow_prediction"])
 def test_denoising_arithmetic_gradcheck_and_inverse(prediction_type):
     generator = torch.Generator().manual_seed(1)
-    output, z_t = (torch.randn(1, 2, 2, 3, generator=generator, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    output, z_t = (
+        torch.randn(1, 2, 2, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+        for _ in range(2)
+    )
     alpha, sigma = (0.6, 0.8) if prediction_type != "flow_prediction" else (0.6, 0.4)
     level = NoiseLevel(double(alpha), double(sigma), prediction_type)
     assert torch.autograd.gradcheck(lambda o, z: z0_from(o, z, level), (output, z_t))

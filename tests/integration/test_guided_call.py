@@ -7,7 +7,13 @@ import json
 import numpy as np
 import pytest
 import torch
-from diffusers import DDIMScheduler, DDPMScheduler, DiffusionPipeline, DPMSolverMultistepScheduler, LCMScheduler
+from diffusers import (
+    DDIMScheduler,
+    DDPMScheduler,
+    DiffusionPipeline,
+    DPMSolverMultistepScheduler,
+    LCMScheduler,
+)
 from PIL import Image
 
 from geodiff_plugin import (
@@ -137,7 +143,9 @@ def test_one_update_of_the_paper_is_algorithm_1(make_pipeline, textured_plane, l
     reference = stock(pipe, left, num_inference_steps=1).latent
     moves = []
     for rate in (1e-2, 2e-2):
-        guidance = GeometryGuidance.paper(textured_plane.right, textured_plane.K, textured_plane.E, step_latents=rate)
+        guidance = GeometryGuidance.paper(
+            textured_plane.right, textured_plane.K, textured_plane.E, step_latents=rate
+        )
         out = pipe(left, guidance=guidance, generator=seeded(), num_inference_steps=1, output_latent=True)
         moves.append(out.latent - reference)
     assert moves[0].abs().max() > 0
@@ -215,7 +223,11 @@ def test_callback_sees_and_replaces(make_pipeline, textured_plane, left):
 
     pipe = enable_geometry_guidance(make_pipeline())
     out = pipe(
-        left, guidance=guidance_for(textured_plane), callback_on_step_end=callback, output_latent=True, generator=seeded()
+        left,
+        guidance=guidance_for(textured_plane),
+        callback_on_step_end=callback,
+        output_latent=True,
+        generator=seeded(),
     )
     assert [s[:2] for s in seen] == [(0, 999), (1, 499)]
     assert seen[0][2] == {"latents", "metric_depth", "loss", "scale", "shift"}
@@ -230,7 +242,9 @@ def test_same_seed_same_answer(make_pipeline, textured_plane, left):
 
 BETAS = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012}
 SCHEDULERS = {
-    "ddim-leading": lambda: DDIMScheduler(**{**SCHEDULER, "timestep_spacing": "leading", "rescale_betas_zero_snr": False}),
+    "ddim-leading": lambda: DDIMScheduler(
+        **{**SCHEDULER, "timestep_spacing": "leading", "rescale_betas_zero_snr": False}
+    ),
     "ddim-zero-snr": lambda: DDIMScheduler(**SCHEDULER),
     "ddim-epsilon": lambda: DDIMScheduler(
         **{**SCHEDULER, "prediction_type": "epsilon", "rescale_betas_zero_snr": False}
@@ -268,7 +282,15 @@ def test_leading_ddim_runs_as_trailing_unless_told(make_pipeline, textured_plane
 
 def test_saved_while_enabled_it_is_a_stock_pipeline(make_pipeline, tmp_path, left):
     reference = stock(make_pipeline(), left)
-    for pipe in (enable_geometry_guidance(make_pipeline()), GuidedMarigoldDepthPipeline(**make_pipeline().components, prediction_type="depth", default_denoising_steps=2, default_processing_resolution=64)):
+    for pipe in (
+        enable_geometry_guidance(make_pipeline()),
+        GuidedMarigoldDepthPipeline(
+            **make_pipeline().components,
+            prediction_type="depth",
+            default_denoising_steps=2,
+            default_processing_resolution=64,
+        ),
+    ):
         pipe.set_progress_bar_config(disable=True)
         pipe.save_pretrained(tmp_path / "p")
         assert isinstance(pipe, GuidedMarigoldDepthPipeline)
@@ -311,7 +333,10 @@ def test_a_pipeline_without_adapter_is_refused():
 def test_compiled_unet(make_pipeline, textured_plane, left, gradient):
     pipe, compiled = enable_geometry_guidance(make_pipeline()), enable_geometry_guidance(make_pipeline())
     compiled.unet = torch.compile(compiled.unet, backend="eager")
-    outs = [p(left, guidance=guidance_for(textured_plane, gradient=gradient), generator=seeded()) for p in (pipe, compiled)]
+    outs = [
+        p(left, guidance=guidance_for(textured_plane, gradient=gradient), generator=seeded())
+        for p in (pipe, compiled)
+    ]
     np.testing.assert_allclose(outs[0].prediction, outs[1].prediction, rtol=1e-4)
 
 
@@ -339,12 +364,16 @@ def test_model_offloading_works_with_the_cheap_gradient_only(make_pipeline, text
 @pytest.mark.parametrize(("near", "far"), [(0.4, 1.1), (0.0, 1.0)])
 @pytest.mark.parametrize("prediction_type", ["depth", "disparity"])
 def test_with_an_oracle_prior_the_scale_is_found(make_oracle, textured_plane, near, far, prediction_type):
-    """The denoiser knows the relative depth up to an affine map; the right view gives the metres within 2 %."""
+    """The denoiser knows depth up to an affine map; the right view gives the metres within 2 %."""
     truth = textured_plane.depth_m
     value = truth if prediction_type == "depth" else 1.0 / truth
     relative = near + (far - near) * (value - value.min()) / (value.max() - value.min())
     pipe = enable_geometry_guidance(make_oracle(relative.astype(np.float32), prediction_type))
-    out = pipe(Image.fromarray(textured_plane.left), guidance=guidance_for(textured_plane, inner_steps=10), generator=seeded())
+    out = pipe(
+        Image.fromarray(textured_plane.left),
+        guidance=guidance_for(textured_plane, inner_steps=10),
+        generator=seeded(),
+    )
     ratio = out.prediction[0, ..., 0] / truth
     assert abs(np.median(ratio) - 1.0) < 0.02
     assert np.mean(np.abs(ratio - 1.0)) < 0.03

@@ -46,7 +46,7 @@ def draw(seed):
 
 
 def walk(make, edit=None, steps=4):
-    """Run a schedule on fixed network outputs; ``edit(z0)`` moves the clean latent. Yields z0_hat, z_{t-1}, own z0."""
+    """Run a schedule on fixed network outputs; yields z0_hat, z_{t-1} and the scheduler's own z0."""
     scheduler = make()
     scheduler.set_timesteps(steps)
     z_t, _ = draw(0)

@@ -13,7 +13,16 @@ K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
 E = np.eye(4)
 E[0, 3] = 0.12
 RIGHT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
-HYPERPARAMETERS = {"gradient", "rule", "step_latents", "inner_steps", "weights", "depth_range", "g_s_range", "gate"}
+HYPERPARAMETERS = {
+    "gradient",
+    "rule",
+    "step_latents",
+    "inner_steps",
+    "weights",
+    "depth_range",
+    "g_s_range",
+    "gate",
+}
 
 
 def test_positional_construction_registers_hyperparameters_and_only_them():
@@ -25,7 +34,9 @@ def test_positional_construction_registers_hyperparameters_and_only_them():
 
 
 def test_save_and_load(tmp_path):
-    guidance = GeometryGuidance(RIGHT, K, E, inner_steps=3, depth_range=(0.5, 9.0), weights={"photometric": 2.0})
+    guidance = GeometryGuidance(
+        RIGHT, K, E, inner_steps=3, depth_range=(0.5, 9.0), weights={"photometric": 2.0}
+    )
     guidance.save_config(tmp_path)
     config = GeometryGuidance.load_config(tmp_path)
     again = GeometryGuidance.from_config(config, right=RIGHT, K=K, E=E)

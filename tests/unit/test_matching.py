@@ -107,7 +107,7 @@ def test_matches_in_any_pose(turn, at):
 
 def test_what_the_right_view_does_not_see_has_no_confidence(rectified):
     _, _, _, depth, visible, _, matches = rectified
-    unseen = ~visible & (depth < 5.9)  # off the left edge of the right image by pixels, not by a rounding error
+    unseen = ~visible & (depth < 5.9)  # off the edge by pixels, not by a rounding error
     assert unseen.any()
     assert (matches.confidence[unseen] > 0.5).float().mean() < 0.25
     assert (matches.confidence[visible] > 0.5).float().mean() > 0.6

@@ -22,7 +22,9 @@ def estimate(**changes):
         "affine_start": affine,
         "z0": torch.zeros(2, 4, 8, 10),
         "z0_prior": torch.zeros(2, 4, 8, 10),
-        "matches": MatchTarget(torch.full((2, 1, 32, 40), 0.5), torch.ones(2, 1, 32, 40), torch.tensor([0.01, 0.02])),
+        "matches": MatchTarget(
+            torch.full((2, 1, 32, 40), 0.5), torch.ones(2, 1, 32, 40), torch.tensor([0.01, 0.02])
+        ),
     }
     return Estimate(**(values | changes))
 
@@ -30,7 +32,11 @@ def estimate(**changes):
 @pytest.mark.parametrize("name", [n for n in TERMS if n != "prior_pull"])
 def test_a_perfect_estimate_costs_nothing(name):
     term = TERMS[name]
-    value = term.function(estimate(), **{"eta": 0.85, "pyramid_levels": 3}) if term.options else term.function(estimate())
+    value = (
+        term.function(estimate(), **{"eta": 0.85, "pyramid_levels": 3})
+        if term.options
+        else term.function(estimate())
+    )
     torch.testing.assert_close(value, torch.zeros(2), atol=1e-5, rtol=0)
 
 
