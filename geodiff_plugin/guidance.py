@@ -251,6 +251,10 @@ class GeometryGuidance(ConfigMixin):
         """The right images, ``(3, H, W)`` float32 in [0, 1] each, native size."""
         return list(self._rights)
 
+    def denoising_steps(self, asked: int | None, pipeline_default: int | None) -> int:
+        """Steps of a guided call: as asked, else the pipeline's default, at least ``min_steps``."""
+        return asked if asked is not None else max(pipeline_default or 1, self.config.min_steps)
+
     def prepare(self, lefts_01: Tensor) -> list[Evidence]:
         """Let the views speak: one cost volume (and its matches, if a term asks) per image.
 

@@ -75,8 +75,8 @@ class _GuidedCall:
         bound = inspect.signature(super().__call__).bind(image, *args, **kwargs)
         bound.apply_defaults()
         call = bound.arguments
-        if call["num_inference_steps"] is None:
-            call["num_inference_steps"] = max(self.default_denoising_steps or 1, guidance.config.min_steps)
+        asked = call["num_inference_steps"]
+        call["num_inference_steps"] = guidance.denoising_steps(asked, self.default_denoising_steps)
         wants_dict, wants_latent = call["return_dict"], call["output_latent"]
         processor, device = self.image_processor, self._execution_device
         native = processor.preprocess(image, 0, device=device, dtype=torch.float32)  # [-1, 1], padded

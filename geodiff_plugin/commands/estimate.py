@@ -77,21 +77,21 @@ def guided_call(pipe: Any, inputs: Inputs, arguments: DepthArguments) -> MetricD
     Raises:
         ValueError: what only both views together show, such as no overlap.
     """
-    steps = arguments.steps or pipe.config.get("default_denoising_steps")
-    total = steps * arguments.ensemble if steps else None
+    steps = inputs.guidance.denoising_steps(arguments.steps, pipe.config.get("default_denoising_steps"))
     options = {
-        "num_inference_steps": arguments.steps,
+        "num_inference_steps": steps,
         "processing_resolution": arguments.resolution,
         "ensemble_size": arguments.ensemble,
         "output_uncertainty": arguments.ensemble > 1,
         "generator": torch.Generator("cpu").manual_seed(arguments.seed),
     }
-    with tqdm(total=total, desc="guided steps", disable=arguments.quiet, file=sys.stderr, leave=False) as bar:
+    total, quiet = steps * arguments.ensemble, arguments.quiet
+    with tqdm(total=total, desc="guided steps", disable=quiet, file=sys.stderr, leave=False) as bar:
 
         def show(_pipe: Any, _step: int, _timestep: Any, now: dict[str, Any]) -> dict[str, Any]:
             bar.update(1)
             bar.set_postfix(loss=f"{float(torch.as_tensor(now['loss']).mean()):.4f}")
             return {}
 
-        callback = {} if arguments.quiet else {"callback_on_step_end": show}
+        callback = {} if quiet else {"callback_on_step_end": show}
         return pipe(inputs.left, guidance=inputs.guidance, **options, **callback)

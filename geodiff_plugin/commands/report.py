@@ -25,7 +25,7 @@ PACKAGES = ("geodiff-plugin", "torch", "diffusers", "transformers", "accelerate"
 
 def versions() -> dict[str, str]:
     """Version of Python and of every package that a result depends on."""
-    found = {"python": platform.python_version(), "platform": platform.platform()}
+    found = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
     for name in PACKAGES:
         try:
             found[name] = version(name)
