@@ -183,16 +183,21 @@ class GeometryGuidance(ConfigMixin):
 
     @classmethod
     def from_calibration(
-        cls, right: Any, path: str | Path | tuple[str | Path, str | Path], **kwargs: Any
+        cls,
+        right: Any,
+        path: str | Path | tuple[str | Path, str | Path],
+        cameras: tuple[int, int] | None = None,
+        **kwargs: Any,
     ) -> GeometryGuidance:
         """Read K and E from a calibration file (or a pair of files, one a view), format told by its content.
 
         Args:
             right: as in the constructor.
             path: file, or tuple of two files; formats are listed in docs/calibration.md.
+            cameras: (left, right) numbers in a file that has more than two, such as KITTI's.
             **kwargs: hyperparameters.
         """
-        rig = read_calibration(path)
+        rig = read_calibration(path, cameras=cameras)
         return cls(right, (rig.K_left, rig.K_right), rig.E, **kwargs)
 
     @classmethod

@@ -160,3 +160,15 @@ def test_paper_preset_is_the_paper():
     assert config.weights == {"photometric": 1.0, "prior_pull": 1e-2}
     assert (config.eta, config.inner_steps, config.pull_to) == (0.85, 1, "zero")
     assert (config.search, config.g_s_range) == ("one-number", (1.0, 80.0))
+
+
+def test_from_calibration_picks_the_cameras(tmp_path):
+    lines = []
+    for number, shift in enumerate((0.0, 0.5, 0.0, 0.3)):
+        row = [60.0, 0, 31.5, -60.0 * shift, 0, 60.0, 23.5, 0, 0, 0, 1, 0]
+        lines.append(f"P{number}: " + " ".join(map(str, row)))
+    (tmp_path / "calib.txt").write_text("\n".join(lines) + "\n")
+    for cameras, baseline in (((0, 1), 0.5), ((2, 3), 0.3)):
+        guidance = GeometryGuidance.from_calibration(RIGHT, tmp_path / "calib.txt", cameras)
+        assert guidance.rigs[0].E[0, 3] == pytest.approx(baseline)
+        np.testing.assert_allclose(guidance.rigs[0].K_left, K)
