@@ -45,7 +45,7 @@ class ScaleSearch:
         near_m: metres, depth of the nearest end of the relative map.
         far_m: metres, depth of its farthest end.
         cost: mean clamped census cost there, [0, 0.35].
-        on_edge: the best pair touches the edge of the range that was searched.
+        on_edge: the best pair touches the far end of the range, or the near end of a given range.
         kept: the current state was as good and stays.
     """
 
@@ -172,7 +172,8 @@ def search_scale(
             n, f = n.exp().clamp(low, high), f.exp().clamp(low, high)
             near, far, mean = best_of(torch.minimum(n, f), torch.maximum(n, f))
             reach = reach / (FINE - 1) * 2
-        on_edge = (near <= low * 1.02) | (far >= high * 0.98)
+        # The volume's own near end lies nearer than anything seen, so only a given one can cut a scene off.
+        on_edge = (far >= high * 0.98) | ((near <= low * 1.02) & (depth_range is not None))
         kept = torch.zeros((), dtype=torch.bool, device=x.device)
         if current is not None:
             a, c = (v[b : b + 1] for v in current)

@@ -55,6 +55,12 @@ def make_vae(seed: int = 1) -> AutoencoderKL:
     )
 
 
+def make_text_encoder(seed: int = 2) -> CLIPTextModel:
+    torch.manual_seed(seed)
+    size = {"hidden_size": 8, "intermediate_size": 8, "num_attention_heads": 2, "num_hidden_layers": 1}
+    return CLIPTextModel(CLIPTextConfig(**size, vocab_size=4))
+
+
 @pytest.fixture(scope="session")
 def tokenizer(tmp_path_factory) -> CLIPTokenizer:
     folder = tmp_path_factory.mktemp("tokenizer")
@@ -69,17 +75,11 @@ def make_pipeline(tokenizer):
     """Factory of tiny random Marigold pipelines; the same seed gives the same weights."""
 
     def make(scheduler=None, prediction_type: str = "depth") -> MarigoldDepthPipeline:
-        torch.manual_seed(2)
-        text = CLIPTextModel(
-            CLIPTextConfig(
-                hidden_size=8, intermediate_size=8, num_attention_heads=2, num_hidden_layers=1, vocab_size=4
-            )
-        )
         pipe = MarigoldDepthPipeline(
             unet=make_unet(),
             vae=make_vae(),
             scheduler=scheduler or DDIMScheduler(**SCHEDULER),
-            text_encoder=text,
+            text_encoder=make_text_encoder(),
             tokenizer=tokenizer,
             prediction_type=prediction_type,
             default_denoising_steps=2,
@@ -177,11 +177,6 @@ def make_oracle(tokenizer):
     def make(relative: np.ndarray, prediction_type: str = "depth") -> MarigoldDepthPipeline:
         unet = OracleUNet()
         unet.relative = torch.from_numpy(relative)[None, None].float()
-        text = CLIPTextModel(
-            CLIPTextConfig(
-                hidden_size=8, intermediate_size=8, num_attention_heads=2, num_hidden_layers=1, vocab_size=4
-            )
-        )
         scheduler = DDIMScheduler(
             **{
                 **SCHEDULER,
@@ -194,7 +189,7 @@ def make_oracle(tokenizer):
             unet=unet,
             vae=OracleVAE(),
             scheduler=scheduler,
-            text_encoder=text,
+            text_encoder=make_text_encoder(),
             tokenizer=tokenizer,
             prediction_type=prediction_type,
             default_denoising_steps=2,
