@@ -93,7 +93,8 @@ def measure(gradient: str | None, full_size: bool, device_name: str) -> Cost:
 
     Args:
         gradient: of the guidance; ``None`` for the plain pipeline.
-        full_size: Marigold v1-1 with random weights at 256 px and 1 step, or the bundled prior as it comes.
+        full_size: Marigold v1-1 with random weights at 256 px, 1 step and 1 update, or the bundled prior
+            with the default guidance; plain and guided calls run the same number of steps.
         device_name: torch device.
     """
     device = torch.device(device_name)
@@ -101,12 +102,14 @@ def measure(gradient: str | None, full_size: bool, device_name: str) -> Cost:
     pipe = random_marigold(device=device) if full_size else load_prior("bundled", device=device)
     pipe.set_progress_bar_config(disable=True)
     enable_geometry_guidance(pipe)
-    options: dict[str, Any] = {}
+    knobs = {"inner_steps": 1, "min_steps": 1} if full_size else {}
+    cameras = (pair.rig.K_left, pair.rig.K_right), pair.rig.E
+    guidance = GeometryGuidance(pair.right, *cameras, gradient=gradient or "denoised", **knobs)
+    options: dict[str, Any] = {"num_inference_steps": guidance.denoising_steps(None, 1)}
     if full_size:
-        options = {"num_inference_steps": 1, "processing_resolution": FULL_SIZE_RESOLUTION}
+        options["processing_resolution"] = FULL_SIZE_RESOLUTION
     if gradient is not None:
-        cameras = (pair.rig.K_left, pair.rig.K_right), pair.rig.E
-        options["guidance"] = GeometryGuidance(pair.right, *cameras, gradient=gradient)
+        options["guidance"] = guidance
 
     def call() -> None:
         pipe(pair.left, generator=torch.Generator("cpu").manual_seed(0), **options)
@@ -129,7 +132,9 @@ def run_bench(full_size: bool, device_name: str) -> None:
         ValueError: no such device.
     """
     device = pick_device(device_name)
-    prior = "Marigold v1-1's configuration, random weights, 256 px, 1 step" if full_size else "bundled prior"
+    prior = "bundled prior, default guidance"
+    if full_size:
+        prior = "Marigold v1-1's configuration, random weights, 256 px, 1 step, 1 update"
     print(f"{prior}; {device}, {torch.get_num_threads()} threads, torch {torch.__version__}; demo pair")
     print(f"{'':<28}{'seconds':>9}{'peak MB':>9}{'time x':>8}{'memory x':>10}", flush=True)
     plain = None
