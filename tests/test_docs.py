@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import geodiff_plugin
-from geodiff_plugin.bundled import PRIOR_FOLDER
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -26,9 +25,6 @@ BLOCKS = [
 ]
 
 
-@pytest.mark.skipif(
-    not (PRIOR_FOLDER / "model_index.json").is_file(), reason="the bundled prior is not there"
-)
 @pytest.mark.parametrize("block", BLOCKS)
 def test_block_runs(block, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
