@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from geodiff_plugin.evidence import Evidence, chunk_views
+from geodiff_plugin.matching import gate_matches
 from geodiff_plugin.metric import AffineState, MetricMap, smooth_floor
 from geodiff_plugin.objective import Loss, Objective
 from geodiff_plugin.scale_search import argmin_over, refine_to_matches, search_scale
@@ -125,11 +126,13 @@ class Trajectory:
         own = [self.evidence[i].matches for i in self.owners]
         if own[0] is None:
             return
-        inverse_depth = torch.stack([m.inverse_depth for m in own])
-        confidence = torch.stack([m.confidence for m in own])
-        ratio = inverse_depth * self.objective.metric_depth(x, self.affine)
-        confidence = confidence * ((ratio < factor) & (ratio > 1.0 / factor))
-        self.matches = MatchTarget(inverse_depth, confidence, torch.stack([m.plane_step for m in own]))
+        depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
+        gated = [gate_matches(m, d[None], factor) for m, d in zip(own, depth_m, strict=True)]
+        self.matches = MatchTarget(
+            torch.stack([m.inverse_depth for m in own]),
+            torch.cat(gated),
+            torch.stack([m.plane_step for m in own]),
+        )
 
     def report(self, step: int, timestep: float, loss: Loss) -> None:
         """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
