@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.baselines import METHODS, Settings
+from geodiff_plugin.evaluation.baselines import METHODS, Settings, find_method
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.report import run_facts, write_tables, write_text
@@ -33,7 +33,7 @@ class PairsOptions:
 
     Attributes:
         data: folder that holds data sets in their official layouts.
-        methods: names in ``METHODS``.
+        methods: names that ``find_method`` knows.
         datasets: names in ``DATASETS``, empty for all.
         scenes: parts of sample names to keep, empty for all.
         limit: at most so many samples; ``None`` for all.
@@ -114,7 +114,7 @@ def _remarks(records: Sequence[dict[str, Any]], settings: Settings) -> list[str]
     reasons: dict[tuple[str, str], int] = {}
     for record in records:
         if record["status"] == "not applicable":
-            key = (METHODS[record["method"]].title, record["reason"])
+            key = (find_method(record["method"]).title, record["reason"])
             reasons[key] = reasons.get(key, 0) + 1
     remarks += [f"{title}: '-' for {n} pairs, {reason}." for (title, reason), n in reasons.items()]
     broken = [record for record in records if record["status"] == "broken"]

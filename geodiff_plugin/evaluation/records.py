@@ -23,7 +23,7 @@ def record_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior
 
     Args:
         ref: the sample; its paths do not count, its other entries (cameras, views) do.
-        method: name in ``METHODS``.
+        method: its name.
         configuration: everything that changes the method's result beside the prior, JSON values.
         prior: name and fingerprint of the prior, empty for a method without one.
         version: of this package.

@@ -18,8 +18,7 @@ from accelerate import PartialState
 from tqdm import tqdm
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import check_choice
-from geodiff_plugin.evaluation.baselines import METHODS
+from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets import DATASETS, load
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
@@ -138,7 +137,7 @@ def run(
 
     Args:
         refs: samples.
-        methods: names in ``METHODS``.
+        methods: names that ``find_method`` knows.
         settings: the user's choices, the same for every method.
         out: folder of ``samples.jsonl``; made where missing.
         skip_broken: go on after a sample that cannot be read or measured; its record says why.
@@ -154,7 +153,7 @@ def run(
         ValueError: an unknown method, no samples, or a broken sample without ``skip_broken``.
         OSError: a missing or unreadable file without ``skip_broken``.
     """
-    chosen = [METHODS[check_choice(name, "methods", METHODS)] for name in methods]
+    chosen = [find_method(name) for name in methods]
     state, priors, out = processes(settings), PriorCache(), Path(out)
     path = out / RECORDS_NAME
     if state.is_main_process:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from geodiff_plugin.evaluation.baselines import METHODS
+from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.runner import headline
 from geodiff_plugin.evaluation.statistics import Mean, mean_with_interval, paired_difference
 
@@ -133,7 +133,7 @@ def per_pair_table(
         )
         if members:
             rows.append((f"mean of {group}", *(_cell(mean, digits) for mean in means)))
-    return Table(title, ("pair", *(METHODS[m].title for m in values)), tuple(rows), note)
+    return Table(title, ("pair", *(find_method(m).title for m in values)), tuple(rows), note)
 
 
 def _summary_cells(scores: Sequence[dict[str, float | None]]) -> tuple[str, ...]:
@@ -159,8 +159,8 @@ def summary_table(records: Sequence[dict[str, Any]], members: set[str], title: s
             if record["method"] == method and record["status"] == "ok" and _label(record) in members
         ]
         for column, name in (
-            ("raw", METHODS[method].title),
-            ("aligned", f"{METHODS[method].title}, aligned"),
+            ("raw", find_method(method).title),
+            ("aligned", f"{find_method(method).title}, aligned"),
         ):
             scores = [both[column] for both in own if both[column] is not None]
             if scores:
@@ -181,14 +181,14 @@ def versus_table(records: Sequence[dict[str, Any]], reference: str) -> Table:
             )
             rows.append(
                 (
-                    METHODS[method].title,
+                    find_method(method).title,
                     str(difference.count),
                     _with_interval(difference, signed=True),
                     f"{wins} of {difference.count}",
                 )
             )
     return Table(
-        f"{METHODS[reference].title} against each other method, AbsRel",
+        f"{find_method(reference).title} against each other method, AbsRel",
         ("method", "pairs", "mean difference [95 %]", "pairs won"),
         tuple(rows),
         "Negative: fewer errors. An interval without 0 tells the two apart.",

@@ -60,8 +60,7 @@ def bench(monkeypatch, tmp_path):
         "double": make_method("double", rectified_only, calls),
     }
     samples = {name: make_sample(name, name != "c") for name in "abc"}
-    monkeypatch.setattr(runner, "METHODS", methods)
-    monkeypatch.setattr("geodiff_plugin.evaluation.tables.METHODS", methods)
+    monkeypatch.setattr("geodiff_plugin.evaluation.baselines.METHODS", methods)
     monkeypatch.setattr(runner, "load", lambda ref: samples[ref.name])
     refs = [SampleRef("middlebury2014", name, {"left": Path(name)}) for name in samples]
 

@@ -6,6 +6,9 @@ Paper: S5.1 (compared methods), S5.3 (ablation).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines.base import (
     Method,
     NotApplicable,
@@ -22,7 +25,16 @@ from geodiff_plugin.evaluation.baselines.search_only import SEARCH_ONLY
 from geodiff_plugin.evaluation.baselines.sgbm import SGBM
 from geodiff_plugin.evaluation.baselines.sweep_sgm import SWEEP_SGM
 
-__all__ = ["METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
+__all__ = [
+    "FAMILIES",
+    "METHODS",
+    "Method",
+    "NotApplicable",
+    "Prediction",
+    "PriorCache",
+    "Settings",
+    "find_method",
+]
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -38,3 +50,24 @@ METHODS: dict[str, Method] = {
     )
 }
 """Every method by name, in the order of the tables' columns."""
+
+FAMILIES: dict[str, Callable[[str], Method]] = {}
+"""Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter."""
+
+
+def find_method(name: str) -> Method:
+    """The method of a name.
+
+    Args:
+        name: a key of ``METHODS``, or ``family:parameter`` with a key of ``FAMILIES``.
+
+    Raises:
+        ValueError: neither; or the family's own error about its parameter.
+    """
+    if name in METHODS:
+        return METHODS[name]
+    family, colon, parameter = name.partition(":")
+    if colon and family in FAMILIES:
+        return FAMILIES[family](parameter)
+    known = [*METHODS, *(f"{key}:..." for key in FAMILIES)]
+    bad_value("methods", f"one of {', '.join(known)}", repr(name))
