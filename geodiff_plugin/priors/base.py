@@ -1,6 +1,6 @@
-"""What a live pipeline must tell us to be guided; a prior never sees a camera.
+"""What a live pipeline must tell us to be guided, and how its folder is known; a prior never sees a camera.
 
-Hop: pipeline -> ``DepthPrior`` -> decode, space, denoiser, grid.
+Hop: folder -> pipeline -> ``DepthPrior`` -> network, decode, space.
 Paper: S4 ("can be integrated with any DB-MDE framework following a similar schema").
 """
 
@@ -11,29 +11,96 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-__all__ = ["DepthPrior"]
+from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.loading import build_pipeline
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+
+__all__ = ["DepthPrior", "OwnPipelinePrior"]
 
 
 class DepthPrior(Protocol):
     """Adapter of one kind of pipeline.
 
+    The grid needs no word of its own: the pipeline's ``image_processor`` resizes and pads, what it returns
+    tells scale per axis and padding, and ``decode`` answers on that padded grid.
+
     Attributes:
         space: what the decoded map is affine in, key of ``metric.SPACES``.
+        max_steps: most denoising steps that make sense, ``None`` for any number. A guided call of a prior
+            with one step makes as many updates in it as it would have made in ``min_steps`` steps.
+        deterministic: the same image gives the same map, so that an ensemble has one member.
+        latents: channels of the scheduler's latents that are depth; no gradient step touches the others.
+        network_input: channels of the network's first argument that are the depth latent z_t; ``None``
+            where the network is not told z_t, so that only its answer can be guided.
+        licence: of the weights by hub id, for those that are known.
     """
 
     space: str
+    max_steps: int | None
+    deterministic: bool
+    latents: slice
+    network_input: slice | None
+    licence: dict[str, str]
 
     @staticmethod
     def matches(pipe: Any) -> bool:
-        """Whether this adapter understands the pipeline."""
+        """Whether this adapter understands the live pipeline."""
+
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """Whether a folder is of this kind, told by its component configs, never by ``_class_name``."""
+
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
+        """The pipeline of a folder that it recognises; ``space`` is what the user said, or ``None``.
+
+        Raises:
+            ValueError: weights missing or left over; a space that cannot be told.
+        """
 
     def __init__(self, pipe: Any) -> None: ...
 
-    def denoiser(self) -> torch.nn.Module:
-        """The module that predicts from z_t, called once a step."""
-
-    def split_input(self, model_input: Tensor) -> tuple[Tensor, Tensor]:
-        """Condition and depth latent of the denoiser's input, in the order in which it concatenates them."""
+    def network(self) -> tuple[Any, str]:
+        """Where the loop calls the network once a step: an object and the name of the method on it."""
 
     def decode(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map ``(B, 1, H, W)`` float32, about [0, 1], with the graph of the latents."""
+        """Unclipped relative map ``(B, 1, H, W)`` float32, about [0, 1], with the graph of the depth latents."""
+
+
+class OwnPipelinePrior:
+    """Adapter of a ``DepthDiffusionPipeline``, which says of itself what guidance must know.
+
+    A subclass names its ``pipeline_class`` and writes ``recognises``; ``load`` if its folder is not in
+    diffusers' layout.
+
+    Args:
+        pipe: the live pipeline.
+    """
+
+    pipeline_class: type[DepthDiffusionPipeline]
+    licence: dict[str, str] = {}
+
+    def __init__(self, pipe: DepthDiffusionPipeline) -> None:
+        self._pipe = pipe
+        self.space = pipe.config.prediction_type
+        self.max_steps, self.deterministic = pipe.max_steps, pipe.deterministic
+        self.latents = pipe.depth_channels
+        self.network_input = pipe.depth_channels if pipe.sees_latents else None
+
+    @classmethod
+    def matches(cls, pipe: Any) -> bool:
+        """Any instance of ``pipeline_class``."""
+        return isinstance(pipe, cls.pipeline_class)
+
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> DepthDiffusionPipeline:
+        """Components by the names of the constructor, each from its own subfolder."""
+        return build_pipeline(cls.pipeline_class, layout, dtype, prediction_type=space)
+
+    def network(self) -> tuple[Any, str]:
+        """The pipeline's own ``denoise``, whose first argument is the latents."""
+        return self._pipe, "denoise"
+
+    def decode(self, z0: Tensor) -> Tensor:
+        """The pipeline's ``decode_relative``."""
+        return self._pipe.decode_relative(z0)

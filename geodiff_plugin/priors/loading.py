@@ -1,0 +1,124 @@
+"""Components of a folder, strictly: every weight has a place and every place a weight.
+
+Hop: ``Layout`` -> modules of diffusers and transformers -> pipeline.
+Paper: none.
+
+Classes come from diffusers, transformers or the caller, never from the folder; weights from safetensors only.
+"""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import diffusers
+import torch
+import transformers
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.priors.layout import Layout
+
+__all__ = ["build_pipeline", "check_weights", "component_class", "load_component"]
+
+#: Keys listed in an error before it says how many more there are.
+LISTED_KEYS = 12
+LIBRARIES = {"diffusers": diffusers, "transformers": transformers}
+
+
+def check_weights(missing: Any, unexpected: Any, where: str) -> None:
+    """Refuse weights that do not fit, listing them.
+
+    Args:
+        missing: names that the module has and the file has not.
+        unexpected: names that the file has and the module has not.
+        where: the folder or file, for the message.
+
+    Raises:
+        ValueError: there is any.
+    """
+    parts = []
+    for label, keys in (("missing", sorted(missing)), ("unexpected", sorted(unexpected))):
+        if keys:
+            more = f" and {len(keys) - LISTED_KEYS} more" if len(keys) > LISTED_KEYS else ""
+            parts.append(f"{label}: {', '.join(map(str, keys[:LISTED_KEYS]))}{more}")
+    if parts:
+        cure = "These weights are of another architecture, or the file is damaged."
+        bad_value(f"weights in {where}", "those of its config, name by name", "; ".join(parts), cure)
+
+
+def component_class(layout: Layout, name: str) -> type:
+    """The class of a component as ``model_index.json`` names it, out of diffusers or transformers.
+
+    Raises:
+        ValueError: not named, or of another library.
+    """
+    entry = layout.index.get(name)
+    library, cls = entry if isinstance(entry, list) and len(entry) == 2 else (None, None)
+    found = getattr(LIBRARIES.get(library), str(cls), None)
+    if not isinstance(found, type):
+        bad_value(
+            f"component {name!r} in {layout.folder / 'model_index.json'}",
+            "a class of diffusers or transformers",
+            repr(entry),
+            "Code that comes with weights is never run.",
+        )
+    return found
+
+
+def load_component(layout: Layout, name: str, cls: type, dtype: torch.dtype) -> Any:
+    """One component of a folder; a module's weights are checked name by name, and it is in eval mode.
+
+    Args:
+        layout: of the folder.
+        name: of the subfolder; ``""`` for the folder itself.
+        cls: with ``from_pretrained``.
+        dtype: of a module's weights.
+
+    Raises:
+        ValueError: weights missing or left over.
+        OSError: no such files.
+    """
+    folder = str(layout.folder / name)
+    if not issubclass(cls, torch.nn.Module):
+        return cls.from_pretrained(folder, local_files_only=True)
+    options: dict[str, Any] = {"use_safetensors": True, "local_files_only": True}
+    if layout.variant is not None:
+        options["variant"] = layout.variant
+    module, found = cls.from_pretrained(folder, dtype=dtype, output_loading_info=True, **options)
+    if found.get("mismatched_keys"):
+        check_weights((), [entry[0] for entry in found["mismatched_keys"]], folder)
+    check_weights(found["missing_keys"], found["unexpected_keys"], folder)
+    return module.eval()
+
+
+def build_pipeline(
+    cls: type,
+    layout: Layout,
+    dtype: torch.dtype,
+    classes: dict[str, type] | None = None,
+    **options: Any,
+) -> Any:
+    """A pipeline from the components that its constructor names and the options that the index holds.
+
+    Args:
+        cls: pipeline class; its constructor's parameters are components and options.
+        layout: of the folder.
+        dtype: of the weights.
+        classes: for components whose class is not what the index says.
+        **options: constructor arguments that go before the index's; ``None`` is left out.
+
+    Raises:
+        ValueError: a component that the folder lacks, weights that do not fit.
+    """
+    arguments: dict[str, Any] = {}
+    for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:
+        given = options.get(name, layout.index.get(name))
+        if name in (classes or {}):
+            arguments[name] = load_component(layout, name, classes[name], dtype)
+        elif isinstance(layout.index.get(name), list) and layout.index[name][0] is not None:
+            arguments[name] = load_component(layout, name, component_class(layout, name), dtype)
+        elif not isinstance(given, list) and given is not None:
+            arguments[name] = given
+        elif parameter.default is parameter.empty:
+            bad_value(str(layout.folder), f"a folder with the component {name!r}", "none of that name")
+    return cls(**arguments)

@@ -1,0 +1,5 @@
+"""Pipelines of ours for priors whose own code lives outside diffusers, one a file.
+
+Hop: component configs and weights -> ``DepthDiffusionPipeline`` with the surface of ``MarigoldDepthPipeline``.
+Paper: S4 (any diffusion-based depth model with iterative updates).
+"""
