@@ -1,4 +1,4 @@
-"""What a run leaves behind: ``table.md``, ``table.tex``, ``table.json``, and a page for the docs.
+"""What a run leaves behind: tables as ``.md``, ``.tex``, ``.json``, and a page for the docs.
 
 Hop: tables + command + versions -> files.
 Paper: none.
@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from geodiff_plugin.commands.report import versions
-from geodiff_plugin.evaluation.tables import Table
+from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.formats import atomic_path
 
 __all__ = ["markdown_page", "run_facts", "write_text", "write_tables"]
@@ -68,16 +68,21 @@ def markdown_page(title: str, facts: dict[str, Any], tables: Sequence[Table], re
 
 
 def write_tables(
-    out: Path, title: str, facts: dict[str, Any], tables: Sequence[Table], remarks: Sequence[str]
+    out: Path,
+    title: str,
+    facts: dict[str, Any],
+    tables: Sequence[Table],
+    remarks: Sequence[str],
+    stem: str = "table",
 ) -> str:
-    """Write ``table.md``, ``table.tex`` and ``table.json`` into ``out``.
+    """Write ``table.md``, ``table.tex`` and ``table.json`` (or another ``stem``) into ``out``.
 
     Returns:
         The Markdown page.
     """
     page = markdown_page(title, facts, tables, remarks)
-    write_text(out / "table.md", page)
-    write_text(out / "table.tex", "\n".join(table.latex() for table in tables))
+    write_text(out / f"{stem}.md", page)
+    write_text(out / f"{stem}.tex", "\n".join(table.latex() for table in tables))
     plain = facts | {"remarks": list(remarks), "tables": [table.as_json() for table in tables]}
-    write_text(out / "table.json", json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
+    write_text(out / f"{stem}.json", json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
     return page

@@ -18,6 +18,7 @@ from accelerate import PartialState
 from tqdm import tqdm
 
 from geodiff_plugin import __version__
+from geodiff_plugin.commands.bench import PeakMemory
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets import DATASETS, load
@@ -67,13 +68,15 @@ def _measure(
     """Run and score one method on one sample."""
     start = time.perf_counter()
     try:
-        prediction = method.run(sample, settings, priors)
+        with PeakMemory(torch.device(settings.device)) as memory:
+            prediction = method.run(sample, settings, priors)
     except NotApplicable as reason:
         return {"status": "not applicable", "reason": str(reason)}, None
     seconds = time.perf_counter() - start
     scores = score(sample, prediction, DATASETS[sample.dataset].cap_m)
     notes = {"sample": dict(sample.notes), "method": dict(prediction.notes)}
-    return {"status": "ok", "seconds": round(seconds, 3), **scores, "notes": notes}, prediction
+    cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
+    return {"status": "ok", **cost, **scores, "notes": notes}, prediction
 
 
 def _finish(

@@ -1,20 +1,20 @@
-"""Records to tables: Markdown, LaTeX, JSON.
+"""Records to the tables of ``geodiff eval pairs``.
 
-Hop: records -> ``Table`` -> text.
-Paper: Tables 1 to 3 in layout; intervals and paired differences are ours.
+Hop: records -> ``Table``.
+Paper: none; per pair, with intervals and paired differences.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from geodiff_plugin.evaluation.baselines import find_method
+from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.runner import headline
 from geodiff_plugin.evaluation.statistics import Mean, mean_with_interval, paired_difference
 
-__all__ = ["Table", "groups", "pairs_tables", "per_pair_table", "summary_table", "versus_table"]
+__all__ = ["groups", "pairs_tables", "per_pair_table", "summary_table", "versus_table"]
 
 _SUMMARY = ("abs_rel", "delta1", "delta2", "delta3", "rmse", "log_rmse", "silog")
 _HEADINGS = {
@@ -26,45 +26,6 @@ _HEADINGS = {
     "log_rmse": "log RMSE",
     "silog": "SILog",
 }
-_LATEX = str.maketrans({"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "δ": r"$\delta$", "±": r"$\pm$"})
-
-
-@dataclass(frozen=True)
-class Table:
-    """Cells as they are printed.
-
-    Attributes:
-        title: heading, one line.
-        header: column headings; the first column names the row.
-        rows: as long as the header each.
-        note: what a reader needs beside it, or empty.
-    """
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
-
-    def markdown(self) -> str:
-        """A heading, the note and a pipe table."""
-        lines = [f"## {self.title}", ""]
-        if self.note:
-            lines += [self.note, ""]
-        lines += ["| " + " | ".join(self.header) + " |", "| --- |" + " ---: |" * (len(self.header) - 1)]
-        lines += ["| " + " | ".join(row) + " |" for row in self.rows]
-        return "\n".join(lines) + "\n"
-
-    def latex(self) -> str:
-        """A ``tabular`` with booktabs rules, its title as a comment."""
-        body = [" & ".join(cell.translate(_LATEX) for cell in row) + r" \\" for row in self.rows]
-        head = " & ".join(cell.translate(_LATEX) for cell in self.header) + r" \\"
-        columns = "l" + "r" * (len(self.header) - 1)
-        rule = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", head, r"\midrule"]
-        return "\n".join([f"% {self.title}", *rule, *body, r"\bottomrule", r"\end{tabular}"]) + "\n"
-
-    def as_json(self) -> dict[str, Any]:
-        """The same as plain values."""
-        return {"title": self.title, "note": self.note, "header": list(self.header), "rows": list(self.rows)}
 
 
 def _cell(value: float | None, digits: int = 3) -> str:

@@ -24,6 +24,7 @@ from geodiff_plugin.evaluation.baselines.scale_shift_only import SCALE_SHIFT_ONL
 from geodiff_plugin.evaluation.baselines.search_only import SEARCH_ONLY
 from geodiff_plugin.evaluation.baselines.sgbm import SGBM
 from geodiff_plugin.evaluation.baselines.sweep_sgm import SWEEP_SGM
+from geodiff_plugin.evaluation.baselines.variants import default_variant, paper_variant
 
 __all__ = [
     "FAMILIES",
@@ -51,7 +52,10 @@ METHODS: dict[str, Method] = {
 }
 """Every method by name, in the order of the tables' columns."""
 
-FAMILIES: dict[str, Callable[[str], Method]] = {}
+FAMILIES: dict[str, Callable[[str], Method]] = {
+    "guided": default_variant,
+    "paper": paper_variant,
+}
 """Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter."""
 
 
