@@ -44,6 +44,7 @@ class Evidence:
         T_right_from_left: ``(4, 4)`` metres.
         volume: plane-sweep costs, or ``None`` where the configuration does not search it.
         matches: aggregated, left-right checked, or ``None`` where no term asks.
+        sweep_matches: the same on the grid of the sweep, which is finer for wide images.
         warning: a sentence for the user, or empty.
     """
 
@@ -54,6 +55,7 @@ class Evidence:
     T_right_from_left: Tensor
     volume: CostVolume | None
     matches: Matches | None
+    sweep_matches: Matches | None
     warning: str = ""
 
 
@@ -107,7 +109,7 @@ def prepare_evidence(
     ratio = float(K_loss[0, 0] / K_right[0, 0])
     long_edge = round(max(right_01.shape[-2:]) * min(1.0, ratio))
     right, K_right_loss = resize_long_edge(right_01, K_right, long_edge)
-    volume, matches, warning = None, None, ""
+    volume, found, matches, warning = None, None, None, ""
     if needs_volume or needs_matches:
         # The sweep chooses its own grid, finer than that of the losses for wide images.
         rights = [(right_01, K_right, T_right_from_left)]
@@ -115,8 +117,9 @@ def prepare_evidence(
         if mirrored_pose_preferred(left_01, rights, K_left).preferred:
             warning = SWAPPED
     if needs_matches:
-        matches = _on_grid(find_matches(left_01, rights, K_left, volume=volume), left, K_loss)
-    return Evidence(left, right, K_loss, K_right_loss, T_right_from_left, volume, matches, warning)
+        found = find_matches(left_01, rights, K_left, volume=volume)
+        matches = _on_grid(found, left, K_loss)
+    return Evidence(left, right, K_loss, K_right_loss, T_right_from_left, volume, matches, found, warning)
 
 
 def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:

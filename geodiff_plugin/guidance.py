@@ -74,6 +74,8 @@ class GeometryGuidance(ConfigMixin):
         depth_range: ``(near, far)`` metres that bound the search, or ``None``.
         gate: factors around the estimate within which matches are believed, at the first and last step.
         loss_resolution: pixels, bound of the longer side of the grid that losses are computed on.
+        refine: bring the result to its matches at full resolution, edge-aware (``refinement.refine_depth``);
+            without a ``matches`` term there is nothing to bring it to.
         respace: run a ``leading`` DDIM schedule as ``trailing`` for guided calls.
 
     Raises:
@@ -113,6 +115,7 @@ class GeometryGuidance(ConfigMixin):
         depth_range: tuple[float, float] | None = None,
         gate: tuple[float, float] = (20.0, 3.0),
         loss_resolution: int = 640,
+        refine: bool = True,
         respace: bool = True,
     ) -> None:
         weights = dict(DEFAULT_WEIGHTS if weights is None else weights)
@@ -143,6 +146,7 @@ class GeometryGuidance(ConfigMixin):
             depth_range=check_range(depth_range, "depth_range"),
             gate=check_range(gate[::-1], "gate, last before first,")[::-1],
             loss_resolution=check_number(loss_resolution, "loss_resolution", 32, 1 << 16, integer=True),
+            refine=bool(refine),
             respace=bool(respace),
         )
         rights = list(right) if isinstance(right, list) else [right]

@@ -17,6 +17,7 @@ from geodiff_plugin.geometry.cameras import resize_intrinsics
 from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.integration.run import GuidedRun
+from geodiff_plugin.refinement import refine_depth
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["assemble_output"]
@@ -48,6 +49,7 @@ def assemble_output(
     if output_type == "np":
         depth_m = torch.from_numpy(depth_m).permute(0, 3, 1, 2)
     depth_m = depth_m.float().to(lefts_01.device)  # (N, 1, H, W) or the processing grid
+    depth_m = _refined(run, depth_m, lefts_01)
     grid = tuple(depth_m.shape[-2:])
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
     K = torch.stack(
@@ -75,7 +77,7 @@ def assemble_output(
 
     visible_map = torch.cat(visible)
     return MetricDepthOutput(
-        prediction=stock.prediction,
+        prediction=out(depth_m),
         uncertainty=stock.uncertainty,
         relative=out(relative),
         scale=members("scale"),
@@ -87,6 +89,17 @@ def assemble_output(
         history=[report for t in run.trajectories for report in t.history],
         warnings=_warnings(run, visible_map),
     )
+
+
+def _refined(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> Tensor:
+    """The depth of every image brought to its matches, where there are any."""
+    if not run.config.refine:
+        return depth_m
+    images = []
+    for evidence, depth, left in zip(run.evidence, depth_m.split(1), lefts_01, strict=True):
+        known = evidence.sweep_matches
+        images.append(depth if known is None else refine_depth(depth, known, left).depth_m)
+    return torch.cat(images)
 
 
 def _reprojection(

@@ -1,0 +1,125 @@
+"""Bring a guided map to its matches at full resolution: what a latent cannot hold, an edge-aware fit adds.
+
+Hop: metric depth, ``Matches``, left image -> smooth log correction -> metric depth, support.
+Paper: none; its output is the decoded latent, which the decoder's grid and its blur limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import log
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.matching import Matches
+
+__all__ = ["Refined", "refine_depth"]
+
+#: A match further than this factor from the guided depth is an outlier, whatever its confidence.
+GATE = 10.0
+#: Relative error of a perfect match: below it one match is as good as another.
+MATCH_NOISE = 0.02
+#: Residual, in standard deviations of a match, from which it counts for less (Cauchy).
+CAUCHY = 2.0
+#: Weight of the correction's slope against a sure match, and of the correction itself: what is far from every
+#: match keeps the guided depth.
+SMOOTHNESS, INERTIA = 0.1, 1e-3
+#: Steps in brightness and in log depth across which a correction does not spread.
+IMAGE_EDGE, DEPTH_EDGE, LEAST_LINK = 0.1, 0.1, 1e-3
+#: Reweighted solves, and conjugate-gradient steps of each: fixed numbers, so that no device is waited for.
+REWEIGHTINGS, STEPS = 3, 60
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Result of ``refine_depth``, on the grid of the depth that it was given.
+
+    Attributes:
+        depth_m: ``(1, 1, H, W)`` metres.
+        support: ``(1, 1, H, W)`` in [0, 1]: how far matches, own or near on the same surface, decided the
+            depth; 0 where it is the guided one.
+    """
+
+    depth_m: Tensor
+    support: Tensor
+
+
+@torch.no_grad()
+def refine_depth(depth_m: Tensor, matches: Matches, left_01: Tensor) -> Refined:
+    """Least-squares correction of log depth that follows matches and stops at edges.
+
+    Args:
+        depth_m: ``(1, 1, H, W)`` metres, the guided depth at any resolution.
+        matches: of the same image, on the grid of the sweep.
+        left_01: ``(3, h, w)`` in [0, 1], the left image at any resolution.
+
+    Returns:
+        ``Refined``. With ``u`` the log of the factor on inverse depth and ``r`` what each match asks of it,
+        the minimiser of ``sum w (u - r)^2 + 0.1 sum g |grad u|^2 + 0.001 sum u^2``, where ``w`` is the
+        confidence over the match's relative variance, robustly reweighted, and ``g`` falls at edges of the
+        image and of the guided depth.
+    """
+    guide = F.interpolate(left_01[None].float(), matches.size, mode="bilinear", antialias=True)
+    coarse = F.interpolate(depth_m.float(), matches.size, mode="bilinear", align_corners=False)
+    wanted = (matches.inverse_depth[None].clamp_min(1e-9) * coarse).log()
+    noise = ((matches.plane_step / matches.inverse_depth[None].clamp_min(1e-9)) ** 2 + MATCH_NOISE**2).sqrt()
+    trusted = matches.confidence[None] * (wanted.abs() < log(GATE)) * (MATCH_NOISE / noise) ** 2
+    wanted = torch.where(trusted > 0, wanted, torch.zeros_like(wanted))
+    across, down = (_links(guide, coarse, axis) for axis in (-1, -2))
+    # Two right-hand sides in one solve: the correction, and a field of ones that shows where it is decided.
+    data = torch.cat([wanted, torch.ones_like(wanted)], 1)
+    field, weight = torch.zeros_like(data), trusted
+    for _ in range(REWEIGHTINGS):
+        field = _solve(field, data, weight, across, down)
+        residual = (field[:, :1] - wanted) / (CAUCHY * noise)
+        weight = trusted / (1.0 + residual**2)
+    field = F.interpolate(field, depth_m.shape[-2:], mode="bilinear", align_corners=False)
+    return Refined((depth_m.float() * torch.exp(-field[:, :1])).to(depth_m.dtype), field[:, 1:].clamp(0.0, 1.0))
+
+
+def _links(guide: Tensor, depth_m: Tensor, axis: int) -> Tensor:
+    """Strength with which neighbours along an axis share a correction, ``(1, 1, h, w)`` less one there."""
+    step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / IMAGE_EDGE
+    jump = depth_m.log().diff(dim=axis).abs() / DEPTH_EDGE
+    return SMOOTHNESS * torch.exp(-step - jump).clamp_min(LEAST_LINK)
+
+
+def _solve(start: Tensor, data: Tensor, weight: Tensor, across: Tensor, down: Tensor) -> Tensor:
+    """Conjugate gradients with a diagonal preconditioner, on every channel by itself."""
+
+    def spread(x: Tensor) -> Tensor:
+        flow_x, flow_y = across * x.diff(dim=-1), down * x.diff(dim=-2)
+        out = (weight + INERTIA) * x
+        out[..., 1:] += flow_x
+        out[..., :-1] -= flow_x
+        out[..., 1:, :] += flow_y
+        out[..., :-1, :] -= flow_y
+        return out
+
+    diagonal = weight + INERTIA + F.pad(across, (1, 0)) + F.pad(across, (0, 1))
+    diagonal = diagonal + F.pad(down, (0, 0, 1, 0)) + F.pad(down, (0, 0, 0, 1))
+    return _conjugate_gradients(spread, start, weight * data, diagonal)
+
+
+def _conjugate_gradients(
+    apply: Callable[[Tensor], Tensor], x: Tensor, target: Tensor, diagonal: Tensor
+) -> Tensor:
+    def dot(a: Tensor, b: Tensor) -> Tensor:
+        return (a * b).sum((-2, -1), keepdim=True)
+
+    tiny = 1e-20  # a channel that has converged stays where it is
+    residual = target - apply(x)
+    z = residual / diagonal
+    direction, along = z, dot(residual, z)
+    for _ in range(STEPS):
+        image = apply(direction)
+        length = along / dot(direction, image).clamp_min(tiny)
+        x = x + length * direction
+        residual = residual - length * image
+        z = residual / diagonal
+        before, along = along, dot(residual, z)
+        direction = z + along / before.clamp_min(tiny) * direction
+    return x
