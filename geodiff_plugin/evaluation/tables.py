@@ -10,67 +10,34 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from geodiff_plugin.evaluation.baselines import find_method
+from geodiff_plugin.evaluation.cells import (
+    HEADINGS,
+    by_method,
+    cell,
+    count_of_pairs,
+    interval_cell,
+    label_of,
+)
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.runner import headline
-from geodiff_plugin.evaluation.statistics import Mean, mean_with_interval, paired_difference
+from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
 
 __all__ = ["groups", "pairs_tables", "per_pair_table", "summary_table", "versus_table"]
 
 _SUMMARY = ("abs_rel", "delta1", "delta2", "delta3", "rmse", "log_rmse", "silog")
-_HEADINGS = {
-    "abs_rel": "AbsRel",
-    "delta1": "δ1",
-    "delta2": "δ2",
-    "delta3": "δ3",
-    "rmse": "RMSE m",
-    "log_rmse": "log RMSE",
-    "silog": "SILog",
-}
-
-
-def _cell(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _with_interval(mean: Mean, digits: int = 3, signed: bool = False) -> str:
-    if mean.count == 0:
-        return "-"
-    sign = "+" if signed else ""
-    text = f"{mean.value:{sign}.{digits}f}"
-    if mean.low is not None:
-        text += f" [{mean.low:{sign}.{digits}f}, {mean.high:{sign}.{digits}f}]"
-    return text
-
-
-def _label(record: dict[str, Any]) -> str:
-    return f"{record['dataset']}/{record['sample']}"
-
-
-def _pairs(count: int, kind: str = "") -> str:
-    return f"{count} {kind}{'pair' if count == 1 else 'pairs'}"
 
 
 def groups(records: Sequence[dict[str, Any]]) -> dict[str, set[str]]:
     """Labels of all samples, and of the rectified and the posed ones where both kinds are there."""
-    rectified = {_label(r) for r in records if r.get("rectified") is True}
-    posed = {_label(r) for r in records if r.get("rectified") is False}
-    everything = {_pairs(len(rectified | posed)): rectified | posed}
+    rectified = {label_of(r) for r in records if r.get("rectified") is True}
+    posed = {label_of(r) for r in records if r.get("rectified") is False}
+    everything = {count_of_pairs(len(rectified | posed)): rectified | posed}
     if rectified and posed:
-        everything |= {_pairs(len(rectified), "rectified "): rectified, _pairs(len(posed), "posed "): posed}
+        everything |= {
+            count_of_pairs(len(rectified), "rectified "): rectified,
+            count_of_pairs(len(posed), "posed "): posed,
+        }
     return everything
-
-
-def _by_method(
-    records: Sequence[dict[str, Any]], value_of: Callable[[dict[str, Any]], float | None]
-) -> dict[str, dict[str, float]]:
-    """``method -> label -> value`` over the finished records that have one."""
-    values: dict[str, dict[str, float]] = {}
-    for record in records:
-        by_label = values.setdefault(record["method"], {})
-        value = value_of(record) if record["status"] == "ok" else None
-        if value is not None:
-            by_label[_label(record)] = value
-    return values
 
 
 def per_pair_table(
@@ -84,16 +51,16 @@ def per_pair_table(
 
     A mean stands only where the method has a number for every sample of the group.
     """
-    values = _by_method(records, value_of)
-    labels = list(dict.fromkeys(_label(record) for record in records))
-    rows = [(label, *(_cell(values[m].get(label), digits) for m in values)) for label in labels]
+    values = by_method(records, value_of)
+    labels = list(dict.fromkeys(label_of(record) for record in records))
+    rows = [(label, *(cell(values[m].get(label), digits) for m in values)) for label in labels]
     for group, members in groups(records).items():
         means = (
             mean_with_interval([values[m][x] for x in members]).value if members <= values[m].keys() else None
             for m in values
         )
         if members:
-            rows.append((f"mean of {group}", *(_cell(mean, digits) for mean in means)))
+            rows.append((f"mean of {group}", *(cell(mean, digits) for mean in means)))
     return Table(title, ("pair", *(find_method(m).title for m in values)), tuple(rows), note)
 
 
@@ -101,7 +68,7 @@ def _summary_cells(scores: Sequence[dict[str, float | None]]) -> tuple[str, ...]
     """Mean and interval of every metric, then the mean coverage."""
     means = [mean_with_interval([s[metric] for s in scores if s[metric] is not None]) for metric in _SUMMARY]
     coverage = mean_with_interval([s["coverage"] for s in scores])
-    return (*(_with_interval(mean) for mean in means), _cell(coverage.value))
+    return (*(interval_cell(mean) for mean in means), cell(coverage.value))
 
 
 def summary_table(records: Sequence[dict[str, Any]], members: set[str], title: str) -> Table:
@@ -117,7 +84,7 @@ def summary_table(records: Sequence[dict[str, Any]], members: set[str], title: s
         own = [
             record["capped"]
             for record in records
-            if record["method"] == method and record["status"] == "ok" and _label(record) in members
+            if record["method"] == method and record["status"] == "ok" and label_of(record) in members
         ]
         for column, name in (
             ("raw", find_method(method).title),
@@ -126,13 +93,13 @@ def summary_table(records: Sequence[dict[str, Any]], members: set[str], title: s
             scores = [both[column] for both in own if both[column] is not None]
             if scores:
                 rows.append((name, str(len(scores)), *_summary_cells(scores)))
-    header = ("method", "pairs", *(_HEADINGS[metric] for metric in _SUMMARY), "coverage")
+    header = ("method", "pairs", *(HEADINGS[metric] for metric in _SUMMARY), "coverage")
     return Table(title, header, tuple(rows), "Capped at 80 m for KITTI and 10 m for Booster; mean [95 %].")
 
 
 def versus_table(records: Sequence[dict[str, Any]], reference: str) -> Table:
     """Paired differences in AbsRel, all pixels, as ``headline``: the reference minus each other method."""
-    values = _by_method(records, headline)
+    values = by_method(records, headline)
     rows = []
     for method in values:
         if method != reference and values[method] and values.get(reference):
@@ -144,7 +111,7 @@ def versus_table(records: Sequence[dict[str, Any]], reference: str) -> Table:
                 (
                     find_method(method).title,
                     str(difference.count),
-                    _with_interval(difference, signed=True),
+                    interval_cell(difference, signed=True),
                     f"{wins} of {difference.count}",
                 )
             )
@@ -158,11 +125,11 @@ def versus_table(records: Sequence[dict[str, Any]], reference: str) -> Table:
 
 def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -> list[Table]:
     """The tables of ``geodiff eval pairs``; ``reference`` is the method that the others are compared with."""
-    count = len({_label(record) for record in records})
+    count = len({label_of(record) for record in records})
     tables = [
         per_pair_table(
             records,
-            f"AbsRel of {_pairs(count)}",
+            f"AbsRel of {count_of_pairs(count)}",
             headline,
             3,
             "All pixels with truth, no cap; metres as they come out, not aligned, but for the columns of "
