@@ -9,6 +9,7 @@ The paper's one number, x = g_s x_rel, prefers depths at which every pixel leave
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,9 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.geometry.projection import plane_rays
 from geodiff_plugin.matching import CostVolume, Matches
-from geodiff_plugin.matching.plane_sweep import inverse_depth_at_shift
 
 __all__ = ["ScaleSearch", "argmin_over", "refine_to_matches", "search_scale"]
 
@@ -106,15 +105,6 @@ def _is_rectified(volume: CostVolume) -> bool:
     )
 
 
-def _bounds(volume: CostVolume, depth_range: tuple[float, float] | None) -> tuple[float, float]:
-    """Nearest and farthest metres to search: the given ones, or the nearest plane and a shift of 0.3 px."""
-    if depth_range is not None:
-        return depth_range
-    rays = [plane_rays(volume.K[None], K[None], T[None], volume.size) for _, K, T in volume.rights]
-    farthest = max(1.0 / float(inverse_depth_at_shift(r, 0.3)) for r in rays)
-    return 1.0 / float(volume.inverse_depth[-1]), farthest
-
-
 @torch.no_grad()
 def search_scale(
     volume: CostVolume,
@@ -139,14 +129,14 @@ def search_scale(
 
     Source: S7.3. Deviation: two numbers instead of one, clamped census cost instead of L_geo.
     """
-    low, high = _bounds(volume, depth_range)
+    low, high = volume.reach_m if depth_range is None else depth_range
     height, width = volume.size
     at = _sample_positions(height, width, x.device)
     cost, seen = volume.cost.flatten(1)[:, at], volume.in_view.flatten(1)[:, at]
     least = MIN_SEEN_RECTIFIED if _is_rectified(volume) else MIN_SEEN_POSED
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
     grid = torch.linspace(0, 1, COARSE, device=x.device)
-    log_low, log_span = torch.tensor(low).log().item(), torch.tensor(high / low).log().item()
+    log_low, log_span = math.log(low), math.log(high / low)
     i, j = torch.triu_indices(COARSE, COARSE, 1, device=x.device)
     offsets = torch.linspace(-1, 1, FINE, device=x.device)
     found = []
@@ -194,7 +184,7 @@ def refine_to_matches(
 
     Args:
         x: ``(B, 1, h, w)`` relative maps of one image.
-        matches: of that image.
+        matches: of that image; or known points.
         near_m: ``(B,)`` metres, start.
         far_m: ``(B,)`` metres, start.
         space: as in ``search_scale``.
@@ -208,7 +198,8 @@ def refine_to_matches(
         nearest surfaces back for good.
     """
     height, width = matches.size
-    at = _sample_positions(height, width, x.device)
+    at = (matches.confidence.flatten() > 0).nonzero()[:, 0]  # known points are few: not one may be missed
+    at = at[:: max(1, len(at) // SAMPLES)]
     target = matches.inverse_depth.flatten()[at]
     # A match at infinity constrains nothing, and a wrong one would push far without end.
     weight = matches.confidence.flatten()[at] * (target > matches.plane_step)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 
@@ -24,6 +25,7 @@ UNSEEN_COST = 0.35
 """Cost of a plane on which no right view sees the pixel: that of unrelated texture, neither good nor bad."""
 
 _CHUNK_PIXELS = 1_000_000
+_LEAST_SHIFT_PX = 0.3
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,13 @@ class CostVolume:
     def plane_step(self) -> torch.Tensor:
         """``()`` float32, 1/m between neighbouring planes."""
         return self.inverse_depth[1] - self.inverse_depth[0]
+
+    @cached_property
+    def reach_m(self) -> tuple[float, float]:
+        """Metres of the nearest plane, and of a shift of 0.3 px, beyond which views say nothing."""
+        all_rays = [plane_rays(self.K[None], K[None], T[None], self.size) for _, K, T in self.rights]
+        farthest = max(1.0 / float(inverse_depth_at_shift(rays, _LEAST_SHIFT_PX)) for rays in all_rays)
+        return 1.0 / float(self.inverse_depth[-1]), farthest
 
 
 def _plane_uv(rays: PlaneRays, inverse_depth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
