@@ -113,8 +113,7 @@ class Preparation:
             image_01: ``(B, 3, H, W)`` float32 in [0, 1].
 
         Returns:
-            ``(B, 3, h, w)`` float32. Where the library resizes bytes it rounds after either axis; here nothing
-            is rounded, so that the two differ by about a grey level at most.
+            ``(B, 3, h, w)`` float32, within about a grey level of the library's, which rounds to bytes twice.
 
         Raises:
             ValueError: an image smaller than the patch that it is cut into.
@@ -125,7 +124,9 @@ class Preparation:
         if min(size) < 1:
             bad_value("image", "at least as large as a patch of the network", f"{x.shape[-1]}x{x.shape[-2]}")
         if size != tuple(x.shape[-2:]):
-            x = self._resize(x, size)
+            corners, antialias = self.kind == "ZoeDepth", self.kind in ("DPT", "GLPN")
+            x = F.interpolate(x, size, mode=self.mode, align_corners=corners, antialias=antialias)
+            x = x.clamp(0.0, 1.0) if antialias else x  # the library resizes bytes, which cannot overshoot
         if self.options["do_normalize"]:
             mean, std = (
                 torch.as_tensor(self.options[k], dtype=x.dtype, device=x.device).view(1, -1, 1, 1)
@@ -133,12 +134,3 @@ class Preparation:
             )
             x = (x - mean) / std
         return F.pad(x, self.padding(*size))
-
-    def _resize(self, x: Tensor, size: tuple[int, int]) -> Tensor:
-        """ZoeDepth aligns corners, DepthPro does not average; the others do as PIL, one axis after the other."""
-        if self.kind in ("ZoeDepth", "DepthPro"):
-            return F.interpolate(x, size, mode=self.mode, align_corners=self.kind == "ZoeDepth")
-        for stage in ((x.shape[-2], size[1]), size):
-            x = F.interpolate(x, stage, mode=self.mode, align_corners=False, antialias=True)
-            x = x.clamp(0.0, 1.0)  # bytes cannot overshoot
-        return x
