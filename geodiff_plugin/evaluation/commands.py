@@ -22,7 +22,7 @@ from geodiff_plugin.evaluation.report import run_facts, write_tables, write_text
 from geodiff_plugin.evaluation.runner import processes, run
 from geodiff_plugin.evaluation.tables import pairs_tables
 
-__all__ = ["PAIRS_METHODS", "PairsOptions", "run_list", "run_pairs", "select"]
+__all__ = ["PAIRS_METHODS", "PairsOptions", "command_line", "remarks_on", "run_list", "run_pairs", "select"]
 
 PAIRS_METHODS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 
@@ -91,10 +91,18 @@ def select(refs: Sequence[SampleRef], options: PairsOptions) -> list[SampleRef]:
     return kept[: options.limit]
 
 
-def _command(options: PairsOptions) -> str:
-    """The command line that gives these options, defaults left out."""
-    words = ["geodiff", "eval", "pairs", str(options.data)]
-    if options.methods != PAIRS_METHODS:
+def command_line(
+    options: PairsOptions, head: Sequence[str], default_methods: tuple[str, ...] = PAIRS_METHODS
+) -> str:
+    """The command line that gives these options, defaults left out.
+
+    Args:
+        options: what was given.
+        head: subcommand and data, such as ``("eval", "pairs", "DIR")``.
+        default_methods: methods of the subcommand when none are named.
+    """
+    words = ["geodiff", *head]
+    if options.methods != default_methods:
         words += ["--methods", ",".join(options.methods)]
     for name in ("datasets", "scenes"):
         if getattr(options, name):
@@ -109,7 +117,8 @@ def _command(options: PairsOptions) -> str:
     return shlex.join(words)
 
 
-def _remarks(records: Sequence[dict[str, Any]], settings: Settings) -> list[str]:
+def remarks_on(records: Sequence[dict[str, Any]], settings: Settings) -> list[str]:
+    """Sentences above the tables: the prior, what a method could not do and why, which samples were broken."""
     remarks = [f"Prior {settings.prior}, seed {settings.seed}, ensemble {settings.ensemble}."]
     reasons: dict[tuple[str, str], int] = {}
     for record in records:
@@ -145,7 +154,8 @@ def run_pairs(options: PairsOptions) -> None:
     state = processes(options.settings)
     if not state.is_main_process:
         return
-    facts, remarks = run_facts(_command(options)), _remarks(records, options.settings)
+    facts = run_facts(command_line(options, ("eval", "pairs", str(options.data))))
+    remarks = remarks_on(records, options.settings)
     if state.num_processes > 1:
         remarks.append(f"Run by {state.num_processes} processes.")
     page = write_tables(options.out, "Results", facts, pairs_tables(records), remarks)
