@@ -6,6 +6,7 @@ Paper: S3.3, S7.2.
 
 from geodiff_plugin.geometry.cameras import (
     invert_rigid,
+    is_rectified,
     nearest_rotation,
     pad_intrinsics,
     relative_pose,
@@ -28,6 +29,7 @@ __all__ = [
     "Warped",
     "hidden_in_right",
     "invert_rigid",
+    "is_rectified",
     "nearest_rotation",
     "pad_intrinsics",
     "plane_rays",

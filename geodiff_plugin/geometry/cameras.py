@@ -8,7 +8,17 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["invert_rigid", "nearest_rotation", "pad_intrinsics", "relative_pose", "resize_intrinsics"]
+__all__ = [
+    "invert_rigid",
+    "is_rectified",
+    "nearest_rotation",
+    "pad_intrinsics",
+    "relative_pose",
+    "resize_intrinsics",
+]
+
+#: Two cameras count as rectified to a milliradian, and to a baseline that is sideways to 1 %.
+ANGLE_TOLERANCE, SIDEWAYS_TOLERANCE = 1e-3, 0.01
 
 
 def resize_intrinsics(K: torch.Tensor, size_from: tuple[int, int], size_to: tuple[int, int]) -> torch.Tensor:
@@ -102,3 +112,26 @@ def nearest_rotation(matrix: torch.Tensor) -> torch.Tensor:
     sign = torch.ones_like(matrix[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh).sign()
     return (u * sign[..., None, :]) @ vh
+
+
+def is_rectified(
+    K_left: torch.Tensor, K_right: torch.Tensor, T_right_from_left: torch.Tensor
+) -> torch.Tensor:
+    """Whether disparity along rows says everything: R = I, a sideways baseline, equal f and cy.
+
+    Args:
+        K_left: ``(..., 3, 3)`` float, pixels.
+        K_right: ``(..., 3, 3)``, pixels, at the same number of pixels per radian; cx may differ.
+        T_right_from_left: ``(..., 4, 4)``, metres.
+
+    Returns:
+        ``(...)`` bool: the rotation is the identity to 1e-3 an entry, ``|t_y|`` and ``|t_z|`` are below 1 %
+        of ``|t_x|``, f agrees to 0.1 % and cy to 0.1 % of f.
+    """
+    turned = (T_right_from_left[..., :3, :3] - torch.eye(3).to(T_right_from_left)).abs().amax((-2, -1))
+    t = T_right_from_left[..., :3, 3].abs()
+    focal = K_left[..., 1, 1]
+    apart = (K_left - K_right).abs()
+    uneven = torch.stack([apart[..., 0, 0], apart[..., 1, 1], apart[..., 1, 2]], -1).amax(-1)
+    sideways = t[..., 1:].amax(-1) < SIDEWAYS_TOLERANCE * t[..., 0]
+    return (turned <= ANGLE_TOLERANCE) & sideways & (uneven <= ANGLE_TOLERANCE * focal)

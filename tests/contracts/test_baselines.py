@@ -4,12 +4,14 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings
 from geodiff_plugin.evaluation.baselines._fill import fill_background
 from geodiff_plugin.evaluation.baselines.sgbm import sgbm_shift
-from geodiff_plugin.evaluation.datasets.sample import StereoSample, is_rectified
+from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
+from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.pipeline import enable_geometry_guidance
 
 NAN = np.nan
@@ -28,7 +30,7 @@ def make_sample(pair, E=None) -> StereoSample:
         E,
         pair.depth_m,
         valid,
-        rectified=is_rectified(pair.K, pair.K, E),
+        rectified=bool(is_rectified(*(torch.as_tensor(m) for m in (pair.K, pair.K, np.linalg.inv(E))))),
     )
 
 

@@ -1,6 +1,7 @@
 """What every entry of DATASETS owes: found in its layout, in our conventions, with errors that name the file.
 
-The layouts are written here from docs/evaluation.md, not from the loaders. The slow tests read real samples.
+The layouts are written here from docs/evaluation.md, not from the loaders; of booster and robustmvd no real
+sample was at hand, so that page is all that there is to check them by. The slow tests read real samples.
 """
 
 import os
@@ -13,6 +14,7 @@ from PIL import Image
 
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, find_pairs, load, load_pairs
 from geodiff_plugin.evaluation.datasets.mvsnet import find_mvsnet
+from geodiff_plugin.evaluation.datasets.robustmvd import KEY_VIEWS, find_robustmvd
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.formats import write_depth_mm_png, write_pfm
 
@@ -136,6 +138,23 @@ def mvsnet(root):
     (group / "pair.txt").write_text("3\n0\n2 1 10.0 2 5.0\n1\n1 0 10.0\n2\n1 0 5.0\n")
 
 
+def robustmvd(root):
+    """The scene Barn with key view 60, its best source 62 to the right of it, and 61 further to the right."""
+    scene = root / "Barn"
+    for place, view in enumerate((60, 62, 61)):
+        save(scene / "images" / f"{view:08d}.jpg", picture())
+        world_to_camera = f"1 0 0 {-BASELINE * place}\n0 1 0 0\n0 0 1 0\n0 0 0 1"
+        path = scene / "cams" / f"{view:08d}_cam.txt"
+        path.parent.mkdir(exist_ok=True)
+        # COLMAP's convention: the first pixel's centre is at 0.5.
+        K = f"{F} 0 {CX + 0.5}\n0 {F} {CY + 0.5}\n0 0 1"
+        path.write_text(f"extrinsic\n{world_to_camera}\n\nintrinsic\n{K}\n")
+    (scene / "depth").mkdir()
+    depth_m = with_hole(F * BASELINE / disparity(), np.inf).astype(np.float32)
+    np.savez_compressed(scene / "depth" / "000061.npz", depth_m)  # scans are counted from 1
+    (scene / "pair.txt").write_text("1\n60\n2 62 10.0 61 5.0\n")
+
+
 def folder(root):
     save(root / "mine" / "left.png", picture())
     save(root / "mine" / "right.png", picture())
@@ -157,6 +176,12 @@ LAYOUTS = {
         "scan1/images/00000001.jpg",
         "scan1/depths/00000000.pfm",
         "scan1/cams/00000001_cam.txt",
+    ),
+    "robustmvd": (
+        robustmvd,
+        "Barn/images/00000062.jpg",
+        "Barn/depth/000061.npz",
+        "Barn/cams/00000062_cam.txt",
     ),
     "folder": (folder, "mine/right.png", "mine/depth.npy", "mine/calib.txt"),
 }
@@ -266,6 +291,8 @@ def test_truth_of_another_size_is_named(tmp_path, name):
         save(path, np.ones((HEIGHT, WIDTH - 2), np.uint16))
     elif path.suffix == ".npy":
         np.save(path, np.ones((HEIGHT, WIDTH - 2), np.float32))
+    elif path.suffix == ".npz":
+        np.savez(path, np.ones((HEIGHT, WIDTH - 2), np.float32))
     else:
         write_pfm(path, np.ones((HEIGHT, WIDTH - 2)))
     with pytest.raises(ValueError, match=path.name.replace(".", r"\.")):
@@ -356,6 +383,28 @@ def test_mvsnet_depth_numbers_change_nothing(tmp_path, depths):
     np.testing.assert_array_equal(before.depth_m, after.depth_m)
 
 
+def test_robustmvd_takes_key_views_and_belongs_to_no_other_set(tmp_path):
+    robustmvd(tmp_path)
+    assert [ref.label for ref in find_pairs(tmp_path)] == ["robustmvd/Barn-60-62"]
+    every = find_robustmvd(tmp_path, pairs="all")
+    assert [ref.name for ref in every] == ["Barn-60-62", "Barn-60-61"]
+    ((_, K, E),) = load(every[0]).extra_views
+    assert K[0, 2] == CX
+    np.testing.assert_allclose(E[:3, 3], [2 * BASELINE, 0, 0], atol=1e-9)
+    assert [len(views) for views in KEY_VIEWS.values()] == [18, 25, 13, 13]
+    with open(tmp_path / "Barn" / "pair.txt", "w") as file:
+        file.write("1\n61\n1 60 10.0\n")  # no key view
+    assert find_pairs(tmp_path) == []
+
+
+def test_options_left_open_are_the_sets_own(tmp_path):
+    robustmvd(tmp_path / "benchmark")
+    mvsnet(tmp_path)
+    first, second = find_pairs(tmp_path, pixel_centre=None, pairs="default")
+    assert (first.dataset, first.files["pixel_centre"]) == ("mvsnet", 0.0)
+    assert (second.dataset, second.files["pixel_centre"]) == ("robustmvd", 0.5)
+
+
 def test_folder_takes_depth_in_three_formats(tmp_path):
     folder(tmp_path)
     expected = one(tmp_path, "folder").depth_m
@@ -409,6 +458,14 @@ def photometric_error(sample, factor):
     warped = warp_right_to_left(right, depth_m, *cameras)
     seen = warped.visible & torch.from_numpy(sample.valid)
     return ((warped.image - left).abs().mean(1, keepdim=True) * seen).sum() / seen.sum()
+
+
+@pytest.mark.parametrize("seed", [0, 1], ids=["rectified", "posed"])
+def test_rendered_truth_warps_right_to_left(seed):
+    (ref,) = find_pairs(Path(f"synthetic:1+{seed}"))
+    sample = load(SampleRef(ref.dataset, ref.name, ref.files | {"size": (96, 128)}))
+    true, nearer, farther = (photometric_error(sample, factor) for factor in (1.0, 0.8, 1.2))
+    assert true < nearer and true < farther
 
 
 @pytest.mark.slow

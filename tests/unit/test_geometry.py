@@ -204,3 +204,27 @@ def test_functions_keep_the_dtype():
         assert {warped.image.dtype, warped.uv.dtype, warped.z_right.dtype} == {dtype}
         assert g.resize_intrinsics(K, SIZE, (10, 10)).dtype == dtype
         assert g.unproject(depth, K).dtype == dtype and g.nearest_rotation(K).dtype == dtype
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({}, True),
+        ({"at": (0.5, 0.004, 0.004)}, True),
+        ({"at": (0.5, 0.006, 0)}, False),
+        ({"at": (0.5, 0, 0.006)}, False),
+        ({"at": (0, 0, 0)}, False),
+        ({"angle": 5e-4}, True),
+        ({"angle": 2e-3}, False),
+        ({"angle": 2e-3, "axis": (0, 0, 1)}, False),
+        ({"cx": 25.0}, True),  # Middlebury's doffs
+        ({"cy": 11.6}, False),
+        ({"f": 30.1}, False),
+    ],
+)
+def test_rectified_means_that_rows_are_epipolar_lines(change, expected):
+    K_right = camera(**{name: change[name] for name in ("f", "cx", "cy") if name in change})
+    E = pose(
+        **({"at": (0.5, 0, 0)} | {name: change[name] for name in ("at", "angle", "axis") if name in change})
+    )
+    assert g.is_rectified(camera(), K_right, g.invert_rigid(E)).tolist() == [expected]

@@ -16,6 +16,7 @@ from geodiff_plugin.evaluation.datasets.kitti2012 import KITTI2012
 from geodiff_plugin.evaluation.datasets.kitti2015 import KITTI2015
 from geodiff_plugin.evaluation.datasets.middlebury import ETH3D, MIDDEVAL3, MIDDLEBURY2014
 from geodiff_plugin.evaluation.datasets.mvsnet import MVSNET
+from geodiff_plugin.evaluation.datasets.robustmvd import ROBUSTMVD
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 from geodiff_plugin.evaluation.datasets.synthetic import SYNTHETIC
 
@@ -31,6 +32,7 @@ DATASETS: dict[str, Dataset] = {
         ETH3D,
         BOOSTER,
         MVSNET,
+        ROBUSTMVD,
         FOLDER,
         SYNTHETIC,
     )
@@ -49,7 +51,8 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
     Args:
         root: folder that holds one or several data sets in their official layouts, or ``synthetic:N``.
         datasets: names to look for; all by default.
-        **options: for the data sets that know them: ``pairs`` and ``pixel_centre`` (mvsnet).
+        **options: for the data sets that know them: ``pairs`` and ``pixel_centre`` (mvsnet, robustmvd);
+            ``None`` for the set's own default.
 
     Returns:
         References; nothing is read yet.
@@ -63,7 +66,8 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
         if name not in DATASETS:
             bad_value("datasets", f"one of {', '.join(DATASETS)}", repr(name))
         dataset = DATASETS[name]
-        refs += dataset.find(root, **{key: options[key] for key in dataset.options if key in options})
+        given = {key: options[key] for key in dataset.options if options.get(key) is not None}
+        refs += dataset.find(root, **given)
     if not refs and not root.is_dir():
         bad_value("root", "an existing folder or synthetic:N", str(root))
     return refs

@@ -1,19 +1,24 @@
 """What several data sets need around the readers of ``formats``.
 
-Hop: path -> array of the left image's size.
+Hop: path -> array of the left image's size; arrays and ``Rig`` -> ``StereoSample``.
 Paper: none.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 from geodiff_plugin.formats import check_file, read_image
+from geodiff_plugin.geometry import is_rectified
+from geodiff_plugin.types import Rig
 
-__all__ = ["check_size", "folders", "read_npy", "read_rgb"]
+__all__ = ["check_size", "folders", "make_sample", "read_npy", "read_rgb"]
 
 
 def read_rgb(path: Path, name: str) -> np.ndarray:
@@ -53,3 +58,39 @@ def folders(root: Path, depth: int) -> list[Path]:
         level = [child for parent in level for child in sorted(parent.iterdir()) if child.is_dir()]
         found = found + level
     return found
+
+
+def make_sample(
+    ref: SampleRef,
+    images: tuple[np.ndarray, np.ndarray],
+    rig: Rig,
+    depth_m: np.ndarray,
+    notes: dict[str, Any],
+    **masks: Any,
+) -> StereoSample:
+    """The sample of a reference, once its files are read.
+
+    Args:
+        ref: names the sample.
+        images: left and right, ``(H, W, 3)`` uint8 each.
+        rig: of the images as they are handed over.
+        depth_m: ``(H, W)`` float, metres; what is not a positive number is unknown.
+        notes: as in ``StereoSample``.
+        **masks: ``occluded``, ``material`` and ``extra_views`` of ``StereoSample``.
+    """
+    valid = np.isfinite(depth_m) & (depth_m > 0)
+    cameras = (torch.as_tensor(matrix) for matrix in (rig.K_left, rig.K_right, rig.T_right_from_left))
+    return StereoSample(
+        dataset=ref.dataset,
+        name=ref.name,
+        left=images[0],
+        right=images[1],
+        K_left=rig.K_left,
+        K_right=rig.K_right,
+        E=rig.E,
+        depth_m=np.where(valid, depth_m, 0).astype(np.float32),
+        valid=valid,
+        rectified=bool(is_rectified(*cameras)),
+        notes=notes,
+        **masks,
+    )

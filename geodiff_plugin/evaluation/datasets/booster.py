@@ -6,6 +6,7 @@ Paper: S5.1, Table 1 (228 pairs of the balanced split).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,8 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.datasets._files import check_size, folders, read_npy, read_rgb
-from geodiff_plugin.evaluation.datasets.sample import (
-    Dataset,
-    SampleRef,
-    StereoSample,
-    disparity_to_depth,
-    is_rectified,
-)
+from geodiff_plugin.evaluation.datasets._files import check_size, folders, make_sample, read_npy, read_rgb
+from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample, disparity_to_depth
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.geometry.cameras import resize_intrinsics
 
@@ -106,21 +101,13 @@ def load_booster(ref: SampleRef) -> StereoSample:
             check_size(files[name], mask.shape, left.shape)
             masks[name] = _sampled(mask)
     occluded = (masks["occluded"] == 0) & (depth_m > 0) if "occluded" in masks else None
-    K_left, K_right = _quarter_intrinsics(rig.K_left, left), _quarter_intrinsics(rig.K_right, right)
-    return StereoSample(
-        dataset=ref.dataset,
-        name=ref.name,
-        left=_shrunk(left),
-        right=_shrunk(right),
-        K_left=K_left,
-        K_right=K_right,
-        E=rig.E,
-        depth_m=depth_m,
-        valid=depth_m > 0,
-        occluded=occluded,
-        material=masks.get("material"),
-        rectified=is_rectified(K_left, K_right, rig.E),
-        notes={"truth": "disp_00.npy", "disparity_step_px": 0.0},
+    quarter = replace(
+        rig, K_left=_quarter_intrinsics(rig.K_left, left), K_right=_quarter_intrinsics(rig.K_right, right)
+    )
+    images = (_shrunk(left), _shrunk(right))
+    notes = {"truth": "disp_00.npy", "disparity_step_px": 0.0}
+    return make_sample(
+        ref, images, quarter, depth_m, notes, occluded=occluded, material=masks.get("material")
     )
 
 

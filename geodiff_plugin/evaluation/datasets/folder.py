@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin.evaluation.datasets._files import check_size, folders, read_npy, read_rgb
-from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample, is_rectified
+from geodiff_plugin.evaluation.datasets._files import check_size, folders, make_sample, read_npy, read_rgb
+from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 from geodiff_plugin.formats import read_calibration, read_depth_mm_png, read_pfm
 
 __all__ = ["FOLDER", "find_folder", "load_folder"]
@@ -52,14 +52,10 @@ def find_folder(root: Path) -> list[SampleRef]:
 
 
 def _read_depth(path: Path) -> np.ndarray:
-    """``(H, W)`` float32 metres, 0 where unknown."""
+    """``(H, W)`` metres, 0 or not finite where unknown."""
     if path.suffix == ".png":
-        depth_m, _ = read_depth_mm_png(path)
-    elif path.suffix == ".pfm":
-        depth_m = read_pfm(path, "depth")
-    else:
-        depth_m = read_npy(path, "depth")
-    return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
+        return read_depth_mm_png(path)[0]
+    return read_pfm(path, "depth") if path.suffix == ".pfm" else read_npy(path, "depth")
 
 
 def load_folder(ref: SampleRef) -> StereoSample:
@@ -86,19 +82,7 @@ def load_folder(ref: SampleRef) -> StereoSample:
     if files["depth"] is not None:
         depth_m, truth = _read_depth(files["depth"]), files["depth"].name
         check_size(files["depth"], depth_m.shape, left.shape)
-    return StereoSample(
-        dataset=ref.dataset,
-        name=ref.name,
-        left=left,
-        right=right,
-        K_left=rig.K_left,
-        K_right=rig.K_right,
-        E=rig.E,
-        depth_m=depth_m,
-        valid=depth_m > 0,
-        rectified=is_rectified(rig.K_left, rig.K_right, rig.E),
-        notes={"truth": truth},
-    )
+    return make_sample(ref, (left, right), rig, depth_m, {"truth": truth})
 
 
 FOLDER = Dataset(

@@ -8,13 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from geodiff_plugin.evaluation.datasets._files import check_size, read_rgb
-from geodiff_plugin.evaluation.datasets.sample import (
-    SampleRef,
-    StereoSample,
-    disparity_to_depth,
-    is_rectified,
-)
+from geodiff_plugin.evaluation.datasets._files import check_size, make_sample, read_rgb
+from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample, disparity_to_depth
 from geodiff_plugin.formats import read_calibration, read_disparity_kitti_png
 
 __all__ = ["KITTI_CAP_M", "load_kitti"]
@@ -52,17 +47,5 @@ def load_kitti(ref: SampleRef) -> StereoSample:
         occluded = valid & ~seen_twice
     depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
     depth_m[~valid] = 0
-    return StereoSample(
-        dataset=ref.dataset,
-        name=ref.name,
-        left=left,
-        right=right,
-        K_left=rig.K_left,
-        K_right=rig.K_right,
-        E=rig.E,
-        depth_m=depth_m,
-        valid=valid,
-        occluded=occluded,
-        rectified=is_rectified(rig.K_left, rig.K_right, rig.E),
-        notes={"truth": Path(files["disparity"]).parent.name, "disparity_step_px": 1 / 256},
-    )
+    notes = {"truth": Path(files["disparity"]).parent.name, "disparity_step_px": 1 / 256}
+    return make_sample(ref, (left, right), rig, depth_m, notes, occluded=occluded)

@@ -11,13 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin.evaluation.datasets._files import check_size, folders, read_rgb
+from geodiff_plugin.evaluation.datasets._files import check_size, folders, make_sample, read_rgb
 from geodiff_plugin.evaluation.datasets.sample import (
     Dataset,
     SampleRef,
     StereoSample,
     disparity_to_depth,
-    is_rectified,
 )
 from geodiff_plugin.formats import read_calibration, read_pfm
 
@@ -93,20 +92,8 @@ def load_middlebury(ref: SampleRef) -> StereoSample:
         check_size(files["mask"], mask.shape, left.shape)
         occluded = valid & (mask == 128)
     depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
-    return StereoSample(
-        dataset=ref.dataset,
-        name=ref.name,
-        left=left,
-        right=right,
-        K_left=rig.K_left,
-        K_right=rig.K_right,
-        E=rig.E,
-        depth_m=depth_m,
-        valid=valid & (depth_m > 0),
-        occluded=occluded,
-        rectified=is_rectified(rig.K_left, rig.K_right, rig.E),
-        notes={"truth": files["disparity"].name, "disparity_step_px": _step_px(disparity[valid])},
-    )
+    notes = {"truth": files["disparity"].name, "disparity_step_px": _step_px(disparity[valid])}
+    return make_sample(ref, (left, right), rig, depth_m, notes, occluded=occluded)
 
 
 def _one_set(name: str, obtain: str, full_count: int | None) -> Dataset:

@@ -21,7 +21,6 @@ __all__ = [
     "StereoSample",
     "depth_to_disparity",
     "disparity_to_depth",
-    "is_rectified",
 ]
 
 ExtraView = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -44,7 +43,7 @@ class StereoSample:
         occluded: ``(H, W)`` bool, hidden in the right view or outside it; ``None`` where the set does not
             say.
         material: ``(H, W)`` uint8 material class; ``None`` where the set has none.
-        rectified: whether rows are epipolar lines with equal focal lengths (``is_rectified``).
+        rectified: whether rows are epipolar lines with equal focal lengths (``geometry.is_rectified``).
         notes: what a reader of the numbers should know, e.g. ``truth``, ``disparity_step_px``.
         extra_views: ``(image, K, E)`` of further views, ``E`` the pose in the left camera's frame.
     """
@@ -111,27 +110,6 @@ class Dataset:
     obtain: str
     options: tuple[str, ...] = ()
     full_count: int | None = None
-
-
-def is_rectified(K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray) -> bool:
-    """Whether disparity along rows says everything: R = I, a sideways baseline, equal f and cy.
-
-    Args:
-        K_left: ``(3, 3)``, pixels.
-        K_right: ``(3, 3)``, pixels.
-        E: ``(4, 4)``, metres; pose of the right camera in the left camera's frame.
-
-    Returns:
-        True where the rotation is the identity to 1e-4, ``|t_y|`` and ``|t_z|`` are below 1 % of ``|t_x|``,
-        and f and cy agree to 0.01 px.
-    """
-    t_x, t_y, t_z = E[:3, 3]
-    sideways = max(abs(t_y), abs(t_z)) < 0.01 * abs(t_x)
-    unrotated = np.allclose(E[:3, :3], np.eye(3), atol=1e-4)
-    same_rows = np.allclose(
-        [K_left[0, 0], K_left[1, 1], K_left[1, 2]], [K_right[0, 0], K_right[1, 1], K_right[1, 2]], atol=1e-2
-    )
-    return bool(sideways and unrotated and same_rows)
 
 
 def disparity_to_depth(

@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample, is_rectified
+from geodiff_plugin.evaluation.datasets._files import make_sample
+from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 from geodiff_plugin.synthetic import render_pair
+from geodiff_plugin.types import Rig
 
 __all__ = ["SYNTHETIC", "find_synthetic", "load_synthetic"]
 
@@ -56,21 +58,15 @@ def load_synthetic(ref: SampleRef) -> StereoSample:
         ref.files["seed"], size=ref.files["size"], posed=ref.files["posed"], exposure=True, effects=True
     )
     valid = pair.left.valid[0].numpy()
-    K_left, K_right, E = (matrix.numpy() for matrix in (pair.K_left, pair.K_right, pair.E))
-    return StereoSample(
-        dataset=ref.dataset,
-        name=ref.name,
-        left=_image(pair.left.image_01),
-        right=_image(pair.right.image_01),
-        K_left=K_left,
-        K_right=K_right,
-        E=E,
-        depth_m=np.where(valid, pair.left.depth_m[0].numpy(), 0).astype(np.float32),
-        valid=valid,
+    rig = Rig(pair.K_left.numpy(), pair.K_right.numpy(), pair.E.numpy(), source="renderer")
+    return make_sample(
+        ref,
+        (_image(pair.left.image_01), _image(pair.right.image_01)),
+        rig,
+        np.where(valid, pair.left.depth_m[0].numpy(), 0),
+        {"truth": "exact", "kind": pair.kind},
         occluded=valid & pair.occluded[0].numpy(),
         material=pair.left.material[0].numpy().astype(np.uint8),
-        rectified=is_rectified(K_left, K_right, E),
-        notes={"truth": "exact", "kind": pair.kind},
     )
 
 
