@@ -1,6 +1,6 @@
-"""Prepare one left image and its right view for guidance: common grid, cost volume, matches.
+"""Prepare one left image and its right views for guidance: common grid, cost volume, matches, points.
 
-Hop: images, K's, T as the user gave them -> ``Evidence`` (once a call) -> ``Views`` of a chunk.
+Hop: images, K's, T's, points as the user gave them -> ``Evidence`` (once a call) -> ``Views`` of a chunk.
 Paper: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
 """
 
@@ -18,11 +18,14 @@ from geodiff_plugin.geometry.projection import plane_rays
 from geodiff_plugin.matching import (
     CostVolume,
     Matches,
+    RightView,
     build_cost_volume,
     find_matches,
     mirrored_pose_preferred,
+    points_to_matches,
 )
-from geodiff_plugin.objective import Views
+from geodiff_plugin.objective import RightViews, Views
+from geodiff_plugin.terms import MatchTarget
 
 SWAPPED = (
     "The inverse pose explains the views better than the given one: are left and right swapped, "
@@ -34,29 +37,28 @@ __all__ = ["Evidence", "chunk_views", "prepare_evidence", "resize_long_edge"]
 
 @dataclass(frozen=True)
 class Evidence:
-    """What two views say before any diffusion step, on the grid of the losses.
+    """What is known before any diffusion step, on the grid of the losses.
 
     Attributes:
         left_01: ``(3, H, W)`` in [0, 1].
-        right_01: ``(3, Hr, Wr)`` in [0, 1].
         K_left: ``(3, 3)`` pixels of ``left_01``.
-        K_right: ``(3, 3)`` pixels of ``right_01``.
-        T_right_from_left: ``(4, 4)`` metres.
+        rights: the right views, with their K's and poses, at as many pixels per radian; none where only
+            points are known.
         volume: plane-sweep costs, or ``None`` where the configuration does not search it.
         matches: aggregated, left-right checked, or ``None`` where no term asks.
         sweep_matches: the same on the grid of the sweep, which is finer for wide images.
-        warning: a sentence for the user, or empty.
+        points: depths that the user knows, in the form of matches, or ``None``.
+        warnings: sentences for the user.
     """
 
     left_01: Tensor
-    right_01: Tensor
     K_left: Tensor
-    K_right: Tensor
-    T_right_from_left: Tensor
+    rights: tuple[RightView, ...]
     volume: CostVolume | None
     matches: Matches | None
     sweep_matches: Matches | None
-    warning: str = ""
+    points: Matches | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tensor, Tensor]:
@@ -81,45 +83,53 @@ def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tenso
 
 def prepare_evidence(
     left_01: Tensor,
-    right_01: Tensor,
+    rights: Sequence[RightView],
     K_left: Tensor,
-    K_right: Tensor,
-    T_right_from_left: Tensor,
+    points: Tensor | None,
     *,
     loss_resolution: int,
     depth_range: tuple[float, float] | None,
     needs_volume: bool,
     needs_matches: bool,
 ) -> Evidence:
-    """Bring both views to the loss grid and let them speak for themselves.
+    """Bring all views and points to the loss grid and let them speak for themselves.
 
     Args:
         left_01: ``(3, H, W)`` float32 in [0, 1], native size.
-        right_01: ``(3, Hr, Wr)``, native size, any other.
+        rights: ``(image (3, Hr, Wr), K_right (3, 3), T_right_from_left (4, 4))`` each, native, any size.
         K_left: ``(3, 3)`` pixels of the native left image.
-        K_right: ``(3, 3)`` pixels of the native right image.
-        T_right_from_left: ``(4, 4)`` metres.
+        points: as ``points_to_matches`` takes them, or ``None``.
         loss_resolution: pixels, bound of the longer side of the loss grid.
         depth_range: ``(near, far)`` metres that the sweep spans, or ``None`` for its default.
-        needs_volume: build the cost volume.
-        needs_matches: aggregate and check it.
+        needs_volume: build the cost volume, of all views together.
+        needs_matches: aggregate it and check it against each right view.
+
+    Raises:
+        ValueError: views that do not overlap; points of which none is in the image.
     """
     left, K_loss = resize_long_edge(left_01, K_left, loss_resolution)
-    # The right view is brought to the same pixels per radian, so that neither aliases in the other.
-    ratio = float(K_loss[0, 0] / K_right[0, 0])
-    long_edge = round(max(right_01.shape[-2:]) * min(1.0, ratio))
-    right, K_right_loss = resize_long_edge(right_01, K_right, long_edge)
-    volume, found, matches, warning = None, None, None, ""
-    if needs_volume or needs_matches:
+    size, size_loss = tuple(left_01.shape[-2:]), tuple(left.shape[-2:])
+    volume, found, matches, known, warnings = None, None, None, None, []
+    if rights and (needs_volume or needs_matches):
         # The sweep chooses its own grid, finer than that of the losses for wide images.
-        rights = [(right_01, K_right, T_right_from_left)]
         volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range)
         if mirrored_pose_preferred(left_01, rights, K_left).preferred:
-            warning = SWAPPED
-    if needs_matches:
+            warnings.append(SWAPPED)
+    if rights and needs_matches:
         found = find_matches(left_01, rights, K_left, volume=volume)
         matches = _on_grid(found, left, K_loss)
-    return Evidence(left, right, K_loss, K_right_loss, T_right_from_left, volume, matches, found, warning)
+    if points is not None:
+        known, left_out = points_to_matches(points, K_left, size, K_loss, size_loss)
+        if left_out:
+            warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
+    small = tuple((*_as_fine_as(image, K, K_loss), T) for image, K, T in rights)
+    return Evidence(left, K_loss, small, volume, matches, found, known, tuple(warnings))
+
+
+def _as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
+    """The right view at no more pixels per radian than the left one, so that neither aliases in the other."""
+    ratio = float(K_left[0, 0] / K_right[0, 0])
+    return resize_long_edge(right_01, K_right, round(max(right_01.shape[-2:]) * min(1.0, ratio)))
 
 
 def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
@@ -135,29 +145,51 @@ def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
 
 
 def chunk_views(evidence: Sequence[Evidence], owners: Sequence[int]) -> Views:
-    """Stack the views of a chunk of samples.
+    """Stack all that is known of a chunk of samples.
 
     Args:
         evidence: one entry per image.
         owners: for every sample of the chunk the image that it belongs to.
 
     Returns:
-        Views with ``B = len(owners)``. Right images of different sizes are brought to the largest one,
-        their K with them.
+        Views with ``B = len(owners)``. Right images of different sizes are brought to the largest one, their
+        K with them. An image with fewer right views than another repeats its first: the terms take the best
+        view of each pixel, which a repetition does not change.
     """
     own = [evidence[i] for i in owners]
-    height = max(e.right_01.shape[-2] for e in own)
-    width = max(e.right_01.shape[-1] for e in own)
-    rights, K_rights = [], []
-    for e in own:
-        image, K, size = e.right_01[None], e.K_right[None], tuple(e.right_01.shape[-2:])
-        if size != (height, width):
-            image = F.interpolate(image, (height, width), mode="bilinear", align_corners=False)
-            K = resize_intrinsics(K, size, (height, width))
-        rights.append(image)
-        K_rights.append(K)
     left = torch.stack([e.left_01 for e in own])
-    K_left, K_right = torch.stack([e.K_left for e in own]), torch.cat(K_rights)
-    T = torch.stack([e.T_right_from_left for e in own])
-    rays = plane_rays(K_left, K_right, T, (left.shape[-2], left.shape[-1]))
-    return Views(left, torch.cat(rights), K_left, K_right, T, rays)
+    K_left = torch.stack([e.K_left for e in own])
+    most = max(len(e.rights) for e in own)
+    rights = tuple(
+        _stack_rights([e.rights[v if v < len(e.rights) else 0] for e in own], K_left, tuple(left.shape[-2:]))
+        for v in range(most)
+    )
+    matches, points = (_stack_targets([getattr(e, name) for e in own]) for name in ("matches", "points"))
+    return Views(left, K_left, rights, matches, points)
+
+
+def _stack_rights(rights: Sequence[RightView], K_left: Tensor, size_left: tuple[int, int]) -> RightViews:
+    """One right view of every sample; smaller images are brought to the largest one, their K with them."""
+    height = max(image.shape[-2] for image, _, _ in rights)
+    width = max(image.shape[-1] for image, _, _ in rights)
+    images, Ks = [], []
+    for image, K, _ in rights:
+        size = tuple(image.shape[-2:])
+        if size != (height, width):
+            image = F.interpolate(image[None], (height, width), mode="bilinear", align_corners=False)[0]
+            K = resize_intrinsics(K[None], size, (height, width))[0]
+        images.append(image)
+        Ks.append(K)
+    K, T = torch.stack(Ks), torch.stack([T for _, _, T in rights])
+    return RightViews(torch.stack(images), K, T, plane_rays(K_left, K, T, size_left))
+
+
+def _stack_targets(found: Sequence[Matches | None]) -> MatchTarget | None:
+    """Matches, or points, of every sample; ``None`` where there are none."""
+    if any(one is None for one in found):
+        return None
+    return MatchTarget(
+        torch.stack([one.inverse_depth for one in found]),
+        torch.stack([one.confidence for one in found]),
+        torch.stack([one.plane_step for one in found]),
+    )

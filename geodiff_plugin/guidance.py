@@ -1,56 +1,51 @@
-"""What a user configures: the right view, its cameras and the hyperparameters of the guidance.
+"""What a user configures: right views, cameras, known points and the hyperparameters of the guidance.
 
-Hop: ``right, K, E`` and keywords -> ``GeometryGuidance`` -> (at call time) one ``Evidence`` per image.
+Hop: ``right, K, E, points``, keywords -> ``GeometryGuidance`` -> (at call time) one ``Evidence`` per image.
 Paper: S4.2, S5.1; ``GeometryGuidance.paper`` is Algorithm 1 with its printed numbers.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from diffusers.configuration_utils import ConfigMixin
 from torch import Tensor
 
-from geodiff_plugin._checks import (
-    bad_type,
-    bad_value,
-    check_baseline,
-    check_choice,
-    check_intrinsics,
-    check_intrinsics_fit,
-    check_number,
-    check_pose,
-    check_range,
-)
+from geodiff_plugin._checks import bad_value, check_choice, check_intrinsics_fit, check_number, check_range
 from geodiff_plugin.evidence import Evidence, prepare_evidence
-from geodiff_plugin.formats import as_image_01, read_calibration
+from geodiff_plugin.guidance_doors import GuidanceDoors
+from geodiff_plugin.guidance_inputs import ImageInputs, read_inputs
+from geodiff_plugin.metric import POSITIVE
 from geodiff_plugin.terms import TERMS
+from geodiff_plugin.terms.points import POINTS_LOSSES
 from geodiff_plugin.types import Rig
 from geodiff_plugin.updates import RULES
 
-__all__ = ["GeometryGuidance"]
+__all__ = ["DEFAULT_WEIGHTS", "GeometryGuidance"]
 
 #: Weights of the default preset; how flat the optimum around each is: docs/knobs.md.
-DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "prior_pull": 0.01, "anchor": 1.0}
-PAPER_WEIGHTS = {"photometric": 1.0, "prior_pull": 0.01}
+DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
 GRADIENTS = ("denoised", "full")
-SEARCHES = ("volume", "one-number")
+SEARCHES = ("volume", "one-number", "points-range")
 ANCHORS = ("start", "zero")
+STEP_FROM = ("given", "updated")
 
 
-class GeometryGuidance(ConfigMixin):
-    """A second view with a known pose, and how strongly it steers the diffusion.
+class GeometryGuidance(GuidanceDoors, ConfigMixin):
+    """A second view with a known pose (or more of them, or points), and how strongly it steers the diffusion.
 
     Args:
-        right: the right image (PIL, numpy HWC uint8/uint16/float in [0, 1], torch CHW), of any size;
-            a list has one entry per image of the batch.
-        K: ``(3, 3)`` intrinsics in pixels, each for its own image at its own size; one matrix for both
-            views, a tuple ``(K_left, K_right)``, or a list with one of these per image.
+        right: the right image (PIL, numpy HWC uint8/uint16/float in [0, 1], torch CHW), of any size; a tuple
+            of several right views; ``None`` with ``points`` alone. A list has one of these per image of the
+            batch.
+        K: ``(3, 3)`` intrinsics in pixels, each for its own image at its own size; one matrix for all
+            views, a tuple ``(K_left, K_right, ...)``, or a list with one of these per image.
         E: ``(4, 4)`` pose of the right camera in the left camera's frame, metres; or a tuple
-            ``(E_left, E_right)`` of camera-to-world poses; or a list with one of these per image.
+            ``(E_left, E_right, ...)`` of camera-to-world poses; ``None`` without a right view; or a list with
+            one of these per image.
+        points: depths that are known, metres: a sparse map ``(H, W)`` of the left image's size (0, NaN and
+            infinity are unknown), or ``(N, 3)`` points in the left camera's frame; or a list of these.
+        left_size: ``(width, height)`` that the left image must have; ``None`` takes any that ``K`` fits.
         gradient: ``"denoised"`` moves the clean latent and stops there; ``"full"`` goes through the
             U-Net to z_t, as the paper.
         rule: how a gradient moves the latent, key of ``RULES``.
@@ -68,8 +63,9 @@ class GeometryGuidance(ConfigMixin):
         pyramid_levels: image pyramid of the photometric term; 1 is the paper's.
         min_visible: visible share below which the photometric term is off, [0, 1].
         pull_to: what ``prior_pull`` pulls scale and shift towards, ``"start"`` or ``"zero"``.
-        search: ``"volume"`` looks up (near, far) in a plane-sweep volume; ``"one-number"`` is the paper's
-            g_s search.
+        search: ``"volume"`` looks up (near, far) in a plane-sweep volume, and fits them to the points where
+            there is no right view; ``"one-number"`` is the paper's g_s search; ``"points-range"`` takes the
+            nearest and the farthest point, as Marigold-DC.
         g_s_range: metres, the candidates of the one-number search.
         depth_range: ``(near, far)`` metres that bound the search, or ``None``.
         gate: factors around the estimate within which matches are believed, at the first and last step.
@@ -77,6 +73,11 @@ class GeometryGuidance(ConfigMixin):
         refine: bring the result to its matches at full resolution, edge-aware (``refinement.refine_depth``);
             without a ``matches`` term there is nothing to bring it to.
         respace: run a ``leading`` DDIM schedule as ``trailing`` for guided calls.
+        points_loss: ``"robust"`` in inverse depth, or ``"l1l2"`` in metres (``terms.points``).
+        positive: how raw scale and shift become positive: ``"softplus"``, or ``"square"`` with a relative map
+            clipped to [0, 1] (``metric.MetricMap``).
+        step_from: with the full gradient, the latent that the scheduler's step starts from: the ``"given"``
+            one, the update added after it (Algorithm 1), or the ``"updated"`` one (Marigold-DC).
 
     Raises:
         TypeError, ValueError: anything of the wrong rank, size, range or rigidity, naming the argument.
@@ -93,8 +94,10 @@ class GeometryGuidance(ConfigMixin):
         self,
         right: Any,
         K: Any,
-        E: Any,
+        E: Any = None,
         *,
+        points: Any = None,
+        left_size: tuple[int, int] | None = None,
         gradient: str = "denoised",
         rule: str = "adam",
         affine_rule: str = "adam",
@@ -117,6 +120,9 @@ class GeometryGuidance(ConfigMixin):
         loss_resolution: int = 640,
         refine: bool = True,
         respace: bool = True,
+        points_loss: str = "robust",
+        positive: str = "softplus",
+        step_from: str = "given",
     ) -> None:
         weights = dict(DEFAULT_WEIGHTS if weights is None else weights)
         for name, weight in weights.items():
@@ -148,117 +154,44 @@ class GeometryGuidance(ConfigMixin):
             loss_resolution=check_number(loss_resolution, "loss_resolution", 32, 1 << 16, integer=True),
             refine=bool(refine),
             respace=bool(respace),
+            points_loss=check_choice(points_loss, "points_loss", POINTS_LOSSES),
+            positive=check_choice(positive, "positive", POSITIVE),
+            step_from=check_choice(step_from, "step_from", STEP_FROM),
         )
-        rights = list(right) if isinstance(right, list) else [right]
-        self._rights = [as_image_01(image, _label("right", i, rights)) for i, image in enumerate(rights)]
-        count = len(self._rights)
-        if count == 0:
-            bad_value("right", "an image or a list with one image per left image", "an empty list")
-        self._rigs = [
-            _rig(
-                _entry(K, "K", i, count),
-                _entry(E, "E", i, count),
-                _label("K", i, rights),
-                _label("E", i, rights),
-            )
-            for i in range(count)
+        self._inputs = read_inputs(right, K, E, points)
+        self._left_size = left_size
+        self._check_fed()
+
+    def _check_fed(self) -> None:
+        """Refuse a configuration that asks for what was not given."""
+        needs = {"one-number": "a right view", "points-range": "points"}
+        views, known = bool(self.rights), self._inputs[0].points is not None
+        if not {"one-number": views, "points-range": known}.get(self.config.search, True):
+            search = self.config.search
+            bad_value("search", f"one that works on what is given ({search!r} needs {needs[search]})", "none")
+        lacking = {"needs_warp": not views, "needs_matches": not views, "needs_points": not known}
+        weights = {name: weight for name, weight in self.config.weights.items() if weight}
+        idle = [
+            n for n in weights if any(absent and getattr(TERMS[n], need) for need, absent in lacking.items())
         ]
-        for i, (image, rig) in enumerate(zip(self._rights, self._rigs, strict=True)):
-            name = _label("K_right", i, rights)
-            check_intrinsics_fit(rig.K_right, image.shape[-1], image.shape[-2], name, "the right image")
+        if self.config.inner_steps and len(idle) == len(weights):
+            cure = "photometric and matches need a right view, points needs points; inner_steps=0 needs none."
+            bad_value("weights", "with a term for what is given", self.config.weights, cure)
 
-    @classmethod
-    def from_baseline(
-        cls, right: Any, K: Any, baseline_m: float, K_right: Any = None, **kwargs: Any
-    ) -> GeometryGuidance:
-        """A rectified rig: the right camera sits ``baseline_m`` metres to the right, looking the same way.
-
-        Args:
-            right: as in the constructor.
-            K: ``(3, 3)`` intrinsics of the left image, pixels.
-            baseline_m: metres; negative if the "right" camera sits to the left.
-            K_right: ``(3, 3)`` of the right image; ``None`` if it is the same.
-            **kwargs: hyperparameters.
-        """
-        check_number(baseline_m, "baseline_m", -1e6, 1e6)
-        E = np.eye(4)
-        E[0, 3] = baseline_m
-        return cls(right, K if K_right is None else (K, K_right), E, **kwargs)
-
-    @classmethod
-    def from_calibration(
-        cls,
-        right: Any,
-        path: str | Path | tuple[str | Path, str | Path],
-        cameras: tuple[int, int] | None = None,
-        **kwargs: Any,
-    ) -> GeometryGuidance:
-        """Read K and E from a calibration file (or a pair of files, one a view), format told by its content.
-
-        Args:
-            right: as in the constructor.
-            path: file, or tuple of two files; formats are listed in docs/calibration.md.
-            cameras: (left, right) numbers in a file that has more than two, such as KITTI's.
-            **kwargs: hyperparameters.
-        """
-        rig = read_calibration(path, cameras=cameras)
-        return cls(right, (rig.K_left, rig.K_right), rig.E, **kwargs)
-
-    @classmethod
-    def paper(
-        cls, right: Any, K: Any, E: Any, g_s_range: tuple[float, float] = (1.0, 80.0), **kwargs: Any
-    ) -> GeometryGuidance:
-        """Algorithm 1 as printed: full gradient, plain steps of 1e-2, gamma 1e-2 towards 0, one-number g_s.
-
-        Args:
-            right: as in the constructor.
-            K: as in the constructor.
-            E: as in the constructor.
-            g_s_range: metres, the paper's "predefined depth range".
-            **kwargs: hyperparameters that shall differ from the paper.
-
-        Source: Algorithm 1, S5.1, S7.3, S9; what the paper leaves open is settled in docs/paper-map.md.
-        """
-        preset: dict[str, Any] = {
-            "gradient": "full",
-            "rule": "plain",
-            "affine_rule": "plain",
-            "step_latents": 1e-2,
-            "step_affine": 1e-2,
-            "inner_steps": 1,
-            "min_steps": 10,
-            "weights": PAPER_WEIGHTS,
-            "eta": 0.85,
-            "pyramid_levels": 1,
-            "min_visible": 0.0,
-            "pull_to": "zero",
-            "search": "one-number",
-            "g_s_range": g_s_range,
-        }
-        return cls(right, K, E, **(preset | kwargs))
-
-    @classmethod
-    def search_only(cls, right: Any, K: Any, E: Any, **kwargs: Any) -> GeometryGuidance:
-        """The default without gradient updates: only the scale and shift that the search finds.
-
-        Args:
-            right: as in the constructor.
-            K: as in the constructor.
-            E: as in the constructor.
-            **kwargs: hyperparameters.
-        """
-        preset: dict[str, Any] = {"inner_steps": 0, "weights": {"photometric": 1.0}}
-        return cls(right, K, E, **(preset | kwargs))
+    @property
+    def inputs(self) -> list[ImageInputs]:
+        """What was given, checked, one entry per left image."""
+        return list(self._inputs)
 
     @property
     def rigs(self) -> list[Rig]:
-        """The calibrations as understood, one per right image."""
-        return list(self._rigs)
+        """The calibrations as understood, one per right image, those of the first left image first."""
+        return [rig for own in self._inputs for rig in own.rigs]
 
     @property
     def rights(self) -> list[Tensor]:
-        """The right images, ``(3, H, W)`` float32 in [0, 1] each, native size."""
-        return list(self._rights)
+        """The right images, ``(3, H, W)`` float32 in [0, 1] each, native size, in the order of ``rigs``."""
+        return [image for own in self._inputs for image in own.rights]
 
     def denoising_steps(self, asked: int | None, pipeline_default: int | None) -> int:
         """Steps of a guided call: as asked, else the pipeline's default, at least ``min_steps``."""
@@ -276,26 +209,22 @@ class GeometryGuidance(ConfigMixin):
         Raises:
             ValueError: not one right view per left image; a left K that is not for images of this size.
         """
-        count = lefts_01.shape[0]
-        if len(self._rights) != count:
-            bad_value("right", f"a list of {count} images, one per left image", f"{len(self._rights)}")
-        config, device, evidence = self.config, lefts_01.device, []
+        count, size = lefts_01.shape[0], tuple(lefts_01.shape[-2:])
+        if len(self._inputs) != count:
+            name, kind = ("right", "images") if self.rights else ("points", "entries")
+            bad_value(name, f"a list of {count} {kind}, one per left image", f"{len(self._inputs)}")
+        if self._left_size not in (None, size[::-1]):
+            width, height = self._left_size
+            bad_value("image", f"of {width}x{height} pixels, as the left view", f"{size[1]}x{size[0]}")
+        config, evidence = self.config, []
         matched = bool(config.weights.get("matches")) and config.inner_steps > 0
-        for i, rig in enumerate(self._rigs):
-            check_intrinsics_fit(
-                rig.K_left,
-                lefts_01.shape[-1],
-                lefts_01.shape[-2],
-                _label("K", i, self._rights),
-                "the left image",
-            )
-            matrices = (rig.K_left, rig.K_right, rig.T_right_from_left)
-            cameras = (torch.as_tensor(m, dtype=torch.float32, device=device) for m in matrices)
+        for i, own in enumerate(self._inputs):
+            name = "K" if count == 1 else f"K[{i}]"
+            check_intrinsics_fit(own.K_left, size[1], size[0], name, "the left image")
             evidence.append(
                 prepare_evidence(
                     lefts_01[i],
-                    self._rights[i].to(device),
-                    *cameras,
+                    *own.on(lefts_01.device),
                     loss_resolution=config.loss_resolution,
                     depth_range=config.depth_range,
                     needs_volume=config.search == "volume",
@@ -303,38 +232,3 @@ class GeometryGuidance(ConfigMixin):
                 )
             )
         return evidence
-
-
-def _label(name: str, i: int, entries: list) -> str:
-    return name if len(entries) == 1 else f"{name}[{i}]"
-
-
-def _entry(value: Any, name: str, i: int, count: int) -> Any:
-    """The entry of image ``i``: a list has one per image, anything else serves all."""
-    if not isinstance(value, list):
-        return value
-    if value and not isinstance(value[0], (tuple, np.ndarray, Tensor)) and np.ndim(value) == 2:
-        return value  # a matrix written as nested lists
-    if len(value) != count:
-        bad_value(name, f"a list of {count} entries, one per right image", f"{len(value)} entries")
-    return value[i]
-
-
-def _rig(K: Any, E: Any, K_name: str, E_name: str) -> Rig:
-    if isinstance(K, tuple):
-        if len(K) != 2:
-            bad_type(K_name, "a 3x3 matrix or a tuple (K_left, K_right)", K)
-        K_left, K_right = (
-            check_intrinsics(K[0], f"{K_name}[left]"),
-            check_intrinsics(K[1], f"{K_name}[right]"),
-        )
-    else:
-        K_left = K_right = check_intrinsics(K, K_name)
-    if isinstance(E, tuple):
-        if len(E) != 2:
-            bad_type(E_name, "a 4x4 matrix or a tuple (E_left, E_right)", E)
-        pose = np.linalg.inv(check_pose(E[0], f"{E_name}[left]")) @ check_pose(E[1], f"{E_name}[right]")
-    else:
-        pose = check_pose(E, E_name)
-    check_baseline(pose, E_name)
-    return Rig(K_left, K_right, pose)

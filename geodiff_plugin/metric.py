@@ -1,7 +1,7 @@
 """Turn a relative map into metres: an affine map with positive scale and shift, times a global scale.
 
 Hop: ``x (B, 1, H, W)`` unclipped relative map, ``s_hat, t_hat, g_s (B,)`` -> ``depth_m (B, 1, H, W)``.
-Paper: S4.1, Eq. 10 and 13 (eq:metric), Eq. 16 (no label).
+Paper: S4.1, Eq. 10 and 13 (eq:metric), Eq. 16 (no label); ``square`` is Marigold-DC's (its Eq. 2).
 """
 
 from __future__ import annotations
@@ -12,9 +12,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import check_choice
 
-__all__ = ["SPACES", "AffineState", "MetricMap", "inverse_softplus", "smooth_floor"]
+__all__ = [
+    "GROWS_WITH_DEPTH",
+    "POSITIVE",
+    "SPACES",
+    "AffineState",
+    "MetricMap",
+    "SquareAffine",
+    "inverse_softplus",
+    "smooth_floor",
+]
 
 #: Half-width of the smooth floor, in units of the relative map (whose range is about [0, 1]).
 FLOOR_EPS = 0.01
@@ -48,7 +57,7 @@ class AffineState:
     Attributes:
         s_hat: raw scale, before softplus.
         t_hat: raw shift, before softplus.
-        g_s: global scale; metres (depth, log, sqrt_disparity and disparity spaces alike).
+        g_s: global scale; metres, in every space.
     """
 
     s_hat: Tensor
@@ -64,6 +73,29 @@ class AffineState:
     def shift(self) -> Tensor:
         """``softplus(t_hat)``, dimensionless."""
         return F.softplus(self.t_hat)
+
+
+@dataclass(frozen=True)
+class SquareAffine(AffineState):
+    """Scale and shift as squares that start at 1, as Marigold-DC has them.
+
+    Attributes:
+        unit_scale: ``(B,)`` what a raw scale of 1 stands for.
+        unit_shift: ``(B,)`` the same for the shift.
+    """
+
+    unit_scale: Tensor
+    unit_shift: Tensor
+
+    @property
+    def scale(self) -> Tensor:
+        """``s_hat^2 unit_scale``, dimensionless."""
+        return self.s_hat**2 * self.unit_scale
+
+    @property
+    def shift(self) -> Tensor:
+        """``t_hat^2 unit_shift``, dimensionless."""
+        return self.t_hat**2 * self.unit_shift
 
 
 def _depth(x: Tensor, s: Tensor, t: Tensor, g: Tensor) -> Tensor:
@@ -82,8 +114,24 @@ def _log(x: Tensor, s: Tensor, t: Tensor, g: Tensor) -> Tensor:
     return g * torch.exp(s * x + t)
 
 
+def _log1p(x: Tensor, s: Tensor, t: Tensor, g: Tensor) -> Tensor:
+    return g * torch.expm1(s * x + t)
+
+
 #: Space in which a prior's output is affine -> its formula.
-SPACES = {"depth": _depth, "disparity": _disparity, "log": _log, "sqrt_disparity": _sqrt_disparity}
+SPACES = {
+    "depth": _depth,
+    "disparity": _disparity,
+    "log": _log,
+    "log1p": _log1p,
+    "sqrt_disparity": _sqrt_disparity,
+}
+#: Those in which a greater value is farther away.
+GROWS_WITH_DEPTH = frozenset({"depth", "log", "log1p"})
+
+
+#: How raw scale and shift become positive, and what keeps the relative map in its range with it.
+POSITIVE = ("softplus", "square")
 
 
 @dataclass(frozen=True)
@@ -93,19 +141,27 @@ class MetricMap:
     Attributes:
         space: key of ``SPACES``: what the prior's output is affine in. With ``s = softplus(s_hat)``
             and ``t = softplus(t_hat)``: depth ``g_s (s x + t)``, disparity ``g_s / (s x + t)``,
-            log ``g_s exp(s x + t)``, sqrt_disparity ``g_s / (s x + t)^2``. All positive and monotone.
+            log ``g_s exp(s x + t)``, log1p ``g_s (exp(s x + t) - 1)``, sqrt_disparity
+            ``g_s / (s x + t)^2``. All positive and monotone.
+        positive: ``"softplus"`` with the smooth floor, or ``"square"`` with ``x`` clipped to [0, 1], whose
+            gradient is zero where it clips.
 
     Raises:
-        ValueError: unknown space.
+        ValueError: unknown space or ``positive``.
 
     Source: Eq. 16 with Eq. 13 (eq:metric). Deviation: the smooth floor, and the spaces beside depth.
     """
 
     space: str = "depth"
+    positive: str = "softplus"
 
     def __post_init__(self) -> None:
-        if self.space not in SPACES:
-            bad_value("space", f"one of {sorted(SPACES)}", repr(self.space))
+        check_choice(self.space, "space", SPACES)
+        check_choice(self.positive, "positive", POSITIVE)
+
+    def confine(self, x: Tensor) -> Tensor:
+        """``x`` as it may be resampled: clipped with ``"square"``, as it is with ``"softplus"``."""
+        return x.clamp(0.0, 1.0) if self.positive == "square" else x
 
     def __call__(self, x: Tensor, affine: AffineState) -> Tensor:
         """Metric depth of a relative map.
@@ -118,19 +174,21 @@ class MetricMap:
             ``(B, 1, H, W)`` metres, > 0, differentiable in ``x``, ``s_hat`` and ``t_hat``; linear in ``g_s``.
         """
         s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
-        return SPACES[self.space](smooth_floor(x), s, t, g)
+        confined = self.confine(x) if self.positive == "square" else smooth_floor(x)
+        return SPACES[self.space](confined, s, t, g)
 
     def from_range(self, at_zero_m: Tensor, at_one_m: Tensor) -> AffineState:
         """The affine state under which ``x = 0`` and ``x = 1`` have the given depths.
 
         Args:
             at_zero_m: ``(B,)`` metres, depth of ``x = 0``; nearer than ``at_one_m`` in depth and log
-                space, farther in the disparity spaces.
+                spaces, farther in the disparity spaces.
             at_one_m: ``(B,)`` metres, depth of ``x = 1``.
 
         Returns:
             State with ``g_s`` the geometric mean of the two in disparity spaces, the far value in depth
-            space and a little under the near one in log space, so that scale and shift are of order 1.
+            space, a little under the near one in log space, so that scale and shift are of order 1, and
+            1 m in log1p space, where the 1 is a metre.
         """
         a, b = at_zero_m.float(), at_one_m.float()
         if self.space == "depth":
@@ -141,13 +199,20 @@ class MetricMap:
             g = a * 0.9  # the shift must stay positive: log(a / g) = 0.105
             t = torch.log(a / g)
             s = torch.log(b / a)
+        elif self.space == "log1p":
+            g = torch.ones_like(a)
+            t = torch.log1p(a)
+            s = torch.log1p(b) - t
         else:
             power = 1.0 if self.space == "disparity" else 0.5
             g = torch.sqrt(a * b)
             t = (g / a) ** power
             s = (g / b) ** power - t
         tiny = 1e-4  # a flat map is legal; softplus cannot reach 0
-        return AffineState(inverse_softplus(s.clamp_min(tiny)), inverse_softplus(t.clamp_min(tiny)), g)
+        s, t = s.clamp_min(tiny), t.clamp_min(tiny)
+        if self.positive == "square":
+            return SquareAffine(torch.ones_like(s), torch.ones_like(t), g, s, t)
+        return AffineState(inverse_softplus(s), inverse_softplus(t), g)
 
     def range_of(self, affine: AffineState) -> tuple[Tensor, Tensor]:
         """Depths in metres, ``(B,)`` each, of ``x = 0`` and ``x = 1``; inverse of ``from_range``."""

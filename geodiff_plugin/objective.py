@@ -19,28 +19,43 @@ from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.metric import AffineState, MetricMap
 from geodiff_plugin.terms import TERMS, Estimate, MatchTarget
 
-__all__ = ["Loss", "Objective", "Views"]
+__all__ = ["Loss", "Objective", "RightViews", "Views"]
+
+
+@dataclass(frozen=True)
+class RightViews:
+    """One right view of every sample of a chunk.
+
+    Attributes:
+        image_01: ``(B, 3, Hr, Wr)`` in [0, 1].
+        K: ``(B, 3, 3)`` pixels of ``image_01``.
+        T_right_from_left: ``(B, 4, 4)`` metres.
+        rays: these cameras and the left one as one affine map per left pixel, made once a chunk.
+    """
+
+    image_01: Tensor
+    K: Tensor
+    T_right_from_left: Tensor
+    rays: PlaneRays
 
 
 @dataclass(frozen=True)
 class Views:
-    """Both views of every sample of a chunk, on the grid where losses are computed.
+    """All that is known of every sample of a chunk, on the grid where losses are computed.
 
     Attributes:
         left_01: ``(B, 3, H, W)`` in [0, 1].
-        right_01: ``(B, 3, Hr, Wr)`` in [0, 1].
         K_left: ``(B, 3, 3)`` pixels of ``left_01``.
-        K_right: ``(B, 3, 3)`` pixels of ``right_01``.
-        T_right_from_left: ``(B, 4, 4)`` metres.
-        rays: the three matrices above as one affine map per pixel, made once a chunk.
+        rights: the right views, as many for every sample; none where only points are known.
+        matches: what the views say by themselves, not gated, or ``None``.
+        points: what the user knows, or ``None``.
     """
 
     left_01: Tensor
-    right_01: Tensor
     K_left: Tensor
-    K_right: Tensor
-    T_right_from_left: Tensor
-    rays: PlaneRays
+    rights: tuple[RightViews, ...]
+    matches: MatchTarget | None = None
+    points: MatchTarget | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -50,7 +65,10 @@ class Views:
 
 @dataclass(frozen=True)
 class Loss:
-    """One evaluation: ``total (B,)`` with its graph, the unweighted ``terms``, the visible share ``(B,)``."""
+    """One evaluation: ``total (B,)`` with its graph, the unweighted ``terms``, the visible share ``(B,)``.
+
+    A pixel is visible where any right view sees it.
+    """
 
     total: Tensor
     terms: dict[str, Tensor]
@@ -78,6 +96,7 @@ class Objective:
 
     def metric_depth(self, x: Tensor, affine: AffineState) -> Tensor:
         """``x (B, 1, h, w)`` upsampled to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""
+        x = self.metric.confine(x)
         if x.shape[-2:] != self.views.size:
             x = F.interpolate(x, self.views.size, mode="bilinear", align_corners=False)
         return self.metric(x, affine)
@@ -101,22 +120,26 @@ class Objective:
             z0_prior: the network's own.
             matches: on the loss grid, or ``None``.
         """
+        points = self.views.points
+        lacking = {
+            "needs_warp": not self.views.rights,
+            "needs_matches": matches is None,
+            "needs_points": points is None,
+        }
         active = {
             name: weight
             for name, weight in self.weights.items()
-            if weight and not (TERMS[name].needs_matches and matches is None)
+            if weight and not any(absent and getattr(TERMS[name], need) for need, absent in lacking.items())
         }
         depth_m = self.metric_depth(x, affine)
-        v = self.views
         needs_warp = any(TERMS[name].needs_warp for name in active)
         with torch.set_grad_enabled(torch.is_grad_enabled() and needs_warp):
-            warped = warp_right_to_left(
-                v.right_01, depth_m, v.K_left, v.K_right, v.T_right_from_left, rays=v.rays
-            )
+            warped_01, visible = self._warp(depth_m)
+        left_01 = self.views.left_01
         estimate = Estimate(
-            depth_m, v.left_01, warped.image, warped.visible, affine, affine_start, z0, z0_prior, matches
+            depth_m, left_01, warped_01, visible, affine, affine_start, z0, z0_prior, matches, points
         )
-        visible_fraction = warped.visible.float().flatten(1).mean(1)
+        visible_fraction = visible.any(1).float().flatten(1).mean(1)
         total = torch.zeros_like(visible_fraction)
         values = {}
         for name, weight in active.items():
@@ -127,3 +150,15 @@ class Objective:
             values[name] = value
             total = total + weight * value
         return Loss(total, values, visible_fraction)
+
+    def _warp(self, depth_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Every right image seen from the left ``(B, V, 3, H, W)``, and whether it sees the pixel."""
+        v = self.views
+        warps = [
+            warp_right_to_left(r.image_01, depth_m, v.K_left, r.K, r.T_right_from_left, rays=r.rays)
+            for r in v.rights
+        ]
+        if not warps:
+            nothing = v.left_01[:, None][:, :0]
+            return nothing, nothing[:, :, :1].bool()
+        return torch.stack([w.image for w in warps], 1), torch.stack([w.visible for w in warps], 1)

@@ -6,6 +6,7 @@ Paper: Eq. 14's re-rendered left image, as a per-pixel report.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from geodiff_plugin.geometry.cameras import resize_intrinsics
 from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.integration.run import GuidedRun
+from geodiff_plugin.matching import RightView
 from geodiff_plugin.refinement import refine_depth
 from geodiff_plugin.types import MetricDepthOutput
 
@@ -52,17 +54,14 @@ def assemble_output(
     depth_m = _refined(run, depth_m, lefts_01)
     grid = tuple(depth_m.shape[-2:])
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
-    K = torch.stack(
-        [torch.as_tensor(rig.K_left, dtype=torch.float32, device=depth_m.device) for rig in guidance.rigs]
-    )
-    K = resize_intrinsics(K, size, grid)
-    visible, error = zip(
-        *(
-            _reprojection(guidance, i, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1])
-            for i in range(count)
-        ),
-        strict=True,
-    )
+    known = [own.on(depth_m.device) for own in guidance.inputs]
+    K = resize_intrinsics(torch.stack([K_left for _, K_left, _ in known]), size, grid)
+    seen = [
+        _reprojection(rights, *(x[i : i + 1] for x in (depth_m, lefts, K)))
+        for i, (rights, _, _) in enumerate(known)
+        if rights
+    ]
+    visible, error = (torch.cat(maps) for maps in zip(*seen, strict=True)) if seen else (None, None)
     relative = torch.cat(run.relative)
     relative = relative.reshape(count, -1, *relative.shape[1:]).median(dim=1).values  # (N, 1, h, w)
     if match_input_resolution:
@@ -72,10 +71,9 @@ def assemble_output(
     def members(name: str) -> Tensor:
         return torch.cat([getattr(a, name) for a in affine]).reshape(count, -1).cpu()
 
-    def out(x: Tensor) -> Any:
-        return x if output_type == "pt" else x.permute(0, 2, 3, 1).cpu().numpy()
+    def out(x: Tensor | None) -> Any:
+        return x if output_type == "pt" or x is None else x.permute(0, 2, 3, 1).cpu().numpy()
 
-    visible_map = torch.cat(visible)
     return MetricDepthOutput(
         prediction=out(depth_m),
         uncertainty=stock.uncertainty,
@@ -83,11 +81,11 @@ def assemble_output(
         scale=members("scale"),
         shift=members("shift"),
         global_scale=members("g_s"),
-        visible=out(visible_map),
-        photometric_error=out(torch.cat(error)),
+        visible=out(visible),
+        photometric_error=out(error),
         K=K if output_type == "pt" else K.cpu().numpy(),
         history=[report for t in run.trajectories for report in t.history],
-        warnings=_warnings(run, visible_map),
+        warnings=_warnings(run, visible),
     )
 
 
@@ -103,31 +101,33 @@ def _refined(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> Tensor:
 
 
 def _reprojection(
-    guidance: GeometryGuidance, i: int, depth_m: Tensor, left_01: Tensor, K_left: Tensor
+    rights: Sequence[RightView], depth_m: Tensor, left_01: Tensor, K_left: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Visible mask and mean absolute error to the re-rendered left image, at the output's resolution."""
-    rig, right = guidance.rigs[i], guidance.rights[i]
-    matrices = (
-        torch.as_tensor(m, dtype=torch.float32, device=depth_m.device)[None]
-        for m in (rig.K_right, rig.T_right_from_left)
-    )
-    warped = warp_right_to_left(right[None].to(depth_m.device), depth_m, K_left, *matrices)
-    error = (warped.image - left_01).abs().mean(1, keepdim=True)
-    return warped.visible, error * warped.visible
+    """Where any right view sees the pixel, and the least mean absolute error to the re-rendered left image.
+
+    The error is that of the view that explains the pixel best; both are at the output's resolution.
+    """
+    best, visible = torch.full_like(depth_m, torch.inf), torch.zeros_like(depth_m, dtype=torch.bool)
+    for image, K_right, T in rights:
+        warped = warp_right_to_left(image[None], depth_m, K_left, K_right[None], T[None])
+        error = (warped.image - left_01).abs().mean(1, keepdim=True)
+        best = torch.where(warped.visible, torch.minimum(best, error), best)
+        visible |= warped.visible
+    return visible, best.where(visible, torch.zeros_like(best))
 
 
-def _warnings(run: GuidedRun, visible: Tensor) -> list[str]:
+def _warnings(run: GuidedRun, visible: Tensor | None) -> list[str]:
     found = []
     if any(bool(t.on_edge.any()) for t in run.trajectories):
         found.append(
             "The search for the scale ended on the edge of its range: the depth may lie beyond it. "
             "Check the calibration (units of the baseline, order of left and right) or widen depth_range."
         )
-    share = visible.float().mean().item()
+    share = 1.0 if visible is None else visible.float().mean().item()
     if share < LITTLE_OVERLAP:
         found.append(
-            f"Only {share:.0%} of the left image is seen by the right camera at this depth; "
+            f"Only {share:.0%} of the left image is seen by a right camera at this depth; "
             "scale rests on little."
         )
-    found.extend(e.warning for e in run.evidence if e.warning)
+    found.extend(sentence for e in run.evidence for sentence in e.warnings)
     return found

@@ -69,6 +69,8 @@ def _depth_at(x: Tensor, near: Tensor, far: Tensor, space: str) -> Tensor:
         return near + (far - near) * x
     if space == "log":
         return near * (far / near) ** x
+    if space == "log1p":
+        return torch.expm1(torch.lerp(torch.log1p(near), torch.log1p(far), x))
     power = 1.0 if space == "disparity" else 0.5
     low, high = far**-power, near**-power
     return (low + (high - low) * x) ** (-1.0 / power)

@@ -7,6 +7,7 @@ Paper: Algorithm 1, S7.3.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,8 +15,9 @@ from torch import Tensor
 
 from geodiff_plugin.evidence import Evidence, chunk_views
 from geodiff_plugin.matching import gate_matches
-from geodiff_plugin.metric import AffineState, MetricMap, smooth_floor
+from geodiff_plugin.metric import GROWS_WITH_DEPTH, AffineState, MetricMap, smooth_floor
 from geodiff_plugin.objective import Loss, Objective
+from geodiff_plugin.point_scale import depth_span, fit_to_points
 from geodiff_plugin.scale_search import argmin_over, refine_to_matches, search_scale
 from geodiff_plugin.terms import MatchTarget
 from geodiff_plugin.types import StepReport
@@ -25,6 +27,8 @@ __all__ = ["Trajectory", "guided_step"]
 
 #: Candidates of the paper's one-number search; its figures step through 1..80.
 G_S_CANDIDATES = 80
+#: Searches that run at the first step only.
+ONCE = ("one-number", "points-range")
 
 
 class Trajectory:
@@ -45,7 +49,7 @@ class Trajectory:
 
     def __init__(self, config: Any, evidence: Sequence[Evidence], owners: Sequence[int], space: str) -> None:
         self.config, self.evidence, self.owners = config, evidence, list(owners)
-        self.metric = MetricMap(space)
+        self.metric = MetricMap(space, config.positive)
         self.objective = Objective(
             chunk_views(evidence, owners), self.metric, config.weights, config, config.min_visible
         )
@@ -70,9 +74,9 @@ class Trajectory:
             x: ``(B, 1, h, w)`` float32 relative map of this step.
             fraction: of the schedule, [0, 1); the gate on matches narrows with it.
         """
-        if self.config.search == "one-number":
+        if self.config.search in ONCE:
             if self.affine is None:
-                self._search_one_number(x)
+                (self._search_one_number if self.config.search == "one-number" else self._span_points)(x)
             return
         self._search_volume(x)
         wide, narrow = self.config.gate
@@ -92,47 +96,65 @@ class Trajectory:
         best, self.on_edge = argmin_over(candidates, cost)
         self.affine = self.affine_start = AffineState(zero, zero, best)
 
+    def _span_points(self, x: Tensor) -> None:
+        """From the nearest known point to the farthest."""
+        nearest, farthest = zip(
+            *(depth_span(self.evidence[owner].points) for owner in self.owners), strict=True
+        )
+        self.affine = self.affine_start = self._state(torch.stack(nearest), torch.stack(farthest))
+        self.on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+
+    def _state(self, near_m: Tensor, far_m: Tensor) -> AffineState:
+        """The affine state whose nearest and farthest depths, ``(B,)`` metres, are these."""
+        increasing = self.metric.space in GROWS_WITH_DEPTH
+        return self.metric.from_range(*((near_m, far_m) if increasing else (far_m, near_m)))
+
     def _search_volume(self, x: Tensor) -> None:
-        """Joint (near, far) by lookup; the current state stays unless a better basin shows up."""
-        floored = smooth_floor(x)
-        at_zero, at_one = x.new_empty(x.shape[0]), x.new_empty(x.shape[0])
+        """Joint (near, far) by lookup, or by a fit to points where there is no right view.
+
+        The current state stays unless a better basin shows up.
+        """
+        near, far = x.new_empty(x.shape[0]), x.new_empty(x.shape[0])
         on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
         for image in sorted(set(self.owners)):
             members = [i for i, owner in enumerate(self.owners) if owner == image]
-            evidence = self.evidence[image]
             current = None
             if self.affine is not None:
                 current = tuple(v[members] for v in self.metric.range_of(self.affine))
-            found = search_scale(
-                evidence.volume,
-                floored[members],
-                self.metric.space,
-                depth_range=self.config.depth_range,
-                current=current,
+            near[members], far[members], on_edge[members] = self._range_of_image(
+                x[members], self.evidence[image], current
             )
-            near_to_far = (found.near_m, found.far_m)
-            if evidence.matches is not None:
-                near_to_far = refine_to_matches(
-                    floored[members], evidence.matches, *near_to_far, self.metric.space
-                )
-            increasing = self.metric.space in ("depth", "log")
-            at_zero[members], at_one[members] = near_to_far if increasing else near_to_far[::-1]
-            on_edge[members] = found.on_edge
         self.on_edge = on_edge
-        self.affine = self.affine_start = self.metric.from_range(at_zero, at_one)
+        self.affine = self.affine_start = self._state(near, far)
+
+    def _range_of_image(
+        self, x: Tensor, evidence: Evidence, current: tuple[Tensor, Tensor] | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Nearest and farthest metres of one image's samples, and whether they lie on the search's edge.
+
+        Points have the last word: they are measured, matches are inferred.
+        """
+        space, floored = self.metric.space, smooth_floor(x)
+        if evidence.volume is None:
+            ends = current if current is None or space in GROWS_WITH_DEPTH else current[::-1]
+            near_far = fit_to_points(x, evidence.points, self.metric, ends)
+            on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+        else:
+            limits = self.config.depth_range
+            found = search_scale(evidence.volume, floored, space, depth_range=limits, current=current)
+            near_far, on_edge = (found.near_m, found.far_m), found.on_edge
+        for known in (evidence.matches, evidence.points):
+            if known is not None:
+                near_far = refine_to_matches(floored, known, *near_far, space)
+        return *near_far, on_edge
 
     def _gate_matches(self, x: Tensor, factor: float) -> None:
         """Believe matches within a factor of the estimate only: others are outliers."""
-        own = [self.evidence[i].matches for i in self.owners]
-        if own[0] is None:
+        known = self.objective.views.matches
+        if known is None:
             return
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
-        gated = [gate_matches(m, d[None], factor) for m, d in zip(own, depth_m, strict=True)]
-        self.matches = MatchTarget(
-            torch.stack([m.inverse_depth for m in own]),
-            torch.cat(gated),
-            torch.stack([m.plane_step for m in own]),
-        )
+        self.matches = replace(known, confidence=gate_matches(known, depth_m, factor))
 
     def report(self, step: int, timestep: float, loss: Loss) -> None:
         """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
@@ -158,7 +180,7 @@ def guided_step(
     eps: Tensor,
     step: int,
     timestep: float,
-    fraction: float,
+    fractions: Sequence[float],
 ) -> Tensor:
     """One pass of Algorithm 1's loop body: search, gradient of L_geo, updates of latent, scale and shift.
 
@@ -170,7 +192,8 @@ def guided_step(
         eps: ``(B, C, h, w)`` predicted noise, the yardstick of the norm-matched rule.
         step: index in the schedule.
         timestep: the scheduler's timestep.
-        fraction: ``step / number of steps``.
+        fractions: where in the schedule, [0, 1), each round of ``inner_steps`` updates stands. One round a
+            step, ``[step / number of steps]``, but for priors that cannot take as many steps as are wanted.
 
     Returns:
         ``(B, C, h, w)`` float32, what to add to the leaf; exactly 0 with ``optimize_latents=False``.
@@ -178,34 +201,37 @@ def guided_step(
     Source: Algorithm 1, with Eq. 16 and 17 (which it omits) and the decode of z0_hat (it prints z_0).
     """
     config, z, z0_prior = trajectory.config, leaf, None
-    updates = config.inner_steps if trajectory.is_active(fraction) else 0
-    for k in range(max(updates, 1)):
-        with torch.set_grad_enabled(updates > 0):
-            if not z.requires_grad and config.optimize_latents and updates:
+    rounds = [f for f in fractions if config.inner_steps and trajectory.is_active(f)]
+    moments = [f for f in rounds for _ in range(config.inner_steps)]  # one an update
+    for k, moment in enumerate(moments or fractions[:1]):
+        opens_round = not moments or k % config.inner_steps == 0
+        with torch.set_grad_enabled(bool(moments)):
+            if not z.requires_grad and config.optimize_latents and moments:
                 z = z.detach().requires_grad_()
             z0_hat = z0_of(z)  # (B, C, h, w), Tweedie
             x0 = decode(z0_hat)  # (B, 1, h', w'), D(z0_hat)
-            if k == 0:
-                z0_prior = z0_hat.detach()
-                trajectory.settle_scale(x0.detach(), fraction)  # g_s*, S7.3
-            s_hat, t_hat = (v.detach().requires_grad_(updates > 0) for v in _raw(trajectory.affine))
-            affine = AffineState(s_hat, t_hat, trajectory.affine.g_s)
+            z0_prior = z0_hat.detach() if z0_prior is None else z0_prior
+            if opens_round:
+                trajectory.settle_scale(x0.detach(), moment)  # g_s*, S7.3
+            s_hat, t_hat = (v.detach().requires_grad_(bool(moments)) for v in _raw(trajectory.affine))
+            affine = replace(trajectory.affine, s_hat=s_hat, t_hat=t_hat)
             loss = trajectory.objective(
                 x0, affine, trajectory.affine_start, z0_hat, z0_prior, trajectory.matches
             )
             total = loss.total.sum()  # samples do not mix, so the gradient of the sum is each one's own
-        if updates:
+        if moments:
             inputs = (s_hat, t_hat, z) if config.optimize_latents else (s_hat, t_hat)
             grads = torch.autograd.grad(total, inputs)
             s_hat = s_hat.detach() + trajectory.scale_rule.step(grads[0])
             t_hat = t_hat.detach() + trajectory.shift_rule.step(grads[1])
-            trajectory.affine = AffineState(s_hat, t_hat, affine.g_s)
+            trajectory.affine = replace(affine, s_hat=s_hat, t_hat=t_hat)
             if config.optimize_latents:
                 z = z.detach() + trajectory.latent_rule.step(grads[2], eps)
-        if k == 0:
+        if opens_round:
             first = loss
+        if not moments or (k + 1) % config.inner_steps == 0:
+            trajectory.report(step, timestep, first)
     trajectory.last_x = x0.detach()
-    trajectory.report(step, timestep, first)
     return (z - leaf).detach()
 
 

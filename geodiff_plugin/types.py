@@ -74,7 +74,7 @@ class StepReport:
         s_hat: ``(B,)`` raw scale before softplus, after the step.
         t_hat: ``(B,)`` raw shift before softplus, after the step.
         g_s: ``(B,)`` global scale in use, metres.
-        visible_fraction: ``(B,)`` share of the pixels that the right view sees.
+        visible_fraction: ``(B,)`` share of the pixels that a right view sees; 0 without one.
     """
 
     step: int
@@ -103,8 +103,10 @@ class MetricDepthOutput(BaseOutput):
         scale: ``(N, E)`` softplus of the learnt scale.
         shift: ``(N, E)`` softplus of the learnt shift.
         global_scale: ``(N, E)`` metres, the pre-selected g_s of Eq. 16.
-        visible: boolean, in front of the right camera and inside its image, shaped as ``prediction``.
-        photometric_error: [0, 1] mean absolute difference to the re-rendered left image, 0 where not visible.
+        visible: boolean, in front of a right camera and inside its image, shaped as ``prediction``; ``None``
+            without a right view.
+        photometric_error: [0, 1] mean absolute difference to the left image re-rendered from the right view
+            that explains the pixel best, 0 where not visible; ``None`` without a right view.
         K: ``(N, 3, 3)`` intrinsics of the output grid, pixels.
         history: one ``StepReport`` a step and batch chunk.
         warnings: what the user should know about this result, as sentences.

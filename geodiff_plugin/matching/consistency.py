@@ -143,7 +143,7 @@ def gate_matches(matches: Matches, depth_m: torch.Tensor, factor: float) -> torc
     """Confidence of the matches that a depth map does not contradict.
 
     Args:
-        matches: of one image.
+        matches: of one image, or of a chunk of samples (``terms.MatchTarget``).
         depth_m: ``(B, 1, H, W)`` metres, > 0, on the matches' grid.
         factor: > 1; a match further than this factor from ``depth_m`` is dropped.
 

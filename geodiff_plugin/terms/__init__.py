@@ -4,7 +4,8 @@ Hop: ``Estimate`` -> ``{name: (B,)}``.
 Paper: Eq. 14 (eq:geo-loss), Eq. 17; the terms beyond the paper say so.
 
 A new term is a new file and one line in ``TERMS``; ``options`` are the names of the configuration
-values that it takes, ``needs_warp`` whether it reads ``Estimate.warped_01``.
+values that it takes, ``needs_warp`` whether it reads ``Estimate.warped_01``, ``needs_matches`` and
+``needs_points`` whether it reads those; a term whose input a call lacks is left out.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from geodiff_plugin.terms.anchor import anchor
 from geodiff_plugin.terms.base import Estimate, MatchTarget, masked_mean
 from geodiff_plugin.terms.matches import matches
 from geodiff_plugin.terms.photometric import photometric, photometric_map
+from geodiff_plugin.terms.points import points
 from geodiff_plugin.terms.prior_pull import prior_pull
 
 __all__ = ["TERMS", "Estimate", "MatchTarget", "Term", "masked_mean", "photometric_map"]
@@ -31,11 +33,13 @@ class Term:
     options: tuple[str, ...] = ()
     needs_warp: bool = False
     needs_matches: bool = False
+    needs_points: bool = False
 
 
 TERMS: dict[str, Term] = {
     "photometric": Term(photometric, ("eta", "pyramid_levels"), needs_warp=True),
     "matches": Term(matches, needs_matches=True),
+    "points": Term(points, ("points_loss",), needs_points=True),
     "prior_pull": Term(prior_pull, ("pull_to",)),
     "anchor": Term(anchor),
 }

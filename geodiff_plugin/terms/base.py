@@ -8,21 +8,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from geodiff_plugin.metric import AffineState
 
-__all__ = ["Estimate", "MatchTarget", "masked_mean"]
+__all__ = ["Estimate", "MatchTarget", "cauchy", "masked_mean"]
 
 
 @dataclass(frozen=True)
 class MatchTarget:
-    """Matches between the views, resampled to the grid of the loss.
+    """Matches between the views, or known points, on the grid of the loss.
 
     Attributes:
         inverse_depth: ``(B, 1, H, W)`` 1/m.
         confidence: ``(B, 1, H, W)`` in [0, 1]; 0 where nothing is known or the gate closed.
-        plane_step: ``(B,)`` 1/m between two planes of the sweep: the unit of the residual.
+        plane_step: ``(B,)`` 1/m, the unit of the residual: between two planes of the sweep, or
+            ``known_points.UNIT`` of the points' median inverse depth.
     """
 
     inverse_depth: Tensor
@@ -37,13 +39,14 @@ class Estimate:
     Attributes:
         depth_m: ``(B, 1, H, W)`` metres, carries the graph.
         left_01: ``(B, 3, H, W)`` the left image.
-        warped_01: ``(B, 3, H, W)`` the right image seen from the left through ``depth_m``.
-        visible: ``(B, 1, H, W)`` bool: real (not padded), and seen by the right camera.
+        warped_01: ``(B, V, 3, H, W)`` every right image seen from the left through ``depth_m``.
+        visible: ``(B, V, 1, H, W)`` bool: real (not padded), and seen by that right camera.
         affine: current scale, shift, g_s; carries the graph.
         affine_start: where the search put them; no graph.
         z0: ``(B, C, h, w)`` current clean latent, carries the graph.
         z0_prior: ``(B, C, h, w)`` the network's own clean latent of this step; no graph.
         matches: the views' own evidence, or ``None``.
+        points: depths that the user knows, in the same form, or ``None``.
     """
 
     depth_m: Tensor
@@ -55,6 +58,12 @@ class Estimate:
     z0: Tensor
     z0_prior: Tensor
     matches: MatchTarget | None
+    points: MatchTarget | None = None
+
+
+def cauchy(e: Tensor, width: float) -> Tensor:
+    """``width^2 / 2 log(1 + (e / width)^2)``: ``e^2 / 2`` near 0, its gradient falls as 1 / e beyond."""
+    return 0.5 * width**2 * torch.log1p((e / width) ** 2)
 
 
 def masked_mean(value: Tensor, weight: Tensor) -> Tensor:

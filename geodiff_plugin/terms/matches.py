@@ -6,10 +6,9 @@ Paper: none (it guides by Eq. 14 alone); what it buys is in docs/results.md.
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from geodiff_plugin.terms.base import Estimate, masked_mean
+from geodiff_plugin.terms.base import Estimate, cauchy, masked_mean
 
 __all__ = ["matches"]
 
@@ -31,5 +30,4 @@ def matches(estimate: Estimate) -> Tensor:
     """
     target = estimate.matches
     e = (1.0 / estimate.depth_m - target.inverse_depth) / target.plane_step.view(-1, 1, 1, 1)
-    c2 = CAUCHY_PLANES**2
-    return masked_mean(0.5 * c2 * torch.log1p(e * e / c2), target.confidence)
+    return masked_mean(cauchy(e, CAUCHY_PLANES), target.confidence)

@@ -1,4 +1,4 @@
-"""Photometric error between the left image and the right one seen through the estimate.
+"""Photometric error between the left image and the right ones seen through the estimate.
 
 Hop: ``Estimate`` -> ``(B,)`` in [0, 1].
 Paper: S4.2, Eq. 14 (eq:geo-loss).
@@ -7,6 +7,7 @@ Paper: S4.2, Eq. 14 (eq:geo-loss).
 from __future__ import annotations
 
 import kornia.metrics
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -16,6 +17,8 @@ __all__ = ["photometric", "photometric_map"]
 
 #: A pyramid level with a shorter side than this says nothing that its parent does not.
 MIN_SIDE = 24
+#: More than any error of a view that sees the pixel.
+UNSEEN = 2.0
 
 
 def photometric_map(left_01: Tensor, warped_01: Tensor, eta: float) -> Tensor:
@@ -38,6 +41,9 @@ def photometric_map(left_01: Tensor, warped_01: Tensor, eta: float) -> Tensor:
 def photometric(estimate: Estimate, *, eta: float = 0.85, pyramid_levels: int = 3) -> Tensor:
     """Mean photometric error over the visible pixels, averaged over an image pyramid.
 
+    With several right views each pixel takes the one that explains it best among those that see it: a view
+    in which something hides the pixel then does not count.
+
     Args:
         estimate: needs ``left_01``, ``warped_01`` and ``visible``.
         eta: weight of SSIM against L1.
@@ -48,10 +54,13 @@ def photometric(estimate: Estimate, *, eta: float = 0.85, pyramid_levels: int = 
         zero where the right image is constant and jumps where a sample crosses a pixel centre).
 
     Source: Eq. 14 (eq:geo-loss). Deviation: masked to visible pixels (the paper's mean over all
-    pixels rewards depths that push pixels out of the right image), and the pyramid.
+    pixels rewards depths that push pixels out of the right image), and the pyramid. Minimum over views:
+    Godard et al. 2019, "Digging into self-supervised monocular depth estimation", Eq. 4.
     """
-    left, warped, mask = estimate.left_01, estimate.warped_01, estimate.visible
-    mask = mask.to(left.dtype)
+    views = estimate.warped_01.shape[1]
+    left = estimate.left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), a view's pixels by themselves
+    warped = estimate.warped_01.flatten(0, 1)
+    mask = estimate.visible.flatten(0, 1).to(left.dtype)
     total, levels = 0.0, 0
     for level in range(pyramid_levels):
         if level:
@@ -62,6 +71,13 @@ def photometric(estimate: Estimate, *, eta: float = 0.85, pyramid_levels: int = 
             left = F.avg_pool2d(left * mask, 2) / seen.clamp_min(1e-6)
             warped = F.avg_pool2d(warped * mask, 2) / seen.clamp_min(1e-6)
             mask = (seen > 0.5).to(left.dtype)
-        total = total + masked_mean(photometric_map(left, warped, eta), mask)
+        total = total + masked_mean(*_best_explained(photometric_map(left, warped, eta), mask, views))
         levels += 1
     return total / levels
+
+
+def _best_explained(error: Tensor, mask: Tensor, views: int) -> tuple[Tensor, Tensor]:
+    """Least error over the views that see a pixel, and whether any does, ``(B, 1, H, W)`` each."""
+    error = error.mean(1, keepdim=True).unflatten(0, (-1, views))
+    mask = mask.unflatten(0, (-1, views))
+    return torch.where(mask > 0, error, torch.full_like(error, UNSEEN)).amin(1), mask.amax(1)

@@ -8,7 +8,7 @@ import torch
 from geodiff_plugin.denoising import NoiseLevel, noise_from, output_from, z0_from
 from geodiff_plugin.geometry.projection import plane_rays
 from geodiff_plugin.metric import AffineState, MetricMap
-from geodiff_plugin.objective import Objective, Views
+from geodiff_plugin.objective import Objective, RightViews, Views
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.terms import MatchTarget
 
@@ -23,7 +23,7 @@ def double(x):
 def views_of(pair):
     left, right = (double(image).permute(2, 0, 1)[None] / 255 for image in (pair.left, pair.right))
     K, T = double(pair.K)[None], torch.linalg.inv(double(pair.E))[None]
-    return Views(left, right, K, K, T, plane_rays(K, K, T, (48, 64)))
+    return Views(left, K, (RightViews(right, K, T, plane_rays(K, K, T, (48, 64))),))
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity", "log", "sqrt_disparity"])

@@ -8,6 +8,7 @@ from geodiff_plugin.terms import TERMS, Estimate, MatchTarget, masked_mean
 from geodiff_plugin.terms.anchor import LEAST
 from geodiff_plugin.terms.matches import CAUCHY_PLANES
 from geodiff_plugin.terms.photometric import photometric, photometric_map
+from geodiff_plugin.terms.points import CAUCHY_UNITS
 
 
 def estimate(**changes):
@@ -16,12 +17,15 @@ def estimate(**changes):
     values = {
         "depth_m": torch.full((2, 1, 32, 40), 2.0),
         "left_01": left,
-        "warped_01": left.clone(),
-        "visible": torch.ones(2, 1, 32, 40, dtype=torch.bool),
+        "warped_01": left[:, None].clone(),
+        "visible": torch.ones(2, 1, 1, 32, 40, dtype=torch.bool),
         "affine": affine,
         "affine_start": affine,
         "z0": torch.zeros(2, 4, 8, 10),
         "z0_prior": torch.zeros(2, 4, 8, 10),
+        "points": MatchTarget(
+            torch.full((2, 1, 32, 40), 0.5), torch.ones(2, 1, 32, 40), torch.tensor([0.01, 0.02])
+        ),
         "matches": MatchTarget(
             torch.full((2, 1, 32, 40), 0.5), torch.ones(2, 1, 32, 40), torch.tensor([0.01, 0.02])
         ),
@@ -32,22 +36,67 @@ def estimate(**changes):
 @pytest.mark.parametrize("name", [n for n in TERMS if n != "prior_pull"])
 def test_a_perfect_estimate_costs_nothing(name):
     term = TERMS[name]
-    value = (
-        term.function(estimate(), **{"eta": 0.85, "pyramid_levels": 3})
-        if term.options
-        else term.function(estimate())
-    )
+    options = {"eta": 0.85, "pyramid_levels": 3, "points_loss": "robust"}
+    value = term.function(estimate(), **{key: options[key] for key in term.options})
     torch.testing.assert_close(value, torch.zeros(2), atol=1e-5, rtol=0)
 
 
 def test_photometric_ignores_what_is_not_visible():
-    warped = estimate().left_01.clone()
-    warped[:, :, :, 20:] = 0.0
-    seen = torch.zeros(2, 1, 32, 40, dtype=torch.bool)
+    warped = estimate().warped_01.clone()
+    warped[..., 20:] = 0.0
+    seen = torch.zeros(2, 1, 1, 32, 40, dtype=torch.bool)
     seen[..., :18] = True  # SSIM looks one pixel around
     masked = photometric(estimate(warped_01=warped, visible=seen), pyramid_levels=1)
     torch.testing.assert_close(masked, torch.zeros(2), atol=1e-5, rtol=0)
     assert (photometric(estimate(warped_01=warped), pyramid_levels=1) > 0.1).all()
+
+
+def test_photometric_takes_the_view_that_explains_a_pixel_best():
+    left = estimate().left_01
+    good, bad = left.clone(), torch.zeros_like(left)
+    first, second = good.clone(), bad.clone()
+    first[..., 20:], second[..., 20:] = 0.0, left[..., 20:]
+    both = estimate(
+        warped_01=torch.stack([first, second], 1), visible=torch.ones(2, 2, 1, 32, 40, dtype=torch.bool)
+    )
+    seam = photometric(both, pyramid_levels=1)  # SSIM looks one pixel across the seam
+    assert (seam < 0.03).all() and (photometric(estimate(warped_01=first[:, None])) > 0.2).all()
+    hidden = both.visible.clone()
+    hidden[:, 1] = False
+    alone = photometric(estimate(warped_01=both.warped_01, visible=hidden))
+    torch.testing.assert_close(alone, photometric(estimate(warped_01=first[:, None])))
+
+
+def test_points_robust_and_in_metres():
+    points = TERMS["points"].function
+    known = torch.zeros(2, 1, 32, 40)
+    known[:, :, 3, 4] = known[:, :, 20, 30] = 1.0
+    target = MatchTarget(torch.full((2, 1, 32, 40), 0.5) * known, known, torch.tensor([0.005, 0.005]))
+    off = estimate(depth_m=torch.full((2, 1, 32, 40), 2.5), points=target)
+    c2 = CAUCHY_UNITS**2
+    expected = torch.full((2,), c2 / 2 * float(torch.log1p(torch.tensor(20.0**2 / c2))))
+    torch.testing.assert_close(points(off), expected)
+    torch.testing.assert_close(points(off, points_loss="l1l2"), torch.full((2,), 0.5 + 0.25))
+
+
+@pytest.mark.parametrize("points_loss", ["robust", "l1l2"])
+def test_points_gradient_in_float64(points_loss):
+    g = torch.Generator().manual_seed(5)
+    depth = torch.rand(1, 1, 6, 7, generator=g, dtype=torch.float64) + 1.0
+    known = (torch.rand(1, 1, 6, 7, generator=g) < 0.4).double()
+    target = MatchTarget(
+        known / (torch.rand(1, 1, 6, 7, generator=g, dtype=torch.float64) + 1.0),
+        known,
+        known.new_tensor([0.01]),
+    )
+    base = estimate(points=target)
+
+    def loss(d):
+        return TERMS["points"].function(Estimate(**{**base.__dict__, "depth_m": d}), points_loss=points_loss)
+
+    assert torch.autograd.gradcheck(loss, depth.requires_grad_())
+    (grad,) = torch.autograd.grad(loss(depth).sum(), depth)
+    assert (grad[known == 0] == 0).all() and (grad[known > 0] != 0).all()
 
 
 def test_photometric_without_ssim_is_l1():
@@ -58,8 +107,10 @@ def test_photometric_without_ssim_is_l1():
 
 def test_photometric_gradient_in_float64():
     g = torch.Generator().manual_seed(3)
-    left, warped = (torch.rand(1, 3, 26, 25, generator=g, dtype=torch.float64) for _ in range(2))
-    base = estimate(left_01=left, visible=torch.ones(1, 1, 26, 25, dtype=torch.bool))
+    left = torch.rand(1, 3, 26, 25, generator=g, dtype=torch.float64)
+    warped = torch.rand(1, 2, 3, 26, 25, generator=g, dtype=torch.float64)
+    seen = torch.rand(1, 2, 1, 26, 25, generator=g) < 0.8
+    base = estimate(left_01=left, visible=seen)
 
     def loss(w):
         return photometric(Estimate(**{**base.__dict__, "warped_01": w}), pyramid_levels=2)
