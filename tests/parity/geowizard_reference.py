@@ -74,16 +74,16 @@ def write_tokenizer(folder: Path) -> Path:
 
 def image_u8() -> np.ndarray:
     """``(H, W, 3)`` uint8."""
-    from tests.parity.named_weights import named_array
+    from tests.parity.named_weights import draw
 
-    return np.clip(named_array("geowizard/image", (*SIZE, 3)) * 60 + 128, 0, 255).astype(np.uint8)
+    return np.clip(draw("geowizard/image", (*SIZE, 3)) * 60 + 128, 0, 255).astype(np.uint8)
 
 
 def noise() -> np.ndarray:
     """``(1, 4, h, w)``, what both halves start from."""
-    from tests.parity.named_weights import named_array
+    from tests.parity.named_weights import draw
 
-    return named_array("geowizard/noise", (1, 4, SIZE[0] // 8, SIZE[1] // 8))
+    return draw("geowizard/noise", (1, 4, SIZE[0] // 8, SIZE[1] // 8))
 
 
 def _stand_ins() -> None:
@@ -149,7 +149,9 @@ def run_case(case: str, coupled: bool) -> dict[str, np.ndarray]:
         pipe = geowizard_pipeline.DepthNormalEstimationPipeline(**parts)
     else:
         encoder = CLIPTextModel(CLIPTextConfig(**TEXT))
-        parts["text_encoder"] = fill(encoder, "text_encoder.", drop="text_model.")
+        parts["text_encoder"] = fill(
+            encoder, "text_encoder.", rename=lambda name: name.removeprefix("text_model.")
+        )
         with tempfile.TemporaryDirectory() as folder:
             write_tokenizer(Path(folder))
             parts["tokenizer"] = CLIPTokenizer(f"{folder}/vocab.json", f"{folder}/merges.txt")
@@ -164,13 +166,16 @@ def run_case(case: str, coupled: bool) -> dict[str, np.ndarray]:
     pipe.unet.register_forward_pre_hook(
         lambda module, args, kwargs: conditions.append(kwargs["encoder_hidden_states"]), with_kwargs=True
     )
-    for name in ("decode_depth", "decode_normal"):
 
-        def spy(latent, own=getattr(pipe, name), name=name):
+    def spied(name, own):
+        def spy(latent):
             decoded[name] = own(latent).clone()
             return decoded[name].clone()
 
-        setattr(pipe, name, spy)
+        return spy
+
+    pipe.decode_depth = spied("depth", pipe.decode_depth)
+    pipe.decode_normal = spied("normal", pipe.decode_normal)
     own_randn, torch.randn = torch.randn, lambda *args, **kwargs: torch.from_numpy(noise())
     try:
         result = pipe(
@@ -185,12 +190,12 @@ def run_case(case: str, coupled: bool) -> dict[str, np.ndarray]:
         torch.randn = own_randn
     return {
         "condition": conditions[0][0].numpy(),  # (tokens, width)
-        "network_output": outputs[0].numpy(),  # (2, 4, h, w): depth, normal
-        "last_output": outputs[-1].numpy(),
-        "depth_unclipped": decoded["decode_depth"][0, 0].numpy()[::4, ::4],
-        "normal_unscaled": decoded["decode_normal"][0].numpy()[:, ::8, ::8],
-        "depth": result.depth_np[::4, ::4],
-        "normal": np.moveaxis(result.normal_np, -1, 0)[:, ::8, ::8],
+        "network_output": outputs[0].numpy()[:, :, ::2, ::2],  # (2, 4, h, w): depth, normals
+        "last_output": outputs[-1].numpy()[:, :, ::2, ::2],
+        "depth_unclipped": decoded["depth"][0, 0].numpy()[::8, ::8],
+        "normals_unscaled": decoded["normal"][0].numpy()[:, ::8, ::8],
+        "depth": result.depth_np[::8, ::8],
+        "normals": np.moveaxis(result.normal_np, -1, 0)[:, ::8, ::8],
     }
 
 
