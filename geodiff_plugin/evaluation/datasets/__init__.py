@@ -11,6 +11,7 @@ from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.datasets.booster import BOOSTER
+from geodiff_plugin.evaluation.datasets.exposure import with_exposure
 from geodiff_plugin.evaluation.datasets.folder import FOLDER
 from geodiff_plugin.evaluation.datasets.kitti2012 import KITTI2012
 from geodiff_plugin.evaluation.datasets.kitti2015 import KITTI2015
@@ -41,8 +42,9 @@ DATASETS: dict[str, Dataset] = {
 
 
 def load(ref: SampleRef) -> StereoSample:
-    """Read the sample that ``ref`` points to, with its data set's loader."""
-    return DATASETS[ref.dataset].load(ref)
+    """Read the sample that ``ref`` points to with its data set's loader, and change it as ``ref`` asks."""
+    sample, change = DATASETS[ref.dataset].load(ref), ref.files.get("right_exposure")
+    return sample if change is None else with_exposure(sample, change, ref.name)
 
 
 def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **options: object) -> list[SampleRef]:
