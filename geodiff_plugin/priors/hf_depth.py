@@ -18,12 +18,15 @@ from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MA
 
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.priors.hf_preparation import Preparation
+from geodiff_plugin.priors.loading import check_weights
 
 __all__ = ["DEPTH_ARCHITECTURES", "DepthMap", "HFDepthModel", "output_of"]
 
 #: Class names of every model that ``AutoModelForDepthEstimation`` loads.
 DEPTH_ARCHITECTURES = frozenset(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values())
 SPACES = ("depth", "disparity")
+#: Weights that DPT's published files lack and no forward reads: the first fusion has nothing to add to.
+UNUSED = "fusion_stage.layers.0.residual_layer1."
 #: DepthPro's own limits on inverse metres.
 NEAREST, FARTHEST = 1e4, 1e-4
 
@@ -122,13 +125,14 @@ class HFDepthModel:
 
         Raises:
             OSError: it does not exist, is neither cached nor can be fetched, or has no safetensors.
-            ValueError: a class whose output, or a processor that, is not known.
+            ValueError: weights that are missing; a class whose output, or a processor that, is not known.
         """
         files = {k: v for k, v in kwargs.items() if k != "variant"}
         config, _ = BaseImageProcessor.get_image_processor_dict(str(name), **files)
-        model = AutoModelForDepthEstimation.from_pretrained(
-            str(name), dtype=dtype, use_safetensors=True, **kwargs
+        model, found = AutoModelForDepthEstimation.from_pretrained(
+            str(name), dtype=dtype, use_safetensors=True, output_loading_info=True, **kwargs
         )
+        check_weights([key for key in found["missing_keys"] if UNUSED not in key], (), str(name))
         model = model.to(device or "cpu").eval().requires_grad_(False)
         return cls(model, Preparation.from_config(config), space)
 

@@ -1,0 +1,47 @@
+"""Any depth model of ``transformers``, as its own ``save_pretrained`` wrote it.
+
+Hop: ``config.json``, ``preprocessor_config.json``, weights -> ``TransformersDepthPipeline``.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from geodiff_plugin.priors.base import OwnPipelinePrior
+from geodiff_plugin.priors.hf_depth import DEPTH_ARCHITECTURES, HFDepthModel
+from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+from geodiff_plugin.priors.pipelines.transformers_depth import TransformersDepthPipeline
+
+__all__ = ["TransformersDepthPrior"]
+
+
+class TransformersDepthPrior(OwnPipelinePrior):
+    """Adapter of ``TransformersDepthPipeline``: scale, shift and a residual per pixel can be guided."""
+
+    pipeline_class = TransformersDepthPipeline
+    licence = {
+        "depth-anything/Depth-Anything-V2-Small-hf": "apache-2.0",
+        "depth-anything/Depth-Anything-V2-Base-hf": "cc-by-nc-4.0",
+        "depth-anything/Depth-Anything-V2-Large-hf": "cc-by-nc-4.0",
+        "Intel/dpt-large": "apache-2.0",
+        "Intel/zoedepth-nyu-kitti": "mit",
+        "vinvino02/glpn-nyu": "apache-2.0",
+        "apple/DepthPro-hf": "apple-amlr",
+    }
+
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """One of the architectures that ``AutoModelForDepthEstimation`` knows."""
+        return not DEPTH_ARCHITECTURES.isdisjoint(layout.config("").get("architectures") or ())
+
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> TransformersDepthPipeline:
+        """The model and the preparation of its images."""
+        options = {} if layout.variant is None else {"variant": layout.variant}
+        loaded = HFDepthModel.from_pretrained(
+            layout.folder, dtype=dtype, space=space, local_files_only=True, **options
+        )
+        preparation = dict(loaded.preparation.options)
+        return cls.pipeline_class(loaded.model, DirectScheduler(timestep=0), preparation, space)

@@ -1,0 +1,130 @@
+"""Run the authors' Pixel-Perfect Depth on named weights, and keep slices of what it answers.
+
+``docs/priors.md`` tells how to make the environment; then, from the root of this repository::
+
+    python -m tests.parity.ppd_reference pixel-perfect-depth stubs tests/parity/fixtures/ppd.npz
+
+The first is a checkout of github.com/gangweix/pixel-perfect-depth, the second a folder with empty modules for what
+it imports and never calls here (torchvision, timm, omegaconf). Nothing of theirs is copied: the networks, the
+sampler and the resizing are imported and run.
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.parity.named_weights import draw, named_state
+
+#: A small DiT; the width of the semantic tokens, 1024, is fixed in their code.
+DIT = {"hidden_size": 32, "depth": 4, "num_heads": 2}
+SEMANTICS = {"img_size": 70, "embed_dim": 1024, "depth": 1, "num_heads": 16, "mlp_ratio": 1.0}
+#: Multiples of 16, not square, and another grid than the 5 x 5 positions.
+SIZE = (48, 80)
+STEPS = 4
+MIDDLE = 500
+COUNTS = (1, 2, 3, 4, 5, 7, 10, 20, 50)
+#: One of more and one of less pixels than 1024 x 768.
+PHOTOGRAPHS = {"large": (900, 1300), "small": (75, 113)}
+#: Two parts of a map; of a resized photograph every 97th pixel. A few kB in all.
+CORNERS = ((slice(None), slice(None), slice(0, 12), slice(0, 12)), (..., slice(30, 42), slice(66, 78)))
+
+
+def picture() -> torch.Tensor:
+    """``(1, 3, 48, 80)`` in [0, 1]."""
+    return torch.from_numpy(np.clip(0.5 + 0.2 * draw("image", (1, 3, *SIZE)), 0, 1))
+
+
+def noise() -> torch.Tensor:
+    """``(1, 1, 48, 80)``, where they draw."""
+    return torch.from_numpy(draw("noise", (1, 1, *SIZE)))
+
+
+def photograph(kind: str) -> np.ndarray:
+    """``(H, W, 3)`` uint8, RGB, smooth with some noise."""
+    height, width = PHOTOGRAPHS[kind]
+    rows, columns = np.mgrid[:height, :width][..., None]
+    waves = 90 * np.sin(rows / 9.0 + np.arange(3)) * np.cos(columns / 13.0)
+    return np.clip(128 + waves + 8 * draw(kind, (height, width, 3)), 0, 255).astype(np.uint8)
+
+
+def corners(values: torch.Tensor) -> np.ndarray:
+    """The kept parts of a map, in one row."""
+    return torch.cat([values[corner].flatten() for corner in CORNERS]).numpy()
+
+
+def semantic_shapes() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of ``depth_anything_v2_vitl.pth`` at the size of ``SEMANTICS``, without its depth head."""
+    width, hidden = SEMANTICS["embed_dim"], int(SEMANTICS["embed_dim"] * SEMANTICS["mlp_ratio"])
+    shapes = {
+        "cls_token": (1, 1, width),
+        "pos_embed": (1, (SEMANTICS["img_size"] // 14) ** 2 + 1, width),
+        "mask_token": (1, width),
+        "patch_embed.proj.weight": (width, 3, 14, 14),
+        "patch_embed.proj.bias": (width,),
+        "norm.weight": (width,),
+        "norm.bias": (width,),
+    }
+    linear = {"attn.qkv": (3 * width, width), "attn.proj": (width, width)}
+    linear |= {"mlp.fc1": (hidden, width), "mlp.fc2": (width, hidden)}
+    for i in range(SEMANTICS["depth"]):
+        for name in ("norm1.weight", "norm1.bias", "norm2.weight", "norm2.bias", "ls1.gamma", "ls2.gamma"):
+            shapes[f"blocks.{i}.{name}"] = (width,)
+        for name, shape in linear.items():
+            shapes |= {f"blocks.{i}.{name}.weight": shape, f"blocks.{i}.{name}.bias": shape[:1]}
+    return {f"pretrained.{name}": shape for name, shape in shapes.items()}
+
+
+def authors_model() -> torch.nn.Module:
+    """Their ``PixelPerfectDepth``, whose constructor would read two files, with small networks."""
+    from ppd.models.depth_anything_v2.dinov2 import DinoVisionTransformer
+    from ppd.models.depth_anything_v2.dinov2_layers import MemEffAttention, NestedTensorBlock
+    from ppd.models.depth_anything_v2.dpt import DepthAnythingV2
+    from ppd.models.dit import DiT
+    from ppd.models.ppd import PixelPerfectDepth
+
+    model, encoder = PixelPerfectDepth.__new__(PixelPerfectDepth), DepthAnythingV2.__new__(DepthAnythingV2)
+    torch.nn.Module.__init__(model)
+    torch.nn.Module.__init__(encoder)
+    block = partial(NestedTensorBlock, attn_class=MemEffAttention)
+    options = {"patch_size": 14, "init_values": 1.0, "block_chunks": 0, "block_fn": block}
+    encoder.pretrained = DinoVisionTransformer(**SEMANTICS, **options)
+    encoder.load_state_dict(named_state(semantic_shapes()))  # strict: these are their names and shapes
+    model.sem_encoder, model.dit = encoder, DiT(**DIT)
+    model.device, model.sampling_steps = torch.device("cpu"), STEPS
+    model.configure_diffusion()
+    state = named_state({f"dit.{name}": tuple(v.shape) for name, v in model.dit.state_dict().items()})
+    model.dit.load_state_dict({name: state[f"dit.{name}"] for name in model.dit.state_dict()})
+    return model.eval()
+
+
+def main(source: str, stubs: str, out: str) -> None:
+    """Run theirs and save ``out``."""
+    sys.path[:0] = [source, stubs]
+    from ppd.utils.diffusion.timesteps import Timesteps
+    from ppd.utils.transform import image2tensor, resize_keep_aspect
+
+    model, kept = authors_model(), {}
+    with torch.no_grad():
+        semantics = model.semantics_prompt(picture())
+        joined = torch.cat([noise(), picture() - 0.5], dim=1)
+        kept["semantics"] = semantics[:, :, ::64].numpy()
+        kept["velocity"] = corners(model.dit(x=joined, semantics=semantics, timestep=torch.tensor(MIDDLE)))
+        drawn, torch.randn = torch.randn, lambda size: noise()
+        kept["final"] = corners(model.forward_test(picture()))
+        torch.randn = drawn
+    for count in COUNTS:
+        kept[f"timesteps_{count}"] = Timesteps(1000, count).timesteps.numpy()
+    for kind in PHOTOGRAPHS:
+        resized = image2tensor(resize_keep_aspect(photograph(kind)[:, :, ::-1].copy()))
+        kept[f"{kind}_size"] = np.array(resized.shape[-2:])
+        kept[kind] = resized[:, :, ::97, ::97].numpy()
+    np.savez_compressed(Path(out), **kept)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
