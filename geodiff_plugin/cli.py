@@ -150,6 +150,25 @@ def bench(
     run_bench(full_size, device)
 
 
+@app.command()
+def convert(
+    source: Annotated[
+        Path, typer.Argument(metavar="SRC", help="Checkpoint (.ckpt, .pth), or a folder of .bin weights.")
+    ],
+    target: Annotated[
+        Path, typer.Argument(metavar="DST", help="Folder of safetensors to appear, for --prior.")
+    ],
+    part: Annotated[
+        str | None,
+        _option("What SRC lacks (docs/priors.md): a file, a folder or a hub id.", RUN, "--with"),
+    ] = None,
+) -> None:
+    """Convert weights that come pickled; only this command reads such files, and runs nothing in them."""
+    from geodiff_plugin.commands.convert import run_convert
+
+    run_convert(source, target, part)
+
+
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and leave by ``SystemExit``.
 

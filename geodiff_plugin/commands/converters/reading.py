@@ -1,0 +1,79 @@
+"""The one place that unpickles: weights, numbers and text, never code.
+
+Hop: .ckpt, .pth, .pt or .bin -> what was saved in it.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from geodiff_plugin._checks import bad_value
+
+__all__ = ["read_checkpoint"]
+
+#: A numpy array in a checkpoint is rebuilt by these; files of numpy 1 call the module ``numpy.core``.
+NUMPY_PARTS = [
+    (np._core.multiarray._reconstruct, "numpy.core.multiarray._reconstruct"),
+    (np._core.multiarray._reconstruct, "numpy._core.multiarray._reconstruct"),
+    np.ndarray,
+    np.dtype,
+    *(type(np.dtype(name)) for name in ("float16", "float32", "float64", "int64")),
+]
+
+
+def read_checkpoint(path: str | Path) -> Mapping[str, Any]:
+    """What ``torch.save`` put into a file, on the CPU; nothing in it is run.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The mapping that it holds.
+
+    Raises:
+        ValueError: no such file; no checkpoint, or a damaged one; one that holds more than plain data; one
+            that holds no mapping.
+    """
+    path = Path(path)
+    if not path.is_file():
+        bad_value("SRC", "a checkpoint file or a folder in diffusers' layout", path, "Check the path.")
+    try:
+        with torch.serialization.safe_globals(NUMPY_PARTS):
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        reason = str(error)
+        if "Unsupported global" in reason or "Unsupported class" in reason or "GLOBAL" in reason:
+            names = _foreign_names(path)
+            cure = (
+                "Unpickling it would run code, which is never done: ask its authors for safetensors, or, "
+                "if you trust it, save its weights anew without those objects."
+            )
+            bad_value(str(path), "a checkpoint of tensors, numbers and text", f"one with {names}", cure)
+        _no_checkpoint(path, error)
+    except (RuntimeError, EOFError, KeyError, ValueError, OSError) as error:
+        _no_checkpoint(path, error)
+    if not isinstance(content, Mapping):
+        bad_value(str(path), "a checkpoint that holds a mapping", type(content).__name__)
+    return content
+
+
+def _no_checkpoint(path: Path, error: Exception) -> None:
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    raise ValueError(
+        f"{path} must be a checkpoint written by torch.save; got one that cannot be read ({reason}). "
+        "Fetch it anew and compare its size with the original's."
+    ) from error
+
+
+def _foreign_names(path: Path) -> str:
+    try:
+        return ", ".join(sorted(torch.serialization.get_unsafe_globals_in_checkpoint(path)))
+    except (RuntimeError, ValueError):  # files from before PyTorch 1.6 cannot be listed
+        return "other objects"
