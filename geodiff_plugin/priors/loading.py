@@ -105,20 +105,23 @@ def build_pipeline(
         layout: of the folder.
         dtype: of the weights.
         classes: for components whose class is not what the index says.
-        **options: constructor arguments that go before the index's; ``None`` is left out.
+        **options: constructor arguments, components too, that go before the folder's; ``None`` is left out.
 
     Raises:
         ValueError: a component that the folder lacks, weights that do not fit.
     """
+    options = {name: value for name, value in options.items() if value is not None}
     arguments: dict[str, Any] = {}
     for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:
-        given = options.get(name, layout.index.get(name))
-        if name in (classes or {}):
+        entry = layout.index.get(name)
+        if name in options:
+            arguments[name] = options[name]
+        elif name in (classes or {}):
             arguments[name] = load_component(layout, name, classes[name], dtype)
-        elif isinstance(layout.index.get(name), list) and layout.index[name][0] is not None:
+        elif isinstance(entry, list) and entry[0] is not None:
             arguments[name] = load_component(layout, name, component_class(layout, name), dtype)
-        elif not isinstance(given, list) and given is not None:
-            arguments[name] = given
+        elif entry is not None and not isinstance(entry, list):
+            arguments[name] = entry
         elif parameter.default is parameter.empty:
             bad_value(str(layout.folder), f"a folder with the component {name!r}", "none of that name")
     return cls(**arguments)

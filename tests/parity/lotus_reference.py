@@ -1,0 +1,212 @@
+"""Run Lotus' own code on tiny networks with named weights, and keep slices of what it computes.
+
+``docs/priors.md`` tells how to make the environment; then, from the root of this repository::
+
+    python -m tests.parity.lotus_reference --authors Lotus --out tests/parity/fixtures/lotus.npz
+
+The configurations below are what the parity test builds our pipeline from. Their code is imported, not
+copied; of torchvision it needs one function, given here as the torch function that it wraps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import types
+from enum import Enum
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+
+import numpy as np
+
+UNET = {
+    "sample_size": 8,
+    "out_channels": 4,
+    "block_out_channels": (8, 16),
+    "layers_per_block": 1,
+    "down_block_types": ("CrossAttnDownBlock2D", "DownBlock2D"),
+    "up_block_types": ("UpBlock2D", "CrossAttnUpBlock2D"),
+    "cross_attention_dim": 8,
+    "attention_head_dim": (2, 4),
+    "norm_num_groups": 4,
+    "use_linear_projection": True,
+    "class_embed_type": "projection",
+    "projection_class_embeddings_input_dim": 4,
+}
+VAE = {
+    "block_out_channels": (4, 8, 8, 8),
+    "down_block_types": ("DownEncoderBlock2D",) * 4,
+    "up_block_types": ("UpDecoderBlock2D",) * 4,
+    "layers_per_block": 1,
+    "latent_channels": 4,
+    "norm_num_groups": 4,
+}
+TEXT = {
+    "hidden_size": 8,
+    "intermediate_size": 16,
+    "num_attention_heads": 2,
+    "num_hidden_layers": 2,
+    "vocab_size": 4,
+    "bos_token_id": 0,
+    "eos_token_id": 1,
+    "pad_token_id": 1,
+}
+VOCABULARY = {"<|startoftext|>": 0, "<|endoftext|>": 1, "a</w>": 2, "a": 3}
+#: case -> (input channels of the U-Net, image size, processing resolution)
+CASES = {
+    "g": (8, (48, 64), 0),
+    "g_odd": (8, (53, 70), 0),  # neither side a multiple of 8: whole cells only, stretched at the end
+    "g_resized": (8, (60, 98), 64),  # the longer side comes out as 63: 98 * (64 / 98) falls short of 64
+    "d": (4, (48, 64), 0),
+    "d_resized": (4, (60, 80), 64),
+}
+
+
+def write_tokenizer(folder: Path) -> tuple[str, str]:
+    """A tokenizer that knows one letter; the files that ``CLIPTokenizer`` wants to be told."""
+    (folder / "vocab.json").write_text(json.dumps(VOCABULARY))
+    (folder / "merges.txt").write_text("#version: 0.2\n")
+    return str(folder / "vocab.json"), str(folder / "merges.txt")
+
+
+def loud(vae):
+    """That VAE with a last layer that leaves [-1, 1] in places, where it matters who clips what."""
+    vae.decoder.conv_out.weight.data *= 4.0
+    return vae
+
+
+def image_u8(case: str) -> np.ndarray:
+    """``(H, W, 3)`` uint8."""
+    from tests.parity.named_weights import draw
+
+    return np.clip(draw(f"lotus/{case}/image", (*CASES[case][1], 3)) * 60 + 128, 0, 255).astype(np.uint8)
+
+
+def drawn(case: str, what: str, shape: tuple[int, ...]) -> np.ndarray:
+    """``"noise"`` of the start or ``"posterior"`` draw, of that shape."""
+    from tests.parity.named_weights import draw
+
+    return draw(f"lotus/{case}/{what}", shape)
+
+
+def keep(x: np.ndarray) -> np.ndarray:
+    """The part of a map that is kept: every fifth row and column, ``(..., H, W)``."""
+    return x[..., ::5, ::5]
+
+
+def _stand_ins() -> None:
+    """torchvision's resize, and empty modules for what is imported only."""
+    import torch.nn.functional as F
+
+    class InterpolationMode(Enum):
+        NEAREST_EXACT = "nearest-exact"
+        BILINEAR = "bilinear"
+        BICUBIC = "bicubic"
+
+    def resize(img, size, interpolation, antialias):
+        smooth = interpolation is not InterpolationMode.NEAREST_EXACT
+        flags = {"align_corners": False, "antialias": antialias} if smooth else {}
+        return F.interpolate(img, size, mode=interpolation.value, **flags)
+
+    contents = {
+        "torchvision": {},
+        "torchvision.transforms": {"InterpolationMode": InterpolationMode},
+        "torchvision.transforms.functional": {"resize": resize},
+        "tensorboard": {},
+        "matplotlib": {},
+    }
+    for name, content in contents.items():
+        module = types.ModuleType(name)
+        module.__spec__ = ModuleSpec(name, None)  # diffusers looks for it
+        module.__dict__.update(content)
+        module.__path__ = []
+        sys.modules[name] = module
+        parent, _, child = name.rpartition(".")
+        if parent:
+            setattr(sys.modules[parent], child, module)
+
+
+def run_case(case: str) -> dict[str, np.ndarray]:
+    """One call as in ``infer.py``: what the network is told and answers, unclipped decode, final output."""
+    import torch
+    from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
+    from diffusers.models.autoencoders import vae as vae_module
+    from pipeline import LotusDPipeline, LotusGPipeline
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+
+    from tests.parity.named_weights import fill
+
+    channels, _, resolution = CASES[case]
+    with tempfile.TemporaryDirectory() as folder:
+        tokenizer = CLIPTokenizer(*write_tokenizer(Path(folder)), model_max_length=77)
+    text_encoder = CLIPTextModel(CLIPTextConfig(**TEXT))
+    pipe = {8: LotusGPipeline, 4: LotusDPipeline}[channels](
+        unet=fill(UNet2DConditionModel(**UNET, in_channels=channels), "unet."),
+        vae=loud(fill(AutoencoderKL(**VAE), "vae.")),
+        text_encoder=fill(text_encoder, "text_encoder.", lambda name: name.removeprefix("text_model.")),
+        tokenizer=tokenizer,
+        scheduler=DDIMScheduler(steps_offset=1, clip_sample=False),
+        safety_checker=None,
+        feature_extractor=None,
+        requires_safety_checker=False,
+    )
+    pipe.set_progress_bar_config(disable=True)
+
+    told, outputs, decoded = {}, [], []
+
+    def spy(module, arguments, options, output):
+        told["input"], told["prompt"] = arguments[0], options["encoder_hidden_states"]
+        outputs.append(output[0])
+
+    pipe.unet.register_forward_hook(spy, with_kwargs=True)
+    own_decode = pipe.vae.decode
+
+    def decode(*arguments, **options):
+        decoded.append(own_decode(*arguments, **options))
+        return decoded[-1]
+
+    pipe.vae.decode = decode
+    vae_module.randn_tensor = lambda shape, **_: torch.from_numpy(drawn(case, "posterior", tuple(shape)))
+
+    image = torch.tensor(image_u8(case).astype(np.float32)).permute(2, 0, 1)[None] / 127.5 - 1.0
+    task = torch.tensor([1, 0]).float()[None]
+    start = {}
+    if channels == 8:
+        edge = max(image.shape[-2:])
+        sides = [int(side * (resolution / edge)) if resolution else side for side in image.shape[-2:]]
+        noise = drawn(case, "noise", (1, 4, sides[0] // 8, sides[1] // 8))
+        start = {"latents": torch.from_numpy(noise), "num_inference_steps": 1}
+    final = pipe(
+        rgb_in=image,
+        prompt="",
+        output_type="np",
+        timesteps=[999],
+        task_emb=torch.cat([torch.sin(task), torch.cos(task)], dim=-1),
+        processing_res=resolution,
+        **start,
+    ).images[0]
+    return {
+        "image_latent": told["input"][0, :4].numpy(),
+        "prompt": told["prompt"][0].numpy(),
+        "network_output": outputs[0][0].numpy(),
+        "unclipped": keep((decoded[0][0].mean(dim=1)[0] / 2 + 0.5).numpy()),
+        "final": keep(final.mean(axis=-1)),
+    }
+
+
+def main() -> None:
+    """Write the slices of every case."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--authors", required=True, help="a checkout of their repository")
+    parser.add_argument("--out", required=True)
+    arguments = parser.parse_args()
+    sys.path.insert(0, arguments.authors)
+    _stand_ins()
+    found = {f"{case}/{name}": x for case in CASES for name, x in run_case(case).items()}
+    np.savez_compressed(arguments.out, **{name: x.astype(np.float32) for name, x in found.items()})
+
+
+if __name__ == "__main__":
+    main()
