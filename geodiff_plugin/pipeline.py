@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import functools
 import inspect
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from diffusers import DiffusionPipeline, MarigoldDepthPipeline
+from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.ensembling import ensemble_metric
 from geodiff_plugin.guidance import GeometryGuidance
-from geodiff_plugin.integration.run import GuidedRun
+from geodiff_plugin.integration.run import GuidedRun, plan_steps
 from geodiff_plugin.output import assemble_output
 from geodiff_plugin.priors import find_adapter
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 
 __all__ = ["GuidedMarigoldDepthPipeline", "disable_geometry_guidance", "enable_geometry_guidance"]
 
@@ -72,27 +75,33 @@ class _GuidedCall:
                 "A guided call needs gradients, which torch.inference_mode() forbids; "
                 "use torch.no_grad() or nothing."
             )
-        bound = inspect.signature(super().__call__).bind(image, *args, **kwargs)
-        bound.apply_defaults()
-        call = bound.arguments
-        asked = call["num_inference_steps"]
-        call["num_inference_steps"] = guidance.denoising_steps(asked, self.default_denoising_steps)
+        call, prior = _bind(super().__call__, image, *args, **kwargs), find_adapter(self)(self)
+        call["num_inference_steps"], rounds = plan_steps(
+            guidance, prior, call["num_inference_steps"], self.default_denoising_steps
+        )
+        if prior.deterministic and call["ensemble_size"] > 1:
+            call |= {"ensemble_size": 1, "output_uncertainty": False}
+            warnings.warn(
+                "This prior gives the same map every time: of the ensemble one member runs.",
+                stacklevel=3,
+            )
         wants_dict, wants_latent = call["return_dict"], call["output_latent"]
         processor, device = self.image_processor, self._execution_device
-        native = processor.preprocess(image, 0, device=device, dtype=torch.float32)  # [-1, 1], padded
+        as_given = MarigoldImageProcessor(vae_scale_factor=1, do_normalize=False)
+        lefts_01 = as_given.preprocess(image, 0, device=device, dtype=torch.float32)[0]  # (N, 3, H, W)
         resolution = call["processing_resolution"]
         resolution = self.default_processing_resolution if resolution is None else resolution
-        padded, padding, size = processor.preprocess(image, resolution, call["resample_method_input"], device)
-        lefts_01 = (native[0][:, :, : size[0], : size[1]] + 1.0) / 2.0  # (N, 3, H, W)
+        padded, padding, _ = processor.preprocess(image, resolution, call["resample_method_input"], device)
         content = (padded.shape[-2] - padding[0], padded.shape[-1] - padding[1])
         run = GuidedRun(
             self,
-            find_adapter(self)(self),
+            prior,
             guidance,
             guidance.prepare(lefts_01),
             call["ensemble_size"],
             call["batch_size"],
             content,
+            rounds,
             callback_on_step_end,
         )
         self._guided_run = run
@@ -119,6 +128,12 @@ class _GuidedCall:
             return super().ensemble_depth(depth, *args, **kwargs)
         return ensemble_metric(depth, kwargs.get("reduction", "median"))
 
+    def put_together(self, maps: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
+        """A prior's own ending of ensembles; while guided, ``ensemble_depth`` for every image."""
+        if self._guided_run is None:
+            return super().put_together(maps, *args, **kwargs)
+        return DepthDiffusionPipeline.put_together(self, maps, *args, **kwargs)
+
     def save_pretrained(self, *args: Any, **kwargs: Any) -> None:
         """Save the stock pipeline: the folder loads where this package is not installed."""
         guided = type(self)
@@ -131,6 +146,18 @@ class _GuidedCall:
 
 class GuidedMarigoldDepthPipeline(_GuidedCall, MarigoldDepthPipeline):
     """``MarigoldDepthPipeline`` whose call takes ``guidance``; ``from_pretrained`` as always."""
+
+
+def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
+    """All arguments of the stock call by name, defaults and what a prior adds included."""
+    signature = inspect.signature(stock_call)
+    bound = signature.bind(*args, **kwargs)
+    bound.apply_defaults()
+    call = dict(bound.arguments)
+    for name, parameter in signature.parameters.items():
+        if parameter.kind is parameter.VAR_KEYWORD:
+            call |= call.pop(name)
+    return call
 
 
 def _stock_class(guided: type) -> type:

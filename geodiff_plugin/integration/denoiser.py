@@ -1,56 +1,60 @@
-"""Keep the U-Net's graph for the full gradient, from inside the pipeline's ``no_grad``.
+"""Keep the network's graph for the full gradient, from inside the pipeline's ``no_grad``.
 
-Hop: the denoiser's input -> a detached leaf of its depth half -> the output with its graph, kept aside.
+Hop: the network's first argument -> a detached leaf of its depth channels -> the output with its graph.
 Paper: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import torch
-from diffusers.hooks import HookRegistry, ModelHook
 from torch import Tensor
+
+from geodiff_plugin.integration.channels import put_channels
 
 __all__ = ["DenoiserTap"]
 
-HOOK_NAME = "geodiff_denoiser_tap"
-
-
-class _TapHook(ModelHook):
-    def __init__(self, tap: DenoiserTap) -> None:
-        super().__init__()
-        self.tap = tap
-
-    def new_forward(self, module: torch.nn.Module, *args: Any, **kwargs: Any) -> Any:
-        return self.tap.run(self.fn_ref.original_forward, *args, **kwargs)
-
 
 class DenoiserTap:
-    """Runs the denoiser with gradients to its depth latent, and can run it again at another one.
+    """Runs the network with gradients to its depth latent, and can run it again at another one.
 
     Args:
-        module: the denoiser.
-        split_input: condition and depth latent of its input.
+        owner: object whose method the loop calls: the U-Net, or a pipeline of ours.
+        method: name of the method, ``"forward"`` of a module; its first argument holds the latent.
+        channels: which channels of that argument are the depth latent.
 
-    Used as a context manager: the hook is gone afterwards, whatever happened.
+    Used as a context manager: the method is as it was afterwards, whatever happened. The instance gets an
+    attribute that hides its class's method, so that hooks and compiled forwards below are called as ever.
+
+    Attributes:
+        leaf: ``(B, C, h, w)`` the depth latent of the latest call, float32 or wider, requires a gradient.
     """
 
-    def __init__(
-        self, module: torch.nn.Module, split_input: Callable[[Tensor], tuple[Tensor, Tensor]]
-    ) -> None:
-        self._module, self._split = module, split_input
+    def __init__(self, owner: Any, method: str, channels: slice) -> None:
+        self._owner, self._method, self._channels = owner, method, channels
         self._call: tuple[Callable[..., Any], Tensor, tuple, dict] | None = None
         self.leaf: Tensor | None = None
         self._output: Tensor | None = None
 
     def __enter__(self) -> DenoiserTap:
-        HookRegistry.check_if_exists_or_initialize(self._module).register_hook(_TapHook(self), HOOK_NAME)
+        own = getattr(self._owner, self._method)
+        self._hidden = self._owner.__dict__.get(self._method)  # of another hook, put back at the end
+
+        @functools.wraps(own)
+        def tapped(model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
+            return self.run(own, model_input, *args, **kwargs)
+
+        setattr(self._owner, self._method, tapped)
         return self
 
     def __exit__(self, *exc: object) -> None:
-        HookRegistry.check_if_exists_or_initialize(self._module).remove_hook(HOOK_NAME, recurse=False)
+        if self._hidden is None:
+            delattr(self._owner, self._method)
+        else:
+            setattr(self._owner, self._method, self._hidden)
         self.release()
 
     def release(self) -> None:
@@ -58,28 +62,32 @@ class DenoiserTap:
         self._call = self.leaf = self._output = None
 
     def run(self, forward: Callable[..., Any], model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
-        """The hooked forward: same result, detached; the graph is kept until ``release``."""
-        condition, depth_latent = self._split(model_input)
-        with torch.enable_grad():
-            leaf = (
-                depth_latent.detach()
-                .to(torch.promote_types(depth_latent.dtype, torch.float32))
-                .requires_grad_()
-            )
-            joined = torch.cat([condition.detach(), leaf.to(condition.dtype)], dim=1)
-            result = forward(joined, *args, **kwargs)
-        self.leaf = leaf
-        self._output = result[0]
-        self._call = (forward, condition.detach(), args, kwargs)
+        """The tapped call: same result, detached; the graph is kept until ``release``."""
+        model_input = model_input.detach()
+        wide = torch.promote_types(model_input.dtype, torch.float32)
+        self.leaf = model_input[:, self._channels].to(wide).requires_grad_()
+        self._call = (forward, model_input, args, kwargs)
+        result = self._forward_at(self.leaf)
+        self._output = _first(result)
         detached = self._output.detach()
+        if isinstance(result, Tensor):
+            return detached
         return (detached, *result[1:]) if isinstance(result, tuple) else type(result)(detached)
 
     def output_at(self, z_t: Tensor) -> Tensor:
         """Network output with its graph to ``z_t (B, C, h, w)`` float32.
 
-        The pipeline's own forward is reused for its own input, so that one update costs no second U-Net call.
+        The pipeline's own forward is reused for its own input: one update costs no second network call.
         """
-        if z_t is self.leaf:
-            return self._output
-        forward, condition, args, kwargs = self._call
-        return forward(torch.cat([condition, z_t.to(condition.dtype)], dim=1), *args, **kwargs)[0]
+        return self._output if z_t is self.leaf else _first(self._forward_at(z_t))
+
+    def _forward_at(self, z_t: Tensor) -> Any:
+        forward, model_input, args, kwargs = self._call
+        with torch.enable_grad():
+            joined = put_channels(model_input, self._channels, z_t.to(model_input.dtype))
+            return forward(joined, *args, **kwargs)
+
+
+def _first(result: Any) -> Tensor:
+    """The tensor out of a tensor, a tuple or a ``BaseOutput``."""
+    return result if isinstance(result, Tensor) else result[0]

@@ -17,13 +17,14 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.evidence import Evidence
 from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.integration.channels import put_channels
 from geodiff_plugin.integration.denoiser import DenoiserTap
 from geodiff_plugin.integration.guided_scheduler import GuidedScheduler
 from geodiff_plugin.integration.schedulers import check_scheduler, noise_level
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.trajectory import Trajectory, guided_step
 
-__all__ = ["GuidedRun"]
+__all__ = ["GuidedRun", "plan_steps"]
 
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor]], dict[str, Tensor] | None]
 
@@ -39,6 +40,7 @@ class GuidedRun:
         ensemble_size: members per image.
         batch_size: samples per chunk, as the pipeline slices them.
         content_size: ``(H, W)`` of the processing grid without padding.
+        rounds: times that every denoising step makes its updates, see ``plan_steps``.
         callback: ``callback_on_step_end`` or ``None``.
     """
 
@@ -51,11 +53,13 @@ class GuidedRun:
         ensemble_size: int,
         batch_size: int,
         content_size: tuple[int, int],
+        rounds: int,
         callback: StepCallback | None,
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
         self.owners = [i for i in range(len(evidence)) for _ in range(ensemble_size)]
-        self.batch_size, self.content_size, self.callback = batch_size, content_size, callback
+        self.batch_size, self.content_size = batch_size, content_size
+        self.rounds, self.callback = rounds, callback
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
         self.step_index, self.timesteps = 0, []
@@ -69,7 +73,9 @@ class GuidedRun:
         with ExitStack() as stack:
             stack.enter_context(_frozen_weights(self.pipe))
             if self.config.gradient == "full" and self.config.optimize_latents and self.config.inner_steps:
-                self._tap = stack.enter_context(DenoiserTap(self.prior.denoiser(), self.prior.split_input))
+                self._tap = stack.enter_context(
+                    DenoiserTap(*self.prior.network(), check_network_input(self.prior))
+                )
             stack.enter_context(
                 GuidedScheduler(
                     self.pipe.scheduler,
@@ -86,9 +92,10 @@ class GuidedRun:
         self._stack.close()
 
     @property
-    def fraction(self) -> float:
-        """Where the current step lies in the schedule, [0, 1)."""
-        return self.step_index / len(self.timesteps)
+    def fractions(self) -> list[float]:
+        """Where the rounds of the current step lie in the schedule, [0, 1) each."""
+        share = 1.0 / (len(self.timesteps) * self.rounds)
+        return [(self.step_index * self.rounds + i) * share for i in range(self.rounds)]
 
     def decode(self, z0: Tensor) -> Tensor:
         """Unclipped relative map without padding, ``(B, 1, H, W)`` float32, with its graph."""
@@ -106,7 +113,7 @@ class GuidedRun:
         """
         trajectory = self.trajectories[self._decoded_chunks]
         self._decoded_chunks += 1
-        x = self.prior.decode(latents)
+        x = self.prior.decode(latents[:, self.prior.latents])
         height, width = self.content_size
         self.relative.append(x[:, :, :height, :width])
         return trajectory.metric(x, trajectory.affine)
@@ -119,41 +126,56 @@ class GuidedRun:
 
     def _on_step(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         level = noise_level(self.pipe.scheduler, timestep)
+        trajectory, depth = self.trajectories[-1], self.prior.latents
         wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
-        wide_output, wide_z_t = output.to(wide), z_t.to(wide)
+        wide_output, wide_z_t = output[:, depth].to(wide), z_t[:, depth].to(wide)
         eps = noise_from(wide_output, wide_z_t, level)
         full = self._tap is not None
         if full:
             leaf = self._tap.leaf
 
             def z0_of(z: Tensor) -> Tensor:
-                return z0_from(self._tap.output_at(z).to(wide), z, level)
+                return z0_from(self._tap.output_at(z)[:, depth].to(wide), z, level)
         else:
             leaf, z0_of = z0_from(wide_output, wide_z_t, level), _identity
         move = guided_step(
-            self.trajectories[-1],
+            trajectory,
             leaf,
             z0_of,
             self.decode,
             eps,
             self.step_index,
             self.timesteps[self.step_index],
-            self.fraction,
+            self.fractions,
         )
+        if not self.config.optimize_latents or not any(map(trajectory.is_active, self.fractions)):
+            result = output, z_t, None  # bit for bit the pipeline's own step
+        elif full and self.prior.max_steps == 1:
+            # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
+            moved = (leaf + move).detach()
+            result = self._tap.output_at(moved).detach(), put_channels(z_t, depth, moved.to(z_t.dtype)), None
+        elif full and self.config.step_from == "updated":
+            moved = (leaf + move).detach().to(z_t.dtype)
+            result = output, put_channels(z_t, depth, moved), None
+        elif full:
+            result = output, z_t, put_channels(torch.zeros_like(z_t, dtype=wide), depth, move)
+        else:
+            moved_output, moved_z_t = output_from(leaf + move, eps, level)
+            result = (
+                put_channels(output, depth, moved_output.to(output.dtype)),
+                put_channels(z_t, depth, moved_z_t.to(z_t.dtype)),
+                None,
+            )
         if full:
             self._tap.release()
-        if not self.config.optimize_latents or not self.trajectories[-1].is_active(self.fraction):
-            return output, z_t, None  # bit for bit the pipeline's own step
-        if full:
-            return output, z_t, move
-        moved_output, moved_z_t = output_from(leaf + move, eps, level)
-        return moved_output.to(output.dtype), moved_z_t.to(z_t.dtype), None
+        return result
 
     def _on_done(self, timestep: Tensor, latents: Tensor) -> Tensor:
         if self.callback is not None:
             trajectory = self.trajectories[-1]
             affine = trajectory.affine
-            x = self.decode(latents) if self.step_index == len(self.timesteps) - 1 else trajectory.last_x
+            depth = latents[:, self.prior.latents]
+            x = self.decode(depth) if self.step_index == len(self.timesteps) - 1 else trajectory.last_x
             values = {
                 "latents": latents,
                 "metric_depth": trajectory.metric(x, affine),
@@ -186,6 +208,44 @@ class _frozen_weights:  # noqa: N801 - a context manager, used like a function
     def __exit__(self, *exc: object) -> None:
         for parameter, flag in self._flags:
             parameter.requires_grad_(flag)
+
+
+def plan_steps(
+    guidance: GeometryGuidance, prior: DepthPrior, asked: int | None, pipeline_default: int | None
+) -> tuple[int, int]:
+    """Denoising steps of a guided call, and how often each makes its updates.
+
+    A prior that can only take fewer steps than guidance wants makes the updates of all of them in those
+    that it has, with the search and the gate on matches moving on as they would from step to step.
+
+    Args:
+        guidance: says how many steps it wants.
+        prior: says how many make sense.
+        asked: ``num_inference_steps`` of the call.
+        pipeline_default: when none was asked for.
+
+    Raises:
+        ValueError: more steps were asked for than the prior has.
+    """
+    wanted = guidance.denoising_steps(asked, pipeline_default)
+    if prior.max_steps is None or wanted <= prior.max_steps:
+        return wanted, 1
+    if asked is not None:
+        cure = "Leave it out: the prior was trained for so few."
+        bad_value("num_inference_steps", f"at most {prior.max_steps} with this prior", asked, cure)
+    return prior.max_steps, -(-wanted // prior.max_steps)
+
+
+def check_network_input(prior: DepthPrior) -> slice:
+    """Where z_t stands in the network's input.
+
+    Raises:
+        ValueError: nowhere, so that there is no gradient through the network.
+    """
+    if prior.network_input is None:
+        cure = "Its network is not told z_t, so only the clean latent can be moved."
+        bad_value("gradient", "'denoised' with this prior", "'full'", cure)
+    return prior.network_input
 
 
 def check_offloading(pipe: Any, gradient: str) -> None:

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.denoising import NoiseLevel
+from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 
 __all__ = ["FAMILIES", "check_scheduler", "noise_level", "trailing_timesteps"]
 
@@ -58,12 +59,19 @@ def _flow(scheduler: Any, timestep: Tensor) -> NoiseLevel:
     return NoiseLevel(1.0 - sigma, sigma, "flow_prediction")
 
 
+def _direct(scheduler: Any, timestep: Tensor) -> NoiseLevel:
+    """The output is the clean latent; its difference to the input stands for the noise."""
+    one = torch.ones((), device=timestep.device)
+    return NoiseLevel(one, one, scheduler.config.prediction_type)
+
+
 FAMILIES: dict[type, Callable[[Any, Tensor], NoiseLevel]] = {
     DDIMScheduler: _discrete,
     DDPMScheduler: _discrete,
     LCMScheduler: _discrete,
     DPMSolverMultistepScheduler: _sigmas_vp,
     FlowMatchEulerDiscreteScheduler: _flow,
+    DirectScheduler: _direct,
 }
 
 

@@ -64,7 +64,7 @@ class DepthPrior(Protocol):
         """Where the loop calls the network once a step: an object and the name of the method on it."""
 
     def decode(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map ``(B, 1, H, W)`` float32, about [0, 1], with the graph of the depth latents."""
+        """Unclipped relative map ``(B, 1, H, W)`` float32, about [0, 1], with the graph of ``z0``."""
 
 
 class OwnPipelinePrior:

@@ -59,7 +59,7 @@ class Layout:
     def config(self, component: str) -> dict[str, Any]:
         """Config of a component by the name of its subfolder, a scheduler's too; ``""`` is the folder itself.
 
-        Empty where there is none, so that ``layout.config("unet").get("in_channels") == 8`` is a safe question.
+        Empty where there is none, so that ``config("unet").get("in_channels") == 8`` is a safe question.
         """
         prefix = f"{component}/" if component else ""
         return self.read_json(f"{prefix}config.json") or self.read_json(f"{prefix}scheduler_config.json")

@@ -11,11 +11,11 @@ from diffusers import MarigoldDepthPipeline
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.metric import SPACES
+from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.loading import build_pipeline
 
 __all__ = ["MarigoldPrior"]
-
-#: The pipeline's own metadata -> our space.
-SPACE_OF = {"depth": "depth", "disparity": "disparity", None: "depth"}
 
 
 class MarigoldPrior:
@@ -25,28 +25,53 @@ class MarigoldPrior:
         pipe: the live pipeline.
 
     Raises:
-        ValueError: its ``prediction_type`` is neither depth nor disparity.
+        ValueError: its ``prediction_type`` is no key of ``metric.SPACES``.
     """
+
+    max_steps: int | None = None
+    deterministic = False
+    latents = slice(None)
+    licence = {
+        "prs-eth/marigold-depth-v1-1": "openrail++",
+        "prs-eth/marigold-depth-v1-0": "apache-2.0",
+        "prs-eth/marigold-v1-0": "apache-2.0",
+        "prs-eth/marigold-depth-lcm-v1-0": "apache-2.0",
+        "prs-eth/marigold-lcm-v1-0": "apache-2.0",
+    }
 
     def __init__(self, pipe: MarigoldDepthPipeline) -> None:
         self._pipe = pipe
-        prediction_type = pipe.config.get("prediction_type")
-        if prediction_type not in SPACE_OF:
-            bad_value("the pipeline's prediction_type", "'depth' or 'disparity'", repr(prediction_type))
-        self.space = SPACE_OF[prediction_type]
+        self.space = pipe.config.get("prediction_type") or "depth"
+        if self.space not in SPACES:
+            bad_value("the pipeline's prediction_type", f"one of {sorted(SPACES)}", repr(self.space))
+        self.network_input = slice(pipe.vae.config.latent_channels, None)  # after the image latent
 
     @staticmethod
     def matches(pipe: object) -> bool:
         """Any instance of ``MarigoldDepthPipeline``."""
         return isinstance(pipe, MarigoldDepthPipeline)
 
-    def denoiser(self) -> torch.nn.Module:
-        """The U-Net; its input is ``cat[image latent, depth latent]``."""
-        return self._pipe.unet
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """A U-Net on image and depth latent, no class labels, a text encoder for the empty prompt."""
+        unet = layout.config("unet")
+        latent = layout.config("vae").get("latent_channels", 4)
+        return (
+            unet.get("in_channels") == 2 * latent
+            and unet.get("out_channels") == latent
+            and unet.get("class_embed_type") is None
+            and "text_encoder" in layout.index
+        )
 
-    def split_input(self, model_input: Tensor) -> tuple[Tensor, Tensor]:
-        """Image latent and depth latent, ``(B, C, h, w)`` each."""
-        return model_input.chunk(2, dim=1)
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> MarigoldDepthPipeline:
+        """The stock pipeline; folders of v1-0 do not say what they predict, which is depth."""
+        space = space or layout.index.get("prediction_type") or "depth"
+        return build_pipeline(MarigoldDepthPipeline, layout, dtype, prediction_type=space)
+
+    def network(self) -> tuple[torch.nn.Module, str]:
+        """The U-Net's forward; its input is ``cat[image latent, depth latent]``."""
+        return self._pipe.unet, "forward"
 
     def decode(self, z0: Tensor) -> Tensor:
         """Mean of the decoded channels, mapped from [-1, 1] to [0, 1] and not clipped.

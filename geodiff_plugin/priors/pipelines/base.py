@@ -193,7 +193,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         return latents * self.vae.config.scaling_factor
 
     def decode_latents(self, z0: Tensor) -> Tensor:
-        """``self.vae`` on scaled latents ``(B, C, h, w)``: ``(B, 3, H, W)`` about [-1, 1], at least float32."""
+        """Scaled latents ``(B, C, h, w)`` through ``self.vae``: ``(B, 3, H, W)``, about [-1, 1], float32."""
         decoded = self.vae.decode((z0 / self.vae.config.scaling_factor).to(self.vae.dtype), return_dict=False)
         return decoded[0].to(torch.promote_types(decoded[0].dtype, torch.float32))  # half precision ends here
 
@@ -264,10 +264,10 @@ class DepthDiffusionPipeline(DiffusionPipeline):
             z = latents.to(z)
         z = self.run_steps(z, condition, steps, batch_size, generator)
 
-        def restore(maps: Tensor) -> Tensor | np.ndarray:
+        def restore(maps: Tensor, method: str = resample_method_output) -> Tensor | np.ndarray:
             """From the padded processing grid to what the caller gets."""
             if match_input_resolution:
-                maps = processor.resize_antialias(maps, size, resample_method_output, is_aa=False)
+                maps = processor.resize_antialias(maps, size, method, is_aa=False)
             return processor.pt_to_numpy(maps) if output_type == "np" else maps
 
         maps = torch.cat([self.decode_prediction(chunk) for chunk in z.split(batch_size)])
@@ -279,7 +279,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
             uncertainty=None if spread is None else restore(spread),
             latent=z if output_latent else None,
             extras={
-                name: restore(processor.unpad_image(extra, padding))
+                name: restore(processor.unpad_image(extra, padding), "nearest-exact")  # unit normals stay so
                 for name, extra in self.decode_extras(z, ensemble_size).items()
             },
         )
