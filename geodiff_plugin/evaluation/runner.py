@@ -6,8 +6,9 @@ Paper: S5.1.
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,11 @@ from accelerate import PartialState
 from tqdm import tqdm
 
 from geodiff_plugin import __version__
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.commands.bench import PeakMemory
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.crops import crop_mask
 from geodiff_plugin.evaluation.datasets import DATASETS, load
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
@@ -49,31 +52,53 @@ def headline(record: dict[str, Any]) -> float | None:
     return (both["raw"] or both["aligned"])["abs_rel"]
 
 
+def _with_prior(method: Method, settings: Settings) -> Settings:
+    """The settings with the prior that the method is bound to, if it is."""
+    return settings if method.prior is None else replace(settings, prior=method.prior)
+
+
 def _keys(
-    refs: Sequence[SampleRef], methods: Iterable[Method], settings: Settings, fingerprint: str
+    refs: Sequence[SampleRef],
+    methods: Iterable[Method],
+    settings: Settings,
+    fingerprint: Callable[[Settings], str],
+    crop: str,
 ) -> dict[tuple[str, str], str]:
-    """``(label, method)`` -> key of its record; the fingerprint is the prior's."""
+    """``(label, method)`` -> key of its record, the same in every process."""
     keys = {}
     for method in methods:
-        prior = f"{settings.prior} {fingerprint}" if method.uses_prior else ""
-        configuration = method.configuration(settings)
+        own, prior = _with_prior(method, settings), ""
+        if method.uses_prior:
+            prior = f"{own.prior} {fingerprint(own)}"
+        configuration = method.configuration(own) | ({} if crop == "none" else {"crop": crop})
         for ref in refs:
-            keys[ref.label, method.name] = record_key(ref, method.name, configuration, prior, __version__)
+            key = record_key(ref, method.base_name, configuration, prior, __version__)
+            keys[ref.label, method.name] = key
     return keys
 
 
+def _cropped(sample: StereoSample, crop: str) -> StereoSample:
+    """The sample with the truth inside of a crop only; images and cameras stay whole."""
+    if crop == "none":
+        return sample
+    valid = sample.valid & crop_mask(crop, sample.valid.shape)
+    if not valid.any():
+        bad_value(f"the truth of {sample.label}", f"known somewhere in the crop {crop!r}", "unknown there")
+    return replace(sample, valid=valid)
+
+
 def _measure(
-    method: Method, sample: StereoSample, settings: Settings, priors: PriorCache
+    method: Method, sample: StereoSample, settings: Settings, priors: PriorCache, crop: str
 ) -> tuple[dict[str, Any], Prediction | None]:
     """Run and score one method on one sample."""
     start = time.perf_counter()
     try:
         with PeakMemory(torch.device(settings.device)) as memory:
-            prediction = method.run(sample, settings, priors)
+            prediction = method.run(sample, _with_prior(method, settings), priors)
     except NotApplicable as reason:
         return {"status": "not applicable", "reason": str(reason)}, None
     seconds = time.perf_counter() - start
-    scores = score(sample, prediction, DATASETS[sample.dataset].cap_m)
+    scores = score(_cropped(sample, crop), prediction, DATASETS[sample.dataset].cap_m)
     notes = {"sample": dict(sample.notes), "method": dict(prediction.notes)}
     cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
     return {"status": "ok", **cost, **scores, "notes": notes}, prediction
@@ -85,19 +110,20 @@ def _finish(
     sample: StereoSample | None,
     settings: Settings,
     priors: PriorCache,
+    crop: str,
     skip_broken: bool,
     depth_folder: Path | None,
 ) -> tuple[dict[str, Any], StereoSample | None]:
     """Body of one record, and the sample, which is read only once; errors as ``run``."""
     try:
         sample = load(ref) if sample is None else sample
-        body, prediction = _measure(method, sample, settings, priors)
+        body, prediction = _measure(method, sample, settings, priors, crop)
     except _BROKEN as error:
         if not skip_broken:
             raise
         return {"status": "broken", "error": str(error)}, sample
     if depth_folder is not None and prediction is not None and prediction.depth_m is not None:
-        target = depth_folder / method.name / f"{ref.label.replace('/', '_')}.npy"
+        target = depth_folder / re.sub(r"[^\w.=+-]+", "_", method.name) / f"{ref.label.replace('/', '_')}.npy"
         target.parent.mkdir(parents=True, exist_ok=True)
         write_depth_npy(target, prediction.depth_m)
     return {"rectified": sample.rectified} | body, sample
@@ -130,6 +156,7 @@ def run(
     settings: Settings,
     out: str | Path,
     *,
+    crop: str = "none",
     skip_broken: bool = False,
     save_depth: bool = False,
     progress: bool = True,
@@ -143,6 +170,7 @@ def run(
         methods: names that ``find_method`` knows.
         settings: the user's choices, the same for every method.
         out: folder of ``samples.jsonl``; made where missing.
+        crop: region of the image that is scored, one of ``crops.CROPS``.
         skip_broken: go on after a sample that cannot be read or measured; its record says why.
         save_depth: write each metric depth map to ``out/depth/<method>/<sample>.npy``.
         progress: show a bar with each method's running AbsRel.
@@ -163,12 +191,10 @@ def run(
         out.mkdir(parents=True, exist_ok=True)
         clean_records(path)
     state.wait_for_everyone()
-    local = settings
-    if state.num_processes > 1 and settings.device == "cuda":
-        local = replace(settings, device=str(state.device))
-    keys = _keys(
-        refs, chosen, settings, priors.fingerprint(local) if any(m.uses_prior for m in chosen) else ""
-    )
+    shared_cuda = state.num_processes > 1 and settings.device == "cuda"
+    device = str(state.device) if shared_cuda else settings.device
+    local = replace(settings, device=device)
+    keys = _keys(refs, chosen, settings, lambda own: priors.fingerprint(replace(own, device=device)), crop)
     finished = {record["key"]: record for record in read_records(path) if "key" in record}
     mine = list(refs)[state.process_index :: state.num_processes]
     depth_folder = out / "depth" if save_depth else None
@@ -179,11 +205,16 @@ def run(
                 key = keys[ref.label, method.name]
                 record = finished.get(key)
                 if record is None:
-                    body, sample = _finish(ref, method, sample, local, priors, skip_broken, depth_folder)
+                    body, sample = _finish(
+                        ref, method, sample, local, priors, crop, skip_broken, depth_folder
+                    )
                     head = {"key": key, "dataset": ref.dataset, "sample": ref.name, "method": method.name}
                     record = head | body | {"process": state.process_index}
                     append_record(path, record)
-                bar.add(record)
+                bar.add(record | {"method": method.name})
     state.wait_for_everyone()
     written = {record["key"]: record for record in read_records(path)}
-    return [written[keys[ref.label, method.name]] for ref in refs for method in chosen]
+    # A record does not depend on whether its prior was the first that was named or a further one.
+    return [
+        written[keys[ref.label, method.name]] | {"method": method.name} for ref in refs for method in chosen
+    ]

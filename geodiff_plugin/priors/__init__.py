@@ -16,12 +16,14 @@ from diffusers import DiffusionPipeline
 from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError, RepositoryNotFoundError
 
 from geodiff_plugin._checks import bad_type, bad_value
-from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.base import DepthPrior, OwnPipelinePrior
+from geodiff_plugin.priors.geowizard import GeoWizardPrior
 from geodiff_plugin.priors.marigold import MarigoldPrior
 
 __all__ = ["PRIORS", "DepthPrior", "find_adapter", "load_prior"]
 
 PRIORS: dict[str, type[DepthPrior]] = {
+    "geowizard": GeoWizardPrior,
     "marigold": MarigoldPrior,
 }
 
@@ -29,12 +31,14 @@ BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
 
 
 def find_adapter(pipe: Any) -> type[DepthPrior]:
-    """The class in ``PRIORS`` that understands a pipeline.
+    """The class in ``PRIORS`` that understands a live pipeline.
+
+    A ``DepthDiffusionPipeline`` that is not in the table says of itself what guidance must know.
 
     Raises:
         TypeError: none does.
     """
-    for adapter in PRIORS.values():
+    for adapter in (*PRIORS.values(), OwnPipelinePrior):
         if adapter.matches(pipe):
             return adapter
     bad_type(

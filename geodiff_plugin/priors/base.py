@@ -77,7 +77,7 @@ class OwnPipelinePrior:
         pipe: the live pipeline.
     """
 
-    pipeline_class: type[DepthDiffusionPipeline]
+    pipeline_class: type[DepthDiffusionPipeline] = DepthDiffusionPipeline
     licence: dict[str, str] = {}
 
     def __init__(self, pipe: DepthDiffusionPipeline) -> None:

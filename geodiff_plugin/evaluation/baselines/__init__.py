@@ -6,7 +6,8 @@ Paper: S5.1 (compared methods), S5.3 (ablation).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines.base import (
@@ -16,10 +17,16 @@ from geodiff_plugin.evaluation.baselines.base import (
     PriorCache,
     Settings,
 )
+from geodiff_plugin.evaluation.baselines.files import files_method
 from geodiff_plugin.evaluation.baselines.guided import GUIDED
+from geodiff_plugin.evaluation.baselines.hf import hf_method
+from geodiff_plugin.evaluation.baselines.matches_only import MATCHES_ONLY
+from geodiff_plugin.evaluation.baselines.no_diffusion import NO_DIFFUSION
 from geodiff_plugin.evaluation.baselines.paper import PAPER
+from geodiff_plugin.evaluation.baselines.photometric_only import PHOTOMETRIC_ONLY
 from geodiff_plugin.evaluation.baselines.plane_sweep import PLANE_SWEEP
 from geodiff_plugin.evaluation.baselines.prior_aligned import PRIOR_ALIGNED
+from geodiff_plugin.evaluation.baselines.reprojection_only import REPROJECTION_ONLY
 from geodiff_plugin.evaluation.baselines.scale_shift_only import SCALE_SHIFT_ONLY
 from geodiff_plugin.evaluation.baselines.search_only import SEARCH_ONLY
 from geodiff_plugin.evaluation.baselines.sgbm import SGBM
@@ -35,6 +42,7 @@ __all__ = [
     "PriorCache",
     "Settings",
     "find_method",
+    "with_priors",
 ]
 
 METHODS: dict[str, Method] = {
@@ -45,6 +53,10 @@ METHODS: dict[str, Method] = {
         SCALE_SHIFT_ONLY,
         PAPER,
         GUIDED,
+        PHOTOMETRIC_ONLY,
+        MATCHES_ONLY,
+        REPROJECTION_ONLY,
+        NO_DIFFUSION,
         SGBM,
         PLANE_SWEEP,
         SWEEP_SGM,
@@ -55,23 +67,55 @@ METHODS: dict[str, Method] = {
 FAMILIES: dict[str, Callable[[str], Method]] = {
     "guided": default_variant,
     "paper": paper_variant,
+    "hf": hf_method,
+    "files": files_method,
 }
 """Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter."""
+
+PRIORLESS = ("hf", "files")
+"""Families that use no prior, so that an @ in their parameter is part of it."""
 
 
 def find_method(name: str) -> Method:
     """The method of a name.
 
     Args:
-        name: a key of ``METHODS``, or ``family:parameter`` with a key of ``FAMILIES``.
+        name: a key of ``METHODS``, or ``family:parameter`` with a key of ``FAMILIES``; a method that uses a
+            prior may be bound to one other than the settings': ``guided@prs-eth/marigold-depth-v1-1``.
 
     Raises:
-        ValueError: neither; or the family's own error about its parameter.
+        ValueError: neither; a prior for a method without one; or the family's own error about its parameter.
     """
     if name in METHODS:
         return METHODS[name]
     family, colon, parameter = name.partition(":")
+    if colon and family in PRIORLESS:
+        return FAMILIES[family](parameter)
+    bare, at, prior = name.rpartition("@")
+    if at:
+        return _bound(find_method(bare), prior)
     if colon and family in FAMILIES:
         return FAMILIES[family](parameter)
     known = [*METHODS, *(f"{key}:..." for key in FAMILIES)]
     bad_value("methods", f"one of {', '.join(known)}", repr(name))
+
+
+def _bound(method: Method, prior: str) -> Method:
+    if not (prior and method.uses_prior):
+        bad_value("methods", "METHOD@PRIOR with a method that uses a prior", f"{method.name}@{prior}")
+    title = f"{method.title} ({prior.rstrip('/').rpartition('/')[2]})"
+    return replace(method, name=f"{method.name}@{prior}", title=title, prior=prior)
+
+
+def with_priors(methods: Sequence[str], priors: Sequence[str]) -> tuple[str, ...]:
+    """The methods, then those of them that use a prior once more for every further prior.
+
+    Args:
+        methods: names.
+        priors: further priors, beside the settings' own.
+
+    Raises:
+        ValueError: as ``find_method``.
+    """
+    bound = [f"{name}@{prior}" for prior in priors for name in methods if find_method(name).uses_prior]
+    return (*methods, *bound)

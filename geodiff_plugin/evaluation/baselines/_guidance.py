@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,14 @@ from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
 
-__all__ = ["call_arguments", "guided_method", "prior_space"]
+__all__ = [
+    "Preset",
+    "call_arguments",
+    "guided_configuration",
+    "guided_method",
+    "guided_prediction",
+    "prior_space",
+]
 
 Preset = Callable[[Any, Any, Any], GeometryGuidance]
 
@@ -54,6 +62,37 @@ def _summary(out: Any) -> dict[str, Any]:
     return notes
 
 
+def guided_prediction(
+    pipe: Any, sample: StereoSample, guidance: GeometryGuidance, arguments: dict[str, Any]
+) -> Prediction:
+    """The answer of one guided call.
+
+    Args:
+        pipe: a pipeline with guidance enabled.
+        sample: its left image is asked for.
+        guidance: made for it.
+        arguments: of the call, as ``call_arguments`` gives them.
+    """
+    spread = arguments.get("ensemble_size", 1) > 1
+    out = pipe(Image.fromarray(sample.left), guidance=guidance, output_uncertainty=spread, **arguments)
+    return Prediction(
+        depth_m=out.prediction[0, ..., 0],
+        space="disparity" if prior_space(pipe) != "depth" else "depth",
+        uncertainty=None if out.uncertainty is None else out.uncertainty[0, ..., 0],
+        notes=_summary(out),
+    )
+
+
+def guided_configuration(preset: Preset, settings: Settings) -> dict[str, Any]:
+    """Every hyperparameter of a preset and every setting but the prior, as JSON values."""
+    any_camera = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]])
+    to_the_right = np.eye(4)
+    to_the_right[0, 3] = 0.1
+    guidance = preset(np.zeros((32, 32, 3), np.uint8), any_camera, to_the_right)
+    chosen = {key: value for key, value in asdict(settings).items() if key != "prior"}
+    return chosen | {"guidance": dict(guidance.config)}
+
+
 def guided_method(name: str, title: str, summary: str, preset: Preset) -> Method:
     """A method that guides the prior under one preset.
 
@@ -64,31 +103,11 @@ def guided_method(name: str, title: str, summary: str, preset: Preset) -> Method
         preset: ``(right, K, E)`` -> guidance.
 
     Returns:
-        The method; its configuration is every hyperparameter of the guidance and every setting but the prior.
+        The method; its configuration is ``guided_configuration``.
     """
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-        pipe = priors.get(settings)
         guidance = preset(sample.right, (sample.K_left, sample.K_right), sample.E)
-        out = pipe(
-            Image.fromarray(sample.left),
-            guidance=guidance,
-            output_uncertainty=settings.ensemble > 1,
-            **call_arguments(settings),
-        )
-        return Prediction(
-            depth_m=out.prediction[0, ..., 0],
-            space="disparity" if prior_space(pipe) != "depth" else "depth",
-            uncertainty=None if out.uncertainty is None else out.uncertainty[0, ..., 0],
-            notes=_summary(out),
-        )
+        return guided_prediction(priors.get(settings), sample, guidance, call_arguments(settings))
 
-    def configuration(settings: Settings) -> dict[str, Any]:
-        any_camera = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]])
-        to_the_right = np.eye(4)
-        to_the_right[0, 3] = 0.1
-        guidance = preset(np.zeros((32, 32, 3), np.uint8), any_camera, to_the_right)
-        chosen = {key: value for key, value in asdict(settings).items() if key != "prior"}
-        return chosen | {"guidance": dict(guidance.config)}
-
-    return Method(name, title, summary, run, configuration, uses_prior=True)
+    return Method(name, title, summary, run, partial(guided_configuration, preset), uses_prior=True)

@@ -19,6 +19,7 @@ from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.pipeline import enable_geometry_guidance
 from geodiff_plugin.priors import load_prior
+from geodiff_plugin.priors.hf_depth import HFDepthModel
 
 __all__ = ["Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
 
@@ -41,6 +42,7 @@ class Settings:
         resolution: longer side that the prior works at, pixels; ``None`` for the pipeline's default.
         device: torch device.
         dtype: of U-Net and VAE: ``"float32"``, ``"bfloat16"`` or ``"float16"``.
+        space: what the prior's output is affine in, for a prior that does not say; ``None`` otherwise.
     """
 
     prior: str = "bundled"
@@ -50,6 +52,7 @@ class Settings:
     resolution: int | None = None
     device: str = "cpu"
     dtype: str = "float32"
+    space: str | None = None
 
     def __post_init__(self) -> None:
         check_choice(self.dtype, "dtype", _DTYPES)
@@ -84,12 +87,17 @@ class Prediction:
     notes: Mapping[str, Any] = field(default_factory=dict)
 
 
+def _which(settings: Settings) -> tuple[str | None, ...]:
+    return settings.prior, settings.device, settings.dtype, settings.space
+
+
 class PriorCache:
-    """Loads a prior once per run, ready to be guided."""
+    """Loads a prior once per run, ready to be guided, and a depth model without diffusion likewise."""
 
     def __init__(self) -> None:
-        self._pipes: dict[tuple[str, str, str], Any] = {}
-        self._fingerprints: dict[tuple[str, str, str], str] = {}
+        self._pipes: dict[tuple[str | None, ...], Any] = {}
+        self._models: dict[tuple[str, ...], HFDepthModel] = {}
+        self._fingerprints: dict[tuple[str | None, ...], str] = {}
 
     def get(self, settings: Settings) -> Any:
         """The pipeline of ``settings.prior`` with geometry guidance enabled.
@@ -98,13 +106,28 @@ class PriorCache:
             ValueError: it does not exist, or is neither cached nor can be fetched.
             TypeError: it loads, but has no adapter.
         """
-        key = (settings.prior, settings.device, settings.dtype)
+        key = _which(settings)
         if key not in self._pipes:
-            pipe = load_prior(settings.prior, device=settings.device, dtype=settings.torch_dtype)
+            said = {} if settings.space is None else {"space": settings.space}
+            pipe = load_prior(settings.prior, device=settings.device, dtype=settings.torch_dtype, **said)
             pipe.set_progress_bar_config(disable=True)
             enable_geometry_guidance(pipe)
             self._pipes[key] = pipe
         return self._pipes[key]
+
+    def depth_model(self, name: str, settings: Settings) -> HFDepthModel:
+        """A depth model of ``transformers``.
+
+        Raises:
+            OSError: it does not exist, is neither cached nor can be fetched, or has no safetensors.
+            ValueError: a class whose output, or a processor that, is not known.
+        """
+        key = (name, settings.device, settings.dtype)
+        if key not in self._models:
+            self._models[key] = HFDepthModel.from_pretrained(
+                name, device=settings.device, dtype=settings.torch_dtype
+            )
+        return self._models[key]
 
     def fingerprint(self, settings: Settings) -> str:
         """Short hash of the prior's configuration and of samples of its weights.
@@ -112,7 +135,7 @@ class PriorCache:
         A prior that was trained further under the same name has another fingerprint, so that its old results
         are not taken for its own.
         """
-        key = (settings.prior, settings.device, settings.dtype)
+        key = _which(settings)
         if key not in self._fingerprints:
             pipe, digest = self.get(settings), hashlib.sha256()
             for name in sorted(pipe.components):
@@ -142,6 +165,7 @@ class Method:
         run: sample, settings, priors -> prediction; raises ``NotApplicable`` with a reason.
         configuration: settings -> JSON values that change the method's result, beside the prior.
         uses_prior: whether ``settings.prior`` matters.
+        prior: the prior that this method is bound to, whatever the settings say; ``None`` otherwise.
     """
 
     name: str
@@ -150,3 +174,9 @@ class Method:
     run: Callable[[StereoSample, Settings, PriorCache], Prediction]
     configuration: Callable[[Settings], dict[str, Any]]
     uses_prior: bool
+    prior: str | None = None
+
+    @property
+    def base_name(self) -> str:
+        """The name without the prior that the method is bound to."""
+        return self.name if self.prior is None else self.name.removesuffix(f"@{self.prior}")

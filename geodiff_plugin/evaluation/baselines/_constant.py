@@ -1,0 +1,144 @@
+"""A prior that always gives the same answer: what guidance does where no network corrects it.
+
+Hop: image -> a fixed latent -> (guided) -> relative map.
+Paper: S5.3.1 (optimisation without the diffusion framework).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from geodiff_plugin.evaluation.baselines._guidance import (
+    guided_configuration,
+    guided_prediction,
+    prior_space,
+)
+from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.pipeline import enable_geometry_guidance
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+
+__all__ = ["ConstantPrior", "Start", "constant_method"]
+
+
+class ConstantPrior(DepthDiffusionPipeline):
+    """A pipeline of one step whose network is ``answer``; guided, it makes the updates of all steps in it.
+
+    Args:
+        vae: of the prior that it stands in for; it says where the work is done.
+        scheduler: a ``DirectScheduler``.
+        prediction_type: what the relative map is affine in.
+        default_denoising_steps: rounds of updates when guided.
+        default_processing_resolution: longer side, pixels; 0 for the image's own.
+
+    Attributes:
+        answer: padded image ``(1, 3, H, W)`` in [-1, 1] -> latent ``(1, C, h, w)``.
+        decode: latent -> unclipped relative map ``(1, 1, H, W)``, differentiable.
+    """
+
+    max_steps = 1
+    deterministic = True
+    sees_latents = False
+    answer: Callable[[Tensor], Tensor]
+    decode: Callable[[Tensor], Tensor]
+
+    def __init__(
+        self,
+        vae: Any,
+        scheduler: Any,
+        prediction_type: str = "depth",
+        default_denoising_steps: int = 1,
+        default_processing_resolution: int = 0,
+    ) -> None:
+        super().__init__()
+        self.register_prior(
+            {"vae": vae, "scheduler": scheduler},
+            prediction_type,
+            default_denoising_steps,
+            default_processing_resolution,
+        )
+
+    def prepare_condition(
+        self, image: Tensor, ensemble_size: int, batch_size: int, generator: Any, **options: Any
+    ) -> dict[str, Tensor]:
+        """The answer, which is all that there is."""
+        return {"image_latent": self.answer(image)}
+
+    def denoise(self, latents: Tensor, timestep: Tensor, condition: dict[str, Tensor]) -> Tensor:
+        """The answer, whatever the latents."""
+        return condition["image_latent"]
+
+    def decode_relative(self, z0: Tensor) -> Tensor:
+        """The prior's decoder, or none."""
+        return self.decode(z0)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a stand-in begins.
+
+    Attributes:
+        answer: as of ``ConstantPrior``.
+        decode: as of ``ConstantPrior``.
+        image_processor: resizes and pads as the latent needs it.
+    """
+
+    answer: Callable[[Tensor], Tensor]
+    decode: Callable[[Tensor], Tensor]
+    image_processor: Any
+
+
+def _stand_in(pipe: Any, start: Start, rounds: int) -> Any:
+    """A pipeline that can be guided and answers with ``start``, at the resolution of a live prior."""
+    resolution = pipe.default_processing_resolution or 0
+    constant = ConstantPrior(pipe.vae, DirectScheduler(), prior_space(pipe), rounds, resolution)
+    constant.answer, constant.decode = start.answer, start.decode
+    constant.image_processor = start.image_processor
+    constant.set_progress_bar_config(disable=True)
+    return enable_geometry_guidance(constant)
+
+
+def constant_method(
+    name: str,
+    title: str,
+    summary: str,
+    preset: Callable[..., GeometryGuidance],
+    start: Callable[[Any, StereoSample, Settings], Start],
+    rounds: int | None = None,
+) -> Method:
+    """A guided method without a network in its loop.
+
+    Args:
+        name: key in ``METHODS``.
+        title: column heading.
+        summary: one sentence.
+        preset: ``(right, K, E, **changes)`` -> guidance.
+        start: live prior, sample, settings -> where the updates begin.
+        rounds: of ``inner_steps`` updates; ``None`` for as many as the default takes with this prior.
+
+    Returns:
+        The method; its configuration is ``guided_configuration``.
+    """
+
+    def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+        pipe, views = priors.get(settings), (sample.right, (sample.K_left, sample.K_right), sample.E)
+        if getattr(pipe, "vae", None) is None:
+            raise NotApplicable("the prior has no latent space")
+        taken = rounds
+        if taken is None:
+            taken = preset(*views).denoising_steps(settings.steps, pipe.default_denoising_steps)
+        with torch.no_grad():
+            begun = start(pipe, sample, settings)
+        arguments = {} if settings.resolution is None else {"processing_resolution": settings.resolution}
+        guidance = preset(*views, min_steps=taken)
+        return guided_prediction(_stand_in(pipe, begun, taken), sample, guidance, arguments)
+
+    return Method(name, title, summary, run, partial(guided_configuration, preset), uses_prior=True)

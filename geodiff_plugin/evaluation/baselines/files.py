@@ -1,0 +1,110 @@
+"""Depth or disparity maps that were made elsewhere, one file a sample.
+
+Hop: ``StereoSample`` -> file of its name -> metres, or relative values to be aligned.
+Paper: S5.1 (UniDepth, RAFT-Stereo, IGEV-Stereo and DUSt3R among the compared methods).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.baselines._folder import folder_fingerprint
+from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.datasets._files import read_npy
+from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth
+from geodiff_plugin.formats import read_depth_mm_png, read_disparity_kitti_png, read_pfm
+
+__all__ = ["KINDS", "files_method", "map_name"]
+
+KINDS = {
+    "depth": "metres",
+    "disparity": "pixels of the left view, rectified pairs",
+    "relative-depth": "depth up to scale and shift",
+    "relative-disparity": "inverse depth up to scale and shift",
+}
+"""What the maps of a folder are; ``depth`` unless the method says otherwise."""
+_SUFFIXES = (".npy", ".pfm", ".png")
+
+
+def map_name(dataset: str, sample: str) -> str:
+    """Name of a sample's map without its suffix, the one that ``--save-depth`` writes."""
+    return f"{dataset}_{sample}"
+
+
+def _read(path: Path, kind: str) -> np.ndarray:
+    """``(H, W)`` float64; NaN where it is not known: 0 in metric maps and PNG files, not finite anywhere."""
+    if path.suffix == ".png":
+        read = read_depth_mm_png if kind == "depth" else read_disparity_kitti_png
+        values, known = read(path)
+    else:
+        values = read_pfm(path, "map") if path.suffix == ".pfm" else read_npy(path, "map")
+        known = np.isfinite(values) if kind.startswith("relative") else np.isfinite(values) & (values > 0)
+    if values.ndim != 2:
+        bad_value("map", "of shape (H, W)", f"{path} of shape {values.shape}")
+    return np.where(known, values.astype(np.float64), np.nan)
+
+
+def _to_size(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Bilinear; a hole grows by the pixels that it mixes into."""
+    if values.shape == tuple(size):
+        return values
+    given = torch.from_numpy(values)[None, None]
+    return F.interpolate(given, tuple(size), mode="bilinear", align_corners=False)[0, 0].numpy()
+
+
+def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Prediction:
+    size = sample.left.shape[:2]
+    resized = _to_size(values, size)
+    if kind.startswith("relative"):
+        return Prediction(None, relative=resized, space=kind.removeprefix("relative-"))
+    if kind == "depth":
+        return Prediction(resized)
+    if not sample.rectified:
+        raise NotApplicable("not rectified")
+    disparity_px = resized * (size[1] / values.shape[1])  # pixels of the map -> pixels of the image
+    depth_m = disparity_to_depth(disparity_px, sample.K_left, sample.K_right, sample.E)
+    return Prediction(np.where(depth_m > 0, depth_m, np.nan), space="disparity")
+
+
+def files_method(text: str) -> Method:
+    """A folder of maps as a method.
+
+    Args:
+        text: ``DIR`` or ``KIND:DIR`` with a key of ``KINDS``. The map of a sample is
+            ``DIR/<dataset>_<sample>`` with the suffix .npy, .pfm or .png (16 bit: millimetres for depth,
+            pixels * 256 for disparity), of any size; 0 and what is not finite is unknown.
+
+    Returns:
+        The method, titled by the folder's name; it does not apply to samples without a file.
+
+    Raises:
+        ValueError: no such folder. When run: a file that is damaged.
+    """
+    kind, colon, named = text.partition(":")
+    if not (colon and kind in KINDS):
+        kind, named = "depth", text
+    folder = Path(named)
+    if not named or not folder.is_dir():
+        cure = f"KIND is one of {', '.join(KINDS)}."
+        bad_value("methods", "files:DIR or files:KIND:DIR with an existing folder", repr(text), cure)
+
+    def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+        stem = map_name(sample.dataset, sample.name)
+        candidates = [folder / f"{stem}{suffix}" for suffix in _SUFFIXES]
+        path = next((path for path in candidates if path.is_file()), None)
+        if path is None:
+            raise NotApplicable("no map in the folder")
+        return _prediction(_read(path, kind), sample, kind)
+
+    def configuration(settings: Settings) -> dict[str, Any]:
+        return {"kind": kind, "files": folder_fingerprint(folder)}
+
+    title = folder.resolve().name
+    summary = f"maps of {title} ({KINDS[kind]})"
+    return Method(f"files:{text}", title, summary, run, configuration, uses_prior=False)

@@ -1,0 +1,42 @@
+"""The default preset without the U-Net: the same losses on a latent that starts as a ramp.
+
+Hop: ``StereoSample`` -> latent of a ramp -> the default's updates of it, scale and shift -> metres.
+Paper: none; what is left of the default once the diffusion is taken out.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from geodiff_plugin.evaluation.baselines._constant import Start, constant_method
+from geodiff_plugin.evaluation.baselines.base import Settings
+from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.priors import find_adapter
+
+__all__ = ["NO_DIFFUSION"]
+
+
+def _start(pipe: Any, sample: StereoSample, settings: Settings) -> Start:
+    """The VAE's latent of a ground plane: near at the bottom, far at the top."""
+    vae, adapter = pipe.vae, find_adapter(pipe)(pipe)
+    near, far = (-1.0, 1.0) if adapter.space in ("depth", "log", "log1p") else (1.0, -1.0)
+
+    def answer(image: Tensor) -> Tensor:
+        rows = torch.linspace(far, near, image.shape[-2], device=image.device)
+        ramp = rows.view(1, 1, -1, 1).expand(len(image), 3, -1, image.shape[-1])
+        return vae.encode(ramp.to(vae.dtype)).latent_dist.mode() * vae.config.scaling_factor
+
+    return Start(answer, adapter.decode, pipe.image_processor)
+
+
+NO_DIFFUSION = constant_method(
+    "no-diffusion",
+    "no diffusion",
+    "the default preset without the U-Net: the same search, losses and updates on the latent of a ramp",
+    GeometryGuidance,
+    _start,
+)
