@@ -19,12 +19,16 @@ from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.priors.base import DepthPrior, OwnPipelinePrior
 from geodiff_plugin.priors.geowizard import GeoWizardPrior
 from geodiff_plugin.priors.marigold import MarigoldPrior
+from geodiff_plugin.priors.ppd import PPDPrior
+from geodiff_plugin.priors.transformers_depth import TransformersDepthPrior
 
 __all__ = ["PRIORS", "DepthPrior", "find_adapter", "load_prior"]
 
 PRIORS: dict[str, type[DepthPrior]] = {
     "geowizard": GeoWizardPrior,
     "marigold": MarigoldPrior,
+    "ppd": PPDPrior,
+    "transformers": TransformersDepthPrior,
 }
 
 BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"

@@ -2,16 +2,17 @@
 
 ``docs/priors.md`` tells how to make the environment; then, from the root of this repository::
 
-    python -m tests.parity.ppd_reference pixel-perfect-depth stubs tests/parity/fixtures/ppd.npz
+    python -m tests.parity.ppd_reference --authors pixel-perfect-depth --out tests/parity/fixtures/ppd.npz
 
-The first is a checkout of github.com/gangweix/pixel-perfect-depth, the second a folder with empty modules for what
-it imports and never calls here (torchvision, timm, omegaconf). Nothing of theirs is copied: the networks, the
-sampler and the resizing are imported and run.
+Their networks, sampler and resizing are imported, not copied; torchvision, timm and omegaconf are replaced by
+empty modules, since nothing of them is called here but a helper that makes a pair of a number.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
+import types
 from functools import partial
 from pathlib import Path
 
@@ -58,7 +59,7 @@ def corners(values: torch.Tensor) -> np.ndarray:
 
 
 def semantic_shapes() -> dict[str, tuple[int, ...]]:
-    """Names and shapes of ``depth_anything_v2_vitl.pth`` at the size of ``SEMANTICS``, without its depth head."""
+    """Names and shapes of ``depth_anything_v2_vitl.pth``, smaller and without its depth head."""
     width, hidden = SEMANTICS["embed_dim"], int(SEMANTICS["embed_dim"] * SEMANTICS["mlp_ratio"])
     shapes = {
         "cls_token": (1, 1, width),
@@ -102,9 +103,25 @@ def authors_model() -> torch.nn.Module:
     return model.eval()
 
 
-def main(source: str, stubs: str, out: str) -> None:
+def stub_modules() -> None:
+    """Empty modules in the place of what their files import on the way."""
+    names = {
+        "torchvision.transforms": {"Compose": None},
+        "timm.layers.grn": {"GlobalResponseNorm": None},
+        "timm.layers.helpers": {"to_2tuple": lambda x: x if isinstance(x, tuple) else (x, x)},
+        "omegaconf": {"DictConfig": dict},
+    }
+    for path, attributes in names.items():
+        for end in range(1, path.count(".") + 2):
+            name = ".".join(path.split(".")[:end])
+            sys.modules.setdefault(name, types.ModuleType(name))
+        vars(sys.modules[path]).update(attributes)
+
+
+def main(authors: Path, out: Path) -> None:
     """Run theirs and save ``out``."""
-    sys.path[:0] = [source, stubs]
+    sys.path.insert(0, str(authors))
+    stub_modules()
     from ppd.utils.diffusion.timesteps import Timesteps
     from ppd.utils.transform import image2tensor, resize_keep_aspect
 
@@ -123,8 +140,14 @@ def main(source: str, stubs: str, out: str) -> None:
         resized = image2tensor(resize_keep_aspect(photograph(kind)[:, :, ::-1].copy()))
         kept[f"{kind}_size"] = np.array(resized.shape[-2:])
         kept[kind] = resized[:, :, ::97, ::97].numpy()
-    np.savez_compressed(Path(out), **kept)
+    np.savez_compressed(out, **kept)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--authors", type=Path, required=True, help="checkout of gangweix/pixel-perfect-depth"
+    )
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    main(arguments.authors, arguments.out)

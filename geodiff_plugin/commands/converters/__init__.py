@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from geodiff_plugin.commands.converters.depthfm import DEPTHFM
 from geodiff_plugin.commands.converters.kinds import Converter
+from geodiff_plugin.commands.converters.ppd import PPD
 
 __all__ = ["CONVERTERS", "Converter"]
 
 CONVERTERS: dict[str, Converter] = {
     "depthfm": DEPTHFM,
+    "ppd": PPD,
 }

@@ -32,12 +32,11 @@ POSITION_OFFSET = 0.1
 
 
 def sampling_timesteps(steps: int) -> list[float]:
-    """1000 and on in steps of 1001 / n, rounded half to even.
+    """1000 and on in steps of 1001 / n, rounded.
 
-    For some n (29, 49, 58, ...) the authors' floating point yields an n+1st timestep, -1; here there are n.
+    For some n (29, 49, 58, ...) floating point gives the authors one more, -1; here there are n.
     """
-    exact = LAST_TIMESTEP - torch.arange(steps, dtype=torch.float64) * ((LAST_TIMESTEP + 1) / steps)
-    return exact.float().round().tolist()
+    return torch.arange(LAST_TIMESTEP, -1, -(LAST_TIMESTEP + 1) / steps).round()[:steps].tolist()
 
 
 def _coverage(before: int, after: int) -> Tensor:
