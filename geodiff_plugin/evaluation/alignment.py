@@ -20,12 +20,14 @@ _TO_SPACE = {
     "depth": lambda z: z,
     "disparity": lambda z: 1.0 / z,
     "log": np.log,
+    "log1p": np.log1p,
     "sqrt_disparity": lambda z: 1.0 / np.sqrt(z),
 }
 _FROM_SPACE = {
     "depth": lambda x: x,
     "disparity": lambda x: 1.0 / np.maximum(x, MIN_DISPARITY),
     "log": np.exp,
+    "log1p": np.expm1,
     "sqrt_disparity": lambda x: 1.0 / np.maximum(x, MIN_DISPARITY**0.5) ** 2,
 }
 
@@ -59,11 +61,11 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
     """Depth in metres of a prediction that is right up to scale and shift in its space.
 
     Args:
-        values: ``(H, W)`` float; affine in depth, inverse depth, log depth or the root of inverse depth, as
-            ``space`` says; not finite where a method leaves a hole.
+        values: ``(H, W)`` float; affine in depth, inverse depth, log depth, log(depth + 1 m) or the root of
+            inverse depth, as ``space`` says; not finite where a method leaves a hole.
         truth_m: ``(H, W)`` float, metres.
         valid: ``(H, W)`` bool, where the truth counts.
-        space: ``"depth"``, ``"disparity"``, ``"log"`` or ``"sqrt_disparity"``.
+        space: ``"depth"``, ``"disparity"``, ``"log"``, ``"log1p"`` or ``"sqrt_disparity"``.
 
     Returns:
         ``(H, W)`` float64, metres, at least ``FLOOR_M``, where Marigold's evaluation clips what least
@@ -73,7 +75,7 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
         ValueError: an unknown space, or no pixel has both truth and prediction.
 
     Source: Marigold's evaluation: ``least_square`` and ``least_square_disparity``, the latter over positive
-        predictions only and clipped at 1e-3; the other two spaces are the same idea.
+        predictions only and clipped at 1e-3; the other spaces are the same idea.
     """
     if space not in _TO_SPACE:
         bad_value("space", f"one of {', '.join(_TO_SPACE)}", repr(space))

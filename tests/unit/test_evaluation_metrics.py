@@ -114,10 +114,11 @@ def test_least_squares_recovers_an_affine_map(scale, shift):
     assert least_squares(x, target, mask) == pytest.approx((scale, shift))
 
 
-@pytest.mark.parametrize("space", ["depth", "disparity", "log", "sqrt_disparity"])
+@pytest.mark.parametrize("space", ["depth", "disparity", "log", "log1p", "sqrt_disparity"])
 def test_alignment_is_exact_where_the_prediction_is_affine_in_its_space(space):
     truth = np.random.default_rng(2).uniform(1, 9, (6, 7))
-    in_space = {"depth": truth, "disparity": 1 / truth, "log": np.log(truth), "sqrt_disparity": truth**-0.5}
+    in_space = {"depth": truth, "disparity": 1 / truth, "sqrt_disparity": truth**-0.5}
+    in_space |= {"log": np.log(truth), "log1p": np.log(truth + 1)}
     values = 0.7 * in_space[space] + 0.2
     np.testing.assert_allclose(align(values, truth, np.ones((6, 7), bool), space), truth, rtol=1e-9)
 

@@ -3,13 +3,20 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.metric import SPACES, AffineState, MetricMap, inverse_softplus, smooth_floor
+from geodiff_plugin.metric import (
+    GROWS_WITH_DEPTH,
+    SPACES,
+    AffineState,
+    MetricMap,
+    inverse_softplus,
+    smooth_floor,
+)
 
 NEAR, FAR = torch.tensor([0.5, 4.0, 0.8]), torch.tensor([0.9, 80.0, 60.0])
 
 
 def ends(space):
-    return (NEAR, FAR) if space in ("depth", "log") else (FAR, NEAR)
+    return (NEAR, FAR) if space in GROWS_WITH_DEPTH else (FAR, NEAR)
 
 
 @pytest.mark.parametrize("space", SPACES)
@@ -28,7 +35,7 @@ def test_positive_monotone_and_linear_in_global_scale(space):
     depth = metric(x, affine)
     assert (depth > 0).all()
     steps = depth.flatten(1).diff(dim=1)
-    assert (steps > 0).all() if space in ("depth", "log") else (steps < 0).all()
+    assert (steps > 0).all() if space in GROWS_WITH_DEPTH else (steps < 0).all()
     doubled = metric(x, AffineState(affine.s_hat, affine.t_hat, 2 * affine.g_s))
     torch.testing.assert_close(doubled, 2 * depth)
 
@@ -56,6 +63,16 @@ def test_floor_never_silences_a_gradient():
 def test_inverse_softplus():
     y = torch.tensor([1e-4, 0.1, 1.0, 30.0])
     torch.testing.assert_close(torch.nn.functional.softplus(inverse_softplus(y)), y)
+
+
+def test_log1p_is_pixel_perfect_depths_own_form_in_metres():
+    near, far = torch.tensor([0.5]), torch.tensor([60.0])
+    affine = MetricMap("log1p").from_range(near, far)
+    a, b = torch.log1p(far) - torch.log1p(near), torch.log1p(near)
+    x = torch.tensor([0.3, 0.9]).view(1, 1, 1, 2)
+    torch.testing.assert_close(
+        MetricMap("log1p")(x, affine), torch.exp(a * smooth_floor(x) + b) - 1, rtol=1e-4, atol=0
+    )
 
 
 def test_unknown_space_names_the_known_ones():

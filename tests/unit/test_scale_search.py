@@ -18,6 +18,7 @@ SPACES = {
     "depth": lambda z: z,
     "disparity": lambda z: 1 / z,
     "log": torch.log,
+    "log1p": torch.log1p,
     "sqrt_disparity": lambda z: z**-0.5,
 }
 NEAR_IS_ONE = ("disparity", "sqrt_disparity")
@@ -41,6 +42,7 @@ def metres(x: torch.Tensor, near: float, far: float, space: str) -> torch.Tensor
         "depth": lambda v: v,
         "disparity": lambda v: 1 / v,
         "log": torch.exp,
+        "log1p": torch.expm1,
         "sqrt_disparity": lambda v: v**-2,
     }
     return back[space](value)
