@@ -79,6 +79,7 @@ class _GuidedCall:
         call["num_inference_steps"], rounds = plan_steps(
             guidance, prior, call["num_inference_steps"], self.default_denoising_steps
         )
+        call["resample_method_output"] = call["resample_method_output"] or "bilinear"
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= {"ensemble_size": 1, "output_uncertainty": False}
             warnings.warn(

@@ -66,7 +66,6 @@ def test_unguided_equals_the_authors_code(case, make_lotus, theirs, monkeypatch)
     out = pipe(
         Image.fromarray(image_u8(case)),
         processing_resolution=resolution,
-        resample_method_output="nearest-exact",
         latents=latents,
         output_latent=True,
     )

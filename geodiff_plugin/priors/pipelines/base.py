@@ -9,6 +9,7 @@ A subclass says how its network is called; preprocessing, batching, ensembling a
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,12 +52,14 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         deterministic: the same image gives the same map, whatever the generator.
         depth_channels: which channels of the latents are depth; others are never guided.
         sees_latents: whether the network is given the latents (else there is no z_t).
+        output_resampling: how its authors bring the map to the image's size.
     """
 
     max_steps: int | None = None
     deterministic = False
     depth_channels = slice(None)
     sees_latents = True
+    output_resampling = "bilinear"
     scale_invariant = shift_invariant = True
 
     progress_bar = MarigoldDepthPipeline.progress_bar
@@ -208,7 +211,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         processing_resolution: int | None = None,
         match_input_resolution: bool = True,
         resample_method_input: str = "bilinear",
-        resample_method_output: str = "bilinear",
+        resample_method_output: str | None = None,
         batch_size: int = 1,
         ensembling_kwargs: dict[str, Any] | None = None,
         latents: Tensor | None = None,
@@ -228,7 +231,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
             processing_resolution: longer side, pixels; 0 for the image's own.
             match_input_resolution: give the map at the image's size.
             resample_method_input: of the image.
-            resample_method_output: of the map.
+            resample_method_output: of the map; ``None`` for ``output_resampling``, bilinear while guided.
             batch_size: members per forward.
             ensembling_kwargs: for ``ensemble_depth``.
             latents: initial latents instead of drawn ones.
@@ -252,6 +255,9 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         self.check_call(steps, ensemble_size, resolution, batch_size, output_type, output_uncertainty)
         if latents is not None and generator is not None:
             bad_value("latents and generator", "given one at a time", "both")
+        unknown = set(options) - set(self.call_options())
+        if unknown:
+            bad_value("arguments of this prior", f"out of {self.call_options()}", sorted(unknown))
         device, processor = self._execution_device, self.image_processor
         padded, padding, size = processor.preprocess(
             image, resolution, resample_method_input, device, self.dtype
@@ -264,7 +270,9 @@ class DepthDiffusionPipeline(DiffusionPipeline):
             z = latents.to(z)
         z = self.run_steps(z, condition, steps, batch_size, generator)
 
-        def restore(maps: Tensor, method: str = resample_method_output) -> Tensor | np.ndarray:
+        def restore(
+            maps: Tensor, method: str = resample_method_output or self.output_resampling
+        ) -> Tensor | np.ndarray:
             """From the padded processing grid to what the caller gets."""
             if match_input_resolution:
                 maps = processor.resize_antialias(maps, size, method, is_aa=False)
@@ -285,6 +293,12 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         )
         self.maybe_free_model_hooks()
         return output if return_dict else (output.prediction, output.uncertainty, output.latent)
+
+    def call_options(self) -> list[str]:
+        """What this prior adds to the call: the keywords of its ``prepare_condition``."""
+        common = inspect.signature(DepthDiffusionPipeline.prepare_condition).parameters
+        own = inspect.signature(self.prepare_condition).parameters
+        return [name for name, p in own.items() if name not in common and p.kind is not p.VAR_KEYWORD]
 
     def check_call(
         self,

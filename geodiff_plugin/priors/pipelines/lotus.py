@@ -70,6 +70,7 @@ class LotusPipeline(DepthDiffusionPipeline):
 
     model_cpu_offload_seq = "text_encoder->unet->vae"
     max_steps = 1
+    output_resampling = "nearest-exact"
 
     def __init__(
         self,
