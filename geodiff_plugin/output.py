@@ -85,6 +85,7 @@ def assemble_output(
         photometric_error=out(error),
         K=K if output_type == "pt" else K.cpu().numpy(),
         history=[report for t in run.trajectories for report in t.history],
+        extras=getattr(stock, "extras", {}),
         warnings=_warnings(run, visible),
     )
 

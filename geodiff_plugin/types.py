@@ -109,6 +109,8 @@ class MetricDepthOutput(BaseOutput):
             that explains the pixel best, 0 where not visible; ``None`` without a right view.
         K: ``(N, 3, 3)`` intrinsics of the output grid, pixels.
         history: one ``StepReport`` a step and batch chunk.
+        extras: further maps of the prior by name (GeoWizard's ``"normals"``), shaped as ``prediction`` with
+            their own channels.
         warnings: what the user should know about this result, as sentences.
     """
 
@@ -123,4 +125,5 @@ class MetricDepthOutput(BaseOutput):
     photometric_error: np.ndarray | torch.Tensor | None = None
     K: np.ndarray | torch.Tensor | None = None
     history: list[StepReport] = field(default_factory=list)
+    extras: dict[str, np.ndarray | torch.Tensor] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)

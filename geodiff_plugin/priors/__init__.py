@@ -1,6 +1,6 @@
 """Adapters of diffusion depth priors, one a file, and how a prior is found by name.
 
-Hop: name or folder -> pipeline -> ``DepthPrior``.
+Hop: name or folder -> ``FoundPrior`` -> pipeline -> ``DepthPrior``.
 Paper: S4 (any diffusion-based depth model with iterative updates).
 
 A new prior is a new file and one line in ``PRIORS``.
@@ -8,30 +8,49 @@ A new prior is a new file and one line in ``PRIORS``.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from diffusers import DiffusionPipeline
-from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError, RepositoryNotFoundError
 
-from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin._checks import bad_type, bad_value, check_choice
+from geodiff_plugin.metric import SPACES
 from geodiff_plugin.priors.base import DepthPrior, OwnPipelinePrior
+from geodiff_plugin.priors.depthfm import DepthFMPrior
+from geodiff_plugin.priors.depthmaster import DepthMasterPrior
+from geodiff_plugin.priors.e2e_ft import E2EFTPrior
+from geodiff_plugin.priors.finding import BUNDLED_FOLDER, REFUSED, fetch_small_files, fetch_weights, refuse
 from geodiff_plugin.priors.geowizard import GeoWizardPrior
+from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.lotus import LotusPrior
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.priors.ppd import PPDPrior
 from geodiff_plugin.priors.transformers_depth import TransformersDepthPrior
 
-__all__ = ["PRIORS", "DepthPrior", "find_adapter", "load_prior"]
+__all__ = [
+    "BUNDLED_FOLDER",
+    "PRIORS",
+    "REFUSED",
+    "DepthPrior",
+    "FoundPrior",
+    "find_adapter",
+    "find_prior",
+    "load_prior",
+]
 
+#: The first that recognises a folder takes it, so the more particular one stands before the more general.
 PRIORS: dict[str, type[DepthPrior]] = {
     "geowizard": GeoWizardPrior,
-    "marigold": MarigoldPrior,
+    "lotus": LotusPrior,
+    "depthmaster": DepthMasterPrior,
+    "depthfm": DepthFMPrior,
     "ppd": PPDPrior,
     "transformers": TransformersDepthPrior,
+    "e2e-ft": E2EFTPrior,
+    "marigold": MarigoldPrior,
 }
-
-BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
 
 
 def find_adapter(pipe: Any) -> type[DepthPrior]:
@@ -53,46 +72,94 @@ def find_adapter(pipe: Any) -> type[DepthPrior]:
     )
 
 
+@dataclass(frozen=True)
+class FoundPrior:
+    """A prior whose folder is known and recognised, before its weights are read.
+
+    Attributes:
+        key: of ``PRIORS``.
+        layout: its folder.
+    """
+
+    key: str
+    layout: Layout
+
+    @property
+    def licence(self) -> str:
+        """Of the weights: as known by hub id, as the model card says, or ``"licence unknown"``."""
+        known = PRIORS[self.key].licence.get(self.layout.name)
+        return known or self.layout.licence or "licence unknown"
+
+    def load(
+        self,
+        device: str | torch.device | None = None,
+        dtype: torch.dtype = torch.float32,
+        space: str | None = None,
+    ) -> DiffusionPipeline:
+        """The pipeline; arguments and errors as ``load_prior``."""
+        if space is not None:
+            check_choice(space, "space", SPACES)
+        pipe = PRIORS[self.key].load(self.layout, dtype, space)
+        pipe.register_to_config(_name_or_path=self.layout.name)
+        return pipe.to(device) if device is not None else pipe
+
+
+def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> FoundPrior:
+    """Find a prior and tell which it is, by the configs of its components.
+
+    Args:
+        name: ``"bundled"``, a folder, or a hub id; with a key of ``PRIORS`` and a colon before it
+            (``"e2e-ft:folder"``) it is taken for that.
+        variant: of the weight files, such as ``"fp16"``.
+        **hub: for the download (``revision``, ``token``, ``cache_dir``, ``local_files_only``).
+
+    Raises:
+        ValueError: it does not exist, is neither cached nor reachable, is refused, or is of no known kind.
+    """
+    key, typed = None, str(name)
+    prefix, colon, rest = typed.partition(":")
+    if colon and prefix in PRIORS:
+        key, typed = prefix, rest
+    else:
+        refuse(typed)
+    folder = fetch_small_files(typed, hub)
+    key = key or _recognise(Layout(folder, typed))
+    return FoundPrior(key, Layout(fetch_weights(typed, folder, variant, hub), typed, variant))
+
+
+def _recognise(layout: Layout) -> str:
+    for key, adapter in PRIORS.items():
+        if adapter.recognises(layout):
+            return key
+    if any(layout.folder.glob("*.ckpt")) or any(layout.folder.glob("*.pth")):
+        cure = "A checkpoint becomes such a folder by `geodiff convert SRC DST`."
+    else:
+        cure = f"Known are {', '.join(PRIORS)} (docs/priors.md); --prior bundled always works."
+    got = (
+        f"{layout.folder} without model_index.json"
+        if not layout.index
+        else f"{layout.folder}, of no known kind"
+    )
+    bad_value("prior", "a folder in diffusers' layout, or of a depth model of transformers", got, cure)
+
+
 def load_prior(
     name: str | Path,
     device: str | torch.device | None = None,
     dtype: torch.dtype = torch.float32,
+    space: str | None = None,
     **kwargs: Any,
 ) -> DiffusionPipeline:
     """Load a pipeline that can be guided.
 
     Args:
-        name: ``"bundled"``, a folder in diffusers' layout, or a hub id (``prs-eth/marigold-depth-v1-1``).
+        name: ``"bundled"``, a folder, or a hub id (``prs-eth/marigold-depth-v1-1``), see ``find_prior``.
         device: where to, CPU for ``None``.
-        dtype: of U-Net and VAE.
-        **kwargs: for ``from_pretrained`` (``revision``, ``variant``, ``token``, ``local_files_only``, ...).
+        dtype: of the networks.
+        space: what the prior's map is affine in, key of ``metric.SPACES``; ``None`` for what the folder says.
+        **kwargs: for ``find_prior`` (``variant``, ``revision``, ``token``, ``local_files_only``, ...).
 
     Raises:
-        ValueError: it does not exist, or is neither cached nor can be fetched.
-        TypeError: it loads, but has no adapter.
+        ValueError: it does not exist, is refused or unknown; its weights do not fit; its space is not told.
     """
-    source = str(BUNDLED_FOLDER) if str(name) == "bundled" else str(name)
-    if Path(source).is_dir():
-        if not (Path(source) / "model_index.json").is_file():
-            cure = "Name the folder that save_pretrained wrote, or use the bundled prior: --prior bundled."
-            bad_value("prior", "a folder in diffusers' layout", f"{source} without model_index.json", cure)
-        kwargs["local_files_only"] = True
-    elif source.count("/") > 1 or source.startswith((".", "/", "~")):
-        bad_value("prior", "'bundled', a folder that is there, or a hub id", repr(source), "Check the path.")
-    try:
-        pipe = DiffusionPipeline.from_pretrained(source, dtype=dtype, **kwargs)
-    except (
-        LocalEntryNotFoundError,
-        RepositoryNotFoundError,
-        HFValidationError,
-        OSError,
-        ConnectionError,
-    ) as error:
-        cure = "Fetch it once with `hf download ID` while online, give a folder, or use --prior bundled."
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(
-            "prior must be 'bundled', a folder or a hub id that is cached or can be reached; "
-            f"got {str(name)!r} ({reason}). {cure}"
-        ) from error
-    find_adapter(pipe)
-    return pipe.to(device) if device is not None else pipe
+    return find_prior(name, **kwargs).load(device, dtype, space)

@@ -81,6 +81,9 @@ def load_component(layout: Layout, name: str, cls: type, dtype: torch.dtype) -> 
     folder = str(layout.folder / name)
     if not issubclass(cls, torch.nn.Module):
         return cls.from_pretrained(folder, local_files_only=True)
+    if not any((layout.folder / name).glob("*.safetensors")):
+        cure = "`geodiff convert SRC DST` once makes such a folder of .bin, .ckpt or .pth."
+        bad_value(f"weights in {folder}", "safetensors", "none of them", cure)
     options: dict[str, Any] = {"use_safetensors": True, "local_files_only": True}
     if layout.variant is not None:
         options["variant"] = layout.variant
