@@ -14,12 +14,13 @@ from typing import Any
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
 from geodiff_plugin.evaluation.baselines.base import Method
-from geodiff_plugin.guidance import DEFAULT_WEIGHTS, PAPER_WEIGHTS, GeometryGuidance
+from geodiff_plugin.guidance import DEFAULT_WEIGHTS, GeometryGuidance
+from geodiff_plugin.presets import PAPER_WEIGHTS
 
 __all__ = ["default_variant", "paper_variant"]
 
 _WEIGHT = "weights."
-_POSITIONAL = {"self", "right", "K", "E", "weights"}
+_POSITIONAL = {"self", "right", "K", "E", "points", "left_size", "weights"}
 _KNOBS = tuple(
     name for name in inspect.signature(GeometryGuidance.__init__).parameters if name not in _POSITIONAL
 )
