@@ -38,7 +38,7 @@ class GeoWizardPrior(OwnPipelinePrior):
     """
 
     pipeline_class = GeoWizardPipeline
-    licence = {"lemonaddie/geowizard": "CC-BY-4.0"}
+    licence = {"lemonaddie/geowizard": "cc-by-4.0", "lemonaddie/Geowizard": "cc-by-4.0"}
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
