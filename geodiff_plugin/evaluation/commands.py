@@ -7,6 +7,7 @@ Paper: S5 (experiments).
 from __future__ import annotations
 
 import random
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -14,8 +15,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.baselines import METHODS, Settings, find_method
+from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS, Settings, find_method, with_priors
+from geodiff_plugin.evaluation.crops import CROPS
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.report import run_facts, write_tables, write_text
@@ -39,13 +41,16 @@ class PairsOptions:
         limit: at most so many samples; ``None`` for all.
         sample: so many samples drawn at random with the settings' seed; ``None`` for all.
         pairs: which pairs of a group of posed views, ``"default"`` or ``"all"``.
-        pixel_centre: coordinate of the first pixel's centre in posed cameras; 0.5 for COLMAP's.
+        pixel_centre: coordinate of the first pixel's centre in posed cameras, 0.5 for COLMAP's; ``None`` for
+            each data set's own.
         settings: what every method is given.
         out: folder of the records and tables.
         results: Markdown page to write beside; ``None`` for none.
         skip_broken: go on after a broken sample.
         save_depth: write depth maps.
         quiet: no bar, no table on the screen.
+        crop: region that is scored, one of ``crops.CROPS``.
+        priors: further priors beside the settings' own: methods that use one are run with each.
     """
 
     data: Path
@@ -55,13 +60,18 @@ class PairsOptions:
     limit: int | None
     sample: int | None
     pairs: str
-    pixel_centre: float
+    pixel_centre: float | None
     settings: Settings
     out: Path
     results: Path | None
     skip_broken: bool
     save_depth: bool
     quiet: bool
+    crop: str = "none"
+    priors: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_choice(self.crop, "crop", CROPS)
 
 
 def select(refs: Sequence[SampleRef], options: PairsOptions) -> list[SampleRef]:
@@ -107,10 +117,16 @@ def command_line(
     for name in ("datasets", "scenes"):
         if getattr(options, name):
             words += [f"--{name}", ",".join(getattr(options, name))]
-    for name, default in (("limit", None), ("sample", None), ("pairs", "default"), ("pixel_centre", 0.0)):
+    defaults = {"limit": None, "sample": None, "pairs": "default", "pixel_centre": None, "crop": "none"}
+    for name, default in defaults.items():
         if getattr(options, name) != default:
             words += [f"--{name.replace('_', '-')}", str(getattr(options, name))]
+    if options.priors:
+        words += ["--prior", options.settings.prior]
+        words += [word for prior in options.priors for word in ("--prior", prior)]
     for field in fields(Settings):
+        if options.priors and field.name == "prior":
+            continue
         value: Any = getattr(options.settings, field.name)
         if value != field.default:
             words += [f"--{field.name}", str(value)]
@@ -118,7 +134,7 @@ def command_line(
 
 
 def remarks_on(records: Sequence[dict[str, Any]], settings: Settings) -> list[str]:
-    """Sentences above the tables: the prior, what a method could not do and why, which samples were broken."""
+    """Sentences above the tables: the prior, what methods could not do and why, samples that were broken."""
     remarks = [f"Prior {settings.prior}, seed {settings.seed}, ensemble {settings.ensemble}."]
     reasons: dict[tuple[str, str], int] = {}
     for record in records:
@@ -144,9 +160,10 @@ def run_pairs(options: PairsOptions) -> None:
     refs = select(find_pairs(options.data, options.datasets or None, **posed), options)
     records = run(
         refs,
-        options.methods,
+        with_priors(options.methods, options.priors),
         options.settings,
         options.out,
+        crop=options.crop,
         skip_broken=options.skip_broken,
         save_depth=options.save_depth,
         progress=not options.quiet,
@@ -156,6 +173,12 @@ def run_pairs(options: PairsOptions) -> None:
         return
     facts = run_facts(command_line(options, ("eval", "pairs", str(options.data))))
     remarks = remarks_on(records, options.settings)
+    if options.priors:
+        remarks.append(f"Rows that name no prior: {options.settings.prior}.")
+    if options.crop != "none":
+        remarks.append(f"Only what lies in the crop {options.crop!r} is scored.")
+    if options.sample is not None:
+        remarks.append(f"Drawn with seed {options.settings.seed}: {', '.join(ref.label for ref in refs)}.")
     if state.num_processes > 1:
         remarks.append(f"Run by {state.num_processes} processes.")
     page = write_tables(options.out, "Results", facts, pairs_tables(records), remarks)
@@ -174,9 +197,15 @@ def run_list(data: Path | None) -> None:
     lines = []
     for name, dataset in DATASETS.items():
         count = 0 if data is None else len(find_pairs(data, [name]))
-        found = f"{count} samples" if count else "not found" if data is not None else "no --data given"
+        found = "not found" if data is not None else "no --data given"
+        if count or not dataset.needs_folder:
+            found = f"{count or 'any number of'} {'sample' if count == 1 else 'samples'}"
         full = f" of {dataset.full_count}" if count and dataset.full_count else ""
         lines.append(f"{name:<15} {found}{full}\n{'':<15} {dataset.obtain}")
     lines.append("")
     lines += [f"{name:<17} {method.summary}" for name, method in METHODS.items()]
+    for name, family in FAMILIES.items():
+        summary = re.split(r"[.;]", family.__doc__ or " ", maxsplit=1)[0]
+        lines.append(f"{name + ':...':<17} {summary[0].lower()}{summary[1:]}")
+    lines.append(f"{'METHOD@PRIOR':<17} a method that uses a prior, with another one than --prior's first")
     sys.stdout.write("\n".join(lines) + "\n")

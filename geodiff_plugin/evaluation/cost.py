@@ -1,0 +1,102 @@
+"""What guidance costs on a data set: seconds and peak memory, plain against guided, as ratios.
+
+Hop: references + methods -> one process per method -> records -> ``Table``.
+Paper: S8 (inference time, run time comparison), as ratios and not as seconds of another machine.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from typing import Any
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.baselines import find_method
+from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
+from geodiff_plugin.evaluation.commands import PairsOptions, command_line, remarks_on, select
+from geodiff_plugin.evaluation.datasets import find_pairs
+from geodiff_plugin.evaluation.layout import Table
+from geodiff_plugin.evaluation.report import run_facts, write_tables
+from geodiff_plugin.evaluation.runner import processes, run
+
+__all__ = ["COST_METHODS", "PLAIN", "cost_table", "run_cost"]
+
+PLAIN = "prior-aligned"
+"""The stock pipeline, which everything is compared with; its alignment costs nothing beside it."""
+COST_METHODS = (PLAIN, "search-only", "guided", "guided:gradient=full", "paper")
+#: Denoising steps when none are asked for: the same for all, and what the default guidance takes.
+STEPS = 4
+
+
+def cost_table(records: Sequence[dict[str, Any]]) -> Table:
+    """Seconds and memory of every method, and both as multiples of the plain pipeline's.
+
+    Args:
+        records: of a run in which ``PLAIN`` is one of the methods.
+    """
+    costs = {}
+    for name in dict.fromkeys(record["method"] for record in records):
+        own = [r for r in records if r["method"] == name and r["status"] == "ok"]
+        if own:
+            seconds = statistics.median(record["seconds"] for record in own)
+            costs[name] = (len(own), seconds, max(record["peak_bytes"] for record in own))
+    _, plain_seconds, plain_bytes = costs[PLAIN]
+    rows = [
+        (
+            "plain pipeline" if name == PLAIN else find_method(name).title,
+            str(count),
+            f"{seconds:.2f}",
+            f"{seconds / max(plain_seconds, 1e-3):.2f}",
+            f"{peak_bytes / 1e6:.0f}",
+            f"{peak_bytes / max(plain_bytes, 1):.2f}",
+        )
+        for name, (count, seconds, peak_bytes) in costs.items()
+    ]
+    header = ("method", "pairs", "seconds", "time × plain", "peak MB", "memory × plain")
+    pairs = count_of_pairs(len({label_of(record) for record in records}))
+    note = (
+        "Median seconds and greatest peak over the pairs, each method in a process of its own, all with the "
+        "same number of denoising steps. On CUDA the peak is what was allocated, weights included, reset for "
+        "each pair; on the CPU it is the increase of resident memory over the start, sampled every 50 ms."
+    )
+    return Table(f"Cost on {pairs}", header, tuple(rows), note)
+
+
+def run_cost(options: PairsOptions) -> None:
+    """Measure, write and print the table; records go to ``out/cost``, apart from those of other commands.
+
+    Args:
+        options: as of ``geodiff eval pairs``; ``methods`` are measured beside ``COST_METHODS``.
+
+    Raises:
+        ValueError: no samples, bad options, or started as several processes.
+        OSError: missing or unreadable files without ``skip_broken``.
+    """
+    if processes(options.settings).num_processes > 1:
+        bad_value("the number of processes", "1 for cost", processes(options.settings).num_processes)
+    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
+    refs = select(find_pairs(options.data, options.datasets or None, **posed), options)
+    settings = replace(options.settings, steps=options.settings.steps or STEPS)
+    records = []
+    for method in dict.fromkeys((*COST_METHODS, *options.methods)):
+        # What one method frees stays with the allocator, where the next would find it at no cost.
+        with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
+            job = fresh_process.submit(
+                run,
+                refs,
+                [method],
+                settings,
+                options.out / "cost",
+                skip_broken=options.skip_broken,
+                progress=not options.quiet,
+            )
+            records += job.result()
+    facts = run_facts(command_line(options, ("eval", "cost", "--data", str(options.data)), ()))
+    remarks = [*remarks_on(records, settings), f"{settings.steps} denoising steps."]
+    page = write_tables(options.out, "Cost", facts, [cost_table(records)], remarks, "cost")
+    if not options.quiet:
+        sys.stdout.write(page)

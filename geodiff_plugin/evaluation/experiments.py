@@ -1,0 +1,132 @@
+"""The paper's tables as runs: which samples, which methods, which files.
+
+Hop: name of a table + options -> references -> records -> tables on disk.
+Paper: Tables 1 to 4, S5.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.baselines import with_priors
+from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
+from geodiff_plugin.evaluation.commands import PairsOptions, command_line, remarks_on, select
+from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, find_pairs
+from geodiff_plugin.evaluation.layout import Table
+from geodiff_plugin.evaluation.paper_tables import CHANGES, FoundColumn, changes_table, layout_table
+from geodiff_plugin.evaluation.published import LAYOUTS, Column, Layout
+from geodiff_plugin.evaluation.report import run_facts, write_tables
+from geodiff_plugin.evaluation.runner import processes, run
+from geodiff_plugin.evaluation.tables import summary_table
+
+__all__ = ["how_to_obtain", "methods_of", "run_experiment"]
+
+
+def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
+    """Every method that a table runs: the paper's rows, our own beside them, and what the user adds."""
+    layout = LAYOUTS[name]
+    names = [*(row.method for row in layout.rows if row.method), *layout.methods, *added]
+    if name == "ablation":
+        names += [method for changes in CHANGES.values() for _, method in changes]
+    return tuple(dict.fromkeys(names))
+
+
+def _find(column: Column, options: PairsOptions, sample: int | None) -> tuple[str | None, list[SampleRef]]:
+    """The first data set that can stand for a column, and the samples to measure."""
+    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
+    wanted = options.datasets or column.datasets
+    for dataset in (name for name in column.datasets if name in wanted):
+        refs = find_pairs(options.data, [dataset], **posed)
+        if refs:
+            drawn = sample if sample is not None and sample <= len(refs) else None
+            return dataset, select(refs, replace(options, sample=options.sample or drawn))
+    return None, []
+
+
+def how_to_obtain(name: str) -> str:
+    """Sentences that say where the data sets of a table come from."""
+    return " ".join(f"{c.title}: {DATASETS[c.datasets[0]].obtain}" for c in LAYOUTS[name].columns)
+
+
+def _missing(columns: Sequence[Column]) -> list[str]:
+    return [f"{c.title} was not found. To obtain it: {DATASETS[c.datasets[0]].obtain}" for c in columns]
+
+
+def _ablation_layout(layout: Layout, options: PairsOptions) -> Layout:
+    """Table 4 on KITTI where it is there, and on everything else that is."""
+    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
+    found = {ref.dataset for ref in find_pairs(options.data, options.datasets or None, **posed)}
+    kitti = [column for column in layout.columns if found & set(column.datasets)]
+    others = [
+        Column(name, (name,), 0)
+        for name in DATASETS
+        if name in found - {d for c in kitti for d in c.datasets}
+    ]
+    return replace(layout, columns=tuple(kitti + others) or layout.columns)
+
+
+def _tables(
+    name: str, layout: Layout, found: Sequence[FoundColumn], records: Sequence[dict[str, Any]], methods: Any
+) -> list[Table]:
+    tables = [layout_table(layout, found, records, methods)]
+    if name == "ablation":
+        tables += [changes_table(records, preset) for preset in CHANGES]
+    for column in found:
+        if column.labels:
+            own = [record for record in records if label_of(record) in column.labels]
+            title = f"All metrics, {column.column.title}, {count_of_pairs(len(column.labels))}"
+            tables.append(summary_table(own, set(column.labels), title))
+    return [table for table in tables if table.rows]
+
+
+def run_experiment(name: str, options: PairsOptions) -> None:
+    """Measure what one table of the paper needs, write and print it.
+
+    Args:
+        name: key of ``LAYOUTS``.
+        options: as of ``geodiff eval pairs``; ``methods`` are run beside the table's own.
+
+    Raises:
+        ValueError: nothing that the table needs is there (the message says how to obtain it), bad options.
+        OSError: missing or unreadable files without ``skip_broken``.
+    """
+    layout = LAYOUTS[name]
+    if name == "ablation":
+        layout = _ablation_layout(layout, options)
+    # The paper drew its posed pairs at random, and so does the table where there are enough to draw from.
+    drawn = {c.title: c.full_count if name == "table3" else None for c in layout.columns}
+    chosen = {column: _find(column, options, drawn[column.title]) for column in layout.columns}
+    refs = [ref for _, own in chosen.values() for ref in own]
+    absent = _missing([column for column, (_, own) in chosen.items() if not own])
+    if not refs:
+        bad_value("data", f"a folder with the data of {name}", str(options.data), " ".join(absent))
+    methods = with_priors(methods_of(name, options.methods), options.priors)
+    records = run(
+        refs,
+        methods,
+        options.settings,
+        options.out,
+        crop=options.crop,
+        skip_broken=options.skip_broken,
+        save_depth=options.save_depth,
+        progress=not options.quiet,
+    )
+    if not processes(options.settings).is_main_process:
+        return
+    finished = {label_of(record) for record in records if record["status"] != "broken"}
+    found = [
+        FoundColumn(column, dataset, frozenset(ref.label for ref in own) & finished)
+        for column, (dataset, own) in chosen.items()
+    ]
+    remarks = remarks_on(records, options.settings) + absent
+    if name == "table3":
+        remarks.append("Pairs: " + ", ".join(ref.name for ref in refs) + ".")
+    facts = run_facts(command_line(options, ("eval", name, "--data", str(options.data)), ()))
+    tables = _tables(name, layout, found, records, methods)
+    page = write_tables(options.out, layout.title, facts, tables, remarks, name)
+    if not options.quiet:
+        sys.stdout.write(page)
