@@ -26,6 +26,7 @@ __all__ = [
     "guided_configuration",
     "guided_method",
     "guided_prediction",
+    "posed_views",
     "prior_space",
 ]
 
@@ -93,6 +94,20 @@ def guided_configuration(preset: Preset, settings: Settings) -> dict[str, Any]:
     return chosen | {"guidance": dict(guidance.config)}
 
 
+def posed_views(sample: StereoSample, views: int) -> tuple[Any, Any, Any]:
+    """``(right, K, E)`` of a sample as ``GeometryGuidance`` takes them.
+
+    Args:
+        sample: of two views or more.
+        views: the most to take, the left one counted; a sample that has fewer gives all it has.
+    """
+    more = sample.extra_views[: views - 2]
+    if not more:
+        return sample.right, (sample.K_left, sample.K_right), sample.E
+    images, Ks, Es = zip((sample.right, sample.K_right, sample.E), *more, strict=True)
+    return images, (sample.K_left, *Ks), (np.eye(4), *Es)
+
+
 def guided_method(name: str, title: str, summary: str, preset: Preset) -> Method:
     """A method that guides the prior under one preset.
 
@@ -107,7 +122,7 @@ def guided_method(name: str, title: str, summary: str, preset: Preset) -> Method
     """
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-        guidance = preset(sample.right, (sample.K_left, sample.K_right), sample.E)
+        guidance = preset(*posed_views(sample, settings.views))
         return guided_prediction(priors.get(settings), sample, guidance, call_arguments(settings))
 
     return Method(name, title, summary, run, partial(guided_configuration, preset), uses_prior=True)

@@ -43,6 +43,7 @@ class Settings:
         device: torch device.
         dtype: of U-Net and VAE: ``"float32"``, ``"bfloat16"`` or ``"float16"``.
         space: what the prior's output is affine in, for a prior that does not say; ``None`` otherwise.
+        views: how many views a guided method takes of a sample that has more than two, at least 2.
     """
 
     prior: str = "bundled"
@@ -53,6 +54,7 @@ class Settings:
     device: str = "cpu"
     dtype: str = "float32"
     space: str | None = None
+    views: int = 2
 
     def __post_init__(self) -> None:
         check_choice(self.dtype, "dtype", _DTYPES)
@@ -60,6 +62,8 @@ class Settings:
             bad_value("ensemble", "at least 1", self.ensemble)
         if self.steps is not None and self.steps < 1:
             bad_value("steps", "at least 1", self.steps)
+        if self.views < 2:
+            bad_value("views", "at least 2", self.views)
 
     @property
     def torch_dtype(self) -> torch.dtype:
