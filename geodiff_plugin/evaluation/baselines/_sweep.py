@@ -17,23 +17,26 @@ from geodiff_plugin.matching import CostVolume, build_cost_volume
 __all__ = ["native_depth", "sweep"]
 
 
-def sweep(sample: StereoSample, device: str) -> CostVolume:
+def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
     """Sweep planes from infinity to the package's default nearest one through the left view.
 
     Args:
         sample: any pose.
         device: where the work is done.
+        views: the most views to compare, the left one counted.
 
     Returns:
         The volume, on a grid of at most 828 pixels a side.
     """
-    left, right = (
-        as_image_01(image, name).to(device)
-        for image, name in ((sample.left, "left"), (sample.right, "right"))
-    )
-    cameras = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
-    K_left, K_right, T = (torch.as_tensor(matrix, dtype=torch.float32, device=device) for matrix in cameras)
-    return build_cost_volume(left, [(right, K_right, T)], K_left)
+
+    def moved(x: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(x, dtype=torch.float32, device=device)
+
+    given = ((sample.right, sample.K_right, sample.E), *sample.extra_views)[: views - 1]
+    rights = [
+        (as_image_01(image, "right").to(device), moved(K), moved(np.linalg.inv(E))) for image, K, E in given
+    ]
+    return build_cost_volume(as_image_01(sample.left, "left").to(device), rights, moved(sample.K_left))
 
 
 def native_depth(

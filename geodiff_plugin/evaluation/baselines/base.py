@@ -43,7 +43,7 @@ class Settings:
         device: torch device.
         dtype: of U-Net and VAE: ``"float32"``, ``"bfloat16"`` or ``"float16"``.
         space: what the prior's output is affine in, for a prior that does not say; ``None`` otherwise.
-        views: how many views a guided method takes of a sample that has more than two, at least 2.
+        views: how many views a method takes of a sample that has more than two, at least 2.
     """
 
     prior: str = "bundled"

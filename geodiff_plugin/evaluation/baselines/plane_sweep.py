@@ -18,7 +18,7 @@ __all__ = ["PLANE_SWEEP"]
 
 
 def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-    volume = sweep(sample, settings.device)
+    volume = sweep(sample, settings.device, settings.views)
     # A plane on which the right camera does not see the pixel cannot win.
     cost = torch.where(volume.in_view, volume.cost, torch.inf)
     best, index = cost.min(dim=0)
@@ -28,7 +28,7 @@ def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Predic
 
 
 def _configuration(settings: Settings) -> dict[str, Any]:
-    return {"cost": "census", "winner": "take all"}
+    return {"cost": "census", "winner": "take all", "views": settings.views}
 
 
 PLANE_SWEEP = Method(

@@ -20,7 +20,7 @@ __all__ = ["SWEEP_SGM"]
 
 
 def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-    volume = sweep(sample, settings.device)
+    volume = sweep(sample, settings.device, settings.views)
     matches = find_matches(volume.left_01, volume.rights, volume.K, volume=volume)
     # A match at infinity is none: the sky would spread over every hole beside it.
     believed = (matches.confidence[0] > 0) & (matches.inverse_depth[0] > 0.5 * volume.plane_step)
@@ -32,7 +32,7 @@ def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Predic
 
 
 def _configuration(settings: Settings) -> dict[str, Any]:
-    return {"cost": "census", "aggregation": "semi-global", "fill": "background"}
+    return {"cost": "census", "aggregation": "semi-global", "fill": "background", "views": settings.views}
 
 
 SWEEP_SGM = Method(
