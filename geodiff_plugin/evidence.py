@@ -23,6 +23,7 @@ from geodiff_plugin.matching import (
     find_matches,
     mirrored_pose_preferred,
     points_to_matches,
+    with_points,
 )
 from geodiff_plugin.objective import RightViews, Views
 from geodiff_plugin.terms import MatchTarget
@@ -46,7 +47,8 @@ class Evidence:
             points are known.
         volume: plane-sweep costs, or ``None`` where the configuration does not search it.
         matches: aggregated, left-right checked, or ``None`` where no term asks.
-        sweep_matches: the same on the grid of the sweep, which is finer for wide images.
+        sweep_matches: the same on the grid of the sweep, which is finer for wide images, with known points in
+            their place; the points where there are no matches.
         points: depths that the user knows, in the form of matches, or ``None``.
         warnings: sentences for the user.
     """
@@ -120,6 +122,8 @@ def prepare_evidence(
         matches = _on_grid(found, left, K_loss)
     if points is not None:
         known, left_out = points_to_matches(points, K_left, size, K_loss, size_loss)
+        grid = (K_loss, size_loss) if found is None else (found.K, found.size)
+        found = with_points(found, points_to_matches(points, K_left, size, *grid)[0])
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
     small = tuple((*_as_fine_as(image, K, K_loss), T) for image, K, T in rights)

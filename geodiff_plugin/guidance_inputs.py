@@ -205,9 +205,8 @@ def split_views(views: Any) -> tuple[tuple[int, int] | None, tuple, tuple, tuple
     if not isinstance(views, (list, tuple)):
         bad_type("views", form, views)
     if len(views) < 2 or not all(isinstance(view, (list, tuple)) and len(view) == 3 for view in views):
-        bad_value(
-            "views", form, f"{len(views)} entries of {[np.shape(view)[:1] or view for view in views]}"[:120]
-        )
+        kinds = [len(v) if isinstance(v, (list, tuple)) else type(v).__name__ for v in views]
+        bad_value("views", form, f"{len(views)} entries of lengths {kinds}", "At least two, three values each.")
     images, Ks, Es = (tuple(column) for column in zip(*views, strict=True))
     if images[0] is None:
         return None, images[1:], Ks, Es

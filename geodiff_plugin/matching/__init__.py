@@ -7,7 +7,7 @@ Paper: S7.3 (the search is a lookup in this volume); the matches go beyond it.
 from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.build import build_cost_volume, find_matches
 from geodiff_plugin.matching.consistency import Matches, gate_matches, match_volume
-from geodiff_plugin.matching.known_points import points_to_matches
+from geodiff_plugin.matching.known_points import points_to_matches, with_points
 from geodiff_plugin.matching.mirrored import PoseCheck, mirrored_pose_preferred
 from geodiff_plugin.matching.plane_sweep import CostVolume, RightView, sweep_planes
 
@@ -24,4 +24,5 @@ __all__ = [
     "mirrored_pose_preferred",
     "points_to_matches",
     "sweep_planes",
+    "with_points",
 ]

@@ -6,13 +6,15 @@ Paper: none; what Marigold-DC (Viola et al. 2024) completes.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import NEAREST_M, project
 from geodiff_plugin.matching.consistency import Matches
 
-__all__ = ["UNIT", "points_to_matches"]
+__all__ = ["UNIT", "points_to_matches", "with_points"]
 
 #: The unit in which errors at points are measured, as a share of their median inverse depth.
 UNIT = 0.01
@@ -70,3 +72,20 @@ def points_to_matches(
     inverse_depth = nearest.view(1, height, width)
     unit = UNIT * nearest[nearest > 0].median()
     return Matches(inverse_depth, (inverse_depth > 0).float(), unit, K_grid, size_grid), left_out
+
+
+def with_points(matches: Matches | None, points: Matches) -> Matches:
+    """Matches with known points in their place, and in their unit; the points alone where there are none.
+
+    Args:
+        matches: of one image, or ``None``.
+        points: of that image, on the same grid.
+    """
+    if matches is None:
+        return points
+    known = points.confidence > 0
+    return replace(
+        matches,
+        inverse_depth=torch.where(known, points.inverse_depth, matches.inverse_depth),
+        confidence=torch.where(known, points.confidence, matches.confidence),
+    )

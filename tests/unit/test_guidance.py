@@ -13,6 +13,7 @@ K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
 E = np.eye(4)
 E[0, 3] = 0.12
 RIGHT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+changed_K = np.array([[60.0, 0, 900.0], [0, 60.0, 23.5], [0, 0, 1]])
 HYPERPARAMETERS = {
     "gradient",
     "rule",
@@ -141,11 +142,116 @@ def changed(matrix, index, value):
         (bad(depth_range=(3.0, 1.0)), ValueError, "depth_range"),
         (bad(weights={"smooth": 1.0}), ValueError, "weights"),
         (bad(weights={"photometric": -1.0}), ValueError, "photometric"),
+        (bad(right=None), ValueError, "right must be an image, or None together with points"),
+        (bad(right=None, points=np.ones((4, 3))), ValueError, "E must be None without a right view"),
+        (bad(points="cloud.ply"), TypeError, "points"),
+        (bad(points=np.ones((4, 2))), ValueError, "points must be a sparse depth map"),
+        (bad(points=np.zeros((48, 64))), ValueError, "at least one of them known"),
+        (bad(points=np.ones((48, 64), np.uint16)), ValueError, "metres as floats"),
+        (bad(points_loss="l2"), ValueError, "points_loss"),
+        (bad(positive="exp"), ValueError, "positive"),
+        (bad(step_from="next"), ValueError, "step_from"),
     ],
 )
 def test_bad_input_names_the_argument(arguments, error, message):
     with pytest.raises(error, match=message):
         GeometryGuidance(**arguments)
+
+
+def test_views_in_any_world_frame():
+    world = np.eye(4)
+    world[:3, 3] = 3.0
+    up = np.eye(4)
+    up[1, 3] = -0.2
+    K_third = K.copy()
+    K_third[0, 2] += 5
+    views = [(RIGHT, K, world), (RIGHT, K, world @ E), (RIGHT, K_third, world @ up)]
+    guidance = GeometryGuidance.from_views(views, inner_steps=3)
+    assert guidance.config.inner_steps == 3 and len(guidance.rights) == 2
+    np.testing.assert_allclose([rig.E for rig in guidance.rigs], [E, up], atol=1e-12)
+    assert guidance.rigs[1].K_right[0, 2] == 36.5 and guidance.rigs[1].K_left[0, 2] == 31.5
+    with pytest.raises(ValueError, match="image must be of 64x48 pixels, as the left view; got 32x24"):
+        guidance.prepare(torch.zeros(1, 3, 24, 32))
+
+
+def test_a_batch_with_several_views_each():
+    E2 = E.copy()
+    E2[0, 3] = 0.2
+    guidance = GeometryGuidance(
+        [(RIGHT, RIGHT), (RIGHT, RIGHT, RIGHT)],
+        K,
+        [(np.eye(4), E, E2), (np.eye(4), E, E2, E)],
+    )
+    assert [len(own.rights) for own in guidance.inputs] == [2, 3]
+    assert [rig.E[0, 3] for rig in guidance.rigs] == [0.12, 0.2, 0.12, 0.2, 0.12]
+
+
+@pytest.mark.parametrize(
+    ("views", "error", "message"),
+    [
+        ([(RIGHT, K, np.eye(4))], ValueError, "views must be a list"),
+        ({"left": RIGHT}, TypeError, "views must be a list"),
+        ([(RIGHT, K, np.eye(4)), (RIGHT, K)], ValueError, "views must be a list"),
+        (
+            [(RIGHT, changed_K, np.eye(4)), (RIGHT, K, E)],
+            ValueError,
+            r"K\[left\] must be for the left view's",
+        ),
+        ([(None, K, np.eye(4)), (RIGHT, K, E), (RIGHT, changed_K, E)], ValueError, r"K\[right view 2\]"),
+        ([(None, K, E), (RIGHT, K, E)], ValueError, "baseline"),
+    ],
+)
+def test_bad_views_are_named(views, error, message):
+    with pytest.raises(error, match=message):
+        GeometryGuidance.from_views(views)
+
+
+def test_points_of_either_form():
+    sparse = np.zeros((48, 64))
+    sparse[3, 4], sparse[5, 6], sparse[7, 8] = 2.0, np.nan, np.inf
+    (own,) = GeometryGuidance.from_points(sparse, K).inputs
+    assert own.rights == () and own.points.shape == (48, 64) and own.points.sum() == 2.0
+    cloud = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, torch.nan]])
+    (own,) = GeometryGuidance(RIGHT, K, E, points=cloud).inputs
+    assert own.points.shape == (1, 3) and len(own.rights) == 1
+    both = GeometryGuidance(None, K, points=[sparse, cloud])
+    assert [tuple(own.points.shape) for own in both.inputs] == [(48, 64), (1, 3)]
+
+
+def test_several_right_views_need_as_many_cameras():
+    with pytest.raises(TypeError, match="E must be a tuple"):
+        GeometryGuidance((RIGHT, RIGHT), K, E)
+    with pytest.raises(ValueError, match="a tuple of 2 for 2 right views"):
+        GeometryGuidance((RIGHT, RIGHT), K, (np.eye(4), E))
+    with pytest.raises(ValueError, match="a tuple of 2 for 2 right views"):
+        GeometryGuidance((RIGHT, RIGHT), (K, K), (np.eye(4), E, E))
+
+
+def test_what_is_given_must_feed_what_is_asked():
+    points = np.array([[0.0, 0.0, 2.0]])
+    with pytest.raises(ValueError, match="weights must be with a term"):
+        GeometryGuidance.from_points(points, K, weights={"photometric": 1.0, "matches": 1.0})
+    with pytest.raises(ValueError, match="'one-number' needs a right view"):
+        GeometryGuidance.from_points(points, K, search="one-number")
+    with pytest.raises(ValueError, match="'points-range' needs points"):
+        GeometryGuidance(RIGHT, K, E, search="points-range")
+
+
+def test_marigold_dc_preset_is_the_published_one():
+    config = GeometryGuidance.marigold_dc(np.array([[0.0, 0.0, 2.0]]), K).config
+    assert (config.gradient, config.rule, config.step_latents, config.step_affine) == (
+        "full",
+        "adam-norm",
+        0.05,
+        0.005,
+    )
+    assert (config.positive, config.points_loss, config.min_steps, config.inner_steps) == (
+        "square",
+        "l1l2",
+        50,
+        1,
+    )
+    assert config.weights == {"points": 1.0}
 
 
 def test_millimetres_are_suspected():
