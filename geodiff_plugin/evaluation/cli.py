@@ -47,6 +47,7 @@ def pairs(
     seed: o.Seed = 0,
     steps: o.Steps = None,
     resolution: o.Resolution = None,
+    views: o.Views = 2,
     device: o.Device = "cpu",
     dtype: o.Dtype = "float32",
     out: o.Out = Path("geodiff-eval"),

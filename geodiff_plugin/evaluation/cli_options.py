@@ -44,6 +44,7 @@ Ensemble = Annotated[int, typer.Option(help="Ensemble members.")]
 Seed = Annotated[int, typer.Option(help="Seed of the noise.")]
 Steps = Annotated[int | None, typer.Option(help="Denoising steps; each method's own by default.")]
 Resolution = Annotated[int | None, typer.Option(help="Longer side for the prior, pixels.")]
+Views = Annotated[int, typer.Option(help="Views that methods take of a group that has more than two.")]
 Device = Annotated[str, typer.Option(help="cpu, cuda or mps.")]
 Dtype = Annotated[str, typer.Option(help="float32, bfloat16 or float16.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Records and results; resumed where it exists.")]
@@ -51,7 +52,7 @@ SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Go on after a b
 SaveDepth = Annotated[bool, typer.Option("--save-depth", help="Write every depth map as .npy.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No bar and nothing on the screen.")]
 
-_SETTINGS = ("ensemble", "seed", "steps", "resolution", "device", "dtype", "space")
+_SETTINGS = ("ensemble", "seed", "steps", "resolution", "device", "dtype", "space", "views")
 
 
 def names(text: str | None) -> tuple[str, ...]:

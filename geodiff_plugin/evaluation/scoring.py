@@ -17,7 +17,10 @@ from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
 from geodiff_plugin.evaluation.metrics import ause, counted, evaluate_depth, evaluate_disparity
 
-__all__ = ["out_of_view", "regions", "score"]
+__all__ = ["TOM_CLASSES", "out_of_view", "regions", "score"]
+
+TOM_CLASSES = (2, 3)
+"""Material classes that Booster's authors call transparent or mirror when they score depth."""
 
 
 def out_of_view(sample: StereoSample) -> np.ndarray:
@@ -39,8 +42,9 @@ def regions(sample: StereoSample) -> dict[str, np.ndarray]:
     """Masks by which AbsRel is split: what the right camera sees, what is hidden, what lies outside.
 
     Returns:
-        ``out_of_view`` always; ``visible`` and ``occluded`` where the set says what is hidden; one
-        ``material_<class>`` per class where it has classes. All ``(H, W)`` bool, within ``sample.valid``.
+        ``out_of_view`` always; ``visible`` and ``occluded`` where the set says what is hidden; where it has
+        material classes, ``tom`` (2 and 3, transparent or mirror), ``not_tom`` (the others) and one
+        ``material_<class>`` per class. All ``(H, W)`` bool, within ``sample.valid``.
     """
     outside = out_of_view(sample)
     masks = {"out_of_view": outside}
@@ -48,6 +52,8 @@ def regions(sample: StereoSample) -> dict[str, np.ndarray]:
         hidden = sample.valid & sample.occluded & ~outside
         masks |= {"occluded": hidden, "visible": sample.valid & ~hidden & ~outside}
     if sample.material is not None:
+        tom = np.isin(sample.material, TOM_CLASSES)
+        masks |= {"tom": sample.valid & tom, "not_tom": sample.valid & ~tom}
         for value in np.unique(sample.material[sample.valid]):
             masks[f"material_{int(value)}"] = sample.valid & (sample.material == value)
     return masks

@@ -18,6 +18,7 @@ from geodiff_plugin.evaluation.cells import (
     interval_cell,
     label_of,
 )
+from geodiff_plugin.evaluation.detail_tables import disparity_table, regions_table, uncertainty_table
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.runner import headline
 from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
@@ -38,6 +39,14 @@ def groups(records: Sequence[dict[str, Any]]) -> dict[str, set[str]]:
             count_of_pairs(len(posed), "posed "): posed,
         }
     return everything
+
+
+def _heading(records: Sequence[dict[str, Any]], method: str) -> str:
+    """A method's title, saying so where it knows relative depth only."""
+    title = find_method(method).title
+    own = [r["all_pixels"]["raw"] for r in records if r["method"] == method and r["status"] == "ok"]
+    relative = bool(own) and all(raw is None for raw in own)
+    return f"{title} + oracle" if relative and "oracle" not in title else title
 
 
 def per_pair_table(
@@ -61,7 +70,7 @@ def per_pair_table(
         )
         if members:
             rows.append((f"mean of {group}", *(cell(mean, digits) for mean in means)))
-    return Table(title, ("pair", *(find_method(m).title for m in values)), tuple(rows), note)
+    return Table(title, ("pair", *(_heading(records, m) for m in values)), tuple(rows), note)
 
 
 def _summary_cells(scores: Sequence[dict[str, float | None]]) -> tuple[str, ...]:
@@ -141,4 +150,5 @@ def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -
         tables.append(versus_table(records, reference))
     for group, members in groups(records).items():
         tables.append(summary_table(records, members, f"All metrics, {group}"))
+    tables += [regions_table(records), disparity_table(records), uncertainty_table(records)]
     return [table for table in tables if table.rows]

@@ -10,7 +10,9 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
 from geodiff_plugin.evaluation.cli import eval_app
+from geodiff_plugin.evaluation.datasets import DATASETS
 from geodiff_plugin.formats import write_pfm
 
 SHIFT = 8
@@ -71,8 +73,22 @@ def test_pairs_draws_a_seeded_sample(data, tmp_path):
     words = ("pairs", data, "--methods", "sgbm", "-o", tmp_path / "out", "--sample")
     picked = ["middlebury2014/two" in invoke(*words, 1, "--seed", seed).stdout for seed in (0, 1, 2, 3, 4, 0)]
     assert picked[0] == picked[-1] and set(picked) == {True, False}
+    assert "Drawn with seed 0: middlebury2014/" in invoke(*words, 1).stdout
     with pytest.raises(ValueError, match="sample must be at most 2"):
         invoke(*words, 3)
+
+
+def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
+    maps = tmp_path / "RAFT-Stereo"
+    maps.mkdir()
+    np.save(maps / "middlebury2014_one.npy", np.full((48, 144), SHIFT, np.float32))
+    words = ("pairs", data, "--methods", f"files:disparity:{maps}", "--scenes", "one", "-o", tmp_path / "out")
+    result = invoke(*words, "--crop", "eigen", "--prior", "one", "--prior", "two", "--space", "disparity")
+    assert "| middlebury2014/one | 0.000 |" in result.stdout and "RAFT-Stereo" in result.stdout
+    assert "--crop eigen --prior one --prior two --space disparity" in result.stdout
+    assert "the crop 'eigen'" in result.stdout
+    with pytest.raises(ValueError, match="crop must be one of"):
+        invoke(*words, "--crop", "middle")
 
 
 def test_pairs_goes_on_after_a_broken_sample_on_request(data, tmp_path):
@@ -87,7 +103,9 @@ def test_pairs_goes_on_after_a_broken_sample_on_request(data, tmp_path):
 def test_list_tells_what_is_there(data):
     found = invoke("list", "--data", data).stdout
     assert "middlebury2014  2 samples" in found and "kitti2015       not found" in found
-    assert "https://" in found and "guided" in found
+    assert "https://" in found and "guided" in found and "files:..." in found
+    assert "synthetic       any number of samples" in found
+    assert all(name in found for name in (*DATASETS, *METHODS, *FAMILIES))
     assert "no --data given" in invoke("list").stdout
 
 

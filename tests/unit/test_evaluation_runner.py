@@ -2,19 +2,22 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from geodiff_plugin.evaluation import runner
+from geodiff_plugin.evaluation.baselines import find_method, with_priors
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, Settings
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
+from geodiff_plugin.evaluation.detail_tables import disparity_table, regions_table, uncertainty_table
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
 from geodiff_plugin.evaluation.runner import headline, run
 from geodiff_plugin.evaluation.scoring import out_of_view, regions, score
 from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
-from geodiff_plugin.evaluation.tables import pairs_tables
+from geodiff_plugin.evaluation.tables import pairs_tables, per_pair_table
 
 SHAPE = (6, 8)
 K = np.array([[10.0, 0, 3.5], [0, 10.0, 2.5], [0, 0, 1]])
@@ -204,8 +207,76 @@ def test_tables_hold_pairs_means_and_differences(bench):
         "All metrics, 3 pairs",
         "All metrics, 2 rectified pairs",
         "All metrics, 1 posed pair",
+        "AbsRel by region and material",
+        "Disparity, rectified pairs",
     ]
     assert [row[0] for row in summaries[0].rows] == ["exact", "exact, aligned", "double", "double, aligned"]
+
+
+def test_detail_tables_say_where_and_whether_it_knows():
+    hidden, glass = np.zeros(SHAPE, bool), np.zeros(SHAPE, np.uint8)
+    hidden[:, 4:] = True
+    glass[:, 6:] = 3
+    with_masks, without = make_sample("a", occluded=hidden, material=glass), make_sample("b")
+    records = []
+    for sample, factor in ((with_masks, 2.0), (without, 3.0)):
+        spread = np.ones(SHAPE)
+        prediction = Prediction(factor * sample.depth_m, uncertainty=spread)
+        head = {"dataset": sample.dataset, "sample": sample.name, "method": "guided", "status": "ok"}
+        records.append(head | score(sample, prediction, None))
+    regions_, disparity = regions_table(records), disparity_table(records)
+    assert regions_.header == (
+        "method",
+        "visible (1 pair)",
+        "occluded (1 pair)",
+        "out of view (2 pairs)",
+        "ToM (1 pair)",
+        "other material (1 pair)",
+        "class 0 (1 pair)",
+        "class 3 (1 pair)",
+    )
+    assert regions_.rows == (("guided", "1.000", "1.000", "1.500", "1.000", "1.000", "1.000", "1.000"),)
+    # A doubled depth halves the shift of f b / z = 5 / z: by 0.5 px in 12 of 48 pixels, by 1.25 px in 36; a
+    # tripled one by 0.667 and 1.667 px.
+    epe = (0.25 * 0.5 + 0.75 * 1.25 + 0.25 * 2 / 3 + 0.75 * 5 / 3) / 2
+    assert disparity.rows == (("guided", f"{epe:.3f}", "0.750", "0.000", "0.000", "0.000"),)
+    assert uncertainty_table(records).rows == (("guided", "2", "0.000"),)
+    bare = [records[1] | {"disparity": None, "ause": None, "regions": {}}]
+    assert [table(bare).rows for table in (regions_table, disparity_table, uncertainty_table)] == [()] * 3
+
+
+def test_crop_is_scored_and_is_another_result(bench):
+    go, calls, _, samples, path = bench
+    go()
+    for name in samples:
+        image = np.zeros((375, 1242, 3), np.uint8)
+        depth_m = np.full(image.shape[:2], 2.0, np.float32)
+        depth_m[0] = 4.0
+        changed = {"left": image, "right": image, "depth_m": depth_m, "valid": depth_m > 0}
+        samples[name] = replace(samples[name], **changed)
+    records = go(crop="benchmark")
+    assert len(calls) == 6 and records[0]["all_pixels"]["raw"]["pixels"] == 352 * 1216
+    samples["a"] = replace(samples["a"], valid=samples["a"].depth_m > 3)
+    with pytest.raises(ValueError, match="the truth of middlebury2014/a must be known somewhere in the crop"):
+        runner._cropped(samples["a"], "garg")
+
+
+def test_further_priors_give_further_rows(bench, monkeypatch):
+    go, calls, methods, _, path = bench
+    methods["exact"] = replace(methods["exact"], uses_prior=True)
+    monkeypatch.setattr(runner.PriorCache, "fingerprint", lambda self, settings: settings.prior[::-1])
+    names = with_priors(["exact", "double"], ["org/other"])
+    assert names == ("exact", "double", "exact@org/other")
+    refs = [SampleRef("middlebury2014", "a", {})]
+    records = run(refs, names, Settings(), path.parent, progress=False)
+    assert [r["method"] for r in records] == list(names)
+    assert per_pair_table(records, "", headline, 3, "").header == ("pair", "exact", "double", "exact (other)")
+    calls.clear()
+    # The other prior alone, named first: the same result under its plain name.
+    again = run(refs, ["exact"], Settings(prior="org/other"), path.parent, progress=False)
+    assert calls == [] and again[0]["method"] == "exact" and again[0]["key"] == records[2]["key"]
+    with pytest.raises(ValueError, match="METHOD@PRIOR with a method that uses a prior"):
+        find_method("double@org/other")
 
 
 def pairs_tables_of(records):

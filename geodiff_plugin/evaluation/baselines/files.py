@@ -73,7 +73,7 @@ def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Predicti
 
 
 def files_method(text: str) -> Method:
-    """A folder of maps as a method.
+    """Maps that were made elsewhere, in a folder: files:DIR or files:KIND:DIR.
 
     Args:
         text: ``DIR`` or ``KIND:DIR`` with a key of ``KINDS``. The map of a sample is

@@ -20,7 +20,7 @@ __all__ = ["hf_method"]
 
 
 def hf_method(name: str) -> Method:
-    """A checkpoint as a method; metric ones raw and aligned, relative ones aligned only.
+    """A depth checkpoint of transformers, hub id or folder; relative ones are scored aligned only.
 
     Args:
         name: hub id, or folder as ``save_pretrained`` wrote it.

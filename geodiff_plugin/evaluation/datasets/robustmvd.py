@@ -108,4 +108,5 @@ ROBUSTMVD = Dataset(
     "download_tanks_and_temples.sh of https://github.com/lmb-freiburg/robustmvd; then cams/ and pair.txt "
     "from its sample list as docs/evaluation.md shows.",
     options=("pairs", "pixel_centre"),
+    full_count=sum(map(len, KEY_VIEWS.values())),
 )

@@ -101,6 +101,7 @@ class Dataset:
         obtain: how to get the set, one sentence with its address and licence.
         options: keywords that ``find`` takes beside the folder.
         full_count: number of pairs in the set as the paper used it; ``None`` where it does not apply.
+        needs_folder: whether there is anything to find; not for what is rendered.
     """
 
     name: str
@@ -110,6 +111,7 @@ class Dataset:
     obtain: str
     options: tuple[str, ...] = ()
     full_count: int | None = None
+    needs_folder: bool = True
 
 
 def disparity_to_depth(

@@ -75,5 +75,6 @@ SYNTHETIC = Dataset(
     find=find_synthetic,
     load=load_synthetic,
     cap_m=None,
+    needs_folder=False,
     obtain="rendered by this package, offline: give synthetic:N (or synthetic:N+FIRST_SEED) as DIR.",
 )
