@@ -35,10 +35,12 @@ def _figure(
         bool, typer.Option("--clouds", help="qualitative, ablation: point clouds from another view too.")
     ] = False,
     prior: o.Prior = "bundled",
+    space: o.Space = None,
     ensemble: o.Ensemble = 1,
     seed: o.Seed = 0,
     steps: o.Steps = None,
     resolution: o.Resolution = None,
+    views: o.Views = 2,
     device: o.Device = "cpu",
     dtype: o.Dtype = "float32",
     out: o.Out = Path("geodiff-eval"),

@@ -60,6 +60,7 @@ def _command(name: str) -> Callable[..., None]:
         seed: o.Seed = 0,
         steps: o.Steps = None,
         resolution: o.Resolution = None,
+        views: o.Views = 2,
         device: o.Device = "cpu",
         dtype: o.Dtype = "float32",
         out: o.Out = Path("geodiff-eval"),

@@ -133,9 +133,14 @@ def command_line(
     return shlex.join(words)
 
 
-def remarks_on(records: Sequence[dict[str, Any]], settings: Settings) -> list[str]:
+def remarks_on(records: Sequence[dict[str, Any]], options: PairsOptions) -> list[str]:
     """Sentences above the tables: the prior, what methods could not do and why, samples that were broken."""
+    settings = options.settings
     remarks = [f"Prior {settings.prior}, seed {settings.seed}, ensemble {settings.ensemble}."]
+    if options.priors:
+        remarks.append(f"Rows that name no prior: {settings.prior}.")
+    if options.crop != "none":
+        remarks.append(f"Only what lies in the crop {options.crop!r} is scored.")
     reasons: dict[tuple[str, str], int] = {}
     for record in records:
         if record["status"] == "not applicable":
@@ -172,11 +177,7 @@ def run_pairs(options: PairsOptions) -> None:
     if not state.is_main_process:
         return
     facts = run_facts(command_line(options, ("eval", "pairs", str(options.data))))
-    remarks = remarks_on(records, options.settings)
-    if options.priors:
-        remarks.append(f"Rows that name no prior: {options.settings.prior}.")
-    if options.crop != "none":
-        remarks.append(f"Only what lies in the crop {options.crop!r} is scored.")
+    remarks = remarks_on(records, options)
     if options.sample is not None:
         remarks.append(f"Drawn with seed {options.settings.seed}: {', '.join(ref.label for ref in refs)}.")
     if state.num_processes > 1:

@@ -15,7 +15,7 @@ from multiprocessing import get_context
 from typing import Any
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.baselines import find_method
+from geodiff_plugin.evaluation.baselines import find_method, with_priors
 from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
 from geodiff_plugin.evaluation.commands import PairsOptions, command_line, remarks_on, select
 from geodiff_plugin.evaluation.datasets import find_pairs
@@ -82,7 +82,7 @@ def run_cost(options: PairsOptions) -> None:
     refs = select(find_pairs(options.data, options.datasets or None, **posed), options)
     settings = replace(options.settings, steps=options.settings.steps or STEPS)
     records = []
-    for method in dict.fromkeys((*COST_METHODS, *options.methods)):
+    for method in with_priors(tuple(dict.fromkeys((*COST_METHODS, *options.methods))), options.priors):
         # What one method frees stays with the allocator, where the next would find it at no cost.
         with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
             job = fresh_process.submit(
@@ -91,12 +91,13 @@ def run_cost(options: PairsOptions) -> None:
                 [method],
                 settings,
                 options.out / "cost",
+                crop=options.crop,
                 skip_broken=options.skip_broken,
                 progress=not options.quiet,
             )
             records += job.result()
     facts = run_facts(command_line(options, ("eval", "cost", "--data", str(options.data)), ()))
-    remarks = [*remarks_on(records, settings), f"{settings.steps} denoising steps."]
+    remarks = [*remarks_on(records, options), f"{settings.steps} denoising steps."]
     page = write_tables(options.out, "Cost", facts, [cost_table(records)], remarks, "cost")
     if not options.quiet:
         sys.stdout.write(page)

@@ -16,6 +16,7 @@ from geodiff_plugin.evaluation.baselines import with_priors
 from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
 from geodiff_plugin.evaluation.commands import PairsOptions, command_line, remarks_on, select
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, find_pairs
+from geodiff_plugin.evaluation.detail_tables import regions_table
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.paper_tables import CHANGES, FoundColumn, changes_table, layout_table
 from geodiff_plugin.evaluation.published import LAYOUTS, Column, Layout
@@ -80,6 +81,7 @@ def _tables(
             own = [record for record in records if label_of(record) in column.labels]
             title = f"All metrics, {column.column.title}, {count_of_pairs(len(column.labels))}"
             tables.append(summary_table(own, set(column.labels), title))
+    tables.append(regions_table(records))
     return [table for table in tables if table.rows]
 
 
@@ -122,9 +124,9 @@ def run_experiment(name: str, options: PairsOptions) -> None:
         FoundColumn(column, dataset, frozenset(ref.label for ref in own) & finished)
         for column, (dataset, own) in chosen.items()
     ]
-    remarks = remarks_on(records, options.settings) + absent
+    remarks = remarks_on(records, options) + absent
     if name == "table3":
-        remarks.append("Pairs: " + ", ".join(ref.name for ref in refs) + ".")
+        remarks.append("Pairs: " + ", ".join(ref.label for ref in refs) + ".")
     facts = run_facts(command_line(options, ("eval", name, "--data", str(options.data)), ()))
     tables = _tables(name, layout, found, records, methods)
     page = write_tables(options.out, layout.title, facts, tables, remarks, name)

@@ -23,6 +23,7 @@ from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.published import Column, Layout, PaperRow
 from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
 from geodiff_plugin.guidance import DEFAULT_WEIGHTS
+from geodiff_plugin.updates import RULES
 
 __all__ = ["CHANGES", "FoundColumn", "changes_table", "layout_table"]
 
@@ -35,9 +36,9 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("reprojection only", "reprojection-only"),
         ("no diffusion", "no-diffusion"),
         ("gradient to z_t (full)", "guided:gradient=full"),
-        ("plain gradient step", "guided:rule=plain"),
-        ("step matched to the noise", "guided:rule=norm"),
-        *((f"without {name}", f"guided:weights.{name}=0") for name in DEFAULT_WEIGHTS),
+        *((f"rule {name}", f"guided:rule={name}") for name in RULES if name != "adam"),
+        *((f"without {name}", f"guided:weights.{name}=0") for name in DEFAULT_WEIGHTS if name != "points"),
+        ("without refinement", "guided:refine=false"),
     ),
     "paper": (
         ("as it is", "paper"),
@@ -46,11 +47,13 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         # One number that is searched within a thousandth of 1 is 1.
         ("g_s = 1", "paper:g_s_range=[0.999,1.001]"),
         ("gradient to the clean latent (denoised)", "paper:gradient=denoised"),
-        ("Adam", "paper:rule=adam+affine_rule=adam"),
-        ("step matched to the noise", "paper:rule=norm"),
+        *((f"rule {name}", f"paper:rule={name}+affine_rule={name}") for name in RULES if name != "plain"),
     ),
 }
-"""What the ablation changes, by the preset that it changes: ``(row, method)``, the unchanged one first."""
+"""What the ablation changes, by the preset that it changes: ``(row, method)``, the unchanged one first.
+
+Every rule and every term has its row; no sample has known points, so their term has none.
+"""
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ class Layout:
 _KITTI = Column("KITTI-Stereo", ("kitti2015",), 200)
 _BOOSTER = Column("Booster", ("booster",), 228)
 _MIDDLEBURY = Column("Middlebury", ("middeval3", "middlebury2014"), 15)
-_TANKS = Column("Tanks and Temples", ("mvsnet",), 116)
+_TANKS = Column("Tanks and Temples", ("robustmvd", "mvsnet"), 116)
 
 
 def _three_sets(kitti: str, booster: str, middlebury: str) -> tuple[tuple[str, tuple[str, ...]], ...]:
