@@ -82,7 +82,19 @@ def depth(
     k_right: Annotated[
         Path | None, _option("3x3 intrinsics of the right image, if they differ.", CAMERAS, "--K-right")
     ] = None,
-    prior: Annotated[str, _option("'bundled', a hub id or a folder.", RUN, "--prior")] = "bundled",
+    prior: Annotated[
+        str, _option("'bundled', a hub id or a folder; KEY:folder says which kind.", RUN, "--prior")
+    ] = "bundled",
+    space: Annotated[
+        str | None,
+        _option(
+            "What the prior is affine in, if its folder does not tell: depth, disparity ...", RUN, "--space"
+        ),
+    ] = None,
+    option: Annotated[
+        list[str] | None,
+        _option("What this prior alone takes, as NAME=VALUE (GeoWizard: domain=outdoor).", RUN, "--option"),
+    ] = None,
     steps: Annotated[
         int | None, _option("Denoising steps; the prior's own by default.", RUN, "--steps")
     ] = None,
@@ -113,7 +125,7 @@ def depth(
     from geodiff_plugin.commands.arguments import DepthArguments
     from geodiff_plugin.commands.depth import run_depth
 
-    run_depth(DepthArguments(**typed | {"calib": tuple(calib or ())}))
+    run_depth(DepthArguments(**typed | {"calib": tuple(calib or ()), "option": tuple(option or ())}))
 
 
 @app.command()
@@ -130,11 +142,14 @@ def demo(
 @app.command()
 def info(
     prior: Annotated[str | None, _option("Tell of this prior as well.", RUN, "--prior")] = None,
+    space: Annotated[
+        str | None, _option("What it is affine in, if its folder does not tell.", RUN, "--space")
+    ] = None,
 ) -> None:
     """Print versions, devices, priors and what is cached."""
     from geodiff_plugin.commands.info import run_info
 
-    run_info(prior)
+    run_info(prior, space)
 
 
 @app.command()

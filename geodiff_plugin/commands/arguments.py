@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
+from geodiff_plugin.metric import SPACES
 
 __all__ = [
     "DTYPES",
@@ -49,6 +50,8 @@ class DepthArguments:
     e: Path | None = None
     k_right: Path | None = None
     prior: str = "bundled"
+    space: str | None = None
+    option: tuple[str, ...] = ()
     steps: int | None = None
     ensemble: int = 1
     resolution: int | None = None
@@ -79,12 +82,14 @@ class Settings:
         device: where the pipeline runs.
         dtype: of U-Net and VAE.
         depth_range: ``(near, far)`` metres, or ``None``.
+        options: what ``--option`` gives to the prior's call.
         cameras: numbers of the left and the right camera in the calibration, or ``None``.
     """
 
     device: torch.device
     dtype: torch.dtype
     depth_range: tuple[float, float] | None
+    options: dict[str, str]
     cameras: tuple[int, int] | None
 
 
@@ -137,6 +142,14 @@ def _check_cameras(text: str | None) -> tuple[int, int] | None:
     return left, right
 
 
+def _check_options(typed: tuple[str, ...]) -> dict[str, str]:
+    pairs = [entry.partition("=") for entry in typed]
+    for entry, (name, equals, value) in zip(typed, pairs, strict=True):
+        if not (name and equals and value):
+            bad_value("--option", "NAME=VALUE, such as domain=outdoor", repr(entry))
+    return {name: value for name, _, value in pairs}
+
+
 def _check_depth_range(near: float | None, far: float | None) -> tuple[float, float] | None:
     if near is None and far is None:
         return None
@@ -177,6 +190,8 @@ def check_arguments(arguments: DepthArguments) -> Settings:
                 arguments.resolution,
                 f"Try {max(32, round(arguments.resolution / 8) * 8)}.",
             )
+    if arguments.space is not None:
+        check_choice(arguments.space, "--space", SPACES)
     check_number(arguments.seed, "--seed", 0, 2**63 - 1, integer=True)
     check_choice(arguments.dtype, "--dtype", DTYPES)
     check_choice(arguments.preset, "--preset", PRESETS)
@@ -185,5 +200,6 @@ def check_arguments(arguments: DepthArguments) -> Settings:
         device=pick_device(arguments.device),
         dtype=DTYPES[arguments.dtype],
         depth_range=_check_depth_range(arguments.near, arguments.far),
+        options=_check_options(arguments.option),
         cameras=_check_cameras(arguments.cameras),
     )

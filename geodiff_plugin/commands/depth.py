@@ -55,7 +55,7 @@ def estimate_and_write(arguments: DepthArguments) -> DepthRun:
         with watch.stage("load"):
             pipe = load_guided_prior(arguments, settings)
         with watch.stage("guided call"):
-            output = guided_call(pipe, inputs, arguments)
+            output = guided_call(pipe, inputs, arguments, settings)
         for sentence in output.warnings:
             if sentence not in warnings:
                 warnings.append(sentence)

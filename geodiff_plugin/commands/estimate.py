@@ -18,10 +18,14 @@ from diffusers.utils import logging as diffusers_logging
 from tqdm import tqdm
 from transformers.utils import logging as transformers_logging
 
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.commands.arguments import DepthArguments, Settings
 from geodiff_plugin.commands.inputs import Inputs
+from geodiff_plugin.commands.voice import say
+from geodiff_plugin.integration.run import plan_steps
 from geodiff_plugin.pipeline import enable_geometry_guidance
-from geodiff_plugin.priors import load_prior
+from geodiff_plugin.priors import find_adapter, find_prior
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["StopWatch", "guided_call", "load_guided_prior"]
@@ -59,33 +63,47 @@ def _no_loading_bars() -> Iterator[None]:
 def load_guided_prior(arguments: DepthArguments, settings: Settings) -> Any:
     """The prior of ``--prior``, with guidance enabled and its own progress bars off.
 
+    Which it is and its licence are said on stderr, unless ``--quiet``.
+
     Raises:
-        ValueError: no such prior, not cached, or no adapter for its class.
+        ValueError: no such prior, not cached, of no known kind; an option that it does not take.
     """
     # A download is worth a bar, reading a folder is not.
-    on_disk = arguments.prior == "bundled" or Path(arguments.prior).is_dir()
+    typed = arguments.prior
+    on_disk = typed == "bundled" or Path(typed).is_dir() or Path(typed.partition(":")[2]).is_dir()
     with _no_loading_bars() if on_disk or arguments.quiet else nullcontext():
-        pipe = load_prior(arguments.prior, device=settings.device, dtype=settings.dtype)
+        found = find_prior(typed)
+        if not arguments.quiet:
+            say(f"prior: {typed} ({found.key}; {found.licence})")
+        pipe = found.load(settings.device, settings.dtype, arguments.space)
+    taken = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
+    for name in settings.options:
+        if name not in taken:
+            bad_value("--option", f"one that {found.key} takes ({', '.join(taken) or 'none'})", repr(name))
     pipe.set_progress_bar_config(disable=True)
     enable_geometry_guidance(pipe)
     return pipe
 
 
-def guided_call(pipe: Any, inputs: Inputs, arguments: DepthArguments) -> MetricDepthOutput:
+def guided_call(
+    pipe: Any, inputs: Inputs, arguments: DepthArguments, settings: Settings
+) -> MetricDepthOutput:
     """Call the pipeline as the options say; unless ``--quiet``, with the loss in a progress bar on stderr.
 
     Raises:
         ValueError: what only both views together show, such as no overlap.
     """
-    steps = inputs.guidance.denoising_steps(arguments.steps, pipe.config.get("default_denoising_steps"))
+    prior = find_adapter(pipe)(pipe)
+    steps, _ = plan_steps(inputs.guidance, prior, arguments.steps, pipe.default_denoising_steps)
     options = {
-        "num_inference_steps": steps,
+        **settings.options,
+        "num_inference_steps": arguments.steps,
         "processing_resolution": arguments.resolution,
         "ensemble_size": arguments.ensemble,
         "output_uncertainty": arguments.ensemble > 1,
         "generator": torch.Generator("cpu").manual_seed(arguments.seed),
     }
-    total, quiet = steps * arguments.ensemble, arguments.quiet
+    total, quiet = steps * (1 if prior.deterministic else arguments.ensemble), arguments.quiet
     with tqdm(total=total, desc="guided steps", disable=quiet, file=sys.stderr, leave=False) as bar:
 
         def show(_pipe: Any, _step: int, _timestep: Any, now: dict[str, Any]) -> dict[str, Any]:

@@ -7,13 +7,13 @@ Paper: none.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import torch
 from huggingface_hub import CacheNotFound, scan_cache_dir
 
 from geodiff_plugin.commands.report import versions
-from geodiff_plugin.priors import BUNDLED_FOLDER, PRIORS, find_adapter, load_prior
+from geodiff_plugin.priors import BUNDLED_FOLDER, PRIORS, FoundPrior, find_adapter, find_prior
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 
 __all__ = ["run_info"]
 
@@ -48,35 +48,48 @@ def _cached() -> list[str]:
     return [f"{repo.repo_id} ({_megabytes(repo.size_on_disk)})" for repo in models]
 
 
-def _describe(pipe: Any, name: str) -> list[tuple[str, str]]:
+def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
+    """What the adapter of a prior found, once its weights are read."""
+    pipe = found.load(space=space)
+    adapter = find_adapter(pipe)(pipe)
     parameters = sum(
         weight.numel()
         for part in pipe.components.values()
         if isinstance(part, torch.nn.Module)
         for weight in part.parameters()
     )
-    adapter = next(key for key, value in PRIORS.items() if value is find_adapter(pipe))
-    rows = [
-        ("prior", name),
+    most = "" if adapter.max_steps is None else f", at most {adapter.max_steps}"
+    gradients = "denoised, full" if adapter.network_input is not None else "denoised"
+    options = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
+    return [
+        ("prior", found.layout.name),
+        ("adapter", found.key),
+        ("licence", found.licence),
         ("pipeline", type(pipe).__name__),
-        ("adapter", adapter),
         ("scheduler", type(pipe.scheduler).__name__),
         ("parameters", f"{parameters / 1e6:.1f} M"),
+        ("space", adapter.space),
+        ("steps", f"{pipe.default_denoising_steps} by default{most}"),
+        ("same every time", "yes, ensembles run one member" if adapter.deterministic else "no"),
+        ("guided", "latent of a VAE" if "vae" in pipe.components else "pixels"),
+        ("gradients", gradients),
+        ("longer side", f"{pipe.default_processing_resolution} pixels by default"),
+        ("grid", f"sides are multiples of {pipe.image_processor.config.vae_scale_factor} pixels"),
+        ("options", ", ".join(options) or "none"),
     ]
-    options = ("prediction_type", "default_denoising_steps", "default_processing_resolution")
-    return rows + [(name, str(pipe.config.get(name))) for name in options]
 
 
-def run_info(prior: str | None) -> None:
+def run_info(prior: str | None, space: str | None = None) -> None:
     """Print it.
 
     Args:
         prior: also load this one and tell what it is.
+        space: what it is affine in, where its folder does not tell.
 
     Raises:
-        ValueError, TypeError: that prior does not exist, is not cached, or has no adapter.
+        ValueError: that prior does not exist, is not cached, is refused or of no known kind.
     """
-    described = [] if prior is None else _describe(load_prior(prior), prior)
+    described = [] if prior is None else _describe(find_prior(prior), space)
     rows = [*versions().items()]
     rows += [("device", line) for line in _devices()]
     rows += [("adapters", ", ".join(PRIORS)), ("bundled prior", _bundled())]

@@ -33,6 +33,7 @@ OUTPUT_FILES = (
     "visible.png",
     "photometric_error.npy",
     "uncertainty.npy",
+    "normals.npy",
     "cloud.ply",
     "report.json",
 )
@@ -89,6 +90,8 @@ def write_maps(folder: Path, output: MetricDepthOutput, left: np.ndarray) -> dic
     np.save(folder / "photometric_error.npy", single_map(output.photometric_error).astype(np.float32))
     if output.uncertainty is not None:
         np.save(folder / "uncertainty.npy", single_map(output.uncertainty).astype(np.float32))
+    for name, extra in output.extras.items():
+        np.save(folder / f"{name}.npy", np.asarray(extra)[0].astype(np.float32))
     flying = flying_points(depth_m)
     points = write_ply(folder / "cloud.ply", depth_m, left, K, valid=~flying)
     return {"depth_mm_zero_pixels": zeros, "cloud_points": points, "flying_points": int(flying.sum())}

@@ -29,6 +29,8 @@ class E2EFTPipeline(MarigoldDepthPipeline):
         text_encoder: for the empty prompt.
         tokenizer: likewise.
         prediction_type: what the map is affine in.
+        scale_invariant: as Marigold's.
+        shift_invariant: as Marigold's.
         default_denoising_steps: 1.
         default_processing_resolution: longer side, pixels.
         initial_latents: ``"zeros"``; saved, so that the folder can be told from Marigold's.
@@ -45,6 +47,8 @@ class E2EFTPipeline(MarigoldDepthPipeline):
         text_encoder: CLIPTextModel,
         tokenizer: CLIPTokenizer,
         prediction_type: str = "depth",
+        scale_invariant: bool = True,
+        shift_invariant: bool = True,
         default_denoising_steps: int = 1,
         default_processing_resolution: int = 768,
         initial_latents: str = "zeros",
@@ -61,6 +65,8 @@ class E2EFTPipeline(MarigoldDepthPipeline):
             text_encoder,
             tokenizer,
             prediction_type=prediction_type,
+            scale_invariant=scale_invariant,
+            shift_invariant=shift_invariant,
             default_denoising_steps=default_denoising_steps,
             default_processing_resolution=default_processing_resolution,
         )
