@@ -53,7 +53,7 @@ def priors(make_pipeline):
 @pytest.mark.parametrize("name", METHODS)
 def test_method_answers_for_a_rectified_pair(name, priors, textured_plane):
     sample = make_sample(textured_plane)
-    prediction = METHODS[name].run(sample, Settings(steps=2), priors)
+    prediction = METHODS[name].run(sample, Settings(steps=1), priors)
     assert (prediction.depth_m is None) != (prediction.relative is None)
     record = score(sample, prediction, cap_m=None)
     assert record["all_pixels"]["aligned"]["coverage"] > 0.5
@@ -66,7 +66,7 @@ def test_method_answers_for_a_posed_pair_or_says_why_not(name, priors, textured_
     E[1, 3] = 0.05
     sample = make_sample(textured_plane, E)
     try:
-        prediction = METHODS[name].run(sample, Settings(steps=2), priors)
+        prediction = METHODS[name].run(sample, Settings(steps=1), priors)
     except NotApplicable as reason:
         assert name == "sgbm" and "rectified" in str(reason)
     else:
@@ -86,7 +86,7 @@ def test_configuration_is_json_and_names_what_matters(name):
 
 def test_same_seed_gives_the_same_depth(priors, textured_plane):
     sample = make_sample(textured_plane)
-    first, second = (METHODS["guided"].run(sample, Settings(steps=2), priors) for _ in range(2))
+    first, second = (METHODS["guided"].run(sample, Settings(steps=1), priors) for _ in range(2))
     np.testing.assert_array_equal(first.depth_m, second.depth_m)
 
 
