@@ -168,15 +168,16 @@ def _load_unet(state: Mapping[str, Tensor], hparams: Mapping[str, Any]) -> UNet2
 
 def _load_vae(part: str | None) -> AutoencoderKL:
     source = part or VAE_ID
-    folder = Path(source)
-    subfolder = "" if (folder / "config.json").is_file() else "vae"
+    expected = "a folder or hub id of Stable Diffusion 1.5, or of its VAE (the checkpoint has none)"
+    if not Path(source).is_dir() and (source.count("/") != 1 or source.startswith((".", "/", "~"))):
+        bad_value("--with", expected, repr(source), "Check the path.")
+    subfolder = "" if (Path(source) / "config.json").is_file() else "vae"
     try:
         return AutoencoderKL.from_pretrained(source, subfolder=subfolder, use_safetensors=True)
     except (OSError, ValueError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ValueError(
-            "The checkpoint has no VAE, so --with must be a folder or hub id of Stable Diffusion 1.5 "
-            f"(or of its VAE); got {source!r}, which cannot be loaded ({reason}). "
+            f"--with must be {expected}; got {source!r}, which cannot be loaded ({reason}). "
             f"Fetch it once: hf download {VAE_ID}."
         ) from error
 

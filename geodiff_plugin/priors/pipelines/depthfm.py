@@ -40,7 +40,12 @@ class SidesOf64(MarigoldImageProcessor):
     """Resizes each side to a multiple of 64 pixels, each with a factor of its own, and never pads."""
 
     def __init__(self) -> None:
-        super().__init__(vae_scale_factor=1)
+        super().__init__(vae_scale_factor=SIDE)
+
+    @staticmethod
+    def pad_image(image: Tensor, align: int) -> tuple[Tensor, tuple[int, int]]:
+        """The image as it is, and no padding."""
+        return image, (0, 0)
 
     def preprocess(
         self,
