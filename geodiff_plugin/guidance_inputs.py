@@ -206,7 +206,7 @@ def split_views(views: Any) -> tuple[tuple[int, int] | None, tuple, tuple, tuple
         bad_type("views", form, views)
     if len(views) < 2 or not all(isinstance(view, (list, tuple)) and len(view) == 3 for view in views):
         kinds = [len(v) if isinstance(v, (list, tuple)) else type(v).__name__ for v in views]
-        bad_value("views", form, f"{len(views)} entries of lengths {kinds}", "At least two, three values each.")
+        bad_value("views", form, f"{len(views)} entries of lengths {kinds}", "Three values each.")
     images, Ks, Es = (tuple(column) for column in zip(*views, strict=True))
     if images[0] is None:
         return None, images[1:], Ks, Es
