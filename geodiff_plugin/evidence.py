@@ -33,7 +33,7 @@ SWAPPED = (
     "is the sign of the baseline wrong, or is E world-to-camera?"
 )
 
-__all__ = ["Evidence", "chunk_views", "prepare_evidence", "resize_long_edge"]
+__all__ = ["Evidence", "chunk_views", "match_target", "prepare_evidence", "resize_long_edge"]
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def chunk_views(evidence: Sequence[Evidence], owners: Sequence[int]) -> Views:
         _stack_rights([e.rights[v if v < len(e.rights) else 0] for e in own], K_left, tuple(left.shape[-2:]))
         for v in range(most)
     )
-    matches, points = (_stack_targets([getattr(e, name) for e in own]) for name in ("matches", "points"))
+    matches, points = (match_target([getattr(e, name) for e in own]) for name in ("matches", "points"))
     return Views(left, K_left, rights, matches, points)
 
 
@@ -188,8 +188,8 @@ def _stack_rights(rights: Sequence[RightView], K_left: Tensor, size_left: tuple[
     return RightViews(torch.stack(images), K, T, plane_rays(K_left, K, T, size_left))
 
 
-def _stack_targets(found: Sequence[Matches | None]) -> MatchTarget | None:
-    """Matches, or points, of every sample; ``None`` where there are none."""
+def match_target(found: Sequence[Matches | None]) -> MatchTarget | None:
+    """Matches, or points, of every sample, on one grid; ``None`` where there are none."""
     if any(one is None for one in found):
         return None
     return MatchTarget(

@@ -70,6 +70,8 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         depth_range: ``(near, far)`` metres that bound the search, or ``None``.
         gate: factors around the estimate within which matches are believed, at the first and last step.
         loss_resolution: pixels, bound of the longer side of the grid that losses are computed on.
+        correct: at every step, before the updates, bring the decoded map to its matches and encode what that
+            changes (gradient ``"denoised"`` only); the gradient then has the rest to do.
         refine: bring the result to its matches at full resolution, edge-aware (``refinement.refine_depth``);
             without a ``matches`` term there is nothing to bring it to.
         respace: run a ``leading`` DDIM schedule as ``trailing`` for guided calls.
@@ -118,6 +120,7 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         depth_range: tuple[float, float] | None = None,
         gate: tuple[float, float] = (20.0, 3.0),
         loss_resolution: int = 640,
+        correct: bool = True,
         refine: bool = True,
         respace: bool = True,
         points_loss: str = "robust",
@@ -152,6 +155,7 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
             depth_range=check_range(depth_range, "depth_range"),
             gate=check_range(gate[::-1], "gate, last before first,")[::-1],
             loss_resolution=check_number(loss_resolution, "loss_resolution", 32, 1 << 16, integer=True),
+            correct=bool(correct),
             refine=bool(refine),
             respace=bool(respace),
             points_loss=check_choice(points_loss, "points_loss", POINTS_LOSSES),
@@ -217,7 +221,7 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
             width, height = self._left_size
             bad_value("image", f"of {width}x{height} pixels, as the left view", f"{size[1]}x{size[0]}")
         config, evidence = self.config, []
-        matched = bool(config.weights.get("matches")) and config.inner_steps > 0
+        matched = bool(config.weights.get("matches")) and (config.inner_steps > 0 or config.correct)
         for i, own in enumerate(self._inputs):
             name = "K" if count == 1 else f"K[{i}]"
             check_intrinsics_fit(own.K_left, size[1], size[0], name, "the left image")

@@ -6,6 +6,7 @@ Paper: S4.1, Eq. 10 and 13 (eq:metric), Eq. 16 (no label); ``square`` is Marigol
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -126,6 +127,14 @@ SPACES = {
     "log1p": _log1p,
     "sqrt_disparity": _sqrt_disparity,
 }
+#: What ``s x + t`` is at a depth in units of g_s: the inverses of the formulas.
+_INVERSES: dict[str, Callable[[Tensor], Tensor]] = {
+    "depth": lambda units: units,
+    "disparity": torch.reciprocal,
+    "log": torch.log,
+    "log1p": torch.log1p,
+    "sqrt_disparity": torch.rsqrt,
+}
 #: Those in which a greater value is farther away.
 GROWS_WITH_DEPTH = frozenset({"depth", "log", "log1p"})
 
@@ -176,6 +185,23 @@ class MetricMap:
         s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
         confined = self.confine(x) if self.positive == "square" else smooth_floor(x)
         return SPACES[self.space](confined, s, t, g)
+
+    def relative(self, depth_m: Tensor, affine: AffineState) -> Tensor:
+        """The relative map of a metric depth; inverse of the call.
+
+        Args:
+            depth_m: ``(B, 1, H, W)`` metres, > 0.
+            affine: per-sample scale, shift and global scale.
+
+        Returns:
+            ``(B, 1, H, W)``; below 0 no further than where the smooth floor has lost half of its height.
+        """
+        s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
+        floored = (_INVERSES[self.space](depth_m / g) - t) / s
+        if self.positive == "square":
+            return self.confine(floored)
+        floored = floored.clamp_min(0.5 * FLOOR_EPS)
+        return floored - FLOOR_EPS**2 / floored
 
     def from_range(self, at_zero_m: Tensor, at_one_m: Tensor) -> AffineState:
         """The affine state under which ``x = 0`` and ``x = 1`` have the given depths.

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from diffusers.pipelines.marigold import MarigoldDepthOutput
 from torch import Tensor
 
+from geodiff_plugin.evidence import match_target
 from geodiff_plugin.geometry.cameras import resize_intrinsics
 from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.guidance import GeometryGuidance
@@ -95,9 +96,9 @@ def _refined(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> Tensor:
     if not run.config.refine:
         return depth_m
     images = []
-    for evidence, depth, left in zip(run.evidence, depth_m.split(1), lefts_01, strict=True):
-        known = evidence.sweep_matches
-        images.append(depth if known is None else refine_depth(depth, known, left).depth_m)
+    for evidence, depth, left in zip(run.evidence, depth_m.split(1), lefts_01.split(1), strict=True):
+        target = match_target([evidence.sweep_matches])
+        images.append(depth if target is None else refine_depth(depth, target, left).depth_m)
     return torch.cat(images)
 
 

@@ -102,6 +102,7 @@ class _GuidedCall:
             call["ensemble_size"],
             call["batch_size"],
             content,
+            padding,
             rounds,
             callback_on_step_end,
         )

@@ -28,10 +28,16 @@ PAPER: dict[str, Any] = {
     "min_visible": 0.0,
     "pull_to": "zero",
     "search": "one-number",
+    "correct": False,
     "refine": False,
 }
 
-SEARCH_ONLY: dict[str, Any] = {"inner_steps": 0, "weights": {"photometric": 1.0}}
+SEARCH_ONLY: dict[str, Any] = {
+    "inner_steps": 0,
+    "weights": {"photometric": 1.0},
+    "correct": False,
+    "refine": False,
+}
 
 #: The published code's numbers; its loss is taken at the image's own resolution, hence no bound on it.
 MARIGOLD_DC: dict[str, Any] = {
@@ -48,5 +54,6 @@ MARIGOLD_DC: dict[str, Any] = {
     "search": "points-range",
     "step_from": "updated",
     "loss_resolution": 1 << 16,
+    "correct": False,
     "refine": False,
 }

@@ -1,6 +1,6 @@
-"""Bring a guided map to its matches at full resolution: what a latent cannot hold, an edge-aware fit adds.
+"""Bring a metric map to its matches by an edge-aware fit: at every step, and once more at full resolution.
 
-Hop: metric depth, ``Matches``, left image -> smooth log correction -> metric depth, support.
+Hop: metric depth, ``MatchTarget``, left image -> smooth log correction -> metric depth, support.
 Paper: none; its output is the decoded latent, which the decoder's grid and its blur limit.
 """
 
@@ -14,18 +14,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.matching import Matches
+from geodiff_plugin.terms import MatchTarget
 
 __all__ = ["Refined", "refine_depth"]
 
-#: A match further than this factor from the guided depth is an outlier, whatever its confidence.
+#: A match further than this factor from the given depth is an outlier, whatever its confidence.
 GATE = 10.0
 #: Relative error of a perfect match: below it one match is as good as another.
 MATCH_NOISE = 0.02
 #: Residual, in standard deviations of a match, from which it counts for less (Cauchy).
 CAUCHY = 2.0
 #: Weight of the correction's slope against a sure match, and of the correction itself: what is far from every
-#: match keeps the guided depth.
+#: match keeps its depth.
 SMOOTHNESS, INERTIA = 0.7, 1e-3
 #: Steps in brightness and in log depth across which a correction does not spread.
 IMAGE_EDGE, DEPTH_EDGE, LEAST_LINK = 0.1, 0.1, 1e-3
@@ -38,9 +38,9 @@ class Refined:
     """Result of ``refine_depth``, on the grid of the depth that it was given.
 
     Attributes:
-        depth_m: ``(1, 1, H, W)`` metres.
-        support: ``(1, 1, H, W)`` in [0, 1]: how far matches, own or near on the same surface, decided the
-            depth; 0 where it is the guided one.
+        depth_m: ``(B, 1, H, W)`` metres.
+        support: ``(B, 1, H, W)`` in [0, 1]: how far matches, own or near on the same surface, decided the
+            depth; 0 where it is the one given.
     """
 
     depth_m: Tensor
@@ -48,25 +48,27 @@ class Refined:
 
 
 @torch.no_grad()
-def refine_depth(depth_m: Tensor, matches: Matches, left_01: Tensor) -> Refined:
+def refine_depth(depth_m: Tensor, target: MatchTarget, left_01: Tensor) -> Refined:
     """Least-squares correction of log depth that follows matches and stops at edges.
 
     Args:
-        depth_m: ``(1, 1, H, W)`` metres, the guided depth at any resolution.
-        matches: of the same image, on the grid of the sweep.
-        left_01: ``(3, h, w)`` in [0, 1], the left image at any resolution.
+        depth_m: ``(B, 1, H, W)`` metres, at any resolution.
+        target: matches or known points of the same images, on any grid.
+        left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
 
     Returns:
         ``Refined``. With ``u`` the log of the factor on inverse depth and ``r`` what each match asks of it,
         the minimiser of ``sum w (u - r)^2 + 0.7 sum g |grad u|^2 + 0.001 sum u^2``, where ``w`` is the
         confidence over the match's relative variance, robustly reweighted, and ``g`` falls at edges of the
-        image and of the guided depth.
+        image and of the given depth.
     """
-    guide = F.interpolate(left_01[None].float(), matches.size, mode="bilinear", antialias=True)
-    coarse = F.interpolate(depth_m.float(), matches.size, mode="bilinear", align_corners=False)
-    wanted = (matches.inverse_depth[None].clamp_min(1e-9) * coarse).log()
-    noise = ((matches.plane_step / matches.inverse_depth[None].clamp_min(1e-9)) ** 2 + MATCH_NOISE**2).sqrt()
-    trusted = matches.confidence[None] * (wanted.abs() < log(GATE)) * (MATCH_NOISE / noise) ** 2
+    size = tuple(target.inverse_depth.shape[-2:])
+    guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
+    coarse = F.interpolate(depth_m.float(), size, mode="bilinear", align_corners=False)
+    known, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
+    wanted = (known * coarse).log()
+    noise = ((step / known) ** 2 + MATCH_NOISE**2).sqrt()
+    trusted = target.confidence * (wanted.abs() < log(GATE)) * (MATCH_NOISE / noise) ** 2
     wanted = torch.where(trusted > 0, wanted, torch.zeros_like(wanted))
     across, down = (_links(guide, coarse, axis) for axis in (-1, -2))
     # Two right-hand sides in one solve: the correction, and a field of ones that shows where it is decided.
@@ -77,11 +79,12 @@ def refine_depth(depth_m: Tensor, matches: Matches, left_01: Tensor) -> Refined:
         residual = (field[:, :1] - wanted) / (CAUCHY * noise)
         weight = trusted / (1.0 + residual**2)
     field = F.interpolate(field, depth_m.shape[-2:], mode="bilinear", align_corners=False)
-    return Refined((depth_m.float() * torch.exp(-field[:, :1])).to(depth_m.dtype), field[:, 1:].clamp(0.0, 1.0))
+    refined_m = depth_m.float() * torch.exp(-field[:, :1])
+    return Refined(refined_m.to(depth_m.dtype), field[:, 1:].clamp(0.0, 1.0))
 
 
 def _links(guide: Tensor, depth_m: Tensor, axis: int) -> Tensor:
-    """Strength with which neighbours along an axis share a correction, ``(1, 1, h, w)`` less one there."""
+    """Strength with which neighbours along an axis share a correction, ``(B, 1, h, w)`` less one there."""
     step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / IMAGE_EDGE
     jump = depth_m.log().diff(dim=axis).abs() / DEPTH_EDGE
     return SMOOTHNESS * torch.exp(-step - jump).clamp_min(LEAST_LINK)

@@ -1,29 +1,31 @@
-"""Algorithm 1's body, and the state that it carries from step to step.
+"""The state that Algorithm 1 carries from step to step: scale, shift, g_s, matches, optimisers, history.
 
-Hop: ``z_t, eps, z0_hat`` of one denoising step -> the step to be added to the guided latent.
+Hop: relative map of a step -> metric state, and the map that the views would have.
 Paper: Algorithm 1, S7.3.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.evidence import Evidence, chunk_views
-from geodiff_plugin.matching import gate_matches
+from geodiff_plugin.matching import gate_matches, with_points
 from geodiff_plugin.metric import GROWS_WITH_DEPTH, AffineState, MetricMap, smooth_floor
 from geodiff_plugin.objective import Loss, Objective
 from geodiff_plugin.point_scale import depth_span, fit_to_points
+from geodiff_plugin.refinement import refine_depth
 from geodiff_plugin.scale_search import argmin_over, refine_to_matches, search_scale
 from geodiff_plugin.terms import MatchTarget
 from geodiff_plugin.types import StepReport
 from geodiff_plugin.updates import RULES
 
-__all__ = ["Trajectory", "guided_step"]
+__all__ = ["Trajectory"]
 
 #: Candidates of the paper's one-number search; its figures step through 1..80.
 G_S_CANDIDATES = 80
@@ -156,6 +158,26 @@ class Trajectory:
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         self.matches = replace(known, confidence=gate_matches(known, depth_m, factor))
 
+    @torch.no_grad()
+    def corrected(self, x: Tensor) -> Tensor:
+        """A relative map brought to what is known, as far as the gate believes it.
+
+        Args:
+            x: ``(B, 1, h, w)`` float32 relative map, for which ``settle_scale`` was called.
+
+        Returns:
+            ``(B, 1, h, w)``; ``x`` where no match or point is near.
+        """
+        views, target = self.objective.views, self.matches
+        if views.points is not None:
+            target = with_points(target, views.points)
+        if target is None:
+            return x
+        depth_m = self.objective.metric_depth(x, self.affine)
+        refined_m = refine_depth(depth_m, target, views.left_01).depth_m
+        change = self.metric.relative(refined_m, self.affine) - self.metric.relative(depth_m, self.affine)
+        return x + F.interpolate(change, x.shape[-2:], mode="bilinear", antialias=True)
+
     def report(self, step: int, timestep: float, loss: Loss) -> None:
         """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
         self.history.append(
@@ -170,70 +192,3 @@ class Trajectory:
                 loss.visible_fraction,
             )
         )
-
-
-def guided_step(
-    trajectory: Trajectory,
-    leaf: Tensor,
-    z0_of: Callable[[Tensor], Tensor],
-    decode: Callable[[Tensor], Tensor],
-    eps: Tensor,
-    step: int,
-    timestep: float,
-    fractions: Sequence[float],
-) -> Tensor:
-    """One pass of Algorithm 1's loop body: search, gradient of L_geo, updates of latent, scale and shift.
-
-    Args:
-        trajectory: state of the chunk; its scale, shift and history are advanced.
-        leaf: ``(B, C, h, w)`` float32, the latent that is guided: z_t ("full") or z0_hat ("denoised").
-        z0_of: the clean latent of a leaf; carries the U-Net's graph in "full", identity in "denoised".
-        decode: latent to unclipped relative map ``(B, 1, h', w')`` float32.
-        eps: ``(B, C, h, w)`` predicted noise, the yardstick of the norm-matched rule.
-        step: index in the schedule.
-        timestep: the scheduler's timestep.
-        fractions: where in the schedule, [0, 1), each round of ``inner_steps`` updates stands. One round a
-            step, ``[step / number of steps]``, but for priors that cannot take as many steps as are wanted.
-
-    Returns:
-        ``(B, C, h, w)`` float32, what to add to the leaf; exactly 0 with ``optimize_latents=False``.
-
-    Source: Algorithm 1, with Eq. 16 and 17 (which it omits) and the decode of z0_hat (it prints z_0).
-    """
-    config, z, z0_prior = trajectory.config, leaf, None
-    rounds = [f for f in fractions if config.inner_steps and trajectory.is_active(f)]
-    moments = [f for f in rounds for _ in range(config.inner_steps)]  # one an update
-    for k, moment in enumerate(moments or fractions[:1]):
-        opens_round = not moments or k % config.inner_steps == 0
-        with torch.set_grad_enabled(bool(moments)):
-            if not z.requires_grad and config.optimize_latents and moments:
-                z = z.detach().requires_grad_()
-            z0_hat = z0_of(z)  # (B, C, h, w), Tweedie
-            x0 = decode(z0_hat)  # (B, 1, h', w'), D(z0_hat)
-            z0_prior = z0_hat.detach() if z0_prior is None else z0_prior
-            if opens_round:
-                trajectory.settle_scale(x0.detach(), moment)  # g_s*, S7.3
-            s_hat, t_hat = (v.detach().requires_grad_(bool(moments)) for v in _raw(trajectory.affine))
-            affine = replace(trajectory.affine, s_hat=s_hat, t_hat=t_hat)
-            loss = trajectory.objective(
-                x0, affine, trajectory.affine_start, z0_hat, z0_prior, trajectory.matches
-            )
-            total = loss.total.sum()  # samples do not mix, so the gradient of the sum is each one's own
-        if moments:
-            inputs = (s_hat, t_hat, z) if config.optimize_latents else (s_hat, t_hat)
-            grads = torch.autograd.grad(total, inputs)
-            s_hat = s_hat.detach() + trajectory.scale_rule.step(grads[0])
-            t_hat = t_hat.detach() + trajectory.shift_rule.step(grads[1])
-            trajectory.affine = replace(affine, s_hat=s_hat, t_hat=t_hat)
-            if config.optimize_latents:
-                z = z.detach() + trajectory.latent_rule.step(grads[2], eps)
-        if opens_round:
-            first = loss
-        if not moments or (k + 1) % config.inner_steps == 0:
-            trajectory.report(step, timestep, first)
-    trajectory.last_x = x0.detach()
-    return (z - leaf).detach()
-
-
-def _raw(affine: AffineState) -> tuple[Tensor, Tensor]:
-    return affine.s_hat, affine.t_hat

@@ -19,6 +19,7 @@ LAYER = {
     "matching": 2,
     "terms": 2,
     "formats": 2,
+    "algorithm": 3,
     "objective": 3,
     "scale_search": 3,
     "updates": 3,

@@ -1,7 +1,7 @@
 """One guided call of one pipeline: everything that is set up for it and taken down after it.
 
 Hop: pipeline + ``GeometryGuidance`` -> hooks on -> trajectories -> metric depth of every member -> hooks off.
-Paper: Algorithm 1 around ``trajectory.guided_step``.
+Paper: Algorithm 1 around ``algorithm.guided_step``.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from contextlib import ExitStack
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.algorithm import guided_step
 from geodiff_plugin.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.evidence import Evidence
 from geodiff_plugin.guidance import GeometryGuidance
@@ -22,7 +24,7 @@ from geodiff_plugin.integration.denoiser import DenoiserTap
 from geodiff_plugin.integration.guided_scheduler import GuidedScheduler
 from geodiff_plugin.integration.schedulers import check_scheduler, noise_level
 from geodiff_plugin.priors import DepthPrior
-from geodiff_plugin.trajectory import Trajectory, guided_step
+from geodiff_plugin.trajectory import Trajectory
 
 __all__ = ["GuidedRun", "plan_steps"]
 
@@ -40,6 +42,7 @@ class GuidedRun:
         ensemble_size: members per image.
         batch_size: samples per chunk, as the pipeline slices them.
         content_size: ``(H, W)`` of the processing grid without padding.
+        padding: rows at the bottom and columns at the right that were added to it.
         rounds: times that every denoising step makes its updates, see ``plan_steps``.
         callback: ``callback_on_step_end`` or ``None``.
     """
@@ -53,12 +56,13 @@ class GuidedRun:
         ensemble_size: int,
         batch_size: int,
         content_size: tuple[int, int],
+        padding: tuple[int, int],
         rounds: int,
         callback: StepCallback | None,
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
         self.owners = [i for i in range(len(evidence)) for _ in range(ensemble_size)]
-        self.batch_size, self.content_size = batch_size, content_size
+        self.batch_size, self.content_size, self.padding = batch_size, content_size, padding
         self.rounds, self.callback = rounds, callback
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
@@ -102,6 +106,11 @@ class GuidedRun:
         height, width = self.content_size
         return self.prior.decode(z0)[:, :, :height, :width]
 
+    def encode(self, x: Tensor) -> Tensor:
+        """Clean latent of a relative map without padding, which is made as the image's was."""
+        bottom, right = self.padding
+        return self.prior.encode(F.pad(x, (0, right, 0, bottom), mode="replicate"))
+
     def metric_prediction(self, latents: Tensor) -> Tensor:
         """Metric depth of the next chunk of final latents; takes the place of the clipping decode.
 
@@ -143,6 +152,7 @@ class GuidedRun:
             leaf,
             z0_of,
             self.decode,
+            None if full else self.encode,
             eps,
             self.step_index,
             self.timesteps[self.step_index],

@@ -66,6 +66,9 @@ class DepthPrior(Protocol):
     def decode(self, z0: Tensor) -> Tensor:
         """Unclipped relative map ``(B, 1, H, W)`` float32, about [0, 1], with the graph of ``z0``."""
 
+    def encode(self, x: Tensor) -> Tensor:
+        """Clean latent of a map ``(B, 1, H, W)`` on the padded grid, about the inverse of ``decode``."""
+
 
 class OwnPipelinePrior:
     """Adapter of a ``DepthDiffusionPipeline``, which says of itself what guidance must know.
@@ -104,3 +107,7 @@ class OwnPipelinePrior:
     def decode(self, z0: Tensor) -> Tensor:
         """The pipeline's ``decode_relative``."""
         return self._pipe.decode_relative(z0)
+
+    def encode(self, x: Tensor) -> Tensor:
+        """The pipeline's ``encode_relative``."""
+        return self._pipe.encode_relative(x)

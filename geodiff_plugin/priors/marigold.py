@@ -14,6 +14,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.metric import SPACES
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.loading import build_pipeline
+from geodiff_plugin.priors.pipelines.base import encode_map
 
 __all__ = ["MarigoldPrior"]
 
@@ -84,3 +85,7 @@ class MarigoldPrior:
         ]  # (B, 3, H, W)
         wide = torch.promote_types(decoded.dtype, torch.float32)  # half precision ends here
         return (decoded.to(wide).mean(dim=1, keepdim=True) + 1.0) / 2.0
+
+    def encode(self, x: Tensor) -> Tensor:
+        """By the pipeline's VAE."""
+        return encode_map(self._pipe.vae, x)

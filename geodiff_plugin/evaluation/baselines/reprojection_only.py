@@ -31,8 +31,13 @@ def _preset(right: Any, K: Any, E: Any, **changes: Any) -> GeometryGuidance:
     The paper names a rate of 1e-2 and no optimiser. A plain step of that size moves no pixel, because the
     gradient of a mean over all pixels is tiny in each; Adam's do.
     """
-    preset = {"weights": PAPER_WEIGHTS, "inner_steps": ITERATIONS, "step_latents": 0.01, "refine": False}
+    preset = {"weights": PAPER_WEIGHTS, "inner_steps": ITERATIONS, "step_latents": 0.01}
+    preset |= {"correct": False, "refine": False}
     return GeometryGuidance(right, K, E, **(preset | changes))
+
+
+def _as_it_is(pixels: Tensor) -> Tensor:
+    return pixels
 
 
 def _start(pipe: Any, sample: StereoSample, settings: Settings) -> Start:
@@ -50,7 +55,7 @@ def _start(pipe: Any, sample: StereoSample, settings: Settings) -> Start:
             return relative
         return F.interpolate(relative, size, mode="bilinear", align_corners=False)
 
-    return Start(answer, lambda map_01: map_01, MarigoldImageProcessor(vae_scale_factor=1))
+    return Start(answer, _as_it_is, _as_it_is, MarigoldImageProcessor(vae_scale_factor=1))
 
 
 REPROJECTION_ONLY = constant_method(

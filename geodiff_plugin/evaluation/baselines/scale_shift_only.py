@@ -15,7 +15,7 @@ __all__ = ["SCALE_SHIFT_ONLY"]
 
 
 def _preset(right: Any, K: Any, E: Any) -> GeometryGuidance:
-    return GeometryGuidance(right, K, E, optimize_latents=False)
+    return GeometryGuidance(right, K, E, optimize_latents=False, refine=False)
 
 
 SCALE_SHIFT_ONLY = guided_method(

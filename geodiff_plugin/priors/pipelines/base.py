@@ -24,7 +24,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 
-__all__ = ["DepthDiffusionPipeline", "DepthOutput"]
+__all__ = ["DepthDiffusionPipeline", "DepthOutput", "encode_map"]
 
 Condition = dict[str, Tensor]
 Generators = torch.Generator | list[torch.Generator] | None
@@ -39,6 +39,14 @@ class DepthOutput(MarigoldDepthOutput):
     """
 
     extras: dict[str, np.ndarray | Tensor] = field(default_factory=dict)
+
+
+def encode_map(vae: Any, x: Tensor) -> Tensor:
+    """Scaled latents ``(B, C, h, w)`` float32 of a map ``(B, 1, H, W)``, 0 to 1 as the encoder's -1 to 1."""
+    picture = (2.0 * x - 1.0).expand(-1, 3, -1, -1).to(vae.dtype)
+    encoded = vae.encode(picture)
+    latents = encoded.latent_dist.mode() if hasattr(encoded, "latent_dist") else encoded.latents
+    return latents.to(torch.promote_types(latents.dtype, torch.float32)) * vae.config.scaling_factor
 
 
 class DepthDiffusionPipeline(DiffusionPipeline):
@@ -153,6 +161,17 @@ class DepthDiffusionPipeline(DiffusionPipeline):
             ``(B, 1, H, W)`` about [0, 1] on the padded grid, float32 or wider, with the graph of ``z0``.
         """
         raise NotImplementedError
+
+    def encode_relative(self, x: Tensor) -> Tensor:
+        """Clean latents of a relative map, about the inverse of ``decode_relative``; by ``self.vae``.
+
+        Args:
+            x: ``(B, 1, H, W)`` on the padded grid; beyond [0, 1] as far as the map goes.
+
+        Returns:
+            ``(B, C, h, w)`` float32, the depth channels only.
+        """
+        return encode_map(self.vae, x)
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """What the unguided call gives: ``(B, 1, H, W)`` in [0, 1]; override for an author's own ending."""

@@ -154,6 +154,12 @@ class LotusPipeline(DepthDiffusionPipeline):
             return x  # latents of no image of this call
         return F.pad(x, (0, right, 0, bottom), mode="replicate")
 
+    def encode_relative(self, x: Tensor) -> Tensor:
+        """As the base class, of whole cells only."""
+        cell = 2 ** (len(self.vae.config.block_out_channels) - 1)
+        height, width = (side // cell * cell for side in x.shape[-2:])
+        return super().encode_relative(x[..., :height, :width])
+
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """As the authors end: clipped to [0, 1], whole cells only; the caller's resizing stretches it."""
         return self._decode(latents, clip=True)

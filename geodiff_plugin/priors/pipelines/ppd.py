@@ -172,6 +172,10 @@ class PPDPipeline(DepthDiffusionPipeline):
         """Clean depth is the map, but for its offset."""
         return z0.to(torch.promote_types(z0.dtype, torch.float32)) + 0.5
 
+    def encode_relative(self, x: Tensor) -> Tensor:
+        """The map, but for its offset."""
+        return x - 0.5
+
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """As the authors end: not clipped."""
         return self.decode_relative(latents)

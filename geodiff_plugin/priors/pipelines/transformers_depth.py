@@ -6,8 +6,6 @@ Paper: none (an honest prior for those who have no diffusion prior).
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,7 +21,6 @@ __all__ = ["TransformersDepthPipeline", "unit_range"]
 
 #: What is 1; a few stray pixels shall not press the rest together.
 TOP_QUANTILE = 0.98
-PREPROCESSOR_FILE = "preprocessor_config.json"
 
 
 def unit_range(values: Tensor) -> Tensor:
@@ -46,7 +43,7 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
     Args:
         model: the network.
         scheduler: one step whose result is what it is given.
-        preparation: contents of ``preprocessor_config.json``.
+        preparation: contents of ``preprocessor_config.json``; needed.
         prediction_type: ``"depth"`` or ``"disparity"``; ``None`` for what the model's class is known to give.
         default_denoising_steps: 1.
         default_processing_resolution: see above.
@@ -61,13 +58,13 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
         self,
         model: PreTrainedModel,
         scheduler: DirectScheduler,
-        preparation: dict[str, Any],
+        preparation: dict[str, Any] | None = None,
         prediction_type: str | None = None,
         default_denoising_steps: int = 1,
         default_processing_resolution: int = 768,
     ) -> None:
         super().__init__()
-        wrapped = HFDepthModel(model, Preparation.from_config(preparation), prediction_type)
+        wrapped = HFDepthModel(model, Preparation.from_config(preparation or {}), prediction_type)
         self.register_prior(
             {"model": model, "scheduler": scheduler},
             wrapped.space,
@@ -102,13 +99,6 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
         """The latent is the map."""
         return z0
 
-    def save_pretrained(self, save_directory: str | Path, **kwargs: Any) -> None:
-        """Save a folder of ``transformers``: it also loads where this package is not installed.
-
-        Args:
-            save_directory: where to.
-            **kwargs: for the model's own ``save_pretrained``.
-        """
-        self.model.save_pretrained(save_directory, **kwargs)
-        text = json.dumps(dict(self.config.preparation), indent=2) + "\n"
-        (Path(save_directory) / PREPROCESSOR_FILE).write_text(text, encoding="utf-8")
+    def encode_relative(self, x: Tensor) -> Tensor:
+        """The map is the latent."""
+        return x
