@@ -228,7 +228,11 @@ def test_no_diffusion_makes_the_updates_of_the_default_without_the_network(
     monkeypatch.setattr(pipe.unet, "forward", None)
     # The method with fewer updates a round, for the sake of time.
     short = constant_method(
-        "short", "short", "short", partial(GeometryGuidance, inner_steps=3), no_diffusion._start
+        "short",
+        "short",
+        "short",
+        partial(GeometryGuidance, inner_steps=3, correct=False),
+        no_diffusion._start,
     )
     prediction = short.run(plane_sample(textured_plane), Settings(steps=steps), OnePipe(pipe))
     assert prediction.depth_m.shape == textured_plane.depth_m.shape and (prediction.depth_m > 0).all()

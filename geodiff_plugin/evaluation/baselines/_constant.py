@@ -17,6 +17,7 @@ from torch import Tensor
 from geodiff_plugin.evaluation.baselines._guidance import (
     guided_configuration,
     guided_prediction,
+    posed_views,
     prior_space,
 )
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
@@ -42,6 +43,7 @@ class ConstantPrior(DepthDiffusionPipeline):
     Attributes:
         answer: padded image ``(1, 3, H, W)`` in [-1, 1] -> latent ``(1, C, h, w)``.
         decode: latent -> unclipped relative map ``(1, 1, H, W)``, differentiable.
+        encode: its inverse.
     """
 
     max_steps = 1
@@ -49,6 +51,7 @@ class ConstantPrior(DepthDiffusionPipeline):
     sees_latents = False
     answer: Callable[[Tensor], Tensor]
     decode: Callable[[Tensor], Tensor]
+    encode: Callable[[Tensor], Tensor]
 
     def __init__(
         self,
@@ -80,6 +83,10 @@ class ConstantPrior(DepthDiffusionPipeline):
         """The prior's decoder, or none."""
         return self.decode(z0)
 
+    def encode_relative(self, x: Tensor) -> Tensor:
+        """The prior's encoder, or none."""
+        return self.encode(x)
+
 
 @dataclass(frozen=True)
 class Start:
@@ -88,11 +95,13 @@ class Start:
     Attributes:
         answer: as of ``ConstantPrior``.
         decode: as of ``ConstantPrior``.
+        encode: as of ``ConstantPrior``.
         image_processor: resizes and pads as the latent needs it.
     """
 
     answer: Callable[[Tensor], Tensor]
     decode: Callable[[Tensor], Tensor]
+    encode: Callable[[Tensor], Tensor]
     image_processor: Any
 
 
@@ -100,7 +109,7 @@ def _stand_in(pipe: Any, start: Start, rounds: int) -> Any:
     """A pipeline that can be guided and answers with ``start``, at the resolution of a live prior."""
     resolution = pipe.default_processing_resolution or 0
     constant = ConstantPrior(pipe.vae, DirectScheduler(), prior_space(pipe), rounds, resolution)
-    constant.answer, constant.decode = start.answer, start.decode
+    constant.answer, constant.decode, constant.encode = start.answer, start.decode, start.encode
     constant.image_processor = start.image_processor
     constant.set_progress_bar_config(disable=True)
     return enable_geometry_guidance(constant)
@@ -129,7 +138,7 @@ def constant_method(
     """
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-        pipe, views = priors.get(settings), (sample.right, (sample.K_left, sample.K_right), sample.E)
+        pipe, views = priors.get(settings), posed_views(sample, settings.views)
         if getattr(pipe, "vae", None) is None:
             raise NotApplicable("the prior has no latent space")
         taken = rounds

@@ -15,22 +15,22 @@ from geodiff_plugin.evaluation.baselines._constant import Start, constant_method
 from geodiff_plugin.evaluation.baselines.base import Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.metric import GROWS_WITH_DEPTH
 from geodiff_plugin.priors import find_adapter
 
 __all__ = ["NO_DIFFUSION"]
 
 
 def _start(pipe: Any, sample: StereoSample, settings: Settings) -> Start:
-    """The VAE's latent of a ground plane: near at the bottom, far at the top."""
-    vae, adapter = pipe.vae, find_adapter(pipe)(pipe)
-    near, far = (-1.0, 1.0) if adapter.space in ("depth", "log", "log1p") else (1.0, -1.0)
+    """The latent of a ground plane: near at the bottom, far at the top."""
+    adapter = find_adapter(pipe)(pipe)
+    near, far = (0.0, 1.0) if adapter.space in GROWS_WITH_DEPTH else (1.0, 0.0)
 
     def answer(image: Tensor) -> Tensor:
         rows = torch.linspace(far, near, image.shape[-2], device=image.device)
-        ramp = rows.view(1, 1, -1, 1).expand(len(image), 3, -1, image.shape[-1])
-        return vae.encode(ramp.to(vae.dtype)).latent_dist.mode() * vae.config.scaling_factor
+        return adapter.encode(rows.view(1, 1, -1, 1).expand(len(image), 1, -1, image.shape[-1]))
 
-    return Start(answer, adapter.decode, pipe.image_processor)
+    return Start(answer, adapter.decode, adapter.encode, pipe.image_processor)
 
 
 NO_DIFFUSION = constant_method(
