@@ -1,7 +1,7 @@
 """What guidance costs on a data set: seconds and peak memory, plain against guided, as ratios.
 
 Hop: references + methods -> one process per method -> records -> ``Table``.
-Paper: S8 (inference time, run time comparison), as ratios and not as seconds of another machine.
+Paper: S9 (inference time, run time comparison), as ratios and not as seconds of another machine.
 """
 
 from __future__ import annotations

@@ -426,6 +426,8 @@ def test_root_must_be_a_folder(tmp_path):
 def test_synthetic_pairs_are_seeded_and_alternate(tmp_path):
     refs = find_pairs(Path("synthetic:3+4"))
     assert [ref.files["seed"] for ref in refs] == [4, 5, 6]
+    assert refs[0].files["size"] == (384, 512)
+    assert find_pairs(Path("synthetic:1+4@64x48"))[0].files == refs[0].files | {"size": (48, 64)}
     assert find_pairs(tmp_path, ["synthetic"]) == []
     small = [SampleRef(ref.dataset, ref.name, ref.files | {"size": (48, 64)}) for ref in refs[:2]]
     rectified, posed = (load(ref) for ref in small)

@@ -20,22 +20,24 @@ from geodiff_plugin.types import Rig
 __all__ = ["SYNTHETIC", "find_synthetic", "load_synthetic"]
 
 SIZE = (384, 512)
-_ROOT = re.compile(r"synthetic:(\d+)(?:\+(\d+))?")
+_ROOT = re.compile(r"synthetic:(\d+)(?:\+(\d+))?(?:@(\d+)x(\d+))?")
 
 
 def find_synthetic(root: Path) -> list[SampleRef]:
     """References to rendered pairs.
 
     Args:
-        root: ``synthetic:N`` for N pairs from seed 0 on, ``synthetic:N+S`` for N from seed S on; any other
-            path holds none. Even seeds give rectified pairs, odd ones a general pose.
+        root: ``synthetic:N`` for N pairs from seed 0 on, ``synthetic:N+S`` for N from seed S on, and
+            ``@WIDTHxHEIGHT`` after either for another size than 512x384 pixels; any other path holds none.
+            Even seeds give rectified pairs, odd ones a general pose.
     """
     asked = _ROOT.fullmatch(str(root))
     if asked is None:
         return []
     first = int(asked[2] or 0)
+    size = (int(asked[4]), int(asked[3])) if asked[3] else SIZE
     return [
-        SampleRef("synthetic", f"seed{seed:04d}", {"seed": seed, "posed": seed % 2 == 1, "size": SIZE})
+        SampleRef("synthetic", f"seed{seed:04d}", {"seed": seed, "posed": seed % 2 == 1, "size": size})
         for seed in range(first, first + int(asked[1]))
     ]
 
@@ -76,5 +78,6 @@ SYNTHETIC = Dataset(
     load=load_synthetic,
     cap_m=None,
     needs_folder=False,
-    obtain="rendered by this package, offline: give synthetic:N (or synthetic:N+FIRST_SEED) as DIR.",
+    obtain="rendered by this package, offline: give synthetic:N as DIR (or synthetic:N+FIRST_SEED; @256x192 "
+    "after either for that size).",
 )
