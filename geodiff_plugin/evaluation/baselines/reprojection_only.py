@@ -1,7 +1,7 @@
 """The paper's ablation without diffusion: move the prior's depth pixels down the photometric error.
 
 Hop: ``StereoSample`` -> prior's relative map -> 50 updates of its pixels, scale and shift -> metres.
-Paper: S5.3.1, Figure 5 (fig:ab1).
+Paper: S5.3.1, Figure 6 (fig:ab1).
 """
 
 from __future__ import annotations

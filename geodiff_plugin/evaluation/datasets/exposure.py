@@ -1,7 +1,7 @@
 """A sample whose right view was taken with another exposure or tone curve.
 
 Hop: ``StereoSample`` + gain + gamma -> ``StereoSample``.
-Paper: S6 (limits under changing illumination); Middlebury's im1E has such views of a few scenes only.
+Paper: S11 (limits under changing illumination); Middlebury's im1E has such views of a few scenes only.
 """
 
 from __future__ import annotations

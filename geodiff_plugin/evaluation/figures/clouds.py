@@ -1,7 +1,7 @@
 """A depth map as a point cloud, seen from another place.
 
 Hop: depth in metres + colours + K -> points -> picture from a second camera.
-Paper: Figure 4 (fig:exp-two-view, point clouds).
+Paper: Figure 5 (fig:exp-two-view, point clouds).
 """
 
 from __future__ import annotations

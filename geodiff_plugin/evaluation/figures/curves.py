@@ -1,7 +1,7 @@
 """Error against one knob: updates per step, and the exposure of the right view.
 
 Hop: samples + variants -> records (resumable) -> mean per variant -> figure.
-Paper: S9 (fig:error_time); S6 (limits) for the exposure.
+Paper: S9 (fig:error_time); S11 (limits) for the exposure.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Depth maps, error maps and point clouds of several methods, side by side.
 
 Hop: samples + methods -> predictions -> figure.
-Paper: Figure 5 (fig:ab1), the qualitative figures (fig:qualitative, fig:exp-two-view).
+Paper: Figure 6 (fig:ab1), the qualitative figures (fig:qualitative, fig:exp-two-view).
 """
 
 from __future__ import annotations
