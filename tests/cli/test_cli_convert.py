@@ -156,8 +156,6 @@ def test_a_folder_of_bin_files(geodiff, tmp_path, tokenizer):
 
     again = geodiff("convert", tmp_path / "out", tmp_path / "more")
     assert again.code == 2 and "needs no conversion" in again.err
-    no_pipeline = geodiff("convert", source / "unet", tmp_path / "more")
-    assert no_pipeline.code == 2 and "model_index.json" in no_pipeline.err
 
 
 def test_names_and_options_of_the_published_checkpoint():

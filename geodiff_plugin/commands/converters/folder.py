@@ -1,4 +1,4 @@
-"""A folder in diffusers' layout whose weights are pickled .bin files.
+"""A folder, of a pipeline or of one component, whose weights are pickled .bin files.
 
 Hop: .bin files -> .safetensors of the names that diffusers and transformers look for; text files are copied.
 Paper: none.
@@ -30,22 +30,20 @@ def _safe_name(name: str) -> str:
 
 
 def convert_folder(source: Path, folder: Path) -> None:
-    """Write the same pipeline with safetensors.
+    """Write the same folder with safetensors.
 
     Args:
-        source: has ``model_index.json``.
+        source: of one component or several.
         folder: an empty one to fill.
 
     Raises:
-        ValueError: no pipeline, or one without .bin files; a file that cannot be read.
+        ValueError: no .bin file in it, or one that cannot be read.
     """
-    if not (source / "model_index.json").is_file():
+    if not any(source.rglob("*.bin")):
+        cure = "One with .safetensors needs no conversion: give it to --prior."
         bad_value(
-            "SRC", "a checkpoint file or a folder in diffusers' layout", f"{source} without model_index.json"
+            "SRC", "a checkpoint file, or a folder with .bin weights", f"the folder {source} without", cure
         )
-    pickled = sorted(source.rglob("*.bin"))
-    if not pickled:
-        bad_value("SRC", "a folder with .bin weights", source, "It needs no conversion: give it to --prior.")
     for path in sorted(p for p in source.rglob("*") if p.is_file()):
         target = folder / path.relative_to(source)
         safe = target.with_name(_safe_name(path.name))
