@@ -118,7 +118,7 @@ def _update(
             )
             affine = replace(trajectory.affine, s_hat=s_hat, t_hat=t_hat)
             loss = trajectory.objective(
-                x0, affine, trajectory.affine_start, z0_hat, anchor, trajectory.matches
+                x0, affine, trajectory.affine_start, z0_hat, anchor, trajectory.matches, trajectory.hidden
             )
             total = loss.total.sum()  # samples do not mix, so the gradient of the sum is each one's own
         if updates:

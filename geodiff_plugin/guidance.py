@@ -61,6 +61,9 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         weights: weight by term; missing terms weigh 0.
         eta: SSIM against L1 in the photometric term, [0, 1].
         pyramid_levels: image pyramid of the photometric term; 1 is the paper's.
+        exposure: compare photographs in the left one's exposure and colour (``terms.exposure``).
+        z_test: pixels that the estimate itself hides from a right camera take no part in the photometric
+            term: there the right image shows something else.
         min_visible: visible share below which the photometric term is off, [0, 1].
         pull_to: what ``prior_pull`` pulls scale and shift towards, ``"start"`` or ``"zero"``.
         search: ``"volume"`` looks up (near, far) in a plane-sweep volume, and fits them to the points where
@@ -113,6 +116,8 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         weights: dict[str, float] | None = None,
         eta: float = 0.85,
         pyramid_levels: int = 3,
+        exposure: bool = True,
+        z_test: bool = True,
         min_visible: float = 0.1,
         pull_to: str = "start",
         search: str = "volume",
@@ -148,6 +153,8 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
             weights=weights,
             eta=check_number(eta, "eta", 0.0, 1.0),
             pyramid_levels=check_number(pyramid_levels, "pyramid_levels", 1, 10, integer=True),
+            exposure=bool(exposure),
+            z_test=bool(z_test),
             min_visible=check_number(min_visible, "min_visible", 0.0, 1.0),
             pull_to=check_choice(pull_to, "pull_to", ANCHORS),
             search=check_choice(search, "search", SEARCHES),

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.geometry.projection import PlaneRays
-from geodiff_plugin.geometry.warping import warp_right_to_left
+from geodiff_plugin.geometry.warping import hidden_in_right, warp_right_to_left
 from geodiff_plugin.metric import AffineState, MetricMap
 from geodiff_plugin.terms import TERMS, Estimate, MatchTarget
 
@@ -109,6 +109,7 @@ class Objective:
         z0: Tensor,
         z0_prior: Tensor,
         matches: MatchTarget | None,
+        hidden: Tensor | None = None,
     ) -> Loss:
         """Loss of one estimate; differentiable in ``x``, ``z0`` and the affine state.
 
@@ -119,6 +120,7 @@ class Objective:
             z0: ``(B, C, h', w')`` float32 latent that ``x`` was decoded from.
             z0_prior: the network's own.
             matches: on the loss grid, or ``None``.
+            hidden: ``(B, V, 1, H, W)`` bool, pixels not to be compared, as ``hidden`` gave them.
         """
         points = self.views.points
         lacking = {
@@ -136,8 +138,9 @@ class Objective:
         with torch.set_grad_enabled(torch.is_grad_enabled() and needs_warp):
             warped_01, visible = self._warp(depth_m)
         left_01 = self.views.left_01
+        shown = visible if hidden is None else visible & ~hidden
         estimate = Estimate(
-            depth_m, left_01, warped_01, visible, affine, affine_start, z0, z0_prior, matches, points
+            depth_m, left_01, warped_01, shown, affine, affine_start, z0, z0_prior, matches, points
         )
         visible_fraction = visible.any(1).float().flatten(1).mean(1)
         total = torch.zeros_like(visible_fraction)
@@ -150,6 +153,19 @@ class Objective:
             values[name] = value
             total = total + weight * value
         return Loss(total, values, visible_fraction)
+
+    def hidden(self, x: Tensor, affine: AffineState) -> Tensor:
+        """``(B, V, 1, H, W)`` bool: what another part of this estimate hides from each right view."""
+        depth_m, v = self.metric_depth(x, affine), self.views
+        return torch.stack(
+            [
+                hidden_in_right(
+                    depth_m, v.K_left, r.K, r.T_right_from_left, tuple(r.image_01.shape[-2:]), rays=r.rays
+                )
+                for r in v.rights
+            ],
+            1,
+        )
 
     def _warp(self, depth_m: Tensor) -> tuple[Tensor, Tensor]:
         """Every right image seen from the left ``(B, V, 3, H, W)``, and whether it sees the pixel."""

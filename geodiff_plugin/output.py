@@ -21,6 +21,7 @@ from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.integration.run import GuidedRun
 from geodiff_plugin.matching import RightView
 from geodiff_plugin.refinement import refine_depth
+from geodiff_plugin.terms.exposure import match_exposure
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["assemble_output"]
@@ -107,12 +108,14 @@ def _reprojection(
 ) -> tuple[Tensor, Tensor]:
     """Where any right view sees the pixel, and the least mean absolute error to the re-rendered left image.
 
-    The error is that of the view that explains the pixel best; both are at the output's resolution.
+    The error is that of the view that explains the pixel best, compared in the left image's exposure; both
+    are at the output's resolution.
     """
     best, visible = torch.full_like(depth_m, torch.inf), torch.zeros_like(depth_m, dtype=torch.bool)
     for image, K_right, T in rights:
         warped = warp_right_to_left(image[None], depth_m, K_left, K_right[None], T[None])
-        error = (warped.image - left_01).abs().mean(1, keepdim=True)
+        matched = match_exposure(warped.image, left_01, warped.visible)
+        error = (matched - left_01).abs().mean(1, keepdim=True)
         best = torch.where(warped.visible, torch.minimum(best, error), best)
         visible |= warped.visible
     return visible, best.where(visible, torch.zeros_like(best))

@@ -25,6 +25,8 @@ PAPER: dict[str, Any] = {
     "weights": PAPER_WEIGHTS,
     "eta": 0.85,
     "pyramid_levels": 1,
+    "exposure": False,
+    "z_test": False,
     "min_visible": 0.0,
     "pull_to": "zero",
     "search": "one-number",

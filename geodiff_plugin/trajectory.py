@@ -46,6 +46,7 @@ class Trajectory:
         affine: current scale, shift and g_s, ``(B,)`` each; ``None`` before the first search.
         history: one ``StepReport`` a step.
         last_x: ``(B, 1, h, w)`` the relative map of the latest evaluation, no graph.
+        hidden: ``(B, V, 1, H, W)`` bool, what the estimate hides from the right cameras, or ``None``.
         on_edge: ``(B,)`` bool, whether the last search ended on the edge of its range.
     """
 
@@ -61,6 +62,7 @@ class Trajectory:
         self.affine: AffineState | None = None
         self.affine_start: AffineState | None = None
         self.matches: MatchTarget | None = None
+        self.hidden: Tensor | None = None
         self.on_edge: Tensor | None = None
         self.last_x: Tensor | None = None
         self.history: list[StepReport] = []
@@ -79,10 +81,12 @@ class Trajectory:
         if self.config.search in ONCE:
             if self.affine is None:
                 (self._search_one_number if self.config.search == "one-number" else self._span_points)(x)
+            self._test_visibility(x)
             return
         self._search_volume(x)
         wide, narrow = self.config.gate
         self._gate_matches(x, wide + (narrow - wide) * fraction)
+        self._test_visibility(x)
 
     def _search_one_number(self, x: Tensor) -> None:
         zero = x.new_zeros(x.shape[0])
@@ -157,6 +161,11 @@ class Trajectory:
             return
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         self.matches = replace(known, confidence=gate_matches(known, depth_m, factor))
+
+    def _test_visibility(self, x: Tensor) -> None:
+        """What this estimate hides from the right cameras; it holds for the updates of the round."""
+        if self.config.z_test and self.config.weights.get("photometric") and self.objective.views.rights:
+            self.hidden = self.objective.hidden(x, self.affine)
 
     @torch.no_grad()
     def corrected(self, x: Tensor) -> Tensor:

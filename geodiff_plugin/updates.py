@@ -70,7 +70,7 @@ class Adam:
     moments: tuple[Tensor, Tensor] | None = field(default=None, repr=False)
 
     def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
-        """The step for ``gradient`` (any shape, the same at every call), ``reference`` used by ``to_norm``."""
+        """The step for ``gradient`` (same shape at every call), ``reference`` used by ``to_norm``."""
         b1, b2 = self.betas
         if self.to_norm and reference is not None:
             gradient = gradient * (_per_sample_norm(reference) / _per_sample_norm(gradient).clamp_min(1e-8))

@@ -37,7 +37,7 @@ class Term:
 
 
 TERMS: dict[str, Term] = {
-    "photometric": Term(photometric, ("eta", "pyramid_levels"), needs_warp=True),
+    "photometric": Term(photometric, ("eta", "pyramid_levels", "exposure"), needs_warp=True),
     "matches": Term(matches, needs_matches=True),
     "points": Term(points, ("points_loss",), needs_points=True),
     "prior_pull": Term(prior_pull, ("pull_to",)),

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.terms.base import Estimate, masked_mean
+from geodiff_plugin.terms.exposure import match_exposure
 
 __all__ = ["photometric", "photometric_map"]
 
@@ -38,7 +39,9 @@ def photometric_map(left_01: Tensor, warped_01: Tensor, eta: float) -> Tensor:
     return eta * ((1.0 - ssim) / 2.0).clamp(0.0, 1.0) + (1.0 - eta) * (left_01 - warped_01).abs()
 
 
-def photometric(estimate: Estimate, *, eta: float = 0.85, pyramid_levels: int = 3) -> Tensor:
+def photometric(
+    estimate: Estimate, *, eta: float = 0.85, pyramid_levels: int = 3, exposure: bool = True
+) -> Tensor:
     """Mean photometric error over the visible pixels, averaged over an image pyramid.
 
     With several right views each pixel takes the one that explains it best among those that see it: a view
@@ -48,6 +51,7 @@ def photometric(estimate: Estimate, *, eta: float = 0.85, pyramid_levels: int = 
         estimate: needs ``left_01``, ``warped_01`` and ``visible``.
         eta: weight of SSIM against L1.
         pyramid_levels: 1 is the paper's; coarser levels widen the basin of attraction.
+        exposure: compare in the left image's exposure (``exposure.match_exposure``).
 
     Returns:
         ``(B,)`` float; differentiable in the depth through ``warped_01`` (bilinear, so the gradient is
@@ -61,6 +65,8 @@ def photometric(estimate: Estimate, *, eta: float = 0.85, pyramid_levels: int = 
     left = estimate.left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), a view's pixels by themselves
     warped = estimate.warped_01.flatten(0, 1)
     mask = estimate.visible.flatten(0, 1).to(left.dtype)
+    if exposure:
+        warped = match_exposure(warped, left, mask)
     total, levels = 0.0, 0
     for level in range(pyramid_levels):
         if level:

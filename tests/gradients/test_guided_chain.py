@@ -12,7 +12,7 @@ from geodiff_plugin.objective import Objective, RightViews, Views
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.terms import MatchTarget
 
-OPTIONS = {"eta": 0.85, "pyramid_levels": 2, "pull_to": "zero"}
+OPTIONS = {"eta": 0.85, "pyramid_levels": 2, "exposure": True, "pull_to": "zero"}
 WEIGHTS = {"photometric": 1.0, "matches": 0.3, "prior_pull": 0.01, "anchor": 0.2}
 
 

@@ -36,7 +36,7 @@ def estimate(**changes):
 @pytest.mark.parametrize("name", [n for n in TERMS if n != "prior_pull"])
 def test_a_perfect_estimate_costs_nothing(name):
     term = TERMS[name]
-    options = {"eta": 0.85, "pyramid_levels": 3, "points_loss": "robust"}
+    options = {"eta": 0.85, "pyramid_levels": 3, "exposure": True, "points_loss": "robust"}
     value = term.function(estimate(), **{key: options[key] for key in term.options})
     torch.testing.assert_close(value, torch.zeros(2), atol=1e-5, rtol=0)
 
