@@ -18,6 +18,7 @@ from diffusers import (
     MarigoldDepthPipeline,
     UNet2DConditionModel,
 )
+from torch._subclasses.fake_tensor import unset_fake_temporarily
 from transformers import (
     CLIPTextConfig,
     CLIPTextModel,
@@ -163,18 +164,24 @@ def _depthmaster() -> DepthMasterPipeline:
     return DepthMasterPipeline(unet=unet, vae=AutoencoderKL(**VAE), **_text())
 
 
+def _flow() -> FlowMatchEulerDiscreteScheduler:
+    """A schedule reads its own numbers, so it is made of real ones even where networks are counted only."""
+    with unset_fake_temporarily():
+        return FlowMatchEulerDiscreteScheduler()
+
+
 def _depthfm() -> DepthFMPipeline:
     return DepthFMPipeline(
         unet=UNet2DConditionModel(**UNET),
         vae=AutoencoderKL(**VAE),
-        scheduler=FlowMatchEulerDiscreteScheduler(),
+        scheduler=_flow(),
         prompt=FixedPrompt(),
     )
 
 
 def _ppd() -> PPDPipeline:
     encoder = Dinov2Model(Dinov2Config(**DINOV2_LARGE))
-    return PPDPipeline(PixelDiT(), encoder, FlowMatchEulerDiscreteScheduler())
+    return PPDPipeline(PixelDiT(), encoder, _flow())
 
 
 def _transformers() -> TransformersDepthPipeline:

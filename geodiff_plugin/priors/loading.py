@@ -17,12 +17,17 @@ import transformers
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.pipelines import direct_scheduler
 
 __all__ = ["build_pipeline", "check_weights", "component_class", "load_component"]
 
 #: Keys listed in an error before it says how many more there are.
 LISTED_KEYS = 12
-LIBRARIES = {"diffusers": diffusers, "transformers": transformers}
+LIBRARIES = {
+    "diffusers": diffusers,
+    "transformers": transformers,
+    direct_scheduler.__name__: direct_scheduler,  # ours, and as small as a scheduler can be
+}
 
 
 def check_weights(missing: Any, unexpected: Any, where: str) -> None:
