@@ -31,11 +31,11 @@ UNUSED = "fusion_stage.layers.0.residual_layer1."
 NEAREST, FARTHEST = 1e4, 1e-4
 
 
-def output_of(config: Any) -> tuple[str, bool]:
+def output_of(model: PreTrainedModel) -> tuple[str, bool]:
     """What the class of a model predicts: space (``depth`` or ``disparity``) and whether in (inverse) metres.
 
     Args:
-        config: the model's configuration, with ``architectures``.
+        model: of any class.
 
     Returns:
         Depth Anything as its ``depth_estimation_type`` says; DPT relative disparity, but metres with the
@@ -44,7 +44,7 @@ def output_of(config: Any) -> tuple[str, bool]:
     Raises:
         ValueError: a class of which this is not known.
     """
-    name = (getattr(config, "architectures", None) or [""])[0]
+    name, config = type(model).__name__, model.config
     if name == "DepthAnythingForDepthEstimation":
         return ("depth", True) if config.depth_estimation_type == "metric" else ("disparity", False)
     if name == "DPTForDepthEstimation":
@@ -54,7 +54,7 @@ def output_of(config: Any) -> tuple[str, bool]:
     if name == "DepthProForDepthEstimation":
         return "disparity", True
     cure = "Say what its output is affine in: space='depth' or space='disparity' (--space)."
-    bad_value("the prior", "a depth model whose output is known", name or "one without architectures", cure)
+    bad_value("the prior", "a depth model whose output is known", name, cure)
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class HFDepthModel:
     def __init__(self, model: PreTrainedModel, preparation: Preparation, space: str | None = None) -> None:
         self.model, self.preparation = model, preparation
         if space is None:
-            self.space, self.metric = output_of(model.config)
+            self.space, self.metric = output_of(model)
         else:
             self.space, self.metric = check_choice(space, "space", SPACES), False
 

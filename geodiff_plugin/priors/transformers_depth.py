@@ -1,4 +1,4 @@
-"""Any depth model of ``transformers``, as its own ``save_pretrained`` wrote it.
+"""Any depth model of ``transformers``, as that saves it or as a pipeline of ours.
 
 Hop: ``config.json``, ``preprocessor_config.json``, weights -> ``TransformersDepthPipeline``.
 Paper: none.
@@ -11,6 +11,7 @@ import torch
 from geodiff_plugin.priors.base import OwnPipelinePrior
 from geodiff_plugin.priors.hf_depth import DEPTH_ARCHITECTURES, HFDepthModel
 from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.loading import build_pipeline
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from geodiff_plugin.priors.pipelines.transformers_depth import TransformersDepthPipeline
 
@@ -33,15 +34,19 @@ class TransformersDepthPrior(OwnPipelinePrior):
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """One of the architectures that ``AutoModelForDepthEstimation`` knows."""
-        return not DEPTH_ARCHITECTURES.isdisjoint(layout.config("").get("architectures") or ())
+        """An architecture that ``AutoModelForDepthEstimation`` knows, alone or as component ``model``."""
+        configs = layout.config(""), layout.config("model")
+        return any(DEPTH_ARCHITECTURES & set(config.get("architectures") or ()) for config in configs)
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> TransformersDepthPipeline:
         """The model and the preparation of its images."""
+        if layout.index:
+            classes = {"scheduler": DirectScheduler}
+            return build_pipeline(cls.pipeline_class, layout, dtype, classes, prediction_type=space)
         options = {} if layout.variant is None else {"variant": layout.variant}
         loaded = HFDepthModel.from_pretrained(
             layout.folder, dtype=dtype, space=space, local_files_only=True, **options
         )
-        preparation = dict(loaded.preparation.options)
-        return cls.pipeline_class(loaded.model, DirectScheduler(timestep=0), preparation, space)
+        scheduler, preparation = DirectScheduler(timestep=0), loaded.preparation.options
+        return cls.pipeline_class(loaded.model, scheduler, preparation, loaded.space)

@@ -1,0 +1,63 @@
+"""Preparation and map of ``transformers`` depth models against its processors that need no torchvision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from transformers import DPTImageProcessorPil, GLPNImageProcessorPil
+from transformers.models.zoedepth.image_processing_pil_zoedepth import ZoeDepthImageProcessorPil
+
+from geodiff_plugin.priors.hf_depth import HFDepthModel
+from geodiff_plugin.priors.hf_preparation import Preparation
+from tests.contracts.tiny_transformers import MODELS, spread
+
+PATCH_OF_14 = {"keep_aspect_ratio": True, "ensure_multiple_of": 14}
+IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+PROCESSORS = {
+    "dpt": DPTImageProcessorPil(),
+    "depth anything": DPTImageProcessorPil(size={"height": 70, "width": 70}, **PATCH_OF_14, **IMAGENET),
+    "dinov2's dpt": DPTImageProcessorPil(do_resize=False, do_pad=True, size_divisor=14, **IMAGENET),
+    "glpn": GLPNImageProcessorPil(),
+    "zoedepth": ZoeDepthImageProcessorPil(size={"height": 64, "width": 96}, ensure_multiple_of=32),
+    "zoedepth as it comes": ZoeDepthImageProcessorPil(),
+    "zoedepth without border": ZoeDepthImageProcessorPil(do_pad=False),
+}
+ROUNDING = 1.2 / 255  # half a grey level after either axis, and the second one overshoots
+
+
+@pytest.fixture(scope="module")
+def photograph() -> np.ndarray:
+    """``(75, 113, 3)`` uint8, mid-grey: what the library cuts off at 0 and 255 is not what is compared."""
+    return np.random.default_rng(0).integers(90, 160, (75, 113, 3), dtype=np.uint8)
+
+
+def as_tensor(photograph: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(photograph).permute(2, 0, 1)[None] / 255.0
+
+
+@pytest.mark.parametrize("name", PROCESSORS)
+def test_preparation(name, photograph):
+    processor = PROCESSORS[name]
+    theirs = processor(photograph, return_tensors="pt")["pixel_values"]
+    preparation = Preparation.from_config(processor.to_dict())
+    ours = preparation(as_tensor(photograph))
+    deviation = min(preparation.options["image_std"]) if preparation.options["do_normalize"] else 1.0
+    # They round to bytes after either axis; ZoeDepth and what is not resized are never rounded.
+    exact = "zoedepth" in name or "dinov2" in name
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-6 if exact else ROUNDING / deviation)
+
+
+@pytest.mark.parametrize("kind", ["depth_anything", "dpt", "glpn"])
+def test_map(kind, photograph):
+    torch.manual_seed(0)
+    model, config = MODELS[kind]()
+    spread(model)
+    preparation = Preparation.from_config(config)
+    processor = (GLPNImageProcessorPil if kind == "glpn" else DPTImageProcessorPil)()
+    with torch.no_grad():
+        output = model(pixel_values=preparation(as_tensor(photograph)))
+    theirs = processor.post_process_depth_estimation(output, [photograph.shape[:2]])[0]["predicted_depth"]
+    ours = HFDepthModel(model, preparation)(as_tensor(photograph), size=photograph.shape[:2])
+    assert theirs.std() > 0
+    torch.testing.assert_close(ours.values[0, 0], theirs, rtol=0, atol=1e-6)
