@@ -23,6 +23,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.commands.bench import PeakMemory
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.baselines.files import map_name
 from geodiff_plugin.evaluation.crops import crop_mask
 from geodiff_plugin.evaluation.datasets import DATASETS, load
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
@@ -123,7 +124,8 @@ def _finish(
             raise
         return {"status": "broken", "error": str(error)}, sample
     if depth_folder is not None and prediction is not None and prediction.depth_m is not None:
-        target = depth_folder / re.sub(r"[^\w.=+-]+", "_", method.name) / f"{ref.label.replace('/', '_')}.npy"
+        own_folder = depth_folder / re.sub(r"[^\w.=+-]+", "_", method.name)
+        target = own_folder / f"{map_name(ref.dataset, ref.name)}.npy"
         target.parent.mkdir(parents=True, exist_ok=True)
         write_depth_npy(target, prediction.depth_m)
     return {"rectified": sample.rectified} | body, sample
@@ -172,7 +174,8 @@ def run(
         out: folder of ``samples.jsonl``; made where missing.
         crop: region of the image that is scored, one of ``crops.CROPS``.
         skip_broken: go on after a sample that cannot be read or measured; its record says why.
-        save_depth: write each metric depth map to ``out/depth/<method>/<sample>.npy``.
+        save_depth: write each metric depth map to ``out/depth/<method>/<dataset>_<sample>.npy``, where the
+            method ``files:out/depth/<method>`` finds it.
         progress: show a bar with each method's running AbsRel.
 
     Returns:

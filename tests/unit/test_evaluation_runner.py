@@ -186,6 +186,8 @@ def test_depth_maps_are_saved_on_request(bench):
     go(save_depth=True)
     saved = np.load(path.parent / "depth" / "double" / "middlebury2014_a.npy")
     np.testing.assert_array_equal(saved, 2 * samples["a"].depth_m)
+    again = find_method(f"files:{path.parent / 'depth' / 'double'}").run(samples["a"], Settings(), None)
+    np.testing.assert_array_equal(again.depth_m, saved)
     assert not (path.parent / "depth" / "double" / "middlebury2014_c.npy").exists()
 
 
