@@ -10,6 +10,7 @@ import torch
 from diffusers import PNDMScheduler
 from safetensors.torch import load_file, save_file
 
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.lotus import LotusPrior, space_of_name
 from geodiff_plugin.priors.pipelines.lotus import LotusImageProcessor, LotusPipeline
@@ -133,3 +134,16 @@ def test_sides_are_rounded_as_the_authors_do():
     assert LotusImageProcessor.resize_to_max_edge(wide, 768, "bilinear").shape == (1, 1, 5, 767)
     with pytest.raises(ValueError, match="aspect"):
         LotusImageProcessor.resize_to_max_edge(wide, 64, "bilinear")
+
+
+def test_d_is_guided_on_an_image_of_odd_size(textured_plane):
+    pair, losses = textured_plane, []
+    pipe = enable_geometry_guidance(make_lotus("d"))
+    fast = {"inner_steps": 3, "min_steps": 2, "loss_resolution": 64, "refine": False}
+    for steps in ({"step_latents": 0.0, "step_affine": 0.0}, {}):
+        guidance = GeometryGuidance(pair.right[:45], pair.K, pair.E, **fast, **steps)
+        out = pipe(pair.left[:45], guidance=guidance, generator=seeded(0))
+        losses.append(float(out.history[-1].loss))
+    assert out.prediction.shape == (1, 45, 64, 1)
+    assert np.isfinite(out.prediction).all() and (out.prediction > 0).all()
+    assert losses[1] < losses[0]
