@@ -23,7 +23,10 @@ def _figure(
         str, typer.Argument(metavar="NAME", help="gs-sweep, inner-steps, ablation, exposure or qualitative.")
     ],
     data: o.Data = Path("synthetic:1"),
-    methods: o.Methods = None,
+    methods: Annotated[
+        str | None,
+        typer.Option(help="Of exposure, ablation, qualitative: comma-separated, instead of their own."),
+    ] = None,
     datasets: o.Datasets = None,
     scenes: o.Scenes = None,
     limit: o.Limit = None,

@@ -42,6 +42,8 @@ def _find(column: Column, options: PairsOptions, sample: int | None) -> tuple[st
     wanted = options.datasets or column.datasets
     for dataset in (name for name in column.datasets if name in wanted):
         refs = find_pairs(options.data, [dataset], **posed)
+        # One column may have what --scenes names while another has not.
+        refs = [ref for ref in refs if not options.scenes or any(s in ref.label for s in options.scenes)]
         if refs:
             drawn = sample if sample is not None and sample <= len(refs) else None
             return dataset, select(refs, replace(options, sample=options.sample or drawn))

@@ -30,7 +30,7 @@ __all__ = [
     "show_image",
 ]
 
-DPI = 110
+DPI = 90
 #: Colours of lines, in order (Okabe and Ito's, told apart by the colour-blind).
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 #: The largest error that has a colour of its own.
@@ -112,7 +112,7 @@ def show_error(
 def plain_log_axis(axis: Any, low: float, high: float) -> None:
     """A logarithmic axis with round numbers instead of powers."""
     axis.axes.set(**{f"{axis.axis_name}scale": "log"})
-    values = ticks(low, high, 7)
+    values = ticks(low, max(high, 1.01 * low), 7)
     axis.set_ticks(values, labels=[f"{value:g}" for value in values])
     axis.set_minor_locator(_matplotlib("ticker").NullLocator())
 

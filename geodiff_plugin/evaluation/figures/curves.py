@@ -15,7 +15,7 @@ from geodiff_plugin.evaluation.cells import count_of_pairs
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.datasets.exposure import exposed_ref
 from geodiff_plugin.evaluation.figures.base import Drawing, FigureOptions, references
-from geodiff_plugin.evaluation.figures.canvas import COLOURS, new_figure
+from geodiff_plugin.evaluation.figures.canvas import COLOURS, new_figure, plain_log_axis
 from geodiff_plugin.evaluation.runner import headline, run
 from geodiff_plugin.evaluation.statistics import Mean, mean_with_interval
 
@@ -130,7 +130,9 @@ def draw_exposure(options: FigureOptions) -> Drawing:
             numbers[name][method] = _numbers(means)
     _finish(axes_of["gain"], GAINS, "gain of the right view", "AbsRel")
     _finish(axes_of["gamma"], GAMMAS, "gamma of the right view", "")
-    axes_of["gain"].set_ylim(bottom=0)
+    drawn = [value for panel in panels for name in methods for value in numbers[panel][name] if value]
+    if drawn:  # errors of good and bad methods are decades apart
+        plain_log_axis(axes_of["gain"].yaxis, min(drawn), max(drawn))
     axes_of["gain"].legend(fontsize=8)
     figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
     return Drawing(figure, numbers)
