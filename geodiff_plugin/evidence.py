@@ -48,7 +48,7 @@ class Evidence:
         volume: plane-sweep costs, or ``None`` where the configuration does not search it.
         matches: aggregated, left-right checked, or ``None`` where no term asks.
         sweep_matches: the same on the grid of the sweep, which is finer for wide images, with known points in
-            their place; the points where there are no matches.
+            their place (``matching.with_points``); the points where there are no matches.
         points: depths that the user knows, in the form of matches, or ``None``.
         warnings: sentences for the user.
     """

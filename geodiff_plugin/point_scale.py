@@ -17,8 +17,8 @@ __all__ = ["depth_span", "fit_to_points"]
 
 #: (near, far) pairs tried, and how far beyond the points' own range, as a factor.
 CANDIDATES, REACH = 48, 4.0
-#: Points that are looked at; width of the Cauchy cost in units of the points.
-SAMPLES, CAUCHY_UNITS = 1500, 8.0
+#: Points that are looked at; width of the Cauchy cost in units of the points, about a prior's own error.
+SAMPLES, CAUCHY_UNITS = 1500, 32.0
 #: A current state this close to the best cost, as a factor, stays: a new one restarts the affine updates.
 KEEP_FACTOR = 1.05
 

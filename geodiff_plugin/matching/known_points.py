@@ -75,17 +75,24 @@ def points_to_matches(
 
 
 def with_points(matches: Matches | None, points: Matches) -> Matches:
-    """Matches with known points in their place, and in their unit; the points alone where there are none.
+    """Matches with known points in their place: what the refinement follows.
 
     Args:
-        matches: of one image, or ``None``.
-        points: of that image, on the same grid.
+        matches: of one image, or of a chunk of samples; ``None`` where there are none.
+        points: of the same, on the same grid.
+
+    Returns:
+        As ``matches`` (or ``points``, without), but that the confidence of a point is the number of pixels
+        that it stands for: few points then decide as much as many, and one that a poor prior contradicts is
+        not taken for an outlier, as a match would be.
     """
-    if matches is None:
-        return points
     known = points.confidence > 0
+    share = known.float().mean((-2, -1), keepdim=True)
+    confidence = points.confidence / share.clamp_min(1.0 / known[0].numel())
+    if matches is None:
+        return replace(points, confidence=confidence)
     return replace(
         matches,
         inverse_depth=torch.where(known, points.inverse_depth, matches.inverse_depth),
-        confidence=torch.where(known, points.confidence, matches.confidence),
+        confidence=torch.where(known, confidence, matches.confidence),
     )

@@ -53,8 +53,8 @@ def test_points_take_the_place_of_matches():
     points, _ = points_to_matches(torch.tensor([[0.0, 0.0, 2.0]]), K, SIZE, K, SIZE)
     half = torch.full((1, *SIZE), 0.5)
     both = with_points(Matches(0.2 * half, half, torch.tensor(0.01), K, SIZE), points)
-    assert (both.inverse_depth == 0.5).sum() == 1 and (both.confidence == 1.0).sum() == 1
-    assert with_points(None, points) is points
+    assert (both.inverse_depth == 0.5).sum() == 1 and (both.confidence == 48 * 64).sum() == 1
+    assert torch.equal(with_points(None, points).inverse_depth, points.inverse_depth)
 
 
 @pytest.mark.parametrize("space", SPACES)
