@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.base import OwnPipelinePrior
 from geodiff_plugin.priors.hf_depth import DEPTH_ARCHITECTURES, HFDepthModel
 from geodiff_plugin.priors.layout import Layout
@@ -16,6 +17,8 @@ from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from geodiff_plugin.priors.pipelines.transformers_depth import TransformersDepthPipeline
 
 __all__ = ["TransformersDepthPrior"]
+
+PREPARATION_FILES = ("preprocessor_config.json", "processor_config.json")
 
 
 class TransformersDepthPrior(OwnPipelinePrior):
@@ -40,10 +43,20 @@ class TransformersDepthPrior(OwnPipelinePrior):
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> TransformersDepthPipeline:
-        """The model and the preparation of its images."""
+        """The model and the preparation of its images.
+
+        Raises:
+            ValueError: a folder without safetensors, or without what says how images are prepared.
+        """
         if layout.index:
             classes = {"scheduler": DirectScheduler}
             return build_pipeline(cls.pipeline_class, layout, dtype, classes, prediction_type=space)
+        if not any(map(layout.has, PREPARATION_FILES)):
+            cure = "Fetch the whole folder anew: without it nobody knows how images are prepared."
+            bad_value(str(layout.folder), f"a folder with {PREPARATION_FILES[0]}", "none", cure)
+        if not any(layout.folder.glob("*.safetensors")):
+            cure = "Run `geodiff convert SRC DST` once if it has a .bin file."
+            bad_value(str(layout.folder), "a folder with .safetensors weights", "none", cure)
         options = {} if layout.variant is None else {"variant": layout.variant}
         loaded = HFDepthModel.from_pretrained(
             layout.folder, dtype=dtype, space=space, local_files_only=True, **options

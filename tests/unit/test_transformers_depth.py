@@ -171,7 +171,12 @@ def test_missing_weights_are_listed_but_for_those_that_nothing_reads(tmp_path):
         HFDepthModel.from_pretrained(tmp_path)
 
 
-def test_without_its_preprocessor_config_a_folder_is_refused_by_its_name(tmp_path):
-    make_transformers("dpt").model.save_pretrained(tmp_path)
-    with pytest.raises(OSError, match="preprocessor_config"):
+def test_a_folder_that_lacks_a_file_is_refused_by_its_name(tmp_path):
+    pipe = make_transformers("dpt")
+    pipe.model.save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match="preprocessor_config"):
+        TransformersDepthPrior.load(Layout(tmp_path, "tiny"), torch.float32, None)
+    save_as_transformers(pipe, tmp_path)
+    (tmp_path / "model.safetensors").rename(tmp_path / "pytorch_model.bin")
+    with pytest.raises(ValueError, match="geodiff convert"):
         TransformersDepthPrior.load(Layout(tmp_path, "tiny"), torch.float32, None)
