@@ -86,9 +86,8 @@ class FoundPrior:
 
     @property
     def licence(self) -> str:
-        """Of the weights: as known by hub id, as the model card says, or ``"licence unknown"``."""
-        known = PRIORS[self.key].licence.get(self.layout.name)
-        return known or self.layout.licence or "licence unknown"
+        """Of the weights: as the model card says, as known by hub id, or ``"licence unknown"``."""
+        return self.layout.licence or PRIORS[self.key].licence.get(self.layout.name) or "licence unknown"
 
     def load(
         self,

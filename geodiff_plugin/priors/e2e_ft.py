@@ -22,10 +22,7 @@ class E2EFTPrior(MarigoldPrior):
 
     max_steps = 1
     deterministic = True
-    licence = {
-        "GonzaloMG/marigold-e2e-ft-depth": "apache-2.0",
-        "GonzaloMG/stable-diffusion-e2e-ft-depth": "apache-2.0",
-    }
+    licence: dict[str, str] = {}  # the authors' repository does not say
 
     @staticmethod
     def matches(pipe: object) -> bool:

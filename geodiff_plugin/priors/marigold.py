@@ -32,13 +32,16 @@ class MarigoldPrior:
     max_steps: int | None = None
     deterministic = False
     latents = slice(None)
-    licence = {
-        "prs-eth/marigold-depth-v1-1": "openrail++",
-        "prs-eth/marigold-depth-v1-0": "apache-2.0",
-        "prs-eth/marigold-v1-0": "apache-2.0",
-        "prs-eth/marigold-depth-lcm-v1-0": "apache-2.0",
-        "prs-eth/marigold-lcm-v1-0": "apache-2.0",
-    }
+    licence = dict.fromkeys(
+        (
+            "prs-eth/marigold-depth-v1-1",
+            "prs-eth/marigold-depth-v1-0",
+            "prs-eth/marigold-v1-0",
+            "prs-eth/marigold-depth-lcm-v1-0",
+            "prs-eth/marigold-lcm-v1-0",
+        ),
+        "openrail++ (RAIL++-M)",
+    )
 
     def __init__(self, pipe: MarigoldDepthPipeline) -> None:
         self._pipe = pipe

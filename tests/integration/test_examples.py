@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.contracts.tiny_depthmaster import make_depthmaster
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
@@ -40,7 +42,8 @@ def pair(textured_plane, tmp_path) -> list[str]:
 
 
 def test_every_example_is_tested():
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == {"depth_from_stereo", "posed_photographs"}
+    tested = {"depth_from_stereo", "posed_photographs", "swap_prior"}
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == tested
 
 
 def test_depth_from_stereo(prior, pair, tmp_path, monkeypatch, capsys):
@@ -49,6 +52,18 @@ def test_depth_from_stereo(prior, pair, tmp_path, monkeypatch, capsys):
     load(EXAMPLES / "depth_from_stereo.py").main(arguments)
     assert "median" in capsys.readouterr().out
     assert (np.load("depth.npy") > 0).all() and Path("depth.png").stat().st_size > 0
+
+
+def test_swap_prior(prior, pair, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    make_depthmaster().save_pretrained(tmp_path / "one-step")
+    arguments = [*pair, "--prior", str(prior), "--prior", str(tmp_path / "one-step")]
+    load(EXAMPLES / "swap_prior.py").main(arguments)
+    said = capsys.readouterr().out
+    assert "marigold; licence unknown" in said and "depthmaster; licence unknown" in said
+    assert said.count("from the first prior's depth") == 2
+    with Image.open("swap_prior.png") as picture:
+        assert picture.width > 3 * 300  # left image and two maps
 
 
 def test_posed_photographs(prior, capsys):

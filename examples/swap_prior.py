@@ -1,0 +1,69 @@
+"""One pair through several priors, drawn side by side in the same colours.
+
+The guidance does not change, only the name of the prior does. Without arguments it runs offline, with the
+small prior of the package alone:
+
+    python examples/swap_prior.py
+    python examples/swap_prior.py left.png right.png calib.txt --prior bundled \
+        --prior prs-eth/marigold-depth-v1-1 --prior jingheya/lotus-depth-g-v2-1-disparity \
+        --prior depth-anything/Depth-Anything-V2-Small-hf
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageOps
+
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
+from geodiff_plugin.plotting import colour_depth, depth_range, grid
+from geodiff_plugin.priors import find_prior
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("left", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "left.png")
+    parser.add_argument("right", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "right.png")
+    parser.add_argument("calib", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "calib.txt")
+    parser.add_argument("--prior", action="append", help="'bundled', a hub id or a folder; again for another")
+    parser.add_argument("--out", type=Path, default=Path("swap_prior.png"), help="the picture")
+    options = parser.parse_args(argv)
+
+    left, right = (ImageOps.exif_transpose(Image.open(path)) for path in (options.left, options.right))
+    guidance = GeometryGuidance.from_calibration(right, options.calib)
+
+    maps, titles = [], []
+    for name in options.prior or ["bundled"]:
+        found = find_prior(name)
+        print(f"{name}: {found.key}; {found.licence}")
+        pipe = enable_geometry_guidance(found.load())  # the only lines that know the prior
+
+        started = time.perf_counter()
+        out = pipe(left, guidance=guidance, generator=torch.Generator("cpu").manual_seed(0))
+        seconds = time.perf_counter() - started
+
+        depth_m = out.prediction[0, ..., 0]
+        apart = np.median(np.abs(depth_m / (maps[0] if maps else depth_m) - 1))
+        print(
+            f"  median {np.median(depth_m):.2f} m, {apart:.1%} from the first prior's depth, {seconds:.1f} s"
+        )
+        for sentence in out.warnings:
+            print(f"  warning: {sentence}")
+        maps.append(depth_m)
+        titles.append(f"{Path(name).name} ({found.key})")
+
+    near, far = depth_range(np.concatenate(maps))  # one scale of colours, so that maps can be compared
+    pictures = [left, *(colour_depth(depth_m, near=near, far=far) for depth_m in maps)]
+    grid(pictures, [f"{near:.2f} m to {far:.2f} m", *titles]).save(options.out)
+    print(f"{options.out}")
+
+
+if __name__ == "__main__":
+    main()
