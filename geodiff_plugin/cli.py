@@ -113,6 +113,9 @@ def depth(
     preset: Annotated[
         str, _option("default, or paper (Algorithm 1 as printed).", RUN, "--preset")
     ] = "default",
+    min_confidence: Annotated[
+        float, _option("Points of the cloud have at least this, 0 to 1.", OUTPUT, "--min-confidence")
+    ] = 0.0,
     out: Annotated[Path, _option("Folder for the results.", OUTPUT, "--out", "-o")] = Path("geodiff-out"),
     overwrite: Annotated[
         bool, _option("Write into a folder that holds files.", OUTPUT, "--overwrite")
@@ -175,7 +178,7 @@ def convert(
     ],
     part: Annotated[
         str | None,
-        _option("What SRC lacks (docs/priors.md): a file, a folder or a hub id.", RUN, "--with"),
+        typer.Option("--with", help="What SRC lacks (docs/priors.md): a file, a folder or a hub id."),
     ] = None,
 ) -> None:
     """Convert weights that come pickled; only this command reads such files, and runs nothing in them."""

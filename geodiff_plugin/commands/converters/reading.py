@@ -9,7 +9,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -48,24 +48,22 @@ def read_checkpoint(path: str | Path) -> Mapping[str, Any]:
         with torch.serialization.safe_globals(NUMPY_PARTS):
             content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        reason = str(error)
-        if "Unsupported global" in reason or "Unsupported class" in reason or "GLOBAL" in reason:
+        if "GLOBAL" in str(error) or "Unsupported class" in str(error):
             names = _foreign_names(path)
             cure = (
                 "Unpickling it would run code, which is never done: ask its authors for safetensors, or, "
                 "if you trust it, save its weights anew without those objects."
             )
             bad_value(str(path), "a checkpoint of tensors, numbers and text", f"one with {names}", cure)
-        _no_checkpoint(path, error)
+        _no_checkpoint(path, error, "it is no pickle of weights")  # torch's own advice is to run its code
     except (RuntimeError, EOFError, KeyError, ValueError, OSError) as error:
-        _no_checkpoint(path, error)
+        _no_checkpoint(path, error, (str(error).splitlines() or [type(error).__name__])[0])
     if not isinstance(content, Mapping):
         bad_value(str(path), "a checkpoint that holds a mapping", type(content).__name__)
     return content
 
 
-def _no_checkpoint(path: Path, error: Exception) -> None:
-    reason = (str(error).splitlines() or [type(error).__name__])[0]
+def _no_checkpoint(path: Path, error: Exception, reason: str) -> NoReturn:
     raise ValueError(
         f"{path} must be a checkpoint written by torch.save; got one that cannot be read ({reason}). "
         "Fetch it anew and compare its size with the original's."
@@ -74,6 +72,7 @@ def _no_checkpoint(path: Path, error: Exception) -> None:
 
 def _foreign_names(path: Path) -> str:
     try:
-        return ", ".join(sorted(torch.serialization.get_unsafe_globals_in_checkpoint(path)))
+        with torch.serialization.safe_globals(NUMPY_PARTS):
+            return ", ".join(sorted(torch.serialization.get_unsafe_globals_in_checkpoint(path)))
     except (RuntimeError, ValueError):  # files from before PyTorch 1.6 cannot be listed
         return "other objects"

@@ -61,13 +61,14 @@ class SidesOf64(MarigoldImageProcessor):
             ``(N, 3, H, W)`` in [-1, 1] with sides of a multiple of 64, no padding ``(0, 0)``, and the size
             ``(H, W)`` that the image came with.
         """
-        image, padding, size = super().preprocess(image, 0, resample_method_input, device, dtype)
+        # In float32 until the end: not every device resizes in half precision.
+        image, padding, size = super().preprocess(image, 0, resample_method_input, device, torch.float32)
         height, width = size
         factor = processing_resolution / max(size) if processing_resolution else 1.0
         grid = tuple(max(SIDE, round(int(side * factor) / SIDE) * SIDE) for side in (height, width))
         if grid != (height, width):
             image = self.resize_antialias(image, grid, resample_method_input, is_aa=True)
-        return image, padding, size
+        return image.to(dtype), padding, size
 
 
 class DepthFMPipeline(DepthDiffusionPipeline):
