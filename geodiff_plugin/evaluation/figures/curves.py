@@ -97,7 +97,7 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     _finish(right, updates, "updates per denoising step", "seconds a pair")
     left.set_ylim(bottom=0)
     right.set_ylim(bottom=0)
-    left.legend(fontsize=8)
+    right.legend(fontsize=8)
     figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
     return Drawing(figure, numbers)
 
