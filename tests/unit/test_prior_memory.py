@@ -1,0 +1,39 @@
+"""Memory is counted by running fake tensors; on tiny networks it can be checked."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from geodiff_plugin.priors import PRIORS
+from geodiff_plugin.priors.full_sizes import FULL_SIZES
+from geodiff_plugin.priors.memory import _LiveBytes, count_memory
+from tests.contracts.tiny_priors import TINY
+
+
+def test_every_prior_has_a_full_size():
+    assert set(FULL_SIZES) == set(PRIORS)
+
+
+def test_live_bytes_rise_and_fall():
+    with _LiveBytes() as counted:
+        a = torch.zeros(1000)
+        b = a + 1  # a and b together: the peak
+        assert counted.live == 8000
+        del a
+        assert counted.live == 4000
+        c = b.view(10, 100)  # no storage of its own
+        del b
+        assert counted.live == 4000
+        del c
+    assert (counted.live, counted.peak) == (0, 8000)
+
+
+@pytest.mark.parametrize("key", ["marigold", "depthmaster"])
+def test_gradients_cost_memory(key, monkeypatch):
+    monkeypatch.setitem(FULL_SIZES, key, TINY[key])
+    found, parts = count_memory(key), TINY[key]().components.values()
+    real = sum(p.numel() for m in parts if isinstance(m, torch.nn.Module) for p in m.parameters())
+    assert found.parameters == real and found.weights == 2 * real  # bfloat16
+    assert 0 < found.plain < found.denoised
+    assert found.full is None if key == "depthmaster" else found.full > found.denoised
