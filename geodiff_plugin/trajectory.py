@@ -78,12 +78,10 @@ class Trajectory:
             x: ``(B, 1, h, w)`` float32 relative map of this step.
             fraction: of the schedule, [0, 1); the gate on matches narrows with it.
         """
-        if self.config.search in ONCE:
-            if self.affine is None:
-                (self._search_one_number if self.config.search == "one-number" else self._span_points)(x)
-            self._test_visibility(x)
-            return
-        self._search_volume(x)
+        if self.config.search not in ONCE:
+            self._search_volume(x)
+        elif self.affine is None:
+            (self._search_one_number if self.config.search == "one-number" else self._span_points)(x)
         wide, narrow = self.config.gate
         self._gate_matches(x, wide + (narrow - wide) * fraction)
         self._test_visibility(x)

@@ -48,6 +48,12 @@ def test_save_and_load(tmp_path):
     assert overridden.config.inner_steps == 5
 
 
+def test_load_without_a_right_view():
+    config = GeometryGuidance.marigold_dc(np.array([[0.0, 0.0, 2.0]]), K).config
+    again = GeometryGuidance.from_config(dict(config), right=None, K=K, points=np.array([[0.1, 0.0, 3.0]]))
+    assert again.config.positive == "square" and float(again.inputs[0].points[0, 2]) == 3.0
+
+
 @pytest.mark.parametrize(
     "right",
     [

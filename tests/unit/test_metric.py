@@ -41,6 +41,18 @@ def test_positive_monotone_and_linear_in_global_scale(space):
 
 
 @pytest.mark.parametrize("space", SPACES)
+def test_squares_start_at_one_and_clip(space):
+    metric = MetricMap(space, "square")
+    affine = metric.from_range(*ends(space))
+    assert torch.equal(affine.s_hat, torch.ones(3)) and torch.equal(affine.t_hat, torch.ones(3))
+    torch.testing.assert_close(metric.range_of(affine), ends(space), rtol=2e-3, atol=0)
+    beyond = torch.tensor([-0.5, 1.5]).view(1, 1, 1, 2).requires_grad_()
+    depth = metric(beyond.expand(3, -1, -1, -1), affine)
+    torch.testing.assert_close(tuple(depth.flatten(1).unbind(1)), metric.range_of(affine))
+    assert torch.autograd.grad(depth.sum(), beyond)[0].abs().max() == 0
+
+
+@pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("raw", [-3.0, 0.0, 5.0])
 def test_gradients(space, raw):
     metric = MetricMap(space)
