@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from diffusers.pipelines.marigold import MarigoldDepthOutput
 from torch import Tensor
 
+from geodiff_plugin.confidence import depth_confidence
 from geodiff_plugin.evidence import match_target
 from geodiff_plugin.geometry.cameras import resize_intrinsics
 from geodiff_plugin.geometry.warping import warp_right_to_left
@@ -49,11 +50,8 @@ def assemble_output(
         output_type: ``"np"`` or ``"pt"``.
     """
     count, size = lefts_01.shape[0], tuple(lefts_01.shape[-2:])
-    depth_m = stock.prediction
-    if output_type == "np":
-        depth_m = torch.from_numpy(depth_m).permute(0, 3, 1, 2)
-    depth_m = depth_m.float().to(lefts_01.device)  # (N, 1, H, W) or the processing grid
-    depth_m = _refined(run, depth_m, lefts_01)
+    depth_m = _as_maps(stock.prediction).to(lefts_01.device)  # (N, 1, H, W) or the processing grid
+    depth_m, support = _refined(run, depth_m, lefts_01)
     grid = tuple(depth_m.shape[-2:])
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
     known = [own.on(depth_m.device) for own in guidance.inputs]
@@ -64,6 +62,12 @@ def assemble_output(
         if rights
     ]
     visible, error = (torch.cat(maps) for maps in zip(*seen, strict=True)) if seen else (None, None)
+    confidence = None
+    if support is not None:
+        spread = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m) / depth_m
+        nowhere = torch.zeros_like(depth_m)
+        shown = (nowhere, nowhere.bool()) if error is None else (error, visible)
+        confidence = depth_confidence(support, *shown, spread)
     relative = torch.cat(run.relative)
     relative = relative.reshape(count, -1, *relative.shape[1:]).median(dim=1).values  # (N, 1, h, w)
     if match_input_resolution:
@@ -85,6 +89,7 @@ def assemble_output(
         global_scale=members("g_s"),
         visible=out(visible),
         photometric_error=out(error),
+        confidence=out(confidence),
         K=K if output_type == "pt" else K.cpu().numpy(),
         history=[report for t in run.trajectories for report in t.history],
         extras=getattr(stock, "extras", {}),
@@ -92,15 +97,23 @@ def assemble_output(
     )
 
 
-def _refined(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> Tensor:
-    """The depth of every image brought to its matches, where there are any."""
-    if not run.config.refine:
-        return depth_m
-    images = []
-    for evidence, depth, left in zip(run.evidence, depth_m.split(1), lefts_01.split(1), strict=True):
-        target = match_target([evidence.sweep_matches])
-        images.append(depth if target is None else refine_depth(depth, target, left).depth_m)
-    return torch.cat(images)
+def _as_maps(values: Any) -> Tensor:
+    """``(N, 1, H, W)`` float32 of what the pipeline gives, numpy or torch."""
+    if isinstance(values, Tensor):
+        return values.float()
+    return torch.from_numpy(values).permute(0, 3, 1, 2).float()
+
+
+def _refined(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> tuple[Tensor, Tensor | None]:
+    """The depth of every image brought to what is known, and how far that decided it."""
+    targets = [match_target([evidence.sweep_matches]) for evidence in run.evidence]
+    if not run.config.refine or any(target is None for target in targets):
+        return depth_m, None
+    refined = [
+        refine_depth(depth, target, left)
+        for target, depth, left in zip(targets, depth_m.split(1), lefts_01.split(1), strict=True)
+    ]
+    return torch.cat([r.depth_m for r in refined]), torch.cat([r.support for r in refined])
 
 
 def _reprojection(

@@ -107,6 +107,9 @@ class MetricDepthOutput(BaseOutput):
             without a right view.
         photometric_error: [0, 1] mean absolute difference to the left image re-rendered from the right view
             that explains the pixel best, 0 where not visible; ``None`` without a right view.
+        confidence: [0, 1] probability that the depth is within 10 % of the truth, shaped as ``prediction``:
+            from matches near on the same surface, photometric error and, if there is an ensemble, its
+            spread; ``None`` without matches and points.
         K: ``(N, 3, 3)`` intrinsics of the output grid, pixels.
         history: one ``StepReport`` a step and batch chunk.
         extras: further maps of the prior by name (GeoWizard's ``"normals"``), shaped as ``prediction`` with
@@ -123,6 +126,7 @@ class MetricDepthOutput(BaseOutput):
     global_scale: torch.Tensor | None = None
     visible: np.ndarray | torch.Tensor | None = None
     photometric_error: np.ndarray | torch.Tensor | None = None
+    confidence: np.ndarray | torch.Tensor | None = None
     K: np.ndarray | torch.Tensor | None = None
     history: list[StepReport] = field(default_factory=list)
     extras: dict[str, np.ndarray | torch.Tensor] = field(default_factory=dict)

@@ -23,6 +23,7 @@ LAYER = {
     "objective": 3,
     "scale_search": 3,
     "updates": 3,
+    "confidence": 3,
     "evidence": 3,
     "guidance": 3,
     "guidance_doors": 3,

@@ -61,6 +61,7 @@ class DepthArguments:
     device: str = "auto"
     dtype: str = "float32"
     preset: str = "default"
+    min_confidence: float = 0.0
     out: Path = Path("geodiff-out")
     overwrite: bool = False
     quiet: bool = False
@@ -195,6 +196,7 @@ def check_arguments(arguments: DepthArguments) -> Settings:
     check_number(arguments.seed, "--seed", 0, 2**63 - 1, integer=True)
     check_choice(arguments.dtype, "--dtype", DTYPES)
     check_choice(arguments.preset, "--preset", PRESETS)
+    check_number(arguments.min_confidence, "--min-confidence", 0.0, 1.0)
     _check_out(arguments.out, arguments.overwrite)
     return Settings(
         device=pick_device(arguments.device),

@@ -63,7 +63,7 @@ def estimate_and_write(arguments: DepthArguments) -> DepthRun:
         report = build_report(inputs, output, pipe, arguments, settings, warnings)
         with staged_folder(arguments.out) as folder:
             with watch.stage("write"):
-                report["files"] = write_maps(folder, output, inputs.left)
+                report["files"] = write_maps(folder, output, inputs.left, arguments.min_confidence)
             report["files"]["names"] = [name for name in OUTPUT_FILES if (folder / name).exists()] + [
                 "report.json"
             ]

@@ -33,6 +33,7 @@ OUTPUT_FILES = (
     "visible.png",
     "photometric_error.npy",
     "uncertainty.npy",
+    "confidence.npy",
     "normals.npy",
     "cloud.ply",
     "report.json",
@@ -70,13 +71,16 @@ def staged_folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(staging, ignore_errors=True)
 
 
-def write_maps(folder: Path, output: MetricDepthOutput, left: np.ndarray) -> dict[str, Any]:
+def write_maps(
+    folder: Path, output: MetricDepthOutput, left: np.ndarray, min_confidence: float = 0.0
+) -> dict[str, Any]:
     """Write every file but the report.
 
     Args:
         folder: an existing one.
         output: of the guided call, at the left image's resolution.
         left: ``(H, W, 3)`` image in [0, 1], colours of the cloud.
+        min_confidence: pixels below it are no points of the cloud, [0, 1].
 
     Returns:
         Counts for the report.
@@ -92,9 +96,18 @@ def write_maps(folder: Path, output: MetricDepthOutput, left: np.ndarray) -> dic
         np.save(folder / "uncertainty.npy", single_map(output.uncertainty).astype(np.float32))
     for name, extra in output.extras.items():
         np.save(folder / f"{name}.npy", np.asarray(extra)[0].astype(np.float32))
-    flying = flying_points(depth_m)
-    points = write_ply(folder / "cloud.ply", depth_m, left, K, valid=~flying)
-    return {"depth_mm_zero_pixels": zeros, "cloud_points": points, "flying_points": int(flying.sum())}
+    flying, doubtful = flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool)
+    if output.confidence is not None:
+        confidence = single_map(output.confidence).astype(np.float32)
+        np.save(folder / "confidence.npy", confidence)
+        doubtful = confidence < min_confidence
+    points = write_ply(folder / "cloud.ply", depth_m, left, K, valid=~(flying | doubtful))
+    return {
+        "depth_mm_zero_pixels": zeros,
+        "cloud_points": points,
+        "flying_points": int(flying.sum()),
+        "doubtful_points": int(doubtful.sum()),
+    }
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> str:

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from geodiff_plugin.confidence import RIGHT_WITHIN
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.cells import by_method, cell, count_of_pairs, interval_cell
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.statistics import mean_with_interval
 
-__all__ = ["disparity_table", "regions_table", "uncertainty_table"]
+__all__ = ["confidence_table", "disparity_table", "regions_table", "uncertainty_table"]
 
 _REGIONS = {
     "visible": "visible",
@@ -102,3 +103,26 @@ def uncertainty_table(records: Sequence[dict[str, Any]]) -> Table:
     ]
     note = "Area under the sparsification error of AbsRel; 0 where the least certain pixels are the worst."
     return Table("Uncertainty", ("method", "pairs", "AUSE [95 %]"), tuple(rows), note)
+
+
+def confidence_table(records: Sequence[dict[str, Any]]) -> Table:
+    """What the confidence of each method promises by decile, and what it keeps; pairs weigh the same."""
+    rows = []
+    for method, own in by_method(records, lambda record: record.get("confidence")).items():
+        pairs = [deciles for deciles in own.values() if deciles]
+        for k in range(10):
+            filled = [deciles[k] for deciles in pairs if deciles[k]["share"]]
+            weight = sum(one["share"] for one in filled)
+            if not filled:
+                continue
+            means = [
+                sum(one[name] * one["share"] for one in filled) / weight
+                for name in ("promised", "kept", "abs_rel")
+            ]
+            title = find_method(method).title
+            rows.append(
+                (title, f"{k / 10:.1f} to {(k + 1) / 10:.1f}", cell(weight / len(pairs)), *map(cell, means))
+            )
+    note = f"Confidence is the probability of a relative error below {RIGHT_WITHIN:g}; pixels of all pairs."
+    header = ("method", "confidence", "share of pixels", "promised", "kept", "AbsRel")
+    return Table("Confidence by decile", header, tuple(rows), note)

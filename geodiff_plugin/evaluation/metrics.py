@@ -10,7 +10,7 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["FLOOR_M", "ause", "counted", "evaluate_depth", "evaluate_disparity"]
+__all__ = ["FLOOR_M", "ause", "confidence_deciles", "counted", "evaluate_depth", "evaluate_disparity"]
 
 FLOOR_M = 1e-5
 """Nearest truth that counts and nearest value of a prediction, metres (Marigold's evaluation of KITTI)."""
@@ -169,3 +169,36 @@ def ause(
     by_uncertainty = np.argsort(-np.asarray(uncertainty, np.float64)[kept], kind="stable")
     by_error = np.argsort(-error, kind="stable")
     return float(np.mean(remaining(by_uncertainty) - remaining(by_error)))
+
+
+def confidence_deciles(
+    pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, confidence: np.ndarray, within: float
+) -> list[dict[str, float | None]]:
+    """What a confidence promises and what it keeps, in ten classes of equal width.
+
+    Args:
+        pred_m: ``(H, W)`` metres.
+        truth_m: ``(H, W)`` metres.
+        valid: ``(H, W)`` bool, where the truth counts.
+        confidence: ``(H, W)`` in [0, 1], a probability that the relative error is below ``within``.
+        within: relative error, > 0.
+
+    Returns:
+        Ten entries, from [0, 0.1) to [0.9, 1]: ``share`` of the pixels, mean ``promised``, ``kept`` (share of
+        pixels within), ``abs_rel``; the last three ``None`` for an empty class.
+
+    Raises:
+        ValueError: shapes differ.
+    """
+    _check_maps(pred_m=pred_m, truth_m=truth_m, valid=valid, confidence=confidence)
+    used = valid & np.isfinite(pred_m) & (pred_m > 0)
+    error = np.abs(pred_m[used] - truth_m[used]) / truth_m[used]
+    promised = confidence[used]
+    decile = np.minimum((promised * 10).astype(int), 9)
+    found = []
+    for k in range(10):
+        own = decile == k
+        values = {"promised": promised, "kept": error < within, "abs_rel": error}
+        means = {name: float(np.mean(v[own])) if own.any() else None for name, v in values.items()}
+        found.append({"share": float(own.mean()) if own.size else 0.0} | means)
+    return found

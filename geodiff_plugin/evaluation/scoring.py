@@ -12,10 +12,17 @@ from typing import Any
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.confidence import RIGHT_WITHIN
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
-from geodiff_plugin.evaluation.metrics import ause, counted, evaluate_depth, evaluate_disparity
+from geodiff_plugin.evaluation.metrics import (
+    ause,
+    confidence_deciles,
+    counted,
+    evaluate_depth,
+    evaluate_disparity,
+)
 
 __all__ = ["TOM_CLASSES", "out_of_view", "regions", "score"]
 
@@ -109,14 +116,15 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
     Returns:
         ``all_pixels``: ``raw`` and ``aligned`` errors over every pixel with truth, without a cap; ``capped``:
         the same two under the cap; ``disparity``: for rectified pairs, not aligned; ``regions``: AbsRel by
-        region under the cap, not aligned (aligned for a method without metres); ``ause`` of the uncertainty.
+        region under the cap, not aligned (aligned for a method without metres); ``ause`` of the uncertainty;
+        ``confidence`` by decile.
         ``None`` where it does not apply.
 
     Raises:
         ValueError: a map of the wrong shape, or a sample without truth.
     """
     truth, valid = sample.depth_m, sample.valid
-    for name in ("depth_m", "relative", "uncertainty"):
+    for name in ("depth_m", "relative", "uncertainty", "confidence"):
         values = getattr(prediction, name)
         if values is not None and values.shape != truth.shape:
             bad_value(f"prediction.{name}", f"of the left image's shape {truth.shape}", values.shape)
@@ -131,12 +139,15 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
     capped = record["all_pixels"]
     if cap_m is not None:
         capped = _both(sample, depth_m, values, prediction.space, cap_m)
-    record |= {"capped": capped, "disparity": None, "ause": None}
+    record |= {"capped": capped, "disparity": None, "ause": None, "confidence": None}
     kept = counted(truth, valid, cap_m)
     shown_m = align(values, truth, kept, prediction.space) if depth_m is None else depth_m
     if depth_m is not None and sample.rectified:
         record["disparity"] = _disparity(sample, depth_m)
     if depth_m is not None and prediction.uncertainty is not None:
         record["ause"] = _plain({"ause": ause(depth_m, truth, kept, prediction.uncertainty)})["ause"]
+    if depth_m is not None and prediction.confidence is not None:
+        found = confidence_deciles(depth_m, truth, kept, prediction.confidence, RIGHT_WITHIN)
+        record["confidence"] = [_plain(decile) for decile in found]
     record["regions"] = _split(shown_m, sample, cap_m)
     return record

@@ -18,7 +18,12 @@ from geodiff_plugin.evaluation.cells import (
     interval_cell,
     label_of,
 )
-from geodiff_plugin.evaluation.detail_tables import disparity_table, regions_table, uncertainty_table
+from geodiff_plugin.evaluation.detail_tables import (
+    confidence_table,
+    disparity_table,
+    regions_table,
+    uncertainty_table,
+)
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.runner import headline
 from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
@@ -151,4 +156,5 @@ def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -
     for group, members in groups(records).items():
         tables.append(summary_table(records, members, f"All metrics, {group}"))
     tables += [regions_table(records), disparity_table(records), uncertainty_table(records)]
+    tables.append(confidence_table(records))
     return [table for table in tables if table.rows]

@@ -44,7 +44,7 @@ def test_writes_everything(geodiff, command, pair_files):
     answer = geodiff(*command)
     assert answer.code == 0, answer.err
     out = pair_files.folder / "geodiff-out"
-    assert {path.name for path in out.iterdir()} == FILES
+    assert {path.name for path in out.iterdir()} == FILES | {"confidence.npy"}
     assert answer.out.count("\n") == 1 and " m to " in answer.out and "geodiff-out/" in answer.out
     assert "loss=" in answer.err
 
@@ -61,7 +61,10 @@ def test_writes_everything(geodiff, command, pair_files):
         assert figure.width > 64
 
     report = json.loads((out / "report.json").read_text())
-    assert set(report["files"]["names"]) == FILES
+    assert set(report["files"]["names"]) == FILES | {"confidence.npy"}
+    confidence = np.load(out / "confidence.npy")
+    assert confidence.shape == (48, 64) and 0.0 <= confidence.min() <= confidence.max() <= 1.0
+    assert report["files"]["doubtful_points"] == 0
     assert report["depth"]["median_m"] == pytest.approx(float(np.median(depth_m)))
     assert report["depth"]["visible_fraction"] == pytest.approx((visible > 0).mean())
     assert report["files"]["depth_mm_zero_pixels"] == (millimetres == 0).sum()
@@ -191,5 +194,17 @@ def test_demo(geodiff, prior, pair_files, monkeypatch):
     answer = geodiff("demo", "--quiet")
     assert answer.code == 0, answer.err
     assert "AbsRel" in answer.out and "delta1" in answer.out and "guided" in answer.out
-    assert {path.name for path in out.iterdir()} == FILES | {"overview.png", "notes.txt"}
+    assert {path.name for path in out.iterdir()} == FILES | {"confidence.npy", "overview.png", "notes.txt"}
     assert np.load(out / "depth.npy").shape == (336, 448)
+
+
+def test_a_cloud_of_what_is_believed(geodiff, command, pair_files):
+    quick = ["--quiet", "--steps", 1, "--resolution", 32]
+    assert geodiff(*command, *quick, "--min-confidence", 0.6).code == 0
+    out = pair_files.folder / "geodiff-out"
+    counts = json.loads((out / "report.json").read_text())["files"]
+    doubtful = np.load(out / "confidence.npy") < 0.6
+    assert counts["doubtful_points"] == doubtful.sum()
+    assert counts["cloud_points"] <= doubtful.size - doubtful.sum()
+    refused = geodiff(*command, *quick, "--min-confidence", 1.5, "--out", "other")
+    assert refused.code == 2 and "--min-confidence" in refused.err

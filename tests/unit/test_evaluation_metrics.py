@@ -6,7 +6,14 @@ import pytest
 import torch
 
 from geodiff_plugin.evaluation.alignment import MIN_DISPARITY, align, least_squares
-from geodiff_plugin.evaluation.metrics import FLOOR_M, ause, counted, evaluate_depth, evaluate_disparity
+from geodiff_plugin.evaluation.metrics import (
+    FLOOR_M,
+    ause,
+    confidence_deciles,
+    counted,
+    evaluate_depth,
+    evaluate_disparity,
+)
 
 ALL = np.ones((1, 2), bool)
 
@@ -141,3 +148,13 @@ def test_depth_sent_behind_the_camera_is_clipped_not_dropped():
 def test_alignment_names_an_unknown_space():
     with pytest.raises(ValueError, match="space must be one of depth, disparity"):
         align(row(1.0), row(1.0), np.ones((1, 1), bool), "inverse")
+
+
+def test_confidence_deciles_closed_form():
+    truth, valid = np.full((1, 4), 2.0), np.array([[True, True, True, False]])
+    pred = np.array([[2.0, 2.1, 3.0, 9.0]])
+    found = confidence_deciles(pred, truth, valid, np.array([[0.95, 1.0, 0.25, 0.25]]), within=0.1)
+    assert [decile["share"] for decile in found] == pytest.approx([0, 0, 1 / 3, 0, 0, 0, 0, 0, 0, 2 / 3])
+    assert found[9] == pytest.approx({"share": 2 / 3, "promised": 0.975, "kept": 1.0, "abs_rel": 0.025})
+    assert found[2]["kept"] == 0.0 and found[2]["abs_rel"] == pytest.approx(0.5)
+    assert found[5]["kept"] is None

@@ -20,7 +20,7 @@ from geodiff_plugin.evaluation.baselines._guidance import (
     posed_views,
     prior_space,
 )
-from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.baselines.base import Method, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.pipeline import enable_geometry_guidance
@@ -34,7 +34,7 @@ class ConstantPrior(DepthDiffusionPipeline):
     """A pipeline of one step whose network is ``answer``; guided, it makes the updates of all steps in it.
 
     Args:
-        vae: of the prior that it stands in for; it says where the work is done.
+        module: any network of the prior that it stands in for, which says where the work is done.
         scheduler: a ``DirectScheduler``.
         prediction_type: what the relative map is affine in.
         default_denoising_steps: rounds of updates when guided.
@@ -55,7 +55,7 @@ class ConstantPrior(DepthDiffusionPipeline):
 
     def __init__(
         self,
-        vae: Any,
+        module: torch.nn.Module,
         scheduler: Any,
         prediction_type: str = "depth",
         default_denoising_steps: int = 1,
@@ -63,7 +63,7 @@ class ConstantPrior(DepthDiffusionPipeline):
     ) -> None:
         super().__init__()
         self.register_prior(
-            {"vae": vae, "scheduler": scheduler},
+            {"module": module, "scheduler": scheduler},
             prediction_type,
             default_denoising_steps,
             default_processing_resolution,
@@ -108,7 +108,8 @@ class Start:
 def _stand_in(pipe: Any, start: Start, rounds: int) -> Any:
     """A pipeline that can be guided and answers with ``start``, at the resolution of a live prior."""
     resolution = pipe.default_processing_resolution or 0
-    constant = ConstantPrior(pipe.vae, DirectScheduler(), prior_space(pipe), rounds, resolution)
+    module = next(part for part in pipe.components.values() if isinstance(part, torch.nn.Module))
+    constant = ConstantPrior(module, DirectScheduler(), prior_space(pipe), rounds, resolution)
     constant.answer, constant.decode, constant.encode = start.answer, start.decode, start.encode
     constant.image_processor = start.image_processor
     constant.set_progress_bar_config(disable=True)
@@ -139,8 +140,6 @@ def constant_method(
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
         pipe, views = priors.get(settings), posed_views(sample, settings.views)
-        if getattr(pipe, "vae", None) is None:
-            raise NotApplicable("the prior has no latent space")
         taken = rounds
         if taken is None:
             taken = preset(*views).denoising_steps(settings.steps, pipe.default_denoising_steps)

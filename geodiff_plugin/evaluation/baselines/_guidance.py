@@ -80,6 +80,7 @@ def guided_prediction(
         depth_m=out.prediction[0, ..., 0],
         space="disparity" if prior_space(pipe) != "depth" else "depth",
         uncertainty=None if out.uncertainty is None else out.uncertainty[0, ..., 0],
+        confidence=None if out.confidence is None else out.confidence[0, ..., 0],
         notes=_summary(out),
     )
 

@@ -81,6 +81,7 @@ class Prediction:
         relative: ``(H, W)`` float, affine in ``space``; ``None`` where only metres are known.
         space: space for the oracle's alignment, see ``alignment.align``.
         uncertainty: ``(H, W)`` float, larger is less certain; ``None`` where the method has none.
+        confidence: ``(H, W)`` float in [0, 1], see ``confidence.depth_confidence``; ``None`` as well.
         notes: what the method reports beside the map, JSON values only.
     """
 
@@ -88,6 +89,7 @@ class Prediction:
     relative: np.ndarray | None = None
     space: str = "depth"
     uncertainty: np.ndarray | None = None
+    confidence: np.ndarray | None = None
     notes: Mapping[str, Any] = field(default_factory=dict)
 
 

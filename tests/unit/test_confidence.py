@@ -1,0 +1,33 @@
+"""Confidence rises with support, falls with photometric error and spread, and stays a probability."""
+
+from __future__ import annotations
+
+import torch
+
+from geodiff_plugin.confidence import depth_confidence
+
+
+def _maps(*values: float) -> torch.Tensor:
+    return torch.tensor(values).view(1, 1, 1, -1)
+
+
+SEEN = torch.ones(1, 1, 1, 3, dtype=torch.bool)
+
+
+def test_rises_with_support():
+    found = depth_confidence(_maps(0.0, 0.9, 1.0), _maps(0.05, 0.05, 0.05), SEEN, None).flatten()
+    assert 0.0 < found[0] < found[1] < found[2] < 1.0
+
+
+def test_falls_with_photometric_error_where_a_camera_sees():
+    support, error = _maps(0.9, 0.9, 0.9), _maps(0.0, 0.05, 0.5)
+    found = depth_confidence(support, error, SEEN, None).flatten()
+    assert found[0] > found[1] > found[2]
+    unseen = depth_confidence(support, error, ~SEEN, None).flatten()
+    assert unseen[0] == unseen[2] < found[0]
+
+
+def test_falls_with_the_spread_of_an_ensemble():
+    support, error = _maps(0.9, 0.9, 0.9), _maps(0.05, 0.05, 0.05)
+    found = depth_confidence(support, error, SEEN, _maps(0.0, 0.05, 0.5)).flatten()
+    assert found[0] > found[1] > found[2]
