@@ -12,8 +12,14 @@ from geodiff_plugin.objective import Objective, RightViews, Views
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.terms import MatchTarget
 
-OPTIONS = {"eta": 0.85, "pyramid_levels": 2, "exposure": True, "pull_to": "zero"}
-WEIGHTS = {"photometric": 1.0, "matches": 0.3, "prior_pull": 0.01, "anchor": 0.2}
+OPTIONS = {
+    "eta": 0.85,
+    "pyramid_levels": 2,
+    "exposure": True,
+    "pull_to": "zero",
+    "points_loss": "robust",
+}
+WEIGHTS = {"photometric": 1.0, "matches": 0.3, "points": 0.1, "prior_pull": 0.01, "anchor": 0.2}
 
 
 def double(x):
@@ -23,7 +29,13 @@ def double(x):
 def views_of(pair):
     left, right = (double(image).permute(2, 0, 1)[None] / 255 for image in (pair.left, pair.right))
     K, T = double(pair.K)[None], torch.linalg.inv(double(pair.E))[None]
-    return Views(left, K, (RightViews(right, K, T, plane_rays(K, K, T, (48, 64))),))
+    below = T.clone()
+    below[:, 1, 3] = -0.1
+    rights = tuple(RightViews(right, K, pose, plane_rays(K, K, pose, (48, 64))) for pose in (T, below))
+    known = torch.zeros(1, 1, 48, 64, dtype=torch.float64)
+    known[..., ::7, ::5] = 1.0
+    points = MatchTarget(known / double(pair.depth_m), known, double([0.005]))
+    return Views(left, K, rights, points=points)
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity", "log", "sqrt_disparity"])
