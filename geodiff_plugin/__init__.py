@@ -25,6 +25,7 @@ _MODULE_OF = {
     "Rig": "geodiff_plugin.types",
     "disable_geometry_guidance": "geodiff_plugin.pipeline",
     "enable_geometry_guidance": "geodiff_plugin.pipeline",
+    "guide_both_views": "geodiff_plugin.left_right",
     "load_bundled_prior": "geodiff_plugin.bundled",
     "load_prior": "geodiff_plugin.priors",
     "read_calibration": "geodiff_plugin.formats",

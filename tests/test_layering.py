@@ -37,6 +37,7 @@ LAYER = {
     "ensembling": 5,
     "output": 5,
     "pipeline": 5,
+    "left_right": 5,
     "evaluation": 6,
     "synthetic": 6,
     "bundled": 6,
