@@ -79,7 +79,14 @@ def read_inputs(right: Any, K: Any, E: Any, points: Any) -> list[ImageInputs]:
     count = len(batch)
     if count == 0:
         bad_value("right", "an image or a list with one image per left image", "an empty list")
-    return [_read_one(right, K, E, points, i, count) for i in range(count)]
+    found = [_read_one(right, K, E, points, i, count) for i in range(count)]
+    for name, given in (
+        ("right", [bool(one.rights) for one in found]),
+        ("points", [one.points is not None for one in found]),
+    ):
+        if any(given) and not all(given):
+            bad_value(name, "given for every left image or for none", f"None for {given.index(False)}")
+    return found
 
 
 def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int) -> ImageInputs:
@@ -108,7 +115,7 @@ def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int) -> Im
 
 def _is_nested_matrix(value: list) -> bool:
     """A matrix written as nested lists of numbers, as opposed to a list with one entry per image."""
-    return bool(value) and not isinstance(value[0], (tuple, np.ndarray, Tensor)) and np.ndim(value) == 2
+    return bool(value) and isinstance(value[0], list) and np.ndim(value) == 2
 
 
 def _entry(value: Any, name: str, i: int, count: int) -> Any:

@@ -4,8 +4,8 @@ From the root of this repository, with the environment of the tests::
 
     python -m tests.parity.marigold_dc_reference --authors DIR --out tests/parity/fixtures/marigold_dc.npz
 
-``DIR`` is a checkout of github.com/prs-eth/Marigold-DC (written with commit 77fa032). The configurations below
-are what the parity test builds our pipeline from. Their code is imported, not copied.
+``DIR`` is a checkout of github.com/prs-eth/Marigold-DC (written with commit 77fa032). The configurations
+below are what the parity test builds our pipeline from. Their code is imported, not copied.
 """
 
 from __future__ import annotations

@@ -233,6 +233,14 @@ def test_several_right_views_need_as_many_cameras():
         GeometryGuidance((RIGHT, RIGHT), (K, K), (np.eye(4), E, E))
 
 
+def test_every_image_of_a_batch_is_given_the_same_kind():
+    points = np.array([[0.0, 0.0, 2.0]])
+    with pytest.raises(ValueError, match="right must be given for every left image or for none"):
+        GeometryGuidance([RIGHT, None], K, [E, None], points=[points, points])
+    with pytest.raises(ValueError, match="points must be given for every left image or for none"):
+        GeometryGuidance([RIGHT, RIGHT], K, E, points=[points, None])
+
+
 def test_what_is_given_must_feed_what_is_asked():
     points = np.array([[0.0, 0.0, 2.0]])
     with pytest.raises(ValueError, match="weights must be with a term"):
