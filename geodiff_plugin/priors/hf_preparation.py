@@ -56,7 +56,7 @@ class Preparation:
         """Of the contents of ``preprocessor_config.json``.
 
         Raises:
-            ValueError: a processor, or a resampling, that is not known here.
+            ValueError: a processor, a resampling or a size that is not known here.
         """
         name = str(config.get("image_processor_type") or config.get("feature_extractor_type"))
         kind = name.removesuffix("Fast").removesuffix("Pil")
@@ -70,6 +70,9 @@ class Preparation:
             bad_value(
                 "resample of preprocessor_config.json", "2 (bilinear) or 3 (bicubic)", options["resample"]
             )
+        size = options["size"]
+        if size is not None and not isinstance(size, int) and not {"height", "width"} <= set(size):
+            bad_value("size of preprocessor_config.json", "a number or a height and a width", size)
         return cls(kind, options)
 
     @property

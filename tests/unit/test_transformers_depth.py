@@ -150,6 +150,8 @@ def test_processors_and_resamplings_that_are_not_known_are_refused():
         Preparation.from_config({"image_processor_type": "CLIPImageProcessor"})
     with pytest.raises(ValueError, match="resample"):
         Preparation.from_config({"image_processor_type": "GLPNImageProcessor", "resample": 0})
+    with pytest.raises(ValueError, match="size"):
+        Preparation.from_config({"image_processor_type": "DPTImageProcessor", "size": {"shortest_edge": 9}})
 
 
 def test_an_image_smaller_than_a_patch_is_refused():
