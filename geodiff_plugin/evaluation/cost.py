@@ -97,7 +97,7 @@ def run_cost(options: PairsOptions) -> None:
             )
             records += job.result()
     facts = run_facts(command_line(options, ("eval", "cost", "--data", str(options.data)), ()))
-    remarks = [*remarks_on(records, options), f"{settings.steps} denoising steps."]
+    remarks = [*remarks_on(records, options), f"Denoising steps of each: {settings.steps}."]
     page = write_tables(options.out, "Cost", facts, [cost_table(records)], remarks, "cost")
     if not options.quiet:
         sys.stdout.write(page)

@@ -264,7 +264,7 @@ def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, 
     monkeypatch.setattr(cost, "ProcessPoolExecutor", Inline)
     answer = invoke("cost", "--data", scene, "-o", tmp_path / "out")
     assert jobs == [[name] for name in cost.COST_METHODS]
-    assert "| plain pipeline | 1 |" in answer.stdout and "4 denoising steps" in answer.stdout
+    assert "| plain pipeline | 1 |" in answer.stdout and "Denoising steps of each: 4." in answer.stdout
     assert (tmp_path / "out" / "cost" / "samples.jsonl").is_file()
     assert (tmp_path / "out" / "cost.tex").is_file()
 
