@@ -97,16 +97,6 @@ def _lookup(
     return (cost * visible).sum(1) / count.clamp_min(1), count / depth_m.shape[1]
 
 
-def _is_rectified(volume: CostVolume) -> bool:
-    return all(
-        bool(
-            ((T[:3, :3] - torch.eye(3, device=T.device)).abs().amax() < 5e-3)
-            & (T[1:3, 3].norm() < 0.02 * T[0, 3].abs())
-        )
-        for _, _, T in volume.rights
-    )
-
-
 @torch.no_grad()
 def search_scale(
     volume: CostVolume,
@@ -135,7 +125,7 @@ def search_scale(
     height, width = volume.size
     at = _sample_positions(height, width, x.device)
     cost, seen = volume.cost.flatten(1)[:, at], volume.in_view.flatten(1)[:, at]
-    least = MIN_SEEN_RECTIFIED if _is_rectified(volume) else MIN_SEEN_POSED
+    least = MIN_SEEN_RECTIFIED if volume.rectified else MIN_SEEN_POSED
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
     grid = torch.linspace(0, 1, COARSE, device=x.device)
     log_low, log_span = math.log(low), math.log(high / low)

@@ -13,7 +13,7 @@ from functools import cached_property
 import torch
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.geometry import NEAREST_M, PlaneRays, plane_rays, sample_at
+from geodiff_plugin.geometry import NEAREST_M, PlaneRays, is_rectified, plane_rays, sample_at
 from geodiff_plugin.matching.census import census, census_cost
 
 __all__ = ["UNSEEN_COST", "CostVolume", "RightView", "inverse_depth_at_shift", "median_shift", "sweep_planes"]
@@ -58,6 +58,11 @@ class CostVolume:
     def plane_step(self) -> torch.Tensor:
         """``()`` float32, 1/m between neighbouring planes."""
         return self.inverse_depth[1] - self.inverse_depth[0]
+
+    @cached_property
+    def rectified(self) -> bool:
+        """Whether every right view is rectified with the left one."""
+        return all(bool(is_rectified(self.K, K, T)) for _, K, T in self.rights)
 
     @cached_property
     def reach_m(self) -> tuple[float, float]:
