@@ -1,4 +1,4 @@
-"""Run the authors' own code of E2E-FT on tiny networks with named weights, and keep slices of what it computes.
+"""Run the authors' own code of E2E-FT on tiny networks with named weights; keep slices of what it computes.
 
 ``docs/priors.md`` tells how to make the environment; then, from the root of this repository::
 

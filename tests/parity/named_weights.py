@@ -32,7 +32,9 @@ def named_state(shapes: dict[str, tuple[int, ...]], seed: int = 0) -> dict[str, 
     return {name: torch.from_numpy(weight(name, shape, seed)) for name, shape in shapes.items()}
 
 
-def fill(module: torch.nn.Module, prefix: str = "", rename=lambda name: name, seed: int = 0) -> torch.nn.Module:
+def fill(
+    module: torch.nn.Module, prefix: str = "", rename=lambda name: name, seed: int = 0
+) -> torch.nn.Module:
     """Set every parameter of a module, in place.
 
     Args:
