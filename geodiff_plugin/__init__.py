@@ -1,8 +1,8 @@
 """Metric depth from a diffusion prior and a second view (GeoDiff, ICCV 2025), as a diffusers plugin.
 
 Reading order, which is the path of one datum: ``types``, ``geometry``, ``metric``, ``denoising``,
-``terms``, ``objective``, ``matching``, ``scale_search``, ``updates``, ``evidence``, ``guidance``,
-``trajectory``, ``priors``, ``integration``, ``pipeline``.
+``terms``, ``objective``, ``matching``, ``scale_search``, ``refinement``, ``updates``, ``evidence``,
+``guidance``, ``trajectory``, ``algorithm``, ``priors``, ``integration``, ``pipeline``.
 
 >>> pipe = load_bundled_prior()
 >>> enable_geometry_guidance(pipe)
