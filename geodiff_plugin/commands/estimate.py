@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from geodiff_plugin.priors import find_adapter, find_prior
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["StopWatch", "guided_call", "load_guided_prior"]
+__all__ = ["StopWatch", "guided_call", "load_guided_prior", "loading_bars"]
 
 
 class StopWatch:
@@ -46,11 +46,16 @@ class StopWatch:
 
 
 @contextmanager
-def _no_loading_bars() -> Iterator[None]:
-    """Switch off the bars of diffusers and transformers, which show seconds of reading from disk."""
-    shown = [
-        library for library in (diffusers_logging, transformers_logging) if library.is_progress_bar_enabled()
-    ]
+def loading_bars(prior: str, quiet: bool = False) -> Iterator[None]:
+    """Switch off the bars of diffusers and transformers, but for a download, which is worth one.
+
+    Args:
+        prior: as typed.
+        quiet: switch them off for a download too.
+    """
+    on_disk = prior == "bundled" or Path(prior).is_dir() or Path(prior.partition(":")[2]).is_dir()
+    libraries = (diffusers_logging, transformers_logging) if on_disk or quiet else ()
+    shown = [library for library in libraries if library.is_progress_bar_enabled()]
     for library in shown:
         library.disable_progress_bar()
     try:
@@ -68,10 +73,8 @@ def load_guided_prior(arguments: DepthArguments, settings: Settings) -> Any:
     Raises:
         ValueError: no such prior, not cached, of no known kind; an option that it does not take.
     """
-    # A download is worth a bar, reading a folder is not.
     typed = arguments.prior
-    on_disk = typed == "bundled" or Path(typed).is_dir() or Path(typed.partition(":")[2]).is_dir()
-    with _no_loading_bars() if on_disk or arguments.quiet else nullcontext():
+    with loading_bars(typed, arguments.quiet):
         found = find_prior(typed)
         if not arguments.quiet:
             say(f"prior: {typed} ({found.key}; {found.licence})")

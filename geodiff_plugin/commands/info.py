@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from huggingface_hub import CacheNotFound, scan_cache_dir
 
+from geodiff_plugin.commands.estimate import loading_bars
 from geodiff_plugin.commands.report import versions
 from geodiff_plugin.priors import BUNDLED_FOLDER, PRIORS, FoundPrior, find_adapter, find_prior
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
@@ -61,6 +62,7 @@ def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
     most = "" if adapter.max_steps is None else f", at most {adapter.max_steps}"
     gradients = "denoised, full" if adapter.network_input is not None else "denoised"
     options = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
+    side = pipe.image_processor.config.vae_scale_factor
     return [
         ("prior", found.layout.name),
         ("adapter", found.key),
@@ -74,7 +76,7 @@ def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
         ("guided", "latent of a VAE" if "vae" in pipe.components else "pixels"),
         ("gradients", gradients),
         ("longer side", f"{pipe.default_processing_resolution} pixels by default"),
-        ("grid", f"sides are multiples of {pipe.image_processor.config.vae_scale_factor} pixels"),
+        ("grid", "sides of any length" if side == 1 else f"sides are multiples of {side} pixels"),
         ("options", ", ".join(options) or "none"),
     ]
 
@@ -89,7 +91,10 @@ def run_info(prior: str | None, space: str | None = None) -> None:
     Raises:
         ValueError: that prior does not exist, is not cached, is refused or of no known kind.
     """
-    described = [] if prior is None else _describe(find_prior(prior), space)
+    described = []
+    if prior is not None:
+        with loading_bars(prior):
+            described = _describe(find_prior(prior), space)
     rows = [*versions().items()]
     rows += [("device", line) for line in _devices()]
     rows += [("adapters", ", ".join(PRIORS)), ("bundled prior", _bundled())]

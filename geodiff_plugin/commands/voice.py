@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
 from typer.core import TyperGroup
 
 __all__ = ["EXIT_BAD_INPUT", "EXIT_INTERRUPTED", "DoorGroup", "collected_warnings", "is_bad_input", "say"]
@@ -25,7 +26,8 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 def say(line: str) -> None:
     """Print one line on stderr, where it does not mix with what a command answers."""
-    print(line, file=sys.stderr, flush=True)
+    tqdm.write(line, file=sys.stderr)  # above a progress bar, if there is one
+    sys.stderr.flush()
 
 
 def is_bad_input(error: BaseException) -> bool:
