@@ -1,0 +1,61 @@
+"""What makes a pipeline impossible to guide, said before anything is computed.
+
+Hop: pipeline, adapter, gradient -> nothing, or one clear error.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.priors import DepthPrior
+
+__all__ = ["check_network_input", "check_offloading"]
+
+
+def check_network_input(prior: DepthPrior) -> slice:
+    """Where z_t stands in the network's input.
+
+    Raises:
+        ValueError: nowhere, so that there is no gradient through the network.
+    """
+    if prior.network_input is None:
+        cure = "Its network is not told z_t, so only the clean latent can be moved."
+        bad_value("gradient", "'denoised' with this prior", "'full'", cure)
+    return prior.network_input
+
+
+def check_offloading(pipe: Any, gradient: str) -> None:
+    """Refuse offloading that takes weights away before the backward pass needs them.
+
+    Raises:
+        ValueError: sequential or group offloading, or model offloading with the full gradient.
+    """
+    modules = [m for m in pipe.components.values() if isinstance(m, torch.nn.Module)]
+    for module in modules:
+        for child in module.modules():
+            hook = getattr(child, "_hf_hook", None)
+            names = {type(h).__name__ for h in getattr(hook, "hooks", [hook] if hook else [])}
+            sequential = "AlignDevicesHook" in names and any(
+                getattr(h, "offload", False) for h in getattr(hook, "hooks", [hook])
+            )
+            registry = getattr(child, "_diffusers_hook", None)
+            grouped = registry is not None and any("group_offloading" in name for name in registry.hooks)
+            if sequential or grouped:
+                bad_value(
+                    "pipe",
+                    "without sequential or group CPU offloading while guided",
+                    f"{type(module).__name__} whose weights leave the device after each forward",
+                    "The backward pass needs them: use pipe.enable_model_cpu_offload() or pipe.to(device).",
+                )
+    if gradient == "full" and getattr(pipe, "_all_hooks", None):
+        bad_value(
+            "gradient",
+            "'denoised' with enable_model_cpu_offload()",
+            "'full'",
+            "Decoding pushes the U-Net to the CPU before its backward pass; "
+            "use gradient='denoised' or pipe.to(device).",
+        )
