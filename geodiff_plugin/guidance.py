@@ -50,9 +50,10 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
             U-Net to z_t, as the paper.
         rule: how a gradient moves the latent, key of ``RULES``.
         affine_rule: the same for scale and shift.
-        step_latents: step size of ``rule``.
+        step_latents: step size of ``rule``; ``None`` for 0.03 after a correction, else 0.1.
         step_affine: step size of ``affine_rule`` on the raw scale and shift.
-        inner_steps: updates per denoising step; 0 leaves only the search for the scale.
+        inner_steps: updates per denoising step; ``None`` for 5 after a correction, else 40; 0 leaves the search
+            and the correction.
         min_steps: denoising steps that a guided call takes at least when it names no ``num_inference_steps``;
             a pipeline's own default may be 1, which leaves nothing for the guidance to come back to.
         optimize_latents: ``False`` learns scale and shift only (S5.3, Table 4), latents stay untouched.
@@ -106,9 +107,9 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         gradient: str = "denoised",
         rule: str = "adam",
         affine_rule: str = "adam",
-        step_latents: float = 0.1,
+        step_latents: float | None = None,
         step_affine: float = 0.01,
-        inner_steps: int = 40,
+        inner_steps: int | None = None,
         min_steps: int = 4,
         optimize_latents: bool = True,
         start: float = 0.0,
@@ -137,6 +138,11 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
             check_choice(name, "a key of weights", TERMS)
             check_number(weight, f"weights[{name!r}]", 0.0, float("inf"))
         stop = check_number(stop, "stop", 0.0, 1.0)
+        # What matches and points can be encoded into is near already; else the gradient has the whole way.
+        known = weights.get("matches") or (weights.get("points") and points is not None)
+        near = bool(correct and known and optimize_latents and gradient == "denoised")
+        inner_steps = (5 if near else 40) if inner_steps is None else inner_steps
+        step_latents = (0.03 if near else 0.1) if step_latents is None else step_latents
         # Registered by hand: the diffusers decorator zips positional arguments with the registered
         # names, and would save the right image as the first hyperparameter.
         self.register_to_config(

@@ -19,14 +19,14 @@ from geodiff_plugin.terms import MatchTarget
 __all__ = ["Refined", "refine_depth"]
 
 #: A match further than this factor from the given depth is an outlier, whatever its confidence.
-GATE = 10.0
+GATE = 3.0
 #: Relative error of a perfect match: below it one match is as good as another.
 MATCH_NOISE = 0.02
 #: Residual, in standard deviations of a match, from which it counts for less (Cauchy).
 CAUCHY = 2.0
 #: Weight of the correction's slope against a sure match, and of the correction itself: what is far from every
 #: match keeps its depth.
-SMOOTHNESS, INERTIA = 0.7, 1e-3
+SMOOTHNESS, INERTIA = 0.7, 3e-3
 #: Steps in brightness and in log depth across which a correction does not spread.
 IMAGE_EDGE, DEPTH_EDGE, LEAST_LINK = 0.1, 0.1, 1e-3
 #: Reweighted solves, and conjugate-gradient steps of each: fixed numbers, so that no device is waited for.
@@ -58,7 +58,7 @@ def refine_depth(depth_m: Tensor, target: MatchTarget, left_01: Tensor) -> Refin
 
     Returns:
         ``Refined``. With ``u`` the log of the factor on inverse depth and ``r`` what each match asks of it,
-        the minimiser of ``sum w (u - r)^2 + 0.7 sum g |grad u|^2 + 0.001 sum u^2``, where ``w`` is the
+        the minimiser of ``sum w (u - r)^2 + 0.7 sum g |grad u|^2 + 0.003 sum u^2``, where ``w`` is the
         confidence over the match's relative variance, robustly reweighted, and ``g`` falls at edges of the
         image and of the given depth.
     """
