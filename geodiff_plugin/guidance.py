@@ -52,8 +52,8 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         affine_rule: the same for scale and shift.
         step_latents: step size of ``rule``; ``None`` for 0.03 after a correction, else 0.1.
         step_affine: step size of ``affine_rule`` on the raw scale and shift.
-        inner_steps: updates per denoising step; ``None`` for 5 after a correction, else 40; 0 leaves the search
-            and the correction.
+        inner_steps: updates per denoising step; ``None`` for 5 after a correction, else 40; 0 leaves search
+            and correction alone.
         min_steps: denoising steps that a guided call takes at least when it names no ``num_inference_steps``;
             a pipeline's own default may be 1, which leaves nothing for the guidance to come back to.
         optimize_latents: ``False`` learns scale and shift only (S5.3, Table 4), latents stay untouched.
