@@ -64,7 +64,8 @@ def score_pairs(
         depth, valid = np.asarray(sample.depth_m), np.asarray(sample.valid)
         image = torch.from_numpy(np.ascontiguousarray(sample.left)).permute(2, 0, 1)[None].float() / 255.0
         prediction = predict(pipeline, image, steps, resolution)[0]
-        found = evaluate_depth(align(prediction, depth, valid), depth, valid)
+        aligned = align(prediction, depth, valid, pipeline.config.prediction_type)
+        found = evaluate_depth(aligned, depth, valid)
         rows.append(
             {
                 "dataset": sample.dataset,
@@ -123,7 +124,8 @@ def main(argv: list[str] | None = None) -> None:
                 print(f"{options.scenes} held-out scenes: AbsRel {abs_rel:.3f}, delta1 {delta1:.3f}")
     if options.sheet:
         images, depth = held_out(6)
-        contact_sheet(images, depth, predict(pipeline, images), options.sheet, columns=1)
+        space = pipeline.config.prediction_type
+        contact_sheet(images, depth, predict(pipeline, images), options.sheet, space, columns=1)
 
 
 if __name__ == "__main__":

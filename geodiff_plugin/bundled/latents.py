@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from diffusers import AutoencoderKL
 from safetensors.torch import load_file, save_file
 
-from geodiff_plugin.bundled.data import FAR_M, SHARD, jitter, normalise_depth, read_shard, shards
+from geodiff_plugin.bundled.data import SHARD, jitter, normalise_disparity, read_shard, shards
 
 __all__ = ["LatentStore", "encode_scenes", "resize_scenes"]
 
@@ -47,7 +47,7 @@ def encode_scenes(
     """
     device = vae.device
     picture = 2.0 * jitter(images.to(device), generator) - 1.0
-    target = normalise_depth(depth_m.to(device)).expand(-1, 3, -1, -1)
+    target = normalise_disparity(depth_m.to(device)).expand(-1, 3, -1, -1)
     if flip:
         picture, target = picture.flip(-1), target.flip(-1)
     with torch.autocast(device.type, dtype=torch.bfloat16):
@@ -85,7 +85,7 @@ class LatentStore:
     ) -> None:
         self.cache, self.vae, self.divisor, self.variants = Path(cache), vae, divisor, variants
         self.rank, self.world, self.fresh = rank, world, fresh
-        self._folder = self.cache / f"latents-{_fingerprint(vae)}-{divisor}-{FAR_M:.0f}m"
+        self._folder = self.cache / f"latents-{_fingerprint(vae)}-{divisor}-disparity"
         self._items: list[tuple[torch.Tensor, torch.Tensor]] = []
         self._known: set[int] = set()
 

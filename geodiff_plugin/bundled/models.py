@@ -137,7 +137,7 @@ def assemble(
         scheduler=build_scheduler(),
         text_encoder=text[0],
         tokenizer=text[1],
-        prediction_type="depth",
+        prediction_type="disparity",
         scale_invariant=True,
         shift_invariant=True,
         default_denoising_steps=steps,
@@ -217,7 +217,9 @@ def _half_copy(part: object) -> object:
     else:
         # from_config falls back to the class's default for what was a default when the module was built
         # (scaling_factor), so the configuration is written once more.
-        copy = type(part).from_config(part.config)
-        copy.register_to_config(**{key: value for key, value in part.config.items() if key[0] != "_"})
+        # Names that start with an underscore say where it was loaded from, which is nobody's business.
+        told = {key: value for key, value in part.config.items() if key[0] != "_"}
+        copy = type(part).from_config(told)
+        copy.register_to_config(**told)
     copy.load_state_dict({name: value.detach().cpu() for name, value in part.state_dict().items()})
     return copy.half().eval()

@@ -77,7 +77,8 @@ class Reporter:
             log.write(json.dumps({key: round(value, 5) for key, value in line.items()}) + "\n")
         shown = slice(0, _SHEET)
         predictions = predict(self._pipeline, images[shown], 1, resolution)
-        contact_sheet(images[shown], depth[shown], predictions, out / "contact.png")
+        space = self._pipeline.config.prediction_type
+        contact_sheet(images[shown], depth[shown], predictions, out / "contact.png", space)
         self._next = progress.seconds + 60 * self._options.validate_minutes
         return line
 

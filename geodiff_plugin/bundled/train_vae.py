@@ -16,7 +16,7 @@ from diffusers import AutoencoderKL
 from safetensors.torch import load_file, save_file
 from tqdm import tqdm
 
-from geodiff_plugin.bundled.data import jitter, normalise_depth, read_shard, shards
+from geodiff_plugin.bundled.data import jitter, normalise_disparity, read_shard, shards
 from geodiff_plugin.bundled.models import build_vae
 from geodiff_plugin.bundled.schedule import learning_rate
 
@@ -42,7 +42,7 @@ class _Crops:
                 self._held.pop(next(iter(self._held)))
             index = fresh[0] if len(self._held) < self._keep else fresh[-1]
             images, depth = read_shard(self._cache, index)
-            self._held[index] = (images, normalise_depth(depth))
+            self._held[index] = (images, normalise_disparity(depth))
         names = list(self._held)
         images, depth = self._held[names[int(torch.randint(len(names), (), generator=generator))]]
         side = min(side, *images.shape[-2:])
@@ -182,7 +182,7 @@ def finish_vae(vae: AutoencoderKL, cache: Path, most: int = 8) -> float:
     vae.eval().requires_grad_(False)
     latents = []
     for index in shards(cache)[:most]:
-        target = normalise_depth(read_shard(cache, index)[1]).expand(-1, 3, -1, -1).to(vae.device)
+        target = normalise_disparity(read_shard(cache, index)[1]).expand(-1, 3, -1, -1).to(vae.device)
         latents.append(vae.encode(target).latent_dist.mode().float().flatten())
     factor = round(1.0 / float(torch.cat(latents).std().clamp(min=1e-6)), 5)
     vae.register_to_config(scaling_factor=factor)

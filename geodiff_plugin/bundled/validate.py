@@ -63,7 +63,8 @@ def score_scenes(
     for prediction, depth in zip(predictions, depth_m[:, 0].numpy(), strict=True):
         valid = depth < SCORED_M
         if valid.sum() > 100:
-            found = evaluate_depth(align(prediction, depth, valid), depth, valid)
+            aligned = align(prediction, depth, valid, pipeline.config.prediction_type)
+            found = evaluate_depth(aligned, depth, valid)
             scores.append((found["abs_rel"], found["delta1"]))
     return tuple(float(value) for value in np.mean(scores, axis=0))
 
@@ -73,6 +74,7 @@ def contact_sheet(
     depth_m: torch.Tensor,
     predictions: np.ndarray,
     path: str | Path,
+    space: str,
     columns: int = 3,
 ) -> None:
     """Image, truth and prediction side by side, one colour scale a scene, as a PNG.
@@ -82,13 +84,14 @@ def contact_sheet(
         depth_m: ``(N, 1, H, W)`` metres, inf for sky.
         predictions: ``(N, H, W)`` relative depth.
         path: file to write, replaced whole.
+        space: what the predictions are affine in, see ``alignment.align``.
         columns: scenes in a row.
     """
     tiles = []
     for image, depth, prediction in zip(images_01, depth_m[:, 0].numpy(), predictions, strict=True):
         valid = depth < SCORED_M
         low, high = np.quantile(depth[valid], [0.02, 0.98]) if valid.any() else (0.0, 1.0)
-        fitted = align(prediction, depth, valid) if valid.sum() > 1 else prediction
+        fitted = align(prediction, depth, valid, space) if valid.sum() > 1 else prediction
         maps = [np.where(valid, depth, high), fitted]
         pictures = [_colour((m - low) / max(high - low, 1e-6)) for m in maps]
         photo = (image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)

@@ -19,9 +19,10 @@ def test_folder_is_small_and_holds_no_pickle():
     assert {path.suffix for path in files} <= {".safetensors", ".json", ".md", ".txt"}
     index = json.loads((PRIOR_FOLDER / "model_index.json").read_text())
     assert index["_class_name"] == "MarigoldDepthPipeline"
-    assert index["prediction_type"] == "depth"
+    assert index["prediction_type"] == "disparity"
     assert index["scale_invariant"] and index["shift_invariant"]
     assert index["default_denoising_steps"] >= 1 and index["default_processing_resolution"] % 4 == 0
+    assert not any("_name_or_path" in path.read_text() for path in PRIOR_FOLDER.rglob("*.json"))
     scheduler = json.loads((PRIOR_FOLDER / "scheduler" / "scheduler_config.json").read_text())
     assert scheduler["timestep_spacing"] == "trailing" and scheduler["rescale_betas_zero_snr"]
 
@@ -72,8 +73,8 @@ def test_ground_is_nearer_below():
     pipeline = load_bundled_prior()
     rows = torch.linspace(0.0, 1.0, 96)[:, None].expand(96, 128)
     floor = torch.where(rows > 0.5, 0.35 + 0.1 * torch.sin(60.0 / (rows - 0.45)), 0.85)
-    depth = pipeline(floor.expand(1, 3, 96, 128).clone(), processing_resolution=0).prediction[0, ..., 0]
-    assert depth[-8:].mean() < depth[:40].mean()
+    nearness = pipeline(floor.expand(1, 3, 96, 128).clone(), processing_resolution=0).prediction[0, ..., 0]
+    assert nearness[-8:].mean() > nearness[:40].mean()
 
 
 @pytest.mark.slow

@@ -7,29 +7,30 @@ from geodiff_plugin.bundled import data
 from geodiff_plugin.bundled.latents import resize_scenes
 
 
-def test_depth_target_spans_the_quantiles_and_puts_the_sky_farthest():
-    depth = torch.linspace(1.0, 11.0, 1000).reshape(1, 1, 20, 50).clone()
+def test_target_spans_the_quantiles_of_inverse_depth_and_puts_the_sky_farthest():
+    inverse = torch.linspace(0.1, 1.1, 1000).reshape(1, 1, 20, 50).clone()
+    depth = 1.0 / inverse
     depth[..., 0, :5] = float("inf")
-    target = data.normalise_depth(depth)
+    target = data.normalise_disparity(depth)
     assert target.min() == -1.0 and target.max() == 1.0
-    assert (target[..., 0, :5] == 1.0).all()
-    assert target[0, 0, 10, 25] == pytest.approx(2 * (float(depth[0, 0, 10, 25]) - 1.25) / 9.55 - 1, abs=0.02)
+    assert (target[..., 0, :5] == -1.0).all()
+    assert target[0, 0, 10, 25] == pytest.approx(
+        2 * (float(inverse[0, 0, 10, 25]) - 0.125) / 0.955 - 1, abs=0.02
+    )
 
 
-def test_depth_target_does_not_change_with_metres_below_the_cut():
-    depth = 1.0 + torch.rand(2, 1, 8, 9, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(data.normalise_depth(depth), data.normalise_depth(3.0 * depth + 2.0))
-
-
-def test_depth_target_is_cut_far_away():
-    depth = torch.linspace(1.0, 500.0, 600).reshape(1, 1, 20, 30)
-    far = depth > data.FAR_M
-    assert (data.normalise_depth(depth)[far] == 1.0).all()
+def test_target_does_not_change_with_scale_nor_with_shift_of_inverse_depth():
+    inverse = 1.0 + torch.rand(2, 1, 8, 9, generator=torch.Generator().manual_seed(0))
+    first = data.normalise_disparity(1.0 / inverse)
+    torch.testing.assert_close(
+        first, data.normalise_disparity(1.0 / (3.0 * inverse + 2.0)), atol=1e-4, rtol=0
+    )
+    torch.testing.assert_close(first, data.normalise_disparity(40.0 / inverse), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("value", [3.0, float("inf")])
-def test_depth_target_of_a_scene_without_spread_is_zero(value):
-    assert (data.normalise_depth(torch.full((1, 1, 4, 5), value)) == 0.0).all()
+def test_target_of_a_scene_without_spread_is_zero(value):
+    assert (data.normalise_disparity(torch.full((1, 1, 4, 5), value)) == 0.0).all()
 
 
 def test_jitter_is_seeded_and_stays_in_range():

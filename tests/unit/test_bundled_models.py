@@ -106,7 +106,7 @@ def test_saved_folder_loads_silently_and_keeps_its_card(tmp_path, capfd):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["prior"]
     assert (again.default_denoising_steps, again.default_processing_resolution) == (2, 96)
     assert again.vae.config.scaling_factor == 0.25
-    assert again.config.prediction_type == "depth" and again.dtype == torch.float32
+    assert again.config.prediction_type == "disparity" and again.dtype == torch.float32
     torch.testing.assert_close(
         again.unet.conv_in.weight, pipeline.unet.conv_in.weight.half().float(), rtol=0, atol=0
     )

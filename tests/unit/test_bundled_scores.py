@@ -1,5 +1,7 @@
 """What the prior is measured by, and what it is measured against."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -33,6 +35,7 @@ class _Oracle:
     """Stands for a pipeline and answers with a fixed affine map of the image's red channel."""
 
     device = torch.device("cpu")
+    config = SimpleNamespace(prediction_type="depth")
 
     def __call__(self, image, num_inference_steps, processing_resolution, generator):
         self.asked = (num_inference_steps, processing_resolution)
@@ -54,7 +57,7 @@ def test_contact_sheet_has_three_pictures_a_scene(tmp_path):
     depth = torch.from_numpy(_ramp()).float()[None, None].repeat(4, 1, 1, 1)
     images, predictions = depth.repeat(1, 3, 1, 1) / 30.0, depth[:, 0].numpy().copy()
     depth[0, 0, 0, :] = float("inf")
-    validate.contact_sheet(images, depth, predictions, tmp_path / "sheet.png", columns=3)
+    validate.contact_sheet(images, depth, predictions, tmp_path / "sheet.png", "depth", columns=3)
     with Image.open(tmp_path / "sheet.png") as sheet:
         assert sheet.size == (3 * 3 * 18, 2 * 12)
 
