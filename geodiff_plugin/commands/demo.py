@@ -53,7 +53,7 @@ def run_demo(out: Path, quiet: bool) -> None:
     run = estimate_and_write(arguments)
     pair = read_demo_pair()
     plain = run.pipe(pair.left, generator=torch.Generator("cpu").manual_seed(arguments.seed))
-    aligned_m = align(single_map(plain.prediction), pair.depth_m, pair.valid)
+    aligned_m = align(single_map(plain.prediction), pair.depth_m, pair.valid, run.pipe.config.prediction_type)
     guided_m = single_map(run.output.prediction)
     print(f"{'':<28}{'AbsRel':>8}{'delta1':>8}{'RMSE, m':>9}")
     for name, depth_m in (
