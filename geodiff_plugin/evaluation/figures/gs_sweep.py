@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from geodiff_plugin._checks import check_number
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache
@@ -20,7 +21,7 @@ from geodiff_plugin.evaluation.figures.canvas import COLOURS, new_figure, plain_
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import warp_right_to_left
-from geodiff_plugin.metric import SPACES, smooth_floor
+from geodiff_plugin.metric import GROWS_WITH_DEPTH, SPACES, smooth_floor
 from geodiff_plugin.terms import masked_mean, photometric_map
 
 __all__ = ["Sweep", "draw_gs_sweep", "sweep_g_s"]
@@ -64,6 +65,8 @@ def _shown(loss: np.ndarray, abs_rel: np.ndarray) -> tuple[int, ...]:
 def sweep_g_s(sample: StereoSample, relative: np.ndarray, space: str, largest_m: float) -> Sweep:
     """Scale a relative map by every candidate: ``x = g_s * x_rel``, without shift.
 
+    A map that falls with depth has no depth at 0 without a shift: it gets that of raw scale and shift 0.
+
     Args:
         sample: with truth.
         relative: ``(H, W)`` the prior's map, about [0, 1].
@@ -77,11 +80,13 @@ def sweep_g_s(sample: StereoSample, relative: np.ndarray, space: str, largest_m:
     cameras = [torch.as_tensor(matrix, dtype=torch.float32)[None] for matrix in cameras]
     x = smooth_floor(torch.from_numpy(np.asarray(relative, np.float32))[None, None])
     candidates = torch.from_numpy(np.geomspace(1.0, largest_m, CANDIDATES).astype(np.float32))
-    one, zero = torch.ones(1), torch.zeros(1)
+    scale, shift = torch.ones(1), torch.zeros(1)
+    if space not in GROWS_WITH_DEPTH:
+        scale = shift = F.softplus(torch.zeros(1))
     losses, shares, errors = [], [], []
 
     def at(g_s: torch.Tensor) -> tuple[torch.Tensor, Any]:
-        depth_m = SPACES[space](x, one, zero, g_s)
+        depth_m = SPACES[space](x, scale, shift, g_s)
         return depth_m, warp_right_to_left(right, depth_m, *cameras)
 
     for g_s in candidates:
