@@ -150,6 +150,8 @@ def test_interrupt_of_a_running_process(command, pair_files):
         cwd=pair_files.folder,
         stderr=subprocess.PIPE,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
+        # A job in the background of a script ignores Ctrl-C, and hands that down.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     heard = b""
     deadline = time.monotonic() + 120
