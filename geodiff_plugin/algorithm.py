@@ -112,6 +112,7 @@ def _update(
             if k == 0:
                 anchor = z0_hat.detach() if anchor is None else anchor
                 trajectory.settle_scale(x0.detach(), moment)  # g_s*, S7.3
+                trajectory.test_visibility(x0.detach())
             s_hat, t_hat = (
                 v.detach().requires_grad_(updates > 0)
                 for v in (trajectory.affine.s_hat, trajectory.affine.t_hat)

@@ -84,7 +84,6 @@ class Trajectory:
             (self._search_one_number if self.config.search == "one-number" else self._span_points)(x)
         wide, narrow = self.config.gate
         self._gate_matches(x, wide + (narrow - wide) * fraction)
-        self._test_visibility(x)
 
     def _search_one_number(self, x: Tensor) -> None:
         zero = x.new_zeros(x.shape[0])
@@ -160,8 +159,12 @@ class Trajectory:
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         self.matches = replace(known, confidence=gate_matches(known, depth_m, factor))
 
-    def _test_visibility(self, x: Tensor) -> None:
-        """What this estimate hides from the right cameras; it holds for the updates of the round."""
+    def test_visibility(self, x: Tensor) -> None:
+        """Find what an estimate hides from the right cameras; it holds for the updates of the round.
+
+        Args:
+            x: ``(B, 1, h, w)`` float32 relative map that the updates start from, its scale settled.
+        """
         if self.config.z_test and self.config.weights.get("photometric") and self.objective.views.rights:
             self.hidden = self.objective.hidden(x, self.affine)
 

@@ -31,7 +31,7 @@ class Stage:
 
 
 SCRATCH = (Stage(0.45, 2, 0.9), Stage(0.65, 2, 0.5), Stage(1.0, 1, 0.5))
-CONTINUED = (Stage(0.55, 2, 0.8), Stage(1.0, 1, 0.6))
+CONTINUED = (Stage(0.65, 2, 0.8), Stage(1.0, 1, 0.6))
 
 
 def stage_at(fraction: float, continued: bool) -> Stage:
