@@ -54,13 +54,13 @@ def guided_step(
     config, z, anchor = trajectory.config, leaf, None
     rounds = [f for f in fractions if trajectory.is_active(f)]
     moves = config.optimize_latents and bool(rounds)
-    for moment in rounds or fractions[:1]:
+    for _ in rounds or fractions[:1]:
         if moves and config.correct and encode is not None:
-            moved = _corrected(trajectory, z, decode, encode, moment)
+            moved = _corrected(trajectory, z, decode, encode)
             anchor = moved if anchor is None else anchor + moved - z
             z = moved
         updates = config.inner_steps if rounds else 0
-        z, anchor, first = _update(trajectory, z, anchor, z0_of, decode, eps, moment, updates)
+        z, anchor, first = _update(trajectory, z, anchor, z0_of, decode, eps, updates)
         trajectory.report(step, timestep, first)
     return (z - leaf).detach()
 
@@ -70,7 +70,6 @@ def _corrected(
     z0: Tensor,
     decode: Callable[[Tensor], Tensor],
     encode: Callable[[Tensor], Tensor],
-    moment: float,
 ) -> Tensor:
     """``z0`` moved by what the correction of its map changes in the code.
 
@@ -79,7 +78,7 @@ def _corrected(
     """
     with torch.no_grad():
         x0 = decode(z0)
-        trajectory.settle_scale(x0, moment)
+        trajectory.settle_scale(x0)
         corrected = trajectory.corrected(x0)
         return z0 if corrected is x0 else z0 + encode(corrected) - encode(x0)
 
@@ -91,7 +90,6 @@ def _update(
     z0_of: Callable[[Tensor], Tensor],
     decode: Callable[[Tensor], Tensor],
     eps: Tensor,
-    moment: float,
     updates: int,
 ) -> tuple[Tensor, Tensor, Loss]:
     """A round of gradient updates of latent, scale and shift.
@@ -111,7 +109,7 @@ def _update(
             x0 = decode(z0_hat)  # (B, 1, h', w'), D(z0_hat)
             if k == 0:
                 anchor = z0_hat.detach() if anchor is None else anchor
-                trajectory.settle_scale(x0.detach(), moment)  # g_s*, S7.3
+                trajectory.settle_scale(x0.detach())  # g_s*, S7.3
                 trajectory.test_visibility(x0.detach())
             s_hat, t_hat = (
                 v.detach().requires_grad_(updates > 0)

@@ -23,7 +23,6 @@ from geodiff_plugin.matching import (
     find_matches,
     mirrored_pose_preferred,
     points_to_matches,
-    with_points,
 )
 from geodiff_plugin.objective import RightViews, Views
 from geodiff_plugin.terms import MatchTarget
@@ -47,9 +46,9 @@ class Evidence:
             points are known.
         volume: plane-sweep costs, or ``None`` where the configuration does not search it.
         matches: aggregated, left-right checked, or ``None`` where no term asks.
-        sweep_matches: the same on the grid of the sweep, which is finer for wide images, with known points in
-            their place (``matching.with_points``); the points where there are no matches.
+        sweep_matches: the same on the grid of the sweep, which is finer for wide images.
         points: depths that the user knows, in the form of matches, or ``None``.
+        sweep_points: the same on the grid of ``sweep_matches``, where there are any.
         warnings: sentences for the user.
     """
 
@@ -60,6 +59,7 @@ class Evidence:
     matches: Matches | None
     sweep_matches: Matches | None
     points: Matches | None = None
+    sweep_points: Matches | None = None
     warnings: tuple[str, ...] = ()
 
 
@@ -111,7 +111,7 @@ def prepare_evidence(
     """
     left, K_loss = resize_long_edge(left_01, K_left, loss_resolution)
     size, size_loss = tuple(left_01.shape[-2:]), tuple(left.shape[-2:])
-    volume, found, matches, known, warnings = None, None, None, None, []
+    volume, found, matches, known, sweep_known, warnings = None, None, None, None, None, []
     if rights and (needs_volume or needs_matches):
         # The sweep chooses its own grid, finer than that of the losses for wide images.
         volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range)
@@ -123,11 +123,11 @@ def prepare_evidence(
     if points is not None:
         known, left_out = points_to_matches(points, K_left, size, K_loss, size_loss)
         grid = (K_loss, size_loss) if found is None else (found.K, found.size)
-        found = with_points(found, points_to_matches(points, K_left, size, *grid)[0])
+        sweep_known, _ = points_to_matches(points, K_left, size, *grid)
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
     small = tuple((*_as_fine_as(image, K, K_loss), T) for image, K, T in rights)
-    return Evidence(left, K_loss, small, volume, matches, found, known, tuple(warnings))
+    return Evidence(left, K_loss, small, volume, matches, found, known, sweep_known, tuple(warnings))
 
 
 def _as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:

@@ -72,10 +72,12 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
             nearest and the farthest point, as Marigold-DC.
         g_s_range: metres, the candidates of the one-number search.
         depth_range: ``(near, far)`` metres that bound the search, or ``None``.
-        gate: factors around the estimate within which matches are believed, at the first and last step.
+        gate: factor around the estimate within which matches are believed, > 1.
         loss_resolution: pixels, bound of the longer side of the grid that losses are computed on.
         correct: at every step, before the updates, bring the decoded map to its matches and encode what that
             changes (gradient ``"denoised"`` only); the gradient then has the rest to do.
+        doubt: matches behind what the prior's first estimate says, over a region and by more than chance, lose
+            their say: mirrors and glass (``matching.contradiction``).
         refine: bring the result to its matches at full resolution, edge-aware (``refinement.refine_depth``);
             without a ``matches`` term there is nothing to bring it to.
         respace: run a ``leading`` DDIM schedule as ``trailing`` for guided calls.
@@ -124,9 +126,10 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         search: str = "volume",
         g_s_range: tuple[float, float] = (1.0, 80.0),
         depth_range: tuple[float, float] | None = None,
-        gate: tuple[float, float] = (20.0, 3.0),
+        gate: float = 3.0,
         loss_resolution: int = 640,
         correct: bool = True,
+        doubt: bool = True,
         refine: bool = True,
         respace: bool = True,
         points_loss: str = "robust",
@@ -166,9 +169,10 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
             search=check_choice(search, "search", SEARCHES),
             g_s_range=check_range(g_s_range, "g_s_range"),
             depth_range=check_range(depth_range, "depth_range"),
-            gate=check_range(gate[::-1], "gate, last before first,")[::-1],
+            gate=check_number(gate, "gate", 1.0, 1e6),
             loss_resolution=check_number(loss_resolution, "loss_resolution", 32, 1 << 16, integer=True),
             correct=bool(correct),
+            doubt=bool(doubt),
             refine=bool(refine),
             respace=bool(respace),
             points_loss=check_choice(points_loss, "points_loss", POINTS_LOSSES),

@@ -7,6 +7,7 @@ Paper: Eq. 14's re-rendered left image, as a per-pixel report.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -20,8 +21,9 @@ from geodiff_plugin.geometry.cameras import resize_intrinsics
 from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.integration.run import GuidedRun
-from geodiff_plugin.matching import RightView
+from geodiff_plugin.matching import RightView, gate_matches, with_points
 from geodiff_plugin.refinement import refine_depth
+from geodiff_plugin.terms import MatchTarget
 from geodiff_plugin.terms.exposure import match_exposure
 from geodiff_plugin.types import MetricDepthOutput
 
@@ -106,14 +108,27 @@ def _as_maps(values: Any) -> Tensor:
 
 def _refined(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> tuple[Tensor, Tensor | None]:
     """The depth of every image brought to what is known, and how far that decided it."""
-    targets = [match_target([evidence.sweep_matches]) for evidence in run.evidence]
-    if not run.config.refine or any(target is None for target in targets):
+    count = len(run.evidence)
+    known = [_known(run, i, depth) for i, depth in enumerate(depth_m.split(1))]
+    if not run.config.refine or any(target is None for target in known):
         return depth_m, None
-    refined = [
-        refine_depth(depth, target, left)
-        for target, depth, left in zip(targets, depth_m.split(1), lefts_01.split(1), strict=True)
-    ]
+    refined = [refine_depth(depth_m[i : i + 1], known[i], lefts_01[i : i + 1]) for i in range(count)]
     return torch.cat([r.depth_m for r in refined]), torch.cat([r.support for r in refined])
+
+
+def _known(run: GuidedRun, image: int, depth_m: Tensor) -> MatchTarget | None:
+    """What a depth ``(1, 1, H, W)`` is brought to: the matches that it and the prior believe, and points."""
+    evidence = run.evidence[image]
+    matches, points = match_target([evidence.sweep_matches]), match_target([evidence.sweep_points])
+    if matches is not None:
+        size = tuple(matches.confidence.shape[-2:])
+        depth = F.interpolate(depth_m, size, mode="bilinear", align_corners=False)
+        own = [t.belief[i] for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
+        belief = torch.stack(own).mean(0, keepdim=True)  # over the members of an ensemble
+        belief = F.interpolate(belief, size, mode="bilinear", align_corners=False)
+        gated = gate_matches(matches, depth, run.config.gate)
+        matches = replace(matches, confidence=belief * gated)
+    return matches if points is None else with_points(matches, points)
 
 
 def _reprojection(

@@ -31,6 +31,7 @@ PAPER: dict[str, Any] = {
     "pull_to": "zero",
     "search": "one-number",
     "correct": False,
+    "doubt": False,
     "refine": False,
 }
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import log
 
 import torch
 import torch.nn.functional as F
@@ -18,8 +17,6 @@ from geodiff_plugin.terms import MatchTarget
 
 __all__ = ["Refined", "refine_depth"]
 
-#: A match further than this factor from the given depth is an outlier, whatever its confidence.
-GATE = 3.0
 #: Relative error of a perfect match: below it one match is as good as another.
 MATCH_NOISE = 0.02
 #: Residual, in standard deviations of a match, from which it counts for less (Cauchy).
@@ -53,7 +50,7 @@ def refine_depth(depth_m: Tensor, target: MatchTarget, left_01: Tensor) -> Refin
 
     Args:
         depth_m: ``(B, 1, H, W)`` metres, at any resolution.
-        target: matches or known points of the same images, on any grid.
+        target: matches or known points of the same images, on any grid; the gate was applied by the caller.
         left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
 
     Returns:
@@ -68,7 +65,7 @@ def refine_depth(depth_m: Tensor, target: MatchTarget, left_01: Tensor) -> Refin
     known, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
     wanted = (known * coarse).log()
     noise = ((step / known) ** 2 + MATCH_NOISE**2).sqrt()
-    trusted = target.confidence * (wanted.abs() < log(GATE)) * (MATCH_NOISE / noise) ** 2
+    trusted = target.confidence * (MATCH_NOISE / noise) ** 2
     wanted = torch.where(trusted > 0, wanted, torch.zeros_like(wanted))
     across, down = (_links(guide, coarse, axis) for axis in (-1, -2))
     # Two right-hand sides in one solve: the correction, and a field of ones that shows where it is decided.

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.evidence import Evidence, chunk_views
-from geodiff_plugin.matching import gate_matches, with_points
+from geodiff_plugin.matching import believe_before_prior, gate_matches, with_points
 from geodiff_plugin.metric import GROWS_WITH_DEPTH, AffineState, MetricMap, smooth_floor
 from geodiff_plugin.objective import Loss, Objective
 from geodiff_plugin.point_scale import depth_span, fit_to_points
@@ -46,6 +46,7 @@ class Trajectory:
         affine: current scale, shift and g_s, ``(B,)`` each; ``None`` before the first search.
         history: one ``StepReport`` a step.
         last_x: ``(B, 1, h, w)`` the relative map of the latest evaluation, no graph.
+        belief: ``(B, 1, H, W)`` in [0, 1], what the prior's first estimate leaves of each match, or ``None``.
         hidden: ``(B, V, 1, H, W)`` bool, what the estimate hides from the right cameras, or ``None``.
         on_edge: ``(B,)`` bool, whether the last search ended on the edge of its range.
     """
@@ -62,6 +63,7 @@ class Trajectory:
         self.affine: AffineState | None = None
         self.affine_start: AffineState | None = None
         self.matches: MatchTarget | None = None
+        self.belief: Tensor | None = None
         self.hidden: Tensor | None = None
         self.on_edge: Tensor | None = None
         self.last_x: Tensor | None = None
@@ -71,19 +73,17 @@ class Trajectory:
         """Whether steps at this fraction of the schedule, [0, 1), are updated."""
         return self.config.start <= fraction < self.config.stop
 
-    def settle_scale(self, x: Tensor, fraction: float) -> None:
+    def settle_scale(self, x: Tensor) -> None:
         """Find g_s and the start of scale and shift for a relative map (S7.3), or better ones than before.
 
         Args:
             x: ``(B, 1, h, w)`` float32 relative map of this step.
-            fraction: of the schedule, [0, 1); the gate on matches narrows with it.
         """
         if self.config.search not in ONCE:
             self._search_volume(x)
         elif self.affine is None:
             (self._search_one_number if self.config.search == "one-number" else self._span_points)(x)
-        wide, narrow = self.config.gate
-        self._gate_matches(x, wide + (narrow - wide) * fraction)
+        self._gate_matches(x)
 
     def _search_one_number(self, x: Tensor) -> None:
         zero = x.new_zeros(x.shape[0])
@@ -151,13 +151,17 @@ class Trajectory:
                 near_far = refine_to_matches(floored, known, *near_far, space)
         return *near_far, on_edge
 
-    def _gate_matches(self, x: Tensor, factor: float) -> None:
-        """Believe matches within a factor of the estimate only: others are outliers."""
+    def _gate_matches(self, x: Tensor) -> None:
+        """Believe matches within a factor of the estimate only, less those that look like reflections."""
         known = self.objective.views.matches
         if known is None:
             return
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
-        self.matches = replace(known, confidence=gate_matches(known, depth_m, factor))
+        if self.belief is None:
+            all_of_it = torch.ones_like(depth_m)
+            self.belief = believe_before_prior(known, depth_m) if self.config.doubt else all_of_it
+        gated = gate_matches(known, depth_m, self.config.gate)
+        self.matches = replace(known, confidence=self.belief * gated)
 
     def test_visibility(self, x: Tensor) -> None:
         """Find what an estimate hides from the right cameras; it holds for the updates of the round.

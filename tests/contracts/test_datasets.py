@@ -16,6 +16,7 @@ from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample
 from geodiff_plugin.evaluation.datasets.mvsnet import find_mvsnet
 from geodiff_plugin.evaluation.datasets.robustmvd import KEY_VIEWS, find_robustmvd
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
+from geodiff_plugin.evaluation.datasets.synthetic import is_reflective
 from geodiff_plugin.formats import write_depth_mm_png, write_pfm
 
 HEIGHT, WIDTH, F, CX, CY, BASELINE = 40, 64, 50.0, 31.0, 19.5, 0.2
@@ -460,6 +461,16 @@ def photometric_error(sample, factor):
     warped = warp_right_to_left(right, depth_m, *cameras)
     seen = warped.visible & torch.from_numpy(sample.valid)
     return ((warped.image - left).abs().mean(1, keepdim=True) * seen).sum() / seen.sum()
+
+
+def test_reflective_pairs_show_mirrors_or_glass():
+    refs = find_pairs(Path("synthetic-reflective:3+10@64x48"))
+    assert [ref.files["seed"] for ref in refs] == sorted(ref.files["seed"] for ref in refs)
+    for ref in refs:
+        material = load(ref).material
+        assert np.isin(material, (2, 3)).mean() > 0.005
+    skipped = set(range(10, refs[-1].files["seed"])) - {ref.files["seed"] for ref in refs}
+    assert skipped and not any(is_reflective(seed) for seed in skipped)
 
 
 @pytest.mark.parametrize("seed", [0, 1], ids=["rectified", "posed"])

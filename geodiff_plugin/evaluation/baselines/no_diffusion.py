@@ -6,6 +6,7 @@ Paper: none; what is left of the default once the diffusion is taken out.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -37,6 +38,6 @@ NO_DIFFUSION = constant_method(
     "no-diffusion",
     "no diffusion",
     "the default preset without the U-Net: the same search, losses and updates on the latent of a ramp",
-    GeometryGuidance,
+    partial(GeometryGuidance, doubt=False),  # a ramp contradicts nothing
     _start,
 )

@@ -7,6 +7,7 @@ Paper: stands in where its data sets cannot be shown (S5.2, S5.3).
 from __future__ import annotations
 
 import re
+from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,19 @@ import torch
 from geodiff_plugin.evaluation.datasets._files import make_sample
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 from geodiff_plugin.synthetic import render_pair
+from geodiff_plugin.synthetic.cameras import intrinsics
+from geodiff_plugin.synthetic.layouts import sample_scene
+from geodiff_plugin.synthetic.render import render_linear
+from geodiff_plugin.synthetic.scene import Camera, Material
 from geodiff_plugin.types import Rig
 
-__all__ = ["SYNTHETIC", "find_synthetic", "load_synthetic"]
+__all__ = ["SYNTHETIC", "find_synthetic", "is_reflective", "load_synthetic"]
 
 SIZE = (384, 512)
-_ROOT = re.compile(r"synthetic:(\d+)(?:\+(\d+))?(?:@(\d+)x(\d+))?")
+REFLECTIVE_SHARE = 0.01
+_ROOT = re.compile(r"synthetic(-reflective)?:(\d+)(?:\+(\d+))?(?:@(\d+)x(\d+))?")
+# Mirrors of one percent of the image still have thirty pixels here.
+_SCAN = (48, 64)
 
 
 def find_synthetic(root: Path) -> list[SampleRef]:
@@ -28,18 +36,33 @@ def find_synthetic(root: Path) -> list[SampleRef]:
 
     Args:
         root: ``synthetic:N`` for N pairs from seed 0 on, ``synthetic:N+S`` for N from seed S on, and
-            ``@WIDTHxHEIGHT`` after either for another size than 512x384 pixels; any other path holds none.
-            Even seeds give rectified pairs, odd ones a general pose.
+            ``@WIDTHxHEIGHT`` after either for another size than 512x384 pixels; ``synthetic-reflective:``
+            with the same for the first N scenes with a mirror or glass on at least 1 % of the left image
+            (one in seven has). Any other path holds none. Even seeds give rectified pairs, odd ones a
+            general pose.
     """
     asked = _ROOT.fullmatch(str(root))
     if asked is None:
         return []
-    first = int(asked[2] or 0)
-    size = (int(asked[4]), int(asked[3])) if asked[3] else SIZE
+    seeds = count(int(asked[3] or 0))
+    if asked[1]:
+        seeds = filter(is_reflective, seeds)
+    size = (int(asked[5]), int(asked[4])) if asked[4] else SIZE
     return [
         SampleRef("synthetic", f"seed{seed:04d}", {"seed": seed, "posed": seed % 2 == 1, "size": size})
-        for seed in range(first, first + int(asked[1]))
+        for seed in islice(seeds, int(asked[2]))
     ]
+
+
+def is_reflective(seed: int) -> bool:
+    """Whether a scene shows a mirror or glass on at least 1 % of its left image; seen at 64x48 pixels."""
+    scene = sample_scene(seed)
+    kinds = (int(Material.MIRROR), int(Material.GLASS))
+    if not torch.isin(scene.material, torch.tensor(kinds)).any():
+        return False
+    camera = Camera(intrinsics(_SCAN, scene.fov_deg), scene.T_world_from_camera)
+    material = render_linear([scene], [camera], [0], _SCAN, "cpu", antialias=False).material
+    return float(torch.isin(material, torch.tensor(kinds)).float().mean()) >= REFLECTIVE_SHARE
 
 
 def _image(image_01: torch.Tensor) -> np.ndarray:
@@ -79,5 +102,5 @@ SYNTHETIC = Dataset(
     cap_m=None,
     needs_folder=False,
     obtain="rendered by this package, offline: give synthetic:N as DIR (or synthetic:N+FIRST_SEED; @256x192 "
-    "after either for that size).",
+    "after either for that size; synthetic-reflective:N for scenes with mirrors or glass).",
 )
