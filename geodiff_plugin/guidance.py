@@ -76,7 +76,7 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         loss_resolution: pixels, bound of the longer side of the grid that losses are computed on.
         correct: at every step, before the updates, bring the decoded map to its matches and encode what that
             changes (gradient ``"denoised"`` only); the gradient then has the rest to do.
-        doubt: matches behind what the prior's first estimate says, over a region and by more than chance, lose
+        doubt: matches behind what the prior first says, over a region and by more than chance, lose
             their say: mirrors and glass (``matching.contradiction``).
         refine: bring the result to its matches at full resolution, edge-aware (``refinement.refine_depth``);
             without a ``matches`` term there is nothing to bring it to.
