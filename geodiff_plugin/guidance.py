@@ -126,7 +126,7 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         search: str = "volume",
         g_s_range: tuple[float, float] = (1.0, 80.0),
         depth_range: tuple[float, float] | None = None,
-        gate: float = 3.0,
+        gate: float = 10.0,
         loss_resolution: int = 640,
         correct: bool = True,
         doubt: bool = True,

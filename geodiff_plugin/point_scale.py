@@ -6,17 +6,22 @@ Paper: none; the range of the points is where Marigold-DC starts (Viola et al. 2
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.matching import Matches
+from geodiff_plugin.matching.known_points import UNIT
 from geodiff_plugin.metric import GROWS_WITH_DEPTH, MetricMap
 
-__all__ = ["depth_span", "fit_to_points"]
+__all__ = ["depth_span", "fit_to_points", "sure_matches"]
 
 #: (near, far) pairs tried, and how far beyond the points' own range, as a factor.
 CANDIDATES, REACH = 48, 4.0
+#: A match counts as sure above this confidence; fewer than so many say nothing about a range.
+SURE, MIN_SURE = 0.5, 50
 #: Points that are looked at; width of the Cauchy cost in units of the points, about a prior's own error.
 SAMPLES, CAUCHY_UNITS = 1500, 32.0
 #: A current state this close to the best cost, as a factor, stays: a new one restarts the affine updates.
@@ -27,6 +32,15 @@ def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
     """Metres, ``()`` each, of the nearest and the farthest known point."""
     known = points.inverse_depth[points.confidence > 0]
     return 1.0 / known.amax(), 1.0 / known.amin()
+
+
+def sure_matches(matches: Matches) -> Matches | None:
+    """The matches that are more likely right than wrong, as if they were points; ``None`` for too few."""
+    believed = (matches.confidence > SURE) & (matches.inverse_depth > matches.plane_step)
+    if int(believed.sum()) < MIN_SURE:
+        return None
+    unit = UNIT * matches.inverse_depth[believed].median()
+    return replace(matches, confidence=believed.float(), plane_step=unit)
 
 
 @torch.no_grad()

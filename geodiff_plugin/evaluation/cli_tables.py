@@ -1,4 +1,4 @@
-"""``geodiff eval table1 | table2 | table3 | ablation | cost``: options and their help.
+"""``geodiff eval table1 | table2 | table3 | ablation | parts | flatness | cost``: options and their help.
 
 Hop: argv -> ``PairsOptions`` -> ``evaluation.experiments`` or ``evaluation.cost``.
 Paper: Tables 1 to 4.
@@ -21,21 +21,27 @@ _HELP = {
     "table2": "Table 2: Booster, beside stereo.",
     "table3": "Table 3: two posed views, Tanks and Temples.",
     "ablation": "Table 4, and one change at a time: gradients, rules, terms, no diffusion.",
+    "parts": "What each part of the default is worth: one left out at a time.",
+    "flatness": "How flat the default lies: every number of it at half and at twice its value.",
     "cost": "Seconds and peak memory, plain against guided, as ratios.",
 }
-_DATA = {"ablation": Path("synthetic:4"), "cost": Path("synthetic:3")}
+_DATA = {
+    name: Path(f"synthetic:{n}") for name, n in {"ablation": 4, "parts": 4, "flatness": 4, "cost": 3}.items()
+}
 """Data by default; the paper's tables have none, since their sets must be obtained first."""
 
 
 def _run(name: str, typed: dict[str, object]) -> None:
     from geodiff_plugin.evaluation.cost import run_cost
-    from geodiff_plugin.evaluation.experiments import how_to_obtain, run_experiment
+    from geodiff_plugin.evaluation.experiments import how_to_obtain, run_changes, run_experiment
 
     if typed["data"] is None:
         bad_value("data", "given, as --data DIR", "nothing", how_to_obtain(name))
     options = o.pairs_options(typed)
     if name == "cost":
         run_cost(options)
+    elif name in ("parts", "flatness"):
+        run_changes(name, options)
     else:
         run_experiment(name, options)
 
@@ -75,6 +81,6 @@ def _command(name: str) -> Callable[..., None]:
 
 
 def add_tables(app: typer.Typer) -> None:
-    """Add one command per table of the paper, and the cost, to ``geodiff eval``."""
+    """Add one command per table of the paper, the tables of changes, and the cost, to ``geodiff eval``."""
     for name in _HELP:
         app.command(name)(_command(name))

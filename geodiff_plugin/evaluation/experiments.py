@@ -14,17 +14,21 @@ from typing import Any
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import with_priors
 from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
+from geodiff_plugin.evaluation.changes import CHANGES, changes_table, flatness_methods, flatness_table
 from geodiff_plugin.evaluation.commands import PairsOptions, command_line, remarks_on, select
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, find_pairs
 from geodiff_plugin.evaluation.detail_tables import regions_table
 from geodiff_plugin.evaluation.layout import Table
-from geodiff_plugin.evaluation.paper_tables import CHANGES, FoundColumn, changes_table, layout_table
+from geodiff_plugin.evaluation.paper_tables import FoundColumn, layout_table
 from geodiff_plugin.evaluation.published import LAYOUTS, Column, Layout
 from geodiff_plugin.evaluation.report import run_facts, write_tables
 from geodiff_plugin.evaluation.runner import processes, run
 from geodiff_plugin.evaluation.tables import summary_table
 
-__all__ = ["how_to_obtain", "methods_of", "run_experiment"]
+__all__ = ["how_to_obtain", "methods_of", "run_changes", "run_experiment"]
+
+ABLATED = ("guided", "paper")
+"""Keys of ``CHANGES`` whose tables stand below Table 4."""
 
 
 def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
@@ -32,7 +36,7 @@ def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
     layout = LAYOUTS[name]
     names = [*(row.method for row in layout.rows if row.method), *layout.methods, *added]
     if name == "ablation":
-        names += [method for changes in CHANGES.values() for _, method in changes]
+        names += [method for preset in ABLATED for _, method in CHANGES[preset]]
     return tuple(dict.fromkeys(names))
 
 
@@ -77,7 +81,7 @@ def _tables(
 ) -> list[Table]:
     tables = [layout_table(layout, found, records, methods)]
     if name == "ablation":
-        tables += [changes_table(records, preset) for preset in CHANGES]
+        tables += [changes_table(records, preset) for preset in ABLATED]
     for column in found:
         if column.labels:
             own = [record for record in records if label_of(record) in column.labels]
@@ -85,6 +89,49 @@ def _tables(
             tables.append(summary_table(own, set(column.labels), title))
     tables.append(regions_table(records))
     return [table for table in tables if table.rows]
+
+
+def _measured(
+    refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions
+) -> list[dict[str, Any]] | None:
+    """Records of a run; ``None`` in every process but the main one."""
+    records = run(
+        refs,
+        with_priors(methods, options.priors),
+        options.settings,
+        options.out,
+        crop=options.crop,
+        skip_broken=options.skip_broken,
+        save_depth=options.save_depth,
+        progress=not options.quiet,
+    )
+    return records if processes(options.settings).is_main_process else None
+
+
+def run_changes(name: str, options: PairsOptions) -> None:
+    """Change one thing of the default at a time: its parts, or its numbers.
+
+    Args:
+        name: ``"parts"`` or ``"flatness"``.
+        options: as of ``geodiff eval pairs``; ``methods`` are run beside the table's own.
+
+    Raises:
+        ValueError, OSError: as ``run_experiment``.
+    """
+    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
+    refs = select(find_pairs(options.data, options.datasets or None, **posed), options)
+    own = flatness_methods() if name == "flatness" else tuple(method for _, method in CHANGES[name])
+    records = _measured(refs, tuple(dict.fromkeys((*own, *options.methods))), options)
+    if records is None:
+        return
+    facts = run_facts(command_line(options, ("eval", name, "--data", str(options.data)), ()))
+    if name == "flatness":
+        title, tables = "Flatness", [flatness_table(records)]
+    else:
+        title, tables = "Parts of the default", [changes_table(records, name), regions_table(records)]
+    page = write_tables(options.out, title, facts, tables, remarks_on(records, options), name)
+    if not options.quiet:
+        sys.stdout.write(page)
 
 
 def run_experiment(name: str, options: PairsOptions) -> None:
@@ -108,18 +155,9 @@ def run_experiment(name: str, options: PairsOptions) -> None:
     absent = _missing([column for column, (_, own) in chosen.items() if not own])
     if not refs:
         bad_value("data", f"a folder with the data of {name}", str(options.data), " ".join(absent))
-    methods = with_priors(methods_of(name, options.methods), options.priors)
-    records = run(
-        refs,
-        methods,
-        options.settings,
-        options.out,
-        crop=options.crop,
-        skip_broken=options.skip_broken,
-        save_depth=options.save_depth,
-        progress=not options.quiet,
-    )
-    if not processes(options.settings).is_main_process:
+    names = methods_of(name, options.methods)
+    records = _measured(refs, names, options)
+    if records is None:
         return
     finished = {label_of(record) for record in records if record["status"] != "broken"}
     found = [
@@ -130,7 +168,7 @@ def run_experiment(name: str, options: PairsOptions) -> None:
     if name == "table3":
         remarks.append("Pairs: " + ", ".join(ref.label for ref in refs) + ".")
     facts = run_facts(command_line(options, ("eval", name, "--data", str(options.data)), ()))
-    tables = _tables(name, layout, found, records, methods)
+    tables = _tables(name, layout, found, records, with_priors(names, options.priors))
     page = write_tables(options.out, layout.title, facts, tables, remarks, name)
     if not options.quiet:
         sys.stdout.write(page)

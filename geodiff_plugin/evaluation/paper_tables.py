@@ -1,7 +1,7 @@
-"""Records to the paper's own tables, and to an ablation of one change at a time.
+"""Records to the paper's own tables.
 
 Hop: ``Layout`` + records -> ``Table``.
-Paper: Tables 1 to 4; the ablation extends S5.3.
+Paper: Tables 1 to 4.
 """
 
 from __future__ import annotations
@@ -16,44 +16,14 @@ from geodiff_plugin.evaluation.cells import (
     by_method,
     cell,
     count_of_pairs,
-    interval_cell,
-    label_of,
 )
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.published import Column, Layout, PaperRow
-from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
-from geodiff_plugin.guidance import DEFAULT_WEIGHTS
-from geodiff_plugin.updates import RULES
+from geodiff_plugin.evaluation.statistics import mean_with_interval
 
-__all__ = ["CHANGES", "FoundColumn", "changes_table", "layout_table"]
+__all__ = ["FoundColumn", "layout_table", "metric_values"]
 
 _ARROWS = {"abs_rel": "↓", "rmse": "↓", "delta1": "↑"}
-
-CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
-    "guided": (
-        ("as it is", "guided"),
-        ("scale and shift only", "scale-shift-only"),
-        ("reprojection only", "reprojection-only"),
-        ("no diffusion", "no-diffusion"),
-        ("gradient to z_t (full)", "guided:gradient=full"),
-        *((f"rule {name}", f"guided:rule={name}") for name in RULES if name != "adam"),
-        *((f"without {name}", f"guided:weights.{name}=0") for name in DEFAULT_WEIGHTS if name != "points"),
-        ("without refinement", "guided:refine=false"),
-    ),
-    "paper": (
-        ("as it is", "paper"),
-        ("scale and shift only", "paper:optimize_latents=false"),
-        ("γ = 0", "paper:weights.prior_pull=0"),
-        # One number that is searched within a thousandth of 1 is 1.
-        ("g_s = 1", "paper:g_s_range=[0.999,1.001]"),
-        ("gradient to the clean latent (denoised)", "paper:gradient=denoised"),
-        *((f"rule {name}", f"paper:rule={name}+affine_rule={name}") for name in RULES if name != "plain"),
-    ),
-}
-"""What the ablation changes, by the preset that it changes: ``(row, method)``, the unchanged one first.
-
-Every rule and every term has its row; no sample has known points, so their term has none.
-"""
 
 
 @dataclass(frozen=True)
@@ -84,7 +54,9 @@ class FoundColumn:
         return f"{self.column.title} ({other}{count_of_pairs(len(self.labels))})"
 
 
-def _values(records: Sequence[dict[str, Any]], alignment: str, metric: str) -> Mapping[str, dict[str, float]]:
+def metric_values(
+    records: Sequence[dict[str, Any]], alignment: str, metric: str
+) -> Mapping[str, dict[str, float]]:
     """Method -> label -> one metric under the cap, raw or aligned."""
 
     def value_of(record: dict[str, Any]) -> float | None:
@@ -100,7 +72,7 @@ def _means(
     """A cell per metric; a dash unless the method has a number for every pair of the column."""
     cells = []
     for metric in metrics:
-        values = _values(records, alignment, metric).get(method, {})
+        values = metric_values(records, alignment, metric).get(method, {})
         whole = found.labels and found.labels <= values.keys()
         mean = mean_with_interval([values[x] for x in found.labels]).value if whole else None
         cells.append(cell(mean))
@@ -118,7 +90,7 @@ def _own_rows(methods: Sequence[str], records: Sequence[dict[str, Any]]) -> list
     """Rows for methods that the paper does not have: as they come out where they know metres, and aligned."""
     rows = []
     for name in methods:
-        title, metric = find_method(name).title, _values(records, "raw", "abs_rel").get(name)
+        title, metric = find_method(name).title, metric_values(records, "raw", "abs_rel").get(name)
         rows += [PaperRow(f"{title}†", False, name)] if metric else []
         rows.append(PaperRow(title, True, name))
     return rows
@@ -167,37 +139,3 @@ def layout_table(
         note += f" Not run here: {recipes}."
     rules = (*layout.rules, len(layout.rows)) if own else layout.rules
     return Table(layout.title, tuple(heads), tuple(rows), note, tuple(groups), rules)
-
-
-def changes_table(records: Sequence[dict[str, Any]], preset: str) -> Table:
-    """Every change of a preset in ``CHANGES`` that ran, with its paired difference to the preset.
-
-    Args:
-        records: of the run.
-        preset: key of ``CHANGES``.
-    """
-    abs_rel, delta1 = _values(records, "raw", "abs_rel"), _values(records, "raw", "delta1")
-    seconds = by_method(records, lambda record: record["seconds"])
-    reference, rows = abs_rel.get(preset, {}), []
-    for title, method in CHANGES[preset]:
-        own = abs_rel.get(method)
-        if not own:
-            continue
-        difference = (
-            "-" if method == preset else interval_cell(paired_difference(own, reference), signed=True)
-        )
-        rows.append(
-            (
-                title,
-                str(len(own)),
-                interval_cell(mean_with_interval(list(own.values()))),
-                interval_cell(mean_with_interval(list(delta1[method].values()))),
-                difference,
-                cell(mean_with_interval(list(seconds[method].values())).value, 1),
-            )
-        )
-    count = count_of_pairs(len({label_of(record) for record in records}))
-    name = {"guided": "The default preset", "paper": "Algorithm 1 as printed"}[preset]
-    header = ("change", "pairs", "AbsRel ↓ [95 %]", "δ1 ↑ [95 %]", "AbsRel more than unchanged", "seconds")
-    note = "Metres as they come out; each change alone, step sizes as they are."
-    return Table(f"{name}, one thing changed, {count}", header, tuple(rows), note)

@@ -8,12 +8,21 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from geodiff_plugin import refinement
 from geodiff_plugin.evaluation import cost, experiments, paper_tables
-from geodiff_plugin.evaluation.baselines import METHODS, Settings, find_method
+from geodiff_plugin.evaluation.baselines import METHODS, Settings, find_method, variants
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction
+from geodiff_plugin.evaluation.cells import label_of
+from geodiff_plugin.evaluation.changes import (
+    CHANGES,
+    NUMBERS,
+    changes_table,
+    flatness_methods,
+    flatness_table,
+)
 from geodiff_plugin.evaluation.cli import eval_app
 from geodiff_plugin.evaluation.layout import Table, latex_escape
-from geodiff_plugin.evaluation.paper_tables import CHANGES, FoundColumn, changes_table, layout_table
+from geodiff_plugin.evaluation.paper_tables import FoundColumn, layout_table
 from geodiff_plugin.evaluation.published import LAYOUTS
 from geodiff_plugin.formats import write_pfm
 
@@ -103,7 +112,8 @@ def test_changes_are_compared_pair_by_pair():
     records = [make_record(m, str(i), e + 0.01 * i, 1.0) for m, e in errors.items() for i in range(5)]
     rows = {row[0]: row for row in changes_table(records, "guided").rows}
     assert set(rows) == {"as it is", "without matches"}
-    assert rows["as it is"][4] == "-" and rows["without matches"][4] == "+0.200 [+0.200, +0.200]"
+    assert rows["as it is"][5] == "-" and rows["without matches"][5] == "+0.200 [+0.200, +0.200]"
+    assert rows["without matches"][3] == "0.340"  # the worst pair
 
 
 @pytest.mark.parametrize("name", [name for own in CHANGES.values() for _, name in own if ":" in name])
@@ -114,8 +124,32 @@ def test_changes_are_configurations_of_the_guidance(name):
     assert changed["guidance"] != preset["guidance"]
 
 
+def test_flatness_tries_every_number_at_half_and_at_twice():
+    names = flatness_methods()
+    assert len(names) == 1 + 2 * len(NUMBERS) == len(set(names))
+    assert "guided:inner_steps=10" in names and "guided:refinement.CAUCHY=4" in names
+    records = [make_record(name, "0", 0.2 if name.endswith("CAUCHY=4") else 0.1, 1.0) for name in names]
+    rows = {row[0]: row for row in flatness_table(records).rows}
+    assert rows["`refinement.CAUCHY`"][1:] == ("2", "0.1000", "0.2000", f"0.100 ({label_of(records[0])})")
+    assert rows["`gate`"][-1] == "0.000"
+
+
+def test_a_constant_is_changed_for_one_call_and_put_back(monkeypatch):
+    seen, before = [], refinement.CAUCHY
+    method = find_method("guided")
+
+    def spy(*_):
+        seen.append(refinement.CAUCHY)
+        raise ValueError("broken sample")
+
+    monkeypatch.setattr(variants, "guided_method", lambda name, *_: replace(method, name=name, run=spy))
+    with pytest.raises(ValueError, match="broken"):
+        find_method("guided:refinement.CAUCHY=4").run(None, Settings(), None)
+    assert seen == [4] and before == refinement.CAUCHY
+
+
 def test_variants_name_what_they_do_not_know():
-    for wrong in ("guided:speed=2", "guided:rule", "paper:"):
+    for wrong in ("guided:speed=2", "guided:rule", "paper:", "guided:refinement.COLOUR=1"):
         with pytest.raises(ValueError, match="knobs of GeometryGuidance"):
             find_method(wrong)
     with pytest.raises(ValueError, match="methods must be one of"):
@@ -174,6 +208,7 @@ def free_methods(monkeypatch):
         return Method(name, name, name, measure, lambda settings: {"steps": settings.steps}, uses_prior=False)
 
     names = {name for own in LAYOUTS for name in experiments.methods_of(own, ())} | {*cost.COST_METHODS}
+    names |= {*flatness_methods(), *(method for _, method in CHANGES["parts"])}
     monkeypatch.setattr("geodiff_plugin.evaluation.baselines.METHODS", {name: free(name) for name in names})
 
 
@@ -236,6 +271,14 @@ def test_ablation_takes_any_data(free_methods, scene, tmp_path):
     assert "| Learning scale and shift only | ✗ | 1.000 |" in answer.stdout
     for title, _ in (*CHANGES["guided"], *CHANGES["paper"]):
         assert f"| {title} | 1 |" in answer.stdout
+
+
+def test_parts_and_flatness_take_any_data(free_methods, scene, tmp_path):
+    answer = invoke("parts", "--data", scene, "-o", tmp_path / "out")
+    for title, _ in CHANGES["parts"]:
+        assert f"| {title} | 1 |" in answer.stdout
+    answer = invoke("flatness", "--data", scene, "-o", tmp_path / "flat")
+    assert "| `gate` | 10 |" in answer.stdout and (tmp_path / "flat" / "flatness.md").is_file()
 
 
 def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, tmp_path, monkeypatch):

@@ -8,65 +8,122 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
+from geodiff_plugin import point_scale, refinement, scale_search
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
-from geodiff_plugin.evaluation.baselines.base import Method
+from geodiff_plugin.evaluation.baselines.base import Method, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance import DEFAULT_WEIGHTS, GeometryGuidance
+from geodiff_plugin.matching import contradiction
 from geodiff_plugin.presets import PAPER_WEIGHTS
 
-__all__ = ["default_variant", "paper_variant"]
+__all__ = ["default_variant", "number_of", "paper_variant"]
+
+CONSTANTS = {
+    module.__name__.rpartition(".")[2]: module
+    for module in (contradiction, point_scale, refinement, scale_search)
+}
+"""Modules whose constants an ablation may change for its own calls: numbers that are no knobs."""
 
 _WEIGHT = "weights."
+_CAMERA = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]])
+_BESIDE = np.eye(4) + 0.1 * np.eye(4, k=3)
 _POSITIONAL = {"self", "right", "K", "E", "points", "left_size", "weights"}
 _KNOBS = tuple(
     name for name in inspect.signature(GeometryGuidance.__init__).parameters if name not in _POSITIONAL
 )
 
 
-def _changes(text: str, weights: dict[str, float]) -> dict[str, Any]:
-    """Keywords of a guidance; values are JSON, or text where they are none."""
+def _is_constant(name: str) -> bool:
+    module, _, constant = name.partition(".")
+    return constant.isupper() and hasattr(CONSTANTS.get(module), constant)
+
+
+def number_of(name: str) -> float:
+    """A number of the default preset: a knob, ``weights.TERM``, or a constant ``module.NAME``."""
+    if _is_constant(name):
+        module, _, constant = name.partition(".")
+        return getattr(CONSTANTS[module], constant)
+    if name.startswith(_WEIGHT):
+        return DEFAULT_WEIGHTS[name.removeprefix(_WEIGHT)]
+    return GeometryGuidance(np.zeros((32, 32, 3), np.uint8), _CAMERA, _BESIDE).config[name]
+
+
+@contextmanager
+def _constants(changed: Mapping[str, float]) -> Iterator[None]:
+    """Module constants set otherwise, and back afterwards."""
+    before = {name: number_of(name) for name in changed}
+    try:
+        for name, value in changed.items():
+            module, _, constant = name.partition(".")
+            setattr(CONSTANTS[module], constant, value)
+        yield
+    finally:
+        for name, value in before.items():
+            module, _, constant = name.partition(".")
+            setattr(CONSTANTS[module], constant, value)
+
+
+def _changes(text: str, weights: dict[str, float]) -> tuple[dict[str, Any], dict[str, float]]:
+    """Keywords of a guidance, and constants; values are JSON, or text where they are none."""
     changes: dict[str, Any] = {}
+    constants: dict[str, float] = {}
     for part in text.split("+"):
         knob, equals, written = part.partition("=")
-        if not equals or not (knob in _KNOBS or knob.startswith(_WEIGHT)):
+        if not equals or not (knob in _KNOBS or knob.startswith(_WEIGHT) or _is_constant(knob)):
             bad_value(
                 "methods",
                 "of the form preset:knob=value+knob=value with knobs of GeometryGuidance, or weights.TERM",
                 repr(text),
-                f"Knobs: {', '.join(_KNOBS)}.",
+                f"Knobs: {', '.join(_KNOBS)}. Constants: module.NAME of {', '.join(CONSTANTS)}.",
             )
         try:
             value = json.loads(written)
         except ValueError:
             value = written
-        if knob.startswith(_WEIGHT):
+        if _is_constant(knob):
+            constants[knob] = value
+        elif knob.startswith(_WEIGHT):
             changes["weights"] = changes.get("weights", weights) | {knob.removeprefix(_WEIGHT): value}
         else:
             changes[knob] = value
-    return changes
+    return changes, constants
 
 
 def _variant(
     base: str, title: str, preset: Callable[..., GeometryGuidance], weights: dict[str, float], text: str
 ) -> Method:
-    changes = _changes(text, weights)
+    changes, constants = _changes(text, weights)
 
     def changed(right: Any, K: Any, E: Any) -> GeometryGuidance:
         return preset(right, K, E, **changes)
 
-    return guided_method(
+    method = guided_method(
         f"{base}:{text}", f"{title}, {text.replace('+', ', ')}", f"{title} with {text}", changed
     )
+    if not constants:
+        return method
+
+    def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+        with _constants(constants):
+            return method.run(sample, settings, priors)
+
+    return replace(method, run=run)
 
 
 def default_variant(text: str) -> Method:
     """The default preset with some knobs changed.
 
     Args:
-        text: ``knob=value``, several joined by ``+``; ``weights.matches=0`` changes one weight.
+        text: ``knob=value``, several joined by ``+``; ``weights.matches=0`` changes one weight,
+            ``refinement.CAUCHY=4`` a constant of a module.
 
     Raises:
         ValueError: another form, or an unknown knob; values are checked when the guidance is made.

@@ -1,0 +1,140 @@
+"""One thing changed at a time: what each part of a preset is worth, and how flat its numbers lie.
+
+Hop: records -> ``Table``.
+Paper: S5.3, which it extends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from geodiff_plugin.evaluation.baselines.variants import number_of
+from geodiff_plugin.evaluation.cells import by_method, cell, count_of_pairs, interval_cell, label_of
+from geodiff_plugin.evaluation.layout import Table
+from geodiff_plugin.evaluation.paper_tables import metric_values
+from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
+from geodiff_plugin.guidance import DEFAULT_WEIGHTS
+from geodiff_plugin.updates import RULES
+
+__all__ = ["CHANGES", "NUMBERS", "changes_table", "flatness_methods", "flatness_table"]
+
+CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
+    "guided": (
+        ("as it is", "guided"),
+        ("scale and shift only", "scale-shift-only"),
+        ("reprojection only", "reprojection-only"),
+        ("no diffusion", "no-diffusion"),
+        ("gradient to z_t (full)", "guided:gradient=full"),
+        *((f"rule {name}", f"guided:rule={name}") for name in RULES if name != "adam"),
+        *((f"without {name}", f"guided:weights.{name}=0") for name in DEFAULT_WEIGHTS if name != "points"),
+    ),
+    "paper": (
+        ("as it is", "paper"),
+        ("scale and shift only", "paper:optimize_latents=false"),
+        ("γ = 0", "paper:weights.prior_pull=0"),
+        # One number that is searched within a thousandth of 1 is 1.
+        ("g_s = 1", "paper:g_s_range=[0.999,1.001]"),
+        ("gradient to the clean latent (denoised)", "paper:gradient=denoised"),
+        *((f"rule {name}", f"paper:rule={name}+affine_rule={name}") for name in RULES if name != "plain"),
+    ),
+    "parts": (
+        ("as it is", "guided"),
+        ("search only", "search-only"),
+        ("photometric only", "photometric-only"),
+        ("matches only", "matches-only"),
+        ("no diffusion", "no-diffusion"),
+        ("without correction at every step", "guided:correct=false"),
+        ("without gradient updates", "guided:inner_steps=0"),
+        ("without refinement of the result", "guided:refine=false"),
+        ("without doubt about reflections", "guided:doubt=false"),
+        ("without a gate on matches", "guided:gate=1000000"),
+        ("without exposure", "guided:exposure=false"),
+        ("without z-test", "guided:z_test=false"),
+    ),
+}
+"""What is changed, by table: ``(row, method)``, the unchanged preset first.
+
+``guided`` and ``paper`` stand below the paper's Table 4, every rule and every term with its row (no sample
+has known points, so their term has none); ``parts`` is what the default has beyond the paper.
+"""
+
+_NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
+
+NUMBERS = (
+    *("gate", "min_steps", "inner_steps", "step_latents", "step_affine"),
+    *("weights.photometric", "weights.matches", "weights.anchor", "loss_resolution"),
+    *("refinement.MATCH_NOISE", "refinement.CAUCHY", "refinement.SMOOTHNESS", "refinement.INERTIA"),
+    *("refinement.IMAGE_EDGE", "refinement.DEPTH_EDGE"),
+    *("contradiction.REGION", "contradiction.SPREADS", "contradiction.FLOOR"),
+    *("point_scale.CAUCHY_UNITS", "scale_search.CAUCHY_PLANES"),
+)
+"""Every number that decides the default's result: knobs, and constants by ``module.NAME``."""
+
+
+def changes_table(records: Sequence[dict[str, Any]], name: str) -> Table:
+    """Every row of ``CHANGES[name]`` that ran, with its paired difference to the unchanged preset.
+
+    Args:
+        records: of the run.
+        name: key of ``CHANGES``.
+    """
+    abs_rel, delta1 = metric_values(records, "raw", "abs_rel"), metric_values(records, "raw", "delta1")
+    seconds = by_method(records, lambda record: record["seconds"])
+    unchanged = CHANGES[name][0][1]
+    reference, rows = abs_rel.get(unchanged, {}), []
+    for title, method in CHANGES[name]:
+        own = abs_rel.get(method)
+        if not own:
+            continue
+        difference = (
+            "-" if method == unchanged else interval_cell(paired_difference(own, reference), signed=True)
+        )
+        rows.append(
+            (
+                title,
+                str(len(own)),
+                interval_cell(mean_with_interval(list(own.values()))),
+                cell(max(own.values())),
+                interval_cell(mean_with_interval(list(delta1[method].values()))),
+                difference,
+                cell(mean_with_interval(list(seconds[method].values())).value, 1),
+            )
+        )
+    count = count_of_pairs(len({label_of(record) for record in records}))
+    header = ("change", "pairs", "AbsRel ↓ [95 %]", "worst", "δ1 ↑ [95 %]", "AbsRel more", "seconds")
+    note = "Metres as they come out; each change alone, step sizes as they are."
+    return Table(f"{_NAMES[name]}, one thing changed, {count}", header, tuple(rows), note)
+
+
+def _at(number: str, factor: float) -> str:
+    """The method with a number of the default at a multiple of itself; integers stay integers."""
+    value = number_of(number)
+    changed = max(1, round(value * factor)) if isinstance(value, int) else float(f"{value * factor:.6g}")
+    return f"guided:{number}={changed:g}"
+
+
+def flatness_methods() -> tuple[str, ...]:
+    """The default, and every one of ``NUMBERS`` at half and at twice its value."""
+    return ("guided", *(_at(number, factor) for number in NUMBERS for factor in (0.5, 2.0)))
+
+
+def flatness_table(records: Sequence[dict[str, Any]]) -> Table:
+    """Mean AbsRel with every number at half and at twice its value, and the pair that it changes most."""
+    values = metric_values(records, "raw", "abs_rel")
+    unchanged, rows = values.get("guided", {}), []
+    for number in NUMBERS:
+        cells, most = [], (0.0, "-")
+        for factor in (0.5, 2.0):
+            own = values.get(_at(number, factor), {})
+            shared = [label for label in own if label in unchanged]
+            cells.append(cell(mean_with_interval([own[x] for x in shared]).value if shared else None, 4))
+            most = max([most, *((abs(own[x] - unchanged[x]), x) for x in shared)])
+        moved = f"{cell(most[0])} ({most[1]})" if most[0] else cell(0.0)
+        rows.append((f"`{number}`", f"{number_of(number):g}", *cells, moved))
+    mean = mean_with_interval(list(unchanged.values())).value
+    title = f"Every number of the default at half and at twice its value, {count_of_pairs(len(unchanged))}"
+    note = f"Mean AbsRel; {cell(mean, 4)} as they are. A constant is named by its module."
+    return Table(
+        title, ("number", "value", "at half", "at twice", "largest change of a pair"), tuple(rows), note
+    )
