@@ -45,6 +45,7 @@ def pairs(
     space: o.Space = None,
     ensemble: o.Ensemble = 1,
     seed: o.Seed = 0,
+    seeds: o.Seeds = 1,
     steps: o.Steps = None,
     resolution: o.Resolution = None,
     views: o.Views = 2,

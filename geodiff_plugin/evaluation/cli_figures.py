@@ -20,7 +20,10 @@ _OWN = ("name", "largest", "updates", "clouds")
 
 def _figure(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="gs-sweep, inner-steps, ablation, exposure or qualitative.")
+        str,
+        typer.Argument(
+            metavar="NAME", help="gs-sweep, inner-steps, ablation, exposure, qualitative or terms."
+        ),
     ],
     data: o.Data = Path("synthetic:1"),
     methods: Annotated[

@@ -42,6 +42,9 @@ Space = Annotated[
 ]
 Ensemble = Annotated[int, typer.Option(help="Ensemble members.")]
 Seed = Annotated[int, typer.Option(help="Seed of the noise.")]
+Seeds = Annotated[
+    int, typer.Option(help="Seeds, from --seed on, of methods that use a prior; a table has their spread.")
+]
 Steps = Annotated[int | None, typer.Option(help="Denoising steps; each method's own by default.")]
 Resolution = Annotated[int | None, typer.Option(help="Longer side for the prior, pixels.")]
 Views = Annotated[int, typer.Option(help="Views that methods take of a group that has more than two.")]

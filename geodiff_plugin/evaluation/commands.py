@@ -16,12 +16,20 @@ from pathlib import Path
 from typing import Any
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS, Settings, find_method, with_priors
+from geodiff_plugin.evaluation.baselines import (
+    FAMILIES,
+    METHODS,
+    Settings,
+    find_method,
+    with_priors,
+    with_seeds,
+)
 from geodiff_plugin.evaluation.crops import CROPS
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.report import run_facts, write_tables, write_text
 from geodiff_plugin.evaluation.runner import processes, run
+from geodiff_plugin.evaluation.seed_tables import without_copies
 from geodiff_plugin.evaluation.tables import pairs_tables
 
 __all__ = ["PAIRS_METHODS", "PairsOptions", "command_line", "remarks_on", "run_list", "run_pairs", "select"]
@@ -51,6 +59,7 @@ class PairsOptions:
         quiet: no bar, no table on the screen.
         crop: region that is scored, one of ``crops.CROPS``.
         priors: further priors beside the settings' own: methods that use one are run with each.
+        seeds: how many seeds, from the settings' own on, methods that use a prior are run with.
     """
 
     data: Path
@@ -69,6 +78,7 @@ class PairsOptions:
     quiet: bool
     crop: str = "none"
     priors: tuple[str, ...] = ()
+    seeds: int = 1
 
     def __post_init__(self) -> None:
         check_choice(self.crop, "crop", CROPS)
@@ -118,6 +128,7 @@ def command_line(
         if getattr(options, name):
             words += [f"--{name}", ",".join(getattr(options, name))]
     defaults = {"limit": None, "sample": None, "pairs": "default", "pixel_centre": None, "crop": "none"}
+    defaults["seeds"] = 1
     for name, default in defaults.items():
         if getattr(options, name) != default:
             words += [f"--{name.replace('_', '-')}", str(getattr(options, name))]
@@ -139,10 +150,12 @@ def remarks_on(records: Sequence[dict[str, Any]], options: PairsOptions) -> list
     remarks = [f"Prior {settings.prior}, seed {settings.seed}, ensemble {settings.ensemble}."]
     if options.priors:
         remarks.append(f"Rows that name no prior: {settings.prior}.")
+    if options.seeds > 1:
+        remarks.append(f"Every table but the spread over {options.seeds} seeds is of seed {settings.seed}.")
     if options.crop != "none":
         remarks.append(f"Only what lies in the crop {options.crop!r} is scored.")
     reasons: dict[tuple[str, str], int] = {}
-    for record in records:
+    for record in without_copies(records):
         if record["status"] == "not applicable":
             key = (find_method(record["method"]).title, record["reason"])
             reasons[key] = reasons.get(key, 0) + 1
@@ -165,7 +178,7 @@ def run_pairs(options: PairsOptions) -> None:
     refs = select(find_pairs(options.data, options.datasets or None, **posed), options)
     records = run(
         refs,
-        with_priors(options.methods, options.priors),
+        with_seeds(with_priors(options.methods, options.priors), options.settings.seed, options.seeds),
         options.settings,
         options.out,
         crop=options.crop,
@@ -209,4 +222,5 @@ def run_list(data: Path | None) -> None:
         summary = re.split(r"[.;]", family.__doc__ or " ", maxsplit=1)[0]
         lines.append(f"{name + ':...':<17} {summary[0].lower()}{summary[1:]}")
     lines.append(f"{'METHOD@PRIOR':<17} a method that uses a prior, with another one than --prior's first")
+    lines.append(f"{'METHOD#SEED':<17} the same with another seed than --seed; METHOD@PRIOR#SEED for both")
     sys.stdout.write("\n".join(lines) + "\n")

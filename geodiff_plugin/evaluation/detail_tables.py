@@ -21,6 +21,8 @@ _REGIONS = {
     "visible": "visible",
     "occluded": "occluded",
     "out_of_view": "out of view",
+    "matched": "matched",
+    "unmatched": "unmatched",
     "tom": "ToM",
     "not_tom": "other material",
 }
@@ -54,14 +56,15 @@ def _columns_table(
 
 
 def regions_table(records: Sequence[dict[str, Any]]) -> Table:
-    """AbsRel by what the right camera sees and by material, mean over the pairs that have such pixels.
+    """AbsRel by what the right camera sees, by matches and by material, mean over the pairs that have such pixels.
 
     Args:
         records: of a run.
 
     Returns:
-        Columns for what is visible, occluded and out of view, for Booster's "transparent or mirror" classes
-        and the others, then for each class that occurs; a dash where no pair says so.
+        Columns for what is visible, occluded and out of view, for where the two views match and where they
+        do not, for Booster's "transparent or mirror" classes and the others, then for each class that
+        occurs; a dash where no pair says so.
     """
     classes = sorted({name for r in records for name in r.get("regions") or {} if name.startswith("mat")})
     columns = _REGIONS | {name: name.replace("material_", "class ") for name in classes}
@@ -71,7 +74,9 @@ def regions_table(records: Sequence[dict[str, Any]]) -> Table:
         lambda record, name: record["regions"].get(name),
         "AbsRel by region and material",
         "Under the cap; aligned for methods that know relative depth only. Visible and occluded are known "
-        "where the data set has a mask, out of view always; ToM is transparent or mirror (classes 2 and 3).",
+        "where the data set has a mask, out of view always; matched is where our plane sweep of the two views "
+        "has a match of confidence 0.5 or more, the same pixels for every method; ToM is transparent or "
+        "mirror (classes 2 and 3).",
     )
 
 

@@ -10,6 +10,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -53,11 +54,6 @@ def headline(record: dict[str, Any]) -> float | None:
     return (both["raw"] or both["aligned"])["abs_rel"]
 
 
-def _with_prior(method: Method, settings: Settings) -> Settings:
-    """The settings with the prior that the method is bound to, if it is."""
-    return settings if method.prior is None else replace(settings, prior=method.prior)
-
-
 def _keys(
     refs: Sequence[SampleRef],
     methods: Iterable[Method],
@@ -68,7 +64,7 @@ def _keys(
     """``(label, method)`` -> key of its record, the same in every process."""
     keys = {}
     for method in methods:
-        own, prior = _with_prior(method, settings), ""
+        own, prior = method.own_settings(settings), ""
         if method.uses_prior:
             prior = f"{own.prior} {fingerprint(own)}"
         configuration = method.configuration(own) | ({} if crop == "none" else {"crop": crop})
@@ -78,8 +74,12 @@ def _keys(
     return keys
 
 
+@lru_cache(maxsize=1)
 def _cropped(sample: StereoSample, crop: str) -> StereoSample:
-    """The sample with the truth inside of a crop only; images and cameras stay whole."""
+    """The sample with the truth inside of a crop only; images and cameras stay whole.
+
+    One object for all methods, so that scoring computes once what depends on the sample only.
+    """
     if crop == "none":
         return sample
     valid = sample.valid & crop_mask(crop, sample.valid.shape)
@@ -95,7 +95,7 @@ def _measure(
     start = time.perf_counter()
     try:
         with PeakMemory(torch.device(settings.device)) as memory:
-            prediction = method.run(sample, _with_prior(method, settings), priors)
+            prediction = method.run(sample, method.own_settings(settings), priors)
     except NotApplicable as reason:
         return {"status": "not applicable", "reason": str(reason)}, None
     seconds = time.perf_counter() - start
@@ -217,7 +217,7 @@ def run(
                 bar.add(record | {"method": method.name})
     state.wait_for_everyone()
     written = {record["key"]: record for record in read_records(path)}
-    # A record does not depend on whether its prior was the first that was named or a further one.
+    # A record does not depend on whether its prior or seed was the first that was named or a further one.
     return [
         written[keys[ref.label, method.name]] | {"method": method.name} for ref in refs for method in chosen
     ]

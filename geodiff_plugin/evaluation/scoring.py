@@ -7,13 +7,16 @@ Paper: S5.1 (metrics, raw and aligned).
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.confidence import RIGHT_WITHIN
 from geodiff_plugin.evaluation.alignment import align
+from geodiff_plugin.evaluation.baselines._sweep import sweep
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
 from geodiff_plugin.evaluation.metrics import (
@@ -23,11 +26,14 @@ from geodiff_plugin.evaluation.metrics import (
     evaluate_depth,
     evaluate_disparity,
 )
+from geodiff_plugin.matching import find_matches
 
-__all__ = ["TOM_CLASSES", "out_of_view", "regions", "score"]
+__all__ = ["SURE_MATCH", "TOM_CLASSES", "matched", "out_of_view", "regions", "score"]
 
 TOM_CLASSES = (2, 3)
 """Material classes that Booster's authors call transparent or mirror when they score depth."""
+SURE_MATCH = 0.5
+"""Confidence from which on a match of our plane sweep counts as one."""
 
 
 def out_of_view(sample: StereoSample) -> np.ndarray:
@@ -45,16 +51,39 @@ def out_of_view(sample: StereoSample) -> np.ndarray:
     return sample.valid & ~inside.reshape(height, width)
 
 
-def regions(sample: StereoSample) -> dict[str, np.ndarray]:
-    """Masks by which AbsRel is split: what the right camera sees, what is hidden, what lies outside.
+@lru_cache(maxsize=1)
+def matched(sample: StereoSample) -> np.ndarray | None:
+    """``(H, W)`` bool: pixels where our plane sweep of the two views finds a match that it is sure of.
+
+    No method, prior or truth has a part in it. It is kept until another sample object comes, so that one
+    sweep serves all methods, and made on the CPU, so that no two runs differ.
 
     Returns:
-        ``out_of_view`` always; ``visible`` and ``occluded`` where the set says what is hidden; where it has
+        ``None`` where the views cannot be swept: no overlap, no baseline, or an image that is too small.
+    """
+    try:
+        volume = sweep(sample, "cpu")
+    except ValueError:
+        return None
+    matches = find_matches(volume.left_01, volume.rights, volume.K, volume=volume)
+    sure = (matches.confidence >= SURE_MATCH).float()
+    return F.interpolate(sure[None], sample.depth_m.shape, mode="nearest-exact")[0, 0].numpy() > 0
+
+
+def regions(sample: StereoSample) -> dict[str, np.ndarray]:
+    """Masks by which AbsRel is split: what the right camera sees, what is hidden, what lies outside, matches.
+
+    Returns:
+        ``out_of_view`` always; ``matched`` and ``unmatched`` (the others) where the two views can be swept;
+        ``visible`` and ``occluded`` where the set says what is hidden; where it has
         material classes, ``tom`` (2 and 3, transparent or mirror), ``not_tom`` (the others) and one
         ``material_<class>`` per class. All ``(H, W)`` bool, within ``sample.valid``.
     """
     outside = out_of_view(sample)
     masks = {"out_of_view": outside}
+    found = matched(sample)
+    if found is not None:
+        masks |= {"matched": sample.valid & found, "unmatched": sample.valid & ~found}
     if sample.occluded is not None:
         hidden = sample.valid & sample.occluded & ~outside
         masks |= {"occluded": hidden, "visible": sample.valid & ~hidden & ~outside}

@@ -26,6 +26,7 @@ from geodiff_plugin.evaluation.detail_tables import (
 )
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.runner import headline
+from geodiff_plugin.evaluation.seed_tables import spread_table, without_copies
 from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
 
 __all__ = ["groups", "pairs_tables", "per_pair_table", "summary_table", "versus_table"]
@@ -138,7 +139,14 @@ def versus_table(records: Sequence[dict[str, Any]], reference: str) -> Table:
 
 
 def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -> list[Table]:
-    """The tables of ``geodiff eval pairs``; ``reference`` is the method that the others are compared with."""
+    """The tables of ``geodiff eval pairs``.
+
+    Args:
+        records: of a run; further seeds of a method in it count in the table of their spread only.
+        reference: the method that the others are compared with.
+    """
+    spread = spread_table(records, groups(records), headline)
+    records = without_copies(records)
     count = len({label_of(record) for record in records})
     tables = [
         per_pair_table(
@@ -156,5 +164,5 @@ def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -
     for group, members in groups(records).items():
         tables.append(summary_table(records, members, f"All metrics, {group}"))
     tables += [regions_table(records), disparity_table(records), uncertainty_table(records)]
-    tables.append(confidence_table(records))
+    tables += [confidence_table(records), spread]
     return [table for table in tables if table.rows]

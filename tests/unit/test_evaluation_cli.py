@@ -86,7 +86,10 @@ def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
     result = invoke(*words, "--crop", "eigen", "--prior", "one", "--prior", "two", "--space", "disparity")
     assert "| middlebury2014/one | 0.000 |" in result.stdout and "RAFT-Stereo" in result.stdout
     assert "--crop eigen --prior one --prior two --space disparity" in result.stdout
-    assert "the crop 'eigen'" in result.stdout
+    assert "the crop 'eigen'" in result.stdout and "--seeds" not in result.stdout
+    seeded = invoke(*words, "--seed", 2, "--seeds", 3).stdout
+    assert "--seeds 3 --seed 2" in seeded and "# Spread" not in seeded
+    assert "Every table but the spread over 3 seeds is of seed 2." in seeded
     with pytest.raises(ValueError, match="crop must be one of"):
         invoke(*words, "--crop", "middle")
 

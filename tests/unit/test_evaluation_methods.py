@@ -198,7 +198,14 @@ def test_families_are_not_taken_for_methods_with_a_prior(tmp_path):
     folder = tmp_path / "maps@work"
     folder.mkdir()
     assert find_method(f"files:{folder}").title == "maps@work"
+    assert find_method(f"files:{folder}#3").name == f"files:{folder}#3"
     assert find_method("guided:inner_steps=1@org/other").prior == "org/other"
+    bound = find_method("guided:inner_steps=1@org/other#3")
+    assert (bound.prior, bound.seed) == ("org/other", 3) and find_method(bound.name).name == bound.name
+    assert bound.base_name == "guided:inner_steps=1" and bound.seedless_name == f"{bound.base_name}@org/other"
+    own = bound.own_settings(Settings(seed=1, ensemble=2))
+    assert own == Settings("org/other", seed=3, ensemble=2)
+    assert find_method("guided@folder#a").prior == "folder#a"
     assert set(FAMILIES) == {"guided", "paper", "hf", "files"}
 
 

@@ -43,6 +43,7 @@ __all__ = [
     "Settings",
     "find_method",
     "with_priors",
+    "with_seeds",
 ]
 
 METHODS: dict[str, Method] = {
@@ -81,16 +82,21 @@ def find_method(name: str) -> Method:
 
     Args:
         name: a key of ``METHODS``, or ``family:parameter`` with a key of ``FAMILIES``; a method that uses a
-            prior may be bound to one other than the settings': ``guided@prs-eth/marigold-depth-v1-1``.
+            prior may be bound to one other than the settings', to another seed, or to both, the seed last:
+            ``guided@prs-eth/marigold-depth-v1-1#3``. Digits after the last # are always a seed.
 
     Raises:
-        ValueError: neither; a prior for a method without one; or the family's own error about its parameter.
+        ValueError: neither; a prior or a seed for a method without a prior; one bound twice; or the family's
+            own error about its parameter.
     """
     if name in METHODS:
         return METHODS[name]
     family, colon, parameter = name.partition(":")
     if colon and family in PRIORLESS:
         return FAMILIES[family](parameter)
+    bare, _, seed = name.rpartition("#")
+    if bare and seed.isdecimal():
+        return _seeded(find_method(bare), int(seed))
     bare, at, prior = name.rpartition("@")
     if at:
         return _bound(find_method(bare), prior)
@@ -101,10 +107,17 @@ def find_method(name: str) -> Method:
 
 
 def _bound(method: Method, prior: str) -> Method:
-    if not (prior and method.uses_prior):
+    if not (prior and method.uses_prior and method.seed is None):
         bad_value("methods", "METHOD@PRIOR with a method that uses a prior", f"{method.name}@{prior}")
     title = f"{method.title} ({prior.rstrip('/').rpartition('/')[2]})"
     return replace(method, name=f"{method.name}@{prior}", title=title, prior=prior)
+
+
+def _seeded(method: Method, seed: int) -> Method:
+    if not (method.uses_prior and method.seed is None):
+        bad_value("methods", "METHOD#SEED with a method that uses a prior", f"{method.name}#{seed}")
+    title = f"{method.title}, seed {seed}"
+    return replace(method, name=f"{method.name}#{seed}", title=title, seed=seed)
 
 
 def with_priors(methods: Sequence[str], priors: Sequence[str]) -> tuple[str, ...]:
@@ -119,3 +132,21 @@ def with_priors(methods: Sequence[str], priors: Sequence[str]) -> tuple[str, ...
     """
     bound = [f"{name}@{prior}" for prior in priors for name in methods if find_method(name).uses_prior]
     return (*methods, *bound)
+
+
+def with_seeds(methods: Sequence[str], first: int, count: int) -> tuple[str, ...]:
+    """The methods, then those of them that use a prior once more for every further seed.
+
+    Args:
+        methods: names; one that is bound to a seed already is not run with others.
+        first: the settings' own seed.
+        count: how many seeds, ``first`` counted, at least 1.
+
+    Raises:
+        ValueError: no seed; else as ``find_method``.
+    """
+    if count < 1:
+        bad_value("seeds", "at least 1", count)
+    noisy = [name for name in methods if find_method(name).uses_prior and find_method(name).seed is None]
+    bound = [f"{name}#{first + i}" for i in range(1, count) for name in noisy]
+    return tuple(dict.fromkeys((*methods, *bound)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -172,6 +172,7 @@ class Method:
         configuration: settings -> JSON values that change the method's result, beside the prior.
         uses_prior: whether ``settings.prior`` matters.
         prior: the prior that this method is bound to, whatever the settings say; ``None`` otherwise.
+        seed: the seed that it is bound to, likewise.
     """
 
     name: str
@@ -181,8 +182,19 @@ class Method:
     configuration: Callable[[Settings], dict[str, Any]]
     uses_prior: bool
     prior: str | None = None
+    seed: int | None = None
+
+    @property
+    def seedless_name(self) -> str:
+        """The name without the seed that the method is bound to."""
+        return self.name if self.seed is None else self.name.removesuffix(f"#{self.seed}")
 
     @property
     def base_name(self) -> str:
-        """The name without the prior that the method is bound to."""
-        return self.name if self.prior is None else self.name.removesuffix(f"@{self.prior}")
+        """The name without the prior and the seed that the method is bound to."""
+        return self.seedless_name if self.prior is None else self.seedless_name.removesuffix(f"@{self.prior}")
+
+    def own_settings(self, settings: Settings) -> Settings:
+        """The settings with the prior and the seed that the method is bound to, if it is."""
+        prior = settings.prior if self.prior is None else self.prior
+        return replace(settings, prior=prior, seed=settings.seed if self.seed is None else self.seed)

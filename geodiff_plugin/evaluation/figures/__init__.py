@@ -17,6 +17,7 @@ from geodiff_plugin.evaluation.figures.canvas import save_png
 from geodiff_plugin.evaluation.figures.curves import draw_exposure, draw_inner_steps
 from geodiff_plugin.evaluation.figures.gs_sweep import draw_gs_sweep
 from geodiff_plugin.evaluation.figures.maps import draw_ablation, draw_qualitative
+from geodiff_plugin.evaluation.figures.terms import draw_terms
 from geodiff_plugin.evaluation.report import run_facts, write_text
 
 __all__ = ["FIGURES", "FigureOptions", "run_figure"]
@@ -29,6 +30,7 @@ FIGURES: dict[str, FigureKind] = {
     "qualitative": FigureKind(
         "depth and error of every method, with --clouds their points", draw_qualitative
     ),
+    "terms": FigureKind("one pair: the prior, the matches, their belief, every loss term", draw_terms),
 }
 """Every figure by name."""
 

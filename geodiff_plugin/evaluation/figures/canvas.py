@@ -20,14 +20,17 @@ from geodiff_plugin.plotting import ticks
 
 __all__ = [
     "COLOURS",
+    "bar_below",
     "depth_bar",
     "error_bar",
+    "mark",
     "new_figure",
     "plain_log_axis",
     "save_png",
     "show_depth",
     "show_error",
     "show_image",
+    "show_values",
 ]
 
 DPI = 90
@@ -109,6 +112,18 @@ def show_error(
     return _map(axes, error, title, "inferno", _matplotlib("colors").Normalize(0, WORST_SHOWN, clip=True))
 
 
+def show_values(axes: Any, values: np.ndarray, title: str, colours: str, low: float, high: float) -> Any:
+    """A map of anything else between two values, in a colour map of matplotlib; NaN is grey."""
+    return _map(axes, values, title, colours, _matplotlib("colors").Normalize(low, high, clip=True))
+
+
+def mark(axes: Any, mask: np.ndarray, colour: str) -> None:
+    """Paint pixels of a map in one colour that its own colours do not have."""
+    rgba = np.zeros((*mask.shape, 4))
+    rgba[mask] = _matplotlib("colors").to_rgba(colour)
+    axes.imshow(rgba, interpolation="nearest")
+
+
 def plain_log_axis(axis: Any, low: float, high: float) -> None:
     """A logarithmic axis with round numbers instead of powers."""
     axis.axes.set(**{f"{axis.axis_name}scale": "log"})
@@ -135,3 +150,19 @@ def error_bar(figure: Any, drawn: Any, axes: Sequence[Any]) -> None:
     bar.set_ticks(steps, labels=[f"{100 * step:.0f}" for step in steps])
     bar.ax.tick_params(labelsize=8)
     bar.set_label("error / depth, %", fontsize=8)
+
+
+def bar_below(figure: Any, drawn: Any, axes: Any, name: str, beyond: str = "neither") -> None:
+    """A colour bar under one map.
+
+    Args:
+        figure: that has the map.
+        drawn: what ``show_values`` or ``show_error`` returned.
+        axes: of the map.
+        name: quantity and unit.
+        beyond: ends at which values go on without a colour of their own: matplotlib's ``extend``.
+    """
+    bar = figure.colorbar(drawn, ax=axes, location="bottom", shrink=0.9, pad=0.03, aspect=16, extend=beyond)
+    bar.set_ticks(np.linspace(drawn.norm.vmin, drawn.norm.vmax, 3))
+    bar.ax.tick_params(labelsize=8)
+    bar.set_label(name, fontsize=8)
