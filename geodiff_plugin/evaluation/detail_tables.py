@@ -56,7 +56,7 @@ def _columns_table(
 
 
 def regions_table(records: Sequence[dict[str, Any]]) -> Table:
-    """AbsRel by what the right camera sees, by matches and by material, mean over the pairs that have such pixels.
+    """AbsRel by what the right camera sees, matches and material, mean over the pairs with such pixels.
 
     Args:
         records: of a run.
@@ -74,9 +74,9 @@ def regions_table(records: Sequence[dict[str, Any]]) -> Table:
         lambda record, name: record["regions"].get(name),
         "AbsRel by region and material",
         "Under the cap; aligned for methods that know relative depth only. Visible and occluded are known "
-        "where the data set has a mask, out of view always; matched is where our plane sweep of the two views "
-        "has a match of confidence 0.5 or more, the same pixels for every method; ToM is transparent or "
-        "mirror (classes 2 and 3).",
+        "where the data set has a mask, out of view always; matched is where our sweep of both views has "
+        "a match of confidence 0.5 or more, the same pixels for every method; ToM is transparent or mirror "
+        "(classes 2 and 3).",
     )
 
 

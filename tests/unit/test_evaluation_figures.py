@@ -7,14 +7,25 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings
+from geodiff_plugin.evaluation.baselines._guidance import call_arguments
 from geodiff_plugin.evaluation.cli import eval_app
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.exposure import exposed_ref
 from geodiff_plugin.evaluation.figures import FIGURES
-from geodiff_plugin.evaluation.figures.canvas import new_figure, save_png, show_depth, show_error
+from geodiff_plugin.evaluation.figures.canvas import (
+    mark,
+    new_figure,
+    save_png,
+    show_depth,
+    show_error,
+    show_values,
+)
 from geodiff_plugin.evaluation.figures.clouds import SHRINK, orbit, render_cloud
 from geodiff_plugin.evaluation.figures.gs_sweep import sweep_g_s
+from geodiff_plugin.evaluation.figures.terms import term_by_term
 from geodiff_plugin.formats import write_depth_npy
+from geodiff_plugin.guidance import GeometryGuidance
 
 
 @pytest.fixture
@@ -87,6 +98,67 @@ def test_qualitative_with_clouds_is_higher(draw):
     without, _ = draw("qualitative", *words)
     with_clouds, numbers = draw("qualitative", *words, "--clouds")
     assert with_clouds.shape[0] > without.shape[0] and "--clouds" in numbers["command"]
+
+
+def test_terms(draw):
+    _, numbers = draw("terms", "--steps", 3)
+    assert set(numbers["abs_rel"]) == {"first", "denoised", "final"}
+    terms = numbers["terms"]
+    assert set(terms) == {"photometric", "matches", "prior_pull", "anchor", "weighted sum"}
+    assert all(len(values) == 3 for values in terms.values())
+    assert 0 < numbers["believed"] <= 1 and 0 < numbers["matched"] <= 1
+    with pytest.raises(ValueError, match="ensemble must be 1"):
+        draw("terms", "--ensemble", 2)
+
+
+@pytest.fixture
+def plane_sample(pair_folder):
+    return load(find_pairs(pair_folder)[0])
+
+
+@pytest.fixture
+def tiny_settings(make_pipeline, tmp_path):
+    make_pipeline().save_pretrained(tmp_path / "prior")
+    return Settings(prior=str(tmp_path / "prior"), steps=2, resolution=64)
+
+
+def test_terms_shows_the_guided_method_and_what_it_started_from(plane_sample, tiny_settings):
+    priors = PriorCache()
+    parts = term_by_term(plane_sample, tiny_settings, priors)
+    guided = METHODS["guided"].run(plane_sample, tiny_settings, priors)
+    np.testing.assert_array_equal(parts.final_m, guided.depth_m)
+    np.testing.assert_array_equal(parts.confidence, guided.confidence)
+    # The call itself doubted the same matches at its own first estimate.
+    trajectories = []
+
+    def keep(pipe, *_):
+        trajectories.append(pipe._guided_run.trajectories[-1])
+
+    views = plane_sample.right, (plane_sample.K_left, plane_sample.K_right), plane_sample.E
+    priors.get(tiny_settings)(
+        Image.fromarray(plane_sample.left),
+        guidance=GeometryGuidance(*views),
+        callback_on_step_end=keep,
+        **call_arguments(tiny_settings),
+    )
+    own = trajectories[0].belief * trajectories[0].objective.views.matches.confidence
+    let_in = np.nan_to_num(parts.believed) > 0
+    assert let_in.mean() > 0.3
+    np.testing.assert_allclose(parts.believed[let_in], own[0, 0].numpy()[let_in], atol=1e-3)
+
+
+def test_terms_of_a_plane(plane_sample, tiny_settings):
+    parts = term_by_term(plane_sample, tiny_settings, PriorCache())
+    matched = np.isfinite(parts.matches_m)
+    error = np.abs(parts.matches_m / plane_sample.depth_m - 1.0)[matched]
+    assert np.median(error) < 0.02
+    np.testing.assert_array_equal(np.isfinite(parts.residual), matched)
+    nearer = (parts.final_m < parts.matches_m)[matched]
+    np.testing.assert_array_equal(parts.residual[matched] > 0, nearer)
+    # The right camera is to the right: it does not see the left edge of a plane, and nothing hides the rest.
+    assert np.isnan(parts.difference[:, 0]).all() and np.isfinite(parts.difference[:, -1]).all()
+    assert not (parts.hidden & np.isnan(parts.difference)).any()
+    assert parts.hidden.mean() < 0.05
 
 
 def test_a_method_that_does_not_apply_is_drawn_as_its_reason(draw, pair_folder):
@@ -164,3 +236,13 @@ def test_maps_show_what_is_unknown_in_grey(tmp_path):
     save_png(figure, tmp_path / "a" / "b.png")
     with Image.open(tmp_path / "a" / "b.png") as picture:
         assert picture.mode == "P"
+
+
+def test_values_have_the_colours_of_their_range_and_marks_cover_them():
+    axes = new_figure(1, 1).subplots()
+    drawn = show_values(axes, np.array([[0.0, np.nan], [2.0, 9.0]]), "", "viridis", 0.0, 4.0)
+    assert drawn.get_array().mask.tolist() == [[False, True], [False, False]]
+    assert (drawn.norm.vmin, drawn.norm.vmax) == (0.0, 4.0)
+    mark(axes, np.array([[True, False], [False, False]]), "#ff0000")
+    painted = axes.images[-1].get_array()
+    assert painted[0, 0].tolist() == [1, 0, 0, 1] and (painted[..., 3].sum() == 1)
