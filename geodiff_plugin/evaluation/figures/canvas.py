@@ -20,7 +20,6 @@ from geodiff_plugin.plotting import ticks
 
 __all__ = [
     "COLOURS",
-    "bar_below",
     "depth_bar",
     "error_bar",
     "mark",
@@ -31,6 +30,7 @@ __all__ = [
     "show_error",
     "show_image",
     "show_values",
+    "value_bar",
 ]
 
 DPI = 90
@@ -67,7 +67,7 @@ def save_png(figure: Any, path: Path) -> None:
     picture = Image.open(drawn).convert("RGB")
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
-        picture.quantize(256, dither=Image.Dither.NONE).save(temporary, format="PNG", optimize=True)
+        picture.quantize(256, kmeans=1, dither=Image.Dither.NONE).save(temporary, format="PNG", optimize=True)
 
 
 def show_image(axes: Any, image: np.ndarray, title: str = "") -> None:
@@ -143,26 +143,31 @@ def depth_bar(figure: Any, drawn: Any, axes: Sequence[Any], near: float, far: fl
     bar.set_label("depth, m", fontsize=8)
 
 
-def error_bar(figure: Any, drawn: Any, axes: Sequence[Any]) -> None:
-    """A colour bar of relative errors beside a row of maps."""
-    bar = figure.colorbar(drawn, ax=list(axes), shrink=0.9, pad=0.01, extend="max")
+def error_bar(figure: Any, drawn: Any, axes: Sequence[Any], location: str = "right") -> None:
+    """A colour bar of relative errors beside a row of maps, or at ``"bottom"`` under one."""
     steps = np.linspace(0, WORST_SHOWN, 6)
+    bar = _bar(figure, drawn, axes, location, extend="max")
     bar.set_ticks(steps, labels=[f"{100 * step:.0f}" for step in steps])
-    bar.ax.tick_params(labelsize=8)
     bar.set_label("error / depth, %", fontsize=8)
 
 
-def bar_below(figure: Any, drawn: Any, axes: Any, name: str, beyond: str = "neither") -> None:
+def value_bar(figure: Any, drawn: Any, axes: Any, name: str, beyond: str = "neither") -> None:
     """A colour bar under one map.
 
     Args:
         figure: that has the map.
-        drawn: what ``show_values`` or ``show_error`` returned.
+        drawn: what ``show_values`` returned.
         axes: of the map.
         name: quantity and unit.
         beyond: ends at which values go on without a colour of their own: matplotlib's ``extend``.
     """
-    bar = figure.colorbar(drawn, ax=axes, location="bottom", shrink=0.9, pad=0.03, aspect=16, extend=beyond)
+    bar = _bar(figure, drawn, [axes], "bottom", extend=beyond)
     bar.set_ticks(np.linspace(drawn.norm.vmin, drawn.norm.vmax, 3))
-    bar.ax.tick_params(labelsize=8)
     bar.set_label(name, fontsize=8)
+
+
+def _bar(figure: Any, drawn: Any, axes: Sequence[Any], location: str, extend: str) -> Any:
+    shape = {"pad": 0.01} if location == "right" else {"pad": 0.03, "aspect": 16, "panchor": False}
+    bar = figure.colorbar(drawn, ax=list(axes), location=location, shrink=0.9, extend=extend, **shape)
+    bar.ax.tick_params(labelsize=8)
+    return bar

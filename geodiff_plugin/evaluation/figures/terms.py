@@ -1,0 +1,232 @@
+"""One pair term by term: what the prior says, what the views say, how far it is believed, what comes of it.
+
+Hop: sample -> a call without updates, a guided call -> maps of both, loss terms by step -> figure.
+Paper: Algorithm 1, Eq. 14 (eq:geo-loss) and Eq. 17; not a figure of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.baselines import PriorCache, Settings
+from geodiff_plugin.evaluation.baselines._guidance import call_arguments, posed_views, prior_space
+from geodiff_plugin.evaluation.datasets import StereoSample
+from geodiff_plugin.evaluation.figures.base import Drawing, FigureOptions, samples
+from geodiff_plugin.evaluation.figures.canvas import (
+    COLOURS,
+    depth_bar,
+    error_bar,
+    mark,
+    new_figure,
+    show_depth,
+    show_error,
+    show_image,
+    show_values,
+    value_bar,
+)
+from geodiff_plugin.evaluation.figures.maps import CELL_IN
+from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.formats import as_image_01
+from geodiff_plugin.geometry import hidden_in_right, warp_right_to_left
+from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.metric import AffineState
+from geodiff_plugin.plotting import depth_range
+from geodiff_plugin.terms.matches import CAUCHY_PLANES
+from geodiff_plugin.trajectory import Trajectory
+from geodiff_plugin.types import StepReport
+
+__all__ = ["TermByTerm", "draw_terms", "term_by_term"]
+
+#: A fraction of the schedule that no step reaches: nothing is updated, the scale is searched all the same.
+NEVER = 1.0
+#: The largest mean absolute difference of colours that has a colour of its own.
+WORST_DIFFERENCE = 0.2
+HIDDEN_COLOUR = COLOURS[5]
+
+
+@dataclass(frozen=True, eq=False)
+class TermByTerm:
+    """One guided call taken apart; ``(h, w)`` is the grid of the losses, ``(H, W)`` the left image's.
+
+    Attributes:
+        first_m: ``(H, W)`` metres, the prior's first estimate with the search's scale.
+        matches_m: ``(h, w)`` metres, depth that the views say by themselves; NaN where nothing.
+        believed: ``(h, w)`` in [0, 1], confidence of the matches after doubt and gate; NaN without one.
+        denoised_m: ``(H, W)`` metres, the decoded result, before it is refined.
+        final_m: ``(H, W)`` metres.
+        residual: ``(h, w)`` planes of the sweep, ``final_m`` against the matches; above 0 is nearer.
+        difference: ``(H, W)`` in [0, 1], the photometric error of ``final_m``; NaN where no camera sees it.
+        hidden: ``(H, W)`` bool, behind another part of ``final_m`` in every right view that reaches it.
+        confidence: ``(H, W)`` in [0, 1].
+        history: one report a round of updates.
+    """
+
+    first_m: np.ndarray
+    matches_m: np.ndarray
+    believed: np.ndarray
+    denoised_m: np.ndarray
+    final_m: np.ndarray
+    residual: np.ndarray
+    difference: np.ndarray
+    hidden: np.ndarray
+    confidence: np.ndarray
+    history: tuple[StepReport, ...]
+
+
+def _followed(
+    pipe: Any, left: Image.Image, guidance: GeometryGuidance, settings: Settings
+) -> tuple[Any, list]:
+    """Output of a guided call, and the metric depth ``(1, 1, h', w')`` after each of its steps."""
+    seen: list[Tensor] = []
+
+    def keep(_pipe: Any, _step: int, _timestep: Any, values: dict[str, Tensor]) -> None:
+        seen.append(values["metric_depth"].detach().float().cpu())
+
+    arguments = call_arguments(settings)
+    return pipe(left, guidance=guidance, callback_on_step_end=keep, **arguments), seen
+
+
+def _hidden(guidance: GeometryGuidance, depth_m: Tensor) -> Tensor:
+    """``(1, 1, H, W)`` bool: right views reach the pixel, and in all of those something else covers it."""
+    rights, K_left, _ = guidance.inputs[0].on(depth_m.device)
+    reached = clear = torch.zeros_like(depth_m, dtype=torch.bool)
+    for image, K_right, T in rights:
+        cameras = (K_left[None], K_right[None], T[None])
+        covered = hidden_in_right(depth_m, *cameras, tuple(image.shape[-2:]))
+        visible = warp_right_to_left(image[None], depth_m, *cameras).visible
+        reached, clear = reached | visible, clear | (visible & ~covered)
+    return reached & ~clear
+
+
+def _resized(values: Tensor, size: tuple[int, ...]) -> Tensor:
+    return F.interpolate(values, size, mode="bilinear", align_corners=False)
+
+
+@torch.no_grad()
+def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -> TermByTerm:
+    """Guide one pair by the default preset and keep what it went through.
+
+    The first estimate is that of a second call, the same but for ``start``: it searches, and updates nothing.
+
+    Raises:
+        ValueError: an ensemble, whose members differ in every map but the last.
+    """
+    if settings.ensemble != 1:
+        bad_value("ensemble", "1 for this figure", settings.ensemble)
+    pipe, left = priors.get(settings), Image.fromarray(sample.left)
+    views, size = posed_views(sample, settings.views), sample.left.shape[:2]
+    guidance = GeometryGuidance(*views)
+    held, estimates = _followed(pipe, left, GeometryGuidance(*views, start=NEVER), settings)
+    out, steps = _followed(pipe, left, guidance, settings)
+    evidence = guidance.prepare(as_image_01(sample.left, "left")[None])
+    trajectory = Trajectory(guidance.config, evidence, [0], prior_space(pipe))
+    start = held.history[0]
+    found = AffineState(*(value.cpu() for value in (start.s_hat, start.t_hat, start.g_s)))
+    trajectory.settle_scale(trajectory.metric.relative(estimates[0], found))
+    known, believed = trajectory.objective.views.matches, trajectory.matches
+    there = (known.confidence > 0) & (known.inverse_depth > 0)
+    final_m = torch.from_numpy(out.prediction).permute(0, 3, 1, 2).float()
+    inverse_m = 1.0 / _resized(final_m, known.inverse_depth.shape[-2:])
+
+    def where_matched(values: Tensor) -> np.ndarray:
+        return torch.where(there, values, torch.full_like(values, torch.nan))[0, 0].numpy()
+
+    return TermByTerm(
+        first_m=_resized(estimates[0], size)[0, 0].numpy(),
+        matches_m=where_matched(1.0 / known.inverse_depth),
+        believed=where_matched(believed.confidence),
+        denoised_m=_resized(steps[-1], size)[0, 0].numpy(),
+        final_m=out.prediction[0, ..., 0],
+        residual=where_matched((inverse_m - known.inverse_depth) / known.plane_step.view(-1, 1, 1, 1)),
+        difference=np.where(out.visible[0, ..., 0], out.photometric_error[0, ..., 0], np.nan),
+        hidden=_hidden(guidance, final_m)[0, 0].numpy(),
+        confidence=out.confidence[0, ..., 0],
+        history=tuple(out.history),
+    )
+
+
+def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[str, float]) -> None:
+    """Depths in the upper row, in the same colours; under them what they are compared with."""
+    figure.suptitle(f"{sample.label}, default preset", x=0.005, ha="left", fontsize=9)
+    upper, lower = figure.subplots(2, 6)
+    for axes in lower:
+        axes.set_anchor("N")  # level with the one that has no bar below
+    truth = np.where(sample.valid, sample.depth_m, np.nan)
+    near, far = depth_range(truth, sample.valid)
+    show_image(upper[0], sample.left, "left image")
+    show_image(lower[0], sample.right, "right image")
+    drawn = show_depth(upper[1], truth, near, far, "truth")
+    show_depth(upper[2], parts.first_m, near, far, f"prior's first estimate\nAbsRel {abs_rel['first']:.3f}")
+    show_depth(upper[3], parts.matches_m, near, far, "matches\n(grey: none)")
+    show_depth(upper[4], parts.denoised_m, near, far, f"denoised\nAbsRel {abs_rel['denoised']:.3f}")
+    show_depth(upper[5], parts.final_m, near, far, f"refined\nAbsRel {abs_rel['final']:.3f}")
+    depth_bar(figure, drawn, upper, near, far)
+    title = "photometric error\n(blue: hidden, grey: unseen)"
+    shown = show_values(lower[1], parts.difference, title, "inferno", 0.0, WORST_DIFFERENCE)
+    mark(lower[1], parts.hidden, HIDDEN_COLOUR)
+    value_bar(figure, shown, lower[1], "mean absolute difference", "max")
+    title, most = "refined against matches\n(red: nearer)", CAUCHY_PLANES
+    shown = show_values(lower[2], parts.residual, title, "RdBu_r", -most, most)
+    value_bar(figure, shown, lower[2], "planes of the sweep", "both")
+    shown = show_values(lower[3], parts.believed, "matches, how far believed", "viridis", 0.0, 1.0)
+    value_bar(figure, shown, lower[3], "confidence after doubt and gate")
+    shown = show_values(lower[4], parts.confidence, "confidence of refined", "viridis", 0.0, 1.0)
+    value_bar(figure, shown, lower[4], "probability of an error < 10 %")
+    shown = show_error(lower[5], parts.final_m, sample.depth_m, sample.valid, "error of refined")
+    error_bar(figure, shown, [lower[5]], "bottom")
+
+
+def _curves(figure: Any, history: Sequence[StepReport], values: dict[str, list[float]]) -> None:
+    """One small plot a term, each with its own unit, from 0."""
+    figure.suptitle("terms of the loss, before the updates of each step", fontsize=9)
+    repeated = len({report.step for report in history}) < len(history)
+    count = range(1, len(history) + 1)
+    for index, (axes, (name, own)) in enumerate(
+        zip(figure.subplots(1, len(values), squeeze=False)[0], values.items(), strict=True)
+    ):
+        axes.plot(count, own, color=COLOURS[index % len(COLOURS)], marker="o", markersize=4, clip_on=False)
+        axes.set_title(name, fontsize=9)
+        axes.set_xticks(count)
+        axes.set_xlabel("round of updates" if repeated else "denoising step", fontsize=8)
+        axes.set_ylim(0.0, 1.1 * max(own) or 1.0)
+        if not any(own):
+            axes.set_yticks([0])
+        axes.tick_params(labelsize=8)
+        axes.grid(alpha=0.3)
+
+
+def draw_terms(options: FigureOptions) -> Drawing:
+    """Draw the first sample.
+
+    Raises:
+        ValueError: no sample, or an ensemble.
+    """
+    sample = samples(options)[0]
+    parts = term_by_term(sample, options.run.settings, PriorCache())
+    depths = {"first": parts.first_m, "denoised": parts.denoised_m, "final": parts.final_m}
+    abs_rel = {
+        name: evaluate_depth(depth_m, sample.depth_m, sample.valid)["abs_rel"]
+        for name, depth_m in depths.items()
+    }
+    values = {name: [float(r.terms[name]) for r in parts.history] for name in parts.history[0].terms}
+    values["weighted sum"] = [float(report.loss) for report in parts.history]
+    high = CELL_IN * sample.left.shape[0] / sample.left.shape[1]
+    heights = 2 * high + 1.55, 1.5
+    figure = new_figure(6 * CELL_IN + 0.9, sum(heights))
+    upper, lower = figure.subfigures(2, 1, height_ratios=heights)
+    _maps(upper, sample, parts, abs_rel)
+    _curves(lower, parts.history, values)
+    matched = np.isfinite(parts.believed)
+    numbers = {"sample": sample.label, "abs_rel": abs_rel, "matched": float(matched.mean())}
+    numbers["believed"] = float(parts.believed[matched].mean()) if matched.any() else 0.0
+    numbers |= {"hidden": float(parts.hidden.mean()), "terms": values}
+    return Drawing(figure, numbers)
