@@ -105,6 +105,14 @@ def depth(
         int | None,
         _option("Longer side for the prior, pixels; 0: as the image.", RUN, "--resolution"),
     ] = None,
+    points: Annotated[
+        Path | None,
+        _option(
+            "Known depths: map of LEFT (mm PNG, PFM, .npy) or N x 3 (.npy, text), metres.",
+            RUN,
+            "--points",
+        ),
+    ] = None,
     near: Annotated[float | None, _option("Nearest depth to search, metres.", RUN, "--near")] = None,
     far: Annotated[float | None, _option("Farthest depth to search, metres.", RUN, "--far")] = None,
     seed: Annotated[int, _option("Seed of the noise.", RUN, "--seed")] = 0,

@@ -55,6 +55,7 @@ class DepthArguments:
     steps: int | None = None
     ensemble: int = 1
     resolution: int | None = None
+    points: Path | None = None
     near: float | None = None
     far: float | None = None
     seed: int = 0
@@ -196,6 +197,8 @@ def check_arguments(arguments: DepthArguments) -> Settings:
     check_number(arguments.seed, "--seed", 0, 2**63 - 1, integer=True)
     check_choice(arguments.dtype, "--dtype", DTYPES)
     check_choice(arguments.preset, "--preset", PRESETS)
+    if arguments.points is not None and arguments.preset == "paper":
+        bad_value("--points", "given with the default preset", "--preset paper", "Algorithm 1 has no points.")
     check_number(arguments.min_confidence, "--min-confidence", 0.0, 1.0)
     _check_out(arguments.out, arguments.overwrite)
     return Settings(

@@ -14,7 +14,7 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value, check_intrinsics, check_intrinsics_fit, check_number, check_pose
 from geodiff_plugin.commands.arguments import DepthArguments, Settings, check_positive
-from geodiff_plugin.formats import read_calibration, read_image, read_matrix, rig_from_parameters
+from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
 
@@ -158,7 +158,8 @@ def _make_guidance(
     if arguments.preset == "paper":
         bounds = {} if settings.depth_range is None else {"g_s_range": settings.depth_range}
         return GeometryGuidance.paper(*cameras, **bounds)
-    return GeometryGuidance(*cameras, depth_range=settings.depth_range)
+    points = None if arguments.points is None else read_points(arguments.points, "--points")
+    return GeometryGuidance(*cameras, points=points, depth_range=settings.depth_range)
 
 
 def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:

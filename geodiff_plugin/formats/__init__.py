@@ -17,6 +17,7 @@ from geodiff_plugin.formats.files import check_file, read_text
 from geodiff_plugin.formats.images import MIN_SIDE, as_image_01, read_image
 from geodiff_plugin.formats.matrices import read_matrix
 from geodiff_plugin.formats.pointcloud import flying_points, write_ply
+from geodiff_plugin.formats.points import read_points
 from geodiff_plugin.formats.reading import CALIBRATION_FORMATS, read_calibration
 from geodiff_plugin.formats.rigs import rig_from_parameters
 
@@ -33,6 +34,7 @@ __all__ = [
     "read_image",
     "read_matrix",
     "read_pfm",
+    "read_points",
     "read_text",
     "rig_from_parameters",
     "write_depth_mm_png",

@@ -40,6 +40,18 @@ def command(pair_files, prior):
     return [*pair_files.command, "--prior", prior, "--device", "cpu"]
 
 
+def test_known_points_move_the_depth(geodiff, command, pair_files, tmp_path):
+    known = np.zeros((48, 64), np.float32)
+    known[::4, ::4] = 2.5
+    np.save(tmp_path / "lidar.npy", known)
+    answer = geodiff(*command, "--steps", 1, "--points", tmp_path / "lidar.npy", "-q")
+    assert answer.code == 0, answer.err
+    depth_m = np.load(pair_files.folder / "geodiff-out" / "depth.npy")
+    assert np.median(np.abs(depth_m[known > 0] / 2.5 - 1)) < 0.1
+    answer = geodiff(*command, *QUICK, "--points", tmp_path / "lidar.npy", "--overwrite")
+    assert answer.code == 2 and "--points must be given with the default preset" in answer.err
+
+
 def test_writes_everything(geodiff, command, pair_files):
     answer = geodiff(*command)
     assert answer.code == 0, answer.err
