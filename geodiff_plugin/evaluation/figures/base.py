@@ -105,7 +105,7 @@ def depths_of(sample: StereoSample, name: str, settings: Settings, priors: Prior
     """Run one method; relative depth gets scale and shift from the truth, and its title says so."""
     method = find_method(name)
     try:
-        prediction = method.run(sample, settings, priors)
+        prediction = method.run(sample, method.own_settings(settings), priors)
     except NotApplicable as reason:
         return MethodDepth(f"{method.title}:\n{reason}", None, None)
     depth_m = prediction.depth_m
