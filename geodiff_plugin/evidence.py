@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -25,6 +26,7 @@ from geodiff_plugin.matching import (
     points_to_matches,
 )
 from geodiff_plugin.objective import RightViews, Views
+from geodiff_plugin.point_scale import sure_matches
 from geodiff_plugin.terms import MatchTarget
 
 SWAPPED = (
@@ -61,6 +63,11 @@ class Evidence:
     points: Matches | None = None
     sweep_points: Matches | None = None
     warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def sure_matches(self) -> Matches | None:
+        """``matches`` as points for the search, where enough are sure; the same at every step of a call."""
+        return None if self.matches is None else sure_matches(self.matches)
 
 
 def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tensor, Tensor]:

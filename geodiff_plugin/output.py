@@ -108,11 +108,13 @@ def _as_maps(values: Any) -> Tensor:
 
 def _refined(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> tuple[Tensor, Tensor | None]:
     """The depth of every image brought to what is known, and how far that decided it."""
-    count = len(run.evidence)
-    known = [_known(run, i, depth) for i, depth in enumerate(depth_m.split(1))]
-    if not run.config.refine or any(target is None for target in known):
+    if not run.config.refine:
         return depth_m, None
-    refined = [refine_depth(depth_m[i : i + 1], known[i], lefts_01[i : i + 1]) for i in range(count)]
+    depths = depth_m.split(1)
+    known = [_known(run, i, depth) for i, depth in enumerate(depths)]
+    if any(target is None for target in known):
+        return depth_m, None
+    refined = [refine_depth(*each) for each in zip(depths, known, lefts_01.split(1), strict=True)]
     return torch.cat([r.depth_m for r in refined]), torch.cat([r.support for r in refined])
 
 

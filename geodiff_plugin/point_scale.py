@@ -15,13 +15,12 @@ from torch import Tensor
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.known_points import UNIT
 from geodiff_plugin.metric import GROWS_WITH_DEPTH, MetricMap
+from geodiff_plugin.scale_search import MIN_SURE, SURE
 
 __all__ = ["depth_span", "fit_to_points", "sure_matches"]
 
 #: (near, far) pairs tried, and how far beyond the points' own range, as a factor.
 CANDIDATES, REACH = 48, 4.0
-#: A match counts as sure above this confidence; fewer than so many say nothing about a range.
-SURE, MIN_SURE = 0.5, 50
 #: Points that are looked at; width of the Cauchy cost in units of the points, about a prior's own error.
 SAMPLES, CAUCHY_UNITS = 1500, 32.0
 #: A current state this close to the best cost, as a factor, stays: a new one restarts the affine updates.

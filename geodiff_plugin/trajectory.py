@@ -18,7 +18,7 @@ from geodiff_plugin.evidence import Evidence, chunk_views
 from geodiff_plugin.matching import believe_before_prior, gate_matches, with_points
 from geodiff_plugin.metric import GROWS_WITH_DEPTH, AffineState, MetricMap, smooth_floor
 from geodiff_plugin.objective import Loss, Objective
-from geodiff_plugin.point_scale import depth_span, fit_to_points, sure_matches
+from geodiff_plugin.point_scale import depth_span, fit_to_points
 from geodiff_plugin.refinement import refine_depth
 from geodiff_plugin.scale_search import argmin_over, refine_to_matches, search_scale
 from geodiff_plugin.terms import MatchTarget
@@ -146,7 +146,7 @@ class Trajectory:
             limits = self.config.depth_range
             found = search_scale(evidence.volume, floored, space, depth_range=limits, current=current)
             near_far, on_edge = (found.near_m, found.far_m), found.on_edge
-        sure = None if evidence.matches is None else sure_matches(evidence.matches)
+        sure = evidence.sure_matches
         if sure is not None:
             # A poor prior's true basin is shallow in raw costs; matches tell basins apart at a prior's error.
             near_far = refine_to_matches(floored, evidence.matches, *near_far, space)

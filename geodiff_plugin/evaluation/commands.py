@@ -32,7 +32,17 @@ from geodiff_plugin.evaluation.runner import processes, run
 from geodiff_plugin.evaluation.seed_tables import without_copies
 from geodiff_plugin.evaluation.tables import pairs_tables
 
-__all__ = ["PAIRS_METHODS", "PairsOptions", "command_line", "remarks_on", "run_list", "run_pairs", "select"]
+__all__ = [
+    "PAIRS_METHODS",
+    "PairsOptions",
+    "all_refs",
+    "command_line",
+    "measure",
+    "remarks_on",
+    "run_list",
+    "run_pairs",
+    "select",
+]
 
 PAIRS_METHODS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 
@@ -82,6 +92,40 @@ class PairsOptions:
 
     def __post_init__(self) -> None:
         check_choice(self.crop, "crop", CROPS)
+
+
+def all_refs(options: PairsOptions, datasets: Sequence[str] | None = None) -> list[SampleRef]:
+    """References to all samples of the data: of the named data sets, else of those that the options name."""
+    return find_pairs(
+        options.data,
+        datasets or options.datasets or None,
+        pairs=options.pairs,
+        pixel_centre=options.pixel_centre,
+    )
+
+
+def measure(
+    refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions
+) -> list[dict[str, Any]] | None:
+    """Run methods, with every further prior and seed of the options.
+
+    Returns:
+        The records; ``None`` in every process but the main one, which alone writes tables.
+
+    Raises:
+        ValueError, OSError: as ``runner.run``.
+    """
+    records = run(
+        refs,
+        with_seeds(with_priors(methods, options.priors), options.settings.seed, options.seeds),
+        options.settings,
+        options.out,
+        crop=options.crop,
+        skip_broken=options.skip_broken,
+        save_depth=options.save_depth,
+        progress=not options.quiet,
+    )
+    return records if processes(options.settings).is_main_process else None
 
 
 def select(refs: Sequence[SampleRef], options: PairsOptions) -> list[SampleRef]:
@@ -174,27 +218,17 @@ def run_pairs(options: PairsOptions) -> None:
         ValueError: bad options, no samples, or a broken sample without ``skip_broken``.
         OSError: missing or unreadable files without ``skip_broken``.
     """
-    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
-    refs = select(find_pairs(options.data, options.datasets or None, **posed), options)
-    records = run(
-        refs,
-        with_seeds(with_priors(options.methods, options.priors), options.settings.seed, options.seeds),
-        options.settings,
-        options.out,
-        crop=options.crop,
-        skip_broken=options.skip_broken,
-        save_depth=options.save_depth,
-        progress=not options.quiet,
-    )
-    state = processes(options.settings)
-    if not state.is_main_process:
+    refs = select(all_refs(options), options)
+    records = measure(refs, options.methods, options)
+    if records is None:
         return
     facts = run_facts(command_line(options, ("eval", "pairs", str(options.data))))
     remarks = remarks_on(records, options)
     if options.sample is not None:
         remarks.append(f"Drawn with seed {options.settings.seed}: {', '.join(ref.label for ref in refs)}.")
-    if state.num_processes > 1:
-        remarks.append(f"Run by {state.num_processes} processes.")
+    count = processes(options.settings).num_processes
+    if count > 1:
+        remarks.append(f"Run by {count} processes.")
     page = write_tables(options.out, "Results", facts, pairs_tables(records), remarks)
     if options.results is not None:
         write_text(options.results, page)

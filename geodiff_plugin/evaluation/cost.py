@@ -17,8 +17,7 @@ from typing import Any
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
 from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
-from geodiff_plugin.evaluation.commands import PairsOptions, command_line, remarks_on, select
-from geodiff_plugin.evaluation.datasets import find_pairs
+from geodiff_plugin.evaluation.commands import PairsOptions, all_refs, command_line, remarks_on, select
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.report import run_facts, write_tables
 from geodiff_plugin.evaluation.runner import processes, run
@@ -78,8 +77,7 @@ def run_cost(options: PairsOptions) -> None:
     """
     if processes(options.settings).num_processes > 1:
         bad_value("the number of processes", "1 for cost", processes(options.settings).num_processes)
-    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
-    refs = select(find_pairs(options.data, options.datasets or None, **posed), options)
+    refs = select(all_refs(options), options)
     settings = replace(options.settings, steps=options.settings.steps or STEPS)
     records = []
     for method in with_priors(tuple(dict.fromkeys((*COST_METHODS, *options.methods))), options.priors):

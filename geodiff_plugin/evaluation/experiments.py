@@ -15,14 +15,20 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import with_priors
 from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
 from geodiff_plugin.evaluation.changes import CHANGES, changes_table, flatness_methods, flatness_table
-from geodiff_plugin.evaluation.commands import PairsOptions, command_line, remarks_on, select
-from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, find_pairs
+from geodiff_plugin.evaluation.commands import (
+    PairsOptions,
+    all_refs,
+    command_line,
+    measure,
+    remarks_on,
+    select,
+)
+from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef
 from geodiff_plugin.evaluation.detail_tables import regions_table
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.paper_tables import FoundColumn, layout_table
 from geodiff_plugin.evaluation.published import LAYOUTS, Column, Layout
 from geodiff_plugin.evaluation.report import run_facts, write_tables
-from geodiff_plugin.evaluation.runner import processes, run
 from geodiff_plugin.evaluation.tables import summary_table
 
 __all__ = ["how_to_obtain", "methods_of", "run_changes", "run_experiment"]
@@ -42,10 +48,9 @@ def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
 
 def _find(column: Column, options: PairsOptions, sample: int | None) -> tuple[str | None, list[SampleRef]]:
     """The first data set that can stand for a column, and the samples to measure."""
-    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
     wanted = options.datasets or column.datasets
     for dataset in (name for name in column.datasets if name in wanted):
-        refs = find_pairs(options.data, [dataset], **posed)
+        refs = all_refs(options, [dataset])
         # One column may have what --scenes names while another has not.
         refs = [ref for ref in refs if not options.scenes or any(s in ref.label for s in options.scenes)]
         if refs:
@@ -65,13 +70,12 @@ def _missing(columns: Sequence[Column]) -> list[str]:
 
 def _ablation_layout(layout: Layout, options: PairsOptions) -> Layout:
     """Table 4 on KITTI where it is there, and on everything else that is."""
-    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
-    found = {ref.dataset for ref in find_pairs(options.data, options.datasets or None, **posed)}
-    kitti = [column for column in layout.columns if found & set(column.datasets)]
+    there = {ref.dataset for ref in all_refs(options)}
+    kitti = [column for column in layout.columns if there & set(column.datasets)]
     others = [
         Column(name, (name,), 0)
         for name in DATASETS
-        if name in found - {d for c in kitti for d in c.datasets}
+        if name in there - {d for c in kitti for d in c.datasets}
     ]
     return replace(layout, columns=tuple(kitti + others) or layout.columns)
 
@@ -91,23 +95,6 @@ def _tables(
     return [table for table in tables if table.rows]
 
 
-def _measured(
-    refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions
-) -> list[dict[str, Any]] | None:
-    """Records of a run; ``None`` in every process but the main one."""
-    records = run(
-        refs,
-        with_priors(methods, options.priors),
-        options.settings,
-        options.out,
-        crop=options.crop,
-        skip_broken=options.skip_broken,
-        save_depth=options.save_depth,
-        progress=not options.quiet,
-    )
-    return records if processes(options.settings).is_main_process else None
-
-
 def run_changes(name: str, options: PairsOptions) -> None:
     """Change one thing of the default at a time: its parts, or its numbers.
 
@@ -118,10 +105,9 @@ def run_changes(name: str, options: PairsOptions) -> None:
     Raises:
         ValueError, OSError: as ``run_experiment``.
     """
-    posed = {"pairs": options.pairs, "pixel_centre": options.pixel_centre}
-    refs = select(find_pairs(options.data, options.datasets or None, **posed), options)
+    refs = select(all_refs(options), options)
     own = flatness_methods() if name == "flatness" else tuple(method for _, method in CHANGES[name])
-    records = _measured(refs, tuple(dict.fromkeys((*own, *options.methods))), options)
+    records = measure(refs, tuple(dict.fromkeys((*own, *options.methods))), options)
     if records is None:
         return
     facts = run_facts(command_line(options, ("eval", name, "--data", str(options.data)), ()))
@@ -156,7 +142,7 @@ def run_experiment(name: str, options: PairsOptions) -> None:
     if not refs:
         bad_value("data", f"a folder with the data of {name}", str(options.data), " ".join(absent))
     names = methods_of(name, options.methods)
-    records = _measured(refs, names, options)
+    records = measure(refs, names, options)
     if records is None:
         return
     finished = {label_of(record) for record in records if record["status"] != "broken"}

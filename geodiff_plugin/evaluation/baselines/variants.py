@@ -13,11 +13,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from geodiff_plugin import point_scale, refinement, scale_search
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.baselines._guidance import guided_method
+from geodiff_plugin.evaluation.baselines._guidance import guided_configuration, guided_method
 from geodiff_plugin.evaluation.baselines.base import Method, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance import DEFAULT_WEIGHTS, GeometryGuidance
@@ -33,27 +31,27 @@ CONSTANTS = {
 """Modules whose constants an ablation may change for its own calls: numbers that are no knobs."""
 
 _WEIGHT = "weights."
-_CAMERA = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]])
-_BESIDE = np.eye(4) + 0.1 * np.eye(4, k=3)
 _POSITIONAL = {"self", "right", "K", "E", "points", "left_size", "weights"}
 _KNOBS = tuple(
     name for name in inspect.signature(GeometryGuidance.__init__).parameters if name not in _POSITIONAL
 )
 
 
-def _is_constant(name: str) -> bool:
+def _constant(name: str) -> tuple[Any, str] | None:
+    """Module and attribute of a constant ``module.NAME``; ``None`` for any other name."""
     module, _, constant = name.partition(".")
-    return constant.isupper() and hasattr(CONSTANTS.get(module), constant)
+    there = constant.isupper() and hasattr(CONSTANTS.get(module), constant)
+    return (CONSTANTS[module], constant) if there else None
 
 
 def number_of(name: str) -> float:
     """A number of the default preset: a knob, ``weights.TERM``, or a constant ``module.NAME``."""
-    if _is_constant(name):
-        module, _, constant = name.partition(".")
-        return getattr(CONSTANTS[module], constant)
+    constant = _constant(name)
+    if constant is not None:
+        return getattr(*constant)
     if name.startswith(_WEIGHT):
         return DEFAULT_WEIGHTS[name.removeprefix(_WEIGHT)]
-    return GeometryGuidance(np.zeros((32, 32, 3), np.uint8), _CAMERA, _BESIDE).config[name]
+    return guided_configuration(GeometryGuidance, Settings())["guidance"][name]
 
 
 @contextmanager
@@ -62,13 +60,11 @@ def _constants(changed: Mapping[str, float]) -> Iterator[None]:
     before = {name: number_of(name) for name in changed}
     try:
         for name, value in changed.items():
-            module, _, constant = name.partition(".")
-            setattr(CONSTANTS[module], constant, value)
+            setattr(*_constant(name), value)
         yield
     finally:
         for name, value in before.items():
-            module, _, constant = name.partition(".")
-            setattr(CONSTANTS[module], constant, value)
+            setattr(*_constant(name), value)
 
 
 def _changes(text: str, weights: dict[str, float]) -> tuple[dict[str, Any], dict[str, float]]:
@@ -77,7 +73,7 @@ def _changes(text: str, weights: dict[str, float]) -> tuple[dict[str, Any], dict
     constants: dict[str, float] = {}
     for part in text.split("+"):
         knob, equals, written = part.partition("=")
-        if not equals or not (knob in _KNOBS or knob.startswith(_WEIGHT) or _is_constant(knob)):
+        if not equals or not (knob in _KNOBS or knob.startswith(_WEIGHT) or _constant(knob)):
             bad_value(
                 "methods",
                 "of the form preset:knob=value+knob=value with knobs of GeometryGuidance, or weights.TERM",
@@ -88,7 +84,7 @@ def _changes(text: str, weights: dict[str, float]) -> tuple[dict[str, Any], dict
             value = json.loads(written)
         except ValueError:
             value = written
-        if _is_constant(knob):
+        if _constant(knob):
             constants[knob] = value
         elif knob.startswith(_WEIGHT):
             changes["weights"] = changes.get("weights", weights) | {knob.removeprefix(_WEIGHT): value}

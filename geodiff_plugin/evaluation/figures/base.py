@@ -16,8 +16,8 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, find_method
 from geodiff_plugin.evaluation.baselines.base import Settings
-from geodiff_plugin.evaluation.commands import PairsOptions, select
-from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load
+from geodiff_plugin.evaluation.commands import PairsOptions, all_refs, select
+from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 
 __all__ = ["Drawing", "FigureKind", "FigureOptions", "MethodDepth", "depths_of", "references", "samples"]
@@ -83,8 +83,7 @@ def references(options: FigureOptions) -> list[SampleRef]:
         ValueError: none, or bad options.
     """
     run = options.run
-    posed = {"pairs": run.pairs, "pixel_centre": run.pixel_centre}
-    return select(find_pairs(run.data, run.datasets or None, **posed), run)
+    return select(all_refs(run), run)
 
 
 def samples(options: FigureOptions) -> list[StereoSample]:
