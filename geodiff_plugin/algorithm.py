@@ -27,7 +27,7 @@ def guided_step(
     eps: Tensor,
     step: int,
     timestep: float,
-    fractions: Sequence[float],
+    spans: Sequence[tuple[float, float]],
 ) -> Tensor:
     """One pass of Algorithm 1's loop body: search, correction, gradient of L_geo, updates.
 
@@ -41,8 +41,8 @@ def guided_step(
         eps: ``(B, C, h, w)`` predicted noise, the yardstick of the norm-matched rule.
         step: index in the schedule.
         timestep: the scheduler's timestep.
-        fractions: where in the schedule, [0, 1), each round of ``inner_steps`` updates stands. One round a
-            step, ``[step / number of steps]``, but for priors that cannot take as many steps as are wanted.
+        spans: begin and end in the schedule, [0, 1], of each round of correction and ``inner_steps`` updates.
+            One round a step, but for priors that cannot take as many steps as are wanted.
 
     Returns:
         ``(B, C, h, w)`` float32, what to add to the leaf; exactly 0 with ``optimize_latents=False``.
@@ -52,14 +52,14 @@ def guided_step(
     corrected map, encoded.
     """
     config, z, anchor = trajectory.config, leaf, None
-    rounds = [f for f in fractions if trajectory.is_active(f)]
+    rounds = [span for span in spans if trajectory.is_active(span[0])]
     moves = config.optimize_latents and bool(rounds)
-    for _ in rounds or fractions[:1]:
+    for _, end in rounds or spans[:1]:
         if moves and config.correct and encode is not None:
             moved = _corrected(trajectory, z, decode, encode)
             anchor = moved if anchor is None else anchor + moved - z
             z = moved
-        updates = config.inner_steps if rounds else 0
+        updates = config.inner_steps if rounds and end > config.updates_from else 0
         z, anchor, first = _update(trajectory, z, anchor, z0_of, decode, eps, updates)
         trajectory.report(step, timestep, first)
     return (z - leaf).detach()

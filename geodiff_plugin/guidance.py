@@ -11,24 +11,15 @@ from typing import Any
 from diffusers.configuration_utils import ConfigMixin
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value, check_choice, check_intrinsics_fit, check_number, check_range
+from geodiff_plugin._checks import bad_value, check_intrinsics_fit
 from geodiff_plugin.evidence import Evidence, prepare_evidence
 from geodiff_plugin.guidance_doors import GuidanceDoors
 from geodiff_plugin.guidance_inputs import ImageInputs, read_inputs
-from geodiff_plugin.metric import POSITIVE
+from geodiff_plugin.knobs import CHECKS, check_knobs
 from geodiff_plugin.terms import TERMS
-from geodiff_plugin.terms.points import POINTS_LOSSES
 from geodiff_plugin.types import Rig
-from geodiff_plugin.updates import RULES
 
-__all__ = ["DEFAULT_WEIGHTS", "GeometryGuidance"]
-
-#: Weights of the default preset; how flat the optimum around each is: docs/knobs.md.
-DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
-GRADIENTS = ("denoised", "full")
-SEARCHES = ("volume", "one-number", "points-range")
-ANCHORS = ("start", "zero")
-STEP_FROM = ("given", "updated")
+__all__ = ["GeometryGuidance"]
 
 
 class GeometryGuidance(GuidanceDoors, ConfigMixin):
@@ -54,6 +45,8 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         step_affine: step size of ``affine_rule`` on the raw scale and shift.
         inner_steps: updates per denoising step; ``None`` for 5 after a correction, else 40; 0 leaves search
             and correction alone.
+        updates_from: steps that end by this fraction of the schedule, [0, 1], make no updates; ``None``
+            for 0.75 after a correction (the last of four steps makes some), else 0.
         min_steps: denoising steps that a guided call takes at least when it names no ``num_inference_steps``;
             a pipeline's own default may be 1, which leaves nothing for the guidance to come back to.
         optimize_latents: ``False`` learns scale and shift only (S5.3, Table 4), latents stay untouched.
@@ -112,6 +105,7 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         step_latents: float | None = None,
         step_affine: float = 0.01,
         inner_steps: int | None = None,
+        updates_from: float | None = None,
         min_steps: int = 4,
         optimize_latents: bool = True,
         start: float = 0.0,
@@ -136,49 +130,10 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         positive: str = "softplus",
         step_from: str = "given",
     ) -> None:
-        weights = dict(DEFAULT_WEIGHTS if weights is None else weights)
-        for name, weight in weights.items():
-            check_choice(name, "a key of weights", TERMS)
-            check_number(weight, f"weights[{name!r}]", 0.0, float("inf"))
-        stop = check_number(stop, "stop", 0.0, 1.0)
-        # What matches and points can be encoded into is near already; else the gradient has the whole way.
-        known = weights.get("matches") or (weights.get("points") and points is not None)
-        near = bool(correct and known and optimize_latents and gradient == "denoised")
-        inner_steps = (5 if near else 40) if inner_steps is None else inner_steps
-        step_latents = (0.03 if near else 0.1) if step_latents is None else step_latents
+        given = {name: value for name, value in locals().items() if name in CHECKS}
         # Registered by hand: the diffusers decorator zips positional arguments with the registered
         # names, and would save the right image as the first hyperparameter.
-        self.register_to_config(
-            gradient=check_choice(gradient, "gradient", GRADIENTS),
-            rule=check_choice(rule, "rule", RULES),
-            affine_rule=check_choice(affine_rule, "affine_rule", RULES),
-            step_latents=check_number(step_latents, "step_latents", 0.0, 1e6),
-            step_affine=check_number(step_affine, "step_affine", 0.0, 1e6),
-            inner_steps=check_number(inner_steps, "inner_steps", 0, 10_000, integer=True),
-            min_steps=check_number(min_steps, "min_steps", 1, 1000, integer=True),
-            optimize_latents=bool(optimize_latents),
-            start=check_number(start, "start", 0.0, stop),
-            stop=stop,
-            weights=weights,
-            eta=check_number(eta, "eta", 0.0, 1.0),
-            pyramid_levels=check_number(pyramid_levels, "pyramid_levels", 1, 10, integer=True),
-            exposure=bool(exposure),
-            z_test=bool(z_test),
-            min_visible=check_number(min_visible, "min_visible", 0.0, 1.0),
-            pull_to=check_choice(pull_to, "pull_to", ANCHORS),
-            search=check_choice(search, "search", SEARCHES),
-            g_s_range=check_range(g_s_range, "g_s_range"),
-            depth_range=check_range(depth_range, "depth_range"),
-            gate=check_number(gate, "gate", 1.0, 1e6),
-            loss_resolution=check_number(loss_resolution, "loss_resolution", 32, 1 << 16, integer=True),
-            correct=bool(correct),
-            doubt=bool(doubt),
-            refine=bool(refine),
-            respace=bool(respace),
-            points_loss=check_choice(points_loss, "points_loss", POINTS_LOSSES),
-            positive=check_choice(positive, "positive", POSITIVE),
-            step_from=check_choice(step_from, "step_from", STEP_FROM),
-        )
+        self.register_to_config(**check_knobs(given, points_given=points is not None))
         self._inputs = read_inputs(right, K, E, points)
         self._left_size = left_size
         self._check_fed()

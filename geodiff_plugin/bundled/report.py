@@ -57,7 +57,7 @@ class Reporter:
         Args:
             progress: counters for the log.
             average: weights to judge.
-            divisor: of the stage; scenes are processed at the size that it trains on.
+            divisor: the stage's least; scenes are processed at the largest size that it trains on.
             last: also try several steps.
 
         Returns:

@@ -21,17 +21,18 @@ class Stage:
 
     Attributes:
         until: fraction of the budget where it ends, in (0, 1].
-        divisor: rendered images are shown at ``1 / divisor`` of their size.
+        divisors: rendered images are shown at ``1 / divisor`` of their size, each in its turn, step by step.
         last: share of samples at the last timestep, where the denoiser is a plain regression from the image.
     """
 
     until: float
-    divisor: int
+    divisors: tuple[int, ...]
     last: float
 
 
-SCRATCH = (Stage(0.45, 2, 0.9), Stage(0.65, 2, 0.5), Stage(1.0, 1, 0.5))
-CONTINUED = (Stage(0.65, 2, 0.8), Stage(1.0, 1, 0.6))
+# Full size alone unlearns half size within an hour, and a wide image is half size at any usual resolution.
+SCRATCH = (Stage(0.45, (2,), 0.9), Stage(0.65, (2,), 0.5), Stage(1.0, (2, 1), 0.5))
+CONTINUED = (Stage(0.6, (2,), 0.8), Stage(1.0, (2, 1), 0.6))
 
 
 def stage_at(fraction: float, continued: bool) -> Stage:

@@ -142,7 +142,7 @@ def _train(options: argparse.Namespace, accelerator: Accelerator) -> Progress:
     network, prepared = accelerator.prepare(unet, optimiser)
     reporter = Reporter(options, assemble(vae, build_unet().to(device).eval(), text))
     step_of = _Step(network, _embed(text).to(device), options, accelerator, progress.step)
-    started, base, pool = time.monotonic(), progress.seconds, None
+    started, base, pools = time.monotonic(), progress.seconds, {}
     bar = tqdm(total=1000, unit="permille", mininterval=10, disable=not accelerator.is_main_process)
     while True:
         progress.seconds = base + time.monotonic() - started
@@ -151,11 +151,14 @@ def _train(options: argparse.Namespace, accelerator: Accelerator) -> Progress:
         stage = stage_at(fraction, continued=options.init_from is not None)
         if accelerator.is_main_process and (fraction >= 1 or reporter.due(progress)):
             store(options.out, unet, average, optimiser, progress)
-            reporter.report(progress, average, stage.divisor, last=fraction >= 1)
+            reporter.report(progress, average, min(stage.divisors), last=fraction >= 1)
         if fraction >= 1:
             break
-        pool = _pool_for(stage.divisor, pool, options, vae, accelerator)
-        if progress.step % 50 == 0 or not len(pool):
+        divisor = stage.divisors[progress.step % len(stage.divisors)]
+        if divisor not in pools:
+            pools[divisor] = _open_pool(divisor, options, vae, accelerator)
+        pool = pools[divisor]
+        if progress.step % 50 < len(stage.divisors) or not len(pool):
             pool.refresh(8)
         for group in optimiser.param_groups:
             group["lr"] = learning_rate(options.rate, fraction, progress.step)
@@ -199,7 +202,7 @@ class _Step:
 
     def __call__(self, pool: LatentStore, stage: Stage, optimiser) -> tuple[torch.Tensor, int]:
         """The loss and the number of scenes; half as many at full size as at low resolution."""
-        size = max(self.batch // (1 if stage.divisor == 2 else 2), 1)
+        size = max(self.batch * pool.divisor // 2, 1)
         image, depth = (x.to(self.text.device) for x in pool.batch(size, self.generator))
         noise = torch.randn(depth.shape, generator=self.generator).to(depth.device)
         timesteps = draw_timesteps(size, stage.last, self.generator).to(depth.device)
@@ -211,10 +214,8 @@ class _Step:
         return loss, size
 
 
-def _pool_for(divisor: int, pool: LatentStore | None, options, vae, accelerator: Accelerator) -> LatentStore:
-    """The store of the stage's resolution; the other one is dropped at a switch."""
-    if pool is not None and pool.divisor == divisor:
-        return pool
+def _open_pool(divisor: int, options, vae, accelerator: Accelerator) -> LatentStore:
+    """The store of one resolution; what is small is kept mirrored too."""
     rank, world = accelerator.process_index, accelerator.num_processes
     variants = 2 if divisor == 2 else 1
     return LatentStore(options.cache, vae, divisor, variants, rank, world, fresh=options.fresh)

@@ -14,7 +14,7 @@ from geodiff_plugin.evaluation.cells import by_method, cell, count_of_pairs, int
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.paper_tables import metric_values
 from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
-from geodiff_plugin.guidance import DEFAULT_WEIGHTS
+from geodiff_plugin.knobs import DEFAULT_WEIGHTS
 from geodiff_plugin.updates import RULES
 
 __all__ = ["CHANGES", "NUMBERS", "changes_table", "flatness_methods", "flatness_table"]
@@ -46,6 +46,7 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("no diffusion", "no-diffusion"),
         ("without correction at every step", "guided:correct=false"),
         ("without gradient updates", "guided:inner_steps=0"),
+        ("with gradient updates at every step", "guided:updates_from=0"),
         ("without refinement of the result", "guided:refine=false"),
         ("without doubt about reflections", "guided:doubt=false"),
         ("without a gate on matches", "guided:gate=1000000"),

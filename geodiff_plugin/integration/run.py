@@ -97,10 +97,10 @@ class GuidedRun:
         self._stack.close()
 
     @property
-    def fractions(self) -> list[float]:
-        """Where the rounds of the current step lie in the schedule, [0, 1) each."""
-        share = 1.0 / (len(self.timesteps) * self.rounds)
-        return [(self.step_index * self.rounds + i) * share for i in range(self.rounds)]
+    def spans(self) -> list[tuple[float, float]]:
+        """Begin and end of the rounds of the current step in the schedule, [0, 1] each."""
+        first, count = self.step_index * self.rounds, len(self.timesteps) * self.rounds
+        return [(i / count, (i + 1) / count) for i in range(first, first + self.rounds)]
 
     def decode(self, z0: Tensor) -> Tensor:
         """Unclipped relative map without padding, ``(B, 1, H, W)`` float32, with its graph."""
@@ -157,9 +157,11 @@ class GuidedRun:
             eps,
             self.step_index,
             self.timesteps[self.step_index],
-            self.fractions,
+            self.spans,
         )
-        if not self.config.optimize_latents or not any(map(trajectory.is_active, self.fractions)):
+        if not self.config.optimize_latents or not any(
+            trajectory.is_active(begin) for begin, _ in self.spans
+        ):
             result = output, z_t, None  # bit for bit the pipeline's own step
         elif full and self.prior.max_steps == 1:
             # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.

@@ -22,6 +22,7 @@ from geodiff_plugin import (
     disable_geometry_guidance,
     enable_geometry_guidance,
 )
+from geodiff_plugin import algorithm as algorithm_module
 from tests.conftest import SCHEDULER
 
 FAST = {"inner_steps": 2, "min_steps": 1, "loss_resolution": 64}
@@ -135,6 +136,31 @@ def test_outside_start_and_stop_nothing_is_updated(make_pipeline, textured_plane
     guidance = guidance_for(textured_plane, start=0.9, stop=1.0)
     out = pipe(left, guidance=guidance, generator=seeded(), output_latent=True)
     assert torch.equal(out.latent, reference.latent)  # 2 steps at fractions 0 and 0.5
+
+
+@pytest.mark.parametrize(
+    "knobs, updates",
+    [
+        ({}, [0, 0, 0, 2]),  # matches are encoded at every step, photographs refine them at the last
+        ({"updates_from": 0.5}, [0, 0, 2, 2]),
+        ({"updates_from": 1.0}, [0, 0, 0, 0]),
+        ({"correct": False}, [2, 2, 2, 2]),
+        ({"weights": {"photometric": 1.0}}, [2, 2, 2, 2]),
+    ],
+)
+def test_updates_wait_for_the_corrections(make_pipeline, textured_plane, left, monkeypatch, knobs, updates):
+    made = []
+
+    def counted(*args):
+        made.append(args[-1])
+        return update(*args)
+
+    update = algorithm_module._update
+    monkeypatch.setattr(algorithm_module, "_update", counted)
+    pipe = enable_geometry_guidance(make_pipeline())
+    guidance = guidance_for(textured_plane, **knobs)
+    pipe(left, guidance=guidance, generator=seeded(), num_inference_steps=4)
+    assert made == updates
 
 
 def test_one_update_of_the_paper_is_algorithm_1(make_pipeline, textured_plane, left):

@@ -35,10 +35,10 @@ def test_timesteps_lean_towards_noise():
 
 
 @pytest.mark.parametrize("continued", [False, True])
-def test_stages_cover_the_budget_and_end_at_full_size(continued):
-    divisors = [schedule.stage_at(k / 100, continued).divisor for k in range(101)]
-    assert divisors == sorted(divisors, reverse=True)
-    assert divisors[0] == 2 and divisors[-1] == 1
+def test_stages_cover_the_budget_and_end_with_every_size(continued):
+    divisors = [schedule.stage_at(k / 100, continued).divisors for k in range(101)]
+    assert divisors == sorted(divisors, key=len)
+    assert divisors[0] == (2,) and divisors[-1] == (2, 1)
 
 
 def test_learning_rate_warms_up_and_falls_to_a_hundredth():

@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
-from geodiff_plugin.guidance import DEFAULT_WEIGHTS, GeometryGuidance
+from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.knobs import DEFAULT_WEIGHTS
 
 __all__ = ["PHOTOMETRIC_ONLY"]
 

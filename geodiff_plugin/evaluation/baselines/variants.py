@@ -18,7 +18,8 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines._guidance import guided_configuration, guided_method
 from geodiff_plugin.evaluation.baselines.base import Method, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.guidance import DEFAULT_WEIGHTS, GeometryGuidance
+from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.knobs import DEFAULT_WEIGHTS
 from geodiff_plugin.matching import contradiction
 from geodiff_plugin.presets import PAPER_WEIGHTS
 
