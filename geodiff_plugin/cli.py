@@ -82,6 +82,16 @@ def depth(
     k_right: Annotated[
         Path | None, _option("3x3 intrinsics of the right image, if they differ.", CAMERAS, "--K-right")
     ] = None,
+    view: Annotated[
+        list[Path] | None, _option("A further view of the scene; repeatable.", CAMERAS, "--view")
+    ] = None,
+    view_k: Annotated[
+        list[Path] | None, _option("3x3 intrinsics of each --view; LEFT's if none.", CAMERAS, "--view-K")
+    ] = None,
+    view_e: Annotated[
+        list[Path] | None,
+        _option("4x4 pose of each --view in the left camera's frame, metres.", CAMERAS, "--view-E"),
+    ] = None,
     prior: Annotated[
         str, _option("'bundled', a hub id or a folder; KEY:folder says which kind.", RUN, "--prior")
     ] = "bundled",
@@ -136,7 +146,8 @@ def depth(
     from geodiff_plugin.commands.arguments import DepthArguments
     from geodiff_plugin.commands.depth import run_depth
 
-    run_depth(DepthArguments(**typed | {"calib": tuple(calib or ()), "option": tuple(option or ())}))
+    repeated = {name: tuple(typed[name] or ()) for name in ("calib", "view", "view_k", "view_e", "option")}
+    run_depth(DepthArguments(**typed | repeated))
 
 
 @app.command()

@@ -49,6 +49,9 @@ class DepthArguments:
     k: Path | None = None
     e: Path | None = None
     k_right: Path | None = None
+    view: tuple[Path, ...] = ()
+    view_k: tuple[Path, ...] = ()
+    view_e: tuple[Path, ...] = ()
     prior: str = "bundled"
     space: str | None = None
     option: tuple[str, ...] = ()
@@ -70,10 +73,13 @@ class DepthArguments:
 
     def as_json(self) -> dict[str, Any]:
         """The options as JSON can hold them."""
-        plain = {
-            name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()
-        }
-        return plain | {"calib": [str(path) for path in self.calib]}
+        return {name: _plain(value) for name, value in asdict(self).items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    return str(value) if isinstance(value, Path) else value
 
 
 @dataclass(frozen=True)
@@ -197,8 +203,14 @@ def check_arguments(arguments: DepthArguments) -> Settings:
     check_number(arguments.seed, "--seed", 0, 2**63 - 1, integer=True)
     check_choice(arguments.dtype, "--dtype", DTYPES)
     check_choice(arguments.preset, "--preset", PRESETS)
-    if arguments.points is not None and arguments.preset == "paper":
-        bad_value("--points", "given with the default preset", "--preset paper", "Algorithm 1 has no points.")
+    if arguments.preset == "paper":
+        for option, what, given in (
+            ("--points", "no points", arguments.points is not None),
+            ("--view", "two views", bool(arguments.view)),
+        ):
+            if given:
+                cure = f"Algorithm 1 has {what}."
+                bad_value(option, "given with the default preset", "--preset paper", cure)
     check_number(arguments.min_confidence, "--min-confidence", 0.0, 1.0)
     _check_out(arguments.out, arguments.overwrite)
     return Settings(

@@ -6,13 +6,21 @@ Paper: S3.3 (two views with known cameras).
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value, check_intrinsics, check_intrinsics_fit, check_number, check_pose
+from geodiff_plugin._checks import (
+    bad_value,
+    check_baseline,
+    check_intrinsics,
+    check_intrinsics_fit,
+    check_number,
+    check_pose,
+)
 from geodiff_plugin.commands.arguments import DepthArguments, Settings, check_positive
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.guidance import GeometryGuidance
@@ -33,7 +41,7 @@ class Inputs:
         left: ``(H, W, 3)`` float32 in [0, 1], EXIF orientation applied.
         right: likewise, of its own size.
         rig: cameras of both, in pixels of these images.
-        guidance: the right view with the settings of the preset.
+        guidance: the right view, and those beside it, with the settings of the preset.
     """
 
     left: np.ndarray
@@ -151,15 +159,40 @@ def read_rig(
     return replace(rig, size_left=left_size, size_right=right_size)
 
 
+def _read_further_views(
+    arguments: DepthArguments, K_left: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Image, K and pose of every ``--view``, checked under its own name."""
+    images, poses, matrices = arguments.view, arguments.view_e, arguments.view_k
+    for option, files, counts in (
+        ("--view-E", poses, {len(images)}),
+        ("--view-K", matrices, {0, len(images)}),
+    ):
+        if len(files) not in counts:
+            bad_value(option, f"given once for each of {len(images)} --view", f"{len(files)} times")
+    views = []
+    for i, path in enumerate(images):
+        option = f"--view {path}"
+        image, K = _read_view(path, option), K_left
+        if matrices:
+            K = check_intrinsics(read_matrix(matrices[i], "--view-K"), f"--view-K {matrices[i]}")
+        check_intrinsics_fit(K, *_size(image), f"K of {option}", "its image")
+        E = check_pose(read_matrix(poses[i], "--view-E"), f"--view-E {poses[i]}")
+        check_baseline(E, f"--view-E {poses[i]}")
+        views.append((image, K, E))
+    return views
+
+
 def _make_guidance(
     arguments: DepthArguments, settings: Settings, right: np.ndarray, rig: Rig
 ) -> GeometryGuidance:
-    cameras = (right, (rig.K_left, rig.K_right), rig.E)
     if arguments.preset == "paper":
         bounds = {} if settings.depth_range is None else {"g_s_range": settings.depth_range}
-        return GeometryGuidance.paper(*cameras, **bounds)
+        return GeometryGuidance.paper(right, (rig.K_left, rig.K_right), rig.E, **bounds)
+    views = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E)]
+    views += _read_further_views(arguments, rig.K_left)
     points = None if arguments.points is None else read_points(arguments.points, "--points")
-    return GeometryGuidance(*cameras, points=points, depth_range=settings.depth_range)
+    return GeometryGuidance.from_views(views, points=points, depth_range=settings.depth_range)
 
 
 def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:
@@ -169,7 +202,10 @@ def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:
         OSError, TypeError, ValueError: naming the option or the file.
     """
     left, right = _read_view(arguments.left, "LEFT"), _read_view(arguments.right, "RIGHT")
-    if arguments.left.samefile(arguments.right):
-        bad_value("RIGHT", "another photograph than LEFT", f"{arguments.right} for both")
+    photographs = {"LEFT": arguments.left, "RIGHT": arguments.right}
+    photographs |= {f"--view {number}": path for number, path in enumerate(arguments.view, 1)}
+    for (one, a), (other, b) in itertools.combinations(photographs.items(), 2):
+        if a.exists() and b.exists() and a.samefile(b):
+            bad_value(other, f"another photograph than {one}", f"{b} for both")
     rig = read_rig(arguments, settings.cameras, _size(left), _size(right))
     return Inputs(left, right, rig, _make_guidance(arguments, settings, right, rig))

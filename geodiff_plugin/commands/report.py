@@ -129,6 +129,7 @@ def build_report(
             "K_right": rig.K_right,
             "E": rig.E,
             "baseline_m": float(np.linalg.norm(rig.E[:3, 3])),
+            "further_views": [{"K": other.K_right, "E": other.E} for other in inputs.guidance.rigs[1:]],
         },
         "prior": {
             "name": arguments.prior,

@@ -142,6 +142,23 @@ def test_same_image_twice(refused, pair_files):
     refused(["depth", pair_files.left, pair_files.left, "--calib", pair_files.calib], "RIGHT")
 
 
+def test_further_views(refused, pair_files):
+    folder = pair_files.folder
+    third, pose, still, K = folder / "third.png", folder / "E.txt", folder / "still.txt", folder / "K.txt"
+    Image.new("RGB", (64, 48)).save(third)
+    np.savetxt(still, np.eye(4))
+    np.savetxt(pose, np.eye(4) + 0.1 * np.eye(4, k=3))
+    np.savetxt(K, 4.0 * np.diag([60.0, 60.0, 0.25]) + 128.0 * np.eye(3, k=2))
+    command = [*pair_files.command, "--view"]
+    refused([*command, third], "--view-E", "once for each of 1 --view", "0 times")
+    refused([*pair_files.command, "--view-E", pose], "--view-E", "0 --view", "1 times")
+    refused([*command, third, "--view-E", still], "--view-E", "baseline")
+    refused([*command, third, "--view-E", pose, "--view-K", K], "third.png", "outside")
+    refused([*command, pair_files.right, "--view-E", pose], "--view 1", "another photograph than RIGHT")
+    refused([*command, folder / "none.png", "--view-E", pose], "none.png")
+    refused([*command, third, "--view-E", pose, "--preset", "paper"], "--view", "two views")
+
+
 def test_unknown_calibration_format(refused, pair_files):
     pair_files.calib.write_text("my camera is a good one\n")
     refused(pair_files.command, "calibration", "calib.txt")

@@ -52,6 +52,20 @@ def test_known_points_move_the_depth(geodiff, command, pair_files, tmp_path):
     assert answer.code == 2 and "--points must be given with the default preset" in answer.err
 
 
+def test_a_further_view_takes_part(geodiff, command, pair_files, textured_plane):
+    """The pair's right image once more, as a third camera: twice the evidence, the same depth."""
+    third, pose = pair_files.folder / "third.png", pair_files.folder / "pose.txt"
+    Image.fromarray(textured_plane.right).save(third)
+    np.savetxt(pose, textured_plane.E)
+    answer = geodiff(*command, "--steps", 1, "--view", third, "--view-E", pose, "-q")
+    assert answer.code == 0, answer.err
+    out = pair_files.folder / "geodiff-out"
+    report = json.loads((out / "report.json").read_text())
+    (further,) = report["inputs"]["further_views"]
+    assert further["E"] == report["inputs"]["E"] and report["arguments"]["view"] == [str(third)]
+    assert np.isfinite(np.load(out / "depth.npy")).all()
+
+
 def test_writes_everything(geodiff, command, pair_files):
     answer = geodiff(*command)
     assert answer.code == 0, answer.err
