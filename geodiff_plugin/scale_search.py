@@ -1,4 +1,4 @@
-"""Find the metres of a relative map by lookup in a plane-sweep volume, and refine them on matches.
+"""Find the metres of a relative map by lookup in a plane-sweep volume.
 
 Hop: ``CostVolume``, relative map ``x (B, 1, h, w)`` -> depths of ``x = 0`` and ``x = 1``, per sample.
 Paper: S7.3 (pre-selection of g_s, "a variant of the traditional Plane Sweep Volume technique").
@@ -17,9 +17,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.matching import CostVolume, Matches
+from geodiff_plugin.matching import CostVolume
 
-__all__ = ["ScaleSearch", "argmin_over", "refine_to_matches", "search_scale"]
+__all__ = ["ScaleSearch", "argmin_over", "depth_at", "search_scale"]
 
 #: Cost beyond which a pixel counts as an outlier (occluded, mirrored, mistaken by the prior).
 COST_CLAMP = 0.35
@@ -29,9 +29,6 @@ COARSE = 48  # 1128 pairs near < far
 FINE = 13
 #: A current state this close to the best cost found stays: re-anchoring restarts the affine updates.
 KEEP_MARGIN = 2e-3
-#: Fit to matches: width of the Cauchy weight in planes, how far near and far may move (log factor), what
-#: counts as a sure match, how many of them a quantile needs, and which quantile the prior calls 0.
-CAUCHY_PLANES, LOG_NEAREST, LOG_FARTHEST, SURE, MIN_SURE, NEAR_QUANTILE = 8.0, 1.4, 0.7, 0.5, 50, 0.02
 #: Least share of the pixels that must stay in the right image.
 MIN_SEEN_RECTIFIED, MIN_SEEN_POSED = 0.6, 0.25
 
@@ -63,7 +60,7 @@ def _sample_positions(height: int, width: int, device: torch.device) -> Tensor:
     return (rows[:, None] * width + columns[None]).flatten()
 
 
-def _depth_at(x: Tensor, near: Tensor, far: Tensor, space: str) -> Tensor:
+def depth_at(x: Tensor, near: Tensor, far: Tensor, space: str) -> Tensor:
     """Metres at relative values ``x (..., P)`` for ranges ``(..., 1)``; monotone between near and far."""
     if space == "depth":
         return near + (far - near) * x
@@ -137,7 +134,7 @@ def search_scale(
         def best_of(
             near: Tensor, far: Tensor, row: Tensor = values[b], every: int = 1
         ) -> tuple[Tensor, Tensor, Tensor]:
-            depth = _depth_at(row[None, ::every], near[:, None], far[:, None], space)
+            depth = depth_at(row[None, ::every], near[:, None], far[:, None], space)
             mean, share = _lookup(cost[:, ::every], seen[:, ::every], volume.inverse_depth, depth)
             mean = mean + (share < least) * 1.0  # only if no pair keeps enough in view does one of these win
             k = mean.argmin()
@@ -166,83 +163,6 @@ def search_scale(
             )
         found.append((near, far, mean, on_edge, kept))
     return ScaleSearch(*(torch.stack(column) for column in zip(*found, strict=True)))
-
-
-@torch.no_grad()
-def refine_to_matches(
-    x: Tensor, matches: Matches, near_m: Tensor, far_m: Tensor, space: str, *, iterations: int = 8
-) -> tuple[Tensor, Tensor]:
-    """Robust fit of the two ends of a relative map to matches, started from the search's result.
-
-    Args:
-        x: ``(B, 1, h, w)`` relative maps of one image.
-        matches: of that image; or known points.
-        near_m: ``(B,)`` metres, start.
-        far_m: ``(B,)`` metres, start.
-        space: as in ``search_scale``.
-        iterations: of reweighted Gauss-Newton on (log near, log far).
-
-    Returns:
-        ``near_m, far_m``, far within a factor of 2 of the start: matches alone have outliers, so they
-        refine what the lookup found and never replace it. Residuals are in planes, with Cauchy weights.
-        Near is at most the 2 % quantile of the matched depths (priors are trained on that normalisation): no
-        value of the map can be nearer than its own zero, so a zero that lies too far away would hold the
-        nearest surfaces back for good.
-    """
-    height, width = matches.size
-    at = (matches.confidence.flatten() > 0).nonzero()[:, 0]  # known points are few: not one may be missed
-    at = at[:: max(1, len(at) // SAMPLES)]
-    target = matches.inverse_depth.flatten()[at]
-    # A match at infinity constrains nothing, and a wrong one would push far without end.
-    weight = matches.confidence.flatten()[at] * (target > matches.plane_step)
-    values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
-    start = torch.stack([near_m, far_m], 1).log()
-    fit = start
-    for _ in range(iterations):
-        fit = _refine_once(fit, start, values, target, weight, matches.plane_step, space, (True, True))
-    sure = weight > SURE
-    if int(sure.sum()) < MIN_SURE:
-        return _ordered(fit)
-    nearest = -torch.quantile(target[sure], 1.0 - NEAR_QUANTILE).log()
-    fit = torch.stack(
-        [torch.minimum(fit[:, 0], torch.maximum(nearest, start[:, 0] - LOG_NEAREST)), fit[:, 1]], 1
-    )
-    for _ in range(iterations):
-        fit = _refine_once(fit, start, values, target, weight, matches.plane_step, space, (False, True))
-    return _ordered(fit)
-
-
-def _ordered(fit: Tensor) -> tuple[Tensor, Tensor]:
-    near, far = fit.exp().unbind(1)
-    return torch.minimum(near, far * 0.98), far
-
-
-def _refine_once(
-    fit: Tensor,
-    start: Tensor,
-    values: Tensor,
-    target: Tensor,
-    weight: Tensor,
-    plane_step: Tensor,
-    space: str,
-    free: tuple[bool, bool],
-) -> Tensor:
-    """One reweighted Gauss-Newton step on ``fit (B, 2)``, log metres; what is not ``free`` stays."""
-
-    def residual(p: Tensor) -> Tensor:
-        return (1.0 / _depth_at(values, p[:, :1].exp(), p[:, 1:].exp(), space) - target) / plane_step
-
-    e, h = residual(fit), 1e-3
-    mask = fit.new_tensor(free)
-    J = torch.stack([(residual(fit + h * d) - e) / h for d in torch.eye(2, device=fit.device)], -1) * mask
-    w = weight / (1.0 + (e / CAUCHY_PLANES) ** 2)
-    normal = torch.einsum("bpi,bp,bpj->bij", J, w, J)
-    damping = 1e-3 * normal.diagonal(dim1=1, dim2=2).sum(1) + 1e-6
-    normal = normal + damping[:, None, None] * torch.eye(2, device=fit.device)
-    gradient = torch.einsum("bpi,bp,bp->bi", J, w, e)
-    step = torch.linalg.solve(normal, gradient).clamp(-0.3, 0.3) * mask
-    limit = fit.new_tensor([LOG_NEAREST, LOG_FARTHEST])
-    return torch.maximum(torch.minimum(fit - step, start + limit), start - limit)
 
 
 def argmin_over(candidates: Tensor, cost: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:

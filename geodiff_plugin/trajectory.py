@@ -18,9 +18,9 @@ from geodiff_plugin.evidence import Evidence, chunk_views
 from geodiff_plugin.matching import believe_before_prior, gate_matches, with_points
 from geodiff_plugin.metric import GROWS_WITH_DEPTH, AffineState, MetricMap, smooth_floor
 from geodiff_plugin.objective import Loss, Objective
-from geodiff_plugin.point_scale import depth_span, fit_to_points
+from geodiff_plugin.point_scale import depth_span, fit_to_points, refine_to_matches
 from geodiff_plugin.refinement import refine_depth
-from geodiff_plugin.scale_search import argmin_over, refine_to_matches, search_scale
+from geodiff_plugin.scale_search import argmin_over, search_scale
 from geodiff_plugin.terms import MatchTarget
 from geodiff_plugin.types import StepReport
 from geodiff_plugin.updates import RULES

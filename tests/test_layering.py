@@ -28,6 +28,7 @@ LAYER = {
     "guidance": 3,
     "guidance_doors": 3,
     "guidance_inputs": 3,
+    "knobs": 3,
     "point_scale": 3,
     "presets": 3,
     "refinement": 3,

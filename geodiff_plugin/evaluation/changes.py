@@ -68,7 +68,7 @@ NUMBERS = (
     *("refinement.MATCH_NOISE", "refinement.CAUCHY", "refinement.SMOOTHNESS", "refinement.INERTIA"),
     *("refinement.IMAGE_EDGE", "refinement.DEPTH_EDGE"),
     *("contradiction.REGION", "contradiction.SPREADS", "contradiction.FLOOR"),
-    *("point_scale.CAUCHY_UNITS", "scale_search.CAUCHY_PLANES"),
+    *("point_scale.CAUCHY_UNITS", "point_scale.CAUCHY_PLANES"),
 )
 """Every number that decides the default's result: knobs, and constants by ``module.NAME``."""
 

@@ -12,7 +12,8 @@ import torch
 from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
 from geodiff_plugin.matching.benchmark import textured_pair
-from geodiff_plugin.scale_search import argmin_over, refine_to_matches, search_scale
+from geodiff_plugin.point_scale import refine_to_matches
+from geodiff_plugin.scale_search import argmin_over, search_scale
 
 SPACES = {
     "depth": lambda z: z,
