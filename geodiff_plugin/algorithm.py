@@ -17,6 +17,10 @@ from geodiff_plugin.trajectory import Trajectory
 
 __all__ = ["guided_step"]
 
+#: The loss is a mean over pixels, so a pixel's gradient is below float16's least number where the decoder
+#: runs in it. A power of two, so that nothing else changes.
+_GRADIENT_SCALE = 2.0**14
+
 
 def guided_step(
     trajectory: Trajectory,
@@ -119,10 +123,11 @@ def _update(
             loss = trajectory.objective(
                 x0, affine, trajectory.affine_start, z0_hat, anchor, trajectory.matches, trajectory.hidden
             )
-            total = loss.total.sum()  # samples do not mix, so the gradient of the sum is each one's own
+            # Samples do not mix, so the gradient of the sum is each one's own.
+            total = _GRADIENT_SCALE * loss.total.sum()
         if updates:
             inputs = (s_hat, t_hat, z) if config.optimize_latents else (s_hat, t_hat)
-            grads = torch.autograd.grad(total, inputs)
+            grads = [g / _GRADIENT_SCALE for g in torch.autograd.grad(total, inputs)]
             s_hat = s_hat.detach() + trajectory.scale_rule.step(grads[0])
             t_hat = t_hat.detach() + trajectory.shift_rule.step(grads[1])
             trajectory.affine = replace(affine, s_hat=s_hat, t_hat=t_hat)

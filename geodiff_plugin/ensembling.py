@@ -12,7 +12,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import check_choice
 
-__all__ = ["REDUCTIONS", "ensemble_metric"]
+__all__ = ["REDUCTIONS", "ensemble_metric", "median"]
 
 REDUCTIONS = ("median", "mean")
 
@@ -33,5 +33,14 @@ def ensemble_metric(depth_m: Tensor, reduction: str = "median") -> tuple[Tensor,
     check_choice(reduction, "ensembling_kwargs['reduction']", REDUCTIONS)
     if reduction == "mean":
         return depth_m.mean(0, keepdim=True), depth_m.std(0, keepdim=True, correction=0)
-    middle = depth_m.median(dim=0, keepdim=True).values
-    return middle, (depth_m - middle).abs().median(dim=0, keepdim=True).values
+    middle = median(depth_m, 0)[None]
+    return middle, median((depth_m - middle).abs(), 0)[None]
+
+
+def median(x: Tensor, dim: int) -> Tensor:
+    """The median along ``dim``, which is dropped: of an even number the mean of the middle two.
+
+    ``torch.median`` takes the lower one, which makes metres too near, and the spread of two members 0.
+    """
+    ordered, count = x.sort(dim=dim).values, x.shape[dim]
+    return 0.5 * (ordered.select(dim, (count - 1) // 2) + ordered.select(dim, count // 2))

@@ -133,12 +133,15 @@ def prepare_evidence(
         sweep_known, _ = points_to_matches(points, K_left, size, *grid)
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
-    small = tuple((*_as_fine_as(image, K, K_loss), T) for image, K, T in rights)
+    small = tuple((*as_fine_as(image, K, K_loss), T) for image, K, T in rights)
     return Evidence(left, K_loss, small, volume, matches, found, known, sweep_known, tuple(warnings))
 
 
-def _as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
-    """The right view at no more pixels per radian than the left one, so that neither aliases in the other."""
+def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
+    """A right image, ``(3, H, W)``, at no more pixels per radian than the left one, and the K of it.
+
+    So that neither aliases in the other.
+    """
     ratio = float(K_left[0, 0] / K_right[0, 0])
     return resize_long_edge(right_01, K_right, round(max(right_01.shape[-2:]) * min(1.0, ratio)))
 
@@ -148,9 +151,10 @@ def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
     size = (left_01.shape[-2], left_01.shape[-1])
     if matches.size == size:
         return matches
-    # Nearest: a mean of two inverse depths across an edge is the depth of neither surface.
+    # Nearest centre: a mean of two inverse depths across an edge is the depth of neither surface.
     maps = (
-        F.interpolate(m[None], size, mode="nearest")[0] for m in (matches.inverse_depth, matches.confidence)
+        F.interpolate(m[None], size, mode="nearest-exact")[0]
+        for m in (matches.inverse_depth, matches.confidence)
     )
     return Matches(*maps, matches.plane_step, K_left, size)
 

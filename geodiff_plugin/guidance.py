@@ -46,7 +46,7 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         inner_steps: updates per denoising step; ``None`` for 5 after a correction, else 40; 0 leaves search
             and correction alone.
         updates_from: steps that end by this fraction of the schedule, [0, 1], make no updates; ``None``
-            for 0.75 after a correction (the last of four steps makes some), else 0.
+            for 0.75 of ``stop`` after a correction (the last of four steps makes some), else 0.
         min_steps: denoising steps that a guided call takes at least when it names no ``num_inference_steps``;
             a pipeline's own default may be 1, which leaves nothing for the guidance to come back to.
         optimize_latents: ``False`` learns scale and shift only (S5.3, Table 4), latents stay untouched.
@@ -64,15 +64,16 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
             there is no right view; ``"one-number"`` is the paper's g_s search; ``"points-range"`` takes the
             nearest and the farthest point, as Marigold-DC.
         g_s_range: metres, the candidates of the one-number search.
-        depth_range: ``(near, far)`` metres that bound the search, or ``None``.
+        depth_range: ``(near, far)`` metres that bound the sweep and the nearest and farthest depth of the
+            search, or ``None``.
         gate: factor around the estimate within which matches are believed, > 1.
         loss_resolution: pixels, bound of the longer side of the grid that losses are computed on.
         correct: at every step, before the updates, bring the decoded map to its matches and encode what that
-            changes (gradient ``"denoised"`` only); the gradient then has the rest to do.
+            changes; the gradient then has the rest to do. Not where the gradient moves z_t (``"full"``).
         doubt: matches behind what the prior first says, over a region and by more than chance, lose
             their say: mirrors and glass (``matching.contradiction``).
-        refine: bring the result to its matches at full resolution, edge-aware (``refinement.refine_depth``);
-            without a ``matches`` term there is nothing to bring it to.
+        refine: bring the result to its matches and points at full resolution, edge-aware
+            (``refinement.refine_depth``); there must be a ``matches`` term or points.
         respace: run a ``leading`` DDIM schedule as ``trailing`` for guided calls.
         points_loss: ``"robust"`` in inverse depth, or ``"l1l2"`` in metres (``terms.points``).
         positive: how raw scale and shift become positive: ``"softplus"``, or ``"square"`` with a relative map
@@ -135,14 +136,15 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         # names, and would save the right image as the first hyperparameter.
         self.register_to_config(**check_knobs(given, points_given=points is not None))
         self._inputs = read_inputs(right, K, E, points)
-        self._left_size = left_size
+        self._left_size = None if left_size is None else tuple(left_size)
         self._check_fed()
 
     def _check_fed(self) -> None:
         """Refuse a configuration that asks for what was not given."""
-        needs = {"one-number": "a right view", "points-range": "points"}
+        needs = {"one-number": "a right view and a photometric weight", "points-range": "points"}
         views, known = bool(self.rights), self._inputs[0].points is not None
-        if not {"one-number": views, "points-range": known}.get(self.config.search, True):
+        compared = views and bool(self.config.weights.get("photometric"))
+        if not {"one-number": compared, "points-range": known}.get(self.config.search, True):
             search = self.config.search
             bad_value("search", f"one that works on what is given ({search!r} needs {needs[search]})", "none")
         lacking = {"needs_warp": not views, "needs_matches": not views, "needs_points": not known}
@@ -193,7 +195,8 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
             width, height = self._left_size
             bad_value("image", f"of {width}x{height} pixels, as the left view", f"{size[1]}x{size[0]}")
         config, evidence = self.config, []
-        matched = bool(config.weights.get("matches")) and (config.inner_steps > 0 or config.correct)
+        used = config.inner_steps > 0 or config.correct or config.refine
+        matched = bool(config.weights.get("matches")) and used
         for i, own in enumerate(self._inputs):
             name = "K" if count == 1 else f"K[{i}]"
             check_intrinsics_fit(own.K_left, size[1], size[0], name, "the left image")

@@ -6,7 +6,7 @@ Paper: S5.1 and Algorithm 1 name some; docs/knobs.md says which, and how flat ea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from geodiff_plugin._checks import bad_type, check_choice, check_number, check_range
@@ -27,8 +27,8 @@ def _number(low: float, high: float, integer: bool = False) -> Check:
     return lambda value, name: check_number(value, name, low, high, integer=integer)
 
 
-def _choice(*choices: str) -> Check:
-    return lambda value, name: check_choice(value, name, choices)
+def _choice(choices: Collection[str]) -> Check:
+    return lambda value, name: check_choice(value, name, choices)  # a table may grow until then
 
 
 def _flag(value: Any, name: str) -> bool:
@@ -45,9 +45,9 @@ def _weights(value: Mapping[str, float], name: str) -> dict[str, float]:
 
 
 CHECKS: dict[str, Check] = {
-    "gradient": _choice("denoised", "full"),
-    "rule": _choice(*RULES),
-    "affine_rule": _choice(*RULES),
+    "gradient": _choice(("denoised", "full")),
+    "rule": _choice(RULES),
+    "affine_rule": _choice(RULES),
     "step_latents": _number(0.0, 1e6),
     "step_affine": _number(0.0, 1e6),
     "inner_steps": _number(0, 10_000, integer=True),
@@ -62,8 +62,8 @@ CHECKS: dict[str, Check] = {
     "exposure": _flag,
     "z_test": _flag,
     "min_visible": _number(0.0, 1.0),
-    "pull_to": _choice("start", "zero"),
-    "search": _choice("volume", "one-number", "points-range"),
+    "pull_to": _choice(("start", "zero")),
+    "search": _choice(("volume", "one-number", "points-range")),
     "g_s_range": check_range,
     "depth_range": check_range,
     "gate": _number(1.0, 1e6),
@@ -72,9 +72,9 @@ CHECKS: dict[str, Check] = {
     "doubt": _flag,
     "refine": _flag,
     "respace": _flag,
-    "points_loss": _choice(*POINTS_LOSSES),
-    "positive": _choice(*POSITIVE),
-    "step_from": _choice("given", "updated"),
+    "points_loss": _choice(POINTS_LOSSES),
+    "positive": _choice(POSITIVE),
+    "step_from": _choice(("given", "updated")),
 }
 """What turns a value into a checked one, by knob; each is a keyword of ``GeometryGuidance``."""
 
@@ -100,7 +100,8 @@ def check_knobs(given: Mapping[str, Any], points_given: bool) -> dict[str, Any]:
     # What matches and points can be encoded into is near already; else the gradient has the whole way.
     known = weights.get("matches") or (weights.get("points") and points_given)
     near = knobs["correct"] and known and knobs["optimize_latents"] and knobs["gradient"] == "denoised"
-    settled = (5, 0.75, 0.03) if near else (40, 0.0, 0.1)
+    late = 0.75 * CHECKS["stop"](knobs["stop"], "stop")
+    settled = (5, late, 0.03) if near else (40, 0.0, 0.1)
     for name, value in zip(("inner_steps", "updates_from", "step_latents"), settled, strict=True):
         if knobs[name] is None:
             knobs[name] = value

@@ -16,7 +16,8 @@ from diffusers.pipelines.marigold import MarigoldDepthOutput
 from torch import Tensor
 
 from geodiff_plugin.confidence import depth_confidence
-from geodiff_plugin.evidence import match_target
+from geodiff_plugin.ensembling import median
+from geodiff_plugin.evidence import as_fine_as, match_target
 from geodiff_plugin.geometry.cameras import resize_intrinsics
 from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.guidance import GeometryGuidance
@@ -71,7 +72,7 @@ def assemble_output(
         shown = (nowhere, nowhere.bool()) if error is None else (error, visible)
         confidence = depth_confidence(support, *shown, spread)
     relative = torch.cat(run.relative)
-    relative = relative.reshape(count, -1, *relative.shape[1:]).median(dim=1).values  # (N, 1, h, w)
+    relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
     if match_input_resolution:
         relative = F.interpolate(relative, size, mode="bilinear", align_corners=False)
     affine = [t.affine for t in run.trajectories]
@@ -143,6 +144,7 @@ def _reprojection(
     """
     best, visible = torch.full_like(depth_m, torch.inf), torch.zeros_like(depth_m, dtype=torch.bool)
     for image, K_right, T in rights:
+        image, K_right = as_fine_as(image, K_right, K_left[0])
         warped = warp_right_to_left(image[None], depth_m, K_left, K_right[None], T[None])
         matched = match_exposure(warped.image, left_01, warped.visible)
         error = (matched - left_01).abs().mean(1, keepdim=True)

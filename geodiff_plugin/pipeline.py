@@ -20,6 +20,7 @@ from torch import Tensor
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.ensembling import ensemble_metric
 from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.integration.refusals import check_guidable
 from geodiff_plugin.integration.run import GuidedRun, plan_steps
 from geodiff_plugin.output import assemble_output
 from geodiff_plugin.priors import find_adapter
@@ -80,6 +81,7 @@ class _GuidedCall:
             guidance, prior, call["num_inference_steps"], self.default_denoising_steps
         )
         call["resample_method_output"] = call["resample_method_output"] or "bilinear"
+        check_guidable(self, prior, guidance.config)
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= {"ensemble_size": 1, "output_uncertainty": False}
             warnings.warn(
@@ -94,11 +96,13 @@ class _GuidedCall:
         resolution = self.default_processing_resolution if resolution is None else resolution
         padded, padding, _ = processor.preprocess(image, resolution, call["resample_method_input"], device)
         content = (padded.shape[-2] - padding[0], padded.shape[-1] - padding[1])
+        with torch.autocast(device.type, enabled=False):
+            evidence = guidance.prepare(lefts_01)
         run = GuidedRun(
             self,
             prior,
             guidance,
-            guidance.prepare(lefts_01),
+            evidence,
             call["ensemble_size"],
             call["batch_size"],
             content,
@@ -112,9 +116,10 @@ class _GuidedCall:
                 stock = super().__call__(**{**call, "return_dict": True, "output_latent": True})
         finally:
             del self._guided_run
-        output = assemble_output(
-            stock, run, guidance, lefts_01, call["match_input_resolution"], call["output_type"]
-        )
+        with torch.autocast(device.type, enabled=False):
+            output = assemble_output(
+                stock, run, guidance, lefts_01, call["match_input_resolution"], call["output_type"]
+            )
         output.latent = stock.latent if wants_latent else None
         return output if wants_dict else (output.prediction, output.uncertainty, output.latent)
 

@@ -42,14 +42,12 @@ class ScaleSearch:
         far_m: metres, depth of its farthest end.
         cost: mean clamped census cost there, [0, 0.35].
         on_edge: the best pair touches the far end of the range, or the near end of a given range.
-        kept: the current state was as good and stays.
     """
 
     near_m: Tensor
     far_m: Tensor
     cost: Tensor
     on_edge: Tensor
-    kept: Tensor
 
 
 def _sample_positions(height: int, width: int, device: torch.device) -> Tensor:
@@ -151,9 +149,6 @@ def search_scale(
             n, f = n.exp().clamp(low, high), f.exp().clamp(low, high)
             near, far, mean = best_of(torch.minimum(n, f), torch.maximum(n, f))
             reach = reach / (FINE - 1) * 2
-        # The volume's own near end lies nearer than anything seen, so only a given one can cut a scene off.
-        on_edge = (far >= high * 0.98) | ((near <= low * 1.02) & (depth_range is not None))
-        kept = torch.zeros((), dtype=torch.bool, device=x.device)
         if current is not None:
             a, c = (v[b : b + 1] for v in current)
             now = best_of(torch.minimum(a, c), torch.maximum(a, c))
@@ -161,7 +156,9 @@ def search_scale(
             near, far, mean = (
                 torch.where(kept, old, new) for old, new in zip(now, (near, far, mean), strict=True)
             )
-        found.append((near, far, mean, on_edge, kept))
+        # The volume's own near end lies nearer than anything seen, so only a given one can cut a scene off.
+        on_edge = (far >= high * 0.98) | ((near <= low * 1.02) & (depth_range is not None))
+        found.append((near, far, mean, on_edge))
     return ScaleSearch(*(torch.stack(column) for column in zip(*found, strict=True)))
 
 

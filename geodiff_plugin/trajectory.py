@@ -29,6 +29,8 @@ __all__ = ["Trajectory"]
 
 #: Candidates of the paper's one-number search; its figures step through 1..80.
 G_S_CANDIDATES = 80
+#: Nearest over farthest depth of a map, at most: a range of nothing has no scale.
+LEAST_RANGE = 0.98
 #: Searches that run at the first step only.
 ONCE = ("one-number", "points-range")
 
@@ -92,9 +94,10 @@ class Trajectory:
 
         def cost(g_s: Tensor) -> Tensor:
             affine = AffineState(zero, zero, g_s.expand_as(zero))
-            return self.objective(x, affine, affine, zero.view(-1, 1), zero.view(-1, 1), None).terms[
-                "photometric"
-            ]
+            loss = self.objective(x, affine, affine, zero.view(-1, 1), zero.view(-1, 1), None)
+            # What no right camera sees costs nothing, and must not win for that.
+            shown = (loss.visible_fraction > 0) & (loss.visible_fraction >= self.config.min_visible)
+            return loss.terms["photometric"].where(shown, torch.inf)
 
         best, self.on_edge = argmin_over(candidates, cost)
         self.affine = self.affine_start = AffineState(zero, zero, best)
@@ -150,10 +153,14 @@ class Trajectory:
         if sure is not None:
             # A poor prior's true basin is shallow in raw costs; matches tell basins apart at a prior's error.
             near_far = refine_to_matches(floored, evidence.matches, *near_far, space)
-            near_far = fit_to_points(floored, sure, self.metric, near_far)
+            near_far = fit_to_points(x, sure, self.metric, near_far)
         for known in (evidence.matches, evidence.points):
             if known is not None:
                 near_far = refine_to_matches(floored, known, *near_far, space)
+        if self.config.depth_range is not None:
+            low, high = self.config.depth_range
+            near, far = (v.clamp(low, high) for v in near_far)
+            near_far = torch.minimum(near, LEAST_RANGE * far), far
         return *near_far, on_edge
 
     def _gate_matches(self, x: Tensor) -> None:

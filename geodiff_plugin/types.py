@@ -97,7 +97,7 @@ class MetricDepthOutput(BaseOutput):
     Attributes:
         prediction: metres; ``(N, H, W, 1)`` numpy or ``(N, 1, H, W)`` torch, as ``output_type`` says.
         uncertainty: metres (median absolute deviation of the members), shaped as ``prediction``; ``None``
-            for one member.
+            unless ``output_uncertainty=True`` asked for it, of two members or more.
         latent: ``(N * E, 4, h, w)`` final latents, with ``output_latent=True``.
         relative: median unclipped relative depth, about [0, 1], shaped as ``prediction``.
         scale: ``(N, E)`` softplus of the learnt scale.
@@ -108,8 +108,8 @@ class MetricDepthOutput(BaseOutput):
         photometric_error: [0, 1] mean absolute difference to the left image re-rendered from the right view
             that explains the pixel best, 0 where not visible; ``None`` without a right view.
         confidence: [0, 1] probability that the depth is within 10 % of the truth, shaped as ``prediction``:
-            from matches near on the same surface, photometric error and, if there is an ensemble, its
-            spread; ``None`` without matches and points.
+            from matches near on the same surface, photometric error and, where it is given, uncertainty;
+            ``None`` without ``refine``, or without matches and points.
         K: ``(N, 3, 3)`` intrinsics of the output grid, pixels.
         history: one ``StepReport`` a step and batch chunk.
         extras: further maps of the prior by name (GeoWizard's ``"normals"``), shaped as ``prediction`` with

@@ -104,7 +104,8 @@ def plane_rays(
     """
     grid = unproject_meshgrid(*size, K_left, device=K_left.device, dtype=K_left.dtype)  # (B, H, W, 3), z = 1
     rays = grid.flatten(1, 2).transpose(1, 2)  # (B, 3, H * W)
-    A = (K_right @ T_right_from_left[:, :3, :3]) @ rays
+    M = K_right @ T_right_from_left[:, :3, :3]
+    A = (M[..., None] * rays[:, None]).sum(2)  # not a matrix product, which TF32 rounds by a quarter pixel
     b = K_right @ T_right_from_left[:, :3, 3:]
     return PlaneRays(A, b)
 

@@ -11,21 +11,43 @@ from typing import Any
 import torch
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.integration.schedulers import check_scheduler
 from geodiff_plugin.priors import DepthPrior
 
-__all__ = ["check_network_input", "check_offloading"]
+__all__ = ["check_guidable", "check_network_input", "check_offloading", "needs_network"]
 
 
-def check_network_input(prior: DepthPrior) -> slice:
-    """Where z_t stands in the network's input.
+def check_guidable(pipe: Any, prior: DepthPrior, config: Any) -> None:
+    """Refuse a pipeline that cannot be guided as configured, while nothing has been computed yet.
+
+    Args:
+        pipe: the pipeline.
+        prior: its adapter.
+        config: hyperparameters of ``GeometryGuidance``.
 
     Raises:
-        ValueError: nowhere, so that there is no gradient through the network.
+        TypeError, ValueError: a scheduler, offloading or network that cannot be guided.
+    """
+    check_scheduler(pipe.scheduler)
+    check_offloading(pipe, config.gradient)
+    if needs_network(config):
+        check_network_input(prior)
+
+
+def needs_network(config: Any) -> bool:
+    """Whether gradients of z_t are taken through the network."""
+    return config.gradient == "full" and config.optimize_latents and config.inner_steps > 0
+
+
+def check_network_input(prior: DepthPrior) -> None:
+    """Refuse the full gradient where the network is not told z_t.
+
+    Raises:
+        ValueError: it is not, so that there is no gradient through it.
     """
     if prior.network_input is None:
         cure = "Its network is not told z_t, so only the clean latent can be moved."
         bad_value("gradient", "'denoised' with this prior", "'full'", cure)
-    return prior.network_input
 
 
 def check_offloading(pipe: Any, gradient: str) -> None:

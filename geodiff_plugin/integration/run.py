@@ -22,8 +22,8 @@ from geodiff_plugin.guidance import GeometryGuidance
 from geodiff_plugin.integration.channels import put_channels
 from geodiff_plugin.integration.denoiser import DenoiserTap
 from geodiff_plugin.integration.guided_scheduler import GuidedScheduler
-from geodiff_plugin.integration.refusals import check_network_input, check_offloading
-from geodiff_plugin.integration.schedulers import check_scheduler, noise_level
+from geodiff_plugin.integration.refusals import needs_network
+from geodiff_plugin.integration.schedulers import noise_level
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.trajectory import Trajectory
 
@@ -73,14 +73,11 @@ class GuidedRun:
         self._stack = ExitStack()
 
     def __enter__(self) -> GuidedRun:
-        check_scheduler(self.pipe.scheduler)
-        check_offloading(self.pipe, self.config.gradient)
         with ExitStack() as stack:
             stack.enter_context(_frozen_weights(self.pipe))
-            if self.config.gradient == "full" and self.config.optimize_latents and self.config.inner_steps:
-                self._tap = stack.enter_context(
-                    DenoiserTap(*self.prior.network(), check_network_input(self.prior))
-                )
+            if needs_network(self.config):
+                tap = DenoiserTap(*self.prior.network(), self.prior.network_input)
+                self._tap = stack.enter_context(tap)
             stack.enter_context(
                 GuidedScheduler(
                     self.pipe.scheduler,
@@ -148,17 +145,18 @@ class GuidedRun:
                 return z0_from(self._tap.output_at(z)[:, depth].to(wide), z, level)
         else:
             leaf, z0_of = z0_from(wide_output, wide_z_t, level), _identity
-        move = guided_step(
-            trajectory,
-            leaf,
-            z0_of,
-            self.decode,
-            None if full else self.encode,
-            eps,
-            self.step_index,
-            self.timesteps[self.step_index],
-            self.spans,
-        )
+        with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
+            move = guided_step(
+                trajectory,
+                leaf,
+                z0_of,
+                self.decode,
+                None if full else self.encode,
+                eps,
+                self.step_index,
+                self.timesteps[self.step_index],
+                self.spans,
+            )
         if not self.config.optimize_latents or not any(
             trajectory.is_active(begin) for begin, _ in self.spans
         ):

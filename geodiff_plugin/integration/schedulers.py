@@ -36,7 +36,7 @@ def _clip(scheduler: Any) -> float | None:
 
 def _discrete(scheduler: Any, timestep: Tensor) -> NoiseLevel:
     """Schedulers that index ``alphas_cumprod`` by the timestep."""
-    # Indexed where the table lies: on CUDA the timestep is there too, and nothing waits for it.
+    # Indexed where the table lies, which diffusers leaves on the CPU.
     table = scheduler.alphas_cumprod
     alpha_bar = table[timestep.to(table.device)].float()
     return NoiseLevel(

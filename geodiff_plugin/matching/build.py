@@ -6,6 +6,7 @@ Paper: S7.3 ("a predefined depth range"); here the views find the range by thems
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -34,12 +35,14 @@ _HEADROOM, _LEAST_SHIFT = 1.25, 0.03
 _FEWEST_PLANES = 24
 
 
-def _shrink(image_01: torch.Tensor, K: torch.Tensor, factor: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Image and K, smaller by ``factor`` < 1 (antialiased); as they are for 1 and above."""
-    if factor >= 1.0:
-        return image_01, K
+def _shrink(
+    image_01: torch.Tensor, K: torch.Tensor, factors: tuple[float, float]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Image and K, height and width smaller by ``factors`` < 1 (antialiased); as they are for 1 and above."""
     size = (image_01.shape[-2], image_01.shape[-1])
-    size_to = (max(1, round(size[0] * factor)), max(1, round(size[1] * factor)))
+    size_to = tuple(max(1, round(side * min(1.0, f))) for side, f in zip(size, factors, strict=True))
+    if size_to == size:
+        return image_01, K
     small = F.interpolate(image_01[None], size_to, mode="bilinear", align_corners=False, antialias=True)[0]
     return small, resize_intrinsics(K[None], size, size_to)[0]
 
@@ -49,8 +52,13 @@ def _to_grid(
 ) -> tuple[torch.Tensor, tuple[RightView, ...], torch.Tensor]:
     """Shrink the left view to its bounds, right ones to as many pixels per radian, so that none aliases."""
     height, width = left.shape[-2:]
-    left, K = _shrink(left, K_left, min(side / max(height, width), (pixels / (height * width)) ** 0.5))
-    small = tuple((*_shrink(image, K_r, float(K[0, 0] / K_r[0, 0])), T) for image, K_r, T in rights)
+    factor = min(side / max(height, width), (pixels / (height * width)) ** 0.5)
+    left, K = _shrink(left, K_left, (factor, factor))
+    # Axis by axis: whole pixels round each differently, and a rectified pair must stay one.
+    small = tuple(
+        (*_shrink(image, K_r, (float(K[1, 1] / K_r[1, 1]), float(K[0, 0] / K_r[0, 0]))), T)
+        for image, K_r, T in rights
+    )
     return left, small, K
 
 
@@ -66,7 +74,7 @@ def _even_planes(
     ends = torch.stack(list(span))
     shifts = [median_shift(plane_rays(K[None], K_r[None], T[None], size), ends) for _, K_r, T in rights]
     moved = max(float(shift[1] - shift[0]) for shift in shifts)
-    wanted = most if moved == float("inf") else round(moved / step_px) + 1
+    wanted = round(moved / step_px) + 1 if math.isfinite(moved) else most  # not finite behind a camera
     steps = torch.linspace(0.0, 1.0, min(max(wanted, _FEWEST_PLANES), most), device=ends.device)
     return ends[0] + (ends[1] - ends[0]) * steps
 

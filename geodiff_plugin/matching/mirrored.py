@@ -56,7 +56,13 @@ def mirrored_pose_preferred(
     Returns:
         ``PoseCheck``; two coarse sweeps, a fraction of a second.
     """
-    inverse = [(image, K_right, invert_rigid(T)) for image, K_right, T in rights]
-    volumes = (pilot_volume(left_01, views, K_left, _PIXELS) for views in (rights, inverse))
-    given, turned = (float(match_volume(volume).confidence.mean()) for volume in volumes)
+
+    def confidence(views: Sequence[RightView]) -> float:
+        return float(match_volume(pilot_volume(left_01, views, K_left, _PIXELS)).confidence.mean())
+
+    given = confidence(rights)
+    try:
+        turned = confidence([(image, K_right, invert_rigid(T)) for image, K_right, T in rights])
+    except ValueError:  # under the inverse pose the views do not overlap, so it is not the true one
+        turned = 0.0
     return PoseCheck(turned > _CLEARLY * given, given, turned)

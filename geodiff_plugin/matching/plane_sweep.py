@@ -113,14 +113,17 @@ def inverse_depth_at_shift(rays: PlaneRays, shift_px: float) -> torch.Tensor:
         shift_px: pixels of the right view, > 0.
 
     Returns:
-        ``()`` float32, 1/m, within 1 %.
+        ``()`` float32, 1/m, within 1 %. A camera that stands behind the other one sees no pixel move further
+        than to the epipole: there, at most the depth at which it has gone half of that way.
 
     Raises:
         ValueError: the views do not overlap, or both cameras stand at one place.
     """
     exponents = rays.A.new_tensor([-8.0, 5.0])
-    if float(median_shift(rays, 10.0 ** exponents[1:])) < shift_px:
+    most = float(median_shift(rays, 10.0 ** exponents[1:]))
+    if most < _LEAST_SHIFT_PX:
         bad_value("E", "a pose with a baseline", "both cameras at one place")
+    shift_px = min(shift_px, 0.5 * most)
     for _ in range(16):  # the shift grows with inverse depth, so bisection of 13 decades reaches 0.05 %
         middle = exponents.mean()
         reached = median_shift(rays, 10.0 ** middle[None])[0] >= shift_px

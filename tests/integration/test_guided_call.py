@@ -12,6 +12,7 @@ from diffusers import (
     DDPMScheduler,
     DiffusionPipeline,
     DPMSolverMultistepScheduler,
+    EulerDiscreteScheduler,
     LCMScheduler,
 )
 from PIL import Image
@@ -23,7 +24,8 @@ from geodiff_plugin import (
     enable_geometry_guidance,
 )
 from geodiff_plugin import algorithm as algorithm_module
-from tests.conftest import SCHEDULER
+from geodiff_plugin.updates import RULES
+from tests.conftest import SCHEDULER, plane_pair
 
 FAST = {"inner_steps": 2, "min_steps": 1, "loss_resolution": 64}
 
@@ -144,6 +146,7 @@ def test_outside_start_and_stop_nothing_is_updated(make_pipeline, textured_plane
         ({}, [0, 0, 0, 2]),  # matches are encoded at every step, photographs refine them at the last
         ({"updates_from": 0.5}, [0, 0, 2, 2]),
         ({"updates_from": 1.0}, [0, 0, 0, 0]),
+        ({"stop": 0.5}, [0, 2, 0, 0]),
         ({"correct": False}, [2, 2, 2, 2]),
         ({"weights": {"photometric": 1.0}}, [2, 2, 2, 2]),
     ],
@@ -366,6 +369,47 @@ def test_compiled_unet(make_pipeline, textured_plane, left, gradient):
     np.testing.assert_allclose(outs[0].prediction, outs[1].prediction, rtol=1e-4)
 
 
+def test_what_cannot_be_guided_is_refused_before_anything_is_computed(
+    make_pipeline, textured_plane, left, monkeypatch
+):
+    def prepare(self, lefts_01):
+        raise AssertionError("the views were swept first")
+
+    monkeypatch.setattr(GeometryGuidance, "prepare", prepare)
+    pipe = enable_geometry_guidance(make_pipeline())
+    pipe.scheduler = EulerDiscreteScheduler()
+    with pytest.raises(TypeError, match="EulerDiscreteScheduler"):
+        pipe(left, guidance=guidance_for(textured_plane))
+
+
+def test_half_precision_keeps_the_photometric_gradient(make_pipeline, textured_plane, left, monkeypatch):
+    """A pixel's share of the mean is below float16's least number."""
+    moved = []
+
+    class Spy(RULES["adam"]):
+        def step(self, gradient, *args):
+            if gradient.ndim == 4:
+                moved.append((gradient != 0).float().mean())
+            return super().step(gradient, *args)
+
+    monkeypatch.setitem(RULES, "adam", Spy)
+    pipe = enable_geometry_guidance(make_pipeline().to(torch.float16))
+    guidance = guidance_for(textured_plane, weights={"photometric": 1e-3})
+    out = pipe(left, guidance=guidance, generator=seeded())
+    assert np.isfinite(out.prediction).all()
+    assert min(moved) > 0.9
+
+
+def test_autocast_leaves_geometry_alone(make_pipeline, textured_plane, left):
+    pipe = enable_geometry_guidance(make_pipeline())
+    guidance = guidance_for(textured_plane, inner_steps=0, weights={"photometric": 1.0})
+    plain = pipe(left, guidance=guidance, generator=seeded())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        mixed = pipe(left, guidance=guidance, generator=seeded())
+    assert np.median(np.abs(mixed.prediction / plain.prediction - 1)) < 0.02
+    assert mixed.prediction.dtype == np.float32
+
+
 class FakeAlign:
     offload = True
 
@@ -385,6 +429,26 @@ def test_model_offloading_works_with_the_cheap_gradient_only(make_pipeline, text
     pipe._all_hooks = [object()]
     with pytest.raises(ValueError, match="enable_model_cpu_offload"):
         pipe(left, guidance=guidance_for(textured_plane, gradient="full"))
+
+
+@pytest.mark.parametrize("bounds", [(5.0, 10.0), (0.1, 1.0)])
+def test_a_given_range_bounds_the_scale(make_pipeline, textured_plane, left, bounds):
+    pair = textured_plane
+    pipe = enable_geometry_guidance(make_pipeline())
+    knobs = FAST | {"inner_steps": 0, "correct": False, "refine": False}
+    points = np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 2.1]])
+    guidance = GeometryGuidance.from_points(points, pair.K, depth_range=bounds, **knobs)
+    out = pipe(left, guidance=guidance, generator=seeded())
+    at_ends = out.global_scale * torch.stack([out.shift, out.scale + out.shift])
+    assert (at_ends > 0.9 * bounds[0]).all() and (at_ends < 1.1 * bounds[1]).all()
+
+
+def test_one_number_never_prefers_what_no_camera_sees(make_oracle):
+    pair = plane_pair(baseline=1.6)
+    pipe = enable_geometry_guidance(make_oracle(pair.depth_m / pair.depth_m.max()))
+    guidance = GeometryGuidance.paper(pair.right, pair.K, pair.E, inner_steps=0, min_steps=1)
+    out = pipe(Image.fromarray(pair.left), guidance=guidance, generator=seeded())
+    assert out.visible.any()
 
 
 @pytest.mark.parametrize(("near", "far"), [(0.4, 1.1), (0.0, 1.0)])

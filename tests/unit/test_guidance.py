@@ -78,6 +78,23 @@ def test_baseline_constructor_pins_the_sign():
     assert guidance.rigs[0].T_right_from_left[0, 3] == pytest.approx(-0.12)
 
 
+def test_refinement_alone_asks_for_matches_too(textured_plane):
+    pair = textured_plane
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, inner_steps=0, correct=False)
+    left_01 = torch.from_numpy(pair.left).permute(2, 0, 1)[None] / 255
+    assert guidance.prepare(left_01)[0].sweep_matches is not None
+
+
+def test_one_number_search_needs_something_to_compare():
+    with pytest.raises(ValueError, match="photometric weight"):
+        GeometryGuidance(RIGHT, K, E, search="one-number", weights={"matches": 1.0})
+
+
+def test_the_left_size_may_be_a_list():
+    guidance = GeometryGuidance(RIGHT, K, E, left_size=[64, 48])
+    assert len(guidance.prepare(torch.rand(1, 3, 48, 64))) == 1
+
+
 def test_pair_of_poses_is_composed():
     left = np.eye(4)
     left[:3, 3] = 3.0

@@ -42,6 +42,33 @@ def relative_errors(matches, depth, mask):
     return ((matches.inverse_depth - 1 / depth).abs() / matches.plane_step)[mask]
 
 
+@pytest.mark.parametrize("size", [SIZE, (94, 320), (144, 96)])
+@pytest.mark.parametrize("ahead", [0.4, -0.4])
+@pytest.mark.parametrize("sideways", [0.0, 0.1])
+def test_motion_along_the_view_gives_matches(size, ahead, sideways):
+    """Behind the left camera no pixel moves further than to the epipole."""
+    left, right, K, depth, visible = scene(at=(sideways, 0.0, ahead), size=size)
+    matches = m.find_matches(left, [right], K)
+    truth = torch.nn.functional.interpolate(depth[None], matches.size, mode="nearest-exact")[0]
+    sure = matches.confidence > 0.5
+    assert sure.float().mean() > 0.3
+    assert ((matches.inverse_depth * truth)[sure] - 1.0).abs().median() < 0.1
+    assert not m.mirrored_pose_preferred(left, [right], K).preferred
+
+
+@pytest.mark.parametrize("size", [(500, 741), (1988, 2964), (375, 1242)])
+def test_a_rectified_pair_stays_one_on_the_grid(size):
+    image = torch.rand(1, *size, generator=torch.Generator().manual_seed(0))
+    K, T = torch.tensor([[700.0, 0, 300], [0, 700, 200], [0, 0, 1]]), torch.eye(4)
+    T[0, 3] = -0.2
+    assert m.build_cost_volume(image, [(image, K, T)], K, depth_range=(2.0, 50.0), planes=24).rectified
+
+
+def test_a_range_behind_the_right_camera_is_swept():
+    left, right, K, _, _ = scene(at=(0.5, 0.0, 5.0))
+    assert m.build_cost_volume(left, [right], K, depth_range=(1.0, 4.0)).cost.isfinite().all()
+
+
 def test_census_ignores_exposure():
     image = torch.rand(1, 20, 30, generator=torch.Generator().manual_seed(0)) * 0.4
     bits = census(image)
