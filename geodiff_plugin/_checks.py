@@ -21,10 +21,14 @@ __all__ = [
     "check_number",
     "check_pose",
     "check_range",
+    "warn_of_other_size",
 ]
 
 #: A baseline longer than this is taken for millimetres that were meant as metres (with a warning).
 LONG_BASELINE_M = 20.0
+#: A principal point in the outer fifth of an image is rather that of an image of another size.
+NEAR_BORDER = 0.2
+SCALED_K = "with s = new size / old size take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy"
 
 
 def _sentence(name: str, expected: str, got: object, cure: str) -> str:
@@ -81,8 +85,18 @@ def check_intrinsics_fit(
             name,
             f"for {image} of {width}x{height} pixels",
             f"principal point ({cx:.1f}, {cy:.1f}) outside of it",
-            "It probably belongs to another resolution: "
-            "multiply fx, cx by new_width / old_width and fy, cy likewise.",
+            f"It probably belongs to another resolution: {SCALED_K}.",
+        )
+
+
+def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
+    """Warn of a principal point near the border, where that of an image of twice the size lies."""
+    shares = (K[0, 2] / width, K[1, 2] / height)
+    if min(shares) < NEAR_BORDER or max(shares) > 1.0 - NEAR_BORDER:
+        warnings.warn(
+            f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) near the border of {image} of "
+            f"{width}x{height} pixels. If it is for another resolution, {SCALED_K}.",
+            stacklevel=3,
         )
 
 

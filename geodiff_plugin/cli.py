@@ -83,7 +83,7 @@ def depth(
         Path | None, _option("3x3 intrinsics of the right image, if they differ.", CAMERAS, "--K-right")
     ] = None,
     view: Annotated[
-        list[Path] | None, _option("A further view of the scene; repeatable.", CAMERAS, "--view")
+        list[Path] | None, _option("A further view, with --view-E; repeat both for each.", CAMERAS, "--view")
     ] = None,
     view_k: Annotated[
         list[Path] | None, _option("3x3 intrinsics of each --view; LEFT's if none.", CAMERAS, "--view-K")
@@ -106,7 +106,7 @@ def depth(
         _option("What this prior alone takes, as NAME=VALUE (GeoWizard: domain=outdoor).", RUN, "--option"),
     ] = None,
     steps: Annotated[
-        int | None, _option("Denoising steps; the prior's own by default.", RUN, "--steps")
+        int | None, _option("Denoising steps; by default the prior's own, at least 4.", RUN, "--steps")
     ] = None,
     ensemble: Annotated[
         int, _option("Members; from 2 on their spread is written as uncertainty.", RUN, "--ensemble")
@@ -131,6 +131,10 @@ def depth(
     preset: Annotated[
         str, _option("default, or paper (Algorithm 1 as printed).", RUN, "--preset")
     ] = "default",
+    knob: Annotated[
+        list[str] | None,
+        _option("A knob of the guidance (docs/knobs.md), as inner_steps=0; repeatable.", RUN, "--knob"),
+    ] = None,
     min_confidence: Annotated[
         float, _option("Points of the cloud have at least this, 0 to 1.", OUTPUT, "--min-confidence")
     ] = 0.0,
@@ -146,8 +150,8 @@ def depth(
     from geodiff_plugin.commands.arguments import DepthArguments
     from geodiff_plugin.commands.depth import run_depth
 
-    repeated = {name: tuple(typed[name] or ()) for name in ("calib", "view", "view_k", "view_e", "option")}
-    run_depth(DepthArguments(**typed | repeated))
+    repeated = ("calib", "view", "view_k", "view_e", "option", "knob")
+    run_depth(DepthArguments(**typed | {name: tuple(typed[name] or ()) for name in repeated}))
 
 
 @app.command()

@@ -11,7 +11,7 @@ from typing import Any
 from diffusers.configuration_utils import ConfigMixin
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value, check_intrinsics_fit
+from geodiff_plugin._checks import bad_value, check_intrinsics_fit, warn_of_other_size
 from geodiff_plugin.evidence import Evidence, prepare_evidence
 from geodiff_plugin.guidance_doors import GuidanceDoors
 from geodiff_plugin.guidance_inputs import ImageInputs, read_inputs
@@ -199,7 +199,9 @@ class GeometryGuidance(GuidanceDoors, ConfigMixin):
         matched = bool(config.weights.get("matches")) and used
         for i, own in enumerate(self._inputs):
             name = "K" if count == 1 else f"K[{i}]"
-            check_intrinsics_fit(own.K_left, size[1], size[0], name, "the left image")
+            fit = (own.K_left, size[1], size[0], name, "the left image")
+            check_intrinsics_fit(*fit)
+            warn_of_other_size(*fit)
             evidence.append(
                 prepare_evidence(
                     lefts_01[i],

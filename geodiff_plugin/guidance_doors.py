@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from geodiff_plugin._checks import check_number
+from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.guidance_inputs import split_views
 from geodiff_plugin.presets import MARIGOLD_DC, PAPER, SEARCH_ONLY
@@ -54,9 +54,18 @@ class GuidanceDoors:
             path: file, or tuple of two files; formats are listed in docs/calibration.md.
             cameras: (left, right) numbers in a file that has more than two, such as KITTI's.
             **kwargs: hyperparameters.
+
+        Raises:
+            ValueError: also, here or when the pipeline is called, images of another size than the file says.
         """
         rig = read_calibration(path, cameras=cameras)
-        return cls(right, (rig.K_left, rig.K_right), rig.E, **kwargs)
+        guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **{"left_size": rig.size_left} | kwargs)
+        for image in guidance.rights:
+            size = (image.shape[-1], image.shape[-2])
+            if rig.size_right not in (None, size):
+                expected = "of {}x{} pixels, as {} says".format(*rig.size_right, rig.source)
+                bad_value("right", expected, "{}x{}".format(*size), "Scale K with the images, or use these.")
+        return guidance
 
     @classmethod
     def from_views(cls, views: Sequence[tuple[Any, Any, Any]], **kwargs: Any) -> Self:

@@ -20,6 +20,7 @@ from geodiff_plugin._checks import (
     check_intrinsics,
     check_intrinsics_fit,
     check_pose,
+    warn_of_other_size,
 )
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.matching import RightView
@@ -105,7 +106,9 @@ def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int) -> Im
     poses = _poses(_entry(E, "E", i, count), label("E"), len(images))
     for v, (K_right, image) in enumerate(zip(K_rights, images, strict=True)):
         name = label("K_right") if len(images) == 1 else f"{label('K')}[{_view(v, len(images))}]"
-        check_intrinsics_fit(K_right, image.shape[-1], image.shape[-2], name, "the right image")
+        fit = (K_right, image.shape[-1], image.shape[-2], name, "the right image")
+        check_intrinsics_fit(*fit)
+        warn_of_other_size(*fit)
     rigs = tuple(Rig(K_left, K_right, pose) for K_right, pose in zip(K_rights, poses, strict=True))
     own_points = _entry(points, "points", i, count)
     return ImageInputs(

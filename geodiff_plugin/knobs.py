@@ -6,16 +6,17 @@ Paper: S5.1 and Algorithm 1 name some; docs/knobs.md says which, and how flat ea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+import json
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
-from geodiff_plugin._checks import bad_type, check_choice, check_number, check_range
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, check_range
 from geodiff_plugin.metric import POSITIVE
 from geodiff_plugin.terms import TERMS
 from geodiff_plugin.terms.points import POINTS_LOSSES
 from geodiff_plugin.updates import RULES
 
-__all__ = ["CHECKS", "DEFAULT_WEIGHTS", "check_knobs"]
+__all__ = ["CHECKS", "DEFAULT_WEIGHTS", "check_knobs", "knobs_from_text"]
 
 #: Weights of the default preset.
 DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
@@ -108,3 +109,35 @@ def check_knobs(given: Mapping[str, Any], points_given: bool) -> dict[str, Any]:
     checked = {name: check(knobs[name], name) for name, check in CHECKS.items()}
     check_number(checked["start"], "start", 0.0, checked["stop"])
     return checked
+
+
+def knobs_from_text(entries: Iterable[str], weights: Mapping[str, float], name: str) -> dict[str, Any]:
+    """Keywords of a guidance as they are written on a command line.
+
+    Args:
+        entries: ``KNOB=VALUE`` each; ``weights.TERM=VALUE`` changes one weight.
+        weights: those of the preset that they change.
+        name: the option, for messages.
+
+    Returns:
+        Keywords; a value is JSON, or text where it is none. It is checked when the guidance is made.
+
+    Raises:
+        ValueError: another form, or a knob that does not exist.
+    """
+    known, knobs = [knob for knob in CHECKS if knob != "weights"], {}
+    for entry in entries:
+        knob, equals, written = entry.partition("=")
+        of, _, term = knob.partition(".")
+        if not equals or (knob not in known and not (of == "weights" and term in TERMS)):
+            cure = f"Knobs: {', '.join(known)}, and weights.TERM with {', '.join(TERMS)}."
+            bad_value(name, "KNOB=VALUE with a knob of GeometryGuidance", repr(entry), cure)
+        try:
+            value = json.loads(written)
+        except ValueError:
+            value = written
+        if term:
+            knobs["weights"] = knobs.get("weights", dict(weights)) | {term: value}
+        else:
+            knobs[knob] = value
+    return knobs

@@ -14,7 +14,9 @@ from typing import Any
 import torch
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
+from geodiff_plugin.knobs import DEFAULT_WEIGHTS, knobs_from_text
 from geodiff_plugin.metric import SPACES
+from geodiff_plugin.presets import PAPER_WEIGHTS
 
 __all__ = [
     "DTYPES",
@@ -65,6 +67,7 @@ class DepthArguments:
     device: str = "auto"
     dtype: str = "float32"
     preset: str = "default"
+    knob: tuple[str, ...] = ()
     min_confidence: float = 0.0
     out: Path = Path("geodiff-out")
     overwrite: bool = False
@@ -91,6 +94,7 @@ class Settings:
         dtype: of U-Net and VAE.
         depth_range: ``(near, far)`` metres, or ``None``.
         options: what ``--option`` gives to the prior's call.
+        knobs: keywords of the guidance from ``--knob``, not checked.
         cameras: numbers of the left and the right camera in the calibration, or ``None``.
     """
 
@@ -98,6 +102,7 @@ class Settings:
     dtype: torch.dtype
     depth_range: tuple[float, float] | None
     options: dict[str, str]
+    knobs: dict[str, Any]
     cameras: tuple[int, int] | None
 
 
@@ -156,6 +161,13 @@ def _check_options(typed: tuple[str, ...]) -> dict[str, str]:
         if not (name and equals and value):
             bad_value("--option", "NAME=VALUE, such as domain=outdoor", repr(entry))
     return {name: value for name, _, value in pairs}
+
+
+def _check_knobs(typed: tuple[str, ...], preset: str) -> dict[str, Any]:
+    knobs = knobs_from_text(typed, PAPER_WEIGHTS if preset == "paper" else DEFAULT_WEIGHTS, "--knob")
+    if "depth_range" in knobs:
+        bad_value("--knob depth_range", "given as --near and --far", knobs["depth_range"])
+    return knobs
 
 
 def _check_depth_range(near: float | None, far: float | None) -> tuple[float, float] | None:
@@ -218,5 +230,6 @@ def check_arguments(arguments: DepthArguments) -> Settings:
         dtype=DTYPES[arguments.dtype],
         depth_range=_check_depth_range(arguments.near, arguments.far),
         options=_check_options(arguments.option),
+        knobs=_check_knobs(arguments.knob, arguments.preset),
         cameras=_check_cameras(arguments.cameras),
     )

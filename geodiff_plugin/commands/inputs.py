@@ -188,11 +188,12 @@ def _make_guidance(
 ) -> GeometryGuidance:
     if arguments.preset == "paper":
         bounds = {} if settings.depth_range is None else {"g_s_range": settings.depth_range}
-        return GeometryGuidance.paper(right, (rig.K_left, rig.K_right), rig.E, **bounds)
+        return GeometryGuidance.paper(right, (rig.K_left, rig.K_right), rig.E, **bounds | settings.knobs)
     views = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E)]
     views += _read_further_views(arguments, rig.K_left)
     points = None if arguments.points is None else read_points(arguments.points, "--points")
-    return GeometryGuidance.from_views(views, points=points, depth_range=settings.depth_range)
+    bounds = {"depth_range": settings.depth_range}
+    return GeometryGuidance.from_views(views, points=points, **bounds | settings.knobs)
 
 
 def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:

@@ -49,7 +49,7 @@ def pairs(
     steps: o.Steps = None,
     resolution: o.Resolution = None,
     views: o.Views = 2,
-    device: o.Device = "cpu",
+    device: o.Device = "auto",
     dtype: o.Dtype = "float32",
     out: o.Out = Path("geodiff-eval"),
     results: Annotated[Path | None, typer.Option(help="Write the Markdown page here as well.")] = None,

@@ -47,7 +47,7 @@ def _figure(
     steps: o.Steps = None,
     resolution: o.Resolution = None,
     views: o.Views = 2,
-    device: o.Device = "cpu",
+    device: o.Device = "auto",
     dtype: o.Dtype = "float32",
     out: o.Out = Path("geodiff-eval"),
     quiet: o.Quiet = False,

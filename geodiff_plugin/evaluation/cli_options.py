@@ -48,7 +48,7 @@ Seeds = Annotated[
 Steps = Annotated[int | None, typer.Option(help="Denoising steps; each method's own by default.")]
 Resolution = Annotated[int | None, typer.Option(help="Longer side for the prior, pixels.")]
 Views = Annotated[int, typer.Option(help="Views that methods take of a group that has more than two.")]
-Device = Annotated[str, typer.Option(help="cpu, cuda or mps.")]
+Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:N or mps.")]
 Dtype = Annotated[str, typer.Option(help="float32, bfloat16 or float16.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Records and results; resumed where it exists.")]
 SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Go on after a broken sample and count it.")]
@@ -70,6 +70,7 @@ def pairs_options(typed: dict[str, Any]) -> PairsOptions:
         typed: options by name; the ``Settings`` among them are put together, lists are split, and what a
             command does not offer has its neutral value.
     """
+    from geodiff_plugin.commands.arguments import pick_device
     from geodiff_plugin.evaluation.baselines import Settings
     from geodiff_plugin.evaluation.commands import PairsOptions
 
@@ -79,5 +80,6 @@ def pairs_options(typed: dict[str, Any]) -> PairsOptions:
     given = typed.get("prior")
     prior, *further = [given] if isinstance(given, str) else list(dict.fromkeys(given or ["bundled"]))
     lists = {name: names(typed.get(name)) for name in ("methods", "datasets", "scenes")}
-    settings = Settings(prior, **{name: typed[name] for name in _SETTINGS if name in typed})
+    chosen = {name: typed[name] for name in _SETTINGS if name in typed}
+    settings = Settings(prior, **chosen | {"device": str(pick_device(typed["device"]))})
     return PairsOptions(**neutral | rest | lists, settings=settings, priors=tuple(further))

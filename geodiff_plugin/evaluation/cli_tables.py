@@ -67,7 +67,7 @@ def _command(name: str) -> Callable[..., None]:
         steps: o.Steps = None,
         resolution: o.Resolution = None,
         views: o.Views = 2,
-        device: o.Device = "cpu",
+        device: o.Device = "auto",
         dtype: o.Dtype = "float32",
         out: o.Out = Path("geodiff-eval"),
         skip_broken: o.SkipBroken = False,

@@ -54,6 +54,11 @@ def refused(geodiff, pair_files):
         (["--device", "tpu"], ["--device", "tpu"]),
         (["--device", "meta"], ["--device", "meta"]),
         (["--dtype", "float64"], ["--dtype", "float16", "float64"]),
+        (["--knob", "speed=9"], ["--knob", "speed=9", "inner_steps"]),
+        (["--knob", "inner_steps"], ["--knob", "KNOB=VALUE"]),
+        (["--knob", "weights.smooth=1"], ["--knob", "weights.smooth"]),
+        (["--knob", "inner_steps=-1"], ["inner_steps", "-1"]),
+        (["--knob", "depth_range=[1,2]"], ["--near", "--far"]),
         (["--preset", "best"], ["--preset", "paper", "best"]),
         (["--cameras", "2"], ["--cameras", "2,3"]),
         (["--cameras", "2,2"], ["--cameras"]),
@@ -157,6 +162,11 @@ def test_further_views(refused, pair_files):
     refused([*command, pair_files.right, "--view-E", pose], "--view 1", "another photograph than RIGHT")
     refused([*command, folder / "none.png", "--view-E", pose], "none.png")
     refused([*command, third, "--view-E", pose, "--preset", "paper"], "--view", "two views")
+
+
+def test_known_points_in_integers(refused, pair_files):
+    np.save(pair_files.folder / "mm.npy", np.full((48, 64), 2500, np.uint16))
+    refused([*pair_files.command, "--points", pair_files.folder / "mm.npy"], "--points", "millimetres")
 
 
 def test_unknown_calibration_format(refused, pair_files):

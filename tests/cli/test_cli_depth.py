@@ -66,6 +66,15 @@ def test_a_further_view_takes_part(geodiff, command, pair_files, textured_plane)
     assert np.isfinite(np.load(out / "depth.npy")).all()
 
 
+def test_knobs_reach_the_guidance(geodiff, command, pair_files):
+    knobs = ["--knob", "inner_steps=0", "--knob", "weights.photometric=0.5", "--knob", "search=volume"]
+    answer = geodiff(*command, "--steps", 1, *knobs, "-q")
+    assert answer.code == 0, answer.err
+    guidance = json.loads((pair_files.folder / "geodiff-out" / "report.json").read_text())["guidance"]
+    assert guidance["inner_steps"] == 0 and guidance["search"] == "volume"
+    assert guidance["weights"]["photometric"] == 0.5 and guidance["weights"]["matches"] == 1.0
+
+
 def test_writes_everything(geodiff, command, pair_files):
     answer = geodiff(*command)
     assert answer.code == 0, answer.err

@@ -90,6 +90,26 @@ def test_one_number_search_needs_something_to_compare():
         GeometryGuidance(RIGHT, K, E, search="one-number", weights={"matches": 1.0})
 
 
+def test_a_principal_point_near_the_border_is_told():
+    """K of an image of twice the size passes every other check, and makes depth wrong by 2."""
+    twice = K.copy()
+    twice[:2] = 2 * K[:2] + np.array([[0, 0, 0.5], [0, 0, 0.5]])
+    with pytest.warns(UserWarning, match="another resolution"):
+        GeometryGuidance(RIGHT, twice, E)
+
+
+@pytest.mark.filterwarnings("ignore:K.*near the border")
+def test_a_calibration_of_another_size_is_refused(tmp_path):
+    camera = "[120 0 63.5; 0 120 47.5; 0 0 1]"
+    file = tmp_path / "calib.txt"
+    file.write_text(f"cam0={camera}\ncam1={camera}\ndoffs=0\nbaseline=120\nwidth=128\nheight=96\n")
+    with pytest.raises(ValueError, match="right must be of 128x96 pixels.*64x48"):
+        GeometryGuidance.from_calibration(RIGHT, file)
+    whole = np.zeros((96, 128, 3), np.uint8)
+    with pytest.raises(ValueError, match="image must be of 128x96 pixels"):
+        GeometryGuidance.from_calibration(whole, file).prepare(torch.rand(1, 3, 48, 64))
+
+
 def test_the_left_size_may_be_a_list():
     guidance = GeometryGuidance(RIGHT, K, E, left_size=[64, 48])
     assert len(guidance.prepare(torch.rand(1, 3, 48, 64))) == 1

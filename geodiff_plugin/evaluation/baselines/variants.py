@@ -6,8 +6,6 @@ Paper: S5.3, S7.3, S9 (ablations).
 
 from __future__ import annotations
 
-import inspect
-import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,7 +17,7 @@ from geodiff_plugin.evaluation.baselines._guidance import guided_configuration, 
 from geodiff_plugin.evaluation.baselines.base import Method, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance import GeometryGuidance
-from geodiff_plugin.knobs import DEFAULT_WEIGHTS
+from geodiff_plugin.knobs import DEFAULT_WEIGHTS, knobs_from_text
 from geodiff_plugin.matching import contradiction
 from geodiff_plugin.presets import PAPER_WEIGHTS
 
@@ -32,10 +30,6 @@ CONSTANTS = {
 """Modules whose constants an ablation may change for its own calls: numbers that are no knobs."""
 
 _WEIGHT = "weights."
-_POSITIONAL = {"self", "right", "K", "E", "points", "left_size", "weights"}
-_KNOBS = tuple(
-    name for name in inspect.signature(GeometryGuidance.__init__).parameters if name not in _POSITIONAL
-)
 
 
 def _constant(name: str) -> tuple[Any, str] | None:
@@ -69,29 +63,21 @@ def _constants(changed: Mapping[str, float]) -> Iterator[None]:
 
 
 def _changes(text: str, weights: dict[str, float]) -> tuple[dict[str, Any], dict[str, float]]:
-    """Keywords of a guidance, and constants; values are JSON, or text where they are none."""
-    changes: dict[str, Any] = {}
-    constants: dict[str, float] = {}
-    for part in text.split("+"):
-        knob, equals, written = part.partition("=")
-        if not equals or not (knob in _KNOBS or knob.startswith(_WEIGHT) or _constant(knob)):
-            bad_value(
-                "methods",
-                "of the form preset:knob=value+knob=value with knobs of GeometryGuidance, or weights.TERM",
-                repr(text),
-                f"Knobs: {', '.join(_KNOBS)}. Constants: module.NAME of {', '.join(CONSTANTS)}.",
-            )
+    """Keywords of a guidance, and constants."""
+    parts = text.split("+")
+    for name in (part.partition("=")[0] for part in parts):
+        if "." in name and not name.startswith(_WEIGHT) and not _constant(name):
+            bad_value("methods", "a constant module.NAME", repr(name), f"Modules: {', '.join(CONSTANTS)}.")
+    ours = [part for part in parts if _constant(part.partition("=")[0])]
+    constants = {}
+    for part in ours:
+        name, _, written = part.partition("=")
         try:
-            value = json.loads(written)
+            constants[name] = float(written)
         except ValueError:
-            value = written
-        if _constant(knob):
-            constants[knob] = value
-        elif knob.startswith(_WEIGHT):
-            changes["weights"] = changes.get("weights", weights) | {knob.removeprefix(_WEIGHT): value}
-        else:
-            changes[knob] = value
-    return changes, constants
+            bad_value(f"methods: {name}", "a number", repr(written))
+    knobs = knobs_from_text([part for part in parts if part not in ours], weights, "methods")
+    return knobs, constants
 
 
 def _variant(
