@@ -2,7 +2,7 @@
 
 Reading order, which is the path of one datum: ``types``, ``geometry``, ``metric``, ``denoising``,
 ``terms``, ``objective``, ``matching``, ``scale_search``, ``refinement``, ``updates``, ``evidence``,
-``guidance``, ``trajectory``, ``algorithm``, ``priors``, ``integration``, ``pipeline``.
+``knobs``, ``guidance``, ``trajectory``, ``algorithm``, ``priors``, ``integration``, ``pipeline``.
 
 >>> pipe = load_bundled_prior()
 >>> enable_geometry_guidance(pipe)

@@ -104,7 +104,7 @@ def changes_table(records: Sequence[dict[str, Any]], name: str) -> Table:
         )
     count = count_of_pairs(len({label_of(record) for record in records}))
     header = ("change", "pairs", "AbsRel ↓ [95 %]", "worst", "δ1 ↑ [95 %]", "AbsRel more", "seconds")
-    note = "Metres as they come out; each change alone, step sizes as they are."
+    note = "Metres as they come out; each change alone, and what the knobs leave open follows it."
     return Table(f"{_NAMES[name]}, one thing changed, {count}", header, tuple(rows), note)
 
 
