@@ -30,7 +30,7 @@ eval_app = typer.Typer(
 
 @eval_app.command("pairs")
 def pairs(
-    data: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with one or several data sets.")],
+    data: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of data sets, or synthetic:N.")],
     methods: Annotated[
         str | None, typer.Option(help="Comma-separated, see geodiff eval list; five of them by default.")
     ] = None,
