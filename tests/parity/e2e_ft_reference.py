@@ -21,31 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.parity import tiny_configs
 from tests.parity.geowizard_reference import TEXT, VAE, write_tokenizer
 
-UNET = {
-    "sample_size": 8,
-    "in_channels": 8,
-    "out_channels": 4,
-    "block_out_channels": (8, 16),
-    "layers_per_block": 1,
-    "down_block_types": ("CrossAttnDownBlock2D", "DownBlock2D"),
-    "up_block_types": ("UpBlock2D", "CrossAttnUpBlock2D"),
-    "cross_attention_dim": 8,
-    "attention_head_dim": (2, 4),
-    "norm_num_groups": 4,
-    "use_linear_projection": True,
-}
-SCHEDULER = {
-    "beta_schedule": "scaled_linear",
-    "beta_start": 0.00085,
-    "beta_end": 0.012,
-    "prediction_type": "v_prediction",
-    "clip_sample": False,
-    "set_alpha_to_one": False,
-    "steps_offset": 1,
-    "timestep_spacing": "trailing",
-}
+UNET = tiny_configs.UNET | {"in_channels": 8}
+SCHEDULER = tiny_configs.SCHEDULER | {"timestep_spacing": "trailing"}
 SIZE = (48, 64)
 
 

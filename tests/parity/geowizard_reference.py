@@ -22,37 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
-UNET = {
-    "sample_size": 8,
-    "in_channels": 8,
-    "out_channels": 4,
-    "block_out_channels": (8, 16),
-    "layers_per_block": 1,
-    "down_block_types": ("CrossAttnDownBlock2D", "DownBlock2D"),
-    "up_block_types": ("UpBlock2D", "CrossAttnUpBlock2D"),
-    "cross_attention_dim": 8,
-    "attention_head_dim": (2, 4),
-    "norm_num_groups": 4,
-    "use_linear_projection": True,
-    "class_embed_type": "projection",
-}
-VAE = {
-    "block_out_channels": (4, 8, 8, 8),
-    "down_block_types": ("DownEncoderBlock2D",) * 4,
-    "up_block_types": ("UpDecoderBlock2D",) * 4,
-    "layers_per_block": 1,
-    "latent_channels": 4,
-    "norm_num_groups": 4,
-}
-SCHEDULER = {
-    "beta_schedule": "scaled_linear",
-    "beta_start": 0.00085,
-    "beta_end": 0.012,
-    "prediction_type": "v_prediction",
-    "clip_sample": False,
-    "set_alpha_to_one": False,
-    "steps_offset": 1,
-}
+from tests.parity import tiny_configs
+
+UNET = tiny_configs.UNET | {"in_channels": 8, "class_embed_type": "projection"}
+VAE = tiny_configs.VAE
+SCHEDULER = tiny_configs.SCHEDULER
 ENCODER = {"hidden_size": 8, "intermediate_size": 16, "num_attention_heads": 2, "num_hidden_layers": 2}
 VISION = ENCODER | {"image_size": 32, "patch_size": 8, "projection_dim": 8}
 TEXT = ENCODER | {"vocab_size": 54, "bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}

@@ -21,28 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
-UNET = {
-    "sample_size": 8,
-    "out_channels": 4,
-    "block_out_channels": (8, 16),
-    "layers_per_block": 1,
-    "down_block_types": ("CrossAttnDownBlock2D", "DownBlock2D"),
-    "up_block_types": ("UpBlock2D", "CrossAttnUpBlock2D"),
-    "cross_attention_dim": 8,
-    "attention_head_dim": (2, 4),
-    "norm_num_groups": 4,
-    "use_linear_projection": True,
-    "class_embed_type": "projection",
-    "projection_class_embeddings_input_dim": 4,
-}
-VAE = {
-    "block_out_channels": (4, 8, 8, 8),
-    "down_block_types": ("DownEncoderBlock2D",) * 4,
-    "up_block_types": ("UpDecoderBlock2D",) * 4,
-    "layers_per_block": 1,
-    "latent_channels": 4,
-    "norm_num_groups": 4,
-}
+from tests.parity import tiny_configs
+
+UNET = tiny_configs.UNET | {"class_embed_type": "projection", "projection_class_embeddings_input_dim": 4}
+VAE = tiny_configs.VAE
 TEXT = {
     "hidden_size": 8,
     "intermediate_size": 16,
