@@ -15,9 +15,11 @@ __all__ = [
     "bad_type",
     "bad_value",
     "check_baseline",
+    "check_calibrated_size",
     "check_choice",
     "check_intrinsics",
     "check_intrinsics_fit",
+    "check_map_in_metres",
     "check_number",
     "check_pose",
     "check_range",
@@ -89,6 +91,15 @@ def check_intrinsics_fit(
         )
 
 
+def check_calibrated_size(
+    size: tuple[int, int], calibrated: tuple[int, int] | None, name: str, source: object, cure: str
+) -> None:
+    """Refuse an image whose ``(width, height)`` is not what its calibration says, if that says any."""
+    if calibrated is not None and tuple(calibrated) != size:
+        expected = "of {}x{} pixels, as {} says".format(*calibrated, source)
+        bad_value(name, expected, "{}x{}".format(*size), cure)
+
+
 def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
     """Warn of a principal point near the border, where that of an image of twice the size lies."""
     shares = (K[0, 2] / width, K[1, 2] / height)
@@ -142,6 +153,13 @@ def check_baseline(E: np.ndarray, name: str = "E") -> None:
             "If that is millimetres, divide the translation by 1000.",
             stacklevel=3,
         )
+
+
+def check_map_in_metres(array: np.ndarray, name: str, got: str = "") -> None:
+    """Refuse a depth map ``(H, W)`` of integers: some file's unit. ``(N, 3)`` points may be whole."""
+    if array.dtype.kind != "f" and array.shape[1] != 3:
+        cure = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."
+        bad_value(name, "metres as floats", got or f"dtype {array.dtype}", cure)
 
 
 def check_number(value: Any, name: str, low: float, high: float, *, integer: bool = False) -> Any:

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin._checks import check_calibrated_size, check_number
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.guidance_inputs import split_views
 from geodiff_plugin.presets import MARIGOLD_DC, PAPER, SEARCH_ONLY
@@ -62,9 +62,8 @@ class GuidanceDoors:
         guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **{"left_size": rig.size_left} | kwargs)
         for image in guidance.rights:
             size = (image.shape[-1], image.shape[-2])
-            if rig.size_right not in (None, size):
-                expected = "of {}x{} pixels, as {} says".format(*rig.size_right, rig.source)
-                bad_value("right", expected, "{}x{}".format(*size), "Scale K with the images, or use these.")
+            cure = "Scale K with the images, or use these."
+            check_calibrated_size(size, rig.size_right, "right", rig.source, cure)
         return guidance
 
     @classmethod

@@ -19,6 +19,7 @@ from geodiff_plugin._checks import (
     check_baseline,
     check_intrinsics,
     check_intrinsics_fit,
+    check_map_in_metres,
     check_pose,
     warn_of_other_size,
 )
@@ -183,9 +184,7 @@ def _as_points(value: Any, name: str) -> Tensor:
         bad_type(name, forms, value)
     if array.ndim != 2 or array.shape[1] < 3:
         bad_value(name, forms, f"shape {array.shape}")
-    if array.dtype.kind != "f" and array.shape[1] != 3:
-        cure = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."
-        bad_value(name, "metres as floats", f"dtype {array.dtype}", cure)
+    check_map_in_metres(array, name)
     array = array.astype(np.float32)
     finite = np.isfinite(array)
     if array.shape[1] == 3:

@@ -17,7 +17,7 @@ from geodiff_plugin.matching.known_points import UNIT
 from geodiff_plugin.metric import GROWS_WITH_DEPTH, MetricMap
 from geodiff_plugin.scale_search import depth_at
 
-__all__ = ["depth_span", "fit_to_points", "refine_to_matches", "sure_matches"]
+__all__ = ["depth_span", "fit_to_points", "ordered", "refine_to_matches", "sure_matches"]
 
 #: (near, far) pairs tried, and how far beyond the points' own range, as a factor.
 CANDIDATES, REACH = 48, 4.0
@@ -121,19 +121,19 @@ def refine_to_matches(
         fit = _refine_once(fit, start, values, target, weight, matches.plane_step, space, (True, True))
     sure = weight > SURE
     if int(sure.sum()) < MIN_SURE:
-        return _ordered(fit)
+        return ordered(*fit.exp().unbind(1))
     nearest = -torch.quantile(target[sure], 1.0 - NEAR_QUANTILE).log()
     fit = torch.stack(
         [torch.minimum(fit[:, 0], torch.maximum(nearest, start[:, 0] - LOG_NEAREST)), fit[:, 1]], 1
     )
     for _ in range(iterations):
         fit = _refine_once(fit, start, values, target, weight, matches.plane_step, space, (False, True))
-    return _ordered(fit)
+    return ordered(*fit.exp().unbind(1))
 
 
-def _ordered(fit: Tensor) -> tuple[Tensor, Tensor]:
-    near, far = fit.exp().unbind(1)
-    return torch.minimum(near, far * 0.98), far
+def ordered(near_m: Tensor, far_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Both ends, near at most 0.98 of far: a range of nothing has no scale."""
+    return torch.minimum(near_m, far_m * 0.98), far_m
 
 
 def _refine_once(

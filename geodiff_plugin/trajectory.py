@@ -18,7 +18,7 @@ from geodiff_plugin.evidence import Evidence, chunk_views
 from geodiff_plugin.matching import believe_before_prior, gate_matches, with_points
 from geodiff_plugin.metric import GROWS_WITH_DEPTH, AffineState, MetricMap, smooth_floor
 from geodiff_plugin.objective import Loss, Objective
-from geodiff_plugin.point_scale import depth_span, fit_to_points, refine_to_matches
+from geodiff_plugin.point_scale import depth_span, fit_to_points, ordered, refine_to_matches
 from geodiff_plugin.refinement import refine_depth
 from geodiff_plugin.scale_search import argmin_over, search_scale
 from geodiff_plugin.terms import MatchTarget
@@ -29,8 +29,6 @@ __all__ = ["Trajectory"]
 
 #: Candidates of the paper's one-number search; its figures step through 1..80.
 G_S_CANDIDATES = 80
-#: Nearest over farthest depth of a map, at most: a range of nothing has no scale.
-LEAST_RANGE = 0.98
 #: Searches that run at the first step only.
 ONCE = ("one-number", "points-range")
 
@@ -159,8 +157,7 @@ class Trajectory:
                 near_far = refine_to_matches(floored, known, *near_far, space)
         if self.config.depth_range is not None:
             low, high = self.config.depth_range
-            near, far = (v.clamp(low, high) for v in near_far)
-            near_far = torch.minimum(near, LEAST_RANGE * far), far
+            near_far = ordered(*(v.clamp(low, high) for v in near_far))
         return *near_far, on_edge
 
     def _gate_matches(self, x: Tensor) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from geodiff_plugin._checks import (
     bad_value,
     check_baseline,
+    check_calibrated_size,
     check_intrinsics,
     check_intrinsics_fit,
     check_number,
@@ -148,13 +149,8 @@ def read_rig(
         ("right", rig.K_right, rig.size_right, right_size, arguments.right),
     )
     for side, K, calibrated_size, size, path in views:
-        if calibrated_size is not None and tuple(calibrated_size) != size:
-            bad_value(
-                f"the {side} image {path}",
-                "of {}x{} pixels, as {} says".format(*calibrated_size, rig.source),
-                "{}x{}".format(*size),
-                "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy.",
-            )
+        cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
+        check_calibrated_size(size, calibrated_size, f"the {side} image {path}", rig.source, cure)
         check_intrinsics_fit(K, *size, f"K of the {side} camera ({rig.source})", f"the {side} image {path}")
     return replace(rig, size_left=left_size, size_right=right_size)
 

@@ -10,7 +10,7 @@ import os
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, check_map_in_metres
 from geodiff_plugin.formats.depth import read_depth_mm_png, read_pfm
 from geodiff_plugin.formats.files import check_file
 
@@ -47,8 +47,6 @@ def read_points(path: str | os.PathLike[str], name: str = "points") -> np.ndarra
             bad_value(name, expected, f"{found}, which does not read ({error})")
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.number):
         bad_value(name, "a map (H, W) or points (N, 3) of numbers", f"{found} of shape {values.shape}")
-    if kind == ".npy" and values.shape[1] != 3 and not np.issubdtype(values.dtype, np.floating):
-        cure = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."
-        bad_value(name, "metres as floats", f"{found} of {values.dtype}", cure)
+    check_map_in_metres(values, name, f"{found} of {values.dtype}")
     values = values.astype(np.float32)
     return values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
