@@ -19,12 +19,14 @@ __all__ = [
     "SCORED_M",
     "SHARD",
     "SHAPES",
+    "STREETS_AT",
     "held_out",
     "jitter",
     "normalise_disparity",
     "read_shard",
     "render_shards",
     "shards",
+    "shard_kind",
     "shard_size",
     "train_seeds",
 ]
@@ -34,6 +36,9 @@ SHARD = 16
 
 SHAPES = ((192, 256), (128, 416), (192, 256), (192, 192), (192, 256), (128, 416), (256, 192), (160, 288))
 """Image sizes (H, W) that shards cycle through: landscape mostly, KITTI's 3.3:1, square, portrait, 16:9."""
+
+STREETS_AT = 1
+"""Of each cycle the shard that shows streets only: pictures as wide as that one are taken from cars."""
 
 HELD_OUT_SEED = 1
 """Held-out scenes have the seeds 1, 2, ...; training scenes start at one million."""
@@ -47,6 +52,11 @@ _TRAIN_SEED = 1_000_000
 def shard_size(index: int) -> tuple[int, int]:
     """Image size (H, W) of a shard."""
     return SHAPES[index % len(SHAPES)]
+
+
+def shard_kind(index: int) -> str | None:
+    """Kind of scene in a shard, None for all kinds."""
+    return "street" if index % len(SHAPES) == STREETS_AT else None
 
 
 def train_seeds(index: int) -> list[int]:
@@ -162,7 +172,8 @@ def render_shards(cache: Path, first: int, stop: int, step: int = 1, device: str
         path = folder / f"{index:06d}.safetensors"
         if path.exists():
             continue
-        images, depth = render_mono(train_seeds(index), size=shard_size(index), device=device, augment=True)
+        size, kind = shard_size(index), shard_kind(index)
+        images, depth = render_mono(train_seeds(index), size=size, device=device, augment=True, kind=kind)
         part = path.with_suffix(f".part{os.getpid()}")
         pixels = (images.clamp(0, 1) * 255.0).round().to(torch.uint8)
         save_file({"images": pixels.cpu().contiguous(), "depth": depth.half().cpu().contiguous()}, part)

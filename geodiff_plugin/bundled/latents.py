@@ -148,12 +148,13 @@ class LatentStore:
         return [(parts[f"image{v}"], parts[f"depth{v}"]) for v in range(len(parts) // 2)]
 
     def _render(self, size: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        from geodiff_plugin.bundled.data import shard_size, train_seeds
+        from geodiff_plugin.bundled.data import shard_kind, shard_size, train_seeds
         from geodiff_plugin.synthetic import render_mono
 
         index = int(torch.randint(2**24, (), generator=generator))
         seeds = [seed for k in range(-(-size // SHARD)) for seed in train_seeds(index + k)][:size]
-        images, depth = render_mono(seeds, size=shard_size(index), device=str(self.vae.device), augment=True)
+        size, kind, device = shard_size(index), shard_kind(index), str(self.vae.device)
+        images, depth = render_mono(seeds, size=size, device=device, augment=True, kind=kind)
         images, depth = resize_scenes(images, depth, self.divisor)
         flip = bool(torch.randint(2, (), generator=generator))
         return tuple(x.float() for x in encode_scenes(self.vae, images, depth, generator, flip))

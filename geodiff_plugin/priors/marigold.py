@@ -14,7 +14,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.metric import SPACES
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import encode_map
+from geodiff_plugin.priors.pipelines.hooks import encode_map
 
 __all__ = ["MarigoldPrior"]
 

@@ -48,6 +48,13 @@ def test_training_seeds_are_distinct_and_never_held_out():
     assert min(seeds) > data.HELD_OUT_SEED + 10_000
 
 
+def test_widest_shards_show_streets_every_other_time():
+    kinds = [data.shard_kind(index) for index in range(2 * len(data.SHAPES))]
+    wide = [kind for index, kind in enumerate(kinds) if data.shard_size(index) == (128, 416)]
+    assert wide == ["street", None] * 2
+    assert kinds.count("street") == 2
+
+
 def test_shards_hold_the_same_scenes_for_the_same_seed(tmp_path, monkeypatch):
     monkeypatch.setattr(data, "SHAPES", ((24, 32),))
     monkeypatch.setattr(data, "SHARD", 2)

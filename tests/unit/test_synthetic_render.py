@@ -13,7 +13,9 @@ from geodiff_plugin.synthetic.benchmark import main, measure
 from geodiff_plugin.synthetic.builder import Builder, Look
 from geodiff_plugin.synthetic.cameras import intrinsics, tile, untile
 from geodiff_plugin.synthetic.effects import apply_effects, sample_effects
-from geodiff_plugin.synthetic.layouts.spot import camera_pose
+from geodiff_plugin.synthetic.layouts.ground import crossing, drives, parcels, repairs
+from geodiff_plugin.synthetic.layouts.plants import thicket
+from geodiff_plugin.synthetic.layouts.spot import Spot, camera_pose
 from geodiff_plugin.synthetic.patterns import LAYERS, TEXELS, bake_layer
 from geodiff_plugin.synthetic.photographs import PHOTOGRAPHS, cover_with_photographs
 from geodiff_plugin.synthetic.render import expose, render_linear, soften
@@ -39,6 +41,40 @@ def scene_of(build, pose=None, **rest) -> Scene:
 def rays() -> torch.Tensor:
     v, u = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
     return torch.linalg.inv(K) @ torch.stack([u, v, torch.ones_like(u)]).double().reshape(3, -1)
+
+
+def test_ground_marks_change_colour_and_not_depth():
+    """A camera at a car's height over bare ground and over every kind of mark."""
+    pose = camera_pose(0.0, -1.6, 0.0, 0.0, 0.2, 0.0)
+
+    def bare(b):
+        b.quad((0, 0, 0), 300, 300, GREY, fixed=True)
+
+    def marked(b):
+        bare(b)
+        repairs(b, 3.0, 0.0, 5)
+        crossing(b, 3.0, 0.0)
+        for s in (-1, 1):
+            parcels(b, s, 3.0, 0.0, 4)
+            drives(b, s, 3.0, 0.0, 3)
+
+    scenes = [scene_of(build, pose) for build in (bare, marked)]
+    plain, changed = (render_views(s, [Camera(K, s.T_world_from_camera)], SIZE)[0] for s in scenes)
+    ground = plain.valid & (plain.depth_m < 80)
+    torch.testing.assert_close(changed.depth_m[ground], plain.depth_m[ground], rtol=0.06, atol=0)
+    difference = (changed.image_01 - plain.image_01).abs().amax(0, keepdim=True)
+    assert (difference[ground] > 0.05).float().mean() > 0.1
+
+
+def test_a_thicket_covers_its_slab_and_no_more():
+    scene = scene_of(
+        lambda b: thicket(Spot(b, 0.0, 12.0, np.pi / 2), 10.0, 3.0, 1.0), camera_pose(0, -1.6, 0, 0, 0, 0)
+    )
+    view = render_views(scene, [Camera(K, scene.T_world_from_camera)], SIZE)[0]
+    seen = view.depth_m[view.valid]
+    assert view.valid.float().mean() > 0.2
+    assert seen.min() > 9 and seen.max() < 15
+    assert seen.std() > 0.1  # ragged, not a wall
 
 
 def test_depth_of_a_plane_is_exact():

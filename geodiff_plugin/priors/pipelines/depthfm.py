@@ -19,7 +19,8 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.priors.pipelines.hooks import Condition, Generators
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
 
 __all__ = ["DepthFMPipeline", "SidesOf64", "cosine_alpha_bar"]

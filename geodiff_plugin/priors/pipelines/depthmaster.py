@@ -10,9 +10,10 @@ from diffusers import AutoencoderKL
 from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from geodiff_plugin.priors.pipelines.fourier_unet import FourierUNet
+from geodiff_plugin.priors.pipelines.hooks import Condition, Generators
 from geodiff_plugin.priors.pipelines.prompts import text_embedding
 
 __all__ = ["DepthMasterPipeline"]

@@ -21,7 +21,8 @@ from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjec
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.priors.pipelines.hooks import Condition, Generators
 from geodiff_plugin.priors.pipelines.prompts import text_embedding
 
 __all__ = ["DOMAINS", "GeoWizardPipeline", "PairAttention"]

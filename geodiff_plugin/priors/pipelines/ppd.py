@@ -16,7 +16,8 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import Dinov2Model
 
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.priors.pipelines.hooks import Condition, Generators
 from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
 
 __all__ = ["AreaImageProcessor", "PPDPipeline", "area_resize", "sampling_timesteps", "semantic_tokens"]

@@ -14,8 +14,9 @@ from transformers import PreTrainedModel
 
 from geodiff_plugin.priors.hf_depth import HFDepthModel
 from geodiff_plugin.priors.hf_preparation import Preparation
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+from geodiff_plugin.priors.pipelines.hooks import Condition, Generators
 
 __all__ = ["TransformersDepthPipeline", "unit_range"]
 

@@ -13,7 +13,7 @@ from geodiff_plugin.synthetic.layouts.palettes import object_look, pick, surface
 from geodiff_plugin.synthetic.layouts.spot import Spot
 from geodiff_plugin.synthetic.scene import Shape
 
-__all__ = ["bush", "leaf_look", "pot_plant", "rock", "tree", "tree_line"]
+__all__ = ["bush", "leaf_look", "pot_plant", "rock", "thicket", "tree", "tree_line"]
 
 
 def leaf_look(rng: np.random.Generator, scale: tuple[float, float] = (0.8, 1.6)) -> Look:
@@ -94,6 +94,23 @@ def tree_line(spot: Spot, width: float, height: float, count: int) -> None:
         if rng.random() < 0.6:
             top = np.asarray(half) * rng.uniform(0.35, 0.6)
             spot.ball(lx + rng.normal(0, 0.5), 0, h - top[1] * 0.4, top, looks[k % 2])
+
+
+def thicket(spot: Spot, length: float, height: float, depth: float) -> None:
+    """A ragged wall of leaves along local z, lit tops over dark gaps, with stems in front here and there."""
+    rng = spot.rng
+    looks = [leaf_look(rng) for _ in range(3)]
+    bark = surface_look(rng, "rock", "soil", (0.3, 0.5))
+    count = int(min(12 + 2 * length, 64))
+    for k in range(count):
+        lz = ((k + rng.random()) / count - 0.5) * length
+        up = height * rng.random() ** 0.7
+        half = rng.uniform(0.2, 0.75, 3) * (0.4 + 0.25 * height)
+        turn = dict(pitch=rng.normal(0, 0.5), roll=rng.normal(0, 0.5))
+        spot.ball(rng.uniform(-0.5, 0.5) * depth, lz, up, half, looks[int(rng.integers(3))], **turn)
+    for _ in range(int(rng.integers(0, 6))):
+        radius, lz = rng.uniform(0.04, 0.2), rng.uniform(-0.5, 0.5) * length
+        spot.column(rng.uniform(-0.7, 0.7) * depth, lz, 0, radius, height, bark, top=0.6)
 
 
 def bush(spot: Spot, size: float) -> None:

@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from geodiff_plugin.synthetic.builder import Builder, Look
+from geodiff_plugin.synthetic.layouts.ground import crossing, drives, parcels, repairs
 from geodiff_plugin.synthetic.layouts.outdoor import building, daylight
 from geodiff_plugin.synthetic.layouts.palettes import palette, pick, surface_look
-from geodiff_plugin.synthetic.layouts.plants import leaf_look, tree, tree_line
+from geodiff_plugin.synthetic.layouts.plants import leaf_look, thicket, tree, tree_line
 from geodiff_plugin.synthetic.layouts.roadside import Plan, country_side, suburb_side, town_side
 from geodiff_plugin.synthetic.layouts.spot import Spot, camera_pose
 from geodiff_plugin.synthetic.layouts.traffic import car, person, pole, wires
@@ -107,6 +108,43 @@ def _close_view(b: Builder, plan: Plan) -> None:
         )
 
 
+def _ground_marks(b: Builder, plan: Plan, style: str) -> None:
+    """What changes the ground's colour and nothing else, or every edge on the ground would be a step."""
+    rng = b.rng
+    if rng.random() < 0.5:
+        repairs(b, plan.half_road, 0.0, int(rng.integers(1, 6)))
+    if rng.random() < 0.15:
+        crossing(b, plan.half_road, 0.0)
+    for s in (-1, 1):
+        if rng.random() < 0.6:
+            parcels(b, s, plan.edge, 0.0, int(rng.integers(1, 5)))
+        if style != "town" and rng.random() < 0.5:
+            drives(b, s, plan.edge, -0.02, int(rng.integers(1, 4)))
+
+
+def _green_walls(b: Builder, plan: Plan, chance: float) -> None:
+    """Hedges gone wild and the edges of woods, close to the road."""
+    rng = b.rng
+    for s in (-1, 1):
+        if rng.random() < chance:
+            z = rng.uniform(-2, 12)
+            for _ in range(int(rng.integers(1, 4))):
+                length, deep = rng.uniform(5, 30), rng.uniform(0.8, 3)
+                x = s * (plan.edge + 0.4 + deep / 2 + rng.exponential(1.5))
+                thicket(Spot(b, x, z + length / 2), length, rng.uniform(1, 7), deep)
+                z += length + rng.exponential(6)
+
+
+def _parking(b: Builder, plan: Plan) -> None:
+    """Cars side by side in bays at a right angle to the road."""
+    rng = b.rng
+    s, z, pitch = pick(rng, -1, 1), rng.uniform(4, 12), rng.uniform(2.5, 3.0)
+    turn = s * np.pi / 2 + pick(rng, 0, np.pi)
+    for _ in range(int(rng.integers(2, 9))):
+        car(Spot(b, s * (plan.edge + 2.6), z, turn + rng.normal(0, 0.04)))
+        z += pitch * pick(rng, 1, 1, 1, 2)
+
+
 def street(rng: np.random.Generator, seed: int) -> Scene:
     """Draw a street."""
     b = Builder(rng)
@@ -123,6 +161,10 @@ def street(rng: np.random.Generator, seed: int) -> Scene:
     if rng.random() < 0.6:
         _close_view(b, plan)
     _cars(b, plan, {"town": 0.65, "suburb": 0.6, "country": 0.1}[style])
+    _ground_marks(b, plan, style)
+    _green_walls(b, plan, {"town": 0.12, "suburb": 0.3, "country": 0.5}[style])
+    if style != "country" and rng.random() < 0.15:
+        _parking(b, plan)
     if rng.random() < 0.15:  # overhanging foliage near the camera
         spot = Spot(b, pick(rng, -1, 1) * (plan.half_road + 0.5), rng.uniform(3, 8))
         b.ball((spot.x, -rng.uniform(2.5, 4), spot.z), rng.uniform(0.8, 2.0, 3), leaf_look(rng))
