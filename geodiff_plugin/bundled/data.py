@@ -24,6 +24,7 @@ __all__ = [
     "jitter",
     "normalise_disparity",
     "read_shard",
+    "render_as_shard",
     "render_shards",
     "shards",
     "shard_kind",
@@ -57,6 +58,13 @@ def shard_size(index: int) -> tuple[int, int]:
 def shard_kind(index: int) -> str | None:
     """Kind of scene in a shard, None for all kinds."""
     return "street" if index % len(SHAPES) == STREETS_AT else None
+
+
+def render_as_shard(index: int, seeds: list[int], device: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images ``(N, 3, H, W)`` in [0, 1] and metres ``(N, 1, H, W)``, size and kind as in a shard."""
+    from geodiff_plugin.synthetic import render_mono
+
+    return render_mono(seeds, shard_size(index), device, augment=True, kind=shard_kind(index))
 
 
 def train_seeds(index: int) -> list[int]:
@@ -164,16 +172,13 @@ def render_shards(cache: Path, first: int, stop: int, step: int = 1, device: str
     Yields:
         The index of each new shard.
     """
-    from geodiff_plugin.synthetic import render_mono
-
     folder = Path(cache) / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
     for index in range(first, stop, step):
         path = folder / f"{index:06d}.safetensors"
         if path.exists():
             continue
-        size, kind = shard_size(index), shard_kind(index)
-        images, depth = render_mono(train_seeds(index), size=size, device=device, augment=True, kind=kind)
+        images, depth = render_as_shard(index, train_seeds(index), device)
         part = path.with_suffix(f".part{os.getpid()}")
         pixels = (images.clamp(0, 1) * 255.0).round().to(torch.uint8)
         save_file({"images": pixels.cpu().contiguous(), "depth": depth.half().cpu().contiguous()}, part)

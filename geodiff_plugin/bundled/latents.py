@@ -14,7 +14,15 @@ import torch.nn.functional as F
 from diffusers import AutoencoderKL
 from safetensors.torch import load_file, save_file
 
-from geodiff_plugin.bundled.data import SHARD, jitter, normalise_disparity, read_shard, shards
+from geodiff_plugin.bundled.data import (
+    SHARD,
+    jitter,
+    normalise_disparity,
+    read_shard,
+    render_as_shard,
+    shards,
+    train_seeds,
+)
 
 __all__ = ["LatentStore", "encode_scenes", "resize_scenes"]
 
@@ -148,13 +156,9 @@ class LatentStore:
         return [(parts[f"image{v}"], parts[f"depth{v}"]) for v in range(len(parts) // 2)]
 
     def _render(self, size: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        from geodiff_plugin.bundled.data import shard_kind, shard_size, train_seeds
-        from geodiff_plugin.synthetic import render_mono
-
         index = int(torch.randint(2**24, (), generator=generator))
         seeds = [seed for k in range(-(-size // SHARD)) for seed in train_seeds(index + k)][:size]
-        size, kind, device = shard_size(index), shard_kind(index), str(self.vae.device)
-        images, depth = render_mono(seeds, size=size, device=device, augment=True, kind=kind)
+        images, depth = render_as_shard(index, seeds, str(self.vae.device))
         images, depth = resize_scenes(images, depth, self.divisor)
         flip = bool(torch.randint(2, (), generator=generator))
         return tuple(x.float() for x in encode_scenes(self.vae, images, depth, generator, flip))
