@@ -1,8 +1,8 @@
 """Two photographs from anywhere: the right camera is turned and moved, nothing is rectified.
 
 A scene is rendered from two camera-to-world poses, in metres, so the truth is known and the error can be
-printed. (COLMAP writes world-to-camera poses without a unit; docs/calibration.md turns them into these.) Runs
-offline:
+printed. (COLMAP writes world-to-camera poses without a unit; docs/reference/calibration.md turns them into
+these.) Runs offline:
 
     python examples/posed_photographs.py --seed 7 --angle 8
 """

@@ -1,8 +1,7 @@
-"""Metric depth from a diffusion prior and a second view (GeoDiff, ICCV 2025), as a diffusers plugin.
+"""Metric depth from a diffusion prior and a second view (GeoDiff, arXiv 2510.18291), as a diffusers plugin.
 
-Reading order, which is the path of one datum: ``types``, ``geometry``, ``metric``, ``denoising``,
-``terms``, ``objective``, ``matching``, ``scale_search``, ``refinement``, ``updates``, ``evidence``,
-``knobs``, ``guidance``, ``trajectory``, ``algorithm``, ``priors``, ``integration``, ``pipeline``.
+Reading order, which is the path of one image: ``types``, ``geometry``, ``guidance.config``, ``matching``,
+``scale``, ``algorithm``, ``guidance``, ``priors``, ``runtime``.
 
 >>> pipe = load_bundled_prior()
 >>> enable_geometry_guidance(pipe)
@@ -18,14 +17,16 @@ __version__ = "0.1.0"
 
 #: Public name -> module, imported on first use so that ``import geodiff_plugin`` stays quick.
 _MODULE_OF = {
-    "GeometryGuidance": "geodiff_plugin.guidance",
-    "GuidedMarigoldDepthPipeline": "geodiff_plugin.pipeline",
+    "GeometryGuidance": "geodiff_plugin.guidance.guidance",
+    "GuidanceConfig": "geodiff_plugin.guidance.config",
+    "GuidedMarigoldDepthPipeline": "geodiff_plugin.runtime.pipeline",
+    "InputError": "geodiff_plugin._checks",
     "MetricDepthOutput": "geodiff_plugin.types",
     "PRIORS": "geodiff_plugin.priors",
     "Rig": "geodiff_plugin.types",
-    "disable_geometry_guidance": "geodiff_plugin.pipeline",
-    "enable_geometry_guidance": "geodiff_plugin.pipeline",
-    "guide_both_views": "geodiff_plugin.left_right",
+    "disable_geometry_guidance": "geodiff_plugin.runtime.pipeline",
+    "enable_geometry_guidance": "geodiff_plugin.runtime.pipeline",
+    "guide_both_views": "geodiff_plugin.runtime.both_views",
     "load_bundled_prior": "geodiff_plugin.bundled",
     "load_prior": "geodiff_plugin.priors",
     "read_calibration": "geodiff_plugin.formats",

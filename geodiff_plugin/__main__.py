@@ -1,10 +1,10 @@
 """``python -m geodiff_plugin`` is the ``geodiff`` command (for ``accelerate launch`` and ``torchrun``).
 
-Hop: argv -> ``geodiff_plugin.cli.main``.
+Hop: argv -> ``geodiff_plugin.cli.app.main``.
 Paper: none.
 """
 
-from geodiff_plugin.cli import main
+from geodiff_plugin.cli.app import main
 
 if __name__ == "__main__":
     main()

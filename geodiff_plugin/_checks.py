@@ -1,6 +1,6 @@
 """The one voice of every user-facing error: name, expected, got, likely cure.
 
-Hop: an argument as the user gave it -> the same argument, or ``ValueError``/``TypeError``.
+Hop: an argument as the user gave it -> the same argument, or ``InputError`` (a ``ValueError``).
 Paper: none.
 """
 
@@ -12,17 +12,26 @@ from typing import Any, NoReturn
 import numpy as np
 
 __all__ = [
+    "FolderError",
+    "ForbiddenFileError",
+    "InputError",
+    "InputFileError",
+    "InputTypeError",
+    "MissingFileError",
     "bad_type",
     "bad_value",
     "check_baseline",
     "check_calibrated_size",
     "check_choice",
+    "check_flag",
     "check_intrinsics",
     "check_intrinsics_fit",
     "check_map_in_metres",
     "check_number",
     "check_pose",
     "check_range",
+    "refuse",
+    "check_size",
     "warn_of_other_size",
 ]
 
@@ -33,26 +42,68 @@ NEAR_BORDER = 0.2
 SCALED_K = "with s = new size / old size take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy"
 
 
+#: What came may be a whole file; so many characters of it tell which.
+LONGEST_GOT = 400
+
+
+class InputError(ValueError):
+    """What the user gave cannot be used; the message says what, and what would do."""
+
+
+class InputTypeError(InputError, TypeError):
+    """The same for what is of the wrong type."""
+
+
+class InputFileError(InputError, OSError):
+    """The same for a file or folder that cannot be read or written."""
+
+
+class MissingFileError(InputFileError, FileNotFoundError):
+    """The same for what is not there."""
+
+
+class FolderError(InputFileError, IsADirectoryError):
+    """The same for a folder where a file must be."""
+
+
+class ForbiddenFileError(InputFileError, PermissionError):
+    """The same for what may not be read."""
+
+
 def _sentence(name: str, expected: str, got: object, cure: str) -> str:
+    got = " ".join(str(got).split())  # arrays are printed over several lines
+    got = got if len(got) <= LONGEST_GOT else f"{got[:LONGEST_GOT]}..."
     return f"{name} must be {expected}; got {got}." + (f" {cure}" if cure else "")
 
 
 def bad_value(name: str, expected: str, got: object, cure: str = "") -> NoReturn:
-    """Raise ``ValueError``: ``<name> must be <expected>; got <got>. <cure>``."""
-    raise ValueError(_sentence(name, expected, got, cure))
+    """Raise ``InputError``: ``<name> must be <expected>; got <got>. <cure>``."""
+    raise InputError(_sentence(name, expected, got, cure))
+
+
+def refuse(sentences: str) -> NoReturn:
+    """Raise ``InputError`` with whole sentences, where the form of ``bad_value`` would read badly."""
+    raise InputError(sentences)
 
 
 def bad_type(name: str, expected: str, got: object, cure: str = "") -> NoReturn:
-    """Raise ``TypeError`` with the same sentence, naming the type of what came."""
-    raise TypeError(_sentence(name, expected, f"{type(got).__name__}", cure))
+    """Raise ``InputTypeError`` with the same sentence, naming the type of what came."""
+    raise InputTypeError(_sentence(name, expected, f"{type(got).__name__}", cure))
+
+
+def _short(value: object) -> str:
+    """A number as text that fits a line."""
+    if isinstance(value, int) and value.bit_length() > 128:
+        return "a whole number of more than 128 bits"
+    return str(value)
 
 
 def _as_matrix(value: Any, name: str, shape: tuple[int, int], cure: str) -> np.ndarray:
     if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()
+        value = value.detach().cpu().double().numpy()  # numpy has no bfloat16
     try:
         matrix = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         bad_type(name, f"a {shape[0]}x{shape[1]} matrix of numbers", value, cure)
     if matrix.shape != shape:
         bad_value(name, f"a {shape[0]}x{shape[1]} matrix", f"shape {matrix.shape}", cure)
@@ -87,7 +138,7 @@ def check_intrinsics_fit(
             name,
             f"for {image} of {width}x{height} pixels",
             f"principal point ({cx:.1f}, {cy:.1f}) outside of it",
-            f"It probably belongs to another resolution: {SCALED_K}.",
+            f"It probably belongs to another resolution: {SCALED_K}. Of a crop say so with cropped=True.",
         )
 
 
@@ -114,10 +165,15 @@ def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image:
 def check_pose(E: Any, name: str = "E") -> np.ndarray:
     """A ``(4, 4)`` float64 rigid transform; a rotation off by at most 1e-2 is projected to the nearest one.
 
+    A 3x4 gets the row 0 0 0 1.
+
     Raises:
-        TypeError, ValueError: not 4x4, not finite, last row not (0, 0, 0, 1), no rotation, mirrored.
+        TypeError, ValueError: neither 4x4 nor 3x4, not finite, last row not (0, 0, 0, 1), no rotation,
+            mirrored.
     """
     cure = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t], [0, 1]], t in metres."
+    if np.shape(E) == (3, 4):
+        E = np.vstack([_as_matrix(E, name, (3, 4), cure), (0.0, 0.0, 0.0, 1.0)])
     E = _as_matrix(E, name, (4, 4), cure)
     if not np.allclose(E[3], (0, 0, 0, 1), atol=1e-6):
         bad_value(
@@ -167,14 +223,33 @@ def check_number(value: Any, name: str, low: float, high: float, *, integer: boo
     kinds = (int, np.integer) if integer else (int, float, np.integer, np.floating)
     if isinstance(value, bool) or not isinstance(value, kinds):
         bad_type(name, "an integer" if integer else "a number", value)
-    if not np.isfinite(value) or not low <= value <= high:
-        bad_value(name, f"between {low:g} and {high:g}", value)
+    # Whole numbers may be longer than any float: compared, not converted. NaN is not within anything.
+    if not low <= value <= high or value in (float("inf"), float("-inf")):
+        bad_value(name, f"between {low:g} and {high:g}", _short(value))
     return value
+
+
+def check_flag(value: Any, name: str) -> bool:
+    """``True`` or ``False``; a number or a text is neither."""
+    if not isinstance(value, (bool, np.bool_)):
+        bad_type(name, "True or False", value)
+    return bool(value)
+
+
+def check_size(value: Any, name: str) -> tuple[int, int] | None:
+    """``None`` or ``(width, height)`` in pixels, as a tuple."""
+    if value is None:
+        return None
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        bad_type(name, "None or a pair (width, height)", value)
+    for side in value:
+        check_number(side, name, 1, 1 << 24, integer=True)
+    return value[0], value[1]
 
 
 def check_choice(value: Any, name: str, choices: Any) -> Any:
     """One of ``choices``, returned as it came."""
-    if value not in choices:
+    if not any(value == known for known in choices):  # what came may have no hash
         bad_value(name, f"one of {sorted(map(str, choices))}", repr(value))
     return value
 
@@ -184,8 +259,9 @@ def check_range(value: Any, name: str) -> tuple[float, float] | None:
     if value is None:
         return None
     try:
-        low, high = (float(v) for v in value)
-    except (TypeError, ValueError):
+        low, high = value
+        low, high = (float(check_number(v, name, -float("inf"), float("inf"))) for v in (low, high))
+    except (TypeError, ValueError, OverflowError):
         bad_type(name, "None or a pair of numbers (low, high)", value)
     if not (0 < low < high < float("inf")):
         bad_value(name, "a pair with 0 < low < high", (low, high))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import tomllib
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 import geodiff_plugin
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 #: A fence that says ``python run`` promises to run offline as it stands.
 RUNNABLE = re.compile(r"^```python run\n(.*?)^```", re.MULTILINE | re.DOTALL)
 README_COMMANDS = (
@@ -38,7 +39,7 @@ def test_readme_has_a_runnable_block():
 @pytest.mark.parametrize("name", geodiff_plugin.__all__)
 def test_public_name_is_documented(name):
     getattr(geodiff_plugin, name)
-    assert re.search(rf"`{name}\b", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"))
+    assert re.search(rf"`{name}\b", (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("command", README_COMMANDS)
@@ -54,15 +55,54 @@ def test_links_lead_somewhere(page):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
+def test_pages_that_the_code_names_exist():
+    named = {
+        (match, path.relative_to(ROOT).as_posix())
+        for folder in ("geodiff_plugin", "examples", "tests")
+        for path in (ROOT / folder).rglob("*.py")
+        for match in re.findall(r"docs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
+    }
+    assert not [(page, where) for page, where in named if not (ROOT / page).is_file()]
+
+
+def _named_parts() -> list[str]:
+    """``scale.space.MetricMap`` and the like: what pages call a module, a class or a function of ours."""
+    folders = "|".join(
+        path.name for path in (ROOT / "geodiff_plugin").iterdir() if (path / "__init__.py").is_file()
+    )
+    pattern = re.compile(rf"`(?:geodiff_plugin\.)?((?:{folders})\.[A-Za-z_][\w.]*\w)[`(]")
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES if page.name != "changelog.md")
+    return sorted({name for name in pattern.findall(text) if not name.endswith((".py", ".json", ".txt"))})
+
+
+@pytest.mark.parametrize("name", _named_parts())
+def test_parts_that_pages_name_exist(name):
+    words = name.split(".")
+    for count in range(len(words), 0, -1):
+        try:
+            found = importlib.import_module(".".join(["geodiff_plugin", *words[:count]]))
+        except ModuleNotFoundError:
+            continue
+        for word in words[count:]:
+            assert hasattr(found, word) or word in getattr(found, "__dataclass_fields__", ()), (
+                f"{found} lacks {word}"
+            )
+            found = getattr(found, word, None)
+        return
+    raise AssertionError(f"{name} is not in the package")
+
+
 def test_constraints_pin_every_dependency():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     needed = project["dependencies"] + [
-        package for extra in ("test", "eval", "train") for package in project["optional-dependencies"][extra]
+        package
+        for extra in ("test", "eval", "train", "app", "test-app", "docs")
+        for package in project["optional-dependencies"][extra]
     ]
     pinned = {
         line.split("==")[0].lower().replace("_", "-")
         for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
         if "==" in line
     }
-    names = {re.split(r"[<>=~! ]", requirement)[0].lower() for requirement in needed}
+    names = {re.split(r"[\[<>=~! ]", requirement)[0].lower() for requirement in needed} - {project["name"]}
     assert names <= pinned, names - pinned

@@ -1,9 +1,10 @@
-"""Every block of docs/extending.md runs, and what it adds to the tables works."""
+"""Every block of docs/how-to/extending.md runs, and what it adds to the tables works."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,20 +13,30 @@ from diffusers import UNet2DModel
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
+from geodiff_plugin.algorithm.objective import Objective
+from geodiff_plugin.algorithm.rules import RULES
+from geodiff_plugin.algorithm.terms import TERMS
+from geodiff_plugin.evaluation.alignment import align
+from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings, find_method
+from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
+from geodiff_plugin.formats import CALIBRATION_FORMATS, read_calibration
+from geodiff_plugin.guidance import presets
+from geodiff_plugin.matching import points_to_matches
 from geodiff_plugin.priors import PRIORS
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
-from geodiff_plugin.terms import TERMS
-from geodiff_plugin.updates import RULES
+from geodiff_plugin.scale.points import fit_to_points
+from geodiff_plugin.scale.space import SPACES, MetricMap
 from tests.conftest import make_vae
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
+(PAGE,) = (Path(__file__).resolve().parents[1] / "docs").rglob("extending.md")
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture
 def page():
     """The names that the page's blocks define, the tables with what they add; all as before afterwards."""
-    before = [(table, dict(table)) for table in (PRIORS, TERMS, RULES)]
+    tables = (PRIORS, TERMS, RULES, SPACES, CALIBRATION_FORMATS, DATASETS, METHODS)
+    before = [(table, dict(table)) for table in tables]
     names: dict = {}
     for block in BLOCKS:
         exec(compile(block, PAGE.name, "exec"), names)
@@ -62,6 +73,7 @@ def test_what_the_page_adds_works(page, textured_plane, tmp_path):
         textured_plane.E,
         rule="sign",
         weights={"photometric": 1.0, "far_pull": 0.1},
+        options={"far_pull.power": 2.0},
         inner_steps=2,
         min_steps=2,
         loss_resolution=64,
@@ -69,3 +81,44 @@ def test_what_the_page_adds_works(page, textured_plane, tmp_path):
     out = pipe(Image.fromarray(textured_plane.left), guidance=guidance)
     assert (out.prediction > 0).all() and np.isfinite(out.prediction).all()
     assert "far_pull" in out.history[0].terms and len(out.history) == 2
+
+
+def test_a_term_takes_its_option(page, textured_plane):
+    estimate = SimpleNamespace(depth_m=torch.full((1, 1, 4, 4), 0.5))
+    for options, value in (({}, 2.0), ({"far_pull.power": 3.0}, 8.0)):
+        settings = presets.DEFAULT.changed(options=options).terms
+        objective = Objective(None, MetricMap(), {"far_pull": 1.0}, settings)
+        assert float(TERMS["far_pull"].function(estimate, **objective.options_of("far_pull"))) == value
+    pair = textured_plane
+    with pytest.raises(ValueError, match="option of options"):
+        GeometryGuidance(pair.right, pair.K, pair.E, options={"far_pull.colour": 1.0})
+
+
+def test_a_space_is_known_to_map_fit_and_alignment(page):
+    x = torch.rand(1, 1, 24, 32, generator=torch.Generator().manual_seed(0)) * 0.9 + 0.05
+    metric, near, far = MetricMap("cube_root"), torch.tensor([1.5]), torch.tensor([9.0])
+    depth_m = metric(x, metric.from_range(near, far))
+    torch.testing.assert_close(metric.range_of(metric.from_range(near, far)), (near, far), rtol=2e-3, atol=0)
+    K = torch.tensor([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
+    points, _ = points_to_matches(depth_m[0, 0], K, (24, 32), K, (24, 32))
+    found = fit_to_points(x, points, metric)
+    assert ((metric(x, metric.from_range(*found)) - depth_m).abs() / depth_m).median() < 0.1
+    truth = depth_m[0, 0].numpy()
+    aligned = align(3 * np.cbrt(truth) + 1, truth, truth > 0, "cube_root")
+    np.testing.assert_allclose(aligned, truth, rtol=1e-5)
+
+
+def test_a_format_a_data_set_and_a_method(page, textured_plane, tmp_path):
+    pair, folder = textured_plane, tmp_path / "one.ink"
+    folder.mkdir()
+    for name in ("left", "right"):
+        Image.fromarray(getattr(pair, name)).save(folder / f"{name}.png")
+    np.save(folder / "depth.npy", pair.depth_m.astype(np.float32))
+    K, E = pair.K, pair.E
+    (folder / "cameras").write_text(f"ink 1\n{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]} {E[0, 3]}\n")
+    np.testing.assert_allclose(read_calibration(folder / "cameras").E, E)
+    (ref,) = find_pairs(tmp_path, ["ink"])
+    sample = load(ref)
+    assert sample.label == "ink/one" and sample.depth_m.shape == pair.depth_m.shape
+    prediction = find_method("flat").run(sample, Settings(), PriorCache())
+    assert (prediction.depth_m == 2.0).all()

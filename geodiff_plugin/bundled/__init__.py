@@ -1,4 +1,4 @@
-"""The small prior that ships in the package: load it, train it, measure it.
+"""The small prior and the stereo pair that ship with the package.
 
 Hop: package data ``bundled/prior`` -> stock ``MarigoldDepthPipeline``.
 Paper: S3.1 (the prior); this one is ours, so that everything works without a download.
@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from diffusers import MarigoldDepthPipeline
 
-from geodiff_plugin.bundled.models import open_pipeline
+from geodiff_plugin.bundled.loading import open_pipeline
 
 __all__ = ["PRIOR_FOLDER", "load_bundled_prior"]
 

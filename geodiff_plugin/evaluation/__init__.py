@@ -1,4 +1,4 @@
-"""Measuring: data sets, metrics, methods side by side, resumable runs and tables.
+"""Evaluation: data sets, metrics, methods side by side, resumable runs, tables and figures.
 
 Hop: folder of a data set -> samples -> every method's depth -> numbers -> table.
 Paper: S5 (experiments).

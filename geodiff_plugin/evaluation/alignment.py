@@ -1,4 +1,4 @@
-"""Scale and shift from the truth: what relative depth is worth once an oracle has aligned it.
+"""Alignment of relative depth to the truth by least squares in scale and shift.
 
 Hop: prediction in its own space + truth -> depth in metres.
 Paper: S5.1 ("aligned"); least squares as Marigold's evaluation does it.
@@ -7,29 +7,35 @@ Paper: S5.1 ("aligned"); least squares as Marigold's evaluation does it.
 from __future__ import annotations
 
 import numpy as np
+import torch
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.evaluation.metrics import FLOOR_M
+from geodiff_plugin.scale.space import SPACES
 
-__all__ = ["MIN_DISPARITY", "align", "least_squares"]
+__all__ = ["MIN_DISPARITY", "align", "least_squares", "to_space"]
 
 MIN_DISPARITY = 1e-3
 """Aligned disparity, 1/m, is clipped here before it is inverted: nothing is farther than a kilometre."""
 
-_TO_SPACE = {
-    "depth": lambda z: z,
-    "disparity": lambda z: 1.0 / z,
-    "log": np.log,
-    "log1p": np.log1p,
-    "sqrt_disparity": lambda z: 1.0 / np.sqrt(z),
-}
-_FROM_SPACE = {
-    "depth": lambda x: x,
-    "disparity": lambda x: 1.0 / np.maximum(x, MIN_DISPARITY),
-    "log": np.exp,
-    "log1p": np.expm1,
-    "sqrt_disparity": lambda x: 1.0 / np.maximum(x, MIN_DISPARITY**0.5) ** 2,
-}
+
+def to_space(depth_m: np.ndarray, space: str) -> np.ndarray:
+    """What depths in metres are in a space, in float64: linear there in a prior that is right.
+
+    Args:
+        depth_m: any shape, metres, > 0.
+        space: key of ``SPACES``.
+    """
+    return SPACES[space].inverse(torch.from_numpy(np.asarray(depth_m, np.float64))).numpy()
+
+
+def _from_space(values: np.ndarray, space: str) -> np.ndarray:
+    """Metres of values in a space; where values fall with depth, none is less than that of a kilometre."""
+    kind, metre = SPACES[space], torch.ones((), dtype=torch.float64)
+    values = torch.from_numpy(np.asarray(values, np.float64))
+    if not kind.grows_with_depth:
+        values = values.clamp_min(float(kind.inverse(metre / MIN_DISPARITY)))
+    return kind.forward(values, metre).numpy()
 
 
 def least_squares(values: np.ndarray, target: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
@@ -61,11 +67,10 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
     """Depth in metres of a prediction that is right up to scale and shift in its space.
 
     Args:
-        values: ``(H, W)`` float; affine in depth, inverse depth, log depth, log(depth + 1 m) or the root of
-            inverse depth, as ``space`` says; not finite where a method leaves a hole.
+        values: ``(H, W)`` float, affine in what ``space`` says; not finite where a method leaves a hole.
         truth_m: ``(H, W)`` float, metres.
         valid: ``(H, W)`` bool, where the truth counts.
-        space: ``"depth"``, ``"disparity"``, ``"log"``, ``"log1p"`` or ``"sqrt_disparity"``.
+        space: key of ``SPACES``.
 
     Returns:
         ``(H, W)`` float64, metres, at least ``FLOOR_M``, where Marigold's evaluation clips what least
@@ -77,12 +82,11 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
     Source: Marigold's evaluation: ``least_square`` and ``least_square_disparity``, the latter over positive
         predictions only and clipped at 1e-3; the other spaces are the same idea.
     """
-    if space not in _TO_SPACE:
-        bad_value("space", f"one of {', '.join(_TO_SPACE)}", repr(space))
+    check_choice(space, "space", SPACES)
     known = valid & np.isfinite(values) & (truth_m > 0)
     if space == "disparity":
         known &= np.nan_to_num(values) > 0
     target = np.zeros(np.shape(truth_m))
-    target[known] = _TO_SPACE[space](np.asarray(truth_m, np.float64)[known])
+    target[known] = to_space(np.asarray(truth_m, np.float64)[known], space)
     scale, shift = least_squares(values, target, known)
-    return np.maximum(_FROM_SPACE[space](np.asarray(values, np.float64) * scale + shift), FLOOR_M)
+    return np.maximum(_from_space(np.asarray(values, np.float64) * scale + shift, space), FLOOR_M)

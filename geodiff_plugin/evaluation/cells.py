@@ -1,4 +1,4 @@
-"""Numbers to the cells of tables.
+"""Formatting of numbers as cells of tables.
 
 Hop: records -> values by method and sample -> text.
 Paper: none.

@@ -1,4 +1,4 @@
-"""One thing changed at a time: what each part of a preset is worth, and how flat its numbers lie.
+"""Ablations of a preset, one change at a time, and the flatness of its optimum.
 
 Hop: records -> ``Table``.
 Paper: S5.3, which it extends.
@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from geodiff_plugin.evaluation.baselines.variants import number_of
+from geodiff_plugin.algorithm.rules import RULES
 from geodiff_plugin.evaluation.cells import by_method, cell, count_of_pairs, interval_cell, label_of
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.paper_tables import metric_values
 from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
-from geodiff_plugin.knobs import DEFAULT_WEIGHTS
-from geodiff_plugin.updates import RULES
+from geodiff_plugin.guidance.knobs import value_of
+from geodiff_plugin.guidance.presets import DEFAULT
 
 __all__ = ["CHANGES", "NUMBERS", "changes_table", "flatness_methods", "flatness_table"]
 
@@ -27,7 +27,7 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("no diffusion", "no-diffusion"),
         ("gradient to z_t (full)", "guided:gradient=full"),
         *((f"rule {name}", f"guided:rule={name}") for name in RULES if name != "adam"),
-        *((f"without {name}", f"guided:weights.{name}=0") for name in DEFAULT_WEIGHTS if name != "points"),
+        *((f"without {name}", f"guided:weights.{name}=0") for name in DEFAULT.weights if name != "points"),
     ),
     "paper": (
         ("as it is", "paper"),
@@ -45,10 +45,10 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("matches only", "matches-only"),
         ("no diffusion", "no-diffusion"),
         ("without correction at every step", "guided:correct=false"),
-        ("without gradient updates", "guided:inner_steps=0"),
+        ("with gradient updates", "guided:inner_steps=5"),
         ("with gradient updates at every step", "guided:updates_from=0"),
         ("without refinement of the result", "guided:refine=false"),
-        ("without doubt about reflections", "guided:doubt=false"),
+        ("without rejection of reflections", "guided:reject_reflections=false"),
         ("without a gate on matches", "guided:gate=1000000"),
         ("without exposure", "guided:exposure=false"),
         ("without z-test", "guided:z_test=false"),
@@ -63,14 +63,12 @@ has known points, so their term has none); ``parts`` is what the default has bey
 _NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
 
 NUMBERS = (
-    *("gate", "min_steps", "inner_steps", "step_latents", "step_affine"),
+    *("gate", "min_steps", "outlier_width", "carry_error", "stiffness_power"),
     *("weights.photometric", "weights.matches", "weights.anchor", "loss_resolution"),
-    *("refinement.MATCH_NOISE", "refinement.CAUCHY", "refinement.SMOOTHNESS", "refinement.INERTIA"),
-    *("refinement.IMAGE_EDGE", "refinement.DEPTH_EDGE"),
-    *("contradiction.REGION", "contradiction.SPREADS", "contradiction.FLOOR"),
-    *("point_scale.CAUCHY_UNITS", "point_scale.CAUCHY_PLANES"),
+    *("match_noise", "correction_cauchy", "smoothness", "inertia", "image_edge", "depth_edge"),
+    *("reflection_region", "reflection_spreads", "reflection_floor", "basin_cauchy", "fit_cauchy"),
 )
-"""Every number that decides the default's result: knobs, and constants by ``module.NAME``."""
+"""The numbers that decide the default's result, by leaf."""
 
 
 def changes_table(records: Sequence[dict[str, Any]], name: str) -> Table:
@@ -110,7 +108,7 @@ def changes_table(records: Sequence[dict[str, Any]], name: str) -> Table:
 
 def _at(number: str, factor: float) -> str:
     """The method with a number of the default at a multiple of itself; integers stay integers."""
-    value = number_of(number)
+    value = value_of(number, DEFAULT)
     changed = max(1, round(value * factor)) if isinstance(value, int) else float(f"{value * factor:.6g}")
     return f"guided:{number}={changed:g}"
 
@@ -132,10 +130,10 @@ def flatness_table(records: Sequence[dict[str, Any]]) -> Table:
             cells.append(cell(mean_with_interval([own[x] for x in shared]).value if shared else None, 4))
             most = max([most, *((abs(own[x] - unchanged[x]), x) for x in shared)])
         moved = f"{cell(most[0])} ({most[1]})" if most[0] else cell(0.0)
-        rows.append((f"`{number}`", f"{number_of(number):g}", *cells, moved))
+        rows.append((f"`{number}`", f"{value_of(number, DEFAULT):g}", *cells, moved))
     mean = mean_with_interval(list(unchanged.values())).value
     title = f"Every number of the default at half and at twice its value, {count_of_pairs(len(unchanged))}"
-    note = f"Mean AbsRel; {cell(mean, 4)} as they are. A constant is named by its module."
+    note = f"Mean AbsRel; {cell(mean, 4)} as they are."
     return Table(
         title, ("number", "value", "at half", "at twice", "largest change of a pair"), tuple(rows), note
     )

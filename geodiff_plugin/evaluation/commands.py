@@ -1,107 +1,26 @@
-"""What the ``geodiff eval`` commands do once their options are read.
+"""Measure methods on pairs and put what came out on a page, for ``geodiff eval pairs`` and its like.
 
-Hop: options -> references -> records -> tables.
+Hop: ``PairsOptions`` -> records -> ``Page``.
 Paper: S5 (experiments).
 """
 
 from __future__ import annotations
 
-import random
-import re
-import shlex
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
+from contextlib import nullcontext
 from typing import Any
 
-from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.evaluation.baselines import (
-    FAMILIES,
-    METHODS,
-    Settings,
-    find_method,
-    with_priors,
-    with_seeds,
-)
-from geodiff_plugin.evaluation.crops import CROPS
-from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
+from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_priors, with_seeds
+from geodiff_plugin.evaluation.datasets.perturbed import perturbed_ref
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
-from geodiff_plugin.evaluation.report import run_facts, write_tables, write_text
+from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
 from geodiff_plugin.evaluation.runner import processes, run
 from geodiff_plugin.evaluation.seed_tables import without_copies
 from geodiff_plugin.evaluation.tables import pairs_tables
+from geodiff_plugin.formats.out_folder import OutFolder
 
-__all__ = [
-    "PAIRS_METHODS",
-    "PairsOptions",
-    "all_refs",
-    "command_line",
-    "measure",
-    "remarks_on",
-    "run_list",
-    "run_pairs",
-    "select",
-]
-
-PAIRS_METHODS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
-
-
-@dataclass(frozen=True)
-class PairsOptions:
-    """Options of ``geodiff eval pairs``; names as on the command line.
-
-    Attributes:
-        data: folder that holds data sets in their official layouts.
-        methods: names that ``find_method`` knows.
-        datasets: names in ``DATASETS``, empty for all.
-        scenes: parts of sample names to keep, empty for all.
-        limit: at most so many samples; ``None`` for all.
-        sample: so many samples drawn at random with the settings' seed; ``None`` for all.
-        pairs: which pairs of a group of posed views, ``"default"`` or ``"all"``.
-        pixel_centre: coordinate of the first pixel's centre in posed cameras, 0.5 for COLMAP's; ``None`` for
-            each data set's own.
-        settings: what every method is given.
-        out: folder of the records and tables.
-        results: Markdown page to write beside; ``None`` for none.
-        skip_broken: go on after a broken sample.
-        save_depth: write depth maps.
-        quiet: no bar, no table on the screen.
-        crop: region that is scored, one of ``crops.CROPS``.
-        priors: further priors beside the settings' own: methods that use one are run with each.
-        seeds: how many seeds, from the settings' own on, methods that use a prior are run with.
-    """
-
-    data: Path
-    methods: tuple[str, ...]
-    datasets: tuple[str, ...]
-    scenes: tuple[str, ...]
-    limit: int | None
-    sample: int | None
-    pairs: str
-    pixel_centre: float | None
-    settings: Settings
-    out: Path
-    results: Path | None
-    skip_broken: bool
-    save_depth: bool
-    quiet: bool
-    crop: str = "none"
-    priors: tuple[str, ...] = ()
-    seeds: int = 1
-
-    def __post_init__(self) -> None:
-        check_choice(self.crop, "crop", CROPS)
-
-
-def all_refs(options: PairsOptions, datasets: Sequence[str] | None = None) -> list[SampleRef]:
-    """References to all samples of the data: of the named data sets, else of those that the options name."""
-    return find_pairs(
-        options.data,
-        datasets or options.datasets or None,
-        pairs=options.pairs,
-        pixel_centre=options.pixel_centre,
-    )
+__all__ = ["measure", "remarks_on", "run_pairs"]
 
 
 def measure(
@@ -109,83 +28,30 @@ def measure(
 ) -> list[dict[str, Any]] | None:
     """Run methods, with every further prior and seed of the options.
 
+    Poses given wrongly and the choice of poses apply to all of them and to the method ``guided``.
+
     Returns:
         The records; ``None`` in every process but the main one, which alone writes tables.
 
     Raises:
         ValueError, OSError: as ``runner.run``.
     """
-    records = run(
-        refs,
-        with_seeds(with_priors(methods, options.priors), options.settings.seed, options.seeds),
-        options.settings,
-        options.out,
-        crop=options.crop,
-        skip_broken=options.skip_broken,
-        save_depth=options.save_depth,
-        progress=not options.quiet,
-    )
-    return records if processes(options.settings).is_main_process else None
-
-
-def select(refs: Sequence[SampleRef], options: PairsOptions) -> list[SampleRef]:
-    """Keep the samples whose label contains one of ``scenes``, draw ``sample``, keep the first ``limit``.
-
-    Returns:
-        References in the order of ``refs``.
-
-    Raises:
-        ValueError: nothing is left, more are to be drawn than there are, or a number is below 1.
-    """
-    scenes, data = options.scenes, options.data
-    for name in ("limit", "sample"):
-        count = getattr(options, name)
-        if count is not None and count < 1:
-            bad_value(name, "at least 1", count)
-    kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
-    if not kept:
-        found = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
-        wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
-        bad_value("DIR", f"a folder with a sample{wanted}", f"{data} with {found}", "See: geodiff eval list.")
-    if options.sample is not None:
-        if options.sample > len(kept):
-            bad_value("sample", f"at most {len(kept)}, the number of samples found", options.sample)
-        drawn = random.Random(options.settings.seed).sample(range(len(kept)), options.sample)
-        kept = [kept[i] for i in sorted(drawn)]
-    return kept[: options.limit]
-
-
-def command_line(
-    options: PairsOptions, head: Sequence[str], default_methods: tuple[str, ...] = PAIRS_METHODS
-) -> str:
-    """The command line that gives these options, defaults left out.
-
-    Args:
-        options: what was given.
-        head: subcommand and data, such as ``("eval", "pairs", "DIR")``.
-        default_methods: methods of the subcommand when none are named.
-    """
-    words = ["geodiff", *head]
-    if options.methods != default_methods:
-        words += ["--methods", ",".join(options.methods)]
-    for name in ("datasets", "scenes"):
-        if getattr(options, name):
-            words += [f"--{name}", ",".join(getattr(options, name))]
-    defaults = {"limit": None, "sample": None, "pairs": "default", "pixel_centre": None, "crop": "none"}
-    defaults["seeds"] = 1
-    for name, default in defaults.items():
-        if getattr(options, name) != default:
-            words += [f"--{name.replace('_', '-')}", str(getattr(options, name))]
-    if options.priors:
-        words += ["--prior", options.settings.prior]
-        words += [word for prior in options.priors for word in ("--prior", prior)]
-    for field in fields(Settings):
-        if options.priors and field.name == "prior":
-            continue
-        value: Any = getattr(options.settings, field.name)
-        if value != field.default:
-            words += [f"--{field.name}", str(value)]
-    return shlex.join(words)
+    methods = with_poses(methods, options.pose)
+    if options.perturb is not None:
+        refs = [perturbed_ref(ref, options.perturb) for ref in refs]
+    main = processes(options.settings).is_main_process
+    with OutFolder(options.out, resume=True) if main else nullcontext():  # one run a folder, of any processes
+        records = run(
+            refs,
+            with_seeds(with_priors(methods, options.priors), options.settings.seed, options.seeds),
+            options.settings,
+            options.out,
+            crop=options.crop,
+            skip_broken=options.skip_broken,
+            save_depth=options.save_depth,
+            progress=not options.quiet,
+        )
+    return records if main else None
 
 
 def remarks_on(records: Sequence[dict[str, Any]], options: PairsOptions) -> list[str]:
@@ -211,8 +77,11 @@ def remarks_on(records: Sequence[dict[str, Any]], options: PairsOptions) -> list
     return remarks
 
 
-def run_pairs(options: PairsOptions) -> None:
-    """Measure methods on pairs, write and print the tables.
+def run_pairs(options: PairsOptions) -> Page | None:
+    """Measure methods on pairs and write the tables.
+
+    Returns:
+        The page; ``None`` in every process but the main one.
 
     Raises:
         ValueError: bad options, no samples, or a broken sample without ``skip_broken``.
@@ -221,7 +90,7 @@ def run_pairs(options: PairsOptions) -> None:
     refs = select(all_refs(options), options)
     records = measure(refs, options.methods, options)
     if records is None:
-        return
+        return None
     facts = run_facts(command_line(options, ("eval", "pairs", str(options.data))))
     remarks = remarks_on(records, options)
     if options.sample is not None:
@@ -229,32 +98,8 @@ def run_pairs(options: PairsOptions) -> None:
     count = processes(options.settings).num_processes
     if count > 1:
         remarks.append(f"Run by {count} processes.")
-    page = write_tables(options.out, "Results", facts, pairs_tables(records), remarks)
+    page = Page("Results", facts, tuple(pairs_tables(records)), tuple(remarks))
+    write_page(page, options.out, "table")
     if options.results is not None:
-        write_text(options.results, page)
-    if not options.quiet:
-        sys.stdout.write(page)
-
-
-def run_list(data: Path | None) -> None:
-    """Print for every data set whether ``data`` has it, how many samples, and how to obtain it.
-
-    Raises:
-        ValueError: ``data`` is given and is not a folder.
-    """
-    lines = []
-    for name, dataset in DATASETS.items():
-        count = 0 if data is None else len(find_pairs(data, [name]))
-        found = "not found" if data is not None else "no --data given"
-        if count or not dataset.needs_folder:
-            found = f"{count or 'any number of'} {'sample' if count == 1 else 'samples'}"
-        full = f" of {dataset.full_count}" if count and dataset.full_count else ""
-        lines.append(f"{name:<15} {found}{full}\n{'':<15} {dataset.obtain}")
-    lines.append("")
-    lines += [f"{name:<17} {method.summary}" for name, method in METHODS.items()]
-    for name, family in FAMILIES.items():
-        summary = re.split(r"[.;]", family.__doc__ or " ", maxsplit=1)[0]
-        lines.append(f"{name + ':...':<17} {summary[0].lower()}{summary[1:]}")
-    lines.append(f"{'METHOD@PRIOR':<17} a method that uses a prior, with another one than --prior's first")
-    lines.append(f"{'METHOD#SEED':<17} the same with another seed than --seed; METHOD@PRIOR#SEED for both")
-    sys.stdout.write("\n".join(lines) + "\n")
+        write_text(options.results, page.markdown())
+    return page

@@ -1,4 +1,4 @@
-"""What guidance costs on a data set: seconds and peak memory, plain against guided, as ratios.
+"""Seconds and peak memory of methods on a data set, as ratios to the plain pipeline.
 
 Hop: references + methods -> one process per method -> records -> ``Table``.
 Paper: S9 (inference time, run time comparison), as ratios and not as seconds of another machine.
@@ -7,7 +7,6 @@ Paper: S9 (inference time, run time comparison), as ratios and not as seconds of
 from __future__ import annotations
 
 import statistics
-import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -17,9 +16,10 @@ from typing import Any
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
 from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
-from geodiff_plugin.evaluation.commands import PairsOptions, all_refs, command_line, remarks_on, select
+from geodiff_plugin.evaluation.commands import remarks_on
 from geodiff_plugin.evaluation.layout import Table
-from geodiff_plugin.evaluation.report import run_facts, write_tables
+from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.runner import processes, run
 
 __all__ = ["COST_METHODS", "PLAIN", "cost_table", "run_cost"]
@@ -65,8 +65,8 @@ def cost_table(records: Sequence[dict[str, Any]]) -> Table:
     return Table(f"Cost on {pairs}", header, tuple(rows), note)
 
 
-def run_cost(options: PairsOptions) -> None:
-    """Measure, write and print the table; records go to ``out/cost``, apart from those of other commands.
+def run_cost(options: PairsOptions) -> Page:
+    """Measure and write the table; records go to ``out/cost``, apart from those of other commands.
 
     Args:
         options: as of ``geodiff eval pairs``; ``methods`` are measured beside ``COST_METHODS``.
@@ -96,6 +96,6 @@ def run_cost(options: PairsOptions) -> None:
             records += job.result()
     facts = run_facts(command_line(options, ("eval", "cost", "--data", str(options.data)), ()))
     remarks = [*remarks_on(records, options), f"Denoising steps of each: {settings.steps}."]
-    page = write_tables(options.out, "Cost", facts, [cost_table(records)], remarks, "cost")
-    if not options.quiet:
-        sys.stdout.write(page)
+    page = Page("Cost", facts, (cost_table(records),), tuple(remarks))
+    write_page(page, options.out, "cost")
+    return page

@@ -1,4 +1,4 @@
-"""Where a method errs: by region and material, in disparity, and whether it knows.
+"""Tables of errors by region and material, in disparity, and of the calibration of uncertainty.
 
 Hop: records -> ``Table``.
 Paper: S5.2 (transparent and mirroring surfaces) as a number; in disparity as stereo benchmarks have it.
@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from geodiff_plugin.confidence import RIGHT_WITHIN
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.cells import by_method, cell, count_of_pairs, interval_cell
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.statistics import mean_with_interval
+from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
 __all__ = ["confidence_table", "disparity_table", "regions_table", "uncertainty_table"]
 

@@ -1,4 +1,4 @@
-"""The paper's tables as runs: which samples, which methods, which files.
+"""The paper's tables as runs: samples, methods, files.
 
 Hop: name of a table + options -> references -> records -> tables on disk.
 Paper: Tables 1 to 4, S5.
@@ -6,7 +6,6 @@ Paper: Tables 1 to 4, S5.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,20 +14,14 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import with_priors
 from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
 from geodiff_plugin.evaluation.changes import CHANGES, changes_table, flatness_methods, flatness_table
-from geodiff_plugin.evaluation.commands import (
-    PairsOptions,
-    all_refs,
-    command_line,
-    measure,
-    remarks_on,
-    select,
-)
+from geodiff_plugin.evaluation.commands import measure, remarks_on
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef
 from geodiff_plugin.evaluation.detail_tables import regions_table
 from geodiff_plugin.evaluation.layout import Table
+from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
 from geodiff_plugin.evaluation.paper_tables import FoundColumn, layout_table
 from geodiff_plugin.evaluation.published import LAYOUTS, Column, Layout
-from geodiff_plugin.evaluation.report import run_facts, write_tables
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.tables import summary_table
 
 __all__ = ["how_to_obtain", "methods_of", "run_changes", "run_experiment"]
@@ -95,12 +88,15 @@ def _tables(
     return [table for table in tables if table.rows]
 
 
-def run_changes(name: str, options: PairsOptions) -> None:
+def run_changes(name: str, options: PairsOptions) -> Page | None:
     """Change one thing of the default at a time: its parts, or its numbers.
 
     Args:
         name: ``"parts"`` or ``"flatness"``.
         options: as of ``geodiff eval pairs``; ``methods`` are run beside the table's own.
+
+    Returns:
+        The page; ``None`` in every process but the main one.
 
     Raises:
         ValueError, OSError: as ``run_experiment``.
@@ -109,23 +105,26 @@ def run_changes(name: str, options: PairsOptions) -> None:
     own = flatness_methods() if name == "flatness" else tuple(method for _, method in CHANGES[name])
     records = measure(refs, tuple(dict.fromkeys((*own, *options.methods))), options)
     if records is None:
-        return
+        return None
     facts = run_facts(command_line(options, ("eval", name, "--data", str(options.data)), ()))
     if name == "flatness":
         title, tables = "Flatness", [flatness_table(records)]
     else:
         title, tables = "Parts of the default", [changes_table(records, name), regions_table(records)]
-    page = write_tables(options.out, title, facts, tables, remarks_on(records, options), name)
-    if not options.quiet:
-        sys.stdout.write(page)
+    page = Page(title, facts, tuple(tables), tuple(remarks_on(records, options)))
+    write_page(page, options.out, name)
+    return page
 
 
-def run_experiment(name: str, options: PairsOptions) -> None:
-    """Measure what one table of the paper needs, write and print it.
+def run_experiment(name: str, options: PairsOptions) -> Page | None:
+    """Measure what one table of the paper needs, and write it.
 
     Args:
         name: key of ``LAYOUTS``.
         options: as of ``geodiff eval pairs``; ``methods`` are run beside the table's own.
+
+    Returns:
+        The page; ``None`` in every process but the main one.
 
     Raises:
         ValueError: nothing that the table needs is there (the message says how to obtain it), bad options.
@@ -144,7 +143,7 @@ def run_experiment(name: str, options: PairsOptions) -> None:
     names = methods_of(name, options.methods)
     records = measure(refs, names, options)
     if records is None:
-        return
+        return None
     finished = {label_of(record) for record in records if record["status"] != "broken"}
     found = [
         FoundColumn(column, dataset, frozenset(ref.label for ref in own) & finished)
@@ -155,6 +154,6 @@ def run_experiment(name: str, options: PairsOptions) -> None:
         remarks.append("Pairs: " + ", ".join(ref.label for ref in refs) + ".")
     facts = run_facts(command_line(options, ("eval", name, "--data", str(options.data)), ()))
     tables = _tables(name, layout, found, records, with_priors(names, options.priors))
-    page = write_tables(options.out, layout.title, facts, tables, remarks, name)
-    if not options.quiet:
-        sys.stdout.write(page)
+    page = Page(layout.title, facts, tuple(tables), tuple(remarks))
+    write_page(page, options.out, name)
+    return page

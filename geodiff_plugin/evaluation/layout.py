@@ -1,4 +1,4 @@
-"""A table as it is printed: Markdown, LaTeX, JSON.
+"""A table in Markdown, LaTeX and JSON.
 
 Hop: cells -> ``Table`` -> text.
 Paper: Tables 1 to 4 in layout (grouped columns, rules between groups of rows).
@@ -69,17 +69,20 @@ class Table:
         headings = [heading for heading, count in self.groups for _ in range(count)]
         return headings or [""] * len(self.header)
 
+    def full_header(self) -> tuple[str, ...]:
+        """Column headings in one line each, with the heading of their group before them."""
+        return tuple(
+            f"{group}: {name}" if group else name
+            for group, name in zip(self._group_of_columns(), self.header, strict=True)
+        )
+
     def markdown(self) -> str:
         """A heading, the note and a pipe table; Markdown has one line of headings, so groups go into it."""
         lines = [f"## {self.title}", ""]
         if self.note:
             lines += [self.note, ""]
-        header = [
-            f"{group}: {name}" if group else name
-            for group, name in zip(self._group_of_columns(), self.header, strict=True)
-        ]
-        rows = [[cell.replace("|", r"\|") for cell in row] for row in (header, *self.rows)]
-        lines += ["| " + " | ".join(rows[0]) + " |", "| --- |" + " ---: |" * (len(header) - 1)]
+        rows = [[cell.replace("|", r"\|") for cell in row] for row in (self.full_header(), *self.rows)]
+        lines += ["| " + " | ".join(rows[0]) + " |", "| --- |" + " ---: |" * (len(self.header) - 1)]
         lines += ["| " + " | ".join(row) + " |" for row in rows[1:]]
         return "\n".join(lines) + "\n"
 

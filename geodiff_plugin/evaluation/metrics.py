@@ -1,7 +1,7 @@
-"""What a depth map is worth against the truth: errors in depth, in disparity, and of the uncertainty.
+"""Metrics of a depth map against the truth: errors in depth and disparity, and of the uncertainty.
 
 Hop: predicted depth + truth + mask -> numbers, one image at a time.
-Paper: S5.1 (AbsRel, delta, RMSE; its printed RMSE lacks the root, docs/paper-map.md E5).
+Paper: S5.1 (AbsRel, delta, RMSE; its printed RMSE lacks the root, docs/reference/paper-map.md E5).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Records to the paper's own tables.
+"""Tables in the paper's layout, from records.
 
 Hop: ``Layout`` + records -> ``Table``.
 Paper: Tables 1 to 4.

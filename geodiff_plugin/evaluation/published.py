@@ -1,4 +1,4 @@
-"""The paper's own numbers, as printed, and which rows and columns its tables have.
+"""The paper's published numbers, and the rows and columns of its tables.
 
 Hop: name of a table -> ``Layout`` with published cells.
 Paper: Table 1 (tab:depth_comparison), 2 (tab:stereo_comparison), 3 (tab:two_views), 4 (tab:ablation_study).

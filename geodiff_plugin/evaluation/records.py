@@ -1,4 +1,4 @@
-"""One JSON line per finished sample and method: what makes a run resumable.
+"""Records of a resumable run: one JSON line per sample and method.
 
 Hop: record -> line of ``samples.jsonl`` -> records of a later run.
 Paper: none.

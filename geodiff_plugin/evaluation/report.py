@@ -1,4 +1,4 @@
-"""What a run leaves behind: tables as ``.md``, ``.tex``, ``.json``, and a page for the docs.
+"""The page of a run, written as Markdown, LaTeX and JSON.
 
 Hop: tables + command + versions -> files.
 Paper: none.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,11 +17,11 @@ from typing import Any
 
 import torch
 
-from geodiff_plugin.commands.report import versions
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.formats import atomic_path
+from geodiff_plugin.runtime.machine import versions
 
-__all__ = ["markdown_page", "run_facts", "write_text", "write_tables"]
+__all__ = ["Page", "run_facts", "write_page", "write_text"]
 
 
 def run_facts(command: str) -> dict[str, Any]:
@@ -44,45 +44,39 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def markdown_page(title: str, facts: dict[str, Any], tables: Sequence[Table], remarks: Sequence[str]) -> str:
-    """One page: how it was made, remarks, then the tables.
+@dataclass(frozen=True)
+class Page:
+    """What a command of the evaluation found.
 
-    Args:
+    Attributes:
         title: heading.
         facts: of ``run_facts``.
         tables: in reading order.
         remarks: sentences that belong above the tables, e.g. how many samples were broken.
     """
-    named = ", ".join(f"{name} {value}" for name, value in facts["versions"].items())
-    head = [
-        f"# {title}",
-        "",
-        f"    {facts['command']}",
-        "",
-        f"{facts['date']}; {named}; {facts['machine']}.",
-        "",
-    ]
-    for remark in remarks:
-        head += [remark, ""]
-    return "\n".join(head) + "\n" + "\n".join(table.markdown() for table in tables)
+
+    title: str
+    facts: dict[str, Any]
+    tables: tuple[Table, ...]
+    remarks: tuple[str, ...] = ()
+
+    def origin(self) -> str:
+        """One line: date, versions, machine."""
+        named = ", ".join(f"{name} {value}" for name, value in self.facts["versions"].items())
+        return f"{self.facts['date']}; {named}; {self.facts['machine']}."
+
+    def markdown(self) -> str:
+        """How it was made, the remarks, then the tables."""
+        head = [f"# {self.title}", "", f"    {self.facts['command']}", "", self.origin(), ""]
+        for remark in self.remarks:
+            head += [remark, ""]
+        return "\n".join(head) + "\n" + "\n".join(table.markdown() for table in self.tables)
 
 
-def write_tables(
-    out: Path,
-    title: str,
-    facts: dict[str, Any],
-    tables: Sequence[Table],
-    remarks: Sequence[str],
-    stem: str = "table",
-) -> str:
-    """Write ``table.md``, ``table.tex`` and ``table.json`` (or another ``stem``) into ``out``.
-
-    Returns:
-        The Markdown page.
-    """
-    page = markdown_page(title, facts, tables, remarks)
-    write_text(out / f"{stem}.md", page)
-    write_text(out / f"{stem}.tex", "\n".join(table.latex() for table in tables))
-    plain = facts | {"remarks": list(remarks), "tables": [table.as_json() for table in tables]}
+def write_page(page: Page, out: Path, stem: str) -> None:
+    """Write ``<stem>.md``, ``<stem>.tex`` and ``<stem>.json`` into ``out``."""
+    write_text(out / f"{stem}.md", page.markdown())
+    write_text(out / f"{stem}.tex", "\n".join(table.latex() for table in page.tables))
+    tables = [table.as_json() for table in page.tables]
+    plain = page.facts | {"remarks": list(page.remarks), "tables": tables}
     write_text(out / f"{stem}.json", json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
-    return page

@@ -1,4 +1,4 @@
-"""Every number about one prediction for one sample, as JSON values.
+"""Every metric of one prediction on one sample, as JSON values.
 
 Hop: ``StereoSample`` + ``Prediction`` -> record.
 Paper: S5.1 (metrics, raw and aligned).
@@ -14,8 +14,7 @@ import numpy as np
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.confidence import RIGHT_WITHIN
-from geodiff_plugin.evaluation.alignment import align
+from geodiff_plugin.evaluation.alignment import align, to_space
 from geodiff_plugin.evaluation.baselines._sweep import sweep
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
@@ -27,6 +26,7 @@ from geodiff_plugin.evaluation.metrics import (
     evaluate_disparity,
 )
 from geodiff_plugin.matching import find_matches
+from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
 __all__ = ["SURE_MATCH", "TOM_CLASSES", "matched", "out_of_view", "regions", "score"]
 
@@ -161,9 +161,8 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
         bad_value(f"the truth of {sample.label}", "known for at least one pixel", "none")
     values, depth_m = prediction.relative, prediction.depth_m
     if values is None:
-        values = depth_m
-        if prediction.space == "disparity":
-            values = 1.0 / _positive(depth_m)
+        # Metres are aligned in the prior's own space, as its relative map would be.
+        values = depth_m if prediction.space == "depth" else to_space(_positive(depth_m), prediction.space)
     record: dict[str, Any] = {"all_pixels": _both(sample, depth_m, values, prediction.space, None)}
     capped = record["all_pixels"]
     if cap_m is not None:

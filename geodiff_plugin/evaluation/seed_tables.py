@@ -1,4 +1,4 @@
-"""How much a method's errors depend on the seed of its noise.
+"""Spread of a method's errors over the seeds of its noise.
 
 Hop: records of ``METHOD`` and ``METHOD#SEED`` -> ``Table``.
 Paper: none; it reports one seed.

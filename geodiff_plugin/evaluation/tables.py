@@ -1,4 +1,4 @@
-"""Records to the tables of ``geodiff eval pairs``.
+"""Tables of ``geodiff eval pairs``, from records.
 
 Hop: records -> ``Table``.
 Paper: none; per pair, with intervals and paired differences.
@@ -154,7 +154,7 @@ def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -
             f"AbsRel of {count_of_pairs(count)}",
             headline,
             3,
-            "All pixels with truth, no cap; metres as they come out, not aligned, but for the columns of "
+            "All pixels with truth, no cap; metres as they come out, not aligned, except in the columns of "
             "methods that know relative depth only ('oracle'), which get scale and shift from the truth.",
         ),
         per_pair_table(records, "Seconds", lambda record: record["seconds"], 1, ""),

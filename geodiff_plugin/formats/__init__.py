@@ -1,44 +1,47 @@
-"""Files in, files out: calibrations, images, depth maps, point clouds.
+"""File formats: calibrations, images, depth maps, point clouds.
 
 Hop: what lies on disk -> ``Rig``, arrays; arrays -> what lies on disk, whole or not at all.
 Paper: S5.1 (the layouts of the data sets).
 """
 
-from geodiff_plugin.formats.atomic import atomic_path
-from geodiff_plugin.formats.depth import (
-    read_depth_mm_png,
-    read_disparity_kitti_png,
-    read_pfm,
-    write_depth_mm_png,
-    write_depth_npy,
-    write_pfm,
-)
-from geodiff_plugin.formats.files import check_file, read_text
-from geodiff_plugin.formats.images import MIN_SIDE, as_image_01, read_image
-from geodiff_plugin.formats.matrices import read_matrix
-from geodiff_plugin.formats.pointcloud import flying_points, write_ply
-from geodiff_plugin.formats.points import read_points
-from geodiff_plugin.formats.reading import CALIBRATION_FORMATS, read_calibration
-from geodiff_plugin.formats.rigs import rig_from_parameters
+from __future__ import annotations
 
-__all__ = [
-    "CALIBRATION_FORMATS",
-    "MIN_SIDE",
-    "as_image_01",
-    "atomic_path",
-    "check_file",
-    "flying_points",
-    "read_calibration",
-    "read_depth_mm_png",
-    "read_disparity_kitti_png",
-    "read_image",
-    "read_matrix",
-    "read_pfm",
-    "read_points",
-    "read_text",
-    "rig_from_parameters",
-    "write_depth_mm_png",
-    "write_depth_npy",
-    "write_pfm",
-    "write_ply",
-]
+import importlib
+from typing import Any
+
+#: Name -> module, imported on first use: some of them need torch, and a file can be looked at without.
+_MODULE_OF = {
+    "CALIBRATION_FORMATS": "reading",
+    "Cloud": "pointcloud",
+    "MIN_SIDE": "images",
+    "as_image_01": "images",
+    "atomic_path": "atomic",
+    "check_file": "files",
+    "flying_points": "pointcloud",
+    "make_cloud": "pointcloud",
+    "read_calibration": "reading",
+    "read_depth_mm_png": "depth",
+    "read_disparity_kitti_png": "depth",
+    "read_image": "images",
+    "read_matrix": "matrices",
+    "read_pfm": "depth",
+    "read_points": "points",
+    "read_text": "files",
+    "rig_from_parameters": "rigs",
+    "write_colmap": "colmap_export",
+    "write_depth_mm_png": "depth",
+    "write_depth_npy": "depth",
+    "write_glb": "glb",
+    "write_pfm": "depth",
+    "write_ply": "pointcloud",
+}
+
+__all__ = sorted(_MODULE_OF)  # noqa: PLE0605
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all.
+"""Atomic writing: a file appears whole or not at all.
 
 Hop: a path -> a temporary one beside it -> the path, by one rename.
 Paper: none.
@@ -11,6 +11,8 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from geodiff_plugin._checks import FolderError, MissingFileError
 
 __all__ = ["atomic_path"]
 
@@ -35,11 +37,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     if target.is_dir():
-        raise IsADirectoryError(
-            f"The output must be a file; got the folder {target}. Name a file inside of it."
-        )
+        raise FolderError(f"The output must be a file; got the folder {target}. Name a file inside of it.")
     if not target.parent.is_dir():
-        raise FileNotFoundError(
+        raise MissingFileError(
             f"The output must be in an existing folder; got {target}. Make the folder {target.parent} first."
         )
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")

@@ -1,4 +1,4 @@
-"""The calibration xml of Booster.
+"""Calibration files of the Booster data set (XML).
 
 Hop: ``proj_matL``, ``proj_matR``, ``baselineLR`` (mm) -> ``Rig``.
 Paper: S5.1 (Booster).

@@ -1,4 +1,4 @@
-"""What a calibration format is: how its text is recognised, and how it becomes a rig.
+"""Interface of a calibration format: how its text is recognised, and how it becomes a rig.
 
 Hop: the text of one or two files -> ``Rig``.
 Paper: S3.3 (known cameras).
@@ -30,15 +30,19 @@ class CalibrationFile:
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """Which two cameras of a file with more than two.
+    """Which two cameras of a file with more than two, and at which resolution.
 
     Attributes:
         cameras: numbers of the left and the right camera, or ``None`` to choose by the folder or the file.
         image_folder_hint: name or path of the left image's folder (or of the image), or ``None``.
+        image_names: names or paths of the left and the right image, or ``None``.
+        image_size: ``(width, height)`` of the left image, or ``None``; chooses among a file's resolutions.
     """
 
     cameras: tuple[int, int] | None = None
     image_folder_hint: str | None = None
+    image_names: tuple[str, str] | None = None
+    image_size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,7 @@ class CalibrationFormat:
         read: ``(files, choice) -> Rig``.
         file_counts: how many files may describe one pair.
         uses_cameras: whether a file may hold more than two cameras, so that ``cameras`` has a meaning.
+        has_unit: whether its lengths have a known unit (or are taken as metres); a warning says where not.
     """
 
     summary: str
@@ -58,3 +63,4 @@ class CalibrationFormat:
     read: Callable[[tuple[CalibrationFile, ...], CameraChoice], Rig]
     file_counts: tuple[int, ...] = (1,)
     uses_cameras: bool = False
+    has_unit: bool = True

@@ -1,4 +1,4 @@
-"""Depth and disparity maps in files: PFM, npy, 16-bit PNG in millimetres or KITTI's 1/256.
+"""Depth and disparity maps: PFM, npy, 16-bit PNG in millimetres or KITTI's 1/256.
 
 Hop: file <-> float32 map and boolean mask.
 Paper: S5.1 (ground truth of the data sets).
@@ -7,6 +7,7 @@ Paper: S5.1 (ground truth of the data sets).
 from __future__ import annotations
 
 import os
+import zlib
 
 import numpy as np
 from PIL import Image
@@ -17,6 +18,7 @@ from geodiff_plugin.formats.files import check_file
 
 __all__ = [
     "read_depth_mm_png",
+    "read_depth_png",
     "read_disparity_kitti_png",
     "read_pfm",
     "write_depth_mm_png",
@@ -139,7 +141,7 @@ def _read_png16(path: PathLike, name: str) -> np.ndarray:
         with Image.open(found) as image:
             image.load()
             mode, values = image.mode, np.asarray(image)
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError) as error:
         bad_value(
             name, "a whole 16-bit PNG file", f"{found}, which does not decode ({error})", "Is it cut off?"
         )
@@ -164,6 +166,25 @@ def read_disparity_kitti_png(path: PathLike, name: str = "disparity") -> tuple[n
     return values / KITTI_STEP, values > 0
 
 
+def read_depth_png(path: PathLike, units_per_m: float, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
+    """Read a 16-bit PNG of depth in any unit.
+
+    Args:
+        path: the file.
+        units_per_m: 1000 for millimetres, 256 for KITTI's.
+        name: the argument that it came in, for messages.
+
+    Returns:
+        ``(H, W)`` float32 metres, and the ``(H, W)`` boolean mask of where it is known (not 0).
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
+        ValueError: not a 16-bit PNG, or cut off.
+    """
+    values = _read_png16(path, name)
+    return values / np.float32(units_per_m), values > 0
+
+
 def read_depth_mm_png(path: PathLike, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
     """Read a 16-bit PNG of millimetres.
 
@@ -174,5 +195,4 @@ def read_depth_mm_png(path: PathLike, name: str = "depth") -> tuple[np.ndarray, 
         FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
         ValueError: not a 16-bit PNG, or cut off.
     """
-    values = _read_png16(path, name)
-    return values / 1000.0, values > 0
+    return read_depth_png(path, 1000.0, name)

@@ -1,4 +1,4 @@
-"""Opens what the user named, or says in one sentence why not.
+"""Opening of files that the user named, with an error in one sentence.
 
 Hop: a path as given -> an existing file, or its text.
 Paper: none.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin._checks import FolderError, ForbiddenFileError, MissingFileError, bad_type, bad_value
 
 __all__ = ["check_file", "read_text"]
 
@@ -39,13 +39,15 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
         bad_type(name, f"the path of {what}", path)
     found = Path(path)
     if found.is_dir():
-        raise IsADirectoryError(f"{name} must be {what}; got the folder {found}. Name the file inside of it.")
+        raise FolderError(f"{name} must be {what}; got the folder {found}. Name the file inside of it.")
     if not found.exists():
-        raise FileNotFoundError(
+        raise MissingFileError(
             f"{name} must be {what}; got {found}, which does not exist. Check the spelling."
         )
     if not os.access(found, os.R_OK):
-        raise PermissionError(f"{name} must be {what} that you may read; got {found}. Check its permissions.")
+        raise ForbiddenFileError(
+            f"{name} must be {what} that you may read; got {found}. Check its permissions."
+        )
     if found.stat().st_size == 0:
         bad_value(name, what, f"{found}, which is empty", "Was its download or copy cut off? Fetch it again.")
     return found

@@ -1,4 +1,4 @@
-"""``K.txt`` as FoundationStereo writes it: the flat K, then the baseline in metres.
+"""``K.txt`` of FoundationStereo: the flat K, then the baseline in metres.
 
 Hop: 9 numbers and 1 -> ``Rig`` with equal K on both sides.
 Paper: none.
@@ -38,11 +38,11 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     """
     path = files[0].path
     values = _numbers(files[0].text)
-    if values.size != 10:
+    if values is None or values.size != 10:
         bad_value(
             f"{path}",
             "a K.txt of 9 numbers of K and the baseline in metres",
-            f"{values.size} numbers",
+            f"{0 if values is None else values.size} numbers",
             "Add the baseline as a second line; a file that holds only K or E goes to K and E (--K, --E).",
         )
     K = values[:9].reshape(3, 3)

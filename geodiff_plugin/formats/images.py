@@ -1,4 +1,4 @@
-"""Images from files and from memory.
+"""Images from files and from memory, as float tensors in [0, 1].
 
 Hop: a file, PIL image, numpy or torch array -> floats in [0, 1].
 Paper: S3.3 (the two views).
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.formats.files import check_file
@@ -25,6 +25,7 @@ MIN_SIDE = 32
 #: Resampling may overshoot [0, 1] by a little; more than this is another range.
 OVERSHOOT = 1e-3
 EXIF_ORIENTATION = 0x0112
+UPRIGHT = 1
 TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",
@@ -98,12 +99,15 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
     try:
         with Image.open(found) as image:
             image.load()
-            turn = TURNS.get(image.getexif().get(EXIF_ORIENTATION))
+            turn = TURNS.get(image.getexif().get(EXIF_ORIENTATION, UPRIGHT))
             upright = ImageOps.exif_transpose(image)
             alpha = _has_alpha(image)
-    except Image.UnidentifiedImageError:
+    except UnidentifiedImageError:
         bad_value(
-            name, "an image file", f"{found}, which is none that Pillow knows", "Convert it to PNG or JPEG."
+            name,
+            "an image file",
+            f"{found}, a format that Pillow does not read",
+            "Convert it to PNG or JPEG.",
         )
     except DECODE_ERRORS as error:
         bad_value(
@@ -197,13 +201,13 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         hwc = _pil_to_array(value, name)
     elif isinstance(value, (np.ndarray, torch.Tensor)):
         raw = _array_to_hwc(value, name) if isinstance(value, np.ndarray) else _tensor_to_hwc(value, name)
-        _check_sides(*raw.shape[:2], name)
+        _check_sides(raw.shape[0], raw.shape[1], name)
         if raw.shape[-1] == 4:
             warnings.warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
             raw = raw[..., :3]
         hwc = _scaled(raw, name)
     else:
         bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
-    _check_sides(*hwc.shape[:2], name)
+    _check_sides(hwc.shape[0], hwc.shape[1], name)
     hwc = np.repeat(hwc, 3, axis=-1) if hwc.shape[-1] == 1 else hwc
     return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))

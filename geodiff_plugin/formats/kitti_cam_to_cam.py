@@ -60,12 +60,16 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     width = len(ROW.findall(text)[0][0])
     names = [f"{camera:0{width}d}" for camera in cameras]
     P_left, P_right = (kitti_row(text, f"P_rect_{n}", 12, path).reshape(3, 4) for n in names)
-    sizes = [
-        tuple(int(v) for v in kitti_row(text, f"S_rect_{n}", 2, path)) if f"S_rect_{n}" in text else None
-        for n in names
-    ]
+    sizes = [_size(text, f"S_rect_{n}", path) for n in names]
     E = pose_from_projections(P_left, P_right, path)
     return make_rig(P_left[:, :3], P_right[:, :3], E, path, size=sizes[0], size_right=sizes[1])
+
+
+def _size(text: str, key: str, path: Path) -> tuple[int, int] | None:
+    if key not in text:
+        return None
+    width, height = (int(value) for value in kitti_row(text, key, 2, path))
+    return width, height
 
 
 KITTI_CAM_TO_CAM = CalibrationFormat(

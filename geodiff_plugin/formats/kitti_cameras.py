@@ -1,4 +1,4 @@
-"""Which two of KITTI's four cameras: 0, 1 are the grey pair, 2, 3 the colour pair.
+"""Choice of two of KITTI's four cameras: 0, 1 are the grey pair, 2, 3 the colour pair.
 
 Hop: ``cameras``, the image folder's name, the file's own cameras -> (left, right).
 Paper: S5.1 (KITTI stereo).

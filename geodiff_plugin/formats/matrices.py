@@ -1,4 +1,4 @@
-"""K and E from files of numbers.
+"""K and E from text and ``.npy`` files.
 
 Hop: whitespace text or ``.npy`` -> float64 matrix, unchecked for meaning.
 Paper: none.
@@ -13,24 +13,13 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import check_file, read_text
+from geodiff_plugin.formats.npy import read_npy
 
 __all__ = ["read_matrix"]
 
 SHAPES = ((3, 3), (4, 4))
 FLAT = {9: (3, 3), 16: (4, 4)}
 EXPECTED = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
-
-
-def _from_npy(path: Path, name: str) -> np.ndarray:
-    try:
-        value = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        bad_value(name, EXPECTED, f"{path}, which numpy cannot load ({error})", "Save it with numpy.save.")
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-        bad_value(
-            name, EXPECTED, f"{path} without an array of real numbers", "Save one matrix with numpy.save."
-        )
-    return value.astype(np.float64)
 
 
 def _from_text(path: Path, name: str) -> np.ndarray:
@@ -67,7 +56,11 @@ def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarra
         ValueError: no matrix of such a shape, or not finite.
     """
     found = check_file(path, name, EXPECTED)
-    matrix = _from_npy(found, name) if found.suffix.lower() == ".npy" else _from_text(found, name)
+    matrix = (
+        read_npy(found, name, EXPECTED).astype(np.float64)
+        if found.suffix.lower() == ".npy"
+        else _from_text(found, name)
+    )
     matrix = np.squeeze(matrix)
     if matrix.ndim == 1 and matrix.size in FLAT:
         matrix = matrix.reshape(FLAT[matrix.size])

@@ -93,7 +93,8 @@ def _number(value: str, name: str) -> float:
 def _size(entries: dict[str, str], path: Path) -> tuple[int, int] | None:
     if "width" not in entries or "height" not in entries:
         return None
-    return tuple(int(positive(entries[key], f"{key} in {path}")) for key in ("width", "height"))
+    width, height = (int(positive(entries[key], f"{key} in {path}")) for key in ("width", "height"))
+    return width, height
 
 
 MIDDLEBURY = CalibrationFormat("Middlebury, MiddEval3 or ETH3D calib.txt (cam0=[...])", matches, read)

@@ -1,4 +1,4 @@
-"""OpenCV's stereo calibration as its samples write it, YAML or XML, in one file or two.
+"""OpenCV's stereo calibration as its samples write it, YAML, XML or JSON, in one file or two.
 
 Hop: ``P1 P2`` (rectified), else ``M1 D1 M2 D2 R T`` -> ``Rig``.
 Paper: none; R, T of ``stereoCalibrate`` map left points to right ones.
@@ -6,6 +6,7 @@ Paper: none; R, T of ``stereoCalibrate`` map left points to right ones.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,8 @@ import numpy as np
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
 from geodiff_plugin.formats.opencv_storage import is_storage, parse_storage
-from geodiff_plugin.formats.rigs import check_no_distortion, check_rigid, make_rig, pose_from_projections
-from geodiff_plugin.types import Rig
+from geodiff_plugin.formats.rigs import check_rigid, make_rig, pose_from_projections
+from geodiff_plugin.types import Distortion, Rig
 
 __all__ = ["OPENCV", "matches", "read"]
 
@@ -76,15 +77,13 @@ def _as_taken(entries: dict[str, np.ndarray], source: str) -> tuple[np.ndarray, 
     K_left, K_right = _first(entries, LEFT_K), _first(entries, RIGHT_K)
     needed = {"M1": K_left, "M2": K_right, "R": entries.get("r"), "T": entries.get("t")}
     missing = [name for name, matrix in needed.items() if matrix is None]
-    if missing:
+    if K_left is None or K_right is None or missing:
         bad_value(
             source,
             "an OpenCV calibration with P1, P2, or with M1, M2, R, T",
             f"no {', '.join(missing)}",
             "Where intrinsics and extrinsics are two files, give both.",
         )
-    for names in (LEFT_D, RIGHT_D):
-        check_no_distortion(_first(entries, names), f"Lens distortion {names[0].upper()} in {source}")
     for matrix, name in ((K_left, "M1"), (K_right, "M2"), (entries["r"], "R")):
         _check_shape(matrix, (3, 3), f"{name} in {source}")
     T_right_from_left = np.eye(4)
@@ -97,17 +96,22 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     """The rig of one file, or of ``intrinsics`` and ``extrinsics`` in any order.
 
     ``P1, P2`` stand for the rectified images and come first, whatever the lens distortion before them was.
-    Without them ``M1, M2, R, T`` are taken, for images without distortion. Lengths are taken as metres:
-    OpenCV keeps the unit of the chessboard's squares, and the file does not say it.
+    Without them ``M1, M2, R, T`` are taken, with the distortion ``D1, D2`` of OpenCV's model. Lengths are
+    taken as metres: OpenCV keeps the unit of the chessboard's squares, and the file does not say it.
 
     Raises:
-        ValueError: neither set is there, distortion is not zero, or a matrix is malformed.
+        ValueError: neither set is there, or a matrix is malformed.
     """
     entries, source = _merged(files), " and ".join(str(file.path) for file in files)
-    cameras = _rectified if {"p1", "p2"} <= entries.keys() else _as_taken
-    return make_rig(*cameras(entries, source), source, size=_size(entries))
+    if {"p1", "p2"} <= entries.keys():
+        return make_rig(*_rectified(entries, source), source, size=_size(entries))
+    rig = make_rig(*_as_taken(entries, source), source, size=_size(entries))
+    lenses = [_first(entries, names) for names in (LEFT_D, RIGHT_D)]
+    return replace(
+        rig, distortion=tuple(None if d is None else Distortion("opencv", d.ravel()) for d in lenses)
+    )
 
 
 OPENCV = CalibrationFormat(
-    "OpenCV stereoRectify YAML or XML (P1, P2, or M1, M2, R, T)", matches, read, file_counts=(1, 2)
+    "OpenCV stereoRectify YAML, XML or JSON (P1, P2, or M1, M2, R, T)", matches, read, file_counts=(1, 2)
 )

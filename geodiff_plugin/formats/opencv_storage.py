@@ -1,4 +1,4 @@
-"""OpenCV's FileStorage, the part that calibrations use: matrices, numbers, short sequences; YAML and XML.
+"""OpenCV's FileStorage, what calibrations use of it: matrices, numbers, short sequences; YAML, XML, JSON.
 
 Hop: text -> {key in small letters: float64 array}.
 Paper: none.
@@ -6,6 +6,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -21,13 +22,17 @@ MATRIX = re.compile(
     r"rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\S+\s+data:\s*\[([^\]]*)\]",
     re.MULTILINE,
 )
+JSON_MARK = '"opencv-matrix"'
+#: Older versions write 1. and .Nan into JSON, which has no such numbers.
+BARE_POINT = re.compile(r"(?<=\d)\.(?=[\s,\]}eE])")
+NOT_FINITE = re.compile(r"(-?)\.(Nan|Inf)")
 SEQUENCE = re.compile(r"^(\w+)[ \t]*:[ \t]*\[([^\]]*)\]", re.MULTILINE)
 SCALAR = re.compile(r"^(\w+)[ \t]*:[ \t]*([-+.\d]\S*)[ \t]*$", re.MULTILINE)
 
 
 def is_storage(text: str) -> bool:
-    """Whether the text is written by OpenCV's FileStorage, as YAML or XML."""
-    return "!!opencv-matrix" in text or "<opencv_storage" in text
+    """Whether the text is written by OpenCV's FileStorage, as YAML, XML or JSON."""
+    return any(mark in text for mark in ("!!opencv-matrix", "<opencv_storage", JSON_MARK))
 
 
 def _numbers(text: str) -> np.ndarray | None:
@@ -93,6 +98,30 @@ def _parse_xml(text: str, path: Path) -> dict[str, np.ndarray]:
     return entries
 
 
+def _parse_json(text: str, path: Path) -> dict[str, np.ndarray]:
+    names = {"Nan": "NaN", "Inf": "Infinity"}
+    text = NOT_FINITE.sub(lambda found: found[1] + names[found[2]], BARE_POINT.sub(".0", text))
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        bad_value(f"{path}", "JSON", f"{error.msg} in line {error.lineno}", "Is the file cut off?")
+    except RecursionError:
+        bad_value(f"{path}", "OpenCV's JSON", "lists within lists without end")
+    entries = {}
+    for key, value in content.items() if isinstance(content, dict) else ():
+        if isinstance(value, dict) and value.get("type_id") == "opencv-matrix":
+            shape = [str(value.get(side, "")) for side in ("rows", "cols")]
+            data = value.get("data")
+            if not all(map(str.isdecimal, shape)) or not isinstance(data, list):
+                bad_value(f"{key} in {path}", "a matrix with rows, cols and data", "none")
+            entries[key.lower()] = _matrix(key, *shape, " ".join(map(str, data)), path)
+        elif isinstance(value, (int, float, list)) and not isinstance(value, bool):
+            numbers = _numbers(str(value).strip("[]"))
+            if numbers is not None:
+                entries[key.lower()] = numbers
+    return entries
+
+
 def parse_storage(text: str, path: Path) -> dict[str, np.ndarray]:
     """Every matrix, sequence and number at the top level.
 
@@ -106,4 +135,6 @@ def parse_storage(text: str, path: Path) -> dict[str, np.ndarray]:
     Raises:
         ValueError: cut off or malformed.
     """
-    return _parse_xml(text, path) if "<opencv_storage" in text else _parse_yaml(text, path)
+    if "<opencv_storage" in text:
+        return _parse_xml(text, path)
+    return _parse_json(text, path) if JSON_MARK in text else _parse_yaml(text, path)

@@ -1,4 +1,4 @@
-"""Depth to a coloured point cloud, without the points that hang between two surfaces.
+"""Coloured point clouds from depth, without flying points between two surfaces.
 
 Hop: depth in metres, image, K -> binary PLY in the left camera's frame.
 Paper: Eq. 9 (unprojection).
@@ -7,13 +7,14 @@ Paper: Eq. 9 (unprojection).
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 
 import numpy as np
 
 from geodiff_plugin._checks import bad_value, check_intrinsics
 from geodiff_plugin.formats.atomic import atomic_path
 
-__all__ = ["flying_points", "write_ply"]
+__all__ = ["Cloud", "flying_points", "make_cloud", "write_ply"]
 
 #: Depth change from one pixel to the next, as a share of the nearer depth. At a focal length of 500 px it is
 #: a surface seen at 87 degrees from its normal: hardly a surface that one camera can see.
@@ -61,31 +62,45 @@ def flying_points(
     return use & (support < FEWEST_NEIGHBOURS)
 
 
-def write_ply(
-    path: str | os.PathLike[str],
-    depth_m: np.ndarray,
-    image_01: np.ndarray,
-    K: np.ndarray,
-    valid: np.ndarray | None = None,
-) -> int:
-    """Write a coloured point cloud as binary little-endian PLY, whole or not at all.
+@dataclass(frozen=True)
+class Cloud:
+    """Coloured points in the left camera's frame.
+
+    Attributes:
+        points_m: ``(N, 3)`` float64 metres; x right, y down, z forward.
+        colours: ``(N, 3)`` uint8 RGB.
+    """
+
+    points_m: np.ndarray
+    colours: np.ndarray
+
+    def thinned(self, most: int) -> Cloud:
+        """At most ``most`` of the points, evenly over their order, which is that of the pixels."""
+        if len(self.points_m) <= most:
+            return self
+        kept = np.linspace(0, len(self.points_m) - 1, most).astype(int)
+        return Cloud(self.points_m[kept], self.colours[kept])
+
+
+def make_cloud(
+    depth_m: np.ndarray, image_01: np.ndarray, K: np.ndarray, valid: np.ndarray | None = None
+) -> Cloud:
+    """The points of a depth map.
 
     Args:
-        path: the file.
         depth_m: ``(H, W)`` metres, z of the left camera.
         image_01: ``(H, W, 3)`` in [0, 1], the colours.
         K: ``(3, 3)`` pixels of this grid.
         valid: ``(H, W)`` boolean; only these become points (``valid & ~flying_points(depth_m)``).
 
     Returns:
-        How many points were written; pixels that are not finite or not above 0 never are.
+        One point a pixel, row by row; pixels that are not finite or not above 0 never are.
 
     Raises:
         ValueError: shapes that do not fit, or a K that is none.
-        OSError: the folder does not exist or is not writable.
 
     Convention:
-        x right, y down, z forward, metres: a pixel on the principal point at 2 m is (0, 0, 2).
+        A pixel on the principal point at 2 m is (0, 0, 2).
     """
     depth_m = np.asarray(depth_m, dtype=np.float64)
     image_01 = np.asarray(image_01)
@@ -96,22 +111,57 @@ def write_ply(
     use = use if valid is None else use & np.asarray(valid, dtype=bool)
     v, u = np.nonzero(use)
     points = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T * depth_m[use][:, None]
-    colours = np.rint(np.clip(image_01[use], 0.0, 1.0) * 255.0).astype(np.uint8)
-    vertices = np.empty(len(points), dtype=VERTEX)
+    return Cloud(points, np.rint(np.clip(image_01[use], 0.0, 1.0) * 255.0).astype(np.uint8))
+
+
+def write_ply(
+    path: str | os.PathLike[str],
+    depth_m: np.ndarray,
+    image_01: np.ndarray,
+    K: np.ndarray,
+    valid: np.ndarray | None = None,
+    unit: str | None = "m",
+) -> int:
+    """Write a coloured point cloud as binary little-endian PLY, whole or not at all.
+
+    Args:
+        path: the file.
+        depth_m: as in ``make_cloud``.
+        image_01: as in ``make_cloud``.
+        K: as in ``make_cloud``.
+        valid: as in ``make_cloud``.
+        depth_m: ``(H, W)`` metres, z of the left camera.
+        image_01: ``(H, W, 3)`` in [0, 1], the colours.
+        K: ``(3, 3)`` pixels of this grid.
+        valid: ``(H, W)`` boolean; only these become points (``valid & ~flying_points(depth_m)``).
+        unit: ``"m"``, or ``None`` for a depth without one; a comment of the file says which.
+
+    Returns:
+        How many points were written.
+
+    Raises:
+        ValueError: as in ``make_cloud``.
+        OSError: the folder does not exist or is not writable.
+
+    Convention:
+        x right, y down, z forward, metres: a pixel on the principal point at 2 m is (0, 0, 2).
+    """
+    cloud = make_cloud(depth_m, image_01, K, valid)
+    vertices = np.empty(len(cloud.points_m), dtype=VERTEX)
     for column, name in enumerate(("x", "y", "z")):
-        vertices[name] = points[:, column]
+        vertices[name] = cloud.points_m[:, column]
     for column, name in enumerate(("red", "green", "blue")):
-        vertices[name] = colours[:, column]
+        vertices[name] = cloud.colours[:, column]
     with atomic_path(path) as temporary:
-        temporary.write_bytes(_ply_head(len(vertices)) + vertices.tobytes())
+        temporary.write_bytes(_ply_head(len(vertices), unit) + vertices.tobytes())
     return len(vertices)
 
 
-def _ply_head(count: int) -> bytes:
+def _ply_head(count: int, unit: str | None) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        "comment camera frame: x right, y down, z forward, metres",
+        f"comment camera frame: x right, y down, z forward, {'metres' if unit else 'no unit'}",
         f"element vertex {count}",
         *(f"property float {name}" for name in ("x", "y", "z")),
         *(f"property uchar {name}" for name in ("red", "green", "blue")),

@@ -1,28 +1,39 @@
-"""The one door to calibration files: the format is recognised from the content.
+"""Reading of calibration files whose format is recognised from their content.
 
 Hop: a path or a pair of paths -> ``CALIBRATION_FORMATS`` -> ``Rig``.
 Paper: S3.3 (known cameras).
 
-A new format is a new file and one line in the table (docs/calibration.md).
+A new format is a new file and one line in the table (docs/reference/calibration.md).
 """
 
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from geodiff_plugin._checks import bad_type, bad_value
+import numpy as np
+
+from geodiff_plugin._checks import FolderError, bad_type, bad_value, check_number
 from geodiff_plugin.formats.booster import BOOSTER
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
+from geodiff_plugin.formats.colmap import COLMAP
 from geodiff_plugin.formats.files import read_text
 from geodiff_plugin.formats.foundation_stereo import FOUNDATION_STEREO
+from geodiff_plugin.formats.kalibr import KALIBR
 from geodiff_plugin.formats.kitti_cam_to_cam import KITTI_CAM_TO_CAM
 from geodiff_plugin.formats.kitti_projections import KITTI_PROJECTIONS
 from geodiff_plugin.formats.middlebury import MIDDLEBURY
 from geodiff_plugin.formats.mvsnet import MVSNET
+from geodiff_plugin.formats.oak import OAK
 from geodiff_plugin.formats.opencv import OPENCV
+from geodiff_plugin.formats.realsense import REALSENSE
+from geodiff_plugin.formats.rigs import check_no_distortion
+from geodiff_plugin.formats.ros import ROS
 from geodiff_plugin.formats.stereodemo import STEREODEMO
+from geodiff_plugin.formats.zed import ZED
 from geodiff_plugin.types import Rig
 
 __all__ = ["CALIBRATION_FORMATS", "read_calibration"]
@@ -37,6 +48,12 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "opencv": OPENCV,
     "booster": BOOSTER,
     "mvsnet": MVSNET,
+    "zed": ZED,
+    "realsense": REALSENSE,
+    "oak": OAK,
+    "ros": ROS,
+    "kalibr": KALIBR,
+    "colmap": COLMAP,
 }
 
 PathLike = str | os.PathLike[str]
@@ -48,7 +65,23 @@ def _paths(path: PathLike | Sequence[PathLike]) -> tuple[Path, ...]:
         bad_type("calibration", "a path, or a pair of paths (left, right)", path)
     if len(paths) not in (1, 2):
         bad_value("calibration", "one file, or a pair (left, right)", f"{len(paths)} files")
+    if len(paths) == 1 and Path(paths[0]).is_dir():
+        return _model_files(Path(paths[0]))
     return tuple(Path(p) for p in paths)
+
+
+def _model_files(folder: Path) -> tuple[Path, ...]:
+    """The two text files of a COLMAP model, the one kind of calibration that is a folder."""
+    files = (folder / "cameras.txt", folder / "images.txt")
+    if not all(file.exists() for file in files):
+        cure = "Name the file inside of it."
+        if (folder / "images.bin").exists():
+            cure = "Write it as text first: colmap model_converter --output_type TXT."
+        raise FolderError(
+            "calibration must be a calibration file, or the folder of a COLMAP model with cameras.txt and "
+            f"images.txt; got the folder {folder}. {cure}"
+        )
+    return files
 
 
 def _recognise(file: CalibrationFile) -> str:
@@ -68,7 +101,9 @@ def _check_cameras(cameras: tuple[int, int] | None, name: str) -> None:
     if cameras is None:
         return
     if not CALIBRATION_FORMATS[name].uses_cameras:
-        bad_value("cameras", "left out for a file of two cameras", cameras, "It chooses among KITTI's four.")
+        bad_value(
+            "cameras", "left out for a file of two cameras", cameras, "It chooses where there are more."
+        )
     if (
         not isinstance(cameras, (tuple, list))
         or len(cameras) != 2
@@ -77,17 +112,49 @@ def _check_cameras(cameras: tuple[int, int] | None, name: str) -> None:
         bad_value("cameras", "a pair of camera numbers, as (2, 3)", repr(cameras))
 
 
+def _in_metres(rig: Rig, baseline_m: float | None, name: str) -> Rig:
+    """The rig with its cameras ``baseline_m`` apart; a warning where nothing says what its unit is."""
+    if baseline_m is None:
+        if not CALIBRATION_FORMATS[name].has_unit:
+            warnings.warn(
+                f"{rig.source} has no unit: depth comes out in the model's own. Give the measured "
+                "distance of the two cameras as baseline_m (--baseline) to get metres.",
+                stacklevel=3,
+            )
+        return rig
+    check_number(baseline_m, "baseline_m", float(np.finfo(np.float64).tiny), 1e9)
+    length = float(np.linalg.norm(rig.E[:3, 3]))
+    if length == 0:
+        bad_value(
+            "baseline_m", f"left out for {rig.source}", baseline_m, "Both its cameras are at one place."
+        )
+    E = rig.E.copy()
+    E[:3, 3] *= baseline_m / length
+    return replace(rig, E=E)
+
+
 def read_calibration(
     path: PathLike | Sequence[PathLike],
     cameras: tuple[int, int] | None = None,
     image_folder_hint: str | None = None,
+    *,
+    image_names: tuple[str, str] | None = None,
+    image_size: tuple[int, int] | None = None,
+    baseline_m: float | None = None,
+    distorted: bool = False,
 ) -> Rig:
     """Read a calibration file, whatever its format.
 
     Args:
-        path: one file, or a pair (left, right) for formats with one file a view.
-        cameras: left and right camera of a KITTI file; ``None`` goes by the folder, then by the file.
+        path: one file, a pair (left, right) for formats with one a view, or the folder of a COLMAP model.
+        cameras: left and right camera of a file of many (KITTI, Kalibr, OAK-D); ``None`` goes by the folder,
+            then by the file.
         image_folder_hint: name or path of the left image's folder (or of the image): ``image_2`` means 2, 3.
+        image_names: names or paths of both images, by which a COLMAP model knows them.
+        image_size: ``(width, height)`` of the left image, for files with several resolutions (ZED, RealSense)
+            or of the whole sensor (OAK-D).
+        baseline_m: measured distance of the two cameras in metres; replaces that of the file.
+        distorted: whether the caller takes lens distortion out of the images (``Rig.distortion``).
 
     Returns:
         The rig: K in pixels of the images that the file is for, E in metres.
@@ -95,7 +162,8 @@ def read_calibration(
     Raises:
         FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
         TypeError: not a path or a pair of paths.
-        ValueError: empty, unknown format, cut off, lens distortion, cameras that are not there.
+        ValueError: empty, unknown format, cut off, lens distortion unless ``distorted``, cameras that are not
+            there.
 
     Convention:
         A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
@@ -104,6 +172,23 @@ def read_calibration(
     if len(paths) == 2 and paths[0] == paths[1]:
         paths = paths[:1]
     files = tuple(CalibrationFile(p, read_text(p, "calibration", "a calibration file")) for p in paths)
+    name = _one_format(files)
+    _check_cameras(cameras, name)
+    choice = CameraChoice(
+        (cameras[0], cameras[1]) if cameras else None,
+        None if image_folder_hint is None else str(image_folder_hint),
+        None if image_names is None else (str(image_names[0]), str(image_names[1])),
+        None if image_size is None else (int(image_size[0]), int(image_size[1])),
+    )
+    rig = CALIBRATION_FORMATS[name].read(files, choice)
+    for side, lens in enumerate(rig.distortion):
+        if lens is not None and not distorted:
+            check_no_distortion(lens.coefficients, f"Lens distortion D{side + 1} in {rig.source}")
+    return _in_metres(rig, baseline_m, name)
+
+
+def _one_format(files: tuple[CalibrationFile, ...]) -> str:
+    """The name of the format that all files have, as many as it needs."""
     names = [_recognise(file) for file in files]
     if len(set(names)) > 1:
         bad_value("calibration", "two files of one format", " and ".join(names))
@@ -118,6 +203,4 @@ def read_calibration(
             if one
             else "It describes both cameras; give it once.",
         )
-    _check_cameras(cameras, names[0])
-    hint = None if image_folder_hint is None else str(image_folder_hint)
-    return known.read(files, CameraChoice(tuple(cameras) if cameras else None, hint))
+    return names[0]

@@ -1,7 +1,7 @@
-"""From the numbers of a file to a checked ``Rig``.
+"""Checked ``Rig`` records from the numbers of a calibration file.
 
 Hop: camera matrices, projections, world-to-camera transforms, baselines -> ``Rig``.
-Paper: S3.3; E as in docs/calibration.md.
+Paper: S3.3; E as in docs/reference/calibration.md.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ __all__ = [
     "check_no_distortion",
     "check_rigid",
     "intrinsics",
+    "is_distorted",
     "make_rig",
     "pose_from_projections",
     "pose_from_world_to_camera",
@@ -81,13 +82,18 @@ def check_rigid(T: np.ndarray, name: str) -> np.ndarray:
     return T
 
 
+def is_distorted(coefficients: np.ndarray | None) -> bool:
+    """Whether a coefficient moves any pixel."""
+    return coefficients is not None and np.abs(coefficients).max(initial=0.0) > DISTORTION_TOLERANCE
+
+
 def check_no_distortion(coefficients: np.ndarray | None, name: str) -> None:
     """Refuse lens distortion: every formula here is of a pinhole camera.
 
     Raises:
         ValueError: a coefficient that is not zero.
     """
-    if coefficients is None or np.abs(coefficients).max(initial=0.0) <= DISTORTION_TOLERANCE:
+    if not is_distorted(coefficients):
         return
     bad_value(
         name,

@@ -1,4 +1,4 @@
-"""``stereodemo_calibration.json``.
+"""``stereodemo_calibration.json``, the calibration of the stereodemo project.
 
 Hop: ``fx fy cx0 cx1 cy baseline_meters width height`` -> ``Rig``.
 Paper: none.
@@ -20,8 +20,9 @@ KEYS = ("fx", "fy", "cx0", "cx1", "cy", "baseline_meters")
 
 
 def matches(text: str, path: Path) -> bool:
-    """Whether the text is a JSON object with ``"fx"`` in it (and not OpenCV's JSON)."""
-    return text.lstrip().startswith("{") and '"fx"' in text and "opencv-matrix" not in text
+    """Whether the text is a JSON object with ``"fx"`` in it (and not OpenCV's or RealSense's JSON)."""
+    others = ("opencv-matrix", '"ppx"')
+    return text.lstrip().startswith("{") and '"fx"' in text and not any(mark in text for mark in others)
 
 
 def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
@@ -35,6 +36,10 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
         data = json.loads(files[0].text)
     except json.JSONDecodeError as error:
         bad_value(f"{path}", "JSON", f"{error.msg} in line {error.lineno}", "Is the file cut off?")
+    except RecursionError:
+        bad_value(f"{path}", "a JSON object of numbers", "lists within lists without end")
+    if not isinstance(data, dict):
+        bad_value(f"{path}", "a JSON object", type(data).__name__)
     if "cx" in data:  # older files: one principal point for both images
         data = {"cx0": data["cx"], "cx1": data["cx"], **data}
     missing = [key for key in KEYS if key not in data]
@@ -48,7 +53,8 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     baseline_m = positive(data["baseline_meters"], f"baseline_meters in {path}")
     size = None
     if "width" in data and "height" in data:
-        size = tuple(int(positive(data[key], f"{key} in {path}")) for key in ("width", "height"))
+        width, height = (int(positive(data[key], f"{key} in {path}")) for key in ("width", "height"))
+        size = (width, height)
     K_left, K_right = (intrinsics(data["fx"], data["fy"], data[cx], data["cy"]) for cx in ("cx0", "cx1"))
     return make_rig(K_left, K_right, pose_to_the_right(baseline_m), path, size=size)
 

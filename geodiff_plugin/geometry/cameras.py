@@ -92,7 +92,7 @@ def relative_pose(E_left: torch.Tensor, E_right: torch.Tensor) -> torch.Tensor:
         gives ``T_right_from_left[0, 3] = -0.12``.
 
     Source: Eq. 25 (eq:forward-warp_supp). Eq. 26 (eq:back-warp_supp) prints ``E2 E1^-1``, which holds
-        for world-to-camera poses only (docs/paper-map.md, E1).
+        for world-to-camera poses only (docs/reference/paper-map.md, E1).
     """
     return invert_rigid(E_right) @ E_left
 
@@ -117,7 +117,7 @@ def nearest_rotation(matrix: torch.Tensor) -> torch.Tensor:
 def is_rectified(
     K_left: torch.Tensor, K_right: torch.Tensor, T_right_from_left: torch.Tensor
 ) -> torch.Tensor:
-    """Whether disparity along rows says everything: R = I, a sideways baseline, equal f and cy.
+    """Whether disparity along rows says everything: R = I, a sideways baseline, equal f, skew, cy.
 
     Args:
         K_left: ``(..., 3, 3)`` float, pixels.
@@ -126,12 +126,14 @@ def is_rectified(
 
     Returns:
         ``(...)`` bool: the rotation is the identity to 1e-3 an entry, ``|t_y|`` and ``|t_z|`` are below 1 %
-        of ``|t_x|``, f agrees to 0.1 % and cy to 0.1 % of f.
+        of ``|t_x|``, f agrees to 0.1 %, skew and cy to 0.1 % of f.
     """
     turned = (T_right_from_left[..., :3, :3] - torch.eye(3).to(T_right_from_left)).abs().amax((-2, -1))
     t = T_right_from_left[..., :3, 3].abs()
     focal = K_left[..., 1, 1]
     apart = (K_left - K_right).abs()
-    uneven = torch.stack([apart[..., 0, 0], apart[..., 1, 1], apart[..., 1, 2]], -1).amax(-1)
+    uneven = torch.stack([apart[..., 0, 0], apart[..., 0, 1], apart[..., 1, 1], apart[..., 1, 2]], -1).amax(
+        -1
+    )
     sideways = t[..., 1:].amax(-1) < SIDEWAYS_TOLERANCE * t[..., 0]
     return (turned <= ANGLE_TOLERANCE) & sideways & (uneven <= ANGLE_TOLERANCE * focal)

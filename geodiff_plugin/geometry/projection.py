@@ -9,8 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.camera import project_points
-from kornia.geometry.depth import depth_to_3d_v2, unproject_meshgrid
 from kornia.geometry.linalg import transform_points
 
 __all__ = ["NEAREST_M", "PlaneRays", "plane_rays", "project", "project_rays", "transform", "unproject"]
@@ -45,8 +43,18 @@ def unproject(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
 
     Convention:
         The pixel at the principal point has ``x = y = 0``; one focal length to its right has ``x = z``.
+        A skew ``K[0, 1]`` is obeyed, here and everywhere else that a ``K`` is taken.
     """
-    return depth_to_3d_v2(depth_m[:, 0], K)
+    return _rays((depth_m.shape[-2], depth_m.shape[-1]), K.to(depth_m.dtype)) * depth_m[:, 0, ..., None]
+
+
+def _rays(size: tuple[int, int], K: torch.Tensor) -> torch.Tensor:
+    """Points at z = 1 behind every pixel, ``(B, H, W, 3)``; kornia's know no skew."""
+    v, u = torch.meshgrid(*(torch.arange(n, device=K.device, dtype=K.dtype) for n in size), indexing="ij")
+    fx, skew, cx, fy, cy = (K[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+    y = (v - cy) / fy
+    x = (u - cx - skew * y) / fx
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
 
 def transform(points: torch.Tensor, T: torch.Tensor) -> torch.Tensor:
@@ -81,7 +89,9 @@ def project(points: torch.Tensor, K: torch.Tensor) -> tuple[torch.Tensor, torch.
     """
     z = points[..., 2]
     in_front, z_safe = _in_front(z)
-    uv = project_points(torch.cat([points[..., :2], z_safe[..., None]], dim=-1), K[:, None, None])
+    x, y = (points[..., i] / z_safe for i in (0, 1))
+    fx, skew, cx, fy, cy = (K[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+    uv = torch.stack([fx * x + skew * y + cx, fy * y + cy], dim=-1)
     return torch.where(in_front[..., None], uv, torch.full_like(uv, _BEHIND_PX)), z
 
 
@@ -102,8 +112,7 @@ def plane_rays(
 
     Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
     """
-    grid = unproject_meshgrid(*size, K_left, device=K_left.device, dtype=K_left.dtype)  # (B, H, W, 3), z = 1
-    rays = grid.flatten(1, 2).transpose(1, 2)  # (B, 3, H * W)
+    rays = _rays(size, K_left).flatten(1, 2).transpose(1, 2)  # (B, 3, H * W)
     M = K_right @ T_right_from_left[:, :3, :3]
     A = (M[..., None] * rays[:, None]).sum(2)  # not a matrix product, which TF32 rounds by a quarter pixel
     b = K_right @ T_right_from_left[:, :3, 3:]

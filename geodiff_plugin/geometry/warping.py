@@ -42,7 +42,7 @@ def sample_at(image: torch.Tensor, uv: torch.Tensor, *, mode: str = "bilinear") 
     Args:
         image: ``(B, C, H, W)`` float.
         uv: ``(B, h, w, 2)`` pixels (column, row); (0, 0) is the centre of the first pixel.
-        mode: ``"bilinear"`` or ``"nearest"``.
+        mode: ``"bilinear"``, ``"nearest"`` or ``"bicubic"``.
 
     Returns:
         ``(B, C, h, w)``; differentiable in ``image`` and, inside the image and bilinear, in ``uv``.
@@ -94,7 +94,7 @@ def warp_right_to_left(
         the right image at ``u - f * b / z``.
 
     Source: S7.2, with the map of Eq. 25 (eq:forward-warp_supp); Eq. 26 (eq:back-warp_supp) has the poses
-        the wrong way round for camera-to-world matrices (docs/paper-map.md, E1).
+        the wrong way round for camera-to-world matrices (docs/reference/paper-map.md, E1).
     """
     if rays is None:
         rays = plane_rays(K_left, K_right, T_right_from_left, (depth_m.shape[-2], depth_m.shape[-1]))

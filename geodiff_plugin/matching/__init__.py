@@ -7,24 +7,23 @@ Paper: S7.3 (the search is a lookup in this volume); the matches go beyond it.
 from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.build import build_cost_volume, find_matches
 from geodiff_plugin.matching.consistency import Matches, gate_matches, match_volume
-from geodiff_plugin.matching.contradiction import believe_before_prior
-from geodiff_plugin.matching.known_points import points_to_matches, with_points
 from geodiff_plugin.matching.mirrored import PoseCheck, mirrored_pose_preferred
-from geodiff_plugin.matching.plane_sweep import CostVolume, RightView, sweep_planes
+from geodiff_plugin.matching.points import points_to_matches, with_points
+from geodiff_plugin.matching.reflections import reject_reflections
+from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
 
 __all__ = [
     "CostVolume",
     "Matches",
     "PoseCheck",
-    "RightView",
     "aggregate",
-    "believe_before_prior",
     "build_cost_volume",
     "find_matches",
     "gate_matches",
     "match_volume",
     "mirrored_pose_preferred",
     "points_to_matches",
+    "reject_reflections",
     "sweep_planes",
     "with_points",
 ]

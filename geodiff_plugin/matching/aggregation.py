@@ -1,6 +1,6 @@
 """Semi-global aggregation: neighbours vote for similar inverse depths along straight paths.
 
-Hop: cost volume (D, H, W) -> aggregated costs (D, H, W).
+Hop: cost levels (D, H, W) -> sums over paths (D, H, W), in small integers.
 Paper: none (Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual information", Eq. 13).
 """
 
@@ -8,36 +8,67 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["aggregate"]
+from geodiff_plugin.matching.census import COST_LEVELS
+
+__all__ = ["NEVER", "PATHS", "Room", "aggregate", "cells"]
+
+PATHS = 4
+"""Up, down, left and right."""
+
+NEVER = 20_000
+"""Above any sum over the paths: in a place that is not to win."""
 
 
-def _scan_rows(cost: torch.Tensor, p1: float, p2: torch.Tensor, total: torch.Tensor) -> None:
+def cells(planes: int, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """Memory ``(planes, N, M)``, not filled, for ``size = (N, M)``; a row with all its planes is one piece.
+
+    So a path from row to row reads memory in order.
+    """
+    return torch.empty(size[0], planes, size[1], dtype=dtype, device=device).transpose(0, 1)
+
+
+class Room:
+    """Memory that one aggregation after the other works in: to touch fresh memory costs as much as a path."""
+
+    def __init__(self) -> None:
+        self._held: dict[str, torch.Tensor] = {}
+
+    def cells(self, name: str, planes: int, size: tuple[int, int], like: torch.Tensor) -> torch.Tensor:
+        """``cells`` in the memory of this name; what it held before is lost."""
+        count, held = planes * size[0] * size[1], self._held.get(name)
+        if held is None or held.numel() < count:
+            held = self._held[name] = torch.empty(count, dtype=like.dtype, device=like.device)
+        return held[:count].view(size[0], planes, size[1]).transpose(0, 1)
+
+
+def _scan_rows(cost: torch.Tensor, p1: int, p2: torch.Tensor, total: torch.Tensor) -> None:
     """Add the path from the first row down and the one from the last row up to ``total``.
 
     Args:
-        cost: ``(D, N, M)``; paths run along N, side by side over M.
+        cost: ``(D, N, M)`` uint8; paths run along N, side by side over M.
         p1: penalty of a step of one plane.
-        p2: ``(N, M)`` penalty of any larger step between row n - 1 and row n.
-        total: ``(D, N, M)``, changed in place.
+        p2: ``(N, M)`` int16, penalty of any larger step between row n - 1 and row n.
+        total: ``(D, N, M)`` int16, changed in place.
     """
-    count = cost.shape[1]
-    # Both directions advance together: entry 0 goes down, entry 1 goes up.
-    path = torch.stack([cost[:, 0], cost[:, -1]])  # (2, D, M)
-    total[:, 0] += path[0]
-    total[:, -1] += path[1]
-    step = torch.empty_like(path)
-    for n in range(1, count):
-        up = count - 1 - n
-        path -= path.amin(dim=1, keepdim=True)
-        limit = torch.stack([p2[n], p2[up + 1]])[:, None]
-        torch.add(path, p1, out=step)
-        torch.minimum(path, limit, out=path)
-        torch.minimum(path[:, 1:], step[:, :-1], out=path[:, 1:])
-        torch.minimum(path[:, :-1], step[:, 1:], out=path[:, :-1])
-        path[0] += cost[:, n]
-        path[1] += cost[:, up]
-        total[:, n] += path[0]
-        total[:, up] += path[1]
+    planes, count, breadth = cost.shape
+    # Both directions advance together, entry 0 down and entry 1 up; a plane more at either end never wins.
+    padded = total.new_full((2, planes + 2, breadth), NEVER)
+    path, before, after = padded[:, 1:-1], padded[:, :-2], padded[:, 2:]
+    step, least = total.new_empty(2, planes, breadth), total.new_empty(2, 1, breadth)
+    limits = torch.stack([p2[1:], p2[1:].flip(0)], dim=1)[:, :, None]
+    for n in range(count):
+        rows = (n, count - 1 - n)
+        if n:
+            torch.amin(path, dim=1, keepdim=True, out=least)
+            torch.minimum(before, after, out=step).add_(p1)
+            torch.minimum(step, path, out=step)
+            torch.minimum(step, limits[n - 1] + least, out=step).sub_(least)
+        for i, row in enumerate(rows):
+            if n:
+                torch.add(step[i], cost[:, row], out=path[i])
+            else:
+                path[i] = cost[:, row]
+            total[:, row] += path[i]
 
 
 def _limits(grey: torch.Tensor, p1: float, p2: float, contrast: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -46,36 +77,48 @@ def _limits(grey: torch.Tensor, p1: float, p2: float, contrast: float) -> tuple[
     for image in (grey, grey.T):
         difference = torch.zeros_like(image)
         difference[1:] = (image[1:] - image[:-1]).abs()
-        limits.append((p2 / (1.0 + difference / contrast)).clamp_min(2.0 * p1))
+        limit = (p2 / (1.0 + difference / contrast)).clamp_min(2.0 * p1)
+        limits.append((COST_LEVELS * limit).round().to(torch.int16))
     return limits[0], limits[1]
 
 
 @torch.no_grad()
 def aggregate(
-    cost: torch.Tensor, grey: torch.Tensor, *, p1: float = 0.15, p2: float = 1.2, contrast: float = 0.1
+    levels: torch.Tensor,
+    grey: torch.Tensor,
+    *,
+    p1: float = 0.15,
+    p2: float = 1.2,
+    contrast: float = 0.1,
+    room: Room | None = None,
 ) -> torch.Tensor:
     """Semi-global aggregation along four paths.
 
     Args:
-        cost: ``(D, H, W)`` float32, about [0, 1].
+        levels: ``(D, H, W)`` uint8, costs of 0 to ``COST_LEVELS``.
         grey: ``(H, W)`` of the same view in [0, 1]: a brightness edge makes a jump in depth cheaper there.
-        p1: penalty of a step of one plane between neighbouring pixels.
-        p2: penalty of any larger step where the image is flat.
+        p1: penalty of a step of one plane between neighbouring pixels, as a share of ``COST_LEVELS``.
+        p2: penalty of any larger step where the image is flat, likewise; at most 15.
         contrast: brightness difference that halves ``p2``.
+        room: memory to work in, which holds the result until its next use; its own by default.
 
     Returns:
-        ``(D, H, W)`` mean over the paths; not differentiable.
+        ``(D, H, W)`` int16, sum over the four paths, below ``NEVER``; not differentiable.
 
     Source: Hirschmueller 2008, Eq. 13 with paths up, down, left, right.
     """
     vertical, horizontal = _limits(grey, p1, p2, contrast)
-    total = torch.zeros_like(cost)
-    _scan_rows(cost, p1, vertical, total)
-    turned = cost.transpose(
-        1, 2
-    ).contiguous()  # (D, W, H): columns become rows, contiguous along the scan's other axis
-    sideways = torch.zeros_like(turned)
-    _scan_rows(turned, p1, horizontal, sideways)
-    del turned
-    total += sideways.transpose(1, 2)
-    return total.mul_(0.25)
+    step = round(COST_LEVELS * p1)
+    planes, height, width = levels.shape
+    room, paths = room or Room(), levels.new_empty(0, dtype=torch.int16)
+    turned = room.cells("turned", planes, (width, height), levels)
+    sideways = room.cells("sideways", planes, (width, height), paths)
+    total = room.cells("total", planes, (height, width), paths)
+    # Plane by plane and from piece to piece: so a transposition goes by blocks, several times as fast.
+    for plane, own in zip(turned, levels, strict=True):
+        plane.copy_(own.contiguous().T.contiguous())
+    _scan_rows(turned, step, horizontal, sideways.zero_())
+    for plane, own in zip(total, sideways, strict=True):
+        plane.copy_(own.contiguous().T.contiguous())
+    _scan_rows(levels, step, vertical, total)
+    return total

@@ -16,18 +16,18 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import plane_rays, resize_intrinsics
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import Matches, match_volume
-from geodiff_plugin.matching.plane_sweep import (
+from geodiff_plugin.matching.sweep import (
     CostVolume,
-    RightView,
     inverse_depth_at_shift,
     median_shift,
     sweep_planes,
 )
+from geodiff_plugin.types import CameraView
 
 __all__ = ["build_cost_volume", "find_matches", "pilot_volume"]
 
 # The first, coarse sweep: pixels of its grid, and how far it looks in fractions of the width.
-_PILOT_PIXELS = 40_000
+_PILOT_PIXELS = 20_000
 _PILOT_SHIFT = 0.4
 # Planes reach this factor nearer than anything that the coarse sweep is sure of, and at least to this shift.
 _HEADROOM, _LEAST_SHIFT = 1.25, 0.03
@@ -48,15 +48,15 @@ def _shrink(
 
 
 def _to_grid(
-    left: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, side: int, pixels: int
-) -> tuple[torch.Tensor, tuple[RightView, ...], torch.Tensor]:
+    left: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, side: int, pixels: int
+) -> tuple[torch.Tensor, tuple[CameraView, ...], torch.Tensor]:
     """Shrink the left view to its bounds, right ones to as many pixels per radian, so that none aliases."""
     height, width = left.shape[-2:]
     factor = min(side / max(height, width), (pixels / (height * width)) ** 0.5)
     left, K = _shrink(left, K_left, (factor, factor))
     # Axis by axis: whole pixels round each differently, and a rectified pair must stay one.
     small = tuple(
-        (*_shrink(image, K_r, (float(K[1, 1] / K_r[1, 1]), float(K[0, 0] / K_r[0, 0]))), T)
+        CameraView(*_shrink(image, K_r, (float(K[1, 1] / K_r[1, 1]), float(K[0, 0] / K_r[0, 0]))), T)
         for image, K_r, T in rights
     )
     return left, small, K
@@ -65,7 +65,7 @@ def _to_grid(
 def _even_planes(
     span: tuple[torch.Tensor, torch.Tensor],
     size: tuple[int, int],
-    rights: Sequence[RightView],
+    rights: Sequence[CameraView],
     K: torch.Tensor,
     step_px: float,
     most: int,
@@ -81,7 +81,7 @@ def _even_planes(
 
 @torch.no_grad()
 def pilot_volume(
-    left_01: torch.Tensor, rights: Sequence[RightView], K_left: torch.Tensor, pixels: int = _PILOT_PIXELS
+    left_01: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, pixels: int = _PILOT_PIXELS
 ) -> CostVolume:
     """A coarse sweep of all depths from infinity to a shift of 40 % of the width.
 
@@ -97,7 +97,7 @@ def pilot_volume(
     Raises:
         ValueError: the views do not overlap, or both cameras stand at one place.
     """
-    views = tuple((grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
+    views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
     left, small, K = _to_grid(grey(left_01), views, K_left.float(), pixels, pixels)
     size = (left.shape[-2], left.shape[-1])
     limit = _at_shift(small, K, size, _PILOT_SHIFT)
@@ -106,7 +106,7 @@ def pilot_volume(
 
 
 def _at_shift(
-    rights: Sequence[RightView], K: torch.Tensor, size: tuple[int, int], fraction: float
+    rights: Sequence[CameraView], K: torch.Tensor, size: tuple[int, int], fraction: float
 ) -> torch.Tensor:
     """Inverse depth at which the view that moves most has moved by this fraction of the width."""
     all_rays = [plane_rays(K[None], K_r[None], T[None], size) for _, K_r, T in rights]
@@ -116,18 +116,18 @@ def _at_shift(
 def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
     """The inverse depth that a coarse sweep says nothing is nearer than."""
     matches = match_volume(pilot)
-    believed = matches.inverse_depth[matches.confidence > 0.8]
-    limit = pilot.inverse_depth[-1]
-    if believed.numel() < 0.03 * pilot.cost[0].numel():
-        return limit  # nothing to go by: the search must see everything
+    sure, limit = matches.confidence > 0.8, pilot.inverse_depth[-1]
+    believed = torch.where(sure, matches.inverse_depth, torch.nan)
     least = _at_shift(pilot.rights, pilot.K, pilot.size, _LEAST_SHIFT)
-    return (_HEADROOM * torch.quantile(believed, 0.995)).clamp(least, limit)
+    nearest = (_HEADROOM * torch.nanquantile(believed, 0.995)).clamp(least, limit)
+    # With little to go by, the search must see everything.
+    return torch.where(sure.float().mean() < 0.03, limit, nearest)
 
 
 @torch.no_grad()
 def build_cost_volume(
     left_01: torch.Tensor,
-    rights: Sequence[RightView],
+    rights: Sequence[CameraView],
     K_left: torch.Tensor,
     *,
     planes: int = 160,
@@ -162,7 +162,7 @@ def build_cost_volume(
     """
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
-    views = tuple((grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
+    views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
     left, small, K = _to_grid(grey(left_01), views, K_left.float(), max_side, max_pixels)
     if depth_range is None:
         nearest = _nearest_inverse_depth(pilot_volume(left, small, K))
@@ -175,7 +175,7 @@ def build_cost_volume(
 
 def find_matches(
     left_01: torch.Tensor,
-    rights: Sequence[RightView],
+    rights: Sequence[CameraView],
     K_left: torch.Tensor,
     *,
     volume: CostVolume | None = None,

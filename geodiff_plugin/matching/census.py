@@ -1,4 +1,4 @@
-"""Soft census: a description of a pixel's surroundings that exposure does not change.
+"""Soft census: a description of a pixel's surroundings that exposure does not change, in small integers.
 
 Hop: grey image -> 16 comparisons a pixel; two of them -> matching cost.
 Paper: none (Zabih and Woodfill 1994, "Non-parametric local transforms for computing visual correspondence").
@@ -7,15 +7,23 @@ Paper: none (Zabih and Woodfill 1994, "Non-parametric local transforms for compu
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 
-__all__ = ["census", "census_cost", "grey"]
+__all__ = ["COST_LEVELS", "MARGIN_PX", "VOTE_LEVELS", "census", "census_cost", "grey", "grey_levels"]
 
-# 7 x 7 window, every second offset.
-_OFFSETS = [(row, column) for row in (-3, -1, 1, 3) for column in (-3, -1, 1, 3)]
+MARGIN_PX = 3
+"""Half the window: how far an image must reach beyond the pixels that are described."""
+
+# 7 x 7 window, every second offset: this many a side.
+_SIDE = 4
 # A difference in brightness of this counts as certain; below it the vote is proportional, so that noise on
 # flat surfaces hardly votes.
 _CONTRAST = 6.0 / 255.0
+
+VOTE_LEVELS = 7
+"""A certain vote; the largest for which a cost still fits into a byte."""
+
+COST_LEVELS = 2 * VOTE_LEVELS * _SIDE * _SIDE
+"""The cost of two descriptions that differ in everything: 224."""
 
 
 def grey(image_01: torch.Tensor) -> torch.Tensor:
@@ -33,46 +41,52 @@ def grey(image_01: torch.Tensor) -> torch.Tensor:
     return (image_01 * image_01.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(dim=0, keepdim=True)
 
 
-def _padded(images: torch.Tensor) -> torch.Tensor:
-    """``(N, H + 6, W + 6)``, edges repeated, in units of the contrast that counts as certain."""
-    return F.pad(images[:, None], (3, 3, 3, 3), mode="replicate")[:, 0] * (1.0 / _CONTRAST)
+def grey_levels(grey_01: torch.Tensor) -> torch.Tensor:
+    """Grey in levels of which ``VOTE_LEVELS`` count as a certain difference, about 1.2 an 8-bit level.
+
+    Args:
+        grey_01: any shape, float in [0, 1].
+
+    Returns:
+        The same shape, int16.
+    """
+    return (grey_01 * (VOTE_LEVELS / _CONTRAST)).round().to(torch.int16)
 
 
-def census(images: torch.Tensor) -> torch.Tensor:
+def census(levels: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
     """How the 16 neighbours of every pixel compare with it.
 
     Args:
-        images: ``(N, H, W)`` float grey in [0, 1].
+        levels: ``(H + 6, W + 6)`` contiguous, of ``grey_levels``, with a margin of ``MARGIN_PX`` all around.
+        out: ``(16, H, W)`` int16 to write to: to touch fresh memory costs more than the work.
 
     Returns:
-        ``(N, 16, H, W)`` in [-1, 1]; unchanged by an offset in brightness, nearly so by a gain.
+        ``(16, H, W)`` int16, within plus and minus ``VOTE_LEVELS``; unchanged by an offset in brightness,
+        nearly so by a gain.
     """
-    height, width = images.shape[-2:]
-    padded = _padded(images)
-    centre = padded[:, 3 : 3 + height, 3 : 3 + width]
-    bits = images.new_empty(images.shape[0], len(_OFFSETS), height, width)
-    for i, (row, column) in enumerate(_OFFSETS):
-        other = padded[:, 3 + row : 3 + row + height, 3 + column : 3 + column + width]
-        torch.sub(other, centre, out=bits[:, i])
-    return bits.clamp_(-1.0, 1.0)
+    height, width = (side - 2 * MARGIN_PX for side in levels.shape)
+    stride = levels.shape[1]
+    neighbours = levels.as_strided((_SIDE, _SIDE, height, width), (2 * stride, 2, stride, 1))
+    centre = levels[MARGIN_PX : MARGIN_PX + height, MARGIN_PX : MARGIN_PX + width]
+    if out is None:
+        out = levels.new_empty(_SIDE * _SIDE, height, width)
+    torch.sub(neighbours, centre, out=out.view(neighbours.shape))
+    return out.clamp_(-VOTE_LEVELS, VOTE_LEVELS)
 
 
-def census_cost(bits: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
-    """Mean difference between one census and that of many images, without holding theirs in memory.
+def census_cost(one: torch.Tensor, other: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+    """Difference between two descriptions.
 
     Args:
-        bits: ``(16, H, W)``, one image's ``census``.
-        images: ``(N, H, W)`` float grey in [0, 1], of the same size.
+        one: ``(16, H, W)`` of ``census``, int8 or int16.
+        other: the same shape and type.
+        out: the same shape and type, to work in; may be ``one`` where that is not needed any more.
 
     Returns:
-        ``(N, H, W)`` in [0, 1]; about 0.35 for unrelated natural texture, 0.5 for unrelated noise.
+        ``(H, W)`` uint8, 0 to ``COST_LEVELS``; about 0.35 of that for unrelated natural texture, 0.5 for
+        unrelated noise.
     """
-    height, width = images.shape[-2:]
-    padded = _padded(images)
-    centre = padded[:, 3 : 3 + height, 3 : 3 + width]
-    cost, bit = torch.zeros_like(images), torch.empty_like(images)
-    for i, (row, column) in enumerate(_OFFSETS):
-        other = padded[:, 3 + row : 3 + row + height, 3 + column : 3 + column + width]
-        torch.sub(other, centre, out=bit)
-        cost += bit.clamp_(-1.0, 1.0).sub_(bits[i]).abs_()
-    return cost.mul_(0.5 / len(_OFFSETS))
+    apart = torch.sub(one, other, out=out).abs_()
+    if apart.dtype == torch.int8:
+        return apart.view(torch.uint8).sum(dim=0, dtype=torch.uint8)
+    return apart.sum(dim=0, dtype=torch.int16).to(torch.uint8)

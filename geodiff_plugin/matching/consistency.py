@@ -6,26 +6,44 @@ Paper: none; the evidence that a photometric loss does not have.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 
-from geodiff_plugin.geometry import invert_rigid, plane_rays, sample_at, warp_right_to_left
-from geodiff_plugin.matching.aggregation import aggregate
-from geodiff_plugin.matching.plane_sweep import CostVolume, RightView, sweep_planes
+from geodiff_plugin.matching.aggregation import NEVER, PATHS, Room, aggregate
+from geodiff_plugin.matching.alignment import AlignedView
+from geodiff_plugin.matching.census import COST_LEVELS
+from geodiff_plugin.matching.sweep import UNSEEN_LEVEL, CostVolume
 
-__all__ = ["Matches", "gate_matches", "match_volume"]
+__all__ = [
+    "LOG_ODDS",
+    "RIGHT_WITHIN_PLANES",
+    "SIGNS",
+    "CheckedMatches",
+    "Matches",
+    "checked_matches",
+    "gate_matches",
+    "match_volume",
+]
 
 # Left and right may differ by this many planes.
 _TOLERANCE = 1.5
-# Log-odds that a checked match is within 3 planes of the truth: constant, log of the margin (0.03 + second
-# best cost - best cost), best cost, left-right difference. Fitted on real pairs; what one half of them gives
-# holds on the other.
-_LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
+#: Planes of the truth within which a match counts as right.
+RIGHT_WITHIN_PLANES = 3.0
+#: Log-odds that a checked match is right, linear in ``_evidence``, by logistic regression on pairs with truth
+#: (``python -m geodiff_plugin.evaluation.calibrate`` refits them).
+LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
+#: Which sign each of them may have; 0 for any.
+SIGNS = (0, 1, -1, -1)
 # Aggregation carries matches over blank walls for ever. Where, within this window, the best planes are no
 # better than the average plane by this much, there is no evidence.
 _WINDOW_PX, _LEAST_CONTRAST = 31, 0.03
+# The right view is asked in every such row.
+_EVERY_ROW = 2
+# A sum over the paths and its plane in one integer, so that one minimum finds both.
+_PLANES = 1 << 12
 
 
 @dataclass(frozen=True)
@@ -49,75 +67,160 @@ class Matches:
 
 @dataclass(frozen=True)
 class _Winner:
-    """Per pixel ``(H, W)``: inverse depth, its cost, the least cost two planes away, and ``_contrast``."""
+    """Per pixel ``(H, W)``: the best plane, that between planes, and the ``(3, H, W)`` planes around it."""
 
-    inverse_depth: torch.Tensor
-    cost: torch.Tensor
-    second: torch.Tensor
-    contrast: torch.Tensor
+    index: torch.Tensor
+    position: torch.Tensor
+    around: torch.Tensor
+    best: torch.Tensor
+
+
+def _winner(total: torch.Tensor) -> _Winner:
+    """The best plane of sums over the paths, with a parabola through its neighbours."""
+    keys = torch.full_like(total[0], NEVER, dtype=torch.int32).mul_(_PLANES)
+    own = torch.empty_like(keys)
+    for plane in range(len(total)):
+        torch.minimum(keys, own.copy_(total[plane]).mul_(_PLANES).add_(plane), out=keys)
+    index, last = (keys % _PLANES).long(), len(total) - 1
+    around = (index + torch.arange(-1, 2, device=index.device)[:, None, None]).clamp_(0, last)
+    below, best, above = total.gather(0, around).float()
+    offset = 0.5 * (below - above) / (below + above - 2.0 * best).clamp_min(1e-6)
+    inner = (index > 0) & (index < last)
+    position = index + torch.where(inner, offset.clamp(-0.5, 0.5), torch.zeros_like(offset))
+    return _Winner(index, position, around, best)
+
+
+def _right_opinion(volume: CostVolume, view: AlignedView, room: Room) -> torch.Tensor:
+    """The position between planes that a right view takes for the best, ``(ceil(h / 2), w)`` of its canvas.
+
+    Its costs are those of the same sweep, looked up along its own pixels, and aggregated along its own edges:
+    an opinion of its own without a sweep of its own. Every second row is enough to ask it.
+    """
+    height, width = volume.size
+    # One row and one column more: what a right view's pixel reads beside the left image.
+    plane = torch.full((height + 1, width + 1), float(UNSEEN_LEVEL), device=volume.levels.device)
+    rows, columns = view.sources(height, 1)[:, ::_EVERY_ROW], view.sources(width, 0)
+    size = (rows.shape[1], columns.shape[1])
+    levels = room.cells("levels", len(volume.levels), size, volume.levels)
+    for k, own in enumerate(volume.levels):
+        plane[:height, :width] = own
+        levels[k] = plane.index_select(0, rows[k]).index_select(1, columns[k])
+    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], room=room)).position
+
+
+def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
+    """Left-right difference ``(H, W)`` in planes; infinite where the right view does not see the match.
+
+    Args:
+        view: the right view.
+        other: what it says, ``_right_opinion``.
+        position: ``(H, W)`` what the left view says, between planes.
+    """
+    device = position.device
+    scale, shift = view.scale.to(device, torch.float32), view.shift.to(device, torch.float32)
+    below = position.floor().long().clamp(0, len(scale) - 2)
+    part = position - below
+    at_scale = torch.lerp(scale[below], scale[below + 1], part)
+    height, width = position.shape
+    lines = (torch.arange(width, device=device), torch.arange(height, device=device)[:, None])
+    found, inside = [], at_scale > 0
+    for axis, line in enumerate(lines):
+        at = (at_scale * line + torch.lerp(shift[below, axis], shift[below + 1, axis], part)).round()
+        last = view.size[1 - axis] - 1
+        inside = inside & (at >= 0) & (at <= last)
+        found.append(at.clamp(0, last).long())
+    column, row = found
+    if view.valid is not None:
+        inside = inside & view.valid[row, column]
+    # Between two rows that were asked, their mean: at an edge it agrees with neither.
+    before, after = row // _EVERY_ROW, ((row + _EVERY_ROW - 1) // _EVERY_ROW).clamp_max(len(other) - 1)
+    difference = (0.5 * (other[before, column] + other[after, column]) - position).abs()
+    return torch.where(inside, difference, torch.full_like(difference, torch.inf))
 
 
 def _contrast(volume: CostVolume, index: torch.Tensor) -> torch.Tensor:
     """How much better than the mean plane the chosen one is, before aggregation, averaged over a window."""
-    total = torch.zeros_like(volume.cost[0])
-    for cost, in_view in zip(
-        volume.cost, volume.in_view, strict=True
-    ):  # one plane at a time: no second volume
-        total += cost * in_view
-    mean = total / volume.in_view.sum(dim=0).clamp_min(1)
-    gain = (mean - volume.cost.gather(0, index[None])[0]).clamp_min(0.0)
-    return F.avg_pool2d(gain[None], _WINDOW_PX, 1, _WINDOW_PX // 2, count_include_pad=False)[0]
+    total, seen = (torch.zeros_like(index, dtype=torch.int32) for _ in range(2))
+    for levels, in_view in zip(volume.levels, volume.in_view, strict=True):
+        total += levels
+        seen += in_view
+    mean = (total - UNSEEN_LEVEL * (len(volume.levels) - seen)) / seen.clamp_min(1)
+    gain = (mean - volume.levels.gather(0, index[None])[0]).clamp_min(0.0)[None] / COST_LEVELS
+    for window in ((_WINDOW_PX, 1), (1, _WINDOW_PX)):
+        padding = (window[0] // 2, window[1] // 2)
+        gain = F.avg_pool2d(gain, window, 1, padding, count_include_pad=False)
+    return gain[0]
 
 
-def _winner(volume: CostVolume) -> _Winner:
-    """Aggregate and take the best plane, with a parabola through its neighbours."""
-    aggregated = aggregate(volume.cost, volume.left_01[0])
-    last = aggregated.shape[0] - 1
-    best, index = aggregated.min(dim=0)
-    below = aggregated.gather(0, (index - 1).clamp_min(0)[None])[0]
-    above = aggregated.gather(0, (index + 1).clamp_max(last)[None])[0]
-    offset = 0.5 * (below - above) / (below + above - 2.0 * best).clamp_min(1e-6)
-    inner = (index > 0) & (index < last)
-    position = index + torch.where(inner, offset.clamp(-0.5, 0.5), torch.zeros_like(offset))
-    near = (index[None] + torch.arange(-1, 2, device=index.device)[:, None, None]).clamp(0, last)
-    second = aggregated.scatter_(0, near, torch.inf).amin(dim=0)
-    inverse_depth = volume.inverse_depth[0] + position * volume.plane_step
-    return _Winner(inverse_depth, best, second, _contrast(volume, index))
+@dataclass(frozen=True)
+class _Asked:
+    """Per pixel ``(H, W)``: the winner, and what each right view, one after the other, says to it.
+
+    Attributes:
+        position: between planes.
+        margin: least cost two planes away, less that of the winner; aggregated, in [0, 1] units.
+        cost: of the winner, aggregated.
+        contrast: ``_contrast``.
+        differences: left-right differences in planes.
+    """
+
+    position: torch.Tensor
+    margin: torch.Tensor
+    cost: torch.Tensor
+    contrast: torch.Tensor
+    differences: Iterator[torch.Tensor]
 
 
-def _seen_from_right(volume: CostVolume, right: RightView) -> CostVolume:
-    """The same sweep with the roles of the two views exchanged, over the same space."""
-    image, K_right, T = right
-    span = volume.inverse_depth[[0, -1]]
-    rays = plane_rays(volume.K[None], K_right[None], T[None], volume.size)
-    # z_right / z_left is the last row of A + inverse_depth * b; beyond a factor of 2 little would match.
-    ratio = (rays.A[0, 2, :, None] + span * rays.b[0, 2]).clamp(0.5, 2.0)
-    low, high = (span / ratio).amin(dim=0)[0], (span / ratio).amax(dim=0)[1]
-    steps = torch.linspace(0.0, 1.0, len(volume.inverse_depth), device=span.device)
-    back = (volume.left_01, volume.K, invert_rigid(T))
-    return sweep_planes(image, [back], K_right, low + (high - low) * steps)
+def _ask(volume: CostVolume, views: Sequence[AlignedView]) -> _Asked:
+    """Aggregate, take the winner, and ask right views whether they agree."""
+    room = Room()
+    total = aggregate(volume.levels, volume.left_01[0], room=room)
+    winner = _winner(total)
+    second = total.scatter_(0, winner.around, NEVER).amin(dim=0)
+    unit = 1.0 / (PATHS * COST_LEVELS)
+    margin, cost = (second - winner.best) * unit, winner.best * unit
+    differences = (_disagreement(view, _right_opinion(volume, view, room), winner.position) for view in views)
+    return _Asked(winner.position, margin, cost, _contrast(volume, winner.index), differences)
 
 
-def _disagreement(volume: CostVolume, winner: _Winner, right: RightView) -> torch.Tensor:
-    """Left-right difference ``(H, W)`` in planes; infinite where the right view does not see the match."""
-    image, K_right, T = right
-    other = _winner(_seen_from_right(volume, right)).inverse_depth
-    depth_m = 1.0 / winner.inverse_depth.clamp_min(1e-3 * volume.plane_step)[None, None]
-    cameras = (volume.K[None], K_right[None], T[None])
-    warped = warp_right_to_left(other[None, None], depth_m, *cameras)
-    read = sample_at(other[None, None], warped.uv, mode="nearest")[0, 0]
-    difference = (read - 1.0 / warped.z_right[0]).abs() / volume.plane_step
-    return torch.where(warped.visible[0, 0], difference, torch.full_like(difference, torch.inf))
+def _evidence(asked: _Asked, difference: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """1, log of the margin (0.03 + second best cost - best cost), best cost, left-right difference."""
+    margin = asked.margin.clamp(0.0, 0.5)
+    ones = torch.ones_like(margin)
+    return ones, (margin + 0.03).log(), asked.cost.clamp(0.0, 0.8), difference.clamp_max(_TOLERANCE)
 
 
-def _confidence(winner: _Winner, difference: torch.Tensor) -> torch.Tensor:
+def _confidence(asked: _Asked, difference: torch.Tensor) -> torch.Tensor:
     """Probability ``(H, W)`` that the winner is right, given the left-right difference in planes."""
-    constant, by_margin, by_cost, by_difference = _LOG_ODDS
-    margin = (winner.second - winner.cost).clamp(0.0, 0.5)
-    odds = constant + by_margin * (margin + 0.03).log() + by_cost * winner.cost.clamp(0.0, 0.8)
-    probability = torch.sigmoid(odds + by_difference * difference.clamp_max(_TOLERANCE))
-    probability = probability * (winner.contrast / _LEAST_CONTRAST).clamp_max(1.0)
+    odds = sum(weight * x for weight, x in zip(LOG_ODDS, _evidence(asked, difference), strict=True))
+    probability = torch.sigmoid(odds)
+    probability = probability * (asked.contrast / _LEAST_CONTRAST).clamp_max(1.0)
     return torch.where(difference <= _TOLERANCE, probability, torch.zeros_like(probability))
+
+
+@dataclass(frozen=True)
+class CheckedMatches:
+    """What the confidence of matches is fitted on.
+
+    Attributes:
+        inverse_depth: ``(H, W)`` float32, 1/m.
+        evidence: ``(4, H, W)``, what their log-odds are linear in.
+        checked: ``(H, W)`` bool: the right view agrees, and there is texture to agree on.
+    """
+
+    inverse_depth: torch.Tensor
+    evidence: torch.Tensor
+    checked: torch.Tensor
+
+
+@torch.no_grad()
+def checked_matches(volume: CostVolume) -> CheckedMatches:
+    """Matches of a cost volume and their evidence, by its first right view."""
+    asked = _ask(volume, volume.aligned[:1])
+    (difference,) = asked.differences
+    checked = (difference <= _TOLERANCE) & (asked.contrast >= _LEAST_CONTRAST)
+    inverse_depth = volume.inverse_depth[0] + asked.position * volume.plane_step
+    return CheckedMatches(inverse_depth, torch.stack(_evidence(asked, difference)), checked)
 
 
 @torch.no_grad()
@@ -125,18 +228,18 @@ def match_volume(volume: CostVolume) -> Matches:
     """Matches of a cost volume: aggregate, take the winner, and ask every right view whether it agrees.
 
     Args:
-        volume: of any number of right views. Each is swept once with the roles exchanged, so this costs one
-            more volume a view; one at a time is in memory.
+        volume: of any number of right views.
 
     Returns:
         ``Matches``; zero confidence where no right view agrees, else about the probability that the match is
-        within 3 planes of the truth (that of the right view most sure of it).
+        within ``RIGHT_WITHIN_PLANES`` of the truth (that of the right view most sure of it).
     """
-    winner = _winner(volume)
-    confidence = torch.zeros_like(winner.cost)
-    for right in volume.rights:
-        confidence = torch.maximum(confidence, _confidence(winner, _disagreement(volume, winner, right)))
-    return Matches(winner.inverse_depth[None], confidence[None], volume.plane_step, volume.K, volume.size)
+    asked = _ask(volume, volume.aligned)
+    confidence = torch.zeros_like(asked.cost)
+    for difference in asked.differences:
+        confidence = torch.maximum(confidence, _confidence(asked, difference))
+    inverse_depth = volume.inverse_depth[0] + asked.position * volume.plane_step
+    return Matches(inverse_depth[None], confidence[None], volume.plane_step, volume.K, volume.size)
 
 
 def gate_matches(matches: Matches, depth_m: torch.Tensor, factor: float) -> torch.Tensor:

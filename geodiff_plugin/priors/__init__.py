@@ -16,7 +16,6 @@ import torch
 from diffusers import DiffusionPipeline
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice
-from geodiff_plugin.metric import SPACES
 from geodiff_plugin.priors.base import DepthPrior, OwnPipelinePrior
 from geodiff_plugin.priors.depthfm import DepthFMPrior
 from geodiff_plugin.priors.depthmaster import DepthMasterPrior
@@ -26,8 +25,11 @@ from geodiff_plugin.priors.geowizard import GeoWizardPrior
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.lotus import LotusPrior
 from geodiff_plugin.priors.marigold import MarigoldPrior
+from geodiff_plugin.priors.marigold_v2 import MarigoldV2Prior
 from geodiff_plugin.priors.ppd import PPDPrior
+from geodiff_plugin.priors.reading import check_device
 from geodiff_plugin.priors.transformers_depth import TransformersDepthPrior
+from geodiff_plugin.scale.space import SPACES
 
 __all__ = [
     "BUNDLED_FOLDER",
@@ -42,6 +44,7 @@ __all__ = [
 
 #: The first that recognises a folder takes it, so the more particular one stands before the more general.
 PRIORS: dict[str, type[DepthPrior]] = {
+    "marigold-v2": MarigoldV2Prior,
     "geowizard": GeoWizardPrior,
     "lotus": LotusPrior,
     "depthmaster": DepthMasterPrior,
@@ -68,7 +71,7 @@ def find_adapter(pipe: Any) -> type[DepthPrior]:
         "pipe",
         f"a pipeline with an adapter ({', '.join(PRIORS)})",
         pipe,
-        "docs/extending.md shows how to write one.",
+        "docs/how-to/extending.md shows how to write one.",
     )
 
 
@@ -98,6 +101,9 @@ class FoundPrior:
         """The pipeline; arguments and errors as ``load_prior``."""
         if space is not None:
             check_choice(space, "space", SPACES)
+        if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
+            bad_value("dtype", "torch.float32, torch.float16 or torch.bfloat16", repr(dtype))
+        device = None if device is None else check_device(device)
         pipe = PRIORS[self.key].load(self.layout, dtype, space)
         pipe.register_to_config(_name_or_path=self.layout.name)
         return pipe.to(device) if device is not None else pipe
@@ -133,7 +139,7 @@ def _recognise(layout: Layout) -> str:
     if any(layout.folder.glob("*.ckpt")) or any(layout.folder.glob("*.pth")):
         cure = "A checkpoint becomes such a folder by `geodiff convert SRC DST`."
     else:
-        cure = f"Known are {', '.join(PRIORS)} (docs/priors.md); --prior bundled always works."
+        cure = f"Known are {', '.join(PRIORS)} (docs/reference/priors.md); --prior bundled always works."
     got = (
         f"{layout.folder} without model_index.json"
         if not layout.index
@@ -155,7 +161,7 @@ def load_prior(
         name: ``"bundled"``, a folder, or a hub id (``prs-eth/marigold-depth-v1-1``), see ``find_prior``.
         device: where to, CPU for ``None``.
         dtype: of the networks.
-        space: what the prior's map is affine in, key of ``metric.SPACES``; ``None`` for what the folder says.
+        space: what the prior's map is affine in, key of ``SPACES``; ``None`` for what the folder says.
         **kwargs: for ``find_prior`` (``variant``, ``revision``, ``token``, ``local_files_only``, ...).
 
     Raises:

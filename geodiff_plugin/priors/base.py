@@ -1,4 +1,4 @@
-"""What a live pipeline must tell us to be guided, and how its folder is known; a prior never sees a camera.
+"""Interface of a prior's adapter: decoding, space, network call; it never sees a camera.
 
 Hop: folder -> pipeline -> ``DepthPrior`` -> network, decode, space.
 Paper: S4 ("can be integrated with any DB-MDE framework following a similar schema").
@@ -25,13 +25,14 @@ class DepthPrior(Protocol):
     tells scale per axis and padding, and ``decode`` answers on that padded grid.
 
     Attributes:
-        space: what the decoded map is affine in, key of ``metric.SPACES``.
+        space: what the decoded map is affine in, key of ``SPACES``.
         max_steps: most denoising steps that make sense, ``None`` for any number. A guided call of a prior
             with one step makes as many updates in it as it would have made in ``min_steps`` steps.
         deterministic: the same image gives the same map, so that an ensemble has one member.
         latents: channels of the scheduler's latents that are depth; no gradient step touches the others.
         network_input: channels of the network's first argument that are the depth latent z_t; ``None``
             where the network is not told z_t, so that only its answer can be guided.
+        takes_prompt: whether the call takes ``prompt_depth``, depths that the network starts from.
         licence: of the weights by hub id, for those that are known.
     """
 
@@ -40,6 +41,7 @@ class DepthPrior(Protocol):
     deterministic: bool
     latents: slice
     network_input: slice | None
+    takes_prompt: bool
     licence: dict[str, str]
 
     @staticmethod
@@ -64,10 +66,23 @@ class DepthPrior(Protocol):
         """Where the loop calls the network once a step: an object and the name of the method on it."""
 
     def decode(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map ``(B, 1, H, W)`` float32, about [0, 1], with the graph of ``z0``."""
+        """Unclipped relative map ``(B, 1, H, W)`` float32, about [0, 1], with the graph of ``z0``.
+
+        It may lack the rows and columns beyond the last whole cell of the latent; a guided call repeats them.
+        """
 
     def encode(self, x: Tensor) -> Tensor:
         """Clean latent of a map ``(B, 1, H, W)`` on the padded grid, about the inverse of ``decode``."""
+
+    def metric_range(self, samples: slice) -> tuple[Tensor, Tensor] | None:
+        """What the prior itself says in metres, from which the search for the scale then starts.
+
+        Args:
+            samples: which members of the running call, once its condition is prepared.
+
+        Returns:
+            Depths of ``x = 0`` and of ``x = 1``, ``(B,)`` metres each; ``None`` for a relative prior.
+        """
 
 
 class OwnPipelinePrior:
@@ -82,6 +97,7 @@ class OwnPipelinePrior:
 
     pipeline_class: type[DepthDiffusionPipeline] = DepthDiffusionPipeline
     licence: dict[str, str] = {}
+    takes_prompt = False
 
     def __init__(self, pipe: DepthDiffusionPipeline) -> None:
         self._pipe = pipe
@@ -111,3 +127,7 @@ class OwnPipelinePrior:
     def encode(self, x: Tensor) -> Tensor:
         """The pipeline's ``encode_relative``."""
         return self._pipe.encode_relative(x)
+
+    def metric_range(self, samples: slice) -> tuple[Tensor, Tensor] | None:
+        """A relative prior has none."""
+        return None

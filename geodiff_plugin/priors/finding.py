@@ -1,4 +1,4 @@
-"""From what a user typed to a folder on this machine.
+"""Resolution of a prior's name: the bundled one, a folder, or a hub id.
 
 Hop: ``"bundled"``, folder or hub id -> folder with the small files -> (once it is known) the weights too.
 Paper: none.
@@ -13,7 +13,7 @@ from typing import Any
 from huggingface_hub import snapshot_download
 from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError, RepositoryNotFoundError
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import InputError, bad_value
 
 __all__ = ["BUNDLED_FOLDER", "REFUSED", "fetch_small_files", "fetch_weights", "refuse"]
 
@@ -101,7 +101,7 @@ def _snapshot(name: str, hub: dict[str, Any], allow: list[str], ignore: list[str
     ) as error:
         cure = "Fetch it once with `hf download ID` while online, give a folder, or use --prior bundled."
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(
+        raise InputError(
             "prior must be 'bundled', a folder or a hub id that is cached or can be reached; "
             f"got {name!r} ({reason}). {cure}"
         ) from error

@@ -19,11 +19,20 @@ from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MA
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.priors.hf_preparation import Preparation
 from geodiff_plugin.priors.loading import check_weights
+from geodiff_plugin.priors.reading import check_finite, reading
 
 __all__ = ["DEPTH_ARCHITECTURES", "DepthMap", "HFDepthModel", "output_of"]
 
-#: Class names of every model that ``AutoModelForDepthEstimation`` loads.
-DEPTH_ARCHITECTURES = frozenset(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values())
+#: Class names of every model that ``AutoModelForDepthEstimation`` loads, and what TIPSv2's files name.
+DEPTH_ARCHITECTURES = frozenset(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values()) | {
+    "Tipsv2DptForDensePrediction"
+}
+#: Those whose map is no depth, and what it is.
+NO_DEPTH = {"CHMv2ForDepthEstimation": "its map is the height of trees above the ground, seen from the air"}
+#: The one that takes depths to start from, and gives metres with them.
+PROMPTED = "PromptDepthAnythingForDepthEstimation"
+#: Whose library brings the map to the image's size bilinearly; the others' do so bicubically.
+BILINEAR = ("DepthPro", "Tipsv2Dpt")
 SPACES = ("depth", "disparity")
 #: Weights that DPT's published files lack and no forward reads: the first fusion has nothing to add to.
 UNUSED = "fusion_stage.layers.0.residual_layer1."
@@ -39,17 +48,20 @@ def output_of(model: PreTrainedModel) -> tuple[str, bool]:
 
     Returns:
         Depth Anything as its ``depth_estimation_type`` says; DPT relative disparity, but metres with the
-        projection that only DINOv2's depth heads have; ZoeDepth and GLPN metres; DepthPro inverse metres.
+        projection that only DINOv2's depth heads have; ZoeDepth, GLPN and TIPSv2 metres; DepthPro inverse
+        metres; Prompt Depth Anything relative depth, until it is given a prompt.
 
     Raises:
         ValueError: a class of which this is not known.
     """
     name, config = type(model).__name__, model.config
+    if name == PROMPTED:
+        return "depth", False
     if name == "DepthAnythingForDepthEstimation":
         return ("depth", True) if config.depth_estimation_type == "metric" else ("disparity", False)
     if name == "DPTForDepthEstimation":
         return ("depth", True) if config.add_projection else ("disparity", False)
-    if name in ("ZoeDepthForDepthEstimation", "GLPNForDepthEstimation"):
+    if name in ("ZoeDepthForDepthEstimation", "GLPNForDepthEstimation", "Tipsv2DptForDepthEstimation"):
         return "depth", True
     if name == "DepthProForDepthEstimation":
         return "disparity", True
@@ -78,10 +90,14 @@ class DepthMap:
             ValueError: the model is a relative one.
         """
         if not self.metric:
-            bad_value("the depth model", "a metric one", "one that predicts relative disparity")
+            bad_value("the depth model", "a metric one", f"one that predicts relative {self.space}")
+        return self.metres_of(self.values)
+
+    def metres_of(self, values: Tensor) -> Tensor:
+        """Metres, > 0, of values of a metric map's unit, any shape."""
         if self.space == "depth":
-            return self.values
-        return 1.0 / self.values.clamp(FARTHEST, NEAREST)
+            return values
+        return 1.0 / values.clamp(FARTHEST, NEAREST)
 
 
 class HFDepthModel:
@@ -95,10 +111,18 @@ class HFDepthModel:
     Attributes:
         space: what its map is affine in.
         metric: whether its map is in metres (inverse metres in disparity space).
+        takes_prompt: whether it can be given depths to start from.
+
+    Raises:
+        ValueError: a class whose map is no depth, or of which it is not known.
     """
 
     def __init__(self, model: PreTrainedModel, preparation: Preparation, space: str | None = None) -> None:
+        name = type(model).__name__
+        if name in NO_DEPTH:
+            bad_value("the prior", "a model of depth", name, f"It is refused because {NO_DEPTH[name]}.")
         self.model, self.preparation = model, preparation
+        self.takes_prompt = name == PROMPTED
         if space is None:
             self.space, self.metric = output_of(model)
         else:
@@ -124,15 +148,24 @@ class HFDepthModel:
             **kwargs: ``revision``, ``variant``, ``token``, ``cache_dir``, ``local_files_only``.
 
         Raises:
-            OSError: it does not exist, is neither cached nor can be fetched, or has no safetensors.
-            ValueError: weights that are missing; a class whose output, or a processor that, is not known.
+            ValueError: it does not exist, is neither cached nor can be fetched, or has no safetensors;
+                weights that are missing; a class whose output, or a processor that, is not known.
         """
         files = {k: v for k, v in kwargs.items() if k != "variant"}
-        config, _ = BaseImageProcessor.get_image_processor_dict(str(name), **files)
-        model, found = AutoModelForDepthEstimation.from_pretrained(
-            str(name), dtype=dtype, use_safetensors=True, output_loading_info=True, **kwargs
-        )
+        expected = "a folder, or a hub id that is cached or can be reached, of a depth model with safetensors"
+        cure = "Fetch it once with `hf download ID` while online, or check the path."
+        with reading("the depth model", expected, repr(str(name)), cure):
+            config, _ = BaseImageProcessor.get_image_processor_dict(str(name), **files)
+            model, found = AutoModelForDepthEstimation.from_pretrained(
+                str(name),
+                dtype=dtype,
+                use_safetensors=True,
+                output_loading_info=True,
+                trust_remote_code=False,
+                **kwargs,
+            )
         check_weights([key for key in found["missing_keys"] if UNUSED not in key], (), str(name))
+        check_finite(model, str(name))
         model = model.to(device or "cpu").eval().requires_grad_(False)
         return cls(model, Preparation.from_config(config), space)
 
@@ -143,32 +176,41 @@ class HFDepthModel:
         return round(h * height / (height + 2 * rows)), round(w * width / (width + 2 * columns))
 
     @torch.no_grad()
-    def __call__(self, image_01: Tensor, size: tuple[int, int] | None = None) -> DepthMap:
+    def __call__(
+        self, image_01: Tensor, size: tuple[int, int] | None = None, prompt_m: Tensor | None = None
+    ) -> DepthMap:
         """Depth of images.
 
         Args:
             image_01: ``(B, 3, H, W)`` in [0, 1], on the model's device.
             size: sides ``(h, w)`` of the map; ``None`` for those of ``grid``.
+            prompt_m: ``(B, 1, h', w')`` metres everywhere, of any size, for a model that takes a prompt; its
+                map is in metres then.
 
         Returns:
             Map over the whole image and nothing but it (what was padded is gone), resampled as the library's
             ``post_process_depth_estimation`` does.
 
         Raises:
-            ValueError: an image too small for the network.
+            ValueError: an image too small for the network; a prompt for a model that takes none.
         """
         height, width = image_01.shape[-2:]
         size = self.grid(height, width) if size is None else size
-        output = self.model(pixel_values=self.preparation(image_01.float()).to(self.model.dtype))
+        told = {}
+        if prompt_m is not None:
+            if not self.takes_prompt:
+                bad_value("prompt_depth", "left out with this model", "given", f"Only {PROMPTED} takes one.")
+            told["prompt_depth"] = _with_a_span(prompt_m).to(image_01.device, self.model.dtype)
+        output = self.model(pixel_values=self.preparation(image_01.float()).to(self.model.dtype), **told)
         values = output.predicted_depth.float()[:, None]  # (B, 1, h', w')
         fov = getattr(output, "field_of_view", None)
         if fov is not None:  # canonical inverse depth -> inverse metres: times width over focal length
             values = values * 2.0 * torch.tan(0.5 * torch.deg2rad(fov.float())).view(-1, 1, 1, 1)
         values = self._without_padding(values, height, width)
-        mode = "bilinear" if self.preparation.kind == "DepthPro" else "bicubic"
+        mode = "bilinear" if self.preparation.kind in BILINEAR else "bicubic"
         if tuple(values.shape[-2:]) != tuple(size):
             values = F.interpolate(values, size, mode=mode, align_corners=False)
-        return DepthMap(values, self.space, self.metric)
+        return DepthMap(values, self.space, self.metric or prompt_m is not None)
 
     def _without_padding(self, values: Tensor, height: int, width: int) -> Tensor:
         """The map over the image's own ``(height, width)``."""
@@ -185,3 +227,10 @@ class HFDepthModel:
             values, (h + top + bottom, w + left + right), mode="bicubic", align_corners=False
         )
         return values[:, :, top : top + h, left : left + w]
+
+
+def _with_a_span(prompt_m: Tensor) -> Tensor:
+    """A prompt that is not one number everywhere, as the library makes it: its span is divided by."""
+    flat = prompt_m.float().clone()
+    flat[:, :, 0, 0] += 1e-6 * (flat.amax((1, 2, 3)) == flat.amin((1, 2, 3)))[:, None]
+    return flat

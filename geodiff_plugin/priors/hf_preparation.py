@@ -18,8 +18,10 @@ from geodiff_plugin._checks import bad_value
 __all__ = ["Preparation"]
 
 MODES = {2: "bilinear", 3: "bicubic"}  # of PIL
+#: Whose library resizes without antialiasing, or pads after normalising.
+ALIASED, PADDED_LAST = ("ZoeDepth", "DepthPro"), ("DPT", "PromptDepthAnything")
 HALF = (0.5, 0.5, 0.5)  # mean and standard deviation where the file names none
-#: Processor -> what its file leaves out; GLPN does not normalise.
+#: Processor -> what its file leaves out; GLPN and Tipsv2Dpt do not normalise.
 DEFAULTS: dict[str, dict[str, Any]] = {
     "DPT": {"size": 384, "resample": 3, "do_normalize": True, "do_pad": False},
     "ZoeDepth": {
@@ -32,6 +34,13 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     },
     "GLPN": {"size": None, "resample": 2, "do_normalize": False, "do_pad": False, "size_divisor": 32},
     "DepthPro": {"size": 1536, "resample": 2, "do_normalize": True, "do_pad": False},
+    "PromptDepthAnything": {"size": 384, "resample": 3, "do_normalize": True, "do_pad": False},
+    "Tipsv2Dpt": {
+        "size": {"height": 448, "width": 448},
+        "resample": 2,
+        "do_normalize": False,
+        "do_pad": False,
+    },
 }
 
 
@@ -102,9 +111,12 @@ class Preparation:
         return _nearest_multiple(scale_h * height, multiple), _nearest_multiple(scale_w * width, multiple)
 
     def padding(self, height: int, width: int) -> tuple[int, int, int, int]:
-        """Left, right, top, bottom zeros that DPT adds after normalising, to a multiple of a patch."""
+        """Left, right, top, bottom zeros that DPT adds after normalising, to a multiple of a patch.
+
+        Others than ``PADDED_LAST`` add none.
+        """
         divisor = self.options.get("size_divisor")
-        if self.kind != "DPT" or not self.options["do_pad"] or not divisor:
+        if self.kind not in PADDED_LAST or not self.options["do_pad"] or not divisor:
             return 0, 0, 0, 0
         rows, columns = -height % divisor, -width % divisor
         return columns // 2, columns - columns // 2, rows // 2, rows - rows // 2
@@ -127,7 +139,7 @@ class Preparation:
         if min(size) < 1:
             bad_value("image", "at least as large as a patch of the network", f"{x.shape[-1]}x{x.shape[-2]}")
         if size != tuple(x.shape[-2:]):
-            corners, antialias = self.kind == "ZoeDepth", self.kind in ("DPT", "GLPN")
+            corners, antialias = self.kind == "ZoeDepth", self.kind not in ALIASED
             x = F.interpolate(x, size, mode=self.mode, align_corners=corners, antialias=antialias)
             x = x.clamp(0.0, 1.0) if antialias else x  # the library resizes bytes, which cannot overshoot
         if self.options["do_normalize"]:

@@ -1,4 +1,4 @@
-"""What a folder of weights says of itself: its small text files, read once.
+"""The configuration files of a folder of weights, read once.
 
 Hop: folder -> ``Layout`` -> configs by component.
 Paper: none.
@@ -45,7 +45,7 @@ class Layout:
             return {}
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
-        except (json.JSONDecodeError, UnicodeDecodeError):
+        except (ValueError, RecursionError):
             content = None
         if not isinstance(content, dict):
             bad_value(str(file), "a JSON object", "something else", "Save or fetch the folder anew.")

@@ -1,4 +1,4 @@
-"""Components of a folder, strictly: every weight has a place and every place a weight.
+"""Strict loading of components: every weight has a place and every place a weight.
 
 Hop: ``Layout`` -> modules of diffusers and transformers -> pipeline.
 Paper: none.
@@ -18,11 +18,13 @@ import transformers
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.pipelines import direct_scheduler
+from geodiff_plugin.priors.reading import check_finite, reading
 
 __all__ = ["build_pipeline", "check_weights", "component_class", "load_component"]
 
 #: Keys listed in an error before it says how many more there are.
 LISTED_KEYS = 12
+CURE = "Is a file of it cut off, or of another version? Save or fetch the folder anew."
 LIBRARIES = {
     "diffusers": diffusers,
     "transformers": transformers,
@@ -60,7 +62,7 @@ def component_class(layout: Layout, name: str) -> type:
     entry = layout.index.get(name)
     library, cls = entry if isinstance(entry, list) and len(entry) == 2 else (None, None)
     found = getattr(LIBRARIES.get(library), str(cls), None)
-    if not isinstance(found, type):
+    if not isinstance(found, type) or not hasattr(found, "from_pretrained"):
         bad_value(
             f"component {name!r} in {layout.folder / 'model_index.json'}",
             "a class of diffusers or transformers",
@@ -70,7 +72,9 @@ def component_class(layout: Layout, name: str) -> type:
     return found
 
 
-def load_component(layout: Layout, name: str, cls: type, dtype: torch.dtype) -> Any:
+def load_component(
+    layout: Layout, name: str, cls: type, dtype: torch.dtype, extra: dict[str, Any] | None = None
+) -> Any:
     """One component of a folder; a module's weights are checked name by name, and it is in eval mode.
 
     Args:
@@ -78,24 +82,32 @@ def load_component(layout: Layout, name: str, cls: type, dtype: torch.dtype) -> 
         name: of the subfolder; ``""`` for the folder itself.
         cls: with ``from_pretrained``.
         dtype: of a module's weights.
+        extra: further arguments of ``from_pretrained`` (a quantisation).
 
     Raises:
-        ValueError: weights missing or left over.
-        OSError: no such files.
+        ValueError: weights missing, left over, cut off or not finite; files that cannot be read.
     """
     folder = str(layout.folder / name)
+    damaged = reading(f"component {name or 'model'!r} of {layout.name}", "one that can be read", folder, CURE)
+    # Said aloud, since transformers asks at the terminal where it is not.
+    untrusted = {"trust_remote_code": False} if cls.__module__.startswith("transformers.") else {}
     if not issubclass(cls, torch.nn.Module):
-        return cls.from_pretrained(folder, local_files_only=True)
+        with damaged:
+            return cls.from_pretrained(folder, local_files_only=True, **untrusted)
     if not any((layout.folder / name).glob("*.safetensors")):
         cure = "`geodiff convert SRC DST` once makes such a folder of .bin, .ckpt or .pth."
         bad_value(f"weights in {folder}", "safetensors", "none of them", cure)
-    options: dict[str, Any] = {"use_safetensors": True, "local_files_only": True}
+    options: dict[str, Any] = {"use_safetensors": True, "local_files_only": True} | (extra or {})
     if layout.variant is not None:
         options["variant"] = layout.variant
-    module, found = cls.from_pretrained(folder, dtype=dtype, output_loading_info=True, **options)
+    with damaged:
+        module, found = cls.from_pretrained(
+            folder, dtype=dtype, output_loading_info=True, **options, **untrusted
+        )
     if found.get("mismatched_keys"):
         check_weights((), [entry[0] for entry in found["mismatched_keys"]], folder)
     check_weights(found["missing_keys"], found["unexpected_keys"], folder)
+    check_finite(module, folder)
     return module.eval()
 
 
@@ -132,4 +144,8 @@ def build_pipeline(
             arguments[name] = entry
         elif parameter.default is parameter.empty:
             bad_value(str(layout.folder), f"a folder with the component {name!r}", "none of that name")
-    return cls(**arguments)
+    try:
+        return cls(**arguments)
+    except (AttributeError, KeyError, TypeError) as error:  # our own classes say what they refuse
+        wrong = str(error)
+    bad_value(str(layout.folder / "model_index.json"), f"the index of a {cls.__name__}", wrong, CURE)

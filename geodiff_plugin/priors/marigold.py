@@ -11,10 +11,10 @@ from diffusers import MarigoldDepthPipeline
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.metric import SPACES
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.loading import build_pipeline
 from geodiff_plugin.priors.pipelines.hooks import encode_map
+from geodiff_plugin.scale.space import SPACES
 
 __all__ = ["MarigoldPrior"]
 
@@ -26,11 +26,12 @@ class MarigoldPrior:
         pipe: the live pipeline.
 
     Raises:
-        ValueError: its ``prediction_type`` is no key of ``metric.SPACES``.
+        ValueError: its ``prediction_type`` is no key of ``SPACES``.
     """
 
     max_steps: int | None = None
     deterministic = False
+    takes_prompt = False
     latents = slice(None)
     licence = dict.fromkeys(
         (
@@ -92,3 +93,7 @@ class MarigoldPrior:
     def encode(self, x: Tensor) -> Tensor:
         """By the pipeline's VAE."""
         return encode_map(self._pipe.vae, x)
+
+    def metric_range(self, samples: slice) -> None:
+        """None: its depth is relative."""
+        return None

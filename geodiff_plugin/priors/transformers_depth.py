@@ -7,6 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.base import OwnPipelinePrior
@@ -34,6 +35,14 @@ class TransformersDepthPrior(OwnPipelinePrior):
         "vinvino02/glpn-nyu": "apache-2.0",
         "apple/DepthPro-hf": "apple-amlr",
     }
+
+    def __init__(self, pipe: TransformersDepthPipeline) -> None:
+        super().__init__(pipe)
+        self.takes_prompt = pipe.takes_prompt
+
+    def metric_range(self, samples: slice) -> tuple[Tensor, Tensor] | None:
+        """Metres of a metric model's map, or of one that was given a prompt."""
+        return None if self._pipe.own_range is None else self._pipe.own_range[samples].unbind(1)
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

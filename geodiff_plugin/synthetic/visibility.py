@@ -68,10 +68,12 @@ def in_sight(scene: Scene, views: Sequence[tuple[Camera, tuple[int, int]]], marg
         p = (scene.centre - pose[:3, 3]) @ pose[:3, :3]
         inside = p[:, 2] > -reach
         for axis, pixels in ((0, width), (1, height)):
-            focal, centre = float(K[axis, axis]), float(K[axis, 2])
-            # Distance to the two side planes, which need not be symmetric.
-            for sign, tangent in ((-1, (centre + 0.5) / focal), (1, (pixels - 0.5 - centre) / focal)):
-                inside &= (sign * p[:, axis] - tangent * p[:, 2]) / (1 + tangent**2) ** 0.5 < reach
+            # Distance to the two side planes, where the pixel coordinate is that of the edge; they need
+            # not be symmetric, nor upright where K has a skew.
+            for sign, edge in ((-1, -0.5), (1, pixels - 0.5)):
+                normal = sign * (K[axis].double() - K.new_tensor([0.0, 0.0, edge]).double())
+                normal = (normal / normal.norm()).to(p)
+                inside &= p @ normal < reach
         keep = keep | inside
     return _select(scene, keep)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin.cli import main
+from geodiff_plugin.cli.app import main
 
 
 @dataclass(frozen=True)

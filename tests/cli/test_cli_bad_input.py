@@ -14,7 +14,7 @@ def no_weights(monkeypatch):
     def load(*_args, **_kwargs):
         raise AssertionError("weights were loaded before the input was checked")
 
-    monkeypatch.setattr("geodiff_plugin.commands.depth.load_guided_prior", load)
+    monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", load)
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def refused(geodiff, pair_files):
         (["--dtype", "float64"], ["--dtype", "float16", "float64"]),
         (["--knob", "speed=9"], ["--knob", "speed=9", "inner_steps"]),
         (["--knob", "inner_steps"], ["--knob", "KNOB=VALUE"]),
-        (["--knob", "weights.smooth=1"], ["--knob", "weights.smooth"]),
+        (["--knob", "weights.smooth=1"], ["weights", "smooth"]),
         (["--knob", "inner_steps=-1"], ["inner_steps", "-1"]),
         (["--knob", "depth_range=[1,2]"], ["--near", "--far"]),
         (["--preset", "best"], ["--preset", "paper", "best"]),
@@ -195,22 +195,9 @@ def test_zero_baseline_in_a_file(refused, pair_files, textured_plane):
     refused(pair_files.command, "baseline")
 
 
-def test_distortion(refused, pair_files):
-    """A file of an unrectified rig: the images need undistorting first."""
-    entries = {
-        "M1": (3, 3, "60, 0, 31.5, 0, 60, 23.5, 0, 0, 1"),
-        "D1": (1, 5, "-0.3, 0.1, 0, 0, 0"),
-        "M2": (3, 3, "60, 0, 31.5, 0, 60, 23.5, 0, 0, 1"),
-        "D2": (1, 5, "-0.3, 0.1, 0, 0, 0"),
-        "R": (3, 3, "1, 0, 0, 0, 1, 0, 0, 0, 1"),
-        "T": (3, 1, "-0.12, 0, 0"),
-    }
-    text = "".join(
-        f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [{numbers}]\n"
-        for name, (rows, columns, numbers) in entries.items()
-    )
-    pair_files.calib.write_text("%YAML:1.0\n---\n" + text)
-    refused(pair_files.command, "ndistort")
+@pytest.mark.parametrize("typed", ["0.1", "fisheye:1,2,3", "a,b,c,d", "lens:1,2,3,4"])
+def test_distortion_that_is_none(refused, pair_files, typed):
+    refused([*pair_files.command, "--distortion", typed], "--distortion", "k1,k2,p1,p2")
 
 
 @pytest.fixture

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +12,10 @@ import torch
 from diffusers import AutoencoderKL, UNet2DConditionModel
 
 from geodiff_plugin.bundled.demo_pair import DemoPair
-from geodiff_plugin.commands.bench import Cost, PeakMemory, measure, run_bench
-from geodiff_plugin.commands.full_size import UNET, VAE
+from geodiff_plugin.cli.bench import BUNDLED, Cost, measure, run_bench
+from geodiff_plugin.development.benchmarks import full_size
+from geodiff_plugin.development.full_sizes import UNET, VAE
+from geodiff_plugin.runtime.machine import PeakMemory
 from geodiff_plugin.types import Rig
 
 
@@ -37,10 +41,9 @@ def test_measure(make_pipeline, textured_plane, tmp_path, monkeypatch, gradient)
     depth_m = textured_plane.depth_m
     rig = Rig(textured_plane.K, textured_plane.K, textured_plane.E)
     pair = DemoPair(left, right, rig, depth_m, depth_m > 0)
-    monkeypatch.setattr("geodiff_plugin.commands.bench.read_demo_pair", lambda: pair)
+    monkeypatch.setattr("geodiff_plugin.cli.bench.read_demo_pair", lambda: pair)
     monkeypatch.setattr("geodiff_plugin.priors.BUNDLED_FOLDER", tmp_path)
-    monkeypatch.setattr("geodiff_plugin.commands.bench.TIMED_CALLS", 1)
-    cost = measure(gradient, False, "cpu")
+    cost = measure(gradient, replace(BUNDLED, repeats=1), "cpu")
     assert cost.seconds > 0 and cost.peak_bytes >= 0
 
 
@@ -70,9 +73,10 @@ def test_table(monkeypatch, capsys):
         def result(self):
             return self.cost
 
-    monkeypatch.setattr("geodiff_plugin.commands.bench.ProcessPoolExecutor", Inline)
-    run_bench(False, "cpu")
-    rows = [line.split() for line in capsys.readouterr().out.splitlines()[2:]]
+    monkeypatch.setattr("geodiff_plugin.cli.bench.ProcessPoolExecutor", Inline)
+    run_bench("cpu")
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    rows = [words for words in lines if words and re.fullmatch(r"\d\.\d\d", words[-1])]
     assert [row[-4:] for row in rows] == [
         ["1.00", "100", "1.00", "1.00"],
         ["2.00", "150", "2.00", "1.50"],
@@ -81,8 +85,7 @@ def test_table(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_full_size_bench(geodiff):
+def test_full_size_bench(capsys):
     """866 M and 84 M parameters, one step at 256 px, plain and both gradients."""
-    answer = geodiff("bench", "--full-size", "--device", "cpu")
-    assert answer.code == 0
-    assert len(answer.out.splitlines()) == 5
+    full_size.main(["--device", "cpu"])
+    assert capsys.readouterr().out.count("guided") == 2

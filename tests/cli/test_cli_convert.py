@@ -11,7 +11,7 @@ import torch
 from diffusers import AutoencoderKL
 from safetensors.torch import load_file
 
-from geodiff_plugin.commands.converters.depthfm import diffusers_name, unet_config
+from geodiff_plugin.cli.converters.depthfm import diffusers_name, unet_config
 from geodiff_plugin.priors.depthfm import DepthFMPrior
 from geodiff_plugin.priors.depthmaster import DepthMasterPrior
 from geodiff_plugin.priors.layout import Layout

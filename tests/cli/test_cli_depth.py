@@ -17,12 +17,15 @@ FILES = {
     "depth.npy",
     "depth_mm.png",
     "depth.png",
+    "overview.png",
     "visible.png",
     "photometric_error.npy",
     "cloud.ply",
     "report.json",
 }
 
+
+CONFIDENCE = {"confidence.npy", "confidence.png"}
 
 #: One update of one step: for tests of everything but the depth.
 QUICK = ["--steps", 1, "--preset", "paper"]
@@ -71,15 +74,22 @@ def test_knobs_reach_the_guidance(geodiff, command, pair_files):
     answer = geodiff(*command, "--steps", 1, *knobs, "-q")
     assert answer.code == 0, answer.err
     guidance = json.loads((pair_files.folder / "geodiff-out" / "report.json").read_text())["guidance"]
-    assert guidance["inner_steps"] == 0 and guidance["search"] == "volume"
+    assert guidance["updates"]["inner_steps"] == 0 and guidance["search"]["search"] == "volume"
     assert guidance["weights"]["photometric"] == 0.5 and guidance["weights"]["matches"] == 1.0
+
+
+def test_info_lists_the_knobs(geodiff):
+    answer = geodiff("info", "--knobs")
+    assert (
+        answer.code == 0 and "  smoothness = 200" in answer.out and "  weights = photometric 1" in answer.out
+    )
 
 
 def test_writes_everything(geodiff, command, pair_files):
     answer = geodiff(*command)
     assert answer.code == 0, answer.err
     out = pair_files.folder / "geodiff-out"
-    assert {path.name for path in out.iterdir()} == FILES | {"confidence.npy"}
+    assert {path.name for path in out.iterdir()} == FILES | CONFIDENCE
     assert answer.out.count("\n") == 1 and " m to " in answer.out and "geodiff-out/" in answer.out
     assert "loss=" in answer.err
 
@@ -96,7 +106,7 @@ def test_writes_everything(geodiff, command, pair_files):
         assert figure.width > 64
 
     report = json.loads((out / "report.json").read_text())
-    assert set(report["files"]["names"]) == FILES | {"confidence.npy"}
+    assert set(report["files"]["names"]) == FILES | CONFIDENCE
     confidence = np.load(out / "confidence.npy")
     assert confidence.shape == (48, 64) and 0.0 <= confidence.min() <= confidence.max() <= 1.0
     assert report["files"]["doubtful_points"] == 0
@@ -112,14 +122,18 @@ def test_writes_everything(geodiff, command, pair_files):
     assert f"element vertex {report['files']['cloud_points']}\n".encode() in cloud
 
 
+#: So small a pair has too few matches to check its pose by, which a run says.
+GIVEN = ("--knob", "pose=given")
+
+
 def test_json_and_quiet(geodiff, command, pair_files):
-    answer = geodiff(*command, "--json", "--quiet", "--ensemble", 2, "--steps", 1, "--resolution", 32)
+    answer = geodiff(*command, "--json", "--quiet", "--ensemble", 2, "--steps", 1, "--resolution", 32, *GIVEN)
     assert (answer.code, answer.err) == (0, "")
     report = json.loads(answer.out)
     assert report == json.loads((pair_files.folder / "geodiff-out" / "report.json").read_text())
     assert report["uncertainty_median_m"] >= 0 and len(report["scale"][0]) == 2
     assert np.load(pair_files.folder / "geodiff-out" / "uncertainty.npy").shape == (48, 64)
-    again = geodiff(*command, "--quiet", "--overwrite", *QUICK)
+    again = geodiff(*command, "--quiet", "--overwrite", *QUICK, *GIVEN)
     assert (again.code, again.out, again.err) == (0, "", "")
     assert {path.name for path in (pair_files.folder / "geodiff-out").iterdir()} == FILES
 
@@ -137,7 +151,8 @@ def test_presets_and_range(geodiff, command, pair_files, preset):
     answer = geodiff(*command, "--quiet", "--json", "--steps", 1, "--preset", preset, "--near", 1, "--far", 5)
     guidance = json.loads(answer.out)["guidance"]
     assert guidance["gradient"] == ("full" if preset == "paper" else "denoised")
-    assert guidance["g_s_range" if preset == "paper" else "depth_range"] == [1.0, 5.0]
+    searched = guidance["search"]["g_s_range"] if preset == "paper" else guidance["depth_range"]
+    assert searched == [1.0, 5.0]
 
 
 def test_images_of_different_kind_and_size(geodiff, prior, pair_files, textured_plane):
@@ -170,7 +185,7 @@ def test_failing_call_writes_nothing(geodiff, command, pair_files, monkeypatch):
     def broken(*_):
         raise RuntimeError("in the middle")
 
-    monkeypatch.setattr("geodiff_plugin.commands.depth.write_maps", broken)
+    monkeypatch.setattr("geodiff_plugin.cli.depth.write_maps", broken)
     before = sorted(path.name for path in pair_files.folder.iterdir())
     with pytest.raises(RuntimeError, match="in the middle"):
         geodiff(*command, "--quiet", *QUICK)
@@ -201,7 +216,7 @@ def test_interrupt_of_a_running_process(command, pair_files):
 
 def test_help_and_version_do_not_import_torch():
     code = (
-        "import sys\nfrom geodiff_plugin.cli import main\n"
+        "import sys\nfrom geodiff_plugin.cli.app import main\n"
         "try:\n    main([sys.argv[1]])\nexcept SystemExit:\n    pass\n"
         "assert 'torch' not in sys.modules and 'diffusers' not in sys.modules"
     )
@@ -228,10 +243,10 @@ def test_demo(geodiff, prior, pair_files, monkeypatch):
     (out / "depth.npy").write_text("of an earlier run")
     (out / "uncertainty.npy").write_text("of an earlier run")
     (out / "notes.txt").write_text("somebody's own")
-    answer = geodiff("demo", "--quiet")
+    answer = geodiff("demo", "--quiet", "--overwrite")
     assert answer.code == 0, answer.err
     assert "AbsRel" in answer.out and "delta1" in answer.out and "guided" in answer.out
-    assert {path.name for path in out.iterdir()} == FILES | {"confidence.npy", "overview.png", "notes.txt"}
+    assert {path.name for path in out.iterdir()} == FILES | CONFIDENCE | {"comparison.png", "notes.txt"}
     assert np.load(out / "depth.npy").shape == (336, 448)
 
 
@@ -245,3 +260,23 @@ def test_a_cloud_of_what_is_believed(geodiff, command, pair_files):
     assert counts["cloud_points"] <= doubtful.size - doubtful.sum()
     refused = geodiff(*command, *quick, "--min-confidence", 1.5, "--out", "other")
     assert refused.code == 2 and "--min-confidence" in refused.err
+
+
+def test_points_without_a_right_image(geodiff, pair_files, prior):
+    known = np.zeros((48, 64), np.float32)
+    known[::4, ::4] = np.linspace(1.5, 3.0, 16)[None]
+    np.save(pair_files.folder / "lidar.npy", known)
+    camera = ["--fx", 60, "--fy", 60, "--cx", 31.5, "--cy", 23.5, "--points", "lidar.npy"]
+    quick = ["--prior", prior, "--steps", 1, "--device", "cpu"]
+    answer = geodiff("depth", pair_files.left, *camera, *quick, "--json", "-q")
+    assert answer.code == 0, answer.err
+    report = json.loads(answer.out)
+    names = {path.name for path in (pair_files.folder / "geodiff-out").iterdir()}
+    assert names == FILES - {"visible.png", "photometric_error.npy"} | CONFIDENCE
+    assert report["judgement"]["signs"]["points"] == 192 and report["depth"]["visible_fraction"] == 0
+    one = np.zeros((48, 64), np.float32)
+    one[20, 30] = 2.0
+    np.save(pair_files.folder / "lidar.npy", one)
+    answer = geodiff("depth", pair_files.left, *camera, *quick, "--strict", "--out", "strict")
+    assert answer.code == 2 and "One known depth does not fix" in answer.err
+    assert not (pair_files.folder / "strict").exists()

@@ -12,7 +12,7 @@ from geodiff_plugin.evaluation.baselines.sgbm import sgbm_shift
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.geometry import is_rectified
-from geodiff_plugin.pipeline import enable_geometry_guidance
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 NAN = np.nan
 

@@ -1,7 +1,7 @@
 """What every entry of DATASETS owes: found in its layout, in our conventions, with errors that name the file.
 
-The layouts are written here from docs/evaluation.md, not from the loaders; of booster and robustmvd no real
-sample was at hand, so that page is all that there is to check them by. The slow tests read real samples.
+The layouts are written here from docs/how-to/evaluation.md, not from the loaders; of booster and robustmvd no
+real sample was at hand, so that page is all that there is to check them by. The slow tests read real samples.
 """
 
 import os

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, UNet2DConditionModel
 
-from geodiff_plugin.commands.converters.depthfm import unet_config
+from geodiff_plugin.cli.converters.depthfm import unet_config
 from geodiff_plugin.priors.pipelines.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
 from tests.parity import depthfm_reference as reference

@@ -17,6 +17,11 @@ from transformers import (
     GLPNConfig,
     GLPNForDepthEstimation,
     PreTrainedModel,
+    PromptDepthAnythingConfig,
+    PromptDepthAnythingForDepthEstimation,
+    Tipsv2DptConfig,
+    Tipsv2DptForDepthEstimation,
+    Tipsv2VisionConfig,
     ZoeDepthConfig,
     ZoeDepthForDepthEstimation,
 )
@@ -105,7 +110,41 @@ def depth_pro() -> tuple[PreTrainedModel, dict[str, Any]]:
     return DepthProForDepthEstimation(config), preparation
 
 
-MODELS = {f.__name__: f for f in (depth_anything, dpt, glpn, zoedepth, depth_pro)}
+def prompt_depth_anything() -> tuple[PreTrainedModel, dict[str, Any]]:
+    """Prompt Depth Anything, which takes depths to start from."""
+    backbone = Dinov2Config(**VIT, **STAGES, mlp_ratio=2, patch_size=14, image_size=56)
+    options = {"reassemble_hidden_size": 16, "head_hidden_size": 8, "patch_size": 14}
+    config = PromptDepthAnythingConfig(
+        backbone_config=backbone, depth_estimation_type="metric", **options, **NECK
+    )
+    size = {"size": {"height": 56, "width": 56}, "keep_aspect_ratio": True, "ensure_multiple_of": 14}
+    preparation = {
+        "image_processor_type": "PromptDepthAnythingImageProcessor",
+        "resample": 3,
+        **size,
+        **IMAGENET,
+    }
+    return PromptDepthAnythingForDepthEstimation(config), preparation
+
+
+def tipsv2() -> tuple[PreTrainedModel, dict[str, Any]]:
+    """TIPSv2's depth head, metres in bins."""
+    backbone = Tipsv2VisionConfig(
+        **VIT,
+        mlp_ratio=2,
+        patch_size=14,
+        image_size=56,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=False,
+    )
+    config = Tipsv2DptConfig(backbone_config=backbone, num_depth_bins=16, **NECK)
+    preparation = {"image_processor_type": "Tipsv2DptImageProcessor", "size": {"height": 56, "width": 56}}
+    return Tipsv2DptForDepthEstimation(config), preparation
+
+
+MODELS = {
+    f.__name__: f for f in (depth_anything, dpt, glpn, zoedepth, depth_pro, prompt_depth_anything, tipsv2)
+}
 
 
 def spread(model: PreTrainedModel) -> PreTrainedModel:

@@ -5,20 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.denoising import NoiseLevel, noise_from, output_from, z0_from
+from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_from, z0_from
+from geodiff_plugin.algorithm.objective import FurtherView, Objective, Views
+from geodiff_plugin.algorithm.terms import MatchTarget
 from geodiff_plugin.geometry.projection import plane_rays
-from geodiff_plugin.metric import AffineState, MetricMap
-from geodiff_plugin.objective import Objective, RightViews, Views
+from geodiff_plugin.guidance.config import TermsConfig
 from geodiff_plugin.priors.marigold import MarigoldPrior
-from geodiff_plugin.terms import MatchTarget
+from geodiff_plugin.scale.space import AffineState, MetricMap
 
-OPTIONS = {
-    "eta": 0.85,
-    "pyramid_levels": 2,
-    "exposure": True,
-    "pull_to": "zero",
-    "points_loss": "robust",
-}
+SETTINGS = TermsConfig(pyramid_levels=2, pull_to="zero", min_visible=0.0)
 WEIGHTS = {"photometric": 1.0, "matches": 0.3, "points": 0.1, "prior_pull": 0.01, "anchor": 0.2}
 
 
@@ -31,25 +26,26 @@ def views_of(pair):
     K, T = double(pair.K)[None], torch.linalg.inv(double(pair.E))[None]
     below = T.clone()
     below[:, 1, 3] = -0.1
-    rights = tuple(RightViews(right, K, pose, plane_rays(K, K, pose, (48, 64))) for pose in (T, below))
+    rights = tuple(FurtherView(right, K, pose, plane_rays(K, K, pose, (48, 64))) for pose in (T, below))
     known = torch.zeros(1, 1, 48, 64, dtype=torch.float64)
     known[..., ::7, ::5] = 1.0
     points = MatchTarget(known / double(pair.depth_m), known, double([0.005]))
-    return Views(left, K, rights, points=points)
+    return Views(left, K, rights), points
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity", "log", "sqrt_disparity"])
 def test_whole_chain_against_finite_differences(make_pipeline, textured_plane, space):
     pipe = make_pipeline().to(torch.float64)
     prior = MarigoldPrior(pipe)
-    objective = Objective(views_of(textured_plane), MetricMap(space), WEIGHTS, OPTIONS, 0.0)
+    views, points = views_of(textured_plane)
+    objective = Objective(views, MetricMap(space), WEIGHTS, SETTINGS)
     generator = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
     condition, z_t = draw(1, 4, 24, 32), draw(1, 4, 24, 32)
     text = draw(1, 2, 8)
     level = NoiseLevel(double(0.6), double(0.8), "v_prediction")
     near, far = torch.tensor([1.3]), torch.tensor([3.1])
-    start = objective.metric.from_range(*((near, far) if space in ("depth", "log") else (far, near)))
+    start = objective.metric.from_range(near, far)
     start = AffineState(double(start.s_hat), double(start.t_hat), double(start.g_s))
     matches = MatchTarget(
         1.0 / double(textured_plane.depth_m)[None, None],
@@ -64,7 +60,7 @@ def test_whole_chain_against_finite_differences(make_pipeline, textured_plane, s
         ]
         z0 = z0_from(output, z, level)
         affine = AffineState(s_hat, t_hat, start.g_s)
-        return objective(prior.decode(z0), affine, start, z0, anchor, matches).total.sum()
+        return objective(prior.decode(z0), affine, start, z0, anchor, matches, points).total.sum()
 
     inputs = [
         z_t.requires_grad_(),

@@ -42,7 +42,7 @@ def pair(textured_plane, tmp_path) -> list[str]:
 
 
 def test_every_example_is_tested():
-    tested = {"depth_from_stereo", "posed_photographs", "swap_prior"}
+    tested = {"depth_from_stereo", "marigold_v2", "posed_photographs", "swap_prior"}
     assert {path.stem for path in EXAMPLES.glob("*.py")} == tested
 
 
@@ -52,6 +52,14 @@ def test_depth_from_stereo(prior, pair, tmp_path, monkeypatch, capsys):
     load(EXAMPLES / "depth_from_stereo.py").main(arguments)
     assert "median" in capsys.readouterr().out
     assert (np.load("depth.npy") > 0).all() and Path("depth.png").stat().st_size > 0
+
+
+def test_marigold_v2_without_weights(pair, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    load(EXAMPLES / "marigold_v2.py").main(pair)
+    said = capsys.readouterr().out
+    assert "random weights" in said and "affine in log depth" in said and "median" in said
+    assert (np.load("marigold_v2.npy") > 0).all()
 
 
 def test_swap_prior(prior, pair, tmp_path, monkeypatch, capsys):

@@ -23,8 +23,7 @@ from geodiff_plugin import (
     disable_geometry_guidance,
     enable_geometry_guidance,
 )
-from geodiff_plugin import algorithm as algorithm_module
-from geodiff_plugin.updates import RULES
+from geodiff_plugin.algorithm.rules import RULES
 from tests.conftest import SCHEDULER, plane_pair
 
 FAST = {"inner_steps": 2, "min_steps": 1, "loss_resolution": 64}
@@ -90,7 +89,7 @@ def test_the_pipeline_is_left_as_it_was(make_pipeline, textured_plane, left, gra
     scheduler = pipe.scheduler
     pipe(left, guidance=guidance_for(textured_plane, gradient=gradient), generator=seeded())
     assert pipe.scheduler is scheduler and not {"step", "set_timesteps"} & set(vars(scheduler))
-    assert not pipe.unet._diffusers_hook.hooks if hasattr(pipe.unet, "_diffusers_hook") else True
+    assert "forward" not in vars(pipe.unet) and not hasattr(pipe.unet, "_diffusers_hook")
     assert not pipe.unet.conv_in.weight.requires_grad and pipe.unet.conv_out.weight.requires_grad
     assert all(p.grad is None for p in pipe.unet.parameters())
     assert_same(stock(pipe, left), reference)
@@ -152,18 +151,19 @@ def test_outside_start_and_stop_nothing_is_updated(make_pipeline, textured_plane
     ],
 )
 def test_updates_wait_for_the_corrections(make_pipeline, textured_plane, left, monkeypatch, knobs, updates):
-    made = []
+    made = [0]
 
-    def counted(*args):
-        made.append(args[-1])
-        return update(*args)
+    class Counted(RULES["adam"]):
+        def step(self, gradient, *args):
+            made[-1] += gradient.ndim == 4
+            return super().step(gradient, *args)
 
-    update = algorithm_module._update
-    monkeypatch.setattr(algorithm_module, "_update", counted)
+    monkeypatch.setitem(RULES, "counted", Counted)
     pipe = enable_geometry_guidance(make_pipeline())
-    guidance = guidance_for(textured_plane, **knobs)
-    pipe(left, guidance=guidance, generator=seeded(), num_inference_steps=4)
-    assert made == updates
+    guidance = guidance_for(textured_plane, rule="counted", **knobs)
+    call = {"generator": seeded(), "num_inference_steps": 4}
+    pipe(left, guidance=guidance, callback_on_step_end=lambda *_: made.append(0), **call)
+    assert made[:-1] == updates
 
 
 def test_one_update_of_the_paper_is_algorithm_1(make_pipeline, textured_plane, left):

@@ -1,6 +1,6 @@
 """Run the authors' own code of E2E-FT on tiny networks with named weights; keep slices of what it computes.
 
-``docs/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
 
     python -m tests.parity.e2e_ft_reference --authors diffusion-e2e-ft/Marigold \
         --out tests/parity/fixtures/e2e_ft.npz

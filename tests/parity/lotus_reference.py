@@ -1,6 +1,6 @@
 """Run Lotus' own code on tiny networks with named weights, and keep slices of what it computes.
 
-``docs/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
 
     python -m tests.parity.lotus_reference --authors Lotus --out tests/parity/fixtures/lotus.npz
 

@@ -1,6 +1,6 @@
 """Run the authors' Pixel-Perfect Depth on named weights, and keep slices of what it answers.
 
-``docs/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
 
     python -m tests.parity.ppd_reference --authors pixel-perfect-depth --out tests/parity/fixtures/ppd.npz
 

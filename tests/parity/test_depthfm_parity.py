@@ -11,7 +11,7 @@ import torch
 from diffusers import AutoencoderKL
 from PIL import Image
 
-from geodiff_plugin.commands.convert import run_convert
+from geodiff_plugin.cli.convert import run_convert
 from geodiff_plugin.priors.depthfm import DepthFMPrior
 from geodiff_plugin.priors.layout import Layout
 from tests.parity.depthfm_reference import HPARAMS, NOISING_STEP, STEPS, VAE, image_u8, noise, prompt
@@ -40,7 +40,7 @@ def pipe(theirs, tmp_path_factory):
     }
     torch.save(checkpoint, folder / "depthfm.ckpt")
     fill(AutoencoderKL(**VAE), "vae.").save_pretrained(folder / "vae")
-    run_convert(folder / "depthfm.ckpt", folder / "converted", str(folder / "vae"))
+    run_convert([folder / "depthfm.ckpt", folder / "converted"], str(folder / "vae"))
     layout = Layout(folder / "converted", "converted")
     assert DepthFMPrior.recognises(layout) and layout.licence == "mit"
     pipe = DepthFMPrior.load(layout, torch.float32, None)

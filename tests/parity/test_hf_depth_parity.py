@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+from types import ModuleType, SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from transformers import DPTImageProcessorPil, GLPNImageProcessorPil
+from transformers.models.prompt_depth_anything.image_processing_pil_prompt_depth_anything import (
+    PromptDepthAnythingImageProcessorPil,
+)
 from transformers.models.zoedepth.image_processing_pil_zoedepth import ZoeDepthImageProcessorPil
 
 from geodiff_plugin.priors.hf_depth import HFDepthModel
@@ -22,6 +29,9 @@ PROCESSORS = {
     "zoedepth": ZoeDepthImageProcessorPil(size={"height": 64, "width": 96}, ensure_multiple_of=32),
     "zoedepth as it comes": ZoeDepthImageProcessorPil(),
     "zoedepth without border": ZoeDepthImageProcessorPil(do_pad=False),
+    "prompt depth anything": PromptDepthAnythingImageProcessorPil(
+        size={"height": 70, "width": 70}, **PATCH_OF_14, **IMAGENET
+    ),
 }
 ROUNDING = 1.2 / 255  # half a grey level after either axis, and the second one overshoots
 
@@ -61,3 +71,43 @@ def test_map(kind, photograph):
     ours = HFDepthModel(model, preparation)(as_tensor(photograph), size=photograph.shape[:2])
     assert theirs.std() > 0
     torch.testing.assert_close(ours.values[0, 0], theirs, rtol=0, atol=1e-6)
+
+
+def theirs_without_torchvision(kind: str, monkeypatch):
+    """A processor's class out of a module that imports torchvision, of which its ending needs nothing."""
+    for name in ("torchvision", "torchvision.transforms", "torchvision.transforms.v2"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    sys.modules["torchvision.transforms.v2"].functional = SimpleNamespace()
+    path = f"transformers.models.{kind}.image_processing_{kind}"
+    monkeypatch.delitem(sys.modules, path, raising=False)
+    module = importlib.import_module(path)
+    modes = {2: SimpleNamespace(value="bilinear"), 3: SimpleNamespace(value="bicubic")}
+    monkeypatch.setattr(module, "pil_torch_interpolation_mapping", modes, raising=False)
+    monkeypatch.delitem(sys.modules, path)
+    return next(v for k, v in vars(module).items() if k.lower() == kind.replace("_", "") + "imageprocessor")
+
+
+@pytest.mark.parametrize(
+    ("kind", "library"),
+    [
+        ("depth_pro", "depth_pro"),
+        ("prompt_depth_anything", "prompt_depth_anything"),
+        ("tipsv2", "tipsv2_dpt"),
+    ],
+)
+@torch.no_grad()
+def test_metres_by_the_librarys_own_ending(kind, library, photograph, monkeypatch):
+    torch.manual_seed(0)
+    model, config = MODELS[kind]()
+    spread(model)
+    preparation, told = Preparation.from_config(config), {}
+    if kind == "prompt_depth_anything":
+        told["prompt_depth"] = torch.rand(1, 1, 12, 16) * 3 + 1
+    output = model(pixel_values=preparation(as_tensor(photograph)), **told)
+    ending = theirs_without_torchvision(library, monkeypatch).post_process_depth_estimation
+    theirs = ending(SimpleNamespace(resample=2), output, [photograph.shape[:2]])[0]["predicted_depth"]
+    ours = HFDepthModel(model, preparation)(
+        as_tensor(photograph), photograph.shape[:2], told.get("prompt_depth")
+    )
+    assert theirs.std() > 0
+    torch.testing.assert_close(ours.metres()[0, 0], theirs, rtol=1e-5, atol=1e-5)

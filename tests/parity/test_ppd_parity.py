@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.commands.convert import run_convert
+from geodiff_plugin.cli.convert import run_convert
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
 from geodiff_plugin.priors.pipelines.ppd import AreaImageProcessor, sampling_timesteps, semantic_tokens
@@ -40,7 +40,7 @@ def folder(tmp_path_factory):
     head = {"depth_head.projects.0.bias": torch.zeros(3)}  # in the file, and no part of the encoder
     torch.save(checkpoint_of_theirs(), folder / "ppd.pth")
     torch.save(named_state(reference.semantic_shapes()) | head, folder / "depth_anything_v2_vitl.pth")
-    run_convert(folder / "ppd.pth", folder / "converted", str(folder / "depth_anything_v2_vitl.pth"))
+    run_convert([folder / "ppd.pth", folder / "converted"], str(folder / "depth_anything_v2_vitl.pth"))
     return folder
 
 
@@ -105,7 +105,7 @@ def test_weights_that_do_not_fit_are_listed(folder, tmp_path):
     encoder = str(folder / "depth_anything_v2_vitl.pth")
     message = "missing: blocks.1.mlp.fc2.bias; unexpected: blocks.0.attn.extra"
     with pytest.raises(ValueError, match=re.escape(message)):
-        run_convert(tmp_path / "ppd.pth", tmp_path / "out", encoder)
+        run_convert([tmp_path / "ppd.pth", tmp_path / "out"], encoder)
 
 
 def test_an_encoder_that_lacks_weights_is_refused(folder, tmp_path):
@@ -115,10 +115,10 @@ def test_an_encoder_that_lacks_weights_is_refused(folder, tmp_path):
     state = named_state(shapes)
     torch.save(state, tmp_path / "encoder.pth")
     with pytest.raises(ValueError, match="layer_scale1"):
-        run_convert(folder / "ppd.pth", tmp_path / "out", str(tmp_path / "encoder.pth"))
+        run_convert([folder / "ppd.pth", tmp_path / "out"], str(tmp_path / "encoder.pth"))
 
 
 def test_without_an_encoder_the_error_says_which(folder, tmp_path):
     with pytest.raises(ValueError, match="Depth-Anything-V2-Large-hf"):
-        run_convert(folder / "ppd.pth", tmp_path / "out", None)
+        run_convert([folder / "ppd.pth", tmp_path / "out"], None)
     assert not (tmp_path / "out").exists()

@@ -13,8 +13,8 @@ from diffusers import (
     LCMScheduler,
 )
 
-from geodiff_plugin.denoising import noise_from, output_from, z0_from
-from geodiff_plugin.integration.schedulers import check_scheduler, noise_level, trailing_timesteps
+from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
+from geodiff_plugin.runtime.noise_levels import check_scheduler, noise_level, trailing_timesteps
 
 BETAS = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012}
 TYPES = ["epsilon", "v_prediction", "sample"]

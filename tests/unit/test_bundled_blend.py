@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from geodiff_plugin.bundled import PRIOR_FOLDER
-from geodiff_plugin.bundled.blend import blend, main
-from geodiff_plugin.bundled.models import open_pipeline, save_prior
+from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.development.training.blend import blend, main
+from geodiff_plugin.development.training.models import save_prior
 
 
 @pytest.fixture(scope="module")

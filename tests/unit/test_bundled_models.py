@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from geodiff_plugin.bundled import models, schedule
-from geodiff_plugin.bundled.state import Average, Progress, restore, store
+from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.development.training import models, schedule
+from geodiff_plugin.development.training.state import Average, Progress, restore, store
 
 
 def test_parts_fit_into_sixteen_megabytes_of_float16():
@@ -101,7 +102,7 @@ def test_saved_folder_loads_silently_and_keeps_its_card(tmp_path, capfd):
     folder = models.save_prior(pipeline, tmp_path / "prior")
     (folder / "README.md").write_text("card")
     models.save_prior(pipeline, folder)
-    again = models.open_pipeline(folder)
+    again = open_pipeline(folder)
     assert (folder / "README.md").read_text() == "card"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["prior"]
     assert (again.default_denoising_steps, again.default_processing_resolution) == (2, 96)

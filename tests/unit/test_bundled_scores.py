@@ -7,9 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.bundled import validate
-from geodiff_plugin.bundled.benchmark import seconds_per_call
-from geodiff_plugin.bundled.evaluate import best_constant, best_plane
+from geodiff_plugin.development.benchmarks.bundled_prior import seconds_per_call
+from geodiff_plugin.development.training import validate
+from geodiff_plugin.development.training.evaluate import best_constant, best_plane
 
 
 def _ramp(seed: int = 0, size: tuple[int, int] = (12, 18)) -> np.ndarray:

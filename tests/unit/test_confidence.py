@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
-from geodiff_plugin.confidence import depth_confidence
+from geodiff_plugin.runtime.confidence import BY_EVIDENCE, SIGNS, depth_confidence, depth_evidence
 
 
 def _maps(*values: float) -> torch.Tensor:
@@ -25,6 +26,18 @@ def test_falls_with_photometric_error_where_a_camera_sees():
     assert found[0] > found[1] > found[2]
     unseen = depth_confidence(support, error, ~SEEN, None).flatten()
     assert unseen[0] == unseen[2]
+
+
+@pytest.mark.parametrize("support", [0.0, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("error", [0.0, 0.05, 1.0])
+def test_not_being_in_view_never_raises_it(support, error):
+    """Whatever the error says; by the form, with any coefficients of the signs that a refit may give."""
+    maps = _maps(*[support] * 3), _maps(*[error] * 3)
+    assert bool((depth_confidence(*maps, ~SEEN, None) <= depth_confidence(*maps, SEEN, None)).all())
+    seen, unseen = (depth_evidence(*maps, visible, None) for visible in (SEEN, ~SEEN))
+    signs = torch.tensor(SIGNS).view(1, -1, 1, 1)
+    assert bool((signs * (seen - unseen) >= 0).all()) and bool((seen - unseen)[:, 0].eq(0).all())
+    assert all(sign * value >= 0 for sign, value in zip(SIGNS, BY_EVIDENCE, strict=True))
 
 
 def test_falls_with_the_spread_of_an_ensemble():

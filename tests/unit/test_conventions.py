@@ -1,10 +1,12 @@
-"""Every line of docs/conventions.md that can be tested, one test a line."""
+"""Every line of docs/reference/conventions.md that can be tested, one test a line."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin import geometry as g
 
 F, B, Z = 40.0, 0.12, 2.0
@@ -84,3 +86,46 @@ def test_convention_doffs_is_the_difference_of_principal_points():
     uv, _ = uv_of(rig(x=B), K_right=g.pad_intrinsics(K, left=3))
     disparity = 20 - uv[0, 5, 20, 0].item()
     assert F * B / (disparity + doffs) == pytest.approx(Z, rel=1e-5)
+
+
+def _cameras():
+    """Two camera matrices that differ, and the world poses of two cameras 0.12 m apart."""
+    K_left, K_right = np.array(K[0]), np.array(K[0])
+    K_right[0, 2] += 3.0
+    E_left = np.eye(4)
+    E_left[:3, 3] = 1.0, -2.0, 0.5
+    right = np.eye(4)
+    right[0, 3] = B
+    return (K_left, K_right), (E_left, E_left @ right)
+
+
+def test_convention_tuple_is_left_and_right_and_poses_are_camera_to_world():
+    cameras, poses = _cameras()
+    (rig,) = GeometryGuidance(np.zeros((*(2 * side for side in SIZE), 3), np.float32), cameras, poses).rigs
+    assert rig.K_right[0, 2] - rig.K_left[0, 2] == pytest.approx(3.0)
+    assert rig.E[0, 3] == pytest.approx(B, abs=1e-6) and rig.T_right_from_left[0, 3] == pytest.approx(
+        -B, abs=1e-6
+    )
+
+
+def test_convention_masks_are_boolean_and_nothing_is_nan():
+    depth_m = torch.full((1, 1, *SIZE), Z)
+    depth_m[..., :4] = 0.01  # leaves the right image
+    warped = g.warp_right_to_left(torch.rand(1, 3, *SIZE), depth_m, K, K, rig(x=B, z=0.5))
+    assert warped.visible.dtype == torch.bool and 0 < warped.visible.float().mean() < 1
+    assert all(torch.isfinite(values).all() for values in (warped.image, warped.uv, warped.z_right))
+
+
+def test_convention_lists_and_dtypes(make_pipeline, textured_plane):
+    """One entry of a list per image of a batch; networks in bfloat16, all that has metres in float32."""
+    assert torch.tensor(761.0).bfloat16() == 760 or torch.tensor(761.0).bfloat16() == 762
+    plane = textured_plane
+    pipe = enable_geometry_guidance(make_pipeline().to(torch.bfloat16))
+    guidance = GeometryGuidance([plane.right] * 2, [plane.K] * 2, [plane.E] * 2, inner_steps=1)
+    out = pipe([plane.left] * 2, guidance=guidance, num_inference_steps=1, output_type="pt")
+    assert pipe.unet.dtype == pipe.vae.dtype == torch.bfloat16
+    assert out.prediction.shape[0] == 2 and out.prediction.dtype == torch.float32
+    for report in out.history:
+        assert {x.dtype for x in (report.loss, report.s_hat, report.t_hat, report.g_s)} == {torch.float32}
+    for values in (out.scale, out.shift, out.global_scale):
+        assert values.dtype == torch.float32

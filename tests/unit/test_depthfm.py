@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.denoising import z0_from
-from geodiff_plugin.integration.schedulers import noise_level
-from geodiff_plugin.priors.pipelines.depthfm import SidesOf64, cosine_alpha_bar
+from geodiff_plugin.algorithm.denoising import z0_from
+from geodiff_plugin.priors.pipelines.depthfm import SIDE, cosine_alpha_bar
+from geodiff_plugin.priors.pipelines.sides import SidesOf
+from geodiff_plugin.runtime.noise_levels import noise_level
 from tests.contracts.tiny_depthfm import make_depthfm
 
 
@@ -34,14 +35,14 @@ def image():
     ],
 )
 def test_sides_are_multiples_of_64(size, resolution, grid):
-    out, padding, native = SidesOf64().preprocess(torch.rand(1, 3, *size), resolution)
+    out, padding, native = SidesOf(SIDE).preprocess(torch.rand(1, 3, *size), resolution)
     assert tuple(out.shape[-2:]) == grid and padding == (0, 0) and tuple(native) == size
     assert -1 <= out.min() < -0.5 and 0.5 < out.max() <= 1
 
 
 def test_an_image_that_fits_is_not_touched():
     image = torch.rand(1, 3, 64, 128)
-    torch.testing.assert_close(SidesOf64().preprocess(image, 128)[0], image * 2 - 1, rtol=0, atol=0)
+    torch.testing.assert_close(SidesOf(SIDE).preprocess(image, 128)[0], image * 2 - 1, rtol=0, atol=0)
 
 
 def test_time_runs_from_0_to_1_and_the_sign_is_the_schedulers(pipe):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -10,8 +11,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from geodiff_plugin.cli.eval.app import eval_app
 from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
-from geodiff_plugin.evaluation.cli import eval_app
 from geodiff_plugin.evaluation.datasets import DATASETS
 from geodiff_plugin.formats import write_pfm
 
@@ -43,7 +44,7 @@ def test_pairs_writes_every_table_and_prints_it(data, tmp_path):
     out, page = tmp_path / "out", tmp_path / "docs" / "results.md"
     result = invoke("pairs", data, "--methods", "sgbm", "--out", out, "--results", page)
     assert result.exit_code == 0
-    assert "| middlebury2014/one |" in result.stdout and "mean of 2 pairs" in result.stdout
+    assert "middlebury2014/one" in result.stdout and "mean of 2 pairs" in result.stdout
     assert page.read_text() == (out / "table.md").read_text()
     assert f"geodiff eval pairs {data} --methods sgbm" in page.read_text()
     assert r"\toprule" in (out / "table.tex").read_text()
@@ -84,11 +85,11 @@ def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
     np.save(maps / "middlebury2014_one.npy", np.full((48, 144), SHIFT, np.float32))
     words = ("pairs", data, "--methods", f"files:disparity:{maps}", "--scenes", "one", "-o", tmp_path / "out")
     result = invoke(*words, "--crop", "eigen", "--prior", "one", "--prior", "two", "--space", "disparity")
-    assert "| middlebury2014/one | 0.000 |" in result.stdout and "RAFT-Stereo" in result.stdout
+    assert re.search(r"middlebury2014/one +0\.000\n", result.stdout) and "RAFT-Stereo" in result.stdout
     assert "--crop eigen --prior one --prior two --space disparity" in result.stdout
     assert "the crop 'eigen'" in result.stdout and "--seeds" not in result.stdout
     seeded = invoke(*words, "--seed", 2, "--seeds", 3).stdout
-    assert "--seeds 3 --seed 2" in seeded and "# Spread" not in seeded
+    assert "--seeds 3 --seed 2" in seeded and "Spread" not in seeded
     assert "Every table but the spread over 3 seeds is of seed 2." in seeded
     with pytest.raises(ValueError, match="crop must be one of"):
         invoke(*words, "--crop", "middle")
@@ -105,9 +106,9 @@ def test_pairs_goes_on_after_a_broken_sample_on_request(data, tmp_path):
 
 def test_list_tells_what_is_there(data):
     found = invoke("list", "--data", data).stdout
-    assert "middlebury2014  2 samples" in found and "kitti2015       not found" in found
+    assert re.search(r"middlebury2014 +2 samples", found) and re.search(r"kitti2015 +not found", found)
     assert "https://" in found and "guided" in found and "files:..." in found
-    assert "synthetic       any number of samples" in found
+    assert re.search(r"synthetic +any number of samples", found)
     assert all(name in found for name in (*DATASETS, *METHODS, *FAMILIES))
     assert "no --data given" in invoke("list").stdout
 

@@ -7,9 +7,10 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from geodiff_plugin.algorithm.terms import TERMS, Term
+from geodiff_plugin.cli.eval.app import eval_app
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings
 from geodiff_plugin.evaluation.baselines._guidance import call_arguments
-from geodiff_plugin.evaluation.cli import eval_app
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.exposure import exposed_ref
 from geodiff_plugin.evaluation.figures import FIGURES
@@ -25,7 +26,8 @@ from geodiff_plugin.evaluation.figures.clouds import SHRINK, orbit, render_cloud
 from geodiff_plugin.evaluation.figures.gs_sweep import sweep_g_s
 from geodiff_plugin.evaluation.figures.terms import term_by_term
 from geodiff_plugin.formats import write_depth_npy
-from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.guidance.config import DEFAULT_WEIGHTS
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 
 
 @pytest.fixture
@@ -122,26 +124,27 @@ def tiny_settings(make_pipeline, tmp_path):
     return Settings(prior=str(tmp_path / "prior"), steps=2, resolution=64)
 
 
-def test_terms_shows_the_guided_method_and_what_it_started_from(plane_sample, tiny_settings):
+def test_terms_shows_the_guided_method_and_what_it_started_from(plane_sample, tiny_settings, monkeypatch):
     priors = PriorCache()
     parts = term_by_term(plane_sample, tiny_settings, priors)
     guided = METHODS["guided"].run(plane_sample, tiny_settings, priors)
     np.testing.assert_array_equal(parts.final_m, guided.depth_m)
     np.testing.assert_array_equal(parts.confidence, guided.confidence)
-    # The call itself doubted the same matches at its own first estimate.
-    trajectories = []
+    # The call itself rejected the same matches at its own first estimate.
+    used = []
 
-    def keep(pipe, *_):
-        trajectories.append(pipe._guided_run.trajectories[-1])
+    def spy(estimate):
+        used.append(estimate.matches.confidence)
+        return 0.0 * estimate.z0.flatten(1).mean(1)
 
+    monkeypatch.setitem(TERMS, "spy", Term(spy, needs_matches=True))
     views = plane_sample.right, (plane_sample.K_left, plane_sample.K_right), plane_sample.E
     priors.get(tiny_settings)(
         Image.fromarray(plane_sample.left),
-        guidance=GeometryGuidance(*views),
-        callback_on_step_end=keep,
+        guidance=GeometryGuidance(*views, weights=DEFAULT_WEIGHTS | {"spy": 1.0}),
         **call_arguments(tiny_settings),
     )
-    own = trajectories[0].belief * trajectories[0].objective.views.matches.confidence
+    own = used[0]
     let_in = np.nan_to_num(parts.believed) > 0
     assert let_in.mean() > 0.3
     np.testing.assert_allclose(parts.believed[let_in], own[0, 0].numpy()[let_in], atol=1e-3)

@@ -1,6 +1,7 @@
 """Methods beside guidance: maps made elsewhere, depth models of transformers, guidance without a network."""
 
 import json
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from PIL import Image
 from transformers import DPTConfig, DPTForDepthEstimation, GLPNConfig, GLPNForDepthEstimation
 
+from geodiff_plugin.algorithm.objective import Objective
 from geodiff_plugin.evaluation.baselines import (
     FAMILIES,
     METHODS,
@@ -19,12 +21,13 @@ from geodiff_plugin.evaluation.baselines import (
     no_diffusion,
 )
 from geodiff_plugin.evaluation.baselines._constant import constant_method
+from geodiff_plugin.evaluation.baselines._guidance import guided_prediction
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm_png, write_pfm
-from geodiff_plugin.guidance import GeometryGuidance
-from geodiff_plugin.objective import Objective
-from geodiff_plugin.pipeline import enable_geometry_guidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.scale.space import SPACES
 
 SHAPE = (32, 48)
 
@@ -113,6 +116,22 @@ def test_samples_without_a_map_and_posed_disparity_do_not_apply(tmp_path):
     np.save(tmp_path / "folder_mine.npy", np.ones(SHAPE))
     with pytest.raises(NotApplicable, match="not rectified"):
         run(f"files:disparity:{tmp_path}", make_sample(rectified=False))
+
+
+@pytest.mark.parametrize("space", ["log", "log1p", "sqrt_disparity"])
+def test_guided_metres_are_aligned_in_the_space_of_the_prior(make_pipeline, space):
+    """A map that is right up to scale and shift in the prior's space is right once it is aligned."""
+    sample = make_sample()
+    pipe = enable_geometry_guidance(make_pipeline(prediction_type=space))
+    guidance = GeometryGuidance.search_only(
+        sample.right, (sample.K_left, sample.K_right), sample.E, min_steps=1
+    )
+    prediction = guided_prediction(pipe, sample, guidance, {"num_inference_steps": 1})
+    assert prediction.space == space
+    value = torch.from_numpy(SPACES[space].inverse(torch.from_numpy(sample.depth_m).double()).numpy())
+    stretched = SPACES[space].forward(1.7 * value + 0.2, torch.ones((), dtype=torch.float64)).numpy()
+    record = score(sample, replace(prediction, depth_m=stretched), None)["all_pixels"]
+    assert record["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6) and record["raw"]["abs_rel"] > 0.1
 
 
 def test_bad_folders_of_maps_are_named(tmp_path):

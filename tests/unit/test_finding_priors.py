@@ -89,7 +89,7 @@ def test_not_refused(name):
 
 def test_unknown_folders_say_what_to_do(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"without model_index.json.*docs/priors.md"):
+    with pytest.raises(ValueError, match=r"without model_index.json.*docs/reference/priors.md"):
         find_prior(tmp_path / "empty")
     (tmp_path / "empty" / "depthfm-v1.ckpt").touch()
     with pytest.raises(ValueError, match="geodiff convert SRC DST"):

@@ -484,3 +484,22 @@ def test_read_matrix_errors(tmp_path):
     (tmp_path / "cut.npy").write_bytes((tmp_path / "words.npy").read_bytes()[:40])
     with pytest.raises(ValueError, match="numpy cannot load"):
         read_matrix(tmp_path / "cut.npy", "K")
+
+
+def test_opencv_json_is_read_as_its_yaml(tmp_path):
+    """What its FileStorage writes by the suffix; older versions write 1. where JSON wants 1.0."""
+    cv2 = pytest.importorskip("cv2")
+    P = {name: np.diag([500.5, 500.5, 1.0]) @ np.eye(3, 4) for name in ("P1", "P2")}
+    P["P2"][0, 3] = -60.06
+    for suffix in ("json", "yml"):
+        storage(cv2, tmp_path / f"x.{suffix}", **P, image_width=640, image_height=480)
+    old = tmp_path / "old.json"
+    old.write_text((tmp_path / "x.json").read_text().replace("0.0,", "0.,"))
+    rigs = [read_calibration(path) for path in (tmp_path / "x.json", tmp_path / "x.yml", old)]
+    for rig in rigs:
+        assert rig.size_left == (640, 480) and rig.E[0, 3] == pytest.approx(0.12)
+        np.testing.assert_array_equal(rig.K_left, rigs[0].K_left)
+    for broken in ('{"a": {"type_id": "opencv-matrix"}}', '{"opencv-matrix": ', '["opencv-matrix"]'):
+        old.write_text(broken)
+        with pytest.raises(ValueError, match="must be"):
+            read_calibration(old)

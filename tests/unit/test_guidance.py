@@ -1,57 +1,48 @@
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.guidance import presets
+from geodiff_plugin.guidance.config import GuidanceConfig
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
 E = np.eye(4)
 E[0, 3] = 0.12
 RIGHT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
 changed_K = np.array([[60.0, 0, 900.0], [0, 60.0, 23.5], [0, 0, 1]])
-HYPERPARAMETERS = {
-    "gradient",
-    "rule",
-    "step_latents",
-    "inner_steps",
-    "weights",
-    "depth_range",
-    "g_s_range",
-    "gate",
-}
 
 
-def test_positional_construction_registers_hyperparameters_and_only_them():
+def test_knobs_are_leaves_of_the_configuration(tmp_path):
+    guidance = GeometryGuidance(RIGHT, K, E, inner_steps=10, smoothness=5.0)
+    assert guidance.config == presets.DEFAULT.changed(inner_steps=10, smoothness=5.0)
+    assert GeometryGuidance(RIGHT, K, E, config=presets.PAPER).config == presets.PAPER
+    guidance.config.save(tmp_path / "guidance.json")
+    again = GeometryGuidance(RIGHT, K, E, config=GuidanceConfig.load(tmp_path / "guidance.json"), eta=0.5)
+    assert again.config == guidance.config.changed(eta=0.5)
+
+
+def test_what_is_left_open_is_settled_for_what_is_given():
+    points = np.array([[0.0, 0.0, 2.0]])
     guidance = GeometryGuidance(RIGHT, K, E)
-    assert HYPERPARAMETERS <= set(guidance.config)
-    assert not {"right", "K", "E"} & set(guidance.config)
-    assert guidance.config.gradient == "denoised"
-    json.loads(guidance.to_json_string())
+    assert guidance.config.updates.inner_steps is None and guidance.updates.inner_steps == 0
+    assert guidance.as_run().updates.inner_steps == 0
+    only_points = {"weights": {"points": 1.0, "photometric": 1.0}}
+    assert GeometryGuidance(RIGHT, K, E, **only_points).updates.inner_steps == 40
+    assert GeometryGuidance(RIGHT, K, E, points=points, **only_points).updates.inner_steps == 0
 
 
-def test_save_and_load(tmp_path):
-    guidance = GeometryGuidance(
-        RIGHT, K, E, inner_steps=3, depth_range=(0.5, 9.0), weights={"photometric": 2.0}
-    )
-    guidance.save_config(tmp_path)
-    config = GeometryGuidance.load_config(tmp_path)
-    again = GeometryGuidance.from_config(config, right=RIGHT, K=K, E=E)
-    assert again.config.inner_steps == 3
-    assert again.config.depth_range == (0.5, 9.0)
-    assert again.config.weights == {"photometric": 2.0}
-    overridden = GeometryGuidance.from_config(config, right=RIGHT, K=K, E=E, inner_steps=5)
-    assert overridden.config.inner_steps == 5
-
-
-def test_load_without_a_right_view():
-    config = GeometryGuidance.marigold_dc(np.array([[0.0, 0.0, 2.0]]), K).config
-    again = GeometryGuidance.from_config(dict(config), right=None, K=K, points=np.array([[0.1, 0.0, 3.0]]))
-    assert again.config.positive == "square" and float(again.inputs[0].points[0, 2]) == 3.0
+def test_names_of_tables_above_the_configuration_are_checked():
+    with pytest.raises(InputError, match="smoothnes.*Did you mean smoothness"):
+        GeometryGuidance(RIGHT, K, E, smoothnes=1.0)
+    with pytest.raises(InputError, match="config must be a GuidanceConfig"):
+        GeometryGuidance(RIGHT, K, E, config={"gradient": "full"})
+    with pytest.raises(InputError, match="the option of options"):
+        GeometryGuidance(RIGHT, K, E, options={"matches.colour": 1.0})
 
 
 @pytest.mark.parametrize(
@@ -212,7 +203,7 @@ def test_views_in_any_world_frame():
     K_third[0, 2] += 5
     views = [(RIGHT, K, world), (RIGHT, K, world @ E), (RIGHT, K_third, world @ up)]
     guidance = GeometryGuidance.from_views(views, inner_steps=3)
-    assert guidance.config.inner_steps == 3 and len(guidance.rights) == 2
+    assert guidance.config.updates.inner_steps == 3 and len(guidance.rights) == 2
     np.testing.assert_allclose([rig.E for rig in guidance.rigs], [E, up], atol=1e-12)
     assert guidance.rigs[1].K_right[0, 2] == 36.5 and guidance.rigs[1].K_left[0, 2] == 31.5
     with pytest.raises(ValueError, match="image must be of 64x48 pixels, as the left view; got 32x24"):
@@ -282,7 +273,7 @@ def test_every_image_of_a_batch_is_given_the_same_kind():
 
 def test_what_is_given_must_feed_what_is_asked():
     points = np.array([[0.0, 0.0, 2.0]])
-    with pytest.raises(ValueError, match="weights must be with a term"):
+    with pytest.raises(ValueError, match="weights must be above 0 for a term"):
         GeometryGuidance.from_points(points, K, weights={"photometric": 1.0, "matches": 1.0})
     with pytest.raises(ValueError, match="'one-number' needs a right view"):
         GeometryGuidance.from_points(points, K, search="one-number")
@@ -292,13 +283,14 @@ def test_what_is_given_must_feed_what_is_asked():
 
 def test_marigold_dc_preset_is_the_published_one():
     config = GeometryGuidance.marigold_dc(np.array([[0.0, 0.0, 2.0]]), K).config
-    assert (config.gradient, config.rule, config.step_latents, config.step_affine) == (
+    updates = config.updates
+    assert (config.gradient, updates.rule, updates.step_latents, updates.step_affine) == (
         "full",
         "adam-norm",
         0.05,
         0.005,
     )
-    assert (config.positive, config.points_loss, config.min_steps, config.inner_steps) == (
+    assert (config.search.positive, config.terms.points_loss, config.min_steps, updates.inner_steps) == (
         "square",
         "l1l2",
         50,
@@ -314,11 +306,12 @@ def test_millimetres_are_suspected():
 
 def test_paper_preset_is_the_paper():
     config = GeometryGuidance.paper(RIGHT, K, E).config
-    assert (config.gradient, config.rule, config.affine_rule) == ("full", "plain", "plain")
-    assert config.step_latents == config.step_affine == 1e-2
+    terms, updates, search = config.terms, config.updates, config.search
+    assert (config.gradient, updates.rule, updates.affine_rule) == ("full", "plain", "plain")
+    assert updates.step_latents == updates.step_affine == 1e-2
     assert config.weights == {"photometric": 1.0, "prior_pull": 1e-2}
-    assert (config.eta, config.inner_steps, config.pull_to) == (0.85, 1, "zero")
-    assert (config.search, config.g_s_range) == ("one-number", (1.0, 80.0))
+    assert (terms.eta, updates.inner_steps, terms.pull_to) == (0.85, 1, "zero")
+    assert (search.search, search.g_s_range) == ("one-number", (1.0, 80.0))
 
 
 def test_from_calibration_picks_the_cameras(tmp_path):

@@ -122,11 +122,42 @@ def test_the_relative_map_lies_pixel_to_pixel_on_an_image_of_odd_size(image):
     pipe = make_lotus("d")
     out = pipe(image[:43, :59], processing_resolution=0, match_input_resolution=False, output_latent=True)
     assert out.prediction.shape == (1, 40, 56, 1)  # theirs: whole cells, to be stretched
-    with torch.no_grad():
-        x = pipe.decode_relative(out.latent)
-    assert x.shape == (1, 1, 43, 59)
-    assert torch.equal(x[..., 40:, :], x[..., 39:40, :].expand(-1, -1, 3, -1))
-    assert torch.equal(x[..., 56:], x[..., 55:56].expand(-1, -1, -1, 3))
+    x = _guided(enable_geometry_guidance(pipe), image[:43, :59]).relative
+    assert x.shape == (1, 43, 59, 1)
+    np.testing.assert_array_equal(x[:, 40:], x[:, 39:40].repeat(3, 1))
+    np.testing.assert_array_equal(x[:, :, 56:], x[:, :, 55:56].repeat(3, 2))
+
+
+def _guided(pipe, image, callback=None):
+    """Without updates, at the image's own size."""
+    camera = np.array([[60.0, 0, 29.5], [0, 60.0, 21.5], [0, 0, 1]])
+    guidance = GeometryGuidance.from_points(
+        np.array([[0.1, 0.1, 2.0], [0.2, 0.0, 3.0]]), camera, inner_steps=0, correct=False, refine=False
+    )
+    call = {"processing_resolution": 0, "match_input_resolution": False, "generator": seeded(0)}
+    return pipe(image, guidance=guidance, callback_on_step_end=callback, **call)
+
+
+@pytest.mark.parametrize("other", [(41, 60), (64, 64)])
+def test_a_call_of_another_size_within_a_guided_one_changes_nothing(image, other):
+    pipe = enable_geometry_guidance(make_lotus("d"))
+    alone = _guided(pipe, image[:43, :59])
+    another = np.resize(image, (*other, 3))
+    beside = _guided(
+        pipe, image[:43, :59], lambda p, *_: p(another, processing_resolution=0, generator=seeded(1)) and None
+    )
+    np.testing.assert_array_equal(alone.prediction, beside.prediction)
+
+
+@pytest.mark.parametrize("kind", ["g", "d"])
+def test_the_layout_of_a_tensor_changes_nothing(kind):
+    pipe = make_lotus(kind)
+    plain = torch.rand(1, 3, 96, 128, generator=seeded(0))
+    maps = [
+        pipe(x, generator=seeded(0), processing_resolution=0).prediction
+        for x in (plain, plain.to(memory_format=torch.channels_last))
+    ]
+    np.testing.assert_array_equal(*maps)
 
 
 def test_sides_are_rounded_as_the_authors_do():

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
-from geodiff_plugin.matching.benchmark import main as benchmark_main
-from geodiff_plugin.matching.benchmark import textured_pair
+from geodiff_plugin.development.benchmarks.matching import main as benchmark_main
+from geodiff_plugin.development.benchmarks.matching import textured_pair
+from geodiff_plugin.matching.aggregation import NEVER, Room
+from geodiff_plugin.matching.alignment import align_view
 from geodiff_plugin.matching.build import pilot_volume
-from geodiff_plugin.matching.census import census, census_cost
-from geodiff_plugin.matching.plane_sweep import UNSEEN_COST, inverse_depth_at_shift, median_shift
+from geodiff_plugin.matching.census import COST_LEVELS, VOTE_LEVELS, census, census_cost, grey_levels
+from geodiff_plugin.matching.sweep import UNSEEN_COST, UNSEEN_LEVEL, inverse_depth_at_shift, median_shift
 
 SIZE = (96, 144)
 
@@ -69,15 +72,101 @@ def test_a_range_behind_the_right_camera_is_swept():
     assert m.build_cost_volume(left, [right], K, depth_range=(1.0, 4.0)).cost.isfinite().all()
 
 
+def described(image):
+    """``census`` of a grey image ``(1, H, W)``, its edges repeated."""
+    padded = torch.nn.functional.pad(image[None], (3, 3, 3, 3), mode="replicate")[0, 0]
+    return census(grey_levels(padded))
+
+
 def test_census_ignores_exposure():
     image = torch.rand(1, 20, 30, generator=torch.Generator().manual_seed(0)) * 0.4
-    bits = census(image)
-    assert bits.shape == (1, 16, 20, 30) and bits.abs().max() <= 1
-    torch.testing.assert_close(census(image + 0.3), bits, atol=1e-4, rtol=0)
-    assert census_cost(bits[0], image).abs().max() == 0
-    assert census_cost(bits[0], 1.3 * image + 0.05).mean() < 0.02
-    other = torch.rand(1, 20, 30, generator=torch.Generator().manual_seed(1))
-    assert 0.4 < census_cost(bits[0], other).mean() < 0.6  # pure noise; real texture that differs: about 0.35
+    votes = described(image)
+    assert votes.shape == (16, 20, 30) and votes.abs().max() == VOTE_LEVELS
+    assert (described(image + 0.3) - votes).abs().max() <= 1  # by rounding
+    assert census_cost(votes, votes).max() == 0
+    assert census_cost(votes, described(1.3 * image + 0.05)).float().mean() < 0.03 * COST_LEVELS
+    other = described(torch.rand(1, 20, 30, generator=torch.Generator().manual_seed(1)))
+    cost = census_cost(votes, other)
+    # pure noise; real texture that differs: about 0.35
+    assert cost.dtype == torch.uint8 and 0.4 < cost.float().mean() / COST_LEVELS < 0.6
+    assert torch.equal(census_cost(votes.to(torch.int8), other.to(torch.int8)), cost)
+
+
+def test_the_worst_cost_fits_into_a_byte():
+    votes = torch.full((16, 2, 2), VOTE_LEVELS, dtype=torch.int8)
+    assert (census_cost(votes, -votes) == COST_LEVELS).all() and COST_LEVELS <= 255
+
+
+POSES = [(0.0, (0.3, 0.0, 0.0)), (0.06, (0.25, 0.1, 0.15)), (0.0, (0.0, 0.3, 0.0)), (-0.1, (0.1, 0.0, -0.3))]
+
+
+@pytest.mark.parametrize(("turn", "at"), POSES)
+def test_rows_and_columns_of_planes_against_the_projection(turn, at):
+    """What scale and shift read of an aligned view is what the projection reads of the right image."""
+    left, right, K, _, _ = scene(turn, at)
+    planes = torch.tensor([0.0, 0.1, 0.3])
+    view = align_view((right[0][:1], *right[1:]), K, SIZE, planes)
+    ramp = torch.stack(torch.meshgrid(*(torch.arange(n) / n for n in SIZE), indexing="ij"))
+    rays = g.plane_rays(K[None], right[1][None], right[2][None], SIZE)
+    for axis in (0, 1):  # an image that is its own coordinates says where it was read
+        turned = align_view((ramp[1 - axis][None], *right[1:]), K, SIZE, planes)
+        columns, rows = turned.positions(SIZE[1], 0), turned.positions(SIZE[0], 1)
+        for k in (1, 2):
+            uv, _ = g.project_rays(torch.full((1, 1, *SIZE), 1 / float(planes[k])), rays)
+            expected = g.sample_at(ramp[1 - axis][None, None], uv)[0, 0]
+            grid = torch.stack(torch.meshgrid(rows[k], columns[k], indexing="ij")[::-1], -1)
+            read = g.sample_at(turned.grey[None, None], grid[None])[0, 0]
+            inside = turned.inside(rows, 1)[k][:, None] & turned.inside(columns, 0)[k]
+            if turned.valid is not None:
+                inside &= g.sample_at(turned.valid[None, None].float(), grid[None])[0, 0] > 0.999
+            assert inside.float().mean() > 0.3
+            assert ((read - expected).abs()[inside] * SIZE[1 - axis]).max() < 0.1  # pixels
+    assert (view.valid is None) == (turn == 0.0)
+
+
+@pytest.mark.parametrize(("turn", "at"), POSES)
+def test_the_way_back_from_an_aligned_view(turn, at):
+    _, right, K, _, _ = scene(turn, at)
+    view = align_view((right[0][:1], *right[1:]), K, SIZE, torch.tensor([0.05, 0.2]))
+    for axis, count in ((0, SIZE[1]), (1, SIZE[0])):
+        there, back = view.positions(count, axis), view.sources(count, axis)
+        for k in (0, 1):
+            known = back[k] < count
+            assert known.sum() > 0.3 * count
+            lines = torch.arange(len(known))[known]
+            assert (there[k][back[k][known]] - lines).abs().max() <= 0.51 * float(view.scale[k])
+
+
+def plain_costs(left, right, K, inverse_depth):
+    """The definition: warp the right image by a plane, compare 16 neighbours in floating point."""
+    image, K_right, T = right
+    depth = torch.full((1, 1, *SIZE), 1 / inverse_depth)
+    warped = g.warp_right_to_left(image[None], depth, K[None], K_right[None], T[None])
+    votes = []
+    for view in (left, warped.image[0]):
+        padded = torch.nn.functional.pad(view[None], (3, 3, 3, 3), mode="replicate")[0, 0]
+        window = padded.unfold(0, 7, 1).unfold(1, 7, 1)
+        votes.append(((window[:, :, ::2, ::2] - view[0, :, :, None, None]) * 255 / 6).clamp(-1, 1))
+    return 0.5 * (votes[0] - votes[1]).abs().mean((-2, -1)), warped.visible[0, 0]
+
+
+@pytest.mark.parametrize(("turn", "at"), POSES)
+@pytest.mark.parametrize("count", [8, 60])
+def test_costs_against_the_definition(turn, at, count):
+    """``count``: few planes are warped one by one, many are shifted where the pair is rectified."""
+    left, (image, K_right, T), K, _, _ = scene(turn, at)
+    left, right = left.mean(0, keepdim=True), (image.mean(0, keepdim=True), K_right, T)
+    volume = m.sweep_planes(left, [right], K, torch.linspace(0.0, 0.4, count))
+    for k in (1, count // 2, count - 1):
+        expected, visible = plain_costs(left, right, K, float(volume.inverse_depth[k]))
+        assert (volume.in_view[k] != visible).float().mean() < 0.03
+        both = volume.in_view[k] & visible
+        # Away from what is not seen: there, the two repeat different edges.
+        both = -torch.nn.functional.max_pool2d(-both[None].float(), 7, 1, 3)[0] > 0
+        error = (volume.cost[k] - expected)[both]
+        assert both.float().mean() > 0.2
+        # A turned view is interpolated twice, and this texture is fine.
+        assert error.abs().mean() < (0.02 if turn == 0 else 0.03) and error.mean().abs() < 0.01
 
 
 def test_median_shift_is_f_b_over_z_and_does_not_count_rotation():
@@ -97,12 +186,17 @@ def test_volume_fields(rectified):
     left, right, K, depth, _, volume, _ = rectified
     planes = len(volume.inverse_depth)
     assert volume.cost.shape == volume.in_view.shape == (planes, *SIZE) and volume.size == SIZE
-    assert volume.cost.dtype == torch.float32 and torch.isfinite(volume.cost).all()
+    assert volume.levels.dtype == torch.uint8 and volume.cost.dtype == torch.float32
     assert volume.cost.min() >= 0 and volume.cost.max() <= 1
     steps = volume.inverse_depth.diff()
     assert volume.inverse_depth[0] == 0 and (steps > 0).all()
     torch.testing.assert_close(steps, volume.plane_step.expand_as(steps), atol=1e-5, rtol=1e-3)
-    assert (volume.cost[~volume.in_view] == UNSEEN_COST).all() and volume.in_view.any()
+    assert (volume.levels[~volume.in_view] == UNSEEN_LEVEL).all() and volume.in_view.any()
+    assert UNSEEN_COST == pytest.approx(0.35, abs=0.005)
+    pixels = torch.tensor([0, 5, SIZE[1] + 3, SIZE[0] * SIZE[1] - 1])
+    cost, seen = volume.at_pixels(pixels)
+    assert torch.equal(cost, volume.cost.flatten(1)[:, pixels])
+    assert torch.equal(seen, volume.in_view.flatten(1)[:, pixels])
 
 
 def test_planes_reach_what_is_there_and_not_much_further(rectified):
@@ -216,40 +310,52 @@ def test_gate_drops_what_the_depth_contradicts(rectified):
     assert (gated[1][close] == 0).all()
 
 
+def as_levels(cost):
+    return (cost * COST_LEVELS).round().to(torch.uint8)
+
+
 def test_aggregation_fills_a_gap_from_its_neighbours():
     """One plane is right everywhere but in a patch that says nothing; the paths carry it across."""
     cost = torch.full((9, 20, 24), 0.4)
     cost[4] = 0.0
     cost[:, 8:12, 10:14] = 0.2
-    out = m.aggregate(cost, torch.full((20, 24), 0.5))
+    out = m.aggregate(as_levels(cost), torch.full((20, 24), 0.5))
     assert out.shape == cost.shape and (out.argmin(dim=0) == 4).all()
-    assert torch.isfinite(out).all()
+    assert out.dtype == torch.int16 and out.min() >= 0
 
 
 def test_aggregation_against_a_plain_loop():
-    """Hirschmueller's recursion written out pixel by pixel."""
-    generator = torch.Generator().manual_seed(0)
-    cost = torch.rand(5, 4, 6, generator=generator)
-    p1, p2 = 0.1, 0.3
-    expected = torch.zeros_like(cost)
-    for rows, columns in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        path = torch.zeros_like(cost)
-        ys = range(4) if rows >= 0 else range(3, -1, -1)
-        xs = range(6) if columns >= 0 else range(5, -1, -1)
-        for y in ys:
-            for x in xs:
-                py, px = y - rows, x - columns
-                path[:, y, x] = cost[:, y, x]
-                if not (0 <= py < 4 and 0 <= px < 6):
-                    continue
-                before = path[:, py, px]
-                for d in range(5):
-                    options = [before[d], before.min() + p2]
-                    options += [before[e] + p1 for e in (d - 1, d + 1) if 0 <= e < 5]
-                    path[d, y, x] += min(options) - before.min()
-        expected += path / 4
-    flat = torch.full((4, 6), 0.5)
-    torch.testing.assert_close(m.aggregate(cost, flat, p1=p1, p2=p2), expected)
+    """Hirschmueller's recursion written out pixel by pixel; the memory of one run may serve the next."""
+    generator, room = torch.Generator().manual_seed(0), Room()
+    for planes, height, width in ((7, 5, 9), (5, 4, 6)):
+        levels = torch.randint(0, COST_LEVELS + 1, (planes, height, width), generator=generator)
+        p1, p2 = 0.1, 0.3
+        small, large = round(p1 * COST_LEVELS), round(p2 * COST_LEVELS)
+        expected = torch.zeros_like(levels)
+        for down, along in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            path = torch.zeros_like(levels)
+            for y in range(height) if down >= 0 else reversed(range(height)):
+                for x in range(width) if along >= 0 else reversed(range(width)):
+                    py, px = y - down, x - along
+                    path[:, y, x] = levels[:, y, x]
+                    if not (0 <= py < height and 0 <= px < width):
+                        continue
+                    before = path[:, py, px]
+                    for d in range(planes):
+                        options = [before[d], before.min() + large]
+                        options += [before[e] + small for e in (d - 1, d + 1) if 0 <= e < planes]
+                        path[d, y, x] += min(options) - before.min()
+            expected += path
+        flat = torch.full((height, width), 0.5)
+        out = m.aggregate(levels.to(torch.uint8), flat, p1=p1, p2=p2, room=room)
+        assert torch.equal(out.long(), expected)
+
+
+def test_the_worst_costs_do_not_overflow():
+    levels = torch.full((4, 30, 40), COST_LEVELS, dtype=torch.uint8)
+    levels[0, ::2] = 0
+    out = m.aggregate(levels, torch.rand(30, 40, generator=torch.Generator().manual_seed(0)))
+    assert out.min() >= 0 and out.max() < NEVER
 
 
 def test_an_edge_makes_a_jump_cheap():
@@ -259,9 +365,52 @@ def test_an_edge_makes_a_jump_cheap():
     cost[1, :, 12:] = 0.1
     edge = torch.zeros(1, 20)
     edge[:, 10:12] = 1.0
-    with_edge = m.aggregate(cost, edge, p1=0.05, p2=0.6)[:, 0, 10:12].argmin(0)
-    without = m.aggregate(cost, torch.zeros(1, 20), p1=0.05, p2=0.6)[:, 0, 10:12].argmin(0)
+    with_edge = m.aggregate(as_levels(cost), edge, p1=0.05, p2=0.6)[:, 0, 10:12].argmin(0)
+    without = m.aggregate(as_levels(cost), torch.zeros(1, 20), p1=0.05, p2=0.6)[:, 0, 10:12].argmin(0)
     assert (with_edge == 4).all() and (without == 1).all()
+
+
+def second_sweep(volume, inverse_depth):
+    """How far a sweep from the right is from the left view's matches, in planes, and what it sees."""
+    image, K_right, T = volume.rights[0]
+    span = volume.inverse_depth[[0, -1]]
+    planes = torch.linspace(float(span[0]), 1.3 * float(span[1]), 2 * len(volume.inverse_depth))
+    back = m.sweep_planes(image, [(volume.left_01, volume.K, g.invert_rigid(T))], K_right, planes)
+    other = planes[m.aggregate(back.levels, image[0]).argmin(0)]
+    depth = 1 / inverse_depth.clamp_min(1e-3 * volume.plane_step)[None]
+    warped = g.warp_right_to_left(other[None, None], depth, volume.K[None], K_right[None], T[None])
+    read = g.sample_at(other[None, None], warped.uv, mode="nearest")[0, 0]
+    return (read - 1 / warped.z_right[0]).abs() / volume.plane_step, warped.visible[0, 0]
+
+
+@pytest.mark.parametrize(("turn", "at"), POSES)
+def test_the_right_view_says_what_a_sweep_of_its_own_says(turn, at):
+    """The costs looked up along the right view's pixels, against a sweep with the roles exchanged."""
+    left, right, K, _, _ = scene(turn, at, size=(144, 216))
+    volume = m.build_cost_volume(left, [right], K)
+    matches = m.match_volume(volume)
+    difference, visible = second_sweep(volume, matches.inverse_depth)
+    agreed, own = (difference <= 1.5) & visible, matches.confidence[0] > 0
+    assert agreed.float().mean() > 0.4
+    assert (agreed == own).float().mean() > 0.9
+    # What one of them accepts, the other rarely puts elsewhere.
+    assert (difference[own & visible] > 4).float().mean() < 0.06
+    assert own[agreed].float().mean() > 0.92
+
+
+def test_matches_are_the_same_every_time(rectified):
+    *_, volume, matches = rectified
+    again = m.match_volume(volume)
+    assert torch.equal(again.inverse_depth, matches.inverse_depth)
+    assert torch.equal(again.confidence, matches.confidence)
+
+
+def test_a_pose_that_matches_plainly_is_not_turned(rectified, monkeypatch):
+    left, right, K, *_, matches = rectified
+    check = m.mirrored_pose_preferred(left, [right], K, matches)
+    assert not check.preferred and check.inverse is None and check.given > 0.4
+    unsure = replace(matches, confidence=0.1 * matches.confidence)
+    assert m.mirrored_pose_preferred(left, [right], K, unsure).inverse is not None
 
 
 @pytest.mark.parametrize(("turn", "at"), [(0.0, (0.3, 0.0, 0.0)), (0.06, (0.25, 0.1, 0.1))])
@@ -296,6 +445,7 @@ def test_blank_images_fall_back_to_the_whole_range():
 
 
 def test_benchmark_prints_its_stages(capsys):
-    benchmark_main(["--size", "48", "96"])
+    threads = torch.get_num_threads()
+    benchmark_main(["--size", "48", "96", "--repeats", "1", "--threads", str(threads)])
     printed = capsys.readouterr().out
-    assert all(stage in printed for stage in ("volume", "one aggregation", "matches"))
+    assert all(stage in printed for stage in ("volume", "one aggregation", "matches", "mean ratio"))

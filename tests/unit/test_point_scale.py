@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.metric import MetricMap
-from geodiff_plugin.point_scale import fit_to_points, sure_matches
+from geodiff_plugin.scale.points import fit_to_points, sure_matches
+from geodiff_plugin.scale.space import MetricMap
 
 SIZE = (40, 60)
 

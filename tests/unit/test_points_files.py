@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geodiff_plugin.formats import read_points, write_depth_mm_png, write_pfm
+from geodiff_plugin import GeometryGuidance
+from geodiff_plugin.formats import read_points, write_depth_mm_png, write_pfm, write_ply
 
 MAP = np.zeros((6, 8), np.float32)
 MAP[1, 2], MAP[4, 5] = 1.25, 3.5
@@ -50,3 +51,130 @@ def test_a_cube_is_no_map(tmp_path):
     np.save(tmp_path / "cube.npy", np.zeros((2, 3, 4)))
     with pytest.raises(ValueError, match=r"map \(H, W\) or points \(N, 3\)"):
         read_points(tmp_path / "cube.npy")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0.1,-0.2,2.0\n0.4,0.3,5.5\n",
+        "x,y,z\n0.1, -0.2, 2.0\n0.4, 0.3, 5.5\n",
+        "X Y Z intensity\n0.1 -0.2 2.0 .5\n0.4 0.3 5.5 .1\n",
+        "# a remark\n0.1;-0.2;2.0\n\n0.4;0.3;5.5 # the last\n",
+        "//X Y Z R G B\r\n0.1\t-0.2\t2.0\t255\t0\t0\r\n0.4\t0.3\t5.5\t0\t0\t9\r\n",
+    ],
+)
+def test_text_as_people_have_it(tmp_path, text):
+    (tmp_path / "points.csv").write_text(text)
+    np.testing.assert_allclose(read_points(tmp_path / "points.csv"), POINTS)
+
+
+@pytest.mark.parametrize("columns", [4, 6])
+def test_columns_beyond_the_third_do_not_count(tmp_path, columns):
+    wide = np.concatenate([POINTS, np.full((2, columns - 3), 7.0)], axis=1)
+    np.save(tmp_path / "points.npy", wide)
+    np.testing.assert_allclose(read_points(tmp_path / "points.npy"), POINTS)
+    guidance = GeometryGuidance.from_points(wide, np.diag([60.0, 60.0, 1.0]) + 0.0)
+    np.testing.assert_allclose(guidance.inputs[0].points.numpy(), POINTS)
+
+
+PLY = "ply\nformat {kind} 1.0\ncomment by hand\nelement vertex 2\n{properties}{more}end_header\n"
+PROPERTIES = "property double x\nproperty uchar red\nproperty float y\nproperty float z\n"
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_binary_ply(tmp_path, order):
+    mark = "<" if order == "little" else ">"
+    kinds = [("x", "f8"), ("red", "u1"), ("y", "f4"), ("z", "f4")]
+    rows = np.zeros(2, np.dtype([(name, mark + kind) for name, kind in kinds]))
+    for axis, name in enumerate("xyz"):
+        rows[name] = POINTS[:, axis]
+    faces = "element face 1\nproperty list uchar int vertex_indices\n"
+    head = PLY.format(kind=f"binary_{order}_endian", properties=PROPERTIES, more=faces)
+    (tmp_path / "points.ply").write_bytes(head.encode() + rows.tobytes() + b"\x03" + bytes(12))
+    np.testing.assert_allclose(read_points(tmp_path / "points.ply"), POINTS, rtol=1e-6)
+    (tmp_path / "points.ply").write_bytes(head.encode() + rows.tobytes()[:-1])
+    with pytest.raises(ValueError, match="points must be 2 points of 17 bytes.*cut off"):
+        read_points(tmp_path / "points.ply")
+
+
+def test_ascii_ply_and_our_own_cloud(tmp_path):
+    head = PLY.format(kind="ascii", properties=PROPERTIES, more="")
+    (tmp_path / "points.ply").write_text(head + "0.1 255 -0.2 2.0\n0.4 0 0.3 5.5\n")
+    np.testing.assert_allclose(read_points(tmp_path / "points.ply"), POINTS)
+    K = np.array([[8.0, 0, 3.5], [0, 8.0, 2.5], [0, 0, 1]])
+    write_ply(tmp_path / "cloud.ply", MAP, np.zeros((6, 8, 3)), K)
+    cloud = read_points(tmp_path / "cloud.ply")
+    np.testing.assert_allclose(sorted(cloud[:, 2]), [1.25, 3.5])
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"ply\nformat ascii 1.0\nelement vertex 2\n",
+        b"pl\nend_header\n",
+        b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n2\n",
+        b"ply\nformat odd 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        b"end_header\n",
+        b"ply\nformat ascii 1.0\nelement vertex 999999999999999\nproperty float x\nproperty float y\n"
+        b"property float z\nend_header\n",
+        b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int i\nelement vertex 2\nend_header\n",
+    ],
+)
+def test_what_is_no_ply(tmp_path, head):
+    (tmp_path / "points.ply").write_bytes(head)
+    with pytest.raises(ValueError, match="points must be"):
+        read_points(tmp_path / "points.ply")
+
+
+#: The scanner looks along x, its y to the left, z up; the camera sits 0.27 m before it.
+TR = "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 -0.27\n"
+P2 = "700 0 600 70 0 700 180 0 0 0 1 0"
+EYE = "1 0 0 0 1 0 0 0 1"
+
+
+def scan(folder):
+    """One point 10 m before the scanner and 1 m to the left, one behind it."""
+    rows = np.array([[10.0, 1.0, 0.5, 0.3], [-5.0, 0.0, 0.0, 0.1]], "<f4")
+    (folder / "0.bin").write_bytes(rows.tobytes())
+    return folder / "0.bin"
+
+
+def test_a_velodyne_scan_with_either_calibration(tmp_path):
+    (tmp_path / "object.txt").write_text(f"P2: {P2}\nR0_rect: {EYE}\n{TR}")
+    (tmp_path / "velo.txt").write_text("calib_time: 1-Jan\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 -0.27\n")
+    (tmp_path / "cams.txt").write_text(f"R_rect_00: {EYE}\nP_rect_02: {P2}\n")
+    expected = [[-1.0 + 70 / 700, -0.5, 9.73]]  # camera 2 stands 0.1 m to the left of camera 0
+    for files in ([tmp_path / "object.txt"], [tmp_path / "velo.txt", tmp_path / "cams.txt"]):
+        np.testing.assert_allclose(read_points(scan(tmp_path), calibration=files), expected, rtol=1e-5)
+
+
+def test_a_velodyne_scan_that_cannot_be_placed(tmp_path):
+    path = scan(tmp_path)
+    (tmp_path / "calib.txt").write_text(f"P2: {P2}\n")
+    with pytest.raises(ValueError, match="points-calib must be given with a .bin"):
+        read_points(path)
+    with pytest.raises(ValueError, match="points-calib must be KITTI's"):
+        read_points(path, calibration=[tmp_path / "calib.txt"])
+    np.save(tmp_path / "points.npy", POINTS)
+    with pytest.raises(ValueError, match="points-calib must be given with a velodyne .bin"):
+        read_points(tmp_path / "points.npy", calibration=[tmp_path / "calib.txt"])
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(ValueError, match="cut off"):
+        read_points(path, calibration=[tmp_path / "calib.txt"])
+
+
+def test_units_by_name_and_by_number(tmp_path):
+    folder = tmp_path / "proj_depth" / "groundtruth"
+    folder.mkdir(parents=True)
+    for path in (tmp_path / "map.png", folder / "map.png"):
+        write_depth_mm_png(path, MAP * 0.256)  # the integers of KITTI's 1/256 m
+    np.testing.assert_allclose(read_points(tmp_path / "map.png", scale=256), MAP, atol=4e-3)
+    with pytest.warns(UserWarning, match="KITTI's units of 1/256 m"):
+        np.testing.assert_allclose(read_points(folder / "map.png"), MAP, atol=4e-3)
+    np.save(tmp_path / "mm.npy", (1000 * MAP).astype(np.uint16))
+    np.testing.assert_allclose(read_points(tmp_path / "mm.npy", scale=1000), MAP, atol=1e-3)
+    np.save(tmp_path / "points.npy", 1000 * POINTS)
+    np.testing.assert_allclose(read_points(tmp_path / "points.npy", scale=1000), POINTS, rtol=1e-5)
+    for scale in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="points-scale must be between"):
+            read_points(tmp_path / "points.npy", scale=scale)

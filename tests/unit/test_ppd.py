@@ -4,7 +4,7 @@ import pytest
 import torch
 from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
-from geodiff_plugin.commands.convert import run_convert
+from geodiff_plugin.cli.convert import run_convert
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
 from geodiff_plugin.priors.pipelines.ppd import AreaImageProcessor, area_resize
@@ -78,7 +78,7 @@ def save_checkpoint(file, semantic_size: int) -> PixelDiT:
 
 def test_the_encoder_may_come_from_a_folder_of_transformers(tmp_path):
     model, dit = save_depth_anything(tmp_path / "da2"), save_checkpoint(tmp_path / "ppd.pth", 64)
-    run_convert(tmp_path / "ppd.pth", tmp_path / "out", str(tmp_path / "da2"))
+    run_convert([tmp_path / "ppd.pth", tmp_path / "out"], str(tmp_path / "da2"))
     pipe = PPDPrior.load(Layout(tmp_path / "out", "out"), torch.float32, None)
     torch.testing.assert_close(dict(pipe.dit.state_dict()), dict(dit.state_dict()))
     wanted = model.backbone.state_dict()
@@ -89,11 +89,11 @@ def test_the_encoder_may_come_from_a_folder_of_transformers(tmp_path):
 def test_an_encoder_of_another_width_is_refused(tmp_path):
     save_depth_anything(tmp_path / "da2"), save_checkpoint(tmp_path / "ppd.pth", 128)
     with pytest.raises(ValueError, match="128 wide"):
-        run_convert(tmp_path / "ppd.pth", tmp_path / "out", str(tmp_path / "da2"))
+        run_convert([tmp_path / "ppd.pth", tmp_path / "out"], str(tmp_path / "da2"))
 
 
 def test_a_folder_of_another_network_is_refused(tmp_path):
     save_checkpoint(tmp_path / "ppd.pth", 64)
     make_ppd().dit.save_pretrained(tmp_path / "encoder")
     with pytest.raises(ValueError, match="--with"):
-        run_convert(tmp_path / "ppd.pth", tmp_path / "out", str(tmp_path / "encoder"))
+        run_convert([tmp_path / "ppd.pth", tmp_path / "out"], str(tmp_path / "encoder"))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.metric import GROWS_WITH_DEPTH, SPACES, AffineState, MetricMap, inverse_softplus
-from geodiff_plugin.refinement import refine_depth
-from geodiff_plugin.terms import MatchTarget
+from geodiff_plugin.algorithm.correction import prior_error, refine_depth
+from geodiff_plugin.algorithm.terms import MatchTarget
+from geodiff_plugin.scale.space import SPACES, AffineState, MetricMap, inverse_softplus
 
 SIZE = (40, 60)
+WEAK, STRONG = (torch.full((1, 1, 1, 1), error) for error in (0.3, 0.02))
 
 
 def _target(depth_m: torch.Tensor, confidence: torch.Tensor) -> MatchTarget:
@@ -22,14 +23,14 @@ def _grey(value: float = 0.5) -> torch.Tensor:
 
 def test_sure_matches_everywhere_are_followed():
     truth = torch.linspace(2.0, 4.0, SIZE[1]).expand(1, 1, *SIZE)
-    refined = refine_depth(1.3 * truth, _target(truth, torch.ones_like(truth)), _grey())
+    refined = refine_depth(1.3 * truth, _target(truth, torch.ones_like(truth)), _grey(), WEAK)
     assert ((refined.depth_m - truth).abs() / truth).max() < 0.01
     assert refined.support.min() > 0.99
 
 
 def test_without_a_match_nothing_moves():
     depth = torch.linspace(2.0, 4.0, SIZE[1]).expand(1, 1, *SIZE)
-    refined = refine_depth(depth, _target(depth, torch.zeros_like(depth)), _grey())
+    refined = refine_depth(depth, _target(depth, torch.zeros_like(depth)), _grey(), WEAK)
     assert torch.equal(refined.depth_m, depth)
     assert refined.support.max() == 0.0
 
@@ -39,11 +40,12 @@ def test_a_correction_spreads_over_its_surface_and_stops_at_an_edge():
     left[..., 30:] = 0.9  # another surface, of which nothing is known
     confidence = torch.zeros_like(truth)
     confidence[..., :, 5:10] = 1.0
-    refined = refine_depth(1.2 * truth, _target(truth, confidence), left)
-    own, other = refined.depth_m[..., 10:20], refined.depth_m[..., 31:]
-    assert (own / 2.0 - 1.0).abs().max() < 0.08
+    error = torch.full((1, 1, 1, 1), 0.1)
+    refined = refine_depth(1.2 * truth, _target(truth, confidence), left, error)
+    own, other = refined.depth_m[..., 10:14], refined.depth_m[..., 31:]
+    assert (own / 2.0 - 1.0).abs().max() < 0.09
     assert (other / 2.4 - 1.0).abs().max() < 0.05
-    assert refined.support[..., 10:20].min() > 0.5
+    assert refined.support[..., 10:14].min() > 0.5
     assert refined.support[..., 31:].max() < 0.3
 
 
@@ -51,7 +53,8 @@ def test_an_outlier_among_matches_loses():
     truth = torch.full((1, 1, *SIZE), 2.0)
     matched = truth.clone()
     matched[..., 20, 30] = 8.0
-    refined = refine_depth(1.1 * truth, _target(matched, torch.ones_like(truth)), _grey())
+    error = torch.full((1, 1, 1, 1), 0.1)
+    refined = refine_depth(1.1 * truth, _target(matched, torch.ones_like(truth)), _grey(), error)
     assert (refined.depth_m / 2.0 - 1.0).abs().max() < 0.05
 
 
@@ -59,11 +62,57 @@ def test_samples_of_a_batch_do_not_mix_and_any_resolution_comes_back():
     truth = torch.full((2, 1, *SIZE), 3.0)
     confidence = torch.stack([torch.ones(1, *SIZE), torch.zeros(1, *SIZE)])
     refined = refine_depth(
-        torch.full((2, 1, 90, 130), 3.3), _target(truth, confidence), _grey().expand(2, -1, -1, -1)
+        torch.full((2, 1, 90, 130), 3.3),
+        _target(truth, confidence),
+        _grey().expand(2, -1, -1, -1),
+        WEAK.expand(2, 1, 1, 1),
     )
     assert refined.depth_m.shape == (2, 1, 90, 130)
     assert refined.depth_m[0].mean() == pytest.approx(3.0, rel=0.01)
     assert refined.depth_m[1].mean() == pytest.approx(3.3, rel=1e-5)
+
+
+def _wavy(truth: torch.Tensor, error: float) -> torch.Tensor:
+    rows = torch.linspace(0, 12.0, SIZE[0])[:, None]
+    return truth * torch.exp(error * torch.sin(rows + torch.linspace(0, 15.0, SIZE[1])))
+
+
+def test_the_error_of_a_prior_is_measured_where_it_was_not_fitted():
+    truth = torch.full((1, 1, *SIZE), 2.0)
+    target = _target(truth, torch.ones_like(truth))
+    found = [float(prior_error(_wavy(truth, error), target, _grey())) for error in (0.0, 0.1, 0.4)]
+    assert found[0] == pytest.approx(0.01) and found[0] < found[1] < found[2]
+    assert 0.03 < found[1] < 0.15 and 0.15 < found[2] < 0.5
+    nothing = _target(truth, torch.zeros_like(truth))
+    assert float(prior_error(truth, nothing, _grey())) == 0.5
+
+
+def test_a_good_prior_keeps_its_surface_where_matches_are_noisy():
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.full((1, 1, *SIZE), 2.0)
+    noisy = truth * torch.exp(0.03 * torch.randn(truth.shape, generator=generator))
+    target = _target(noisy, torch.ones_like(truth))
+    strong, weak = (refine_depth(truth, target, _grey(), error).depth_m for error in (STRONG, WEAK))
+    assert (strong - truth).abs().mean() < 0.2 * (weak - truth).abs().mean()
+
+
+def test_matches_that_a_good_prior_contradicts_over_a_region_lose():
+    truth = torch.full((1, 1, *SIZE), 2.0)
+    matched = truth.clone()
+    matched[..., 10:16, 20:26] = 2.6
+    target = _target(matched, torch.ones_like(truth))
+    strong = refine_depth(truth, target, _grey(), STRONG).depth_m
+    assert (strong / 2.0 - 1.0).abs().max() < 0.02
+
+
+def test_a_second_pass_fits_what_the_first_left_over():
+    truth = torch.full((1, 1, *SIZE), 2.0)
+    prior, target = _wavy(truth, 0.2), _target(truth, torch.ones_like(truth))
+    error = torch.full((1, 1, 1, 1), 0.1)
+    first = refine_depth(prior, target, _grey(), error)
+    second = refine_depth(prior, target, _grey(), error, carried=first.field)
+    left_over = [float((r.depth_m / truth).log().abs().mean()) for r in (first, second)]
+    assert left_over[1] < 0.8 * left_over[0]
 
 
 @pytest.mark.parametrize("space", sorted(SPACES))
@@ -71,7 +120,7 @@ def test_samples_of_a_batch_do_not_mix_and_any_resolution_comes_back():
 def test_relative_is_the_inverse_of_the_metric_map(space, positive):
     metric, x = MetricMap(space, positive), torch.linspace(0.05, 0.95, 12).view(1, 1, 3, 4)
     near, far = torch.tensor([1.5]), torch.tensor([9.0])
-    affine = metric.from_range(*((near, far) if space in GROWS_WITH_DEPTH else (far, near)))
+    affine = metric.from_range(near, far)
     assert torch.allclose(metric.relative(metric(x, affine), affine), x, atol=1e-4)
 
 

@@ -11,9 +11,9 @@ import torch
 
 from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
-from geodiff_plugin.matching.benchmark import textured_pair
-from geodiff_plugin.point_scale import refine_to_matches
-from geodiff_plugin.scale_search import argmin_over, search_scale
+from geodiff_plugin.development.benchmarks.matching import textured_pair
+from geodiff_plugin.scale.points import refine_to_matches
+from geodiff_plugin.scale.volume_search import argmin_over, search_scale
 
 SPACES = {
     "depth": lambda z: z,
@@ -118,7 +118,7 @@ def test_current_state_stays_unless_something_better_shows_up(scene, space):
     volume, depth = scene
     x = relative(depth, space)
     found = search_scale(volume, x, space)
-    ends = (found.far_m, found.near_m) if space in NEAR_IS_ONE else (found.near_m, found.far_m)
+    ends = (found.near_m, found.far_m)
     again = search_scale(volume, x, space, current=ends)
     assert torch.equal(again.near_m, found.near_m) and torch.equal(again.far_m, found.far_m)
     wrong = search_scale(volume, x, space, current=tuple(3.0 * end for end in ends))
@@ -151,6 +151,18 @@ def test_refinement_without_matches_changes_nothing(scene):
     start = (torch.tensor([2.0]), torch.tensor([9.0]))
     near, far = refine_to_matches(x, nothing, *start, "depth")
     torch.testing.assert_close((near, far), start)
+
+
+@pytest.mark.parametrize("space", ["depth", "disparity", "log"])
+def test_points_of_one_depth_give_a_finite_range(scene, space):
+    volume, depth = scene
+    same = m.Matches(
+        torch.full_like(depth, 0.4), torch.ones_like(depth), torch.tensor(0.004), volume.K, volume.size
+    )
+    near, far = refine_to_matches(
+        relative(depth, space), same, torch.tensor([2.0]), torch.tensor([9.0]), space
+    )
+    assert torch.isfinite(near).all() and torch.isfinite(far).all() and float(near) < float(far)
 
 
 def test_argmin_over_is_per_sample_and_tells_edges():

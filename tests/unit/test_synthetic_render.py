@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from geodiff_plugin.development.benchmarks.rendering import main, measure
 from geodiff_plugin.synthetic import Camera, CameraEffects, Material, render_views, sample_scene
-from geodiff_plugin.synthetic.benchmark import main, measure
 from geodiff_plugin.synthetic.builder import Builder, Look
 from geodiff_plugin.synthetic.cameras import intrinsics, tile, untile
 from geodiff_plugin.synthetic.effects import apply_effects, sample_effects

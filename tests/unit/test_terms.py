@@ -3,12 +3,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.metric import AffineState
-from geodiff_plugin.terms import TERMS, Estimate, MatchTarget, masked_mean
-from geodiff_plugin.terms.anchor import LEAST
-from geodiff_plugin.terms.matches import CAUCHY_PLANES
-from geodiff_plugin.terms.photometric import photometric, photometric_map
-from geodiff_plugin.terms.points import CAUCHY_UNITS
+from geodiff_plugin.algorithm.terms import TERMS, Estimate, MatchTarget, masked_mean
+from geodiff_plugin.algorithm.terms.photometric import photometric, photometric_map
+from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.scale.space import AffineState
 
 
 def estimate(**changes):
@@ -36,8 +34,7 @@ def estimate(**changes):
 @pytest.mark.parametrize("name", [n for n in TERMS if n != "prior_pull"])
 def test_a_perfect_estimate_costs_nothing(name):
     term = TERMS[name]
-    options = {"eta": 0.85, "pyramid_levels": 3, "exposure": True, "points_loss": "robust"}
-    value = term.function(estimate(), **{key: options[key] for key in term.options})
+    value = term.function(estimate(), **{key: getattr(DEFAULT.terms, key) for key in term.options})
     torch.testing.assert_close(value, torch.zeros(2), atol=1e-5, rtol=0)
 
 
@@ -73,7 +70,7 @@ def test_points_robust_and_in_metres():
     known[:, :, 3, 4] = known[:, :, 20, 30] = 1.0
     target = MatchTarget(torch.full((2, 1, 32, 40), 0.5) * known, known, torch.tensor([0.005, 0.005]))
     off = estimate(depth_m=torch.full((2, 1, 32, 40), 2.5), points=target)
-    c2 = CAUCHY_UNITS**2
+    c2 = DEFAULT.terms.points_cauchy**2
     expected = torch.full((2,), c2 / 2 * float(torch.log1p(torch.tensor(20.0**2 / c2))))
     torch.testing.assert_close(points(off), expected)
     torch.testing.assert_close(points(off, points_loss="l1l2"), torch.full((2,), 0.5 + 0.25))
@@ -126,7 +123,7 @@ def test_photometric_gradient_in_float64():
 
 def test_matches_in_planes():
     near = estimate(depth_m=torch.full((2, 1, 32, 40), 1 / 0.53))
-    c2 = CAUCHY_PLANES**2
+    c2 = DEFAULT.terms.matches_cauchy**2
     expected = c2 / 2 * torch.log(1 + torch.tensor([3.0, 1.5]) ** 2 / c2)
     torch.testing.assert_close(TERMS["matches"].function(near), expected, rtol=1e-4, atol=0)
 
@@ -162,7 +159,7 @@ def test_anchor_holds_what_no_match_holds():
     half[..., :20] = 0.0
     half = MatchTarget(target.inverse_depth, half, target.plane_step)
     value = TERMS["anchor"].function(estimate(z0=moved, matches=half))
-    torch.testing.assert_close(value, torch.full((2,), 9.0 * (1.0 + LEAST) / 2.0))
+    torch.testing.assert_close(value, torch.full((2,), 9.0 * (1.0 + DEFAULT.terms.anchor_floor) / 2.0))
 
 
 def test_masked_mean():

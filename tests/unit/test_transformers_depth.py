@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES
 
 from geodiff_plugin.priors import PRIORS, find_adapter
-from geodiff_plugin.priors.hf_depth import DepthMap, HFDepthModel, output_of
+from geodiff_plugin.priors.hf_depth import NO_DEPTH, DepthMap, HFDepthModel, output_of
 from geodiff_plugin.priors.hf_preparation import Preparation
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.pipelines.transformers_depth import unit_range
@@ -22,6 +23,8 @@ OUTPUTS = {
     "glpn": ("depth", True),
     "zoedepth": ("depth", True),
     "depth_pro": ("disparity", True),
+    "prompt_depth_anything": ("depth", False),
+    "tipsv2": ("depth", True),
 }
 
 
@@ -98,6 +101,21 @@ def test_both_layouts_load_and_answer_the_same(kind, layout_of, tmp_path):
 @pytest.mark.parametrize("kind", MODELS)
 def test_what_each_class_predicts(kind):
     assert output_of(MODELS[kind]()[0]) == OUTPUTS[kind]
+
+
+def test_every_class_of_the_library_is_guided_or_refused():
+    guided = {type(MODELS[kind]()[0]).__name__ for kind in MODELS}
+    assert guided | set(NO_DEPTH) == set(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values())
+
+
+@pytest.mark.parametrize("space", [None, "depth"])
+def test_canopy_height_is_refused_with_the_reason(space):
+    class CHMv2ForDepthEstimation(Echo):
+        config = None
+
+    preparation = Preparation.from_config({"image_processor_type": "GLPNImageProcessor"})
+    with pytest.raises(ValueError, match="height of trees"):
+        HFDepthModel(CHMv2ForDepthEstimation(), preparation, space)
 
 
 def test_metric_depth_anything_and_dinov2s_dpt_give_metres():

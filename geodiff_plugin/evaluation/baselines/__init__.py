@@ -26,6 +26,7 @@ from geodiff_plugin.evaluation.baselines.paper import PAPER
 from geodiff_plugin.evaluation.baselines.photometric_only import PHOTOMETRIC_ONLY
 from geodiff_plugin.evaluation.baselines.plane_sweep import PLANE_SWEEP
 from geodiff_plugin.evaluation.baselines.prior_aligned import PRIOR_ALIGNED
+from geodiff_plugin.evaluation.baselines.prior_fit import PRIOR_FIT_METHOD
 from geodiff_plugin.evaluation.baselines.reprojection_only import REPROJECTION_ONLY
 from geodiff_plugin.evaluation.baselines.scale_shift_only import SCALE_SHIFT_ONLY
 from geodiff_plugin.evaluation.baselines.search_only import SEARCH_ONLY
@@ -36,12 +37,14 @@ from geodiff_plugin.evaluation.baselines.variants import default_variant, paper_
 __all__ = [
     "FAMILIES",
     "METHODS",
+    "POSES",
     "Method",
     "NotApplicable",
     "Prediction",
     "PriorCache",
     "Settings",
     "find_method",
+    "with_poses",
     "with_priors",
     "with_seeds",
 ]
@@ -53,6 +56,7 @@ METHODS: dict[str, Method] = {
         SEARCH_ONLY,
         SCALE_SHIFT_ONLY,
         PAPER,
+        PRIOR_FIT_METHOD,
         GUIDED,
         PHOTOMETRIC_ONLY,
         MATCHES_ONLY,
@@ -72,6 +76,10 @@ FAMILIES: dict[str, Callable[[str], Method]] = {
     "files": files_method,
 }
 """Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter."""
+
+POSES = ("refine", "given", "estimated")
+"""Where ``guided`` may have poses from: the given ones refined, as given, or withheld but for the baseline's
+length."""
 
 PRIORLESS = ("hf", "files")
 """Families that use no prior, so that an @ in their parameter is part of it."""
@@ -132,6 +140,20 @@ def with_priors(methods: Sequence[str], priors: Sequence[str]) -> tuple[str, ...
     """
     bound = [f"{name}@{prior}" for prior in priors for name in methods if find_method(name).uses_prior]
     return (*methods, *bound)
+
+
+def with_poses(methods: Sequence[str], poses: Sequence[str]) -> tuple[str, ...]:
+    """The methods, with ``guided`` once for each of the named poses.
+
+    Args:
+        methods: names.
+        poses: of ``POSES``; none leaves the methods as they are.
+    """
+    rows = [
+        [f"guided:pose={pose}" for pose in poses] if name == "guided" and poses else [name]
+        for name in methods
+    ]
+    return tuple(name for row in rows for name in row)
 
 
 def with_seeds(methods: Sequence[str], first: int, count: int) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""A prior that always gives the same answer: what guidance does where no network corrects it.
+"""A pipeline that always gives the same answer, for methods without a network in their loop.
 
 Hop: image -> a fixed latent -> (guided) -> relative map.
 Paper: S5.3.1 (optimisation without the diffusion framework).
@@ -22,10 +22,10 @@ from geodiff_plugin.evaluation.baselines._guidance import (
 )
 from geodiff_plugin.evaluation.baselines.base import Method, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.guidance import GeometryGuidance
-from geodiff_plugin.pipeline import enable_geometry_guidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 __all__ = ["ConstantPrior", "Start", "constant_method"]
 
@@ -147,6 +147,7 @@ def constant_method(
             begun = start(pipe, sample, settings)
         arguments = {} if settings.resolution is None else {"processing_resolution": settings.resolution}
         guidance = preset(*views, min_steps=taken)
+        guidance.evidence_store = priors.evidence
         return guided_prediction(_stand_in(pipe, begun, taken), sample, guidance, arguments)
 
     return Method(name, title, summary, run, partial(guided_configuration, preset), uses_prior=True)

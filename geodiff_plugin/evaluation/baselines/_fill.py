@@ -1,4 +1,4 @@
-"""Filling the holes of a match map from behind.
+"""Filling of holes in a match map from the background.
 
 Hop: shift or inverse depth with holes -> without.
 Paper: none; as KITTI's development kit does it for sparse results.

@@ -1,4 +1,4 @@
-"""What stands for the files of a folder in the key of a result.
+"""Fingerprint of a folder's files, for the key of a result.
 
 Hop: folder -> names, sizes and times of change -> short hash.
 Paper: none.

@@ -17,7 +17,7 @@ from PIL import Image
 
 from geodiff_plugin.evaluation.baselines.base import Method, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
 
 __all__ = [
@@ -58,6 +58,10 @@ def _summary(out: Any) -> dict[str, Any]:
         values = getattr(out, name)
         if values is not None:
             notes[name] = [round(float(value), 6) for value in values.flatten()]
+    if out.poses:
+        notes["pose"] = out.poses[0].status
+        notes["residual_px_given"] = [round(px, 3) for px in out.poses[0].residual_px_given]
+        notes["residual_px"] = [round(px, 3) for px in out.poses[0].residual_px]
     if out.visible is not None:
         notes["visible"] = round(float(np.mean(out.visible)), 4)
     return notes
@@ -78,7 +82,7 @@ def guided_prediction(
     out = pipe(Image.fromarray(sample.left), guidance=guidance, output_uncertainty=spread, **arguments)
     return Prediction(
         depth_m=out.prediction[0, ..., 0],
-        space="disparity" if prior_space(pipe) != "depth" else "depth",
+        space=prior_space(pipe),
         uncertainty=None if out.uncertainty is None else out.uncertainty[0, ..., 0],
         confidence=None if out.confidence is None else out.confidence[0, ..., 0],
         notes=_summary(out),
@@ -92,7 +96,7 @@ def guided_configuration(preset: Preset, settings: Settings) -> dict[str, Any]:
     to_the_right[0, 3] = 0.1
     guidance = preset(np.zeros((32, 32, 3), np.uint8), any_camera, to_the_right)
     chosen = {key: value for key, value in asdict(settings).items() if key != "prior"}
-    return chosen | {"guidance": dict(guidance.config)}
+    return chosen | {"guidance": guidance.as_run().to_dict()}
 
 
 def posed_views(sample: StereoSample, views: int) -> tuple[Any, Any, Any]:
@@ -124,6 +128,7 @@ def guided_method(name: str, title: str, summary: str, preset: Preset) -> Method
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
         guidance = preset(*posed_views(sample, settings.views))
+        guidance.evidence_store = priors.evidence
         return guided_prediction(priors.get(settings), sample, guidance, call_arguments(settings))
 
     return Method(name, title, summary, run, partial(guided_configuration, preset), uses_prior=True)

@@ -1,4 +1,4 @@
-"""What a method under test is, what it is given and what it hands back.
+"""Interface of a method under test: what it is given and what it returns.
 
 Hop: ``StereoSample`` + ``Settings`` -> ``Prediction``.
 Paper: S5.1 (compared methods).
@@ -17,9 +17,10 @@ import torch
 
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.pipeline import enable_geometry_guidance
+from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.priors.hf_depth import HFDepthModel
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 __all__ = ["Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
 
@@ -66,7 +67,7 @@ class Settings:
             bad_value("views", "at least 2", self.views)
 
     @property
-    def torch_dtype(self) -> torch.dtype:
+    def weights_dtype(self) -> torch.dtype:
         """``dtype`` as torch names it."""
         return _DTYPES[self.dtype]
 
@@ -98,9 +99,14 @@ def _which(settings: Settings) -> tuple[str | None, ...]:
 
 
 class PriorCache:
-    """Loads a prior once per run, ready to be guided, and a depth model without diffusion likewise."""
+    """Loads a prior once per run, ready to be guided, and a depth model without diffusion likewise.
+
+    Attributes:
+        evidence: of the last pairs, for the methods that guide the prior by them.
+    """
 
     def __init__(self) -> None:
+        self.evidence = EvidenceStore()
         self._pipes: dict[tuple[str | None, ...], Any] = {}
         self._models: dict[tuple[str, ...], HFDepthModel] = {}
         self._fingerprints: dict[tuple[str | None, ...], str] = {}
@@ -115,7 +121,7 @@ class PriorCache:
         key = _which(settings)
         if key not in self._pipes:
             said = {} if settings.space is None else {"space": settings.space}
-            pipe = load_prior(settings.prior, device=settings.device, dtype=settings.torch_dtype, **said)
+            pipe = load_prior(settings.prior, device=settings.device, dtype=settings.weights_dtype, **said)
             pipe.set_progress_bar_config(disable=True)
             enable_geometry_guidance(pipe)
             self._pipes[key] = pipe
@@ -125,13 +131,13 @@ class PriorCache:
         """A depth model of ``transformers``.
 
         Raises:
-            OSError: it does not exist, is neither cached nor can be fetched, or has no safetensors.
-            ValueError: a class whose output, or a processor that, is not known.
+            ValueError: it does not exist, is neither cached nor can be fetched, or has no safetensors; a
+                class whose output, or a processor that, is not known.
         """
         key = (name, settings.device, settings.dtype)
         if key not in self._models:
             self._models[key] = HFDepthModel.from_pretrained(
-                name, device=settings.device, dtype=settings.torch_dtype
+                name, device=settings.device, dtype=settings.weights_dtype
             )
         return self._models[key]
 

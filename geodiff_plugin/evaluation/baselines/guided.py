@@ -1,13 +1,13 @@
-"""The default preset: what this package proposes.
+"""The default preset.
 
 Hop: ``StereoSample`` -> guided pipeline -> metres.
-Paper: S4; where the default departs from it, docs/knobs.md says why.
+Paper: S4; where the default departs from it, docs/reference/knobs.md says why.
 """
 
 from __future__ import annotations
 
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
-from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 
 __all__ = ["GUIDED"]
 

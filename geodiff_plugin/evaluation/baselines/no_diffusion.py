@@ -15,9 +15,9 @@ from torch import Tensor
 from geodiff_plugin.evaluation.baselines._constant import Start, constant_method
 from geodiff_plugin.evaluation.baselines.base import Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.guidance import GeometryGuidance
-from geodiff_plugin.metric import GROWS_WITH_DEPTH
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
+from geodiff_plugin.scale.space import SPACES
 
 __all__ = ["NO_DIFFUSION"]
 
@@ -25,7 +25,7 @@ __all__ = ["NO_DIFFUSION"]
 def _start(pipe: Any, sample: StereoSample, settings: Settings) -> Start:
     """The latent of a ground plane: near at the bottom, far at the top."""
     adapter = find_adapter(pipe)(pipe)
-    near, far = (0.0, 1.0) if adapter.space in GROWS_WITH_DEPTH else (1.0, 0.0)
+    near, far = (0.0, 1.0) if SPACES[adapter.space].grows_with_depth else (1.0, 0.0)
 
     def answer(image: Tensor) -> Tensor:
         rows = torch.linspace(far, near, image.shape[-2], device=image.device)
@@ -38,6 +38,6 @@ NO_DIFFUSION = constant_method(
     "no-diffusion",
     "no diffusion",
     "the default preset without the U-Net: the same search, losses and updates on the latent of a ramp",
-    partial(GeometryGuidance, doubt=False),  # a ramp contradicts nothing
+    partial(GeometryGuidance, reject_reflections=False),  # a ramp contradicts nothing
     _start,
 )

@@ -1,4 +1,4 @@
-"""Algorithm 1 as printed.
+"""Algorithm 1 of the paper as printed.
 
 Hop: ``StereoSample`` -> pipeline guided with the paper's numbers -> metres.
 Paper: Algorithm 1, S5.1, S7.3.
@@ -7,7 +7,7 @@ Paper: Algorithm 1, S5.1, S7.3.
 from __future__ import annotations
 
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
-from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 
 __all__ = ["PAPER"]
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 from typing import Any
 
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
-from geodiff_plugin.guidance import GeometryGuidance
-from geodiff_plugin.knobs import DEFAULT_WEIGHTS
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.guidance.presets import DEFAULT
 
 __all__ = ["PHOTOMETRIC_ONLY"]
 
 
 def _preset(right: Any, K: Any, E: Any) -> GeometryGuidance:
-    return GeometryGuidance(right, K, E, weights=DEFAULT_WEIGHTS | {"matches": 0.0})
+    return GeometryGuidance(right, K, E, weights=DEFAULT.weights | {"matches": 0.0})
 
 
 PHOTOMETRIC_ONLY = guided_method(

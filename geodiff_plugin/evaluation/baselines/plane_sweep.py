@@ -1,4 +1,4 @@
-"""Winner take all over our own plane sweep: what the cost volume says with nothing else.
+"""Winner-takes-all depth of our plane sweep, without aggregation.
 
 Hop: ``StereoSample`` of any pose -> cost volume -> best plane -> metres.
 Paper: none; the floor under every method that uses the volume.

@@ -1,4 +1,4 @@
-"""The paper's ablation without diffusion: move the prior's depth pixels down the photometric error.
+"""The paper's ablation without diffusion: gradient descent of the prior's depth on the photometric error.
 
 Hop: ``StereoSample`` -> prior's relative map -> 50 updates of its pixels, scale and shift -> metres.
 Paper: S5.3.1, Figure 6 (fig:ab1).
@@ -17,8 +17,8 @@ from geodiff_plugin.evaluation.baselines._constant import Start, constant_method
 from geodiff_plugin.evaluation.baselines._guidance import call_arguments
 from geodiff_plugin.evaluation.baselines.base import Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.guidance import GeometryGuidance
-from geodiff_plugin.presets import PAPER_WEIGHTS
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.guidance.presets import PAPER
 
 __all__ = ["REPROJECTION_ONLY"]
 
@@ -31,7 +31,7 @@ def _preset(right: Any, K: Any, E: Any, **changes: Any) -> GeometryGuidance:
     The paper names a rate of 1e-2 and no optimiser. A plain step of that size moves no pixel, because the
     gradient of a mean over all pixels is tiny in each; Adam's do.
     """
-    preset = {"weights": PAPER_WEIGHTS, "inner_steps": ITERATIONS, "step_latents": 0.01}
+    preset = {"weights": PAPER.weights, "inner_steps": ITERATIONS, "step_latents": 0.01}
     preset |= {"correct": False, "refine": False}
     return GeometryGuidance(right, K, E, **(preset | changes))
 

@@ -1,4 +1,4 @@
-"""The paper's ablation: learn scale and shift, leave the latents as the prior draws them.
+"""The paper's ablation that learns scale and shift and leaves the latents alone.
 
 Hop: ``StereoSample`` -> pipeline guided in two numbers -> metres.
 Paper: S5.3, Table 4.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
-from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 
 __all__ = ["SCALE_SHIFT_ONLY"]
 

@@ -1,4 +1,4 @@
-"""The default preset without gradient updates: what the search for the scale gives by itself.
+"""The default preset without gradient updates: the search for the scale alone.
 
 Hop: ``StereoSample`` -> pipeline, scale and shift from the search -> metres.
 Paper: S7.3 (the pre-selected g_s), extended to near and far.
@@ -7,7 +7,7 @@ Paper: S7.3 (the pre-selected g_s), extended to near and far.
 from __future__ import annotations
 
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
-from geodiff_plugin.guidance import GeometryGuidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 
 __all__ = ["SEARCH_ONLY"]
 

@@ -1,4 +1,4 @@
-"""OpenCV's semi-global block matching with background fill: the classical training-free peer.
+"""OpenCV's semi-global block matching with background fill.
 
 Hop: rectified ``StereoSample`` -> disparity -> filled -> metres.
 Paper: leaves this peer out; fill as KITTI's development kit does it for sparse results.

@@ -1,4 +1,4 @@
-"""Our own plane sweep, aggregated, left-right checked and filled: stereo for any pose without a prior.
+"""Our plane sweep with semi-global aggregation, left-right check and fill: stereo for any pose, no prior.
 
 Hop: ``StereoSample`` of any pose -> cost volume -> matches -> filled -> metres.
 Paper: none; shows what of the guided result the matches alone explain.

@@ -17,6 +17,7 @@ from geodiff_plugin.evaluation.datasets.kitti2012 import KITTI2012
 from geodiff_plugin.evaluation.datasets.kitti2015 import KITTI2015
 from geodiff_plugin.evaluation.datasets.middlebury import ETH3D, MIDDEVAL3, MIDDLEBURY2014
 from geodiff_plugin.evaluation.datasets.mvsnet import MVSNET
+from geodiff_plugin.evaluation.datasets.perturbed import with_perturbed_poses
 from geodiff_plugin.evaluation.datasets.robustmvd import ROBUSTMVD
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 from geodiff_plugin.evaluation.datasets.synthetic import SYNTHETIC
@@ -43,8 +44,11 @@ DATASETS: dict[str, Dataset] = {
 
 def load(ref: SampleRef) -> StereoSample:
     """Read the sample that ``ref`` points to with its data set's loader, and change it as ``ref`` asks."""
-    sample, change = DATASETS[ref.dataset].load(ref), ref.files.get("right_exposure")
-    return sample if change is None else with_exposure(sample, change, ref.name)
+    sample = DATASETS[ref.dataset].load(ref)
+    for key, changed in (("right_exposure", with_exposure), ("perturbed", with_perturbed_poses)):
+        if key in ref.files:
+            sample = changed(sample, ref.files[key], ref.name)
+    return sample
 
 
 def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **options: object) -> list[SampleRef]:

@@ -106,7 +106,7 @@ ROBUSTMVD = Dataset(
     cap_m=None,
     obtain="tanks_and_temples_images.zip and tanks_and_temples_depth.zip, fetched by "
     "download_tanks_and_temples.sh of https://github.com/lmb-freiburg/robustmvd; then cams/ and pair.txt "
-    "from its sample list as docs/evaluation.md shows.",
+    "from its sample list as docs/how-to/evaluation.md shows.",
     options=("pairs", "pixel_centre"),
     full_count=sum(map(len, KEY_VIEWS.values())),
 )

@@ -26,7 +26,7 @@ __all__ = ["SYNTHETIC", "find_synthetic", "is_reflective", "load_synthetic"]
 
 SIZE = (384, 512)
 REFLECTIVE_SHARE = 0.01
-_ROOT = re.compile(r"synthetic(-reflective)?:(\d+)(?:\+(\d+))?(?:@(\d+)x(\d+))?")
+_ROOT = re.compile(r"synthetic(-reflective|-posed)?:(\d+)(?:\+(\d+))?(?:@(\d+)x(\d+))?")
 # Mirrors of one percent of the image still have thirty pixels here.
 _SCAN = (48, 64)
 
@@ -38,14 +38,16 @@ def find_synthetic(root: Path) -> list[SampleRef]:
         root: ``synthetic:N`` for N pairs from seed 0 on, ``synthetic:N+S`` for N from seed S on, and
             ``@WIDTHxHEIGHT`` after either for another size than 512x384 pixels; ``synthetic-reflective:``
             with the same for the first N scenes with a mirror or glass on at least 1 % of the left image
-            (one in seven has). Any other path holds none. Even seeds give rectified pairs, odd ones a
-            general pose.
+            (one in seven has), ``synthetic-posed:`` for the first N that have a general pose. Any other path
+            holds none. Even seeds give rectified pairs, odd ones a general pose.
     """
     asked = _ROOT.fullmatch(str(root))
     if asked is None:
         return []
     seeds = count(int(asked[3] or 0))
-    if asked[1]:
+    if asked[1] == "-posed":
+        seeds = filter(lambda seed: seed % 2 == 1, seeds)
+    elif asked[1]:
         seeds = filter(is_reflective, seeds)
     size = (int(asked[5]), int(asked[4])) if asked[4] else SIZE
     return [
@@ -102,5 +104,6 @@ SYNTHETIC = Dataset(
     cap_m=None,
     needs_folder=False,
     obtain="rendered by this package, offline: give synthetic:N as DIR (or synthetic:N+FIRST_SEED; @256x192 "
-    "after either for that size; synthetic-reflective:N for scenes with mirrors or glass).",
+    "after either for that size; synthetic-reflective:N for scenes with mirrors or glass, synthetic-posed:N "
+    "for pairs in a general pose).",
 )

@@ -7,17 +7,17 @@ Paper: Figure 6 (fig:ab1), fig:qualitative, supplementary figures of S7.3 and S9
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 from geodiff_plugin._checks import check_choice
-from geodiff_plugin.evaluation.commands import command_line
 from geodiff_plugin.evaluation.figures.base import FigureKind, FigureOptions
 from geodiff_plugin.evaluation.figures.canvas import save_png
 from geodiff_plugin.evaluation.figures.curves import draw_exposure, draw_inner_steps
+from geodiff_plugin.evaluation.figures.epipolar import draw_epipolar
 from geodiff_plugin.evaluation.figures.gs_sweep import draw_gs_sweep
 from geodiff_plugin.evaluation.figures.maps import draw_ablation, draw_qualitative
 from geodiff_plugin.evaluation.figures.terms import draw_terms
+from geodiff_plugin.evaluation.options import command_line
 from geodiff_plugin.evaluation.report import run_facts, write_text
 
 __all__ = ["FIGURES", "FigureOptions", "run_figure"]
@@ -30,6 +30,7 @@ FIGURES: dict[str, FigureKind] = {
     "qualitative": FigureKind(
         "depth and error of every method, with --clouds their points", draw_qualitative
     ),
+    "epipolar": FigureKind("one pair: epipolar lines and residuals as given and refined", draw_epipolar),
     "terms": FigureKind("one pair: the prior, the matches, their belief, every loss term", draw_terms),
 }
 """Every figure by name."""
@@ -46,7 +47,7 @@ def _head(name: str, options: FigureOptions) -> tuple[str, ...]:
 
 
 def run_figure(name: str, options: FigureOptions) -> Path:
-    """Draw one figure, write it and its numbers, say where.
+    """Draw one figure, and write it and its numbers.
 
     Returns:
         Path of the PNG.
@@ -62,6 +63,4 @@ def run_figure(name: str, options: FigureOptions) -> Path:
     save_png(drawing.figure, path)
     facts = run_facts(command_line(run, _head(name, options), ()))
     write_text(path.with_suffix(".json"), json.dumps(facts | drawing.numbers, indent=1) + "\n")
-    if not run.quiet:
-        sys.stdout.write(f"{path}\n")
     return path

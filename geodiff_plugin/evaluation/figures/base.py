@@ -1,4 +1,4 @@
-"""What a figure is given, and the depth maps that several of them draw.
+"""Options of a figure, and the depth maps that several figures draw.
 
 Hop: options -> samples and predictions of methods.
 Paper: none.
@@ -16,9 +16,9 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, find_method
 from geodiff_plugin.evaluation.baselines.base import Settings
-from geodiff_plugin.evaluation.commands import PairsOptions, all_refs, select
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
 from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
 
 __all__ = ["Drawing", "FigureKind", "FigureOptions", "MethodDepth", "depths_of", "references", "samples"]
 

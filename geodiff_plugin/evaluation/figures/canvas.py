@@ -1,4 +1,4 @@
-"""What every figure is drawn with: a sheet, maps with shared colour bars, small PNG files.
+"""Drawing tools of the figures: a sheet, maps with shared colour bars, small PNG files.
 
 Hop: arrays -> matplotlib figure -> PNG.
 Paper: none.
@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin.formats import atomic_path
-from geodiff_plugin.plotting import ticks
+from geodiff_plugin.plotting.figures import ticks
 
 __all__ = [
     "COLOURS",

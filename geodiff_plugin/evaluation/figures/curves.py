@@ -1,4 +1,4 @@
-"""Error against one knob: updates per step, and the exposure of the right view.
+"""Curves of error against updates per step, and against the exposure of the right view.
 
 Hop: samples + variants -> records (resumable) -> mean per variant -> figure.
 Paper: S9 (fig:error_time); S11 (limits) for the exposure.

@@ -1,4 +1,4 @@
-"""What the global scale does: L_geo and AbsRel against g_s, and the left image re-rendered at a few of them.
+"""Sweep of the global scale: L_geo and AbsRel against g_s, with re-rendered left images.
 
 Hop: sample + the prior's relative map -> losses and errors per g_s -> figure.
 Paper: S7.3, supplementary figures (fig:lossAbs1, fig:lossAbs2, fig:warp).
@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import check_number
+from geodiff_plugin.algorithm.terms import masked_mean, photometric_map
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache
 from geodiff_plugin.evaluation.datasets import StereoSample
 from geodiff_plugin.evaluation.figures.base import Drawing, FigureOptions, samples
@@ -21,8 +22,7 @@ from geodiff_plugin.evaluation.figures.canvas import COLOURS, new_figure, plain_
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import warp_right_to_left
-from geodiff_plugin.metric import GROWS_WITH_DEPTH, SPACES, smooth_floor
-from geodiff_plugin.terms import masked_mean, photometric_map
+from geodiff_plugin.scale.space import SPACES, smooth_floor
 
 __all__ = ["Sweep", "draw_gs_sweep", "sweep_g_s"]
 
@@ -73,7 +73,8 @@ def sweep_g_s(sample: StereoSample, relative: np.ndarray, space: str, largest_m:
         space: what it is affine in, key of ``SPACES``.
         largest_m: the last candidate, metres; the first one is 1 m.
 
-    Source: S7.3. Deviation: L_geo is the mean over the visible pixels, not over all (docs/paper-map.md, E8).
+    Source: S7.3. Deviation: L_geo is the mean over the visible pixels, not over all
+    (docs/reference/paper-map.md, E8).
     """
     left, right = (as_image_01(image, "image")[None] for image in (sample.left, sample.right))
     cameras = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
@@ -81,12 +82,12 @@ def sweep_g_s(sample: StereoSample, relative: np.ndarray, space: str, largest_m:
     x = smooth_floor(torch.from_numpy(np.asarray(relative, np.float32))[None, None])
     candidates = torch.from_numpy(np.geomspace(1.0, largest_m, CANDIDATES).astype(np.float32))
     scale, shift = torch.ones(1), torch.zeros(1)
-    if space not in GROWS_WITH_DEPTH:
+    if not SPACES[space].grows_with_depth:
         scale = shift = F.softplus(torch.zeros(1))
     losses, shares, errors = [], [], []
 
     def at(g_s: torch.Tensor) -> tuple[torch.Tensor, Any]:
-        depth_m = SPACES[space](x, scale, shift, g_s)
+        depth_m = SPACES[space].forward(scale * x + shift, g_s)
         return depth_m, warp_right_to_left(right, depth_m, *cameras)
 
     for g_s in candidates:

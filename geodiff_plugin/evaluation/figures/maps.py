@@ -1,4 +1,4 @@
-"""Depth maps, error maps and point clouds of several methods, side by side.
+"""Depth maps, error maps and point clouds of several methods side by side.
 
 Hop: samples + methods -> predictions -> figure.
 Paper: Figure 6 (fig:ab1), the qualitative figures (fig:qualitative, fig:exp-two-view).
@@ -23,7 +23,7 @@ from geodiff_plugin.evaluation.figures.canvas import (
     show_image,
 )
 from geodiff_plugin.evaluation.figures.clouds import orbit, render_cloud
-from geodiff_plugin.plotting import depth_range
+from geodiff_plugin.plotting.figures import depth_range
 
 __all__ = ["ABLATION_METHODS", "QUALITATIVE_METHODS", "draw_ablation", "draw_qualitative"]
 

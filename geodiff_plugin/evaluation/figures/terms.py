@@ -1,4 +1,4 @@
-"""One pair term by term: what the prior says, what the views say, how far it is believed, what comes of it.
+"""Anatomy of one guided call: prior, matches, confidence, loss terms, result.
 
 Hop: sample -> a call without updates, a guided call -> maps of both, loss terms by step -> figure.
 Paper: Algorithm 1, Eq. 14 (eq:geo-loss) and Eq. 17; not a figure of its own.
@@ -17,6 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.algorithm.state import Trajectory
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines._guidance import call_arguments, posed_views, prior_space
 from geodiff_plugin.evaluation.datasets import StereoSample
@@ -37,11 +38,10 @@ from geodiff_plugin.evaluation.figures.maps import CELL_IN
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import hidden_in_right, warp_right_to_left
-from geodiff_plugin.guidance import GeometryGuidance
-from geodiff_plugin.metric import AffineState
-from geodiff_plugin.plotting import depth_range
-from geodiff_plugin.terms.matches import CAUCHY_PLANES
-from geodiff_plugin.trajectory import Trajectory
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.plotting.figures import depth_range
+from geodiff_plugin.scale.space import AffineState
 from geodiff_plugin.types import StepReport
 
 __all__ = ["TermByTerm", "draw_terms", "term_by_term"]
@@ -60,7 +60,7 @@ class TermByTerm:
     Attributes:
         first_m: ``(H, W)`` metres, the prior's first estimate with the search's scale.
         matches_m: ``(h, w)`` metres, depth that the views say by themselves; NaN where nothing.
-        believed: ``(h, w)`` in [0, 1], confidence of the matches after doubt and gate; NaN without one.
+        believed: ``(h, w)`` in [0, 1], confidence of the matches after rejection and gate; NaN without one.
         denoised_m: ``(H, W)`` metres, the decoded result, before it is refined.
         final_m: ``(H, W)`` metres.
         residual: ``(h, w)`` planes of the sweep, ``final_m`` against the matches; above 0 is nearer.
@@ -97,9 +97,9 @@ def _followed(
 
 def _hidden(guidance: GeometryGuidance, depth_m: Tensor) -> Tensor:
     """``(1, 1, H, W)`` bool: right views reach the pixel, and in all of those something else covers it."""
-    rights, K_left, _ = guidance.inputs[0].on(depth_m.device)
+    further, K_left, _ = guidance.inputs[0].on(depth_m.device)
     reached = clear = torch.zeros_like(depth_m, dtype=torch.bool)
-    for image, K_right, T in rights:
+    for image, K_right, T in further:
         cameras = (K_left[None], K_right[None], T[None])
         covered = hidden_in_right(depth_m, *cameras, tuple(image.shape[-2:]))
         visible = warp_right_to_left(image[None], depth_m, *cameras).visible
@@ -132,7 +132,7 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
     start = held.history[0]
     found = AffineState(*(value.cpu() for value in (start.s_hat, start.t_hat, start.g_s)))
     trajectory.settle_scale(trajectory.metric.relative(estimates[0], found))
-    known, believed = trajectory.objective.views.matches, trajectory.matches
+    known, believed = trajectory.known.matches, trajectory.matches
     there = (known.confidence > 0) & (known.inverse_depth > 0)
     final_m = torch.from_numpy(out.prediction).permute(0, 3, 1, 2).float()
     inverse_m = 1.0 / _resized(final_m, known.inverse_depth.shape[-2:])
@@ -174,11 +174,11 @@ def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[st
     shown = show_values(lower[1], parts.difference, title, "inferno", 0.0, WORST_DIFFERENCE)
     mark(lower[1], parts.hidden, HIDDEN_COLOUR)
     value_bar(figure, shown, lower[1], "mean absolute difference", "max")
-    title, most = "refined against matches\n(red: nearer)", CAUCHY_PLANES
+    title, most = "refined against matches\n(red: nearer)", DEFAULT.terms.matches_cauchy
     shown = show_values(lower[2], parts.residual, title, "RdBu_r", -most, most)
     value_bar(figure, shown, lower[2], "planes of the sweep", "both")
     shown = show_values(lower[3], parts.believed, "matches, how far believed", "viridis", 0.0, 1.0)
-    value_bar(figure, shown, lower[3], "confidence after doubt and gate")
+    value_bar(figure, shown, lower[3], "confidence after rejection and gate")
     shown = show_values(lower[4], parts.confidence, "confidence of refined", "viridis", 0.0, 1.0)
     value_bar(figure, shown, lower[4], "probability of an error < 10 %")
     shown = show_error(lower[5], parts.final_m, sample.depth_m, sample.valid, "error of refined")

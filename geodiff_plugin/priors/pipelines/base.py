@@ -1,4 +1,4 @@
-"""The common loop of depth priors that diffusers has no pipeline for.
+"""Base pipeline of depth priors that diffusers has no pipeline for.
 
 Hop: image -> condition, latents -> ``denoise`` once a step -> clean latent -> relative map -> output grid.
 Paper: S3.1 (the prior's own sampling), around which Algorithm 1 is put.
@@ -108,6 +108,7 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
         padded, padding, size = processor.preprocess(
             image, resolution, resample_method_input, device, self.dtype
         )  # (N, 3, H, W)
+        padded = padded.contiguous()  # in another layout a network rounds otherwise
         condition = self.prepare_condition(padded, ensemble_size, batch_size, generator, **options)
         z = self.prepare_latents(condition, None if latents is not None else generator)  # (N * E, C, h, w)
         if latents is not None:

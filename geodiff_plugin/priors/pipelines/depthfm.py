@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, UNet2DConditionModel
-from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
@@ -22,8 +21,9 @@ from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.priors.pipelines.hooks import Condition, Generators
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
+from geodiff_plugin.priors.pipelines.sides import SidesOf
 
-__all__ = ["DepthFMPipeline", "SidesOf64", "cosine_alpha_bar"]
+__all__ = ["DepthFMPipeline", "cosine_alpha_bar"]
 
 #: Steps of the schedule that ``noising_step`` counts in.
 NOISING_STEPS = 1000
@@ -35,41 +35,6 @@ def cosine_alpha_bar(time: float) -> float:
     """Share of the signal's variance at a time in [0, 1] of the cosine schedule."""
     log_snr = -2.0 * math.log(math.tan(math.pi * time / 2.0) + 1e-5)
     return 1.0 / (1.0 + math.exp(-log_snr))
-
-
-class SidesOf64(MarigoldImageProcessor):
-    """Resizes each side to a multiple of 64 pixels, each with a factor of its own, and never pads."""
-
-    def __init__(self) -> None:
-        super().__init__(vae_scale_factor=SIDE)
-
-    @staticmethod
-    def pad_image(image: Tensor, align: int) -> tuple[Tensor, tuple[int, int]]:
-        """The image as it is, and no padding."""
-        return image, (0, 0)
-
-    def preprocess(
-        self,
-        image: Any,
-        processing_resolution: int | None = None,
-        resample_method_input: str = "bilinear",
-        device: torch.device | str = "cpu",
-        dtype: torch.dtype = torch.float32,
-    ) -> tuple[Tensor, tuple[int, int], tuple[int, int]]:
-        """As the stock method, but for the size.
-
-        Returns:
-            ``(N, 3, H, W)`` in [-1, 1] with sides of a multiple of 64, no padding ``(0, 0)``, and the size
-            ``(H, W)`` that the image came with.
-        """
-        # In float32 until the end: not every device resizes in half precision.
-        image, padding, size = super().preprocess(image, 0, resample_method_input, device, torch.float32)
-        height, width = size
-        factor = processing_resolution / max(size) if processing_resolution else 1.0
-        grid = tuple(max(SIDE, round(int(side * factor) / SIDE) * SIDE) for side in (height, width))
-        if grid != (height, width):
-            image = self.resize_antialias(image, grid, resample_method_input, is_aa=True)
-        return image.to(dtype), padding, size
 
 
 class DepthFMPipeline(DepthDiffusionPipeline):
@@ -110,7 +75,7 @@ class DepthFMPipeline(DepthDiffusionPipeline):
             prediction_type,
             default_denoising_steps,
             default_processing_resolution,
-            image_processor=SidesOf64(),
+            image_processor=SidesOf(SIDE),
             noising_step=noising_step,
         )
 

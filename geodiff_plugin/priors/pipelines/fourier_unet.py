@@ -60,7 +60,7 @@ class FourierUNet(UNet2DConditionModel):
     """
 
     # The wraps keeps the signature, from which diffusers reads what a config may hold.
-    @functools.wraps(UNet2DConditionModel.__init__)
+    @functools.wraps(UNet2DConditionModel.__init__)  # type: ignore[misc]
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.fftblock = FourierBlock(self.config.block_out_channels[-1])

@@ -1,4 +1,4 @@
-"""What a depth prior tells the common loop: modules and options, condition, network call, decoder.
+"""What a subclass of ``DepthDiffusionPipeline`` overrides: condition, network call, decoder.
 
 Hop: image -> condition; latents, time -> network output; clean latents <-> relative map.
 Paper: S3.1 (the prior's own sampling), around which Algorithm 1 is put.
@@ -6,7 +6,8 @@ Paper: S3.1 (the prior's own sampling), around which Algorithm 1 is put.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import torch
 from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
@@ -39,6 +40,12 @@ class PriorHooks:
         output_resampling: how its authors bring the map to the image's size.
     """
 
+    if TYPE_CHECKING:  # what DiffusionPipeline, the other base of every subclass, brings
+        vae: Any
+        scheduler: Any
+        register_modules: Callable[..., None]
+        register_to_config: Callable[..., None]
+
     max_steps: int | None = None
     deterministic = False
     depth_channels = slice(None)
@@ -58,7 +65,7 @@ class PriorHooks:
 
         Args:
             modules: by the names of the constructor's parameters.
-            prediction_type: what the relative map is affine in, key of ``metric.SPACES``.
+            prediction_type: what the relative map is affine in, key of ``scale.space.SPACES``.
             default_denoising_steps: when a call names none.
             default_processing_resolution: longer side, pixels, when a call names none.
             image_processor: a ``MarigoldImageProcessor``, or the number that padded sides are multiples of.
@@ -80,7 +87,13 @@ class PriorHooks:
     # What a subclass overrides -----------------------------------------------------------------------------
 
     def prepare_condition(
-        self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators, **options: Any
+        self,
+        image: Tensor,
+        ensemble_size: int,
+        batch_size: int,
+        generator: Generators,
+        *args: Any,
+        **options: Any,
     ) -> Condition:
         """Everything that the network is told beside latents and time.
 
@@ -89,6 +102,7 @@ class PriorHooks:
             ensemble_size: members E per image.
             batch_size: images or members that one forward may take.
             generator: for a prior that draws here (a posterior sample).
+            *args: nothing; with ``options`` it lets a subclass name its own keywords.
             **options: what the subclass adds to the call.
 
         Returns:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from diffusers import AutoencoderKL, UNet2DConditionModel
 from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from torch import Tensor
@@ -112,13 +111,11 @@ class LotusPipeline(DepthDiffusionPipeline):
             default_processing_resolution,
             LotusImageProcessor(),
         )
-        self._processing_size = (0, 0)
 
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
         """Image latents (a draw each), embedded task and empty prompt, ``N * E`` of each."""
-        self._processing_size = tuple(image.shape[-2:])
         latents = self.image_latents(image, ensemble_size, batch_size, generator, sample=True)
         task = torch.tensor(DEPTH_TASK)
         task = torch.cat([task.sin(), task.cos()]).to(latents)  # (4,)
@@ -145,15 +142,10 @@ class LotusPipeline(DepthDiffusionPipeline):
     def decode_relative(self, z0: Tensor) -> Tensor:
         """Channel mean in [0, 1], not clipped, pixel to pixel with the processed image.
 
-        The latent covers whole cells of 8 pixels only; the rows and columns of the last call's image beyond
-        them repeat the last one. (The authors stretch instead, which moves the map by up to 7 pixels.)
+        The latent covers whole cells of 8 pixels only; a guided call repeats the last row and column beyond
+        them. (The authors stretch instead, which moves the map by up to 7 pixels.)
         """
-        x = self._decode(z0)  # (B, 1, 8 h, 8 w)
-        cell = 2 ** (len(self.vae.config.block_out_channels) - 1)
-        bottom, right = (a - b for a, b in zip(self._processing_size, x.shape[-2:], strict=True))
-        if not (0 <= bottom < cell and 0 <= right < cell):
-            return x  # latents of no image of this call
-        return F.pad(x, (0, right, 0, bottom), mode="replicate")
+        return self._decode(z0)  # (B, 1, 8 h, 8 w)
 
     def encode_relative(self, x: Tensor) -> Tensor:
         """As the base class, of whole cells only."""

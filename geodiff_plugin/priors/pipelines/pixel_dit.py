@@ -79,7 +79,7 @@ class _TimeEmbedder(nn.Module):
         half = self.frequencies // 2
         rates = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device).float() / half)
         angles = t[:, None].float() * rates
-        return self.mlp(torch.cat([angles.cos(), angles.sin()], dim=-1).to(self.mlp[0].weight.dtype))
+        return self.mlp(torch.cat([angles.cos(), angles.sin()], dim=-1).to(next(self.mlp.parameters()).dtype))
 
 
 class _Block(nn.Module):

@@ -1,4 +1,4 @@
-"""What a U-Net with cross-attention is told in words: an encoded prompt, or one that came with the weights.
+"""Prompt embeddings for U-Nets with cross-attention: encoded, or saved with the weights.
 
 Hop: prompt -> ``(1, n, C)`` text embedding.
 Paper: none (Marigold's empty prompt).

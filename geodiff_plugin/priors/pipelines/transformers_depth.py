@@ -12,30 +12,38 @@ import torch
 from torch import Tensor
 from transformers import PreTrainedModel
 
-from geodiff_plugin.priors.hf_depth import HFDepthModel
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.priors.hf_depth import DepthMap, HFDepthModel, output_of
 from geodiff_plugin.priors.hf_preparation import Preparation
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from geodiff_plugin.priors.pipelines.hooks import Condition, Generators
 
-__all__ = ["TransformersDepthPipeline", "unit_range"]
+__all__ = ["TransformersDepthPipeline", "range_of", "unit_range"]
 
 #: What is 1; a few stray pixels shall not press the rest together.
 TOP_QUANTILE = 0.98
+#: Metres; a network's least depth may be 0.
+NEAREST_M = 1e-3
+
+
+def range_of(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Least value and 98 % quantile of maps ``(B, 1, H, W)``, ``(B,)`` each."""
+    rows = values.flatten(1)
+    # A quantile of every pixel of a large map is more than torch.quantile takes.
+    high = torch.quantile(rows[:, :: max(1, rows.shape[1] // 1_000_000)], TOP_QUANTILE, dim=1)
+    return rows.amin(dim=1), high
 
 
 def unit_range(values: Tensor) -> Tensor:
     """Maps ``(B, 1, H, W)`` with their least value at 0 and their 98 % quantile at 1; a flat map is 0."""
-    rows = values.flatten(1)
-    low = rows.amin(dim=1)
-    # A quantile of every pixel of a large map is more than torch.quantile takes.
-    high = torch.quantile(rows[:, :: max(1, rows.shape[1] // 1_000_000)], TOP_QUANTILE, dim=1)
+    low, high = range_of(values)
     span = (high - low).clamp_min(torch.finfo(values.dtype).tiny)
     return (values - low.view(-1, 1, 1, 1)) / span.view(-1, 1, 1, 1)
 
 
 class TransformersDepthPipeline(DepthDiffusionPipeline):
-    """Depth Anything, DPT, ZoeDepth, GLPN, DepthPro and whatever else ``AutoModelForDepthEstimation`` loads.
+    """Every model that ``AutoModelForDepthEstimation`` loads, but that of canopy height.
 
     There are no latents to speak of: what guidance moves beside scale and shift is the map itself, pixel by
     pixel. ``processing_resolution`` is the longer side of that map, 0 for the image's own; which size the
@@ -48,6 +56,10 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
         prediction_type: ``"depth"`` or ``"disparity"``; ``None`` for what the model's class is known to give.
         default_denoising_steps: 1.
         default_processing_resolution: see above.
+
+    Attributes:
+        own_range: ``(N * E, 2)`` metres at 0 and at 1 of the latest call's maps, of a model that is metric by
+            itself or was given a prompt; else ``None``.
     """
 
     model_cpu_offload_seq = "model"
@@ -66,6 +78,9 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
     ) -> None:
         super().__init__()
         wrapped = HFDepthModel(model, Preparation.from_config(preparation or {}), prediction_type)
+        # A space that the model's class is known for says nothing new: what is saved with it stays metric.
+        self._said = None if wrapped.space == _space_of(model) else wrapped.space
+        self.takes_prompt, self.own_range = wrapped.takes_prompt, None
         self.register_prior(
             {"model": model, "scheduler": scheduler},
             wrapped.space,
@@ -76,17 +91,37 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
         )
 
     def prepare_condition(
-        self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators, **options: Any
+        self,
+        image: Tensor,
+        ensemble_size: int,
+        batch_size: int,
+        generator: Generators,
+        prompt_depth: Tensor | None = None,
     ) -> Condition:
-        """The relative map of every image, ``(N * E, 1, H, W)`` float32."""
-        wrapped = HFDepthModel(
-            self.model, Preparation.from_config(self.config.preparation), self.config.prediction_type
-        )
+        """The relative map of every image, ``(N * E, 1, H, W)`` float32.
+
+        Args:
+            image: as in the base class.
+            ensemble_size: as there.
+            batch_size: as there.
+            generator: as there.
+            prompt_depth: ``(N, 1, h, w)`` metres everywhere, for Prompt Depth Anything; a guided call makes
+                it of matches and points, unless it is given one.
+        """
+        prompts = [None] * len(image.split(batch_size))
+        if prompt_depth is not None:
+            prompt_depth = torch.as_tensor(prompt_depth)
+            if prompt_depth.ndim != 4 or len(prompt_depth) != len(image):
+                bad_value("prompt_depth", f"({len(image)}, 1, h, w) metres", tuple(prompt_depth.shape))
+            prompts = prompt_depth.split(batch_size)
+        wrapped = HFDepthModel(self.model, Preparation.from_config(self.config.preparation), self._said)
         maps = [
-            wrapped(part.float() / 2 + 0.5, size=tuple(part.shape[-2:])).values
-            for part in image.split(batch_size)
+            wrapped(part.float() / 2 + 0.5, tuple(part.shape[-2:]), prompt)
+            for part, prompt in zip(image.split(batch_size), prompts, strict=True)
         ]
-        return {"relative": unit_range(torch.cat(maps)).repeat_interleave(ensemble_size, dim=0)}
+        self.own_range = _own_range(maps, ensemble_size)
+        values = torch.cat([found.values for found in maps])
+        return {"relative": unit_range(values).repeat_interleave(ensemble_size, dim=0)}
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
         """Zeros; nothing reads them."""
@@ -103,3 +138,19 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
     def encode_relative(self, x: Tensor) -> Tensor:
         """The map is the latent."""
         return x
+
+
+def _space_of(model: PreTrainedModel) -> str | None:
+    """What the class of a model is known to give, if it is."""
+    try:
+        return output_of(model)[0]
+    except ValueError:
+        return None
+
+
+def _own_range(maps: list[DepthMap], ensemble_size: int) -> Tensor | None:
+    """``(N * E, 2)`` metres where the ranged maps are 0 and 1; ``None`` for relative ones."""
+    if not all(found.metric for found in maps):
+        return None
+    ends = [torch.stack([found.metres_of(v) for v in range_of(found.values)], 1) for found in maps]
+    return torch.cat(ends).clamp_min(NEAREST_M).repeat_interleave(ensemble_size, dim=0)

@@ -1,0 +1,180 @@
+"""Three nodes: cameras of a pair, guided depth, point cloud.
+
+An ``IMAGE`` of ComfyUI is ``(B, H, W, 3)`` float32 in [0, 1], a ``MASK`` is ``(B, H, W)``. Two types
+are ours: ``GEODIFF_RIG`` is a ``geodiff_plugin.Rig``, ``GEODIFF_DEPTH`` a dict with the arrays of one batch.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import comfy.model_management
+import comfy.utils
+import folder_paths
+import numpy as np
+import torch
+
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior, read_calibration
+from geodiff_plugin.formats import flying_points, make_cloud, rig_from_parameters, write_glb, write_ply
+from geodiff_plugin.plotting.figures import colour_depth
+
+CATEGORY = "GeoDiff"
+#: The prior that was used last, with the device it is on: a graph is run again and again.
+_LOADED: dict[tuple[str, str], object] = {}
+
+
+def _prior(name: str) -> object:
+    device = comfy.model_management.get_torch_device()
+    key = (name, str(device))
+    if key not in _LOADED:
+        _LOADED.clear()
+        pipe = load_prior(name).to(device)
+        pipe.set_progress_bar_config(disable=True)
+        _LOADED[key] = enable_geometry_guidance(pipe)
+    return _LOADED[key]
+
+
+class GeoDiffCalibration:
+    """Cameras of a stereo pair, from a calibration file or from numbers."""
+
+    CATEGORY, FUNCTION = CATEGORY, "read"
+    RETURN_TYPES, RETURN_NAMES = ("GEODIFF_RIG",), ("rig",)
+
+    @classmethod
+    def INPUT_TYPES(cls):  # noqa: D102, N802
+        number = {"default": 0.0, "min": 0.0, "max": 1e6, "step": 0.01}
+        return {
+            "required": {
+                "file": (
+                    "STRING",
+                    {"default": "", "tooltip": "In ComfyUI's input folder; empty: the numbers."},
+                )
+            },
+            "optional": {
+                "fx": ("FLOAT", number | {"tooltip": "Focal length, pixels."}),
+                "cx": ("FLOAT", number | {"tooltip": "Principal point, pixels."}),
+                "cy": ("FLOAT", number | {"tooltip": "Principal point, pixels."}),
+                "baseline_m": ("FLOAT", number | {"tooltip": "Distance of the cameras, metres."}),
+                "image": ("IMAGE", {"tooltip": "Left image, for files with several resolutions."}),
+            },
+        }
+
+    def read(self, file, fx=0.0, cx=0.0, cy=0.0, baseline_m=0.0, image=None):
+        """Read the file, or make a rectified rig of the numbers."""
+        if not file:
+            return (rig_from_parameters(fx, fx, cx, cy, baseline_m),)
+        size = None if image is None else (image.shape[2], image.shape[1])
+        path = Path(folder_paths.get_input_directory()) / file
+        return (read_calibration(path, image_size=size, baseline_m=baseline_m or None),)
+
+
+class GeoDiffDepth:
+    """Depth in metres of the left image, guided by the right one."""
+
+    CATEGORY, FUNCTION = CATEGORY, "estimate"
+    RETURN_TYPES = ("GEODIFF_DEPTH", "IMAGE", "IMAGE", "MASK")
+    RETURN_NAMES = ("depth", "coloured", "near_is_white", "confidence")
+
+    @classmethod
+    def INPUT_TYPES(cls):  # noqa: D102, N802
+        return {
+            "required": {
+                "left": ("IMAGE",),
+                "right": ("IMAGE",),
+                "rig": ("GEODIFF_RIG",),
+                "prior": ("STRING", {"default": "bundled", "tooltip": "'bundled', a hub id or a folder."}),
+                "steps": ("INT", {"default": 0, "min": 0, "max": 100, "tooltip": "0: the prior's own."}),
+                "ensemble": ("INT", {"default": 1, "min": 1, "max": 20}),
+                "preset": (["default", "paper"],),
+                "seed": ("INT", {"default": 0, "min": 0, "max": 0xFFFFFFFFFFFFFFFF}),
+            }
+        }
+
+    def estimate(self, left, right, rig, prior, steps, ensemble, preset, seed):
+        """One guided call over the batch."""
+        # ComfyUI runs nodes under inference_mode, in which nothing has a gradient, nor weights that it loads.
+        with torch.inference_mode(False):
+            return self._estimate(left, right, rig, prior, steps, ensemble, preset, seed)
+
+    def _estimate(self, left, right, rig, prior, steps, ensemble, preset, seed):
+        pipe = _prior(prior)
+        lefts, rights = (list(batch.cpu().numpy()) for batch in (left, right))
+        make = GeometryGuidance.paper if preset == "paper" else GeometryGuidance
+        guidance = make(rights, (rig.K_left, rig.K_right), rig.E)
+        asked = guidance.denoising_steps(steps or None, pipe.default_denoising_steps)
+        bar = comfy.utils.ProgressBar(asked * len(lefts) * ensemble)
+
+        def show(*_):
+            comfy.model_management.throw_exception_if_processing_interrupted()
+            bar.update(1)
+            return {}
+
+        out = pipe(
+            lefts,
+            guidance=guidance,
+            num_inference_steps=steps or None,
+            ensemble_size=ensemble,
+            generator=torch.Generator("cpu").manual_seed(seed % 2**63),
+            callback_on_step_end=show,
+        )
+        depth_m = out.prediction[..., 0].astype(np.float32)
+        found = {"depth_m": depth_m, "K": np.asarray(out.K), "image": np.stack(lefts), "rig": rig}
+        sure = np.ones_like(depth_m) if out.confidence is None else out.confidence[..., 0].astype(np.float32)
+        found["confidence"] = sure
+        coloured = np.stack([colour_depth(each) for each in depth_m]).astype(np.float32) / 255.0
+        return found, torch.from_numpy(coloured), _near_is_white(depth_m), torch.from_numpy(sure)
+
+
+def _near_is_white(depth_m: np.ndarray) -> torch.Tensor:
+    """``(B, H, W, 3)``: inverse depth from 0 to 1, as depth ControlNets expect it."""
+    inverse = 1.0 / depth_m
+    low, high = (np.percentile(inverse, share, axis=(1, 2), keepdims=True) for share in (1, 99))
+    grey = np.clip((inverse - low) / np.maximum(high - low, 1e-9), 0, 1).astype(np.float32)
+    return torch.from_numpy(grey)[..., None].repeat(1, 1, 1, 3)
+
+
+class GeoDiffPointCloud:
+    """The cloud of the first image, in ComfyUI's output folder; ``Preview 3D`` shows the GLB."""
+
+    CATEGORY, FUNCTION, OUTPUT_NODE = CATEGORY, "write", True
+    RETURN_TYPES, RETURN_NAMES = ("STRING",), ("model_file",)
+
+    @classmethod
+    def INPUT_TYPES(cls):  # noqa: D102, N802
+        return {
+            "required": {
+                "depth": ("GEODIFF_DEPTH",),
+                "least_confidence": ("FLOAT", {"default": 0.5, "min": 0.0, "max": 1.0, "step": 0.05}),
+                "format": (["glb", "ply"],),
+                "filename_prefix": ("STRING", {"default": "geodiff/cloud"}),
+            }
+        }
+
+    def write(self, depth, least_confidence, format, filename_prefix):
+        """Write one file under the prefix, numbered as the host numbers images."""
+        depth_m, image, K = depth["depth_m"][0], depth["image"][0], depth["K"][0]
+        keep = ~flying_points(depth_m) & (depth["confidence"][0] >= least_confidence)
+        folder, name, counter, subfolder, _ = folder_paths.get_save_image_path(
+            filename_prefix, folder_paths.get_output_directory()
+        )
+        path = Path(folder) / f"{name}_{counter:05}_.{format}"
+        if format == "ply":
+            write_ply(path, depth_m, image, K, keep)
+        else:
+            size, rig = (image.shape[1], image.shape[0]), depth["rig"]
+            cameras = [(K, np.eye(4), size), (rig.K_right, rig.E, rig.size_right or size)]
+            write_glb(path, make_cloud(depth_m, image, K, keep), cameras)
+        shown = {"filename": path.name, "subfolder": subfolder, "type": "output"}
+        return {"ui": {"3d": [shown]}, "result": (str(Path(subfolder) / path.name),)}
+
+
+NODE_CLASS_MAPPINGS = {
+    "GeoDiffCalibration": GeoDiffCalibration,
+    "GeoDiffDepth": GeoDiffDepth,
+    "GeoDiffPointCloud": GeoDiffPointCloud,
+}
+NODE_DISPLAY_NAME_MAPPINGS = {
+    "GeoDiffCalibration": "GeoDiff calibration",
+    "GeoDiffDepth": "GeoDiff guided depth",
+    "GeoDiffPointCloud": "GeoDiff point cloud",
+}

@@ -1,0 +1,200 @@
+"""Bring a metric map to its matches by an edge-aware fit, as stiff as the prior is good.
+
+Hop: metric depth, ``MatchTarget``, left image, error of the prior -> smooth log correction -> metric depth.
+Paper: none; its output is the decoded latent, which the decoder's grid and its blur limit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.algorithm.solver import FieldSystem, reweighted, solve_field
+from geodiff_plugin.algorithm.terms.base import MatchTarget
+from geodiff_plugin.guidance.config import CorrectionConfig
+from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.scale.points import weighted_median
+
+__all__ = ["Refined", "prior_error", "refine_depth"]
+
+#: Longer side in pixels of the grid that ``smoothness``, ``image_edge`` and ``depth_edge`` are numbers of; on
+#: another one they are scaled, so that a correction reaches the same share of the image.
+REFERENCE_SIDE = 512.0
+#: Error of the prior at which ``smoothness`` and ``inertia`` are as the configuration says.
+REFERENCE_ERROR = 0.05
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Result of ``refine_depth``.
+
+    Attributes:
+        depth_m: ``(B, 1, H, W)`` metres, on the grid of the depth that was given.
+        support: ``(B, 1, H, W)`` in [0, 1]: how far matches, own or near on the same surface, decided the
+            depth; 0 where it is the one given.
+        field: ``(B, 1, h, w)`` on the grid of the matches, log of the factor on inverse depth.
+    """
+
+    depth_m: Tensor
+    support: Tensor
+    field: Tensor
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What the matches ask of a map on their grid, ``(B, 1, h, w)`` each, and the links of that grid.
+
+    Attributes:
+        wanted: log factor on inverse depth.
+        noise: standard deviation of it, from the match alone.
+        trusted: confidence over the relative variance of a match, 0 without one.
+        links: across and down, of a smoothness of 1.
+    """
+
+    wanted: Tensor
+    noise: Tensor
+    trusted: Tensor
+    links: tuple[Tensor, Tensor]
+
+    def system(self, smoothness: Tensor) -> FieldSystem:
+        """With the smoothness ``(B, 1, 1, 1)`` of every sample."""
+        across, down = self.links
+        return FieldSystem(self.trusted, self.trusted, smoothness * across, smoothness * down)
+
+
+def _asked(depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: CorrectionConfig) -> _Asked:
+    size = tuple(target.inverse_depth.shape[-2:])
+    guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
+    log_depth = F.interpolate(depth_m.float().log(), size, mode="bilinear", align_corners=False)
+    known, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
+    noise = ((step / known) ** 2 + config.match_noise**2).sqrt()
+    trusted = target.confidence * (config.match_noise / noise) ** 2
+    wanted = torch.where(trusted > 0, known.log() + log_depth, torch.zeros_like(known))
+    across, down = (_links(guide, log_depth, axis, config) for axis in (-1, -2))
+    return _Asked(wanted, noise, trusted, (across, down))
+
+
+def _links(guide: Tensor, log_depth: Tensor, axis: int, config: CorrectionConfig) -> Tensor:
+    """Strength with which neighbours along an axis share a correction, ``(B, 1, h, w)`` less one there."""
+    scale = max(guide.shape[-2:]) / REFERENCE_SIDE
+    step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / config.image_edge
+    jump = log_depth.diff(dim=axis).abs() / config.depth_edge
+    return scale**2 * torch.exp(-scale * (step + jump)).clamp_min(config.least_link)
+
+
+def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: CorrectionConfig) -> Tensor:
+    """Cauchy weight of residuals that a prior of this error leaves beside the noise of a match."""
+    return 1.0 / (1.0 + residual**2 / (config.outlier_width**2 * (noise**2 + error**2)))
+
+
+def _stiff(asked: _Asked, trusted: Tensor, error: Tensor, config: CorrectionConfig) -> Tensor:
+    """The field ``(B, 1, h, w)`` that only says what matches say over wide regions."""
+    stiff = torch.full_like(error, config.stiff_smoothness)
+    system, weight, field = asked.system(stiff), trusted, None
+    for _ in range(config.reweightings + 1):
+        own = reweighted(system, weight, asked.wanted, config.stiff_inertia * stiff)
+        field = solve_field(own, config.solver_steps, field)
+        weight = trusted * _robust(field - asked.wanted, asked.noise, error, config)
+    return field
+
+
+def _spread(residual: Tensor, asked: _Asked) -> Tensor:
+    """``(B, 1, 1, 1)`` robust standard deviation of residuals beyond the noise of their matches."""
+    weight = asked.trusted.flatten(1)
+    square, noise = (weighted_median(v.flatten(1) ** 2, weight) for v in (residual, asked.noise))
+    beyond = (square * 1.4826**2 - noise / 4.0).clamp_min(0.0).sqrt() * (weight.sum(1) > 0)
+    return beyond.view(-1, 1, 1, 1)
+
+
+@torch.no_grad()
+def prior_error(
+    depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: CorrectionConfig = DEFAULT.correction
+) -> Tensor:
+    """How far a prior is wrong, in log depth, as far as its matches can tell.
+
+    Matches are left out in blocks, and foretold from those of the other blocks by the prior's map under a
+    stiff correction: what the map itself is worth between matches, not how well it can be bent to them.
+
+    Args:
+        depth_m: ``(B, 1, H, W)`` metres, of a prior that no match has moved yet but for scale and shift.
+        target: matches of the same images.
+        left_01: ``(B, 3, h, w)`` in [0, 1].
+        config: the fit's numbers.
+
+    Returns:
+        ``(B, 1, 1, 1)``, the robust standard deviation of what is foretold wrongly, beyond the noise of
+        matches; within ``least_error`` and ``most_error``, the latter for a sample without matches.
+    """
+    asked = _asked(depth_m, target, left_01, config)
+    height, width = asked.wanted.shape[-2:]
+    side = max(1, round(config.block * max(height, width)))
+    rows, columns = (torch.arange(n, device=depth_m.device) // side for n in (height, width))
+    black = ((rows[:, None] + columns[None]) % 2).to(asked.wanted.dtype)
+    first = _bounded(_spread(asked.wanted, asked), config)
+    told = [_stiff(asked, asked.trusted * colour, first, config) for colour in (black, 1.0 - black)]
+    error = _spread(torch.where(black > 0, told[1], told[0]) - asked.wanted, asked)
+    matched = asked.trusted.flatten(1).amax(1).view(-1, 1, 1, 1) > 0
+    return torch.where(matched, _bounded(error, config), torch.full_like(error, config.most_error))
+
+
+def _bounded(error: Tensor, config: CorrectionConfig) -> Tensor:
+    return error.clamp(config.least_error, config.most_error)
+
+
+@torch.no_grad()
+def refine_depth(
+    depth_m: Tensor,
+    target: MatchTarget,
+    left_01: Tensor,
+    error: Tensor,
+    config: CorrectionConfig = DEFAULT.correction,
+    carried: Tensor | None = None,
+) -> Refined:
+    """Least-squares correction of log depth that follows matches and stops at edges.
+
+    Args:
+        depth_m: ``(B, 1, H, W)`` metres, at any resolution.
+        target: matches or known points of the same images, on any grid; the gate was applied by the caller.
+        left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
+        error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it: a good prior is bent over wide
+            regions only, and its matches are doubted where it contradicts them.
+        config: the fit's numbers; it solves a fixed number of times, so that no device is waited for.
+        carried: ``(B, 1, h, w)`` field of an earlier pass that ``depth_m`` does not have in it yet. The pass
+            then fits what that field has left over (iterated Tikhonov regularisation): several stiff passes
+            follow the matches as closely as one loose pass, with less of their noise.
+
+    Returns:
+        ``Refined``. With ``u`` the log of the factor on inverse depth and ``r`` what each match asks of it,
+        less what is carried, the minimiser of ``sum w (u - r)^2 + a sum g |grad u|^2 + b sum u^2``: ``w`` is
+        the confidence over the match's relative variance, robustly reweighted, ``g`` falls at edges of the
+        image and of the given depth, and ``a``, ``b`` fall with the prior's error.
+    """
+    asked = _asked(depth_m, target, left_01, config)
+    ratio = REFERENCE_ERROR / error
+    smoothness = (config.smoothness * ratio**config.stiffness_power).clamp(config.loosest, config.stiffest)
+    inertia = (config.inertia * ratio**4).clamp(config.least_inertia, config.most_inertia)
+    broad = _stiff(asked, asked.trusted, error, config)
+    trusted = asked.trusted * _robust(broad - asked.wanted, asked.noise, error, config)
+    # A weak prior is bent loosely as it is; what earlier passes made of it would only add their noise.
+    share = (config.carry_error / error).square().clamp_max(1.0)
+    base = torch.zeros_like(asked.wanted) if carried is None else share * carried
+    # Two right-hand sides in one solve: the correction, and a field of ones that shows where it is decided.
+    data = torch.cat([asked.wanted - base, torch.ones_like(base)], 1)
+    system, weight, found = asked.system(smoothness), trusted, None
+    for _ in range(config.reweightings):
+        found = solve_field(reweighted(system, weight, data, inertia), config.solver_steps, found)
+        residual = base + found[:, :1] - asked.wanted
+        weight = trusted / (1.0 + (residual / (config.correction_cauchy * asked.noise)) ** 2)
+    field = base + found[:, :1]
+    size = tuple(depth_m.shape[-2:])
+    change, support = (
+        F.interpolate(
+            part, size, mode="bilinear", align_corners=False, antialias=size < tuple(part.shape[-2:])
+        )
+        for part in (field, found[:, 1:])
+    )
+    refined_m = depth_m.float() * torch.exp(-change)
+    return Refined(refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), field)

@@ -1,0 +1,213 @@
+"""Prepare one left image and its further views for guidance: common grid, cost volume, matches, points.
+
+Hop: images, K's, T's, points as the user gave them -> ``Evidence`` (once a call) -> ``Views`` of a chunk.
+Paper: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.algorithm.objective import FurtherView, Views
+from geodiff_plugin.geometry.cameras import resize_intrinsics
+from geodiff_plugin.geometry.projection import plane_rays
+from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.matching import (
+    CostVolume,
+    Matches,
+    build_cost_volume,
+    find_matches,
+    mirrored_pose_preferred,
+    points_to_matches,
+)
+from geodiff_plugin.pose.mistakes import INVERSE
+from geodiff_plugin.scale.points import sure_matches
+from geodiff_plugin.types import CameraView, PoseReport
+
+__all__ = ["Evidence", "as_fine_as", "chunk_views", "prepare_evidence", "resize_long_edge"]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known before any diffusion step, on the grid of the losses.
+
+    Attributes:
+        left_01: ``(3, H, W)`` in [0, 1].
+        K_left: ``(3, 3)`` pixels of ``left_01``.
+        views: the further views, at as many pixels per radian; none where only points are known.
+        volume: plane-sweep costs, or ``None`` where the configuration does not search it.
+        matches: aggregated, left-right checked, or ``None`` where no term asks.
+        sweep_matches: the same on the grid of the sweep, which is finer for wide images.
+        points: depths that the user knows, in the form of matches, or ``None``.
+        sweep_points: the same on the grid of ``sweep_matches``, where there are any.
+        sure: ``matches`` as points for the search, where enough are sure; else ``None``.
+        native: the further views as everything downstream sees them, at their native sizes.
+        pose: how their poses fit; ``None`` where only points are known.
+        warnings: sentences for the user.
+    """
+
+    left_01: Tensor
+    K_left: Tensor
+    views: tuple[CameraView, ...]
+    volume: CostVolume | None
+    matches: Matches | None
+    sweep_matches: Matches | None
+    points: Matches | None = None
+    sweep_points: Matches | None = None
+    sure: Matches | None = None
+    native: tuple[CameraView, ...] = ()
+    pose: PoseReport | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tensor, Tensor]:
+    """Shrink an image, antialiased, so that its longer side is at most ``long_edge`` pixels.
+
+    Args:
+        image_01: ``(3, H, W)``.
+        K: ``(3, 3)`` pixels of it.
+        long_edge: pixels; a smaller image is returned as it is.
+
+    Returns:
+        image and the camera matrix that belongs to it.
+    """
+    height, width = image_01.shape[-2:]
+    factor = long_edge / max(height, width)
+    if factor >= 1.0:
+        return image_01, K
+    size = (max(1, round(height * factor)), max(1, round(width * factor)))
+    small = F.interpolate(image_01[None], size, mode="bilinear", align_corners=False, antialias=True)[0]
+    return small, resize_intrinsics(K[None], (height, width), size)[0]
+
+
+def prepare_evidence(
+    left_01: Tensor,
+    views: Sequence[CameraView],
+    K_left: Tensor,
+    points: Tensor | None,
+    config: GuidanceConfig,
+    needs_matches: bool,
+    pose: PoseReport | None = None,
+) -> Evidence:
+    """Bring all views and points to the loss grid and let them speak for themselves.
+
+    Args:
+        left_01: ``(3, H, W)`` float32 in [0, 1], native size.
+        views: the further views, native, of any size.
+        K_left: ``(3, 3)`` pixels of the native left image.
+        points: as ``points_to_matches`` takes them, or ``None``.
+        config: says how large the grids are, what the sweep spans, and whether the search needs it.
+        needs_matches: aggregate the volume and check it against each view.
+        pose: how the poses of ``views`` came about.
+
+    Raises:
+        InputError: views that do not overlap; points of which none is in the image.
+    """
+    left, K_loss = resize_long_edge(left_01, K_left, config.loss_resolution)
+    size, size_loss = tuple(left_01.shape[-2:]), tuple(left.shape[-2:])
+    volume, found, matches, known, sweep_known, warnings = None, None, None, None, None, []
+    warnings += [] if pose is None else pose.warnings
+    if views and (config.search.search == "volume" or needs_matches):
+        # The sweep chooses its own grid, finer than that of the losses for wide images.
+        sweep = config.sweep
+        volume = build_cost_volume(
+            left_01,
+            views,
+            K_left,
+            depth_range=config.depth_range,
+            planes=sweep.planes,
+            max_side=sweep.sweep_side,
+            max_pixels=sweep.sweep_pixels,
+            step_px=sweep.plane_step_px,
+        )
+        if needs_matches:
+            found = find_matches(left_01, views, K_left, volume=volume)
+            matches = _on_grid(found, left, K_loss)
+        if mirrored_pose_preferred(left_01, views, K_left, found).preferred:
+            warnings.append(INVERSE)
+    if points is not None:
+        known, left_out = points_to_matches(points, K_left, size, K_loss, size_loss)
+        grid = (K_loss, size_loss) if found is None else (found.K, found.size)
+        sweep_known, _ = points_to_matches(points, K_left, size, *grid)
+        if left_out:
+            warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
+    return Evidence(
+        left,
+        K_loss,
+        tuple(CameraView(*as_fine_as(v.image_01, v.K, K_loss), v.T_right_from_left) for v in views),
+        volume,
+        matches,
+        found,
+        known,
+        sweep_known,
+        None if matches is None else sure_matches(matches, config.fit),
+        tuple(views),
+        pose,
+        tuple(dict.fromkeys(warnings)),  # the same mistake may show in two ways
+    )
+
+
+def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
+    """A right image, ``(3, H, W)``, at no more pixels per radian than the left one, and the K of it.
+
+    So that neither aliases in the other.
+    """
+    ratio = float(K_left[0, 0] / K_right[0, 0])
+    return resize_long_edge(right_01, K_right, round(max(right_01.shape[-2:]) * min(1.0, ratio)))
+
+
+def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
+    """Matches of the sweep's grid on that of the losses."""
+    size = (left_01.shape[-2], left_01.shape[-1])
+    if matches.size == size:
+        return matches
+    # Nearest centre: a mean of two inverse depths across an edge is the depth of neither surface.
+    maps = (
+        F.interpolate(m[None], size, mode="nearest-exact")[0]
+        for m in (matches.inverse_depth, matches.confidence)
+    )
+    return Matches(*maps, matches.plane_step, K_left, size)
+
+
+def chunk_views(evidence: Sequence[Evidence], owners: Sequence[int]) -> Views:
+    """Stack the views of a chunk of samples.
+
+    Args:
+        evidence: one entry per image.
+        owners: for every sample of the chunk the image that it belongs to.
+
+    Returns:
+        Views with ``B = len(owners)``. Further images of different sizes are brought to the largest one,
+        their K with them. An image with fewer views than another repeats its first: the terms take the best
+        view of each pixel, which a repetition does not change.
+    """
+    own = [evidence[i] for i in owners]
+    left = torch.stack([e.left_01 for e in own])
+    K_left = torch.stack([e.K_left for e in own])
+    most = max(len(e.views) for e in own)
+    further = tuple(
+        _stack([e.views[v if v < len(e.views) else 0] for e in own], K_left, tuple(left.shape[-2:]))
+        for v in range(most)
+    )
+    return Views(left, K_left, further)
+
+
+def _stack(views: Sequence[CameraView], K_left: Tensor, size_left: tuple[int, int]) -> FurtherView:
+    """One further view of every sample; smaller images are brought to the largest one, their K with them."""
+    height = max(view.image_01.shape[-2] for view in views)
+    width = max(view.image_01.shape[-1] for view in views)
+    images, Ks = [], []
+    for image, K, _ in views:
+        size = tuple(image.shape[-2:])
+        if size != (height, width):
+            image = F.interpolate(image[None], (height, width), mode="bilinear", align_corners=False)[0]
+            K = resize_intrinsics(K[None], size, (height, width))[0]
+        images.append(image)
+        Ks.append(K)
+    K, T = torch.stack(Ks), torch.stack([view.T_right_from_left for view in views])
+    return FurtherView(torch.stack(images), K, T, plane_rays(K_left, K, T, size_left))

@@ -1,0 +1,117 @@
+"""Weighted least squares of a smooth field on an image grid, coarse to fine.
+
+Hop: what each pixel asks for, its weight, links between neighbours -> the field.
+Paper: none; a screened Poisson equation, solved by conjugate gradients on a pyramid (cascadic multigrid,
+Bornemann and Deuflhard 1996).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+__all__ = ["FieldSystem", "reweighted", "solve_field"]
+
+#: The shorter side, in pixels, of the coarsest grid, and its conjugate-gradient steps: near enough to exact.
+COARSEST_SIDE, COARSEST_STEPS = 24, 80
+
+
+@dataclass(frozen=True)
+class FieldSystem:
+    """The minimiser ``u`` of ``sum weight (u - data)^2 + sum link |grad u|^2``, a channel at a time.
+
+    Attributes:
+        weight: ``(B, 1, H, W)`` >= 0; with some above 0 in every part that links connect.
+        pull: ``(B, C, H, W)`` weight times data.
+        across: ``(B, 1, H, W - 1)`` >= 0, links between horizontal neighbours.
+        down: ``(B, 1, H - 1, W)`` >= 0, links between vertical neighbours.
+    """
+
+    weight: Tensor
+    pull: Tensor
+    across: Tensor
+    down: Tensor
+
+    def apply(self, u: Tensor) -> Tensor:
+        """The left-hand side of the normal equations at ``u (B, C, H, W)``."""
+        flow_x, flow_y = self.across * u.diff(dim=-1), self.down * u.diff(dim=-2)
+        out = self.weight * u
+        out[..., 1:] += flow_x
+        out[..., :-1] -= flow_x
+        out[..., 1:, :] += flow_y
+        out[..., :-1, :] -= flow_y
+        return out
+
+    def diagonal(self) -> Tensor:
+        """``(B, 1, H, W)``, the preconditioner."""
+        beside = F.pad(self.across, (1, 0)) + F.pad(self.across, (0, 1))
+        return self.weight + beside + F.pad(self.down, (0, 0, 1, 0)) + F.pad(self.down, (0, 0, 0, 1))
+
+    def coarser(self) -> FieldSystem:
+        """The same problem for fields that are constant over cells of 2x2 pixels.
+
+        Links across a cell's border are halved: their ends are twice as far apart.
+        """
+        height, width = (-(-side // 2) for side in self.weight.shape[-2:])
+        across = _cells(self.across[..., 1::2], height, None, (height, width - 1))
+        down = _cells(self.down[..., 1::2, :], None, width, (height - 1, width))
+        sums = (_cells(part, height, width, (height, width)) for part in (self.weight, self.pull))
+        weight, pull = sums
+        return FieldSystem(weight, pull, 0.5 * across, 0.5 * down)
+
+
+def _cells(x: Tensor, height: int | None, width: int | None, size: tuple[int, int]) -> Tensor:
+    """Sums over pairs of rows, of columns or both, on a grid of ``size``."""
+    rows, columns = (2 if height else 1), (2 if width else 1)
+    x = F.pad(x, (0, size[1] * columns - x.shape[-1], 0, size[0] * rows - x.shape[-2]))
+    return F.avg_pool2d(x, (rows, columns)) * (rows * columns)
+
+
+def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) -> Tensor:
+    """The field of a system; a fixed amount of work, so that no device is waited for.
+
+    Args:
+        system: of any size.
+        steps: conjugate-gradient steps on every grid but the coarsest.
+        start: ``(B, C, H, W)`` a field that is near already; without one the coarser grids give it.
+
+    Returns:
+        ``(B, C, H, W)``.
+    """
+    height, width = system.weight.shape[-2:]
+    if start is not None:
+        return _conjugate_gradients(system, start, steps)
+    if min(height, width) <= COARSEST_SIDE:
+        return _conjugate_gradients(system, torch.zeros_like(system.pull), COARSEST_STEPS)
+    coarse = solve_field(system.coarser(), steps)
+    coarse = coarse.repeat_interleave(2, -2).repeat_interleave(2, -1)[..., :height, :width]
+    blurred = F.avg_pool2d(F.pad(coarse, (1, 1, 1, 1), mode="replicate"), 3, 1)
+    return _conjugate_gradients(system, blurred, steps)
+
+
+def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:
+    def dot(a: Tensor, b: Tensor) -> Tensor:
+        return (a * b).sum((-2, -1), keepdim=True)
+
+    tiny = 1e-20  # a channel that has converged stays where it is
+    inverse = 1.0 / system.diagonal()
+    residual = system.pull - system.apply(x)
+    z = residual * inverse
+    direction, along = z, dot(residual, z)
+    for _ in range(steps):
+        image = system.apply(direction)
+        length = along / dot(direction, image).clamp_min(tiny)
+        x = x + length * direction
+        residual = residual - length * image
+        z = residual * inverse
+        before, along = along, dot(residual, z)
+        direction = z + along / before.clamp_min(tiny) * direction
+    return x
+
+
+def reweighted(system: FieldSystem, weight: Tensor, data: Tensor, screen: Tensor) -> FieldSystem:
+    """The same links with other weights on the data, ``(B, 1, H, W)``, and a pull towards 0 of ``screen``."""
+    return replace(system, weight=weight + screen, pull=weight * data)

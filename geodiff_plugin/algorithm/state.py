@@ -1,0 +1,266 @@
+"""The state that Algorithm 1 carries along: scale, shift, g_s, what is known, optimisers, history.
+
+Hop: relative map of a step -> metric state, and the map that the views would have.
+Paper: Algorithm 1, S7.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.algorithm.evidence import Evidence, chunk_views
+from geodiff_plugin.algorithm.gradient import FiniteWatch
+from geodiff_plugin.algorithm.known import Known
+from geodiff_plugin.algorithm.objective import Loss, Objective
+from geodiff_plugin.algorithm.rules import RULES
+from geodiff_plugin.algorithm.terms import MatchTarget
+from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.scale.order import order_agreement
+from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refine_to_matches
+from geodiff_plugin.scale.space import AffineState, MetricMap, smooth_floor
+from geodiff_plugin.scale.volume_search import argmin_over, search_scale
+from geodiff_plugin.types import StepReport
+
+__all__ = ["Trajectory"]
+
+#: Searches that run at the first step only.
+ONCE = ("one-number", "points-range")
+
+
+class Trajectory:
+    """Scale, shift, optimiser state and history of one chunk of samples along the schedule.
+
+    Args:
+        config: hyperparameters of ``GeometryGuidance``.
+        evidence: one entry per image of the call.
+        owners: for every sample of the chunk the image that it belongs to.
+        space: what the prior's output is affine in.
+        own_range: metres ``(B,)`` of ``x = 0`` and of ``x = 1`` that a metric prior says itself, from which
+            the search starts; ``None`` for a relative one.
+
+    Attributes:
+        affine: current scale, shift and g_s, ``(B,)`` each; ``None`` before the first search.
+        history: one ``StepReport`` a step.
+        watch: whether what the steps computed was finite.
+        last_x: ``(B, 1, h, w)`` the relative map of the latest evaluation, no graph.
+        result: ``(B, 1, h, w)`` the corrected relative map of the latest step, which its clean latent is the
+            code of; ``None`` where something else than the correction moved that latent, or nothing did.
+        known: matches and points on the grid of the losses.
+        matches: those of them that the latest estimate believes, or ``None``.
+        hidden: ``(B, V, 1, H, W)`` bool, what the estimate hides from the right cameras, or ``None``.
+        order: ``(B,)`` in [-1, 1], rank correlation of the prior's first map and what is known, or ``None``.
+        on_edge: ``(B,)`` bool, whether the last search ended on the edge of its range.
+        own_depth: ``(B, 1, h, w)`` metres, the prior's own of its first estimate, or ``None``.
+    """
+
+    def __init__(
+        self,
+        config: GuidanceConfig,
+        evidence: Sequence[Evidence],
+        owners: Sequence[int],
+        space: str,
+        own_range: tuple[Tensor, Tensor] | None = None,
+    ) -> None:
+        self.config, self.evidence, self.owners = config, evidence, list(owners)
+        self.metric = MetricMap(space, config.search.positive)
+        self.objective = Objective(chunk_views(evidence, owners), self.metric, config.weights, config.terms)
+        self.known = Known.of([evidence[i] for i in owners], config, "loss")
+        updates = config.updates
+        self.plan = config.plan_updates(points_given=self.known.points is not None)
+        self.latent_rule = RULES[updates.rule](self.plan.step_latents)
+        self.scale_rule = RULES[updates.affine_rule](updates.step_affine)
+        self.shift_rule = RULES[updates.affine_rule](updates.step_affine)
+        # Of a disparity, x = 1 is the nearest end.
+        self.own_range = None if own_range is None else torch.stack(own_range).sort(0).values.unbind(0)
+        self.own_depth: Tensor | None = None
+        self.affine: AffineState | None = None
+        self.affine_start: AffineState | None = None
+        self.matches: MatchTarget | None = None
+        self.hidden: Tensor | None = None
+        self.order: Tensor | None = None
+        self.on_edge: Tensor | None = None
+        self.last_x: Tensor | None = None
+        self.result: Tensor | None = None
+        self.history: list[StepReport] = []
+        self._pass: tuple[Tensor, Tensor] | None = None  # log depth before the last correction, its field
+        self.watch = FiniteWatch()
+
+    def is_active(self, fraction: float) -> bool:
+        """Whether steps at this fraction of the schedule, [0, 1), are updated."""
+        return self.config.updates.start <= fraction < self.config.updates.stop
+
+    def settle_scale(self, x: Tensor) -> None:
+        """Find g_s and the start of scale and shift for a relative map (S7.3), or better ones than before.
+
+        Args:
+            x: ``(B, 1, h, w)`` float32 relative map of this step.
+        """
+        if self.own_range is not None and self.own_depth is None:
+            self.own_depth = self.metric(x, self.metric.from_range(*self.own_range))
+        if self.order is None:
+            self.order = self._order(x)
+        search = self.config.search.search
+        if search not in ONCE:
+            self._search_volume(x)
+        elif self.affine is None:
+            (self._search_one_number if search == "one-number" else self._span_points)(x)
+        depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
+        self.known = self.known.judged(depth_m, self.objective.views.left_01)
+        self.matches = self.known.believed(depth_m)
+
+    def _order(self, x: Tensor) -> Tensor:
+        """How far the prior alone agrees with matches or points on near and far; NaN where neither tells."""
+        found = x.new_full((x.shape[0],), torch.nan)
+        for i, owner in enumerate(self.owners):
+            known = self.evidence[owner].matches or self.evidence[owner].points
+            if known is not None:
+                found[i] = order_agreement(x[i : i + 1], known, self.metric.space)
+        return found
+
+    def _search_one_number(self, x: Tensor) -> None:
+        zero = x.new_zeros(x.shape[0])
+        low, high = self.config.search.g_s_range
+        candidates = torch.linspace(low, high, self.config.search.g_s_candidates, device=x.device)
+
+        def cost(g_s: Tensor) -> Tensor:
+            affine = AffineState(zero, zero, g_s.expand_as(zero))
+            loss = self.objective(x, affine, affine, zero.view(-1, 1), zero.view(-1, 1), None)
+            # What no right camera sees costs nothing, and must not win for that.
+            shown = (loss.visible_fraction > 0) & (loss.visible_fraction >= self.config.terms.min_visible)
+            return loss.terms["photometric"].where(shown, torch.inf)
+
+        best, self.on_edge = argmin_over(candidates, cost)
+        self.affine = self.affine_start = AffineState(zero, zero, best)
+
+    def _span_points(self, x: Tensor) -> None:
+        """From the nearest known point to the farthest."""
+        nearest, farthest = zip(
+            *(depth_span(self.evidence[owner].points) for owner in self.owners), strict=True
+        )
+        self.affine = self.affine_start = self.metric.from_range(torch.stack(nearest), torch.stack(farthest))
+        self.on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+
+    def _search_volume(self, x: Tensor) -> None:
+        """Joint (near, far) by lookup, or by a fit to points where there is no right view.
+
+        The current state, at first a metric prior's own, stays unless a better basin shows up.
+        """
+        ends = self.own_range if self.affine is None else self.metric.range_of(self.affine)
+        near, far = x.new_empty(x.shape[0]), x.new_empty(x.shape[0])
+        on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+        for image in sorted(set(self.owners)):
+            members = [i for i, owner in enumerate(self.owners) if owner == image]
+            current = None if ends is None else tuple(v[members] for v in ends)
+            near[members], far[members], on_edge[members] = self._range_of_image(
+                x[members], self.evidence[image], current, members
+            )
+        self.on_edge = on_edge
+        self.affine = self.affine_start = self.metric.from_range(near, far)
+
+    def _range_of_image(
+        self,
+        x: Tensor,
+        evidence: Evidence,
+        current: tuple[Tensor, Tensor] | None,
+        members: list[int],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Nearest and farthest metres of one image's samples, and whether they lie on the search's edge.
+
+        Points have the last word: they are measured, matches are inferred.
+        """
+        space, floored = self.metric.space, smooth_floor(x)
+        if evidence.volume is None:
+            near_far = fit_to_points(x, evidence.points, self.metric, current, self.config.fit)
+            on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+        elif current is not None and evidence.sure is not None and self.on_edge is not None:
+            # Later steps start from what the first found; sure matches tell whether its basin still holds.
+            near_far, on_edge = current, self.on_edge[members]
+        else:
+            found = search_scale(
+                evidence.volume,
+                floored,
+                space,
+                depth_range=self.config.depth_range,
+                current=current,
+                config=self.config.search,
+            )
+            near_far, on_edge = (found.near_m, found.far_m), found.on_edge
+        fit, sure = self.config.fit, evidence.sure
+        if sure is not None:
+            # A poor prior's true basin is shallow in raw costs; matches tell basins apart at a prior's error.
+            near_far = refine_to_matches(floored, evidence.matches, *near_far, space, fit)
+            near_far = fit_to_points(x, sure, self.metric, near_far, fit)
+        for known in (evidence.matches, evidence.points):
+            if known is not None:
+                near_far = refine_to_matches(floored, known, *near_far, space, fit)
+        if self.config.depth_range is not None:
+            low, high = self.config.depth_range
+            near_far = ordered(*(v.clamp(low, high) for v in near_far))
+        return *near_far, on_edge
+
+    def test_visibility(self, x: Tensor) -> None:
+        """Find what an estimate hides from the right cameras; it holds for the updates of the round.
+
+        Args:
+            x: ``(B, 1, h, w)`` float32 relative map that the updates start from, its scale settled.
+        """
+        compared = self.config.weights.get("photometric") and self.objective.views.further
+        if self.config.terms.z_test and compared:
+            self.hidden = self.objective.hidden(x, self.affine)
+
+    @torch.no_grad()
+    def corrected(self, x: Tensor) -> Tensor:
+        """A relative map brought to what is known, as far as the gate believes it.
+
+        Args:
+            x: ``(B, 1, h, w)`` float32 relative map, for which ``settle_scale`` was called.
+
+        Returns:
+            ``(B, 1, h, w)``; ``x`` where no match or point is near.
+        """
+        depth_m = self.objective.metric_depth(x, self.affine)
+        carried = self._left_to_carry(depth_m)
+        brought = self.known.bring(depth_m, self.objective.views.left_01, carried)
+        if brought is None:
+            return x
+        self._pass = (depth_m.log(), brought.field)
+        # A factor, not a difference of maps: interpolated over an edge the latter is an error on either side.
+        field = F.interpolate(brought.field, x.shape[-2:], mode="bilinear", antialias=True)
+        return self.metric.relative(self.metric(x, self.affine) * torch.exp(-field), self.affine)
+
+    def _left_to_carry(self, depth_m: Tensor) -> Tensor | None:
+        """What of the last pass's field the network's new estimate has not taken up, ``(B, 1, H, W)``."""
+        if self._pass is None:
+            return None
+        log_before, field = self._pass
+        moved = log_before - depth_m.log()
+        dims = (1, 2, 3)
+        share = (moved * field).sum(dims, keepdim=True) / field.square().sum(dims, keepdim=True).clamp_min(
+            1e-12
+        )
+        return (1.0 - share.clamp(0.0, 1.0)) * field
+
+    def loss(self, x: Tensor, affine: AffineState, z0: Tensor, anchor: Tensor) -> Loss:
+        """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""
+        return self.objective(
+            x, affine, self.affine_start, z0, anchor, self.matches, self.known.points, self.hidden
+        )
+
+    def report(self, step: int, timestep: float, loss: Loss) -> None:
+        """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
+        self.history.append(
+            StepReport(
+                step,
+                timestep,
+                loss.total.detach(),
+                {name: value.detach() for name, value in loss.terms.items()},
+                self.affine.s_hat,
+                self.affine.t_hat,
+                self.affine.g_s,
+                loss.visible_fraction,
+            )
+        )

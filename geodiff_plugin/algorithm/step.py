@@ -1,0 +1,144 @@
+"""Algorithm 1's body on one screen: what happens to one estimate of the clean latent.
+
+Hop: ``z_t, eps, z0_hat`` of one denoising step -> what to add to the guided latent.
+Paper: Algorithm 1, with Eq. 16 and 17.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from geodiff_plugin.algorithm.gradient import pull_back
+from geodiff_plugin.algorithm.objective import Loss
+from geodiff_plugin.algorithm.state import Trajectory
+
+__all__ = ["StepContext", "guided_step"]
+
+
+@dataclass(frozen=True)
+class StepContext:
+    """What one denoising step gives to its guidance.
+
+    Attributes:
+        step: index in the schedule.
+        timestep: the scheduler's timestep.
+        spans: begin and end in the schedule, [0, 1], of each round of correction and ``inner_steps`` updates.
+            One round a step, but for priors that cannot take as many steps as are wanted.
+        eps: ``(B, C, h, w)`` predicted noise, the yardstick of the norm-matched rule.
+        z0_of: the clean latent of a guided one: Tweedie with the U-Net's graph in "full", identity in
+            "denoised".
+        decode: latent to unclipped relative map ``(B, 1, h', w')`` float32, D in the paper.
+        encode: relative map to clean latent; ``None`` where the guided latent is no clean one, which then is
+            moved by gradients alone.
+    """
+
+    step: int
+    timestep: float
+    spans: Sequence[tuple[float, float]]
+    eps: Tensor
+    z0_of: Callable[[Tensor], Tensor]
+    decode: Callable[[Tensor], Tensor]
+    encode: Callable[[Tensor], Tensor] | None
+
+
+def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor:
+    """One pass of Algorithm 1's loop body: search, correction, gradient of L_geo, updates.
+
+    Args:
+        state: of the chunk; its scale, shift and history are advanced.
+        leaf: ``(B, C, h, w)`` float32, the latent that is guided: z_t ("full") or z0_hat ("denoised").
+        at: what the denoising step gives.
+
+    Returns:
+        ``(B, C, h, w)`` float32, what to add to the leaf; exactly 0 with ``optimize_latents=False``.
+
+    Source: Algorithm 1, with Eq. 16 and 17 (which it omits) and the decode of z0_hat (it prints z_0). The
+    correction before the updates is ours, after SteeredMarigold's (Gregorek and Nalpantidis 2024): a
+    corrected map, encoded.
+    """
+    config, z, anchor = state.config, leaf, None
+    rounds, state.result = [span for span in at.spans if state.is_active(span[0])], None
+    corrects = config.correction.correct and config.updates.optimize_latents and bool(rounds)
+    for _, end in rounds or at.spans[:1]:
+        if corrects and at.encode is not None:
+            moved = _corrected(state, z, at)
+            anchor = moved if anchor is None else anchor + moved - z
+            z = moved
+        updates = state.plan.inner_steps if rounds and end > state.plan.updates_from else 0
+        z, anchor, loss = _update(state, z, anchor, at, updates)
+        state.report(at.step, at.timestep, loss)
+    return (z - leaf).detach()
+
+
+def _corrected(state: Trajectory, z0: Tensor, at: StepContext) -> Tensor:
+    """``z0`` moved by what the correction of its map changes in the code.
+
+    A difference of two codes, so that what the autoencoder loses is not lost again at every step, and a map
+    that needs no correction leaves the latent as it is.
+    """
+    with torch.no_grad():
+        x0 = at.decode(z0)
+        state.watch.note("the network's clean latent", at.step, z0)
+        state.watch.note("the decoded map", at.step, x0)
+        state.settle_scale(x0)
+        corrected = state.corrected(x0)
+        state.result = corrected
+        moved = z0 if corrected is x0 else z0 + at.encode(corrected) - at.encode(x0)
+        state.watch.note("the encoded correction", at.step, moved)
+        return moved
+
+
+def _update(
+    state: Trajectory, z: Tensor, anchor: Tensor | None, at: StepContext, updates: int
+) -> tuple[Tensor, Tensor, Loss]:
+    """A round of gradient updates of latent, scale and shift.
+
+    With 0 updates the scale is settled and the loss evaluated, nothing moves.
+
+    Returns:
+        The moved latent; the clean latent that the step's network stands for, corrections included, which
+        further rounds are anchored to as well; the loss before the first update.
+    """
+    watch = state.watch
+    moves = state.config.updates.optimize_latents and updates > 0
+    for k in range(max(updates, 1)):
+        with torch.set_grad_enabled(updates > 0):
+            if moves and not z.requires_grad:
+                z = z.detach().requires_grad_()
+            z0_hat = at.z0_of(z)  # (B, C, h, w), Tweedie
+            z0 = z0_hat.detach().requires_grad_(moves)
+            x0 = at.decode(z0)  # (B, 1, h', w'), D(z0_hat)
+            x = x0.detach().requires_grad_(moves)
+            if k == 0:
+                watch.note("the network's clean latent", at.step, z0)
+                watch.note("the decoded map", at.step, x)
+                anchor = z0.detach() if anchor is None else anchor
+                if updates or state.result is None:  # else the correction settled it, and nothing moved since
+                    state.settle_scale(x.detach())  # g_s*, S7.3
+                    state.test_visibility(x.detach())
+            s_hat, t_hat = (
+                v.detach().requires_grad_(updates > 0) for v in (state.affine.s_hat, state.affine.t_hat)
+            )
+            affine = replace(state.affine, s_hat=s_hat, t_hat=t_hat)
+            loss = state.loss(x, affine, z0, anchor)  # L_geo, Eq. 14, with Eq. 17
+            # Samples do not mix, so the gradient of the sum is each one's own.
+            total = loss.total.sum()
+        if updates:
+            inputs = (s_hat, t_hat, x, z0) if moves else (s_hat, t_hat)
+            grads = torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)
+            if moves:
+                at_z0 = grads[3] + pull_back(x0, z0, grads[2])  # the anchor's, and through the decoder
+                at_z = pull_back(z0_hat, z, at_z0)  # through the network, with the full gradient
+                watch.note("the gradient in the latent", at.step, at_z)
+                z, state.result = z.detach() + state.latent_rule.step(at_z, at.eps), None
+            s_hat = s_hat.detach() + state.scale_rule.step(grads[0])
+            t_hat = t_hat.detach() + state.shift_rule.step(grads[1])
+            state.affine = replace(affine, s_hat=s_hat, t_hat=t_hat)
+        if k == 0:
+            first = loss
+    state.last_x = x.detach()
+    return z, anchor, first

@@ -1,0 +1,33 @@
+"""Keep the guided latent near what the network said at this step.
+
+Hop: ``Estimate`` -> ``(B,)``.
+Paper: none; the proximal form of one diffusion posterior step (S3.2 takes a single gradient step instead).
+"""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.algorithm.terms.base import Estimate
+from geodiff_plugin.guidance.presets import DEFAULT
+
+__all__ = ["anchor"]
+
+
+def anchor(estimate: Estimate, *, anchor_floor: float = DEFAULT.terms.anchor_floor) -> Tensor:
+    """Mean squared distance of the clean latent from the network's own, where the views say nothing.
+
+    Args:
+        estimate: needs ``z0`` and ``z0_prior``; with ``matches`` the pull falls as their confidence rises.
+        anchor_floor: share of the pull that remains where every pixel is matched.
+
+    Returns:
+        ``(B,)`` float. With several inner updates it is what keeps unmatched regions with the prior,
+        and leaves matched ones to the matches.
+    """
+    square = (estimate.z0 - estimate.z0_prior).pow(2).mean(1, keepdim=True)  # (B, 1, h, w)
+    if estimate.matches is not None:
+        known = F.interpolate(estimate.matches.confidence, square.shape[-2:], mode="area")
+        square = square * (1.0 - known).clamp_min(anchor_floor)
+    return square.flatten(1).mean(1)

@@ -1,0 +1,105 @@
+"""Photometric error between the left image and the right ones seen through the estimate.
+
+Hop: ``Estimate`` -> ``(B,)`` in [0, 1].
+Paper: S4.2, Eq. 14 (eq:geo-loss).
+"""
+
+from __future__ import annotations
+
+import kornia.metrics
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.algorithm.terms.base import Estimate, masked_mean
+from geodiff_plugin.algorithm.terms.exposure import match_exposure
+from geodiff_plugin.guidance.presets import DEFAULT
+
+__all__ = ["photometric", "photometric_map"]
+
+#: A pyramid level with a shorter side than this says nothing that its parent does not.
+MIN_SIDE = 24
+#: More than any error of a view that sees the pixel.
+UNSEEN = 2.0
+
+
+def photometric_map(left_01: Tensor, warped_01: Tensor, eta: float) -> Tensor:
+    """Per-pixel ``eta (1 - SSIM) / 2 + (1 - eta) L1``.
+
+    Args:
+        left_01: ``(B, 3, H, W)`` in [0, 1].
+        warped_01: ``(B, 3, H, W)`` in [0, 1].
+        eta: weight of SSIM, [0, 1].
+
+    Returns:
+        ``(B, 3, H, W)`` in [0, 1].
+
+    Source: Eq. 14 (eq:geo-loss). The paper gives no window; 3x3 follows the works it cites.
+    """
+    ssim = kornia.metrics.ssim(left_01, warped_01, window_size=3)
+    return eta * ((1.0 - ssim) / 2.0).clamp(0.0, 1.0) + (1.0 - eta) * (left_01 - warped_01).abs()
+
+
+def photometric(
+    estimate: Estimate,
+    *,
+    eta: float = DEFAULT.terms.eta,
+    pyramid_levels: int = DEFAULT.terms.pyramid_levels,
+    exposure: bool = DEFAULT.terms.exposure,
+    exposure_gain: tuple[float, float] = DEFAULT.terms.exposure_gain,
+    exposure_rows: int = DEFAULT.terms.exposure_rows,
+    exposure_columns: int = DEFAULT.terms.exposure_columns,
+    exposure_prior: float = DEFAULT.terms.exposure_prior,
+) -> Tensor:
+    """Mean photometric error over the visible pixels, averaged over an image pyramid.
+
+    With several right views each pixel takes the one that explains it best among those that see it: a view
+    in which something hides the pixel then does not count.
+
+    Args:
+        estimate: needs ``left_01``, ``warped_01`` and ``visible``.
+        eta: weight of SSIM against L1.
+        pyramid_levels: 1 is the paper's; coarser levels widen the basin of attraction.
+        exposure: compare in the left image's exposure (``exposure.match_exposure``).
+        exposure_gain: as ``gain_range`` there.
+        exposure_rows: of its cells.
+        exposure_columns: of its cells.
+        exposure_prior: as ``prior`` there.
+
+    Returns:
+        ``(B,)`` float; differentiable in the depth through ``warped_01`` (bilinear, so the gradient is
+        zero where the right image is constant and jumps where a sample crosses a pixel centre).
+
+    Source: Eq. 14 (eq:geo-loss). Deviation: masked to visible pixels (the paper's mean over all
+    pixels rewards depths that push pixels out of the right image), and the pyramid. Minimum over views:
+    Godard et al. 2019, "Digging into self-supervised monocular depth estimation", Eq. 4.
+    """
+    views = estimate.warped_01.shape[1]
+    left = estimate.left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), a view's pixels by themselves
+    warped = estimate.warped_01.flatten(0, 1)
+    mask = estimate.visible.flatten(0, 1).to(left.dtype)
+    if exposure:
+        cells = (exposure_rows, exposure_columns)
+        warped = match_exposure(
+            warped, left, mask, gain_range=exposure_gain, cells=cells, prior=exposure_prior
+        )
+    total, levels = 0.0, 0
+    for level in range(pyramid_levels):
+        if level:
+            if min(left.shape[-2:]) < 2 * MIN_SIDE:
+                break
+            # Masked averaging: a coarse pixel is the mean of its visible fine ones.
+            seen = F.avg_pool2d(mask, 2)
+            left = F.avg_pool2d(left * mask, 2) / seen.clamp_min(1e-6)
+            warped = F.avg_pool2d(warped * mask, 2) / seen.clamp_min(1e-6)
+            mask = (seen > 0.5).to(left.dtype)
+        total = total + masked_mean(*_best_explained(photometric_map(left, warped, eta), mask, views))
+        levels += 1
+    return total / levels
+
+
+def _best_explained(error: Tensor, mask: Tensor, views: int) -> tuple[Tensor, Tensor]:
+    """Least error over the views that see a pixel, and whether any does, ``(B, 1, H, W)`` each."""
+    error = error.mean(1, keepdim=True).unflatten(0, (-1, views))
+    mask = mask.unflatten(0, (-1, views))
+    return torch.where(mask > 0, error, torch.full_like(error, UNSEEN)).amin(1), mask.amax(1)

@@ -1,0 +1,168 @@
+"""The ways in which a visitor can say where the cameras are.
+
+Hop: fields of the page -> ``GeometryGuidance``.
+Paper: S3.3 (two views with known cameras).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from geodiff_plugin._checks import bad_value, check_calibrated_size
+from geodiff_plugin.formats import read_calibration, rig_from_parameters
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.types import Rig
+
+__all__ = ["CAMERA_WAYS", "CameraFields", "CameraWay", "Views"]
+
+
+@dataclass(frozen=True)
+class CameraFields:
+    """What the page asks about cameras; ``None`` is an empty field.
+
+    Attributes:
+        calibration: path of a calibration file.
+        second_calibration: path of the right camera's file, for formats with one file a view.
+        fx: focal length, pixels.
+        fy: the same for y; empty means ``fx``.
+        cx: principal point, pixels; empty means the middle of the image.
+        cy: likewise.
+        baseline_m: distance of the cameras, metres.
+        third_pose: the third camera's pose in the left camera's frame, 12 or 16 numbers in rows.
+    """
+
+    calibration: str | None = None
+    second_calibration: str | None = None
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    baseline_m: float | None = None
+    third_pose: str | None = None
+
+
+@dataclass(frozen=True)
+class Views:
+    """The photographs, ``(H, W, 3)`` float32 in [0, 1], and their names.
+
+    Attributes:
+        left: the one that gets the depth.
+        right: the second view.
+        third: a further one, or ``None``.
+        names: paths of the left and the right one.
+        third_name: path of the third one, or ``None``.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    third: np.ndarray | None
+    names: tuple[str, str]
+    third_name: str | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(width, height)`` of the left one."""
+        return self.left.shape[1], self.left.shape[0]
+
+
+@dataclass(frozen=True)
+class CameraWay:
+    """One choice of the page.
+
+    Attributes:
+        label: what the page calls it.
+        fields: names of the ``CameraFields`` that it asks for.
+        guide: ``(views, fields, knobs) -> GeometryGuidance``.
+    """
+
+    label: str
+    fields: tuple[str, ...]
+    guide: Callable[[Views, CameraFields, dict[str, Any]], GeometryGuidance]
+
+
+def _third_pose(text: str | None) -> np.ndarray:
+    words = (text or "").replace(",", " ").replace(";", " ").split()
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.size not in (12, 16):
+        cure = "Write the 4x4 pose of the third camera in the left camera's frame, row by row, in metres."
+        bad_value("the third camera's pose", "12 or 16 numbers", f"{len(words)} words", cure)
+    return np.vstack([numbers.reshape(-1, 4)[:3], [0, 0, 0, 1]])
+
+
+def _guidance_of_rig(views: Views, rig: Rig, fields: CameraFields, knobs: dict[str, Any]) -> GeometryGuidance:
+    for side, image, size in (("left", views.left, rig.size_left), ("right", views.right, rig.size_right)):
+        cure = "Use the photographs that the calibration is for, or give the numbers scaled to these."
+        check_calibrated_size(image.shape[1::-1], size, f"the {side} photograph", Path(rig.source).name, cure)
+    posed = [(views.left, rig.K_left, np.eye(4)), (views.right, rig.K_right, rig.E)]
+    if views.third is not None:
+        posed.append((views.third, rig.K_left, _third_pose(fields.third_pose)))
+    return GeometryGuidance.from_views(posed, **knobs)
+
+
+def _from_file(views: Views, fields: CameraFields, knobs: dict[str, Any]) -> GeometryGuidance:
+    if fields.calibration is None:
+        bad_value(
+            "calibration", "a calibration file", "none", "Choose one, or give focal length and baseline."
+        )
+    paths = [path for path in (fields.calibration, fields.second_calibration) if path is not None]
+    rig = read_calibration(
+        paths, image_names=views.names, image_size=views.size, baseline_m=fields.baseline_m
+    )
+    return _guidance_of_rig(views, rig, fields, knobs)
+
+
+def _intrinsics(views: Views, fields: CameraFields) -> np.ndarray:
+    """K of fx and whatever else was filled in; square pixels and the middle of the image where it was not."""
+    (width, height), fx = views.size, fields.fx
+    fy = fx if fields.fy is None else fields.fy
+    cx = (width - 1) / 2 if fields.cx is None else fields.cx
+    cy = (height - 1) / 2 if fields.cy is None else fields.cy
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def _from_numbers(views: Views, fields: CameraFields, knobs: dict[str, Any]) -> GeometryGuidance:
+    missing = [
+        label for label, value in (("fx", fields.fx), ("baseline", fields.baseline_m)) if value is None
+    ]
+    if missing:
+        bad_value(" and ".join(missing), "given", "nothing", "fx is in pixels, the baseline in metres.")
+    K = _intrinsics(views, fields)
+    rig = rig_from_parameters(K[0, 0], K[1, 1], K[0, 2], K[1, 2], fields.baseline_m)
+    return _guidance_of_rig(views, rig, fields, knobs)
+
+
+def _from_photographs(views: Views, fields: CameraFields, knobs: dict[str, Any]) -> GeometryGuidance:
+    if fields.baseline_m is None:
+        cure = (
+            "Photographs alone have no unit: measure how far the two cameras were from each other, in metres."
+        )
+        bad_value("the distance of the cameras", "given", "nothing", cure)
+    K = None  # of the EXIF of the photographs
+    if fields.fx is not None:
+        K = _intrinsics(views, fields)
+    names = views.names if views.third is None else (*views.names, views.third_name)
+    photographs = [ImageOps.exif_transpose(Image.open(name)) for name in names]
+    return GeometryGuidance.from_photographs(photographs, baseline_m=fields.baseline_m, K=K, **knobs)
+
+
+NUMBERS = ("fx", "fy", "cx", "cy", "baseline_m")
+#: Every way by name, in the order of the page.
+CAMERA_WAYS: dict[str, CameraWay] = {
+    "file": CameraWay(
+        "Calibration file",
+        ("calibration", "second_calibration", "baseline_m", "third_pose"),
+        _from_file,
+    ),
+    "numbers": CameraWay("Focal length and baseline", (*NUMBERS, "third_pose"), _from_numbers),
+}
+if hasattr(GeometryGuidance, "from_photographs"):
+    CAMERA_WAYS["photographs"] = CameraWay("Estimate from the photographs", NUMBERS, _from_photographs)

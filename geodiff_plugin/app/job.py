@@ -1,0 +1,254 @@
+"""One job of the page: what a visitor asked for, run through the public API, to everything that is shown.
+
+Hop: ``Request`` -> images, ``GeometryGuidance``, prior -> ``Result``.
+Paper: Algorithm 1, run by the pipeline.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from geodiff_plugin._checks import bad_value, check_choice, check_number
+from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
+from geodiff_plugin.cli.voice import collected_warnings
+from geodiff_plugin.formats import read_image
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.guidance.presets import DEFAULT, PAPER
+from geodiff_plugin.priors import load_prior
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.types import MetricDepthOutput
+
+__all__ = ["PRESETS", "Priors", "Request", "Result", "Stopped", "run_job"]
+
+PRESETS = {"default": DEFAULT, "paper": PAPER}
+MOST_STEPS, MOST_MEMBERS, LARGEST_RESOLUTION = 100, 20, 4096
+Report = Callable[[float, str], None]
+
+
+class Stopped(Exception):
+    """The visitor asked to stop."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a visitor filled in.
+
+    Attributes:
+        left: path of the left photograph.
+        right: path of the right one.
+        third: path of a third one, or ``None``.
+        way: key of ``CAMERA_WAYS``.
+        cameras: what was filled in about cameras.
+        prior: name, as ``load_prior`` takes it.
+        preset: key of ``PRESETS``.
+        steps: denoising steps; 0 for the prior's own.
+        members: of the ensemble.
+        resolution: longer side for the prior, pixels; 0 for the prior's own.
+        near: metres, or ``None``.
+        far: metres, or ``None``.
+        seed: of the noise.
+        show_prior: also run the prior without guidance, to show what it says alone.
+    """
+
+    left: str | None
+    right: str | None
+    third: str | None = None
+    way: str = "file"
+    cameras: CameraFields = field(default_factory=CameraFields)
+    prior: str = "bundled"
+    preset: str = "default"
+    steps: int = 0
+    members: int = 1
+    resolution: int = 0
+    near: float | None = None
+    far: float | None = None
+    seed: int = 0
+    show_prior: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What is shown and measured; maps are ``(H, W)`` at the left photograph's size.
+
+    Attributes:
+        views: the photographs.
+        guidance: with the cameras as understood.
+        depth_m: metres.
+        K: ``(3, 3)`` pixels.
+        prior_map: the prior's own map without guidance, or ``None``.
+        confidence: [0, 1], or ``None``.
+        uncertainty_m: metres, or ``None``.
+        error: photometric error, [0, 1], or ``None``.
+        visible: bool, or ``None``.
+        warnings: sentences.
+        seconds: by stage.
+        request: what was asked.
+    """
+
+    views: Views
+    guidance: GeometryGuidance
+    depth_m: np.ndarray
+    K: np.ndarray
+    prior_map: np.ndarray | None
+    confidence: np.ndarray | None
+    uncertainty_m: np.ndarray | None
+    error: np.ndarray | None
+    visible: np.ndarray | None
+    warnings: list[str]
+    seconds: dict[str, float]
+    request: Request
+
+
+class Priors:
+    """The priors that this page offers, each loaded once, when it is first used.
+
+    Args:
+        names: as ``load_prior`` takes them; a visitor can choose among these alone.
+        device: where they run.
+    """
+
+    def __init__(self, names: tuple[str, ...], device: torch.device) -> None:
+        self.names, self.device = names, device
+        self._loaded: dict[str, Any] = {}
+
+    def get(self, name: str) -> Any:
+        """The pipeline, with guidance enabled and its bars off."""
+        check_choice(name, "prior", self.names)
+        if name not in self._loaded:
+            pipe = load_prior(name).to(self.device)
+            pipe.set_progress_bar_config(disable=True)
+            self._loaded[name] = enable_geometry_guidance(pipe)
+        return self._loaded[name]
+
+
+def _photograph(path: str | None, name: str) -> tuple[np.ndarray | None, list[str]]:
+    return (None, []) if path is None else read_image(path, name)
+
+
+def _views(request: Request) -> tuple[Views, list[str]]:
+    for name, path in (("left", request.left), ("right", request.right)):
+        if path is None:
+            bad_value(f"the {name} photograph", "given", "nothing", "Drop a picture into its field.")
+    read = [
+        _photograph(path, f"the {name} photograph")
+        for name, path in (("left", request.left), ("right", request.right), ("third", request.third))
+    ]
+    notes = [note for _, found in read for note in found]
+    return Views(*(image for image, _ in read), (request.left, request.right), request.third), notes
+
+
+def _knobs(request: Request) -> dict[str, Any]:
+    """Keywords of the guidance."""
+    check_choice(request.preset, "preset", PRESETS)
+    if (request.near is None) != (request.far is None):
+        bad_value("near and far", "both given or neither", f"{request.near} and {request.far}", "In metres.")
+    if request.near is None:
+        return {"config": PRESETS[request.preset]}
+    key = "g_s_range" if request.preset == "paper" else "depth_range"
+    return {"config": PRESETS[request.preset], key: (request.near, request.far)}
+
+
+def _call_options(request: Request) -> dict[str, Any]:
+    """Keywords of the call that a guided and a plain one share."""
+    check_number(request.steps, "steps", 0, MOST_STEPS, integer=True)
+    check_number(request.members, "members", 1, MOST_MEMBERS, integer=True)
+    check_number(request.resolution, "resolution", 0, LARGEST_RESOLUTION, integer=True)
+    return {
+        "num_inference_steps": request.steps or None,
+        "processing_resolution": request.resolution or None,
+        "ensemble_size": request.members,
+    }
+
+
+def _map(value: Any) -> np.ndarray | None:
+    """``(H, W)`` of one map of an output."""
+    return None if value is None else np.asarray(value)[0, ..., 0]
+
+
+def _call(pipe: Any, request: Request, views: Views, **more: Any) -> MetricDepthOutput:
+    generator = torch.Generator("cpu").manual_seed(request.seed)
+    return pipe(views.left, generator=generator, **_call_options(request), **more)
+
+
+def _result(
+    request: Request,
+    views: Views,
+    guidance: GeometryGuidance,
+    output: MetricDepthOutput,
+    prior_map: np.ndarray | None,
+    warnings: list[str],
+    seconds: dict[str, float],
+) -> Result:
+    return Result(
+        views=views,
+        guidance=guidance,
+        depth_m=_map(output.prediction).astype(np.float32),
+        K=np.asarray(output.K)[0].astype(np.float64),
+        prior_map=prior_map,
+        confidence=_map(output.confidence),
+        uncertainty_m=_map(output.uncertainty),
+        error=_map(output.photometric_error),
+        visible=_map(output.visible),
+        warnings=warnings,
+        seconds=seconds,
+        request=request,
+    )
+
+
+def run_job(request: Request, priors: Priors, stop: threading.Event, report: Report) -> Result:
+    """Read, estimate, and say how far it is; only one job runs at a time.
+
+    Args:
+        request: what was filled in.
+        priors: what may be chosen.
+        stop: looked at before every stage and after every denoising step.
+        report: called with the share that is done, [0, 1], and the name of the stage.
+
+    Raises:
+        Stopped: ``stop`` was set.
+        OSError, TypeError, ValueError: bad input, in one sentence.
+    """
+
+    def stage(share: float, name: str) -> None:
+        if stop.is_set():
+            raise Stopped
+        report(share, name)
+
+    warnings: list[str] = []
+    seconds, started = {}, time.perf_counter()
+    with collected_warnings(warnings):
+        stage(0.0, "Reading the photographs and cameras")
+        options = _call_options(request)
+        views, notes = _views(request)
+        guidance = CAMERA_WAYS[request.way].guide(views, request.cameras, _knobs(request))
+        stage(0.05, "Loading the prior")
+        pipe = priors.get(request.prior)
+        steps = guidance.denoising_steps(options["num_inference_steps"], pipe.default_denoising_steps)
+        total, done = steps * request.members, 0
+        seconds["prepare"] = time.perf_counter() - started
+        stage(0.1, "Comparing the views")
+
+        def show(_pipe: Any, _step: int, _timestep: Any, _now: dict[str, Any]) -> dict[str, Any]:
+            nonlocal done
+            done += 1
+            stage(0.2 + 0.6 * min(done / total, 1.0), f"Guided step {min(done, total)} of {total}")
+            return {}
+
+        uncertain = {"output_uncertainty": True} if request.members > 1 else {}
+        output = _call(pipe, request, views, guidance=guidance, callback_on_step_end=show, **uncertain)
+        seconds["guided call"] = time.perf_counter() - started - sum(seconds.values())
+        prior_map = None
+        if request.show_prior:
+            stage(0.85, "The prior alone")
+            prior_map = _map(_call(pipe, request, views).prediction).astype(np.float32)
+            seconds["prior alone"] = time.perf_counter() - started - sum(seconds.values())
+        stage(0.95, "Drawing")
+    sentences = list(dict.fromkeys([*notes, *warnings, *output.warnings]))
+    return _result(request, views, guidance, output, prior_map, sentences, seconds)

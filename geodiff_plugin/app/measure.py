@@ -1,0 +1,113 @@
+"""A ruler on a depth map: the point of a pixel, the distance of two, and how sure each is.
+
+Hop: a pixel -> ``Reading`` (point in metres, spread, confidence) -> distance of two.
+Paper: Eq. 9 (unprojection).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value
+
+__all__ = ["Reading", "distance_m", "read_pixel"]
+
+#: ``confidence`` is the probability that a depth is within this share of the truth.
+CONFIDENT_WITHIN = 0.1
+#: Confidences beyond these say no more about the spread than these do.
+LEAST_CONFIDENCE, MOST_CONFIDENCE = 0.05, 0.999
+#: From the median absolute deviation to the standard deviation of a normal distribution.
+SD_OF_MAD = 1.4826
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the depth map says at one pixel.
+
+    Attributes:
+        pixel: ``(x, y)``, whole numbers.
+        point_m: ``(3,)`` metres in the left camera's frame.
+        spread: standard deviation of the depth as a share of it; ``None`` where nothing tells.
+        confidence: [0, 1], or ``None``.
+    """
+
+    pixel: tuple[int, int]
+    point_m: np.ndarray
+    spread: float | None
+    confidence: float | None
+
+    @property
+    def depth_m(self) -> float:
+        """z, metres."""
+        return float(self.point_m[2])
+
+    @property
+    def spread_m(self) -> float | None:
+        """Standard deviation of the depth in metres."""
+        return None if self.spread is None else self.spread * self.depth_m
+
+
+def _spread(confidence: float | None, uncertainty_m: float | None, depth_m: float) -> float | None:
+    """The larger of what the confidence and the spread of the members say, as a share of the depth."""
+    spreads = []
+    if confidence is not None:
+        bounded = min(max(confidence, LEAST_CONFIDENCE), MOST_CONFIDENCE)
+        # A normal error that is within 10 % with this probability has this standard deviation.
+        spreads.append(CONFIDENT_WITHIN / NormalDist().inv_cdf((1 + bounded) / 2))
+    if uncertainty_m is not None:
+        spreads.append(SD_OF_MAD * uncertainty_m / depth_m)
+    return max(spreads, default=None)
+
+
+def read_pixel(
+    depth_m: np.ndarray,
+    K: np.ndarray,
+    pixel: tuple[int, int],
+    confidence: np.ndarray | None = None,
+    uncertainty_m: np.ndarray | None = None,
+) -> Reading:
+    """The point that a pixel shows.
+
+    Args:
+        depth_m: ``(H, W)`` metres.
+        K: ``(3, 3)`` pixels of this map.
+        pixel: ``(x, y)`` from the top left corner.
+        confidence: ``(H, W)`` in [0, 1], or ``None``.
+        uncertainty_m: ``(H, W)`` metres, median absolute deviation of the members, or ``None``.
+
+    Raises:
+        ValueError: a pixel outside the map, or one without depth.
+    """
+    x, y = (int(v) for v in pixel)
+    height, width = depth_m.shape
+    if not (0 <= x < width and 0 <= y < height):
+        bad_value("pixel", f"inside the map of {width}x{height}", (x, y))
+    z = float(depth_m[y, x])
+    if not (np.isfinite(z) and z > 0):
+        bad_value("pixel", "one with a depth", (x, y))
+    sure = None if confidence is None else float(confidence[y, x])
+    spread_m = None if uncertainty_m is None else float(uncertainty_m[y, x])
+    point_m = z * (np.linalg.inv(K) @ (x, y, 1.0))
+    return Reading((x, y), point_m, _spread(sure, spread_m, z), sure)
+
+
+def distance_m(a: Reading, b: Reading) -> tuple[float, float | None]:
+    """How far two points are from each other, and the standard deviation of that, in metres.
+
+    An error of depth moves a point along its own ray; the errors of the two points are taken as independent,
+    so a scale that is wrong as a whole is counted as if each point had its own.
+
+    Returns:
+        Distance and its spread; the spread is ``None`` where that of either point is.
+    """
+    between = b.point_m - a.point_m
+    length = float(np.linalg.norm(between))
+    if a.spread is None or b.spread is None:
+        return length, None
+    if length == 0:
+        return 0.0, float(np.hypot(a.spread, b.spread) * np.linalg.norm(a.point_m))
+    along = [float(between @ reading.point_m) / length * reading.spread for reading in (a, b)]
+    return length, float(np.hypot(*along))

@@ -1,0 +1,129 @@
+"""What the page shows of a result: coloured maps with their legends, and marks on a photograph.
+
+Hop: maps, readings -> RGB arrays of the left photograph's size, legends as HTML.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from geodiff_plugin.app.measure import Reading, distance_m
+from geodiff_plugin.plotting.figures import colour_depth, depth_range, ticks
+
+__all__ = [
+    "colour_relative",
+    "colour_share",
+    "in_metres",
+    "legend_of_depth",
+    "legend_of_share",
+    "marked",
+    "metres",
+]
+
+#: Low to high, for shares: a dark violet over teal to yellow, light where it is high.
+SHARE_STOPS = np.array([[43, 10, 61], [52, 78, 120], [38, 130, 142], [95, 200, 120], [250, 230, 60]], float)
+MARKS = ("A", "B")
+LEGEND_STOPS = 24
+
+
+def metres(value: float, spread: float | None = None) -> str:
+    """``2.31 m`` or ``2.31 ± 0.07 m``; to the millimetre where the spread is below half a centimetre."""
+    decimals = 3 if spread is not None and spread < 0.005 else 2
+    return f"{value:.{decimals}f}{'' if spread is None else f' ± {spread:.{decimals}f}'} m"
+
+
+def in_metres(depth_m: np.ndarray) -> np.ndarray:
+    """``(H, W, 3)`` uint8: the depth map in the colours of ``legend_of_depth``."""
+    return colour_depth(depth_m)
+
+
+def colour_relative(values: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+    """``(H, W, 3)`` uint8: a map without a unit, its near end in the colour of the metric map's near end.
+
+    Args:
+        values: ``(H, W)`` depth, inverse depth or the like, up to scale and shift.
+        depth_m: ``(H, W)`` metres; tells which end is near.
+    """
+    low, high = np.percentile(values, (2, 98))
+    share = np.clip((values - low) / max(high - low, 1e-9), 0, 1)
+    if np.corrcoef(share.ravel(), depth_m.ravel())[0, 1] < 0:
+        share = 1 - share
+    return colour_depth(np.exp(share), near=1.0, far=math.e)  # exp: the colours go with the logarithm
+
+
+def colour_share(values: np.ndarray, most: float = 1.0) -> np.ndarray:
+    """``(H, W, 3)`` uint8 of a map in [0, most]."""
+    position = np.clip(values / most, 0, 1) * (len(SHARE_STOPS) - 1)
+    lower = np.minimum(position.astype(int), len(SHARE_STOPS) - 2)
+    part = (position - lower)[..., None]
+    return np.rint(SHARE_STOPS[lower] * (1 - part) + SHARE_STOPS[lower + 1] * part).astype(np.uint8)
+
+
+def _legend(colours: np.ndarray, marks: Sequence[tuple[float, str]], caption: str) -> str:
+    stops = ", ".join(
+        f"rgb({r},{g},{b}) {100 * i / (len(colours) - 1):.1f}%" for i, (r, g, b) in enumerate(colours)
+    )
+    words = "".join(f'<span style="left:{100 * share:.2f}%">{text}</span>' for share, text in marks)
+    bar = f"background:linear-gradient(90deg, {stops})"
+    return (
+        f'<div class="legend"><div class="legend-bar" style="{bar}"></div>'
+        f'<div class="legend-ticks">{words}</div><div class="legend-caption">{caption}</div></div>'
+    )
+
+
+def legend_of_depth(depth_m: np.ndarray) -> str:
+    """A bar from near to far with depths in metres under it, as HTML."""
+    near, far = depth_range(depth_m)
+    shares = np.linspace(0, 1, LEGEND_STOPS)
+    colours = colour_depth((near * (far / near) ** shares)[None], near=near, far=far)[0]
+    marks = [(math.log(value / near) / math.log(far / near), f"{value:g} m") for value in ticks(near, far, 7)]
+    return _legend(colours, marks, "depth in metres; equal steps of colour are equal factors")
+
+
+def legend_of_share(most: float, caption: str) -> str:
+    """A bar from 0 to ``most`` with percentages under it, as HTML."""
+    colours = colour_share(np.linspace(0, 1, LEGEND_STOPS))
+    return _legend(colours, [(s, f"{100 * s * most:.0f} %") for s in (0, 0.25, 0.5, 0.75, 1)], caption)
+
+
+def marked(picture: np.ndarray, points: Sequence[tuple[tuple[int, int], Reading]]) -> np.ndarray:
+    """A copy of a picture with the points that were clicked, and the distance of two between them.
+
+    Args:
+        picture: ``(h, w, 3)`` uint8.
+        points: none, one or two, each ``(pixel of this picture, reading)``.
+    """
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image)
+    unit = max(image.size) / 100
+    radius, font = max(3.0, 0.8 * unit), ImageFont.load_default(size=max(11.0, 2.8 * unit))
+    pixels = [pixel for pixel, _ in points]
+    if len(pixels) == 2:
+        draw.line(pixels, fill="black", width=max(3, round(0.7 * unit)))
+        draw.line(pixels, fill="white", width=max(1, round(0.3 * unit)))
+    for (x, y), name in zip(pixels, MARKS, strict=False):
+        box = (x - radius, y - radius, x + radius, y + radius)
+        draw.ellipse(box, fill="#e8590c", outline="white", width=max(1, round(0.25 * unit)))
+        _label(draw, (x, y - 2.6 * radius), name, font)
+    if len(pixels) == 2:
+        middle = tuple((a + b) / 2 for a, b in zip(*pixels, strict=True))
+        _label(
+            draw,
+            (middle[0], middle[1] - 2.2 * radius),
+            f"{distance_m(*(reading for _, reading in points))[0]:.2f} m",
+            font,
+        )
+    return np.asarray(image)
+
+
+def _label(
+    draw: ImageDraw.ImageDraw, centre: tuple[float, float], text: str, font: ImageFont.ImageFont
+) -> None:
+    left, top, right, bottom = draw.textbbox(centre, text, font=font, anchor="mm")
+    draw.rounded_rectangle((left - 3, top - 2, right + 3, bottom + 2), radius=3, fill=(20, 20, 20))
+    draw.text(centre, text, font=font, fill="white", anchor="mm")

@@ -1,0 +1,116 @@
+"""What a run of ``geodiff depth`` does before torch is imported: every file looked at, its folder taken.
+
+Hop: ``DepthArguments`` -> checked, ``OutFolder`` held -> the work.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from PIL import Image
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments, check_arguments
+from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.out_folder import OutFolder
+
+__all__ = ["CALIBRATION_WAYS", "PARAMETERS", "begun", "calibration_way"]
+
+CALIBRATION_WAYS = "--calib FILE, or --fx --fy --cx --cy --baseline, or --K FILE --E FILE"
+CAMERA_WAYS = "--calib FILE, or --fx --fy --cx --cy, or --K FILE"
+PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
+
+
+def calibration_way(arguments: DepthArguments) -> str:
+    """Which of the three ways was taken: ``"file"``, ``"parameters"`` or ``"matrices"``.
+
+    Raises:
+        ValueError: none, or more than one.
+    """
+    ways = {
+        "file": bool(arguments.calib),
+        # --baseline beside --calib gives a file its unit, as COLMAP's models need it.
+        "parameters": any(
+            getattr(arguments, name) is not None
+            for name in PARAMETERS
+            if not (name == "baseline" and arguments.calib)
+        ),
+        "matrices": any(path is not None for path in (arguments.k, arguments.e, arguments.k_right)),
+    }
+    taken = [way for way, is_taken in ways.items() if is_taken]
+    known = CAMERA_WAYS if arguments.right is None else CALIBRATION_WAYS
+    if not taken:
+        bad_value("calibration", f"given: {known}", "none", "Without cameras two images carry no metres.")
+    if len(taken) > 1:
+        bad_value("calibration", f"given in one way: {known}", " and ".join(taken), "Drop the others.")
+    if arguments.cameras is not None and taken != ["file"]:
+        bad_value(
+            "--cameras", "given with --calib only", "no --calib", "It chooses among the cameras of a file."
+        )
+    return taken[0]
+
+
+def _photographs(arguments: DepthArguments) -> dict[str, Path]:
+    photographs = {"LEFT": arguments.left}
+    if arguments.right is not None:
+        photographs["RIGHT"] = arguments.right
+    return photographs | {f"--view {number}": path for number, path in enumerate(arguments.view, 1)}
+
+
+def _check_photographs(arguments: DepthArguments) -> None:
+    photographs = _photographs(arguments)
+    for name, path in photographs.items():
+        found = check_file(path, name, "an image file")
+        try:
+            with Image.open(found):  # the head alone; the rest when it is read
+                pass
+        except (Image.UnidentifiedImageError, Image.DecompressionBombError):
+            cure = "Convert it to PNG or JPEG."
+            bad_value(name, "an image file", f"{found}, which is none that Pillow knows", cure)
+        except (OSError, SyntaxError, ValueError, EOFError) as error:
+            cure = "Is it cut off? Fetch it again."
+            bad_value(name, "a whole image file", f"{found}, which does not decode ({error})", cure)
+    for (one, a), (other, b) in itertools.combinations(photographs.items(), 2):
+        if a.samefile(b):
+            bad_value(other, f"another photograph than {one}", f"{b} for both")
+
+
+def _is_colmap_model(path: Path) -> bool:
+    """The one kind of calibration that is a folder; what it lacks is told when it is read."""
+    return any((path / name).exists() for name in ("cameras.txt", "images.txt", "images.bin"))
+
+
+def _check_other_files(arguments: DepthArguments) -> None:
+    for name, paths in (
+        ("calibration", arguments.calib),
+        ("--K", (arguments.k,)),
+        ("--E", (arguments.e,)),
+        ("--K-right", (arguments.k_right,)),
+        ("--view-K", arguments.view_k),
+        ("--view-E", arguments.view_e),
+        ("--points", (arguments.points,)),
+        ("--points-calib", arguments.points_calib),
+    ):
+        for path in paths:
+            if path is not None and not (name == "calibration" and _is_colmap_model(path)):
+                check_file(path, name, "a calibration file" if name == "calibration" else "a file")
+
+
+@contextmanager
+def begun(arguments: DepthArguments) -> Iterator[OutFolder]:
+    """Check what can be checked at once, and hold the folder of the results meanwhile.
+
+    Raises:
+        OSError, TypeError, ValueError: naming the option or the file.
+    """
+    check_arguments(arguments)
+    if not arguments.estimate_pose:
+        calibration_way(arguments)
+    _check_photographs(arguments)
+    _check_other_files(arguments)
+    with OutFolder(arguments.out, OUTPUT_FILES, overwrite=arguments.overwrite) as out:
+        yield out

@@ -1,0 +1,170 @@
+"""Converter of ``ppd.pth``: a diffusion transformer on pixels, with the encoder of Depth Anything V2 Large.
+
+Hop: ``dit.*`` and the encoder that ``--with`` names -> ``PPDPipeline`` -> folder.
+Paper: none; Pixel-Perfect Depth (arXiv 2510.07316).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from diffusers import FlowMatchEulerDiscreteScheduler
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from transformers import Dinov2Config, Dinov2Model
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.cli.converters.kinds import Converter, write_card
+from geodiff_plugin.cli.converters.reading import read_checkpoint
+from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.loading import check_weights, load_component
+from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
+from geodiff_plugin.priors.pipelines.ppd import PPDPipeline
+
+__all__ = ["PPD", "encoder_name"]
+
+TRANSFORMER, IN_CHECKPOINT, IN_FILE, IN_FOLDER = "dit.", "sem_encoder.pretrained.", "pretrained.", "backbone."
+#: The same weights as depth_anything_v2_vitl.pth, as transformers has them.
+ENCODER_ID = "depth-anything/Depth-Anything-V2-Large-hf"
+ENCODER_FILE = "depth_anything_v2_vitl.pth"
+#: Every DINOv2 has heads of this width.
+HEAD_SIZE = 64
+OUTSIDE = {
+    "cls_token": "embeddings.cls_token",
+    "pos_embed": "embeddings.position_embeddings",
+    "mask_token": "embeddings.mask_token",
+    "patch_embed.proj": "embeddings.patch_embeddings.projection",
+    "norm": "layernorm",
+}
+INSIDE = {
+    "attn.proj": "attention.output.dense",
+    "ls1.gamma": "layer_scale1.lambda1",
+    "ls2.gamma": "layer_scale2.lambda1",
+}
+IN_A_BLOCK = re.compile(r"blocks\.(\d+)\.(.+)")
+QKV = ("query", "key", "value")
+
+
+def encoder_name(name: str) -> str:
+    """Name in transformers of a weight of Depth Anything's encoder, but for ``qkv``, three there."""
+    module, _, kind = name.rpartition(".")
+    found = IN_A_BLOCK.fullmatch(name)
+    if found is None:
+        return OUTSIDE.get(name) or f"{OUTSIDE.get(module, module)}.{kind}"
+    index, rest = found.groups()
+    module, _, kind = rest.rpartition(".")
+    return f"encoder.layer.{index}." + (INSIDE.get(rest) or f"{INSIDE.get(module, module)}.{kind}")
+
+
+def _in_transformers_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    renamed: dict[str, Tensor] = {}
+    for name, value in state.items():
+        new = encoder_name(name)
+        if ".attn.qkv." in new:
+            parts = zip(QKV, value.chunk(3), strict=True)
+            renamed |= {new.replace("attn.qkv", f"attention.attention.{part}"): v for part, v in parts}
+        else:
+            renamed[new] = value
+    return renamed
+
+
+def _without(prefix: str, state: Mapping[str, Any]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): v for name, v in state.items() if str(name).startswith(prefix)}
+
+
+def _encoder_state(checkpoint: Mapping[str, Any], part: str | None) -> dict[str, Tensor]:
+    """The encoder in transformers' names: out of the checkpoint itself, or what ``--with`` names."""
+    own = _without(IN_CHECKPOINT, checkpoint)
+    if own and part is None:
+        return _in_transformers_names(own)
+    source = Path(part or "")
+    if part and source.is_file():
+        state = _in_transformers_names(_without(IN_FILE, read_checkpoint(source)))
+    elif part and (source / "model.safetensors").is_file():
+        state = _without(IN_FOLDER, load_file(source / "model.safetensors"))
+    else:
+        state = {}
+    if not state:
+        bad_value(
+            "--with",
+            f"{ENCODER_FILE} or a folder of {ENCODER_ID}: the encoder whose tokens ppd.pth needs",
+            part or "nothing",
+            f"Fetch it once: hf download {ENCODER_ID} --local-dir da2. A checkpoint that was trained with "
+            "MoGe-2's tokens (ppd_moge.pth) cannot be used.",
+        )
+    return state
+
+
+def _load_encoder(state: dict[str, Tensor], where: str) -> Dinov2Model:
+    """The encoder, of the size that its weights have, every one of them in its place."""
+    try:
+        width = state["embeddings.cls_token"].shape[-1]
+        patch = state["embeddings.patch_embeddings.projection.weight"].shape[-1]
+        positions = state["embeddings.position_embeddings"].shape[1] - 1
+        hidden = state["encoder.layer.0.mlp.fc1.weight"].shape[0]
+    except KeyError as error:
+        bad_value(where, "the weights of a DINOv2 encoder", f"none called {error}")
+    layers = {int(found[1]) for name in state if (found := re.match(r"encoder\.layer\.(\d+)\.", name))}
+    config = Dinov2Config(
+        hidden_size=width,
+        num_hidden_layers=len(layers),
+        num_attention_heads=width // HEAD_SIZE,
+        mlp_ratio=hidden // width,
+        image_size=round(positions**0.5) * patch,
+        patch_size=patch,
+        use_mask_token="embeddings.mask_token" in state,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        # Through a file: transformers renames on loading, and which names are its own differs by its version.
+        whole = {name: value.contiguous().float() for name, value in state.items()}
+        save_file(whole, Path(folder) / "model.safetensors", metadata={"format": "pt"})
+        text = json.dumps(config.to_dict() | {"architectures": ["Dinov2Model"]})
+        (Path(folder) / "config.json").write_text(text, encoding="utf-8")
+        return load_component(Layout(Path(folder), where), "", Dinov2Model, torch.float32)
+
+
+def _load_transformer(state: Mapping[str, Tensor]) -> PixelDiT:
+    """The transformer, of the size that its weights have."""
+    try:
+        width, _, side, _ = state["x_embedder.proj.weight"].shape
+        head_size = state["blocks.0.attn.q_norm.weight"].shape[0]
+        fusion = state["proj_fusion.0.weight"].shape[1]
+        hidden = state["blocks.0.mlp.fc1.weight"].shape[0]
+    except KeyError as error:
+        bad_value("the checkpoint", "the weights of Pixel-Perfect Depth", f"none called dit.{error.args[0]}")
+    blocks = {name.split(".")[1] for name in state if name.startswith("blocks.")}
+    dit = PixelDiT(width, len(blocks), width // head_size, side // 2, fusion - width, hidden / width)
+    wanted = set(dit.state_dict())
+    check_weights(wanted - set(state), set(state) - wanted, "the checkpoint")
+    dit.load_state_dict(state)
+    return dit.eval()
+
+
+def _recognises(checkpoint: Mapping[str, Any]) -> bool:
+    return {f"{TRANSFORMER}x_embedder.proj.weight", f"{TRANSFORMER}proj_fusion.0.weight"} <= set(checkpoint)
+
+
+def _write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
+    dit = _load_transformer(_without(TRANSFORMER, checkpoint))
+    encoder = _load_encoder(_encoder_state(checkpoint, part), part or "the checkpoint")
+    if encoder.config.hidden_size != dit.config.semantic_size:
+        got = f"{encoder.config.hidden_size} wide, another size of Depth Anything V2"
+        bad_value(
+            "the encoder of --with", f"{dit.config.semantic_size} wide, as the checkpoint's tokens", got
+        )
+    PPDPipeline(dit, encoder, FlowMatchEulerDiscreteScheduler()).save_pretrained(folder)
+    write_card(
+        folder,
+        "cc-by-nc-4.0",
+        "Pixel-Perfect Depth (gangweix/pixel-perfect-depth, Apache-2.0), converted by `geodiff convert`. "
+        "The encoder of Depth Anything V2 Large, without which it cannot run, is CC-BY-NC-4.0.",
+    )
+
+
+PPD = Converter(_recognises, _write)

@@ -1,0 +1,87 @@
+"""The ``geodiff eval`` commands: options and their help.
+
+Hop: argv -> ``PairsOptions`` -> ``evaluation.commands`` -> its page, printed.
+Paper: S5 (experiments).
+
+Torch and diffusers are imported inside the commands, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geodiff_plugin.cli.eval import options as o
+from geodiff_plugin.cli.eval.figures import add_figures
+from geodiff_plugin.cli.eval.strength import add_strength
+from geodiff_plugin.cli.eval.tables import add_tables
+from geodiff_plugin.cli.eval.trust import add_trust
+
+__all__ = ["eval_app"]
+
+eval_app = typer.Typer(
+    help="Measure this package and its peers on data sets in their official layouts.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@eval_app.command("pairs")
+def pairs(
+    data: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of data sets, or synthetic:N.")],
+    methods: Annotated[
+        str | None, typer.Option(help="Comma-separated, see geodiff eval list; five of them by default.")
+    ] = None,
+    datasets: o.Datasets = None,
+    scenes: o.Scenes = None,
+    limit: o.Limit = None,
+    sample: o.Sample = None,
+    view_pairs: o.ViewPairs = "default",
+    pixel_centre: o.PixelCentre = None,
+    crop: o.Crop = "none",
+    prior: o.Priors = None,
+    space: o.Space = None,
+    ensemble: o.Ensemble = 1,
+    seed: o.Seed = 0,
+    seeds: o.Seeds = 1,
+    steps: o.Steps = None,
+    resolution: o.Resolution = None,
+    views: o.Views = 2,
+    pose: o.Pose = None,
+    perturb: o.Perturb = None,
+    device: o.Device = "auto",
+    dtype: o.Dtype = "float32",
+    out: o.Out = Path("geodiff-eval"),
+    results: Annotated[Path | None, typer.Option(help="Write the Markdown page here as well.")] = None,
+    skip_broken: o.SkipBroken = False,
+    save_depth: o.SaveDepth = False,
+    quiet: o.Quiet = False,
+) -> None:
+    """Measure methods side by side on every metric pair below DIR."""
+    typed = locals()
+    from geodiff_plugin.evaluation.commands import run_pairs
+    from geodiff_plugin.evaluation.options import PAIRS_METHODS
+
+    typed["pairs"] = typed.pop("view_pairs")
+    typed["methods"] = methods or ",".join(PAIRS_METHODS)
+    o.run_and_print(run_pairs, o.pairs_options(typed))
+
+
+add_tables(eval_app)
+add_strength(eval_app)
+add_figures(eval_app)
+add_trust(eval_app)
+
+
+@eval_app.command("list")
+def list_(
+    data: Annotated[Path | None, typer.Option(help="Folder to look into.")] = None,
+) -> None:
+    """Say for every data set whether it is there and how to obtain it, and list the methods."""
+    from geodiff_plugin.cli.eval.listing import run_list
+
+    run_list(data)

@@ -1,0 +1,78 @@
+"""``geodiff eval strength``: options and their help.
+
+Hop: argv -> ``StrengthOptions`` -> ``evaluation.strength`` -> its page, printed.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["add_strength"]
+
+
+def strength(
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of data sets, or synthetic:N; may be repeated."),
+    ] = None,
+    strengths: Annotated[
+        str | None,
+        typer.Option(help="Comma-separated: exact, 2%, 5%, 10%, 20%, blur, gamma."),
+    ] = None,
+    space: Annotated[str, typer.Option(help="Affine in disparity, depth or log.")] = "disparity",
+    follow: Annotated[
+        float, typer.Option(help="How far the prior's later answers follow their input, 0 to 1.")
+    ] = 0.3,
+    methods: Annotated[
+        str | None, typer.Option(help="Comma-separated methods that use a prior, see geodiff eval list.")
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="Denoising steps.")] = 4,
+    resolution: Annotated[int, typer.Option(min=64, help="Longer side for the prior, px.")] = 384,
+    seed: Annotated[int, typer.Option(help="Of the noise, and of the prior's error.")] = 0,
+    limit: Annotated[int | None, typer.Option(min=1, help="Pairs of each --data at most.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the records; a run goes on where it stopped.")] = Path(
+        "geodiff-eval"
+    ),
+    results: Annotated[Path | None, typer.Option(help="Write the Markdown page here as well.")] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="PNG: error against the prior's error, and lit surfaces."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+) -> None:
+    """Emulated priors from exact to weak: plain with oracle, fitted once, and guided."""
+    from geodiff_plugin.cli.eval.printing import print_page
+    from geodiff_plugin.evaluation.emulated import STRENGTHS
+    from geodiff_plugin.evaluation.strength import METHODS, StrengthOptions, run_strength
+
+    def names(text: str | None, default: tuple[str, ...]) -> tuple[str, ...]:
+        return default if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
+
+    options = StrengthOptions(
+        data=tuple(data or [Path("synthetic:4")]),
+        command=shlex.join(["geodiff", *sys.argv[1:]]),
+        strengths=names(strengths, tuple(STRENGTHS)),
+        space=space,
+        follow=follow,
+        methods=names(methods, METHODS),
+        steps=steps,
+        resolution=resolution,
+        seed=seed,
+        limit=limit,
+        out=out,
+        results=results,
+        figure=figure,
+        quiet=quiet,
+    )
+    print_page(run_strength(options))
+
+
+def add_strength(app: typer.Typer) -> None:
+    """Add the command to ``geodiff eval``."""
+    app.command("strength")(strength)

@@ -1,0 +1,54 @@
+"""``geodiff eval trust``: options and their help.
+
+Hop: argv -> ``TrustOptions`` -> ``evaluation.trust``.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geodiff_plugin.cli.eval import options as o
+
+__all__ = ["add_trust"]
+
+
+def _trust(
+    data: Annotated[
+        Path | None, typer.Option("--data", help="Folder of real pairs; none by default.")
+    ] = None,
+    rendered: Annotated[int, typer.Option(help="Rendered pairs, every other one rectified.", min=0)] = 60,
+    width: Annotated[int, typer.Option(help="Width of the rendered pairs, pixels.", min=64)] = 512,
+    kinds: Annotated[
+        str | None, typer.Option(help="Comma-separated kinds of wrong calibration; ten by default.")
+    ] = None,
+    limit: o.Limit = None,
+    prior: o.Prior = "bundled",
+    space: o.Space = None,
+    seed: o.Seed = 0,
+    steps: o.Steps = None,
+    device: o.Device = "auto",
+    dtype: o.Dtype = "float32",
+    out: o.Out = Path("geodiff-trust"),
+    quiet: o.Quiet = False,
+) -> None:
+    """How many wrong calibrations are caught, and how many right ones are doubted."""
+    from geodiff_plugin.cli.eval.printing import print_page
+    from geodiff_plugin.evaluation.baselines import Settings
+    from geodiff_plugin.evaluation.trust import TEN, TrustOptions, run_trust
+    from geodiff_plugin.runtime.machine import pick_device
+
+    chosen = {"seed": seed, "steps": steps, "space": space, "dtype": dtype}
+    settings = Settings(prior, **chosen, device=str(pick_device(device)))
+    kinds_given = o.names(kinds) or TEN
+    page = run_trust(TrustOptions(data, rendered, width, kinds_given, limit, settings, out, quiet))
+    if not quiet:
+        print_page(page)
+
+
+def add_trust(app: typer.Typer) -> None:
+    """Add the command to ``geodiff eval``."""
+    app.command("trust")(_trust)

@@ -1,0 +1,104 @@
+"""``geodiff info``: what is installed, where it can run, and which priors are at hand.
+
+Hop: the machine -> lines of text.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from huggingface_hub import CacheNotFound, scan_cache_dir
+
+from geodiff_plugin.cli.estimate import loading_bars
+from geodiff_plugin.cli.terminal import print_lines
+from geodiff_plugin.priors import BUNDLED_FOLDER, PRIORS, FoundPrior, find_adapter, find_prior
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.runtime.machine import versions
+
+__all__ = ["run_info"]
+
+
+def _megabytes(size_bytes: int) -> str:
+    return f"{size_bytes / 1e6:.1f} MB"
+
+
+def _devices() -> list[str]:
+    lines = [f"cpu ({torch.get_num_threads()} threads)"]
+    for index in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(index)
+        lines.append(f"cuda:{index} ({properties.name}, {properties.total_memory / 2**30:.0f} GiB)")
+    return lines + (["mps"] if torch.backends.mps.is_available() else [])
+
+
+def _bundled() -> str:
+    if not (BUNDLED_FOLDER / "model_index.json").is_file():
+        return "missing from this installation"
+    return _megabytes(sum(path.stat().st_size for path in BUNDLED_FOLDER.rglob("*") if path.is_file()))
+
+
+def _cached() -> list[str]:
+    """Pipelines and models in the hub cache, whatever they are; only those with an adapter can be guided."""
+    try:
+        repositories = scan_cache_dir().repos
+    except CacheNotFound:
+        return []
+    models = sorted(
+        (repo for repo in repositories if repo.repo_type == "model"), key=lambda repo: repo.repo_id
+    )
+    return [f"{repo.repo_id} ({_megabytes(repo.size_on_disk)})" for repo in models]
+
+
+def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
+    """What the adapter of a prior found, once its weights are read."""
+    pipe = found.load(space=space)
+    adapter = find_adapter(pipe)(pipe)
+    parameters = sum(
+        weight.numel()
+        for part in pipe.components.values()
+        if isinstance(part, torch.nn.Module)
+        for weight in part.parameters()
+    )
+    most = "" if adapter.max_steps is None else f", at most {adapter.max_steps}"
+    gradients = "denoised, full" if adapter.network_input is not None else "denoised"
+    options = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
+    side = pipe.image_processor.config.vae_scale_factor
+    return [
+        ("prior", found.layout.name),
+        ("adapter", found.key),
+        ("licence", found.licence),
+        ("pipeline", type(pipe).__name__),
+        ("scheduler", type(pipe.scheduler).__name__),
+        ("parameters", f"{parameters / 1e6:.1f} M"),
+        ("space", adapter.space),
+        ("steps", f"{pipe.default_denoising_steps} by default{most}"),
+        ("same every time", "yes, ensembles run one member" if adapter.deterministic else "no"),
+        ("guided", "latent of a VAE" if "vae" in pipe.components else "pixels"),
+        ("gradients", gradients),
+        ("longer side", f"{pipe.default_processing_resolution} pixels by default"),
+        ("grid", "sides of any length" if side == 1 else f"sides are multiples of {side} pixels"),
+        ("options", ", ".join(options) or "none"),
+    ]
+
+
+def run_info(prior: str | None, space: str | None = None) -> None:
+    """Print it.
+
+    Args:
+        prior: also load this one and tell what it is.
+        space: what it is affine in, where its folder does not tell.
+
+    Raises:
+        ValueError: that prior does not exist, is not cached, is refused or of no known kind.
+    """
+    described = []
+    if prior is not None:
+        with loading_bars(prior):
+            described = _describe(find_prior(prior), space)
+    rows = [*versions().items()]
+    rows += [("device", line) for line in _devices()]
+    rows += [("adapters", ", ".join(PRIORS)), ("bundled prior", _bundled())]
+    rows += [("cached", line) for line in _cached() or ["nothing"]]
+    rows += [("package", str(Path(__file__).resolve().parents[1])), *described]
+    print_lines(rows)

@@ -1,0 +1,223 @@
+"""Reading and checking of the files that ``geodiff depth`` is given, before any weights load.
+
+Hop: ``DepthArguments`` -> images, a ``Rig`` and the ``GeometryGuidance`` made of them.
+Paper: S3.3 (two views with known cameras).
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from geodiff_plugin._checks import (
+    bad_value,
+    check_baseline,
+    check_calibrated_size,
+    check_intrinsics,
+    check_intrinsics_fit,
+    check_number,
+    check_pose,
+)
+from geodiff_plugin.cli.arguments import DepthArguments, check_positive
+from geodiff_plugin.cli.begin import PARAMETERS, calibration_way
+from geodiff_plugin.cli.settings import Settings
+from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
+from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
+from geodiff_plugin.formats.rigs import intrinsics, is_distorted
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.types import Distortion, Rig
+
+__all__ = ["Inputs", "read_inputs", "read_rig"]
+
+MOST_PIXELS = 1e6
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The views, ready to be guided by.
+
+    Attributes:
+        left: ``(H, W, 3)`` float32 in [0, 1], EXIF orientation applied.
+        right: likewise, of its own size; ``None`` where known points stand in its place.
+        rig: cameras of both, in pixels of these images; the left one's twice where there is no right one.
+        guidance: the right view, and those beside it, with the settings of the preset.
+        undistorted: whether lens distortion was taken out of the images.
+    """
+
+    left: np.ndarray
+    right: np.ndarray | None
+    rig: Rig
+    guidance: GeometryGuidance
+    undistorted: bool = False
+
+
+def _size(image: np.ndarray) -> tuple[int, int]:
+    """``(width, height)``."""
+    return image.shape[1], image.shape[0]
+
+
+def _read_view(path: Path, name: str) -> np.ndarray:
+    image, notes = read_image(path, name)
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
+    return image
+
+
+def _rig_from_options(arguments: DepthArguments, size: tuple[int, int]) -> Rig:
+    alone = arguments.right is None
+    names = PARAMETERS[:-1] if alone else PARAMETERS
+    values = {name: getattr(arguments, name) for name in names}
+    missing = [f"--{name}" for name, value in values.items() if value is None]
+    if missing:
+        centre = ((size[0] - 1) / 2, (size[1] - 1) / 2)
+        bad_value(
+            " ".join(missing),
+            "given as well, with " + " ".join(f"--{name}" for name in names if f"--{name}" not in missing),
+            "nothing",
+            f"--fy is --fx where pixels are square; --cx, --cy are near the centre, here {centre[0]:g} and "
+            f"{centre[1]:g}; --baseline is the distance of the cameras in metres.",
+        )
+    check_positive(values["fx"], "--fx", "pixels")
+    check_positive(values["fy"], "--fy", "pixels")
+    check_number(values["cx"], "--cx", -MOST_PIXELS, MOST_PIXELS)
+    check_number(values["cy"], "--cy", -MOST_PIXELS, MOST_PIXELS)
+    if alone:
+        K = intrinsics(*values.values())
+        return Rig(K, K, np.eye(4))
+    cure = "Two views from one place carry no scale; if the right camera is the left one, swap the images."
+    check_positive(values["baseline"], "--baseline", "metres", cure)
+    return rig_from_parameters(*values.values())
+
+
+def _rig_from_matrices(arguments: DepthArguments) -> Rig:
+    alone = arguments.right is None
+    for option, path in (("--K", arguments.k), ("--E", arguments.e)):
+        if path is None and not (alone and option == "--E"):
+            bad_value(option, "given as well", "nothing", "--K and --E go together; --K-right is optional.")
+    K = check_intrinsics(read_matrix(arguments.k, "--K"), "--K")
+    if alone:
+        return Rig(K, K, np.eye(4), source=str(arguments.k))
+    K_right = K
+    if arguments.k_right is not None:
+        K_right = check_intrinsics(read_matrix(arguments.k_right, "--K-right"), "--K-right")
+    return Rig(K, K_right, check_pose(read_matrix(arguments.e, "--E"), "--E"), source=str(arguments.k))
+
+
+def read_rig(
+    arguments: DepthArguments,
+    cameras: tuple[int, int] | None,
+    left_size: tuple[int, int],
+    right_size: tuple[int, int] | None,
+) -> Rig:
+    """The cameras, from whichever of the three ways was taken, for images of these sizes.
+
+    Args:
+        arguments: the options.
+        cameras: numbers of the left and the right camera of the calibration, or ``None``.
+        left_size: ``(width, height)`` of the left image.
+        right_size: ``(width, height)`` of the right image; ``None`` without one.
+
+    Raises:
+        OSError, TypeError, ValueError: no calibration or more than one, a file that is none, K for images
+            of another size.
+    """
+    way = calibration_way(arguments)
+    if way == "file":
+        rig = read_calibration(
+            arguments.calib,
+            cameras,
+            str(arguments.left),
+            image_names=None if arguments.right is None else (str(arguments.left), str(arguments.right)),
+            image_size=left_size,
+            baseline_m=arguments.baseline,
+            distorted=True,
+        )
+    else:
+        rig = (
+            _rig_from_options(arguments, left_size) if way == "parameters" else _rig_from_matrices(arguments)
+        )
+    views = (
+        ("left", rig.K_left, rig.size_left, left_size, arguments.left),
+        ("right", rig.K_right, rig.size_right, right_size, arguments.right),
+    )
+    for side, K, calibrated_size, size, path in views:
+        if size is None:
+            continue
+        cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
+        check_calibrated_size(size, calibrated_size, f"the {side} image {path}", rig.source, cure)
+        if not arguments.cropped:
+            named = f"K of the {side} camera ({rig.source})", f"the {side} image {path}"
+            check_intrinsics_fit(K, *size, *named)
+    return replace(rig, size_left=left_size, size_right=right_size)
+
+
+def _read_further_views(
+    arguments: DepthArguments, K_left: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Image, K and pose of every ``--view``, checked under its own name."""
+    images, poses, matrices = arguments.view, arguments.view_e, arguments.view_k
+    views = []
+    for i, path in enumerate(images):
+        option = f"--view {path}"
+        image, K = _read_view(path, option), K_left
+        if matrices:
+            K = check_intrinsics(read_matrix(matrices[i], "--view-K"), f"--view-K {matrices[i]}")
+        if not arguments.cropped:
+            check_intrinsics_fit(K, *_size(image), f"K of {option}", "its image")
+        E = check_pose(read_matrix(poses[i], "--view-E"), f"--view-E {poses[i]}")
+        check_baseline(E, f"--view-E {poses[i]}")
+        views.append((image, K, E))
+    return views
+
+
+def _make_guidance(
+    arguments: DepthArguments, settings: Settings, right: np.ndarray | None, rig: Rig
+) -> GeometryGuidance:
+    config, points = settings.config, None
+    if arguments.points is not None:
+        given = {"scale": arguments.points_scale, "calibration": arguments.points_calib}
+        points = read_points(arguments.points, "--points", **given)
+    common = {"config": config, "points": points, "cropped": arguments.cropped}
+    if right is None:
+        return GeometryGuidance(None, rig.K_left, **common)
+    views = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E)]
+    return GeometryGuidance.from_views(views + _read_further_views(arguments, rig.K_left), **common)
+
+
+def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:
+    """Read the images and the calibration, and see that they fit each other.
+
+    Raises:
+        OSError, TypeError, ValueError: naming the option or the file.
+    """
+    left = _read_view(arguments.left, "LEFT")
+    right = None if arguments.right is None else _read_view(arguments.right, "RIGHT")
+    rig = read_rig(arguments, settings.cameras, _size(left), None if right is None else _size(right))
+    lenses = lenses_of(arguments, rig.distortion)
+    left, right = (
+        image if lens is None or image is None else undistorted(image, K, lens)
+        for image, K, lens in zip((left, right), (rig.K_left, rig.K_right), lenses, strict=True)
+    )
+    guidance = _make_guidance(arguments, settings, right, rig)
+    return Inputs(left, right, rig, guidance, any(lens is not None for lens in lenses))
+
+
+def lenses_of(
+    arguments: DepthArguments, own: tuple[Distortion | None, Distortion | None] = (None, None)
+) -> tuple[Distortion | None, Distortion | None]:
+    """Distortion of both lenses: as typed, else the calibration's own; ``None`` where a lens has none.
+
+    Raises:
+        ValueError: more than two lenses, malformed coefficients, or further views, whose lenses are not told.
+    """
+    typed = [distortion_from_text(text) for text in arguments.distortion]
+    if len(typed) > 2:
+        bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
+    found = (typed[0], typed[-1]) if typed else own
+    lenses = tuple(lens if lens is not None and is_distorted(lens.coefficients) else None for lens in found)
+    if arguments.view and any(lens is not None for lens in lenses):
+        bad_value("--view", "left out with lens distortion", "given", "Undistort the further views first.")
+    return lenses

@@ -1,0 +1,98 @@
+"""``geodiff depth --estimate-pose``: photographs whose cameras nobody measured.
+
+Hop: ``DepthArguments`` -> images, K from options or EXIF -> estimated poses -> ``Inputs``.
+Paper: none; it takes known cameras for granted (S3.3).
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value, check_intrinsics
+from geodiff_plugin.cli.arguments import DepthArguments, check_positive
+from geodiff_plugin.cli.inputs import Inputs, lenses_of
+from geodiff_plugin.cli.settings import Settings
+from geodiff_plugin.cli.voice import say
+from geodiff_plugin.formats import read_image, read_matrix, read_points
+from geodiff_plugin.formats.distortion import undistorted
+from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.formats.rigs import intrinsics
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+
+__all__ = ["known_length", "read_photographs"]
+
+
+def known_length(text: str | None) -> tuple[float, ...] | None:
+    """``X1,Y1,X2,Y2,METRES`` as typed.
+
+    Raises:
+        ValueError: not five numbers.
+    """
+    if text is None:
+        return None
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 5:
+        cure = "Two pixels of LEFT and the distance of the two places, such as 100,200,400,210,1.5."
+        bad_value("--known-length", "X1,Y1,X2,Y2,METRES", repr(text), cure)
+    return numbers
+
+
+def _intrinsics(arguments: DepthArguments, path: Path, i: int, size: tuple[int, int]) -> np.ndarray:
+    """K of photograph ``i``, 0 being the left one, from the options, else from its EXIF."""
+    typed = [getattr(arguments, name) for name in ("fx", "fy", "cx", "cy")]
+    if arguments.k is not None:
+        own = arguments.k_right if i > 0 and arguments.k_right is not None else arguments.k
+        return check_intrinsics(read_matrix(own, "--K"), "--K")
+    if any(value is not None for value in typed):
+        if any(value is None for value in typed):
+            bad_value("--fx --fy --cx --cy", "given all together", "some of them")
+        return intrinsics(*typed)
+    if arguments.fov is not None:
+        return intrinsics_from_fov(arguments.fov, size)
+    K, notes = intrinsics_from_exif(path, path.name)
+    for note in notes:
+        say(note)
+    return K
+
+
+def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
+    """Read the photographs and estimate their cameras.
+
+    Raises:
+        OSError, TypeError, ValueError: naming the option, the file or the package that is missing, or why
+            there is no pose to be had.
+    """
+    for option, given in (("--calib", arguments.calib), ("--E", arguments.e), ("--view-E", arguments.view_e)):
+        if given:
+            bad_value(
+                option, "left out with --estimate-pose", "given", "Poses are given or estimated, not both."
+            )
+    if arguments.baseline is not None:
+        check_positive(arguments.baseline, "--baseline", "metres")
+    images, Ks, lenses = [], [], lenses_of(arguments)
+    for i, path in enumerate((arguments.left, arguments.right, *arguments.view)):
+        image, notes = read_image(path, ("LEFT", "RIGHT")[i] if i < 2 else f"--view {path}")
+        for note in notes:
+            warnings.warn(note, stacklevel=2)
+        Ks.append(_intrinsics(arguments, path, i, (image.shape[1], image.shape[0])))
+        lens = lenses[min(i, 1)]
+        images.append(image if lens is None else undistorted(image, Ks[-1], lens))
+    points = None if arguments.points is None else read_points(arguments.points, "--points")
+    guidance = GeometryGuidance.from_photographs(
+        images,
+        K=Ks,
+        baseline_m=arguments.baseline,
+        known_length=known_length(arguments.known_length),
+        points=points,
+        config=settings.config,
+    )
+    sizes = [(image.shape[1], image.shape[0]) for image in images[:2]]
+    rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
+    return Inputs(images[0], images[1], rig, guidance, any(lens is not None for lens in lenses))

@@ -1,0 +1,183 @@
+"""``report.json``: every number of a guided call as one JSON document.
+
+Hop: inputs, ``MetricDepthOutput``, options, seconds -> ``dict`` for ``report.json`` and ``--json``.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.inputs import Inputs
+from geodiff_plugin.cli.settings import Settings
+from geodiff_plugin.runtime.machine import versions
+from geodiff_plugin.types import MetricDepthOutput
+
+__all__ = ["build_report", "depth_summary", "single_map", "summary_line"]
+
+
+def single_map(value: Any) -> np.ndarray:
+    """The ``(H, W)`` map of the one image of a call."""
+    return np.asarray(value)[0, ..., 0]
+
+
+def depth_summary(depth_m: np.ndarray, visible: np.ndarray) -> dict[str, Any]:
+    """Near, far, median in metres over valid pixels; shares and counts over all.
+
+    Args:
+        depth_m: ``(H, W)`` metres.
+        visible: ``(H, W)`` bool.
+    """
+    valid = np.isfinite(depth_m) & (depth_m > 0)
+    kept = depth_m[valid]
+    names = ("min_m", "median_m", "mean_m", "max_m")
+    values = (kept.min(), np.median(kept), kept.mean(), kept.max()) if kept.size else (math.nan,) * 4
+    return {name: float(value) for name, value in zip(names, values, strict=True)} | {
+        "width": depth_m.shape[1],
+        "height": depth_m.shape[0],
+        "invalid_pixels": int((~valid).sum()),
+        "visible_fraction": float(visible.mean()),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Tensors and arrays as lists, numbers that JSON has no name for as ``None``."""
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, torch.Tensor):
+        return _plain(value.detach().cpu().tolist())
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _history(output: MetricDepthOutput) -> list[dict[str, Any]]:
+    return [
+        {
+            "step": entry.step,
+            "timestep": float(entry.timestep),
+            "loss": entry.loss,
+            "terms": entry.terms,
+            "s_hat": entry.s_hat,
+            "t_hat": entry.t_hat,
+            "g_s": entry.g_s,
+            "visible_fraction": entry.visible_fraction,
+        }
+        for entry in output.history
+    ]
+
+
+def _estimated(inputs: Inputs) -> dict[str, Any] | None:
+    """What was found out about cameras that nobody measured; ``None`` for given ones."""
+    found = inputs.guidance.estimated
+    if found is None:
+        return None
+    return {
+        "inliers": found.inliers,
+        "parallax_deg": found.parallax_deg,
+        "residual_px": found.residual_px,
+        "scale_from": found.scale.source,
+        "scale_spread": found.scale.spread,
+        "assumed": found.notes,
+    }
+
+
+def build_report(
+    inputs: Inputs,
+    output: MetricDepthOutput,
+    pipe: Any,
+    arguments: DepthArguments,
+    settings: Settings,
+    warnings: list[str],
+) -> dict[str, Any]:
+    """The report without seconds and files, which are known when everything else is written.
+
+    Args:
+        inputs: the views and cameras.
+        output: of the guided call.
+        pipe: the pipeline that made it.
+        arguments: options as typed.
+        settings: what was understood of them.
+        warnings: sentences, those of the output included.
+    """
+    rig = inputs.rig
+    depth_m, error_mean = single_map(output.prediction), math.nan
+    visible = np.zeros(depth_m.shape, dtype=bool)
+    if output.visible is not None:
+        visible = single_map(output.visible)
+        error_mean = (
+            float(single_map(output.photometric_error)[visible].mean()) if visible.any() else math.nan
+        )
+    report = {
+        "depth": depth_summary(depth_m, visible),
+        "judgement": asdict(output.judgements[0]),
+        "photometric_error_mean": error_mean,
+        "uncertainty_median_m": None
+        if output.uncertainty is None
+        else np.median(single_map(output.uncertainty)),
+        "K": output.K,
+        "scale": output.scale,
+        "shift": output.shift,
+        "global_scale": output.global_scale,
+        "own_scale": output.own_scale,
+        "history": _history(output),
+        "warnings": warnings,
+        "unit": output.unit,
+        "undistorted": inputs.undistorted,
+        "estimated_pose": _estimated(inputs),
+        "pose": None if not output.poses else vars(output.poses[0]),
+        "inputs": {
+            "left_size": rig.size_left,
+            "right_size": rig.size_right,
+            "calibration": rig.source,
+            "K_left": rig.K_left,
+            "K_right": rig.K_right,
+            "E": rig.E,
+            "baseline_m": float(np.linalg.norm(rig.E[:3, 3])),
+            "further_views": [{"K": other.K_right, "E": other.E} for other in inputs.guidance.rigs[1:]],
+        },
+        "prior": {
+            "name": arguments.prior,
+            "pipeline": type(pipe).__name__,
+            "scheduler": type(pipe.scheduler).__name__,
+            "device": str(settings.device),
+            "dtype": arguments.dtype,
+        },
+        "guidance": inputs.guidance.as_run().to_dict(),
+        "arguments": arguments.as_json(),
+        "versions": versions(),
+    }
+    return _plain(report)
+
+
+def _quality(judgement: dict[str, Any]) -> str:
+    """What the judgement rests on, in a few words."""
+    signs = judgement["signs"]
+    said = [] if signs["confidence"] is None else [f"confidence {signs['confidence']:.2f}"]
+    said += [] if signs["matched"] is None else [f"{100 * signs['matched']:.0f} % matched"]
+    said += [] if not signs["points"] else [f"{signs['points']} known depths"]
+    return ("" if judgement["trusted"] else "DO NOT TRUST THIS, ") + (", ".join(said) or "not judged")
+
+
+def summary_line(report: dict[str, Any], where: str) -> str:
+    """One line for people: near, far, median, how far to trust them, how far off a metric prior was."""
+    depth, seconds = report["depth"], sum(report["seconds"].values())
+    if depth["median_m"] is None:
+        return f"no valid depth; {seconds:.1f} s -> {where}"
+    own = report.get("own_scale")
+    said = "" if own is None else f"; prior's own metres x {own[0][0]:.2f}"
+    unit = report.get("unit", "m") or "baselines (no unit)"
+    return (
+        f"{depth['min_m']:.2f} {unit} to {depth['max_m']:.2f} {unit}, median {depth['median_m']:.2f} {unit}; "
+        f"{_quality(report['judgement'])}{said}; {seconds:.1f} s -> {where}"
+    )

@@ -1,0 +1,60 @@
+"""``geodiff video``: results of a sequence to one moving picture.
+
+Hop: folders of ``geodiff depth``, or depth maps -> a video.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats import check_file
+from geodiff_plugin.plotting.video import depth_frames, write_depth_video
+
+__all__ = ["run_video"]
+
+
+def _map(path: Path) -> np.ndarray:
+    file = check_file(
+        path / "depth.npy" if path.is_dir() else path, "FRAME", "a folder of geodiff depth or a .npy"
+    )
+    try:
+        depth_m = np.load(file, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        bad_value("FRAME", "a depth map that numpy.save wrote", f"{file} ({error})")
+    if not isinstance(depth_m, np.ndarray) or depth_m.ndim != 2 or depth_m.dtype.kind != "f":
+        bad_value("FRAME", "a depth map (H, W) of floats in metres", f"{file}")
+    return depth_m
+
+
+def _photograph(folder: Path) -> Image.Image:
+    """The left image of a result, where it lay when the result was made."""
+    report = check_file(folder / "report.json", "--photographs", "the report of a folder of geodiff depth")
+    left = Path(json.loads(report.read_text(encoding="utf-8"))["arguments"]["left"])
+    return ImageOps.exif_transpose(Image.open(check_file(left, f"the left image of {folder}")))
+
+
+def run_video(
+    frames: list[Path], out: Path, fps: float, near: float | None, far: float | None, photographs: bool
+) -> None:
+    """Write the video and say what is in it.
+
+    Args:
+        frames: folders of ``geodiff depth``, or ``.npy`` maps of one size, in order.
+        out: the video.
+        fps: frames a second.
+        near: depth of the last colour, metres, or ``None``.
+        far: depth of the first colour, metres, or ``None``.
+        photographs: show the left images beside the depth.
+    """
+    depths_m = [_map(path) for path in frames]
+    pictures = depth_frames(
+        depths_m, [_photograph(path) for path in frames] if photographs else None, near, far
+    )
+    write_depth_video(out, pictures, fps)
+    print(f"{len(pictures)} frames, {len(pictures) / fps:.1f} s -> {out}")

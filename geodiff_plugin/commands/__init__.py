@@ -1,1 +1,0 @@
-"""What the subcommands of ``geodiff`` do, one file a command; ``cli.py`` has their options."""

@@ -1,0 +1,195 @@
+"""Refit the probabilities that the package promises: of a depth, and of a match.
+
+Hop: pairs with truth -> evidence and outcome by pixel -> coefficients, deciles on the half not fitted on.
+Paper: none; it gives no confidence.
+
+``python -m geodiff_plugin.evaluation.calibrate --data DIR --data synthetic:40`` prints constants that can be
+pasted into ``runtime/confidence.py`` and ``matching/consistency.py``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+import typer
+from PIL import Image
+from rich.console import Console
+from rich.table import Table
+from tqdm import tqdm
+
+from geodiff_plugin.evaluation.baselines._guidance import call_arguments, posed_views
+from geodiff_plugin.evaluation.baselines._sweep import sweep
+from geodiff_plugin.evaluation.baselines.base import PriorCache, Settings
+from geodiff_plugin.evaluation.datasets import find_pairs, load
+from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.evaluation.logistic import deciles, fit_log_odds, promised
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.matching import consistency
+from geodiff_plugin.runtime import confidence
+
+__all__ = ["Observed", "calibrate", "observe_depth", "observe_matches"]
+
+#: Pixels of a pair that are looked at; more say nothing new.
+PIXELS = 5000
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Pixels of one pair: ``evidence (N, F)`` float64, and whether each was ``right (N,)``."""
+
+    evidence: np.ndarray
+    right: np.ndarray
+
+
+def _drawn(evidence: np.ndarray, right: np.ndarray, where: np.ndarray, seed: int) -> Observed:
+    """At most ``PIXELS`` of the pixels ``where (H, W)``, at random; ``evidence`` is ``(F, H, W)``."""
+    at = np.flatnonzero(where)
+    if len(at) > PIXELS:
+        at = np.random.default_rng(seed).choice(at, PIXELS, replace=False)
+    return Observed(evidence.reshape(len(evidence), -1)[:, at].T.astype(np.float64), right.ravel()[at])
+
+
+def observe_depth(sample: StereoSample, settings: Settings, priors: PriorCache) -> Observed:
+    """Evidence of ``runtime.confidence`` of a guided call, and where its depth is within 10 %.
+
+    Args:
+        sample: with truth.
+        settings: of the call; with an ensemble the spread of its members is evidence as well.
+        priors: where the prior is kept.
+    """
+    guidance = GeometryGuidance(*posed_views(sample, settings.views))
+    out = priors.get(settings)(
+        Image.fromarray(sample.left),
+        guidance=guidance,
+        output_uncertainty=settings.ensemble > 1,
+        output_type="pt",
+        **call_arguments(settings),
+    )
+    spread = None if out.uncertainty is None else out.uncertainty / out.prediction
+    evidence = confidence.depth_evidence(out.support, out.photometric_error, out.visible, spread)[0]
+    depth_m = out.prediction[0, 0].cpu().numpy()
+    right = np.abs(depth_m / np.where(sample.valid, sample.depth_m, 1.0) - 1.0) < confidence.RIGHT_WITHIN
+    return _drawn(evidence.cpu().numpy(), right, sample.valid, settings.seed)
+
+
+def observe_matches(sample: StereoSample, settings: Settings, priors: PriorCache) -> Observed:
+    """Evidence of ``matching.consistency`` of checked matches, and which are within 3 planes of the truth.
+
+    Args:
+        sample: with truth.
+        settings: its device sweeps.
+        priors: not used.
+    """
+    volume = sweep(sample, settings.device)
+    found = consistency.checked_matches(volume)
+    truth = torch.from_numpy(np.where(sample.valid, sample.depth_m, 0.0)).float()[None, None]
+    truth_m = F.interpolate(truth, volume.size, mode="nearest-exact")[0, 0].numpy()
+    known = found.checked.cpu().numpy() & (truth_m > 0)
+    error = np.abs(found.inverse_depth.cpu().numpy() - 1.0 / np.where(truth_m > 0, truth_m, 1.0))
+    right = error <= consistency.RIGHT_WITHIN_PLANES * float(volume.plane_step)
+    return _drawn(found.evidence.cpu().numpy(), right, known, settings.seed)
+
+
+def _stack(pairs: Sequence[Observed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Evidence, outcome and weight of all pixels; every pair weighs the same."""
+    weights = [np.full(len(pair.right), 1.0 / len(pair.right)) for pair in pairs]
+    evidence, right = ([getattr(pair, name) for pair in pairs] for name in ("evidence", "right"))
+    return np.concatenate(evidence), np.concatenate(right), np.concatenate(weights)
+
+
+def calibrate(
+    pairs: Sequence[Observed], signs: Sequence[int]
+) -> tuple[np.ndarray, list[np.ndarray], tuple[np.ndarray, ...]]:
+    """Fit on all pairs, and on each half of them to see what it promises for the other.
+
+    Args:
+        pairs: in the order of the data, so that every second one makes a half that has something of each set.
+        signs: as for ``fit_log_odds``.
+
+    Returns:
+        Coefficients of all pairs; of each half; and of every pixel the probability by the coefficients of the
+        half that it is not in, its outcome and its weight.
+    """
+    pairs = [pair for pair in pairs if len(pair.right)]
+    halves = pairs[::2], pairs[1::2]
+    fitted = [fit_log_odds(*_stack(half), signs) for half in halves]
+    columns: list[tuple[np.ndarray, ...]] = []
+    for half, coefficients in zip(reversed(halves), fitted, strict=True):
+        evidence, right, weights = _stack(half)
+        columns.append((promised(evidence, coefficients), right, weights))
+    judged = tuple(np.concatenate(column) for column in zip(*columns, strict=True))
+    return fit_log_odds(*_stack(pairs), signs), fitted, judged
+
+
+def _constants(name: str, coefficients: Iterable[float]) -> str:
+    return f"{name} = ({', '.join(f'{value:.3g}' for value in coefficients)})"
+
+
+def _print(
+    console: Console,
+    title: str,
+    where: str,
+    name: str,
+    pairs: Sequence[Observed],
+    signs: Sequence[int],
+    shipped: Sequence[float],
+) -> None:
+    """Constants to paste, those of the halves, and the deciles."""
+    coefficients, halves, judged = calibrate(pairs, signs)
+    # What was the same everywhere (the spread, of a single member) tells nothing: the shipped number stays.
+    varies = np.ptp(np.concatenate([pair.evidence for pair in pairs]), axis=0) > 0
+    coefficients = np.where(varies | (np.arange(len(shipped)) == 0), coefficients, shipped)
+    console.print(title)
+    table = Table("promised", "kept", "share")
+    worst = 0.0
+    for decile in deciles(*judged):
+        table.add_row(*(f"{value:.3f}" for value in (decile.promised, decile.kept, decile.share)))
+        worst = max(worst, abs(decile.promised - decile.kept))
+    console.print(table)
+    console.print(f"largest gap between promised and kept: {worst:.3f}", highlight=False)
+    for half, own in zip(("even", "odd"), halves, strict=True):
+        console.print(f"# the {half} half alone: {_constants(name, own)}", highlight=False)
+    console.print(f"# {where}\n{_constants(name, coefficients)}\n", highlight=False, soft_wrap=True)
+
+
+def main(
+    data: Annotated[list[str], typer.Option(help="Folder with data sets, or synthetic:N; repeat it.")],
+    prior: Annotated[list[str] | None, typer.Option(help="Priors to guide; repeat it for several.")] = None,
+    ensemble: Annotated[int, typer.Option(help="Members; 2 and more also fit the effect of spread.")] = 1,
+    resolution: Annotated[int | None, typer.Option(help="Longer side for the prior, pixels.")] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:N or mps.")] = "cpu",
+    what: Annotated[str, typer.Option(help="depth, matches or both.")] = "both",
+) -> None:
+    """Print coefficients of confidence, fitted on pairs with truth, and how they do on the other half."""
+    refs = [ref for root in data for ref in find_pairs(root)]
+    console, priors = Console(width=100), PriorCache()
+    kinds: dict[str, tuple[Callable[..., Observed], tuple[Any, ...]]] = {
+        "matches": (
+            observe_matches,
+            ("matching/consistency.py", "LOG_ODDS", consistency.SIGNS, consistency.LOG_ODDS),
+        ),
+        "depth": (
+            observe_depth,
+            ("runtime/confidence.py", "BY_EVIDENCE", confidence.SIGNS, confidence.BY_EVIDENCE),
+        ),
+    }
+    settings = [
+        Settings(prior=one, ensemble=ensemble, resolution=resolution, device=device)
+        for one in prior or ["bundled"]
+    ]
+    for kind, (observe, (where, name, signs, shipped)) in kinds.items():
+        if what not in (kind, "both"):
+            continue
+        each = settings if kind == "depth" else settings[:1]
+        jobs = [(ref, own) for own in each for ref in refs]
+        pairs = [observe(load(ref), own, priors) for ref, own in tqdm(jobs, desc=kind)]
+        _print(console, f"{kind}, on the half not fitted on", where, name, pairs, signs, shipped)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,93 @@
+"""A sample whose pose is given wrongly, by a known amount.
+
+Hop: ``StereoSample`` + degrees + share of the baseline -> ``StereoSample``.
+Paper: none; it takes exact poses for granted (S3.3).
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
+
+__all__ = ["perturbation", "perturbed_pose", "perturbed_ref", "with_perturbed_poses"]
+
+#: Errors are drawn between this share of the asked ones and all of them.
+LEAST = 0.3
+
+
+def perturbation(text: str) -> tuple[float, float]:
+    """``DEGREES,SHARE`` as typed.
+
+    Raises:
+        ValueError: not two numbers, an angle outside [0, 30], or a share outside [0, 0.9].
+    """
+    found = re.fullmatch(r"\s*([\d.]+)\s*,\s*([\d.]+)\s*", text)
+    try:
+        degrees, share = (float(number) for number in found.groups()) if found else (-1.0, -1.0)
+    except ValueError:
+        degrees, share = -1.0, -1.0
+    if not (0 <= degrees <= 30 and 0 <= share <= 0.9):
+        cure = "1.5,0.1 turns by up to 1.5 degrees and shifts by up to a tenth of the baseline."
+        bad_value("--perturb", "DEGREES,SHARE with numbers in [0, 30] and [0, 0.9]", repr(text), cure)
+    return degrees, share
+
+
+def perturbed_ref(ref: SampleRef, change: tuple[float, float]) -> SampleRef:
+    """The reference to a sample with perturbed poses; it is named by what was changed."""
+    name = f"{ref.name}-turn{change[0]:g}-shift{change[1]:g}"
+    return replace(ref, name=name, files={**ref.files, "perturbed": change})
+
+
+def perturbed_pose(
+    E: np.ndarray, degrees: float, share: float, depth_m: float, rng: np.random.Generator
+) -> np.ndarray:
+    """A pose with an error.
+
+    Args:
+        E: ``(4, 4)``, metres; pose of the right camera in the left camera's frame.
+        degrees: the largest turn.
+        share: the largest shift, of the baseline.
+        depth_m: of the scene.
+        rng: draws the error. Every second one is of a tracker's kind, whose shift makes up for its turn at
+            the scene's depth as far as it may; the others' shift goes anywhere.
+
+    Returns:
+        ``(4, 4)``; its baseline is as long as before: the length is what no photograph tells.
+    """
+    axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    turn = axis * np.radians(degrees) * rng.uniform(LEAST, 1.0)
+    baseline = np.linalg.norm(E[:3, 3])
+    shift = way * share * baseline * rng.uniform(LEAST, 1.0)
+    if rng.random() < 0.5:
+        shift = -np.cross(turn, (0.0, 0.0, depth_m))
+        shift *= min(1.0, share * baseline / max(np.linalg.norm(shift), 1e-12))
+    wrong = E.copy()
+    wrong[:3, :3] = E[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+    moved = E[:3, 3] + E[:3, :3] @ shift
+    wrong[:3, 3] = moved * baseline / np.linalg.norm(moved)
+    return wrong
+
+
+def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
+    """Give the poses of a sample's right views wrongly; images, intrinsics and truth stay.
+
+    Args:
+        sample: as it was taken.
+        change: degrees and share, as for ``perturbed_pose``.
+        name: of the result; the error is drawn from it.
+    """
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    depth_m = float(np.median(sample.depth_m[sample.valid]))
+    E = perturbed_pose(sample.E, *change, depth_m, rng)
+    extra = tuple(
+        (image, K, perturbed_pose(other, *change, depth_m, rng)) for image, K, other in sample.extra_views
+    )
+    return replace(sample, name=name, E=E, extra_views=extra)

@@ -1,0 +1,151 @@
+"""Options of a run: samples, methods, settings; and the command line that repeats it.
+
+Hop: ``PairsOptions`` -> references to samples; ``PairsOptions`` -> text of a command.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import random
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.evaluation.baselines import POSES, Settings
+from geodiff_plugin.evaluation.crops import CROPS
+from geodiff_plugin.evaluation.datasets import find_pairs
+from geodiff_plugin.evaluation.datasets.sample import SampleRef
+
+__all__ = ["PAIRS_METHODS", "PairsOptions", "all_refs", "command_line", "select"]
+
+PAIRS_METHODS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
+
+
+@dataclass(frozen=True)
+class PairsOptions:
+    """Options of ``geodiff eval pairs``; names as on the command line.
+
+    Attributes:
+        data: folder that holds data sets in their official layouts.
+        methods: names that ``find_method`` knows.
+        datasets: names in ``DATASETS``, empty for all.
+        scenes: parts of sample names to keep, empty for all.
+        limit: at most so many samples; ``None`` for all.
+        sample: so many samples drawn at random with the settings' seed; ``None`` for all.
+        pairs: which pairs of a group of posed views, ``"default"`` or ``"all"``.
+        pixel_centre: coordinate of the first pixel's centre in posed cameras, 0.5 for COLMAP's; ``None`` for
+            each data set's own.
+        settings: what every method is given.
+        out: folder of the records and tables.
+        results: Markdown page to write beside; ``None`` for none.
+        skip_broken: go on after a broken sample.
+        save_depth: write depth maps.
+        quiet: no bar, no table on the screen.
+        crop: region that is scored, one of ``crops.CROPS``.
+        priors: further priors beside the settings' own: methods that use one are run with each.
+        seeds: how many seeds, from the settings' own on, methods that use a prior are run with.
+        pose: where the poses come from: rows of ``guided`` that differ in it, see ``POSES``.
+        perturb: largest turn in degrees and shift as a share of the baseline that poses are given wrong by.
+    """
+
+    data: Path
+    methods: tuple[str, ...]
+    datasets: tuple[str, ...]
+    scenes: tuple[str, ...]
+    limit: int | None
+    sample: int | None
+    pairs: str
+    pixel_centre: float | None
+    settings: Settings
+    out: Path
+    results: Path | None
+    skip_broken: bool
+    save_depth: bool
+    quiet: bool
+    crop: str = "none"
+    priors: tuple[str, ...] = ()
+    seeds: int = 1
+    pose: tuple[str, ...] = ()
+    perturb: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        check_choice(self.crop, "crop", CROPS)
+        for pose in self.pose:
+            check_choice(pose, "pose", POSES)
+
+
+def all_refs(options: PairsOptions, datasets: Sequence[str] | None = None) -> list[SampleRef]:
+    """References to all samples of the data: of the named data sets, else of those that the options name."""
+    return find_pairs(
+        options.data,
+        datasets or options.datasets or None,
+        pairs=options.pairs,
+        pixel_centre=options.pixel_centre,
+    )
+
+
+def select(refs: Sequence[SampleRef], options: PairsOptions) -> list[SampleRef]:
+    """Keep the samples whose label contains one of ``scenes``, draw ``sample``, keep the first ``limit``.
+
+    Returns:
+        References in the order of ``refs``.
+
+    Raises:
+        ValueError: nothing is left, more are to be drawn than there are, or a number is below 1.
+    """
+    scenes, data = options.scenes, options.data
+    for name in ("limit", "sample"):
+        count = getattr(options, name)
+        if count is not None and count < 1:
+            bad_value(name, "at least 1", count)
+    kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
+    if not kept:
+        found = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
+        wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
+        bad_value("DIR", f"a folder with a sample{wanted}", f"{data} with {found}", "See: geodiff eval list.")
+    if options.sample is not None:
+        if options.sample > len(kept):
+            bad_value("sample", f"at most {len(kept)}, the number of samples found", options.sample)
+        drawn = random.Random(options.settings.seed).sample(range(len(kept)), options.sample)
+        kept = [kept[i] for i in sorted(drawn)]
+    return kept[: options.limit]
+
+
+def command_line(
+    options: PairsOptions, head: Sequence[str], default_methods: tuple[str, ...] = PAIRS_METHODS
+) -> str:
+    """The command line that gives these options, defaults left out.
+
+    Args:
+        options: what was given.
+        head: subcommand and data, such as ``("eval", "pairs", "DIR")``.
+        default_methods: methods of the subcommand when none are named.
+    """
+    words = ["geodiff", *head]
+    if options.methods != default_methods:
+        words += ["--methods", ",".join(options.methods)]
+    for name in ("datasets", "scenes"):
+        if getattr(options, name):
+            words += [f"--{name}", ",".join(getattr(options, name))]
+    defaults = {"limit": None, "sample": None, "pairs": "default", "pixel_centre": None, "crop": "none"}
+    defaults["seeds"] = 1
+    for name, default in defaults.items():
+        if getattr(options, name) != default:
+            words += [f"--{name.replace('_', '-')}", str(getattr(options, name))]
+    if options.priors:
+        words += ["--prior", options.settings.prior]
+        words += [word for prior in options.priors for word in ("--prior", prior)]
+    for field in fields(Settings):
+        if options.priors and field.name == "prior":
+            continue
+        value: Any = getattr(options.settings, field.name)
+        if value != field.default:
+            words += [f"--{field.name}", str(value)]
+    if options.pose:
+        words += ["--pose", ",".join(options.pose)]
+    if options.perturb is not None:
+        words += ["--perturb", "{:g},{:g}".format(*options.perturb)]
+    return shlex.join(words)

@@ -1,0 +1,265 @@
+"""What guidance makes of priors from exact to weak: ``geodiff eval strength``.
+
+Hop: dense pairs + ``STRENGTHS`` -> emulated prior -> plain, fitted and guided -> tables.
+Paper: none; S5 measures one prior.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from tqdm import tqdm
+
+from geodiff_plugin._checks import bad_value, check_choice, check_number
+from geodiff_plugin.evaluation.alignment import align
+from geodiff_plugin.evaluation.baselines import PriorCache, Settings, find_method
+from geodiff_plugin.evaluation.cells import count_of_pairs
+from geodiff_plugin.evaluation.datasets import SampleRef, find_pairs, load
+from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.evaluation.emulated import SPACES, STRENGTHS, EmulatedPrior
+from geodiff_plugin.evaluation.figures.strength import draw_strength, shaded
+from geodiff_plugin.evaluation.layout import Table
+from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.records import append_record, read_records
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
+from geodiff_plugin.evaluation.surfaces import DenseTruth
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+
+__all__ = ["METHODS", "StrengthOptions", "run_strength", "strength_tables"]
+
+#: The plain call whose scale and shift the truth decides.
+ORACLE = "prior-aligned"
+METHODS = (ORACLE, "prior-fit", "guided", "search-only", "guided:inner_steps=5")
+#: Strength whose surfaces the figure shows.
+SHOWN = "5%"
+#: Share of pixels with truth from which a sample is dense: a prior is made of its truth.
+DENSE = 0.5
+_VALUES = {"abs_rel": "AbsRel", "delta1": "δ1", "edges": "at edges", "surfaces": "surfaces"}
+
+
+@dataclass(frozen=True)
+class StrengthOptions:
+    """What to measure.
+
+    Attributes:
+        data: folders of data sets, or ``synthetic:N``; samples without dense truth are left out.
+        command: as typed, for the page.
+        strengths: keys of ``STRENGTHS``.
+        space: what the emulated prior is affine in.
+        follow: how far its later answers follow their input, [0, 1].
+        methods: of ``METHODS``, or any method that uses a prior.
+        steps: denoising steps of the plain call.
+        resolution: ``processing_resolution`` of every call.
+        seed: of noise and of the prior's error.
+        limit: samples of each folder at most.
+        out: folder of the records; a run goes on where it was stopped.
+        results: where the Markdown page is written as well.
+        figure: where the figure is drawn.
+        quiet: no progress bar.
+    """
+
+    data: tuple[Path, ...]
+    command: str
+    strengths: tuple[str, ...] = tuple(STRENGTHS)
+    space: str = "disparity"
+    follow: float = 0.3
+    methods: tuple[str, ...] = METHODS
+    steps: int = 4
+    resolution: int = 384
+    seed: int = 0
+    limit: int | None = None
+    out: Path = Path("geodiff-eval")
+    results: Path | None = None
+    figure: Path | None = None
+    quiet: bool = False
+
+    def __post_init__(self) -> None:
+        for strength in self.strengths:
+            check_choice(strength, "strengths", STRENGTHS)
+        check_choice(self.space, "space", SPACES)
+        check_number(self.follow, "follow", 0.0, 1.0)
+        for name in self.methods:
+            if not find_method(name).uses_prior:
+                bad_value("methods", "methods that use a prior", repr(name))
+
+
+class _Emulated(PriorCache):
+    """Hands the emulated pipeline to every method that asks for a prior."""
+
+    def __init__(self, prior: EmulatedPrior) -> None:
+        super().__init__()
+        self._pipe = enable_geometry_guidance(prior.pipe)
+
+    def get(self, settings: Settings) -> Any:
+        """The emulated pipeline, whatever prior the settings name."""
+        return self._pipe
+
+
+def run_strength(options: StrengthOptions) -> Page:
+    """Measure every method at every strength, and write the page.
+
+    Raises:
+        InputError: bad options, or no sample with dense truth.
+        OSError: missing or unreadable files.
+    """
+    refs = [ref for root in options.data for ref in find_pairs(root)[: options.limit]]
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "strength.jsonl"
+    found = {record["key"]: record for record in read_records(path)}
+    prior = EmulatedPrior(options.space, options.follow)
+    cache, records = _Emulated(prior), []
+    for ref in tqdm(refs, disable=options.quiet, desc="pairs"):
+        keys = {(s, m): _key(ref, s, m, options) for s in options.strengths for m in options.methods}
+        if not all(key in found for key in keys.values()):
+            sample = load(ref)
+            if sample.valid.mean() < DENSE:
+                continue
+            for record in _measure(sample, prior, cache, keys, found, options):
+                found[record["key"]] = record
+                append_record(path, record)
+        records += [found[key] for key in keys.values() if key in found]
+    if not records:
+        bad_value("data", f"with dense truth (on {DENSE:.0%} of the pixels) for some pair", "none")
+    remarks = (
+        f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; processed "
+        f"at {options.resolution} px, {options.steps} steps, seed {options.seed}.",
+    )
+    page = Page("Priors from exact to weak", run_facts(options.command), strength_tables(records), remarks)
+    write_page(page, options.out, "strength")
+    if options.results is not None:
+        write_text(options.results, page.markdown())
+    if options.figure is not None:
+        labels = {record["pair"] for record in records}
+        sample = load(next(ref for ref in refs if ref.label in labels))
+        draw_strength(records, ORACLE, _pictures(sample, prior, cache, options), options.figure)
+    return page
+
+
+def _pictures(
+    sample: StereoSample, prior: EmulatedPrior, cache: PriorCache, options: StrengthOptions
+) -> dict[str, np.ndarray]:
+    """The middle of one pair, lit, at the strength of the figure: truth, prior, fitted once, guided."""
+    strength = SHOWN if SHOWN in options.strengths else options.strengths[0]
+    height, width = sample.depth_m.shape
+    window = np.s_[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
+    maps = {"truth": sample.depth_m}
+    for method in (ORACLE, "prior-fit", "guided"):
+        title = f"{find_method(method).title}, {strength}"
+        maps[title] = _depth(sample, prior, cache, strength, method, options)
+    return {title: shaded(depth_m[window], float(sample.K_left[0, 0])) for title, depth_m in maps.items()}
+
+
+def _key(ref: SampleRef, strength: str, method: str, options: StrengthOptions) -> str:
+    how = (options.space, options.follow, options.steps, options.resolution, options.seed)
+    return "|".join(map(str, (ref.label, strength, method, *how)))
+
+
+def _measure(
+    sample: StereoSample,
+    prior: EmulatedPrior,
+    cache: PriorCache,
+    keys: dict[tuple[str, str], str],
+    found: dict[str, Any],
+    options: StrengthOptions,
+) -> list[dict[str, Any]]:
+    """A record of every method and strength that has none yet."""
+    truth, records = DenseTruth(sample.depth_m, sample.valid), []
+    for (strength, method), key in keys.items():
+        if key in found:
+            continue
+        depth_m = _depth(sample, prior, cache, strength, method, options)
+        scores = evaluate_depth(depth_m, sample.depth_m, sample.valid, None)
+        records.append(
+            {
+                "key": key,
+                "pair": sample.label,
+                "rectified": bool(sample.rectified),
+                "rendered": sample.dataset == "synthetic",
+                "strength": strength,
+                "method": method,
+                "abs_rel": scores["abs_rel"],
+                "delta1": scores["delta1"],
+                "edges": truth.edge_error(depth_m),
+                "surfaces": truth.surface_error(depth_m),
+            }
+        )
+    return records
+
+
+def _depth(
+    sample: StereoSample,
+    prior: EmulatedPrior,
+    cache: PriorCache,
+    strength: str,
+    method: str,
+    options: StrengthOptions,
+) -> np.ndarray:
+    """``(H, W)`` metres of one method with a prior of one strength."""
+    prior.answer(sample, STRENGTHS[strength], options.resolution, options.seed)
+    settings = Settings(steps=options.steps, resolution=options.resolution, seed=options.seed)
+    if method != ORACLE:
+        depth_m = find_method(method).run(sample, settings, cache).depth_m
+        assert depth_m is not None
+        return depth_m
+    out = prior.pipe(
+        Image.fromarray(sample.left),
+        num_inference_steps=settings.steps,
+        processing_resolution=settings.resolution,
+        generator=torch.Generator().manual_seed(settings.seed),
+    )
+    return align(out.prediction[0, ..., 0], sample.depth_m, sample.valid, prior.space)
+
+
+def strength_tables(records: Sequence[dict[str, Any]]) -> tuple[Table, ...]:
+    """One table a group of pairs (all, rendered rectified, rendered posed, real), strengths by methods.
+
+    Args:
+        records: of ``run_strength``.
+    """
+    groups = {
+        "All pairs": lambda r: True,
+        "Rendered, rectified": lambda r: r["rendered"] and r["rectified"],
+        "Rendered, any pose": lambda r: r["rendered"] and not r["rectified"],
+        "Real": lambda r: not r["rendered"],
+    }
+    tables = []
+    for title, belongs in groups.items():
+        own = [record for record in records if belongs(record)]
+        if own:
+            tables.append(_table(title, own))
+    return tuple(tables)
+
+
+def _table(title: str, records: Sequence[dict[str, Any]]) -> Table:
+    strengths = list(dict.fromkeys(record["strength"] for record in records))
+    methods = list(dict.fromkeys(record["method"] for record in records))
+    rows, rules = [], []
+    for strength in strengths:
+        rules.append(len(rows))
+        for method in methods:
+            own = [r for r in records if r["strength"] == strength and r["method"] == method]
+            if not own:
+                continue
+            means = {name: _mean([r[name] for r in own]) for name in _VALUES}
+            worst = max(r["abs_rel"] for r in own)
+            shown = [f"{means[n]:.2f}" if n == "surfaces" else f"{means[n]:.4f}" for n in _VALUES]
+            rows.append((strength, find_method(method).title, *shown, f"{worst:.3f}"))
+    pairs = count_of_pairs(len({record["pair"] for record in records}))
+    note = (
+        f"{pairs}. AbsRel and δ1 in metres, without alignment but for the prior with oracle; AbsRel within "
+        f"3 px of the truth's edges; error of the slope of log depth away from them, per mille a pixel."
+    )
+    header = ("prior's error", "method", *_VALUES.values(), "worst AbsRel")
+    return Table(title, header, tuple(rows), note, rules=tuple(rules[1:]))
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else float("nan")

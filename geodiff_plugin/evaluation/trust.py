@@ -1,0 +1,173 @@
+"""How often a wrong calibration is caught, and how often a right one is doubted: ``geodiff eval trust``.
+
+Hop: pairs, right and made wrong -> guided calls -> judgements -> one table.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin.evaluation.baselines import Settings
+from geodiff_plugin.evaluation.baselines._guidance import call_arguments
+from geodiff_plugin.evaluation.baselines.base import PriorCache
+from geodiff_plugin.evaluation.datasets import find_pairs, load
+from geodiff_plugin.evaluation.datasets.sample import SampleRef
+from geodiff_plugin.evaluation.layout import Table
+from geodiff_plugin.evaluation.records import append_record, clean_records, read_records
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page
+from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, Case, cases_of
+from geodiff_plugin.formats.out_folder import OutFolder
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+
+__all__ = ["TEN", "TrustOptions", "run_trust"]
+
+#: The ten kinds of wrong calibration that every pair is given with.
+TEN = (
+    "swapped", "inverse", "axis", "tilted", "mirrored",
+    "millimetres", "thousandth", "K-1.5", "K-2", "K-0.67",
+)  # fmt: skip
+#: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.
+OFF = 0.2
+RECORDS = "trust.jsonl"
+
+
+@dataclass(frozen=True)
+class TrustOptions:
+    """Options of ``geodiff eval trust``.
+
+    Attributes:
+        data: folder of real pairs, or ``None``.
+        rendered: so many rendered pairs.
+        width: of the rendered ones, pixels; 3/4 of it high.
+        kinds: keys of ``WRONG`` and ``WRONG_POINTS``.
+        limit: at most so many real pairs.
+        settings: prior, device, seed.
+        out: folder of records and table; resumed.
+        quiet: no bar.
+    """
+
+    data: Path | None
+    rendered: int
+    width: int
+    kinds: tuple[str, ...]
+    limit: int | None
+    settings: Settings
+    out: Path
+    quiet: bool
+
+
+def _measure(case: Case, pipe: Any, settings: Settings) -> dict[str, Any]:
+    """One guided call, what was said of it, and how far it is off."""
+    sample, said = case.sample, []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            cameras = (sample.K_left, sample.K_right), sample.E
+            guidance = GeometryGuidance(sample.right, *cameras, points=case.points)
+            out = pipe(Image.fromarray(sample.left), guidance=guidance, **call_arguments(settings))
+        except InputError as error:
+            return {"status": "refused", "said": [str(error)], "off": None}
+        said += [str(warning.message) for warning in caught if warning.category is UserWarning]
+    judgement, depth_m = out.judgements[0], out.prediction[0, ..., 0]
+    off = None
+    if case.truth:
+        off = float(np.median(np.abs(depth_m[sample.valid] / sample.depth_m[sample.valid] - 1.0)))
+    signs = {name: None if value != value else value for name, value in asdict(judgement.signs).items()}
+    status = "trusted" if judgement.trusted else "not trusted"
+    return {"status": status, "said": said + out.warnings, "off": off, "signs": signs}
+
+
+def _refs(options: TrustOptions) -> dict[str, list[SampleRef]]:
+    real = [] if options.data is None else find_pairs(options.data, None)[: options.limit]
+    if options.data is not None and not real:
+        bad_value("--data", "a folder with pairs", str(options.data), "See: geodiff eval list.")
+    size = f"@{options.width}x{options.width * 3 // 4}"
+    rendered = find_pairs(Path(f"synthetic:{options.rendered}{size}"), None) if options.rendered else []
+    return {"real": real, "rendered": rendered}
+
+
+def _records(options: TrustOptions) -> Iterator[dict[str, Any]]:
+    """Every case's record: those that the folder has, and the others as they are measured."""
+    path, priors = options.out / RECORDS, PriorCache()
+    clean_records(path)
+    done = {record["key"]: record for record in read_records(path)}
+    for group, refs in _refs(options).items():
+        for i, ref in enumerate(tqdm(refs, desc=group, disable=options.quiet, file=sys.stderr)):
+            other = load(refs[(i + 1) % len(refs)])
+            for case in cases_of(load(ref), other, options.kinds):
+                settings = asdict(options.settings) | {"width": options.width if group == "rendered" else 0}
+                key = json.dumps([ref.label, case.kind, settings], sort_keys=True)
+                if key not in done:
+                    found = _measure(case, priors.get(options.settings), options.settings)
+                    head = {"key": key, "group": group, "sample": ref.label, "kind": case.kind}
+                    done[key] = head | found
+                    append_record(path, done[key])
+                yield done[key]
+
+
+def _share(part: int, whole: int) -> str:
+    return "-" if whole == 0 else f"{part} of {whole} ({100 * part / whole:.0f} %)"
+
+
+def _table(group: str, records: Sequence[dict[str, Any]], kinds: Sequence[str]) -> Table:
+    names = {kind: WRONG[kind][0] for kind in kinds if kind in WRONG}
+    names |= {kind: f"points {WRONG_POINTS[kind]:g} times too far" for kind in kinds if kind in WRONG_POINTS}
+    rows, all_off, all_told = [], 0, 0
+    for kind in ("right", "right, points", *kinds):
+        own = [record for record in records if record["kind"] == kind]
+        if not own:
+            continue
+        right = kind.startswith("right")
+        off = [r for r in own if r["off"] is None or r["off"] > OFF]
+        told = [r for r in off if r["status"] != "trusted" or r["said"]]
+        if not right:
+            all_off, all_told = all_off + len(off), all_told + len(told)
+        doubted = sum(r["status"] != "trusted" for r in own)
+        median = np.median([r["off"] for r in own if r["off"] is not None] or [math.nan])
+        warned = sum(r["status"] != "trusted" or bool(r["said"]) for r in own)
+        rows.append(
+            [
+                names.get(kind, kind),
+                "-" if math.isnan(median) else f"{median:.2f}",
+                _share(doubted, len(own)),
+                _share(warned, len(own)),
+                _share(len(told), len(off)),
+            ]
+        )
+    rows.append(["all wrong ones", "", "", "", _share(all_told, all_off)])
+    head = ["given as", "median error", "not trusted", "anything said", f"said, of those > {OFF:.0%} off"]
+    return Table(f"Wrong calibrations caught, right ones doubted: {group} pairs", head, rows)
+
+
+def run_trust(options: TrustOptions) -> Page:
+    """Measure, write ``trust.jsonl`` and the table.
+
+    Raises:
+        InputError: an unknown kind, no pairs.
+    """
+    for kind in options.kinds:
+        if kind not in WRONG and kind not in WRONG_POINTS:
+            known = ", ".join((*WRONG, *WRONG_POINTS))
+            bad_value("--kinds", f"some of {known}", repr(kind))
+    with OutFolder(options.out, resume=True):
+        records = list(_records(options))
+        words = ["geodiff eval trust", f"--rendered {options.rendered}@{options.width}"]
+        words += [] if options.data is None else [f"--data {options.data.name}"]
+        groups = dict.fromkeys(record["group"] for record in records)
+        tables = [_table(g, [r for r in records if r["group"] == g], options.kinds) for g in groups]
+        page = Page("Trust", run_facts(" ".join(words)), tuple(tables))
+        write_page(page, options.out, "trust")
+    return page

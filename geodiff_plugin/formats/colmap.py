@@ -1,0 +1,126 @@
+"""A COLMAP model in text: ``cameras.txt`` and ``images.txt``, and the names of two images in it.
+
+Hop: lines of two images and of their cameras -> ``Rig``, in the model's unit.
+Paper: S5.1 (Tanks and Temples).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
+from geodiff_plugin.formats.lenses import FactoryCamera, rig_of_cameras
+from geodiff_plugin.formats.rigs import intrinsics, pose_from_world_to_camera
+from geodiff_plugin.formats.structured import array_of
+from geodiff_plugin.types import Rig
+
+__all__ = ["COLMAP", "matches", "read"]
+
+#: How many numbers of a model stand before its lens: f cx cy, or fx fy cx cy.
+FOCALS = {
+    "SIMPLE_PINHOLE": 1,
+    "PINHOLE": 2,
+    "SIMPLE_RADIAL": 1,
+    "RADIAL": 1,
+    "OPENCV": 2,
+    "OPENCV_FISHEYE": 2,
+    "FULL_OPENCV": 2,
+    "SIMPLE_RADIAL_FISHEYE": 1,
+    "RADIAL_FISHEYE": 1,
+    "THIN_PRISM_FISHEYE": 2,
+}
+FISHEYES = {name for name in FOCALS if "FISHEYE" in name}
+CAMERA = re.compile(r"^(\d+) ([A-Z_]+) (\d+) (\d+) (.+)$", re.MULTILINE)
+IMAGE = re.compile(r"^(\d+)((?: [-+.\deE]+){7}) (\d+) (\S.*)$", re.MULTILINE)
+CAMERAS_MARK, IMAGES_MARK = "# Camera list with", "# Image list with"
+UNDISTORT = "Undistort the images first (colmap image_undistorter) and give the model that it writes."
+
+
+def matches(text: str, path: Path) -> bool:
+    """Whether it opens with COLMAP's head of ``cameras.txt`` or ``images.txt``, or has lines of either."""
+    if CAMERAS_MARK in text or IMAGES_MARK in text:
+        return True
+    found = CAMERA.search(text)
+    return (found is not None and found.group(2) in FOCALS) or IMAGE.search(text) is not None
+
+
+def _cameras(file: CalibrationFile) -> dict[str, FactoryCamera]:
+    cameras = {}
+    for number, model, width, height, words in CAMERA.findall(file.text):
+        where = f"camera {number} in {file.path}"
+        if model not in FOCALS:
+            bad_value(f"the model of {where}", f"one of {', '.join(FOCALS)}", model, UNDISTORT)
+        if model in FISHEYES:
+            bad_value(f"the model of {where}", "a pinhole", model, UNDISTORT)
+        numbers = array_of(words.split(), (-1,), f"parameters of {where}")
+        count = FOCALS[model]
+        if numbers.size < count + 2:
+            bad_value(f"parameters of {where}", f"at least {count + 2} numbers", numbers.size, "Cut off?")
+        fx, fy = numbers[0], numbers[count - 1]
+        # COLMAP puts the centre of the first pixel at (0.5, 0.5).
+        cx, cy = numbers[count : count + 2] - 0.5
+        cameras[number] = FactoryCamera(
+            intrinsics(fx, fy, cx, cy), numbers[count + 2 :], (int(width), int(height))
+        )
+    return cameras
+
+
+def _named(images: dict[str, tuple[np.ndarray, str]], wanted: str, path: Path) -> tuple[np.ndarray, str]:
+    """The image whose name ends the wanted path; names may hold folders."""
+    parts = Path(wanted).parts
+    fitting = [name for name in images if Path(name).parts == parts[-len(Path(name).parts) :]]
+    if not fitting:
+        some = ", ".join(sorted(images)[:3])
+        bad_value("the image", f"one of the {len(images)} in {path} ({some}, ...)", wanted, "Check its name.")
+    return images[max(fitting, key=len)]
+
+
+def _images(file: CalibrationFile) -> dict[str, tuple[np.ndarray, str]]:
+    """World-to-camera transform and number of the camera, by the image's name."""
+    images = {}
+    for number, words, camera, name in IMAGE.findall(file.text):
+        qw, qx, qy, qz, *translation = array_of(words.split(), (7,), f"image {number} in {file.path}")
+        if not (qw, qx, qy, qz) != (0.0, 0.0, 0.0, 0.0):
+            bad_value(f"the rotation of {name} in {file.path}", "a quaternion", "zeros")
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_quat([qx, qy, qz, qw]).as_matrix()
+        T[:3, 3] = translation
+        images[name.strip()] = (T, camera)
+    return images
+
+
+def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
+    """The rig of the two images of ``choice.image_names``; both files in any order.
+
+    Lengths keep the model's unit, which is no metre: one measured distance gives it (``baseline_m``).
+
+    Raises:
+        ValueError: no such images, no names, a lens, or two files of one kind.
+    """
+    by_kind = {bool(CAMERA.search(file.text)) and IMAGES_MARK not in file.text: file for file in files}
+    if len(by_kind) != 2:
+        bad_value("calibration", "cameras.txt and images.txt", " and ".join(str(file.path) for file in files))
+    cameras, images = _cameras(by_kind[True]), _images(by_kind[False])
+    if choice.image_names is None:
+        bad_value("image_names", "given for a COLMAP model, as ('left.jpg', 'right.jpg')", "none")
+    (T_left, left), (T_right, right) = (
+        _named(images, name, by_kind[False].path) for name in choice.image_names
+    )
+    for camera in (left, right):
+        if camera not in cameras:
+            bad_value(
+                f"{by_kind[True].path}", f"with camera {camera}", f"only {', '.join(cameras)}", "Cut off?"
+            )
+    source = " and ".join(str(file.path) for file in files)
+    E = pose_from_world_to_camera(T_left, T_right)
+    return rig_of_cameras(cameras[left], cameras[right], E, source)
+
+
+COLMAP = CalibrationFormat(
+    "a COLMAP model (cameras.txt and images.txt)", matches, read, file_counts=(2,), has_unit=False
+)

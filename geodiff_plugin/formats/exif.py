@@ -1,0 +1,112 @@
+"""Camera matrices from what a photograph says of itself, or from a field of view.
+
+Hop: EXIF of an image, or degrees -> K in pixels of the upright image.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.rigs import intrinsics
+
+__all__ = ["intrinsics_from_exif", "intrinsics_from_fov"]
+
+_ORIENTATION, _IFD, _FOCAL, _FOCAL_35, _ZOOM = 0x0112, 0x8769, 0x920A, 0xA405, 0xA404
+_WIDTH, _HEIGHT, _X_RESOLUTION, _Y_RESOLUTION, _UNIT = 0xA002, 0xA003, 0xA20E, 0xA20F, 0xA210
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+#: Diagonal of a 35 mm frame, which equivalent focal lengths are compared by.
+_DIAGONAL_35_MM = math.hypot(36.0, 24.0)
+#: Sides may be rounded by this share before an image counts as cropped.
+_SAME_SHAPE = 0.01
+CURES = "Give K (--fx --fy --cx --cy or --K), a field of view (--fov), or photographs with their EXIF."
+
+
+def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
+    """K of a camera with square pixels and its principal point in the middle.
+
+    Args:
+        fov_deg: horizontal field of view, degrees, in [1, 170].
+        size: ``(width, height)``.
+    """
+    check_number(fov_deg, "fov", 1.0, 170.0)
+    focal = size[0] / 2 / math.tan(math.radians(fov_deg) / 2)
+    return intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
+
+
+def intrinsics_from_exif(
+    source: str | os.PathLike[str] | Image.Image, name: str
+) -> tuple[np.ndarray, list[str]]:
+    """K of a photograph: of a file for its upright pixels, of an image in memory for its pixels as they lie.
+
+    A focal length in 35 mm equivalent is taken by the diagonal; else a focal length in mm with the resolution
+    of the sensor. Both are known to a few per cent.
+
+    Args:
+        source: a file, or an image that still carries its EXIF.
+        name: the argument, for messages.
+
+    Returns:
+        ``(3, 3)`` float64, pixels, and sentences about what was assumed.
+
+    Raises:
+        ValueError: no focal length in it, or an image that was cropped since.
+    """
+    if isinstance(source, Image.Image):
+        return _of(source, name, turned=False)
+    with Image.open(check_file(source, name, "an image file")) as image:
+        return _of(image, name, turned=image.getexif().get(_ORIENTATION) in (5, 6, 7, 8))
+
+
+def _number(entries: Any, tag: int) -> float:
+    try:
+        value = float(entries.get(tag) or 0.0)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return 0.0
+    return value if math.isfinite(value) and value > 0 else 0.0
+
+
+def _of(image: Image.Image, name: str, turned: bool) -> tuple[np.ndarray, list[str]]:
+    exif = image.getexif()
+    entries = exif.get_ifd(_IFD)
+    width, height = image.size
+    taken = _number(entries, _WIDTH), _number(entries, _HEIGHT)
+    if all(taken):
+        shapes = [(taken[0] / taken[1]) / shape for shape in (width / height, height / width)]
+        if min(max(ratio, 1 / ratio) for ratio in shapes) > 1 + _SAME_SHAPE:
+            bad_value(
+                f"EXIF of {name}",
+                f"of an image of {width}x{height}",
+                f"one of {taken[0]:.0f}x{taken[1]:.0f}: it was cropped since it was taken",
+                f"Give the image as it was taken. {CURES}",
+            )
+    focal_35, focal_mm = _number(entries, _FOCAL_35), _number(entries, _FOCAL)
+    per_unit = _MM_PER_UNIT.get(int(_number(entries, _UNIT) or 2), 25.4)
+    pitch_mm = [
+        per_unit / r if r else 0.0 for r in (_number(entries, t) for t in (_X_RESOLUTION, _Y_RESOLUTION))
+    ]
+    zoom, notes = _number(entries, _ZOOM), []
+    if focal_35:
+        fx = fy = focal_35 * math.hypot(width, height) / _DIAGONAL_35_MM
+        notes.append(f"K of {name}: {focal_35:g} mm in 35 mm equivalent by its EXIF, {fx:.0f} px.")
+    elif focal_mm and pitch_mm[0] and taken[0]:
+        resized = max(width, height) / max(taken)
+        fx = focal_mm / pitch_mm[0] * resized * max(zoom, 1.0)
+        fy = fx * pitch_mm[0] / (pitch_mm[1] or pitch_mm[0])
+        notes.append(f"K of {name}: {focal_mm:g} mm on its sensor by its EXIF, {fx:.0f} px.")
+    else:
+        bad_value(f"K of {name}", "known", "no focal length in its EXIF", CURES)
+    if zoom > 1.01:
+        notes.append(
+            f"{name} was zoomed digitally by {zoom:g}; not every camera says whether that is counted in."
+        )
+    if turned:
+        (width, height), (fx, fy) = (height, width), (fy, fx)
+    return intrinsics(fx, fy, (width - 1) / 2, (height - 1) / 2), notes

@@ -1,0 +1,74 @@
+"""Kalibr's ``camchain.yaml``.
+
+Hop: ``cam0``, ``cam1`` with ``intrinsics``, ``distortion_coeffs``, ``T_cn_cnm1`` -> ``Rig``.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
+from geodiff_plugin.formats.lenses import FactoryCamera, rig_of_cameras
+from geodiff_plugin.formats.rigs import check_rigid, intrinsics, pose_from_world_to_camera
+from geodiff_plugin.formats.structured import array_of, entry, parse_yaml
+from geodiff_plugin.types import Rig
+
+__all__ = ["KALIBR", "matches", "read"]
+
+MARK = re.compile(r"^cam\d+:\s*$", re.MULTILINE)
+
+
+def matches(text: str, path: Path) -> bool:
+    """Whether a line is ``cam0:`` or of another number."""
+    return MARK.search(text) is not None
+
+
+def _camera(chain: dict[str, Any], name: str, path: Path) -> FactoryCamera:
+    where = f"{name} in {path}"
+    camera = entry(chain, name, f"{path}")
+    model = entry(camera, "camera_model", where)
+    if model != "pinhole":
+        bad_value(
+            f"camera_model of {where}", "pinhole", repr(model), "Undistort the images to a pinhole first."
+        )
+    numbers = array_of(entry(camera, "intrinsics", where), (4,), f"intrinsics of {where}")
+    lens = array_of(entry(camera, "distortion_coeffs", where), (-1,), f"distortion_coeffs of {where}")
+    width, height = array_of(entry(camera, "resolution", where), (2,), f"resolution of {where}")
+    return FactoryCamera(intrinsics(*numbers), lens, (int(width), int(height)))
+
+
+def _from_first(chain: dict[str, Any], number: int, path: Path) -> np.ndarray:
+    """Takes points of cam0 to those of camera ``number``, along the chain."""
+    T = np.eye(4)
+    for n in range(1, number + 1):
+        where = f"cam{n} in {path}"
+        link = array_of(
+            entry(entry(chain, f"cam{n}", f"{path}"), "T_cn_cnm1", where), (4, 4), f"T_cn_cnm1 of {where}"
+        )
+        T = check_rigid(link, f"T_cn_cnm1 of {where}") @ T
+    return T
+
+
+def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
+    """The rig of two cameras of a chain: ``choice.cameras``, or cam0 (left) and cam1 (right).
+
+    ``T_cn_cnm1`` takes points of the camera before to this one, in metres.
+
+    Raises:
+        ValueError: an entry is missing or malformed, another camera model than pinhole, lens distortion.
+    """
+    path = files[0].path
+    chain = parse_yaml(files[0].text, path)
+    left, right = choice.cameras or (0, 1)
+    cameras = [_camera(chain, f"cam{number}", path) for number in (left, right)]
+    E = pose_from_world_to_camera(*(_from_first(chain, number, path) for number in (left, right)))
+    return rig_of_cameras(*cameras, E, str(path))
+
+
+KALIBR = CalibrationFormat("Kalibr camchain.yaml (cam0, cam1)", matches, read, uses_cameras=True)

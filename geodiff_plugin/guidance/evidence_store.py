@@ -1,0 +1,106 @@
+"""Evidence of the last pairs, for many guided calls on one pair.
+
+Hop: views and points as given, configuration -> ``Evidence``, made or remembered.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from geodiff_plugin.algorithm.evidence import Evidence, prepare_evidence
+from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.guidance.posing import pose_views
+from geodiff_plugin.types import CameraView
+
+__all__ = ["EvidenceStore", "make_evidence"]
+
+
+def make_evidence(
+    left_01: Tensor,
+    views: Sequence[CameraView],
+    K_left: Tensor,
+    points: Tensor | None,
+    config: GuidanceConfig,
+    needs_matches: bool,
+) -> Evidence:
+    """Poses as the knob ``pose`` says, then ``prepare_evidence``, whose arguments these are."""
+    if not views:
+        return prepare_evidence(left_01, views, K_left, points, config, needs_matches)
+    posed = pose_views(left_01, views, K_left, config.pose)
+    return prepare_evidence(left_01, posed.rights, K_left, points, config, needs_matches, posed.report)
+
+
+def _settings(config: GuidanceConfig, needs_matches: bool) -> tuple[Any, ...]:
+    """What of a configuration evidence depends on."""
+    swept = config.search.search == "volume"
+    return (
+        *(config.pose, config.loss_resolution, config.depth_range, config.sweep, config.fit),
+        *(swept, needs_matches),
+    )
+
+
+@dataclass(frozen=True)
+class _Entry:
+    tensors: list[Tensor | None]
+    settings: tuple[Any, ...]
+    evidence: Evidence
+    seconds: float
+
+    def fits(self, tensors: list[Tensor | None], settings: tuple[Any, ...]) -> bool:
+        """Whether it was made from the same values with the same settings on the same device."""
+        if self.settings != settings or len(self.tensors) != len(tensors):
+            return False
+        return all(_equal(own, given) for own, given in zip(self.tensors, tensors, strict=True))
+
+
+def _equal(one: Tensor | None, other: Tensor | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return one.device == other.device and one.shape == other.shape and torch.equal(one, other)
+
+
+class EvidenceStore:
+    """Remembers evidence by the values that it was made from: images, cameras, points and settings.
+
+    Give one to the ``GeometryGuidance`` of every call that is to share: ``guidance.evidence_store = store``.
+    """
+
+    def __init__(self, size: int = 2) -> None:
+        """Keep the evidence of the last ``size`` images; about 100 MB each with its cost volume."""
+        self._size, self._entries, self._spared = size, [], 0.0
+
+    def get(
+        self,
+        left_01: Tensor,
+        views: Sequence[CameraView],
+        K_left: Tensor,
+        points: Tensor | None,
+        config: GuidanceConfig,
+        needs_matches: bool,
+    ) -> Evidence:
+        """What ``make_evidence`` gives for these arguments; not to be changed by who gets it."""
+        tensors = [left_01, K_left, points, *(value for view in views for value in view)]
+        settings = _settings(config, needs_matches)
+        for entry in self._entries:
+            if entry.fits(tensors, settings):
+                self._spared += entry.seconds
+                return entry.evidence
+        start = time.perf_counter()
+        evidence = make_evidence(left_01, views, K_left, points, config, needs_matches)
+        # Copies, so that who changes an image in place asks anew.
+        held = [None if value is None else value.clone() for value in tensors]
+        entry = _Entry(held, settings, evidence, time.perf_counter() - start)
+        self._entries = [entry, *self._entries][: self._size]
+        return evidence
+
+    def take_spared_seconds(self) -> float:
+        """Seconds that remembering has spared since this was last asked; a fair account adds them."""
+        spared, self._spared = self._spared, 0.0
+        return spared

@@ -1,0 +1,188 @@
+"""Photographs without poses: cameras, poses and scale from what there is.
+
+Hop: images, K's or EXIF, one known length -> tracks -> poses up to scale -> ``EstimatedRig``.
+Paper: none; it takes known cameras for granted (S3.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from geodiff_plugin._checks import bad_type, bad_value, check_intrinsics, check_intrinsics_fit, check_number
+from geodiff_plugin.formats import as_image_01
+from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.guidance.posing import coarse_depth
+from geodiff_plugin.pose.estimate import EstimatedPose, estimate_pose
+from geodiff_plugin.pose.refine import polished
+from geodiff_plugin.pose.scale import Scale, find_scale
+from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
+from geodiff_plugin.pose.views import GreyViews, grey_views, sparse_tracks
+
+__all__ = ["EstimatedRig", "estimate_rig"]
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedRig:
+    """Cameras of photographs that came without poses.
+
+    Attributes:
+        size_left: ``(width, height)`` of the left photograph.
+        Ks: ``(3, 3)`` each, left one first.
+        Es: ``(4, 4)`` each, pose of every right camera in the left camera's frame, in metres or in units.
+        inliers: matches that each right view's pose explains.
+        parallax_deg: median angle between the two rays of a point, one a right view.
+        residual_px: median distance of the inliers from their epipolar lines, one a right view.
+        scale: where the unit comes from.
+        notes: sentences about what was assumed.
+        warnings: sentences for the user.
+    """
+
+    size_left: tuple[int, int]
+    Ks: tuple[np.ndarray, ...]
+    Es: tuple[np.ndarray, ...]
+    inliers: tuple[int, ...]
+    parallax_deg: tuple[float, ...]
+    residual_px: tuple[float, ...]
+    scale: Scale
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def _cameras(
+    photographs: Sequence[Any], images: Sequence[Tensor], K: Any, fov: float | None
+) -> tuple[list, list]:
+    """K of every photograph, and what was assumed for it."""
+    given = list(K) if isinstance(K, (tuple, list)) and np.ndim(K[0]) == 2 else [K] * len(images)
+    if len(given) != len(images):
+        bad_value("K", f"one matrix, or {len(images)} of them", f"{len(given)}")
+    found, notes = [], []
+    for i, (photograph, image, own) in enumerate(zip(photographs, images, given, strict=True)):
+        name, size = (
+            ("the left photograph" if i == 0 else f"right photograph {i}"),
+            (image.shape[-1], image.shape[-2]),
+        )
+        if own is not None:
+            own = check_intrinsics(own, f"K of {name}")
+            check_intrinsics_fit(own, *size, f"K of {name}", name)
+        elif fov is not None:
+            own = intrinsics_from_fov(fov, size)
+        elif hasattr(photograph, "getexif"):
+            own, said = intrinsics_from_exif(photograph, name)
+            notes += said
+        else:
+            cure = "Give K, a field of view (fov), or PIL images that carry their EXIF."
+            bad_value(f"K of {name}", "known", "an array without EXIF", cure)
+        found.append(own)
+    return found, notes
+
+
+def _tracks(views: GreyViews) -> tuple[Tracks, list[EstimatedPose]]:
+    """The inliers of all views, and the pose of each, the first baseline of length 1."""
+    tracks, poses = sparse_tracks(views), []
+    for v in range(len(views.rights)):
+        name = "the two photographs" if len(views.rights) == 1 else f"the left and right photograph {v + 1}"
+        own, mirrored = tracks.view(v), 0
+        if len(own) < 30:
+            turned = replace(
+                views, rights=(views.rights[v][:, ::-1].copy(),), K_rights=views.K_rights[v : v + 1]
+            )
+            mirrored = len(sparse_tracks(turned))
+        poses.append(estimate_pose(own, name, mirrored))
+    seen = tracks.seen.copy()
+    for v, pose in enumerate(poses):
+        seen[v, tracks.seen[v]] = pose.inliers
+    tracks = replace(tracks, seen=seen)
+    return tracks, [poses[0], *(_same_unit(tracks, poses, v) for v in range(1, len(poses)))]
+
+
+def _same_unit(tracks: Tracks, poses: Sequence[EstimatedPose], v: int) -> EstimatedPose:
+    """Pose ``v`` with its baseline in units of the first one, by the points that both see."""
+    both = tracks.kept(tracks.seen[0] & tracks.seen[v])
+    if len(both) < 15:
+        bad_value(
+            "photographs", "with points that all of them show", f"{len(both)} of them in view {v + 1} too"
+        )
+    first, other = (
+        solve_inverse_depth(
+            replace(
+                both,
+                right_px=both.right_px[i : i + 1],
+                seen=both.seen[i : i + 1],
+                K_rights=both.K_rights[i : i + 1],
+            ),
+            poses[i].T[None],
+        )
+        for i in (0, v)
+    )
+    T = poses[v].T.copy()
+    T[:3, 3] *= np.median(other / np.maximum(first, 1e-9))
+    return replace(poses[v], T=T)
+
+
+def estimate_rig(
+    photographs: Sequence[Any],
+    *,
+    K: Any = None,
+    fov: float | None = None,
+    baseline_m: float | None = None,
+    known_length: tuple[float, float, float, float, float] | None = None,
+    points: Any = None,
+) -> EstimatedRig:
+    """Cameras of two photographs or more, left one first.
+
+    Args:
+        photographs: as ``GeometryGuidance`` takes images.
+        K: ``(3, 3)`` for all, or one for each; ``None`` for ``fov`` or EXIF.
+        fov: horizontal field of view of all, degrees.
+        baseline_m: distance of the first right camera from the left one.
+        known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left photograph and their distance.
+        points: ``(N, 3)`` metres in the left camera's frame.
+
+    Raises:
+        TypeError, ValueError: PoseLib is not installed; no K, or no pose to be had (``pose.estimate``).
+    """
+    if len(photographs) < 2:
+        bad_type("photographs", "two images or more", photographs)
+    names = ["left", *(f"right photograph {i}" for i in range(1, len(photographs)))]
+    images = [as_image_01(p, n) for p, n in zip(photographs, names, strict=True)]
+    Ks, notes = _cameras(photographs, images, K, fov)
+    if baseline_m is not None:
+        check_number(baseline_m, "baseline_m", 1e-6, 1e6)
+    K_left = torch.as_tensor(Ks[0], dtype=torch.float32)
+
+    def posed(Ts: Sequence[np.ndarray]) -> list:
+        matrices = [torch.as_tensor(m, dtype=torch.float32) for m in (*Ks[1:], *Ts)]
+        return list(zip(images[1:], matrices[: len(Ts)], matrices[len(Ts) :], strict=True))
+
+    nowhere = posed([np.eye(4)] * (len(images) - 1))
+    tracks, poses = _tracks(grey_views(images[0], nowhere, K_left))
+    Ts = np.stack([pose.T for pose in poses])
+    rights = posed(Ts)
+    if not all(pose.rectified for pose in poses):
+        Ts, tracks = polished(
+            images[0],
+            rights,
+            K_left,
+            lambda views: coarse_depth(images[0], views, K_left),
+            tracks.kept(tracks.seen.any(0)),
+        )
+    factor = tracks.K_left[0, 0] / Ks[0][0, 0]
+    scale = find_scale(tracks, Ts, factor, baseline_m, known_length, points)
+    Ts[:, :3, 3] *= scale.factor
+    return EstimatedRig(
+        (images[0].shape[-1], images[0].shape[-2]),
+        tuple(Ks),
+        tuple(np.linalg.inv(T) for T in Ts),
+        tuple(int(pose.inliers.sum()) for pose in poses),
+        tuple(pose.parallax_deg for pose in poses),
+        tuple(pose.residual_px for pose in poses),
+        scale,
+        tuple(notes),
+        tuple(sentence for pose in poses for sentence in pose.warnings) + scale.warnings,
+    )

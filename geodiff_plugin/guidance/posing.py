@@ -1,0 +1,64 @@
+"""The poses of an image's right views as everything downstream uses them.
+
+Hop: right views as given -> ``pose.refine`` with a first depth of a coarse sweep -> right views and report.
+Paper: none; it takes exact poses for granted (S3.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.matching.build import pilot_volume
+from geodiff_plugin.matching.consistency import match_volume
+from geodiff_plugin.pose.refine import RefinedViews, refine_views, untouched
+from geodiff_plugin.types import CameraView
+
+__all__ = ["coarse_depth", "pose_views"]
+
+#: Windows that spread sure matches into holes, pixels of the coarse sweep; a wider one counts a hundredth.
+_WINDOWS = (3, 7, 15, 31, 63)
+_FARTHEST = 1e-3
+
+
+def pose_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, pose: str) -> RefinedViews:
+    """The right views with the poses of the knob ``pose``.
+
+    Args:
+        left_01: ``(3, H, W)`` float32 in [0, 1], native size.
+        rights: as the user gave them.
+        K_left: ``(3, 3)`` pixels of ``left_01``.
+        pose: ``"refine"`` or ``"given"``.
+    """
+    if pose == "given":
+        return untouched(rights)
+    found = refine_views(left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left))
+    return replace(found, rights=tuple(_named(view) for view in found.rights))
+
+
+def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> Tensor:
+    """A rough, smooth depth without holes, ``(1, 1, h, w)`` metres: a coarse sweep, its sure matches spread.
+
+    Args:
+        left_01: ``(3, H, W)`` float32 in [0, 1].
+        rights: with poses that fit roughly.
+        K_left: ``(3, 3)`` pixels of ``left_01``.
+    """
+    matches = match_volume(pilot_volume(left_01, [_named(view) for view in rights], K_left))
+    weight = matches.confidence[None] ** 2 + 1e-9
+    values = matches.inverse_depth[None] * weight
+    above, below = values.clone(), weight.clone()
+    for i, window in enumerate(_WINDOWS):
+        share = 100.0 ** -(i + 1)
+        above += share * F.avg_pool2d(values, window, 1, window // 2, count_include_pad=False)
+        below += share * F.avg_pool2d(weight, window, 1, window // 2, count_include_pad=False)
+    inverse = F.avg_pool2d(above / below, 5, 1, 2, count_include_pad=False)
+    return 1.0 / inverse.clamp_min(_FARTHEST * float(inverse.max()))
+
+
+def _named(view: Sequence[Tensor]) -> CameraView:
+    """A view that was not touched stays the very one."""
+    return view if isinstance(view, CameraView) else CameraView(*view)

@@ -1,0 +1,164 @@
+"""A right view turned parallel to the left one: there, every plane is one scale and one shift.
+
+Hop: right image, K, pose + left K, grid -> ``AlignedView`` -> where each plane's rows and columns lie in it.
+Paper: none (Collins 1996, "A space-sweep approach to true multi-image matching").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from geodiff_plugin.geometry import sample_at
+
+__all__ = ["AlignedView", "align_view"]
+
+# A view that needs no turning to within this is taken as it is.
+_AS_IT_IS_PX = 0.02
+# Planes that come nearer to the right camera's plane than this share of their depth are not seen.
+_LEAST_RATIO = 0.02
+# Rounding at image edges: the last pixel centre itself must count as inside.
+_EDGE_PX = 1e-2
+
+
+@dataclass(frozen=True)
+class AlignedView:
+    """A right image on a canvas with the left grid's orientation and pixels per radian.
+
+    A left pixel ``(u, v)`` on plane k lies at ``scale[k] * (u, v) + shift[k]`` of the canvas: rows and
+    columns apart, so that a plane's image is two look-ups of lines, and so is the way back.
+
+    Attributes:
+        grey: ``(h, w)`` float32 in [0, 1].
+        valid: ``(h, w)`` bool, inside the right image; ``None`` where all of the canvas is.
+        scale: ``(D,)`` float64 on the CPU; 0 for a plane that lies behind the right camera.
+        shift: ``(D, 2)`` float64 on the CPU, column and row.
+    """
+
+    grey: torch.Tensor
+    valid: torch.Tensor | None
+    scale: torch.Tensor
+    shift: torch.Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(h, w)`` of the canvas."""
+        return self.grey.shape[0], self.grey.shape[1]
+
+    def positions(self, count: int, axis: int, margin: int = 0) -> torch.Tensor:
+        """Where the left grid's lines lie.
+
+        Args:
+            count: the left grid's columns (``axis`` 0) or rows (``axis`` 1).
+            axis: 0 for columns, 1 for rows.
+            margin: lines beyond the grid on either side, which repeat its outermost.
+
+        Returns:
+            ``(D, count + 2 * margin)`` float32, canvas pixels, not clipped.
+        """
+        lines = torch.arange(-margin, count + margin, dtype=torch.float64).clamp_(0, count - 1)
+        at = self.scale[:, None] * lines + self.shift[:, axis, None]
+        return at.to(self.grey.device, torch.float32)
+
+    def sources(self, count: int, axis: int) -> torch.Tensor:
+        """The left line that each line of the canvas shows: the way back of ``positions``, rounded.
+
+        Returns:
+            ``(D, w or h)`` int64; ``count`` where there is none.
+        """
+        lines = torch.arange(self.size[1 - axis], dtype=torch.float64)
+        scale = self.scale[:, None]
+        at = ((lines - self.shift[:, axis, None]) / scale.clamp_min(1e-9)).round()
+        known = (scale > 0) & (at >= 0) & (at < count)
+        return torch.where(known, at, float(count)).long().to(self.grey.device)
+
+    def inside(self, positions: torch.Tensor, axis: int) -> torch.Tensor:
+        """Which of the ``positions`` are on the canvas, and not behind the right camera; ``(D, n)`` bool."""
+        last = self.size[1 - axis] - 1
+        on = (positions >= -_EDGE_PX) & (positions <= last + _EDGE_PX)
+        return on & (self.scale > 0).to(positions.device)[:, None]
+
+
+def align_view(
+    right: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    K_left: torch.Tensor,
+    size: tuple[int, int],
+    inverse_depth: torch.Tensor,
+) -> AlignedView:
+    """Turn a right view parallel to the left one.
+
+    Args:
+        right: ``(grey (1, Hr, Wr), K_right (3, 3), T_right_from_left (4, 4))``.
+        K_left: ``(3, 3)`` pixels of the left grid.
+        size: ``(H, W)`` of the left grid.
+        inverse_depth: ``(D,)`` 1/m, the planes, fronto-parallel in the left view.
+
+    Returns:
+        ``AlignedView``. The canvas covers what the planes see of the right image, at most three times as wide
+        and high as the left grid. A rectified right image is its own canvas.
+    """
+    image, *matrices = right
+    K_r, T, K = (matrix.detach().cpu().double() for matrix in (*matrices, K_left))
+    R, w = T[:3, :3], inverse_depth.cpu().double()
+    centre = R.T @ T[:3, 3]
+    ratio = 1.0 + w * centre[2]  # depth in the turned view over depth in the left view
+    scale = torch.where(ratio > _LEAST_RATIO, 1.0 / ratio.clamp_min(_LEAST_RATIO), torch.zeros_like(ratio))
+    moved = w[:, None] * centre[:2] * K[[0, 1], [0, 1]] - K[:2, 2]
+    shift = scale[:, None] * moved + K[:2, 2]
+    to_right = K_r @ R @ torch.linalg.inv(K)  # of a left pixel's point at infinity
+    offset = _translation(to_right, size)
+    if offset is not None:
+        return AlignedView(image[0], None, scale, shift + offset)
+    low, high = _extent(to_right, size, tuple(image.shape[-2:]), scale, shift)
+    return AlignedView(*_turned(image, to_right, low, high), scale, shift - low)
+
+
+def _turned(
+    image: torch.Tensor, to_right: torch.Tensor, low: torch.Tensor, high: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """A right image under a homography, from column and row ``low`` to ``high``, and what of it is inside."""
+    columns, rows = (
+        torch.arange(int(a), int(b) + 1, dtype=torch.float64) for a, b in zip(low, high, strict=True)
+    )
+    row, column = torch.meshgrid(rows, columns, indexing="ij")
+    p = torch.stack([column, row, torch.ones_like(row)], dim=-1) @ to_right.T
+    uv, ahead = p[..., :2] / p[..., 2:].clamp_min(1e-9), p[..., 2] > 1e-9
+    last = uv.new_tensor([image.shape[-1] - 1, image.shape[-2] - 1])
+    valid = ahead & ((uv >= -_EDGE_PX) & (uv <= last + _EDGE_PX)).all(dim=-1)
+    # Bicubic, since what is read here is interpolated once more on every plane.
+    turned = sample_at(image[None], uv[None].to(image), mode="bicubic")[0, 0].clamp(0.0, 1.0)
+    return turned, valid.to(image.device)
+
+
+def _translation(to_right: torch.Tensor, size: tuple[int, int]) -> torch.Tensor | None:
+    """The shift ``(2,)`` that a homography is on the left grid, or ``None`` if it is none."""
+    height, width = size
+    corners = torch.tensor([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]])
+    p = corners.double() @ to_right.T
+    moved = p[:, :2] / p[:, 2:] - corners[:, :2]
+    close = (p[:, 2] > 0).all() and (moved - moved.mean(0)).abs().amax() < _AS_IT_IS_PX
+    return moved.mean(0) if close else None
+
+
+def _extent(
+    to_right: torch.Tensor,
+    size: tuple[int, int],
+    size_right: tuple[int, int],
+    scale: torch.Tensor,
+    shift: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """First and last column and row ``(2,)`` of the canvas, in pixels of the left grid at infinity."""
+    far = torch.tensor([size[1] - 1.0, size[0] - 1.0], dtype=torch.float64)
+    ends = torch.stack([shift, shift + scale[:, None] * far])[:, scale > 0].flatten(0, 1)
+    low, high = (ends.amin(0), ends.amax(0)) if len(ends) else (torch.zeros_like(far), far)
+    low, high = torch.maximum(low, -far), torch.minimum(high, 2 * far)
+    steps = torch.linspace(0, 1, 9, dtype=torch.float64)
+    u, v = steps * (size_right[1] - 1), steps * (size_right[0] - 1)
+    grid = torch.stack(torch.meshgrid(u, v, indexing="ij"), -1).flatten(0, 1)
+    back = torch.nn.functional.pad(grid, (0, 1), value=1.0) @ torch.linalg.inv(to_right).T
+    if (back[:, 2] > 0.1 * back[:, 2].abs().amax()).all():  # else the image reaches to the horizon
+        seen = back[:, :2] / back[:, 2:]
+        low, high = torch.maximum(low, seen.amin(0)), torch.minimum(high, seen.amax(0))
+    low = low.floor()
+    return low, torch.maximum(high.ceil(), low + 1)

@@ -1,0 +1,63 @@
+"""Matches that lie behind what the prior says, over a region: mirrors and glass.
+
+Hop: matches + metric depth of the prior's first estimate -> share of each match's confidence that remains.
+Paper: S5.2 (transparent and mirroring surfaces are where a second view misleads and the prior knows).
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.guidance.config import ReflectionsConfig
+from geodiff_plugin.guidance.presets import DEFAULT
+
+__all__ = ["reject_reflections"]
+
+
+class _Known(Protocol):
+    """``Matches`` or ``terms.MatchTarget``."""
+
+    inverse_depth: Tensor
+    confidence: Tensor
+
+
+@torch.no_grad()
+def reject_reflections(
+    matches: _Known, depth_m: Tensor, config: ReflectionsConfig = DEFAULT.reflections
+) -> Tensor:
+    """What remains of each match, given the depth that the prior saw before any match moved it.
+
+    One-sided: a reflection and what is seen through glass lie behind the surface, never before it. A prior
+    that is right to 5 % can name a reflection, one that errs by 30 % cannot.
+
+    Args:
+        matches: of a chunk of samples, ``(B, 1, H, W)``.
+        depth_m: ``(B, 1, H, W)`` metres, > 0, the prior's first estimate with the search's scale.
+        config: the numbers.
+
+    Returns:
+        ``(B, 1, H, W)`` in [0, 1]; 1 where a match, or the region around it, is not behind the prior by more
+        than chance.
+    """
+    weight, most = matches.confidence.float(), config.reflection_limit
+    behind = -(matches.inverse_depth * depth_m).clamp_min(1e-6).log().clamp(-most, most)
+    sure = torch.where(weight > config.reflection_sure, behind, torch.full_like(behind, torch.nan)).flatten(1)
+    middle = sure.nanmedian(1, keepdim=True).values
+    spread = 1.4826 * (sure - middle).abs().nanmedian(1).values
+    spread = spread.nan_to_num(most).clamp_min(config.reflection_least_spread)
+    least = (config.reflection_spreads * spread).clamp_min(config.reflection_floor)[:, None, None, None]
+    radius = max(1, round(config.reflection_region * max(depth_m.shape[-2:])))
+    region = _window_mean(behind * weight, radius) / _window_mean(weight, radius).clamp_min(1e-6)
+    rejected = ((torch.minimum(region, behind) / least - 1.0) / (config.reflection_gone - 1.0)).clamp(
+        0.0, 1.0
+    )
+    return 1.0 - rejected
+
+
+def _window_mean(x: Tensor, radius: int) -> Tensor:
+    side = 2 * radius + 1
+    return F.avg_pool2d(F.avg_pool2d(x, (1, side), 1, (0, radius)), (side, 1), 1, (radius, 0))

@@ -1,0 +1,281 @@
+"""Pictures of depth maps: colours, a legend in metres, contact sheets; with Pillow alone.
+
+Hop: depth in metres, mask -> RGB picture.
+Paper: Figures of S5 (coloured depth).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+from geodiff_plugin._checks import bad_value
+
+__all__ = ["colour_depth", "depth_figure", "depth_range", "grid", "text_font", "ticks"]
+
+# The map "plasma" of matplotlib (public domain, CC0), at 17 equal steps. Its lightness grows evenly, so equal
+# steps look equal; far is dark blue, near is bright yellow, and no entry is near the grey of "no depth".
+PLASMA = (
+    "0d0887 310597 4c02a1 6600a7 7e03a8 9511a1 aa2395 bc3587 cc4778 "
+    "da5a6a e66c5c f0804e f89540 fdac33 fdc527 f8df25 f0f921"
+)
+TABLE = np.array([[int(word[i : i + 2], 16) for i in (0, 2, 4)] for word in PLASMA.split()], dtype=np.float64)
+GREY = (128, 128, 128)
+WHITE, BLACK = (255, 255, 255), (0, 0, 0)
+#: Share of the pixels beyond either end of the colours, so that one outlier does not flatten the rest.
+TAIL_PERCENT = 2.0
+#: Maps lower than this are enlarged in a figure, so that the legend can be read.
+FIGURE_MIN_HEIGHT = 256
+
+
+def _plain(values: np.ndarray) -> np.ndarray:
+    """``(H, W)`` of ``(1, H, W, 1)``, ``(1, 1, H, W)`` and the like."""
+    while values.ndim > 2 and values.shape[0] == 1:
+        values = values[0]
+    while values.ndim > 2 and values.shape[-1] == 1:
+        values = values[..., 0]
+    return values
+
+
+def _as_map(depth_m: Any, valid: Any) -> tuple[np.ndarray, np.ndarray]:
+    depth_m, valid = (
+        v.detach().cpu().numpy() if isinstance(v, torch.Tensor) else v for v in (depth_m, valid)
+    )
+    depth_m = _plain(np.asarray(depth_m, dtype=np.float64))
+    if depth_m.ndim != 2:
+        bad_value("depth_m", "one map of shape (H, W)", f"shape {depth_m.shape}")
+    use = np.isfinite(depth_m) & (np.where(np.isfinite(depth_m), depth_m, 0.0) > 0)
+    if valid is not None:
+        mask = _plain(np.asarray(valid, dtype=bool))
+        if mask.shape != depth_m.shape:
+            bad_value("valid", f"of shape {depth_m.shape} as depth_m", f"shape {mask.shape}")
+        use &= mask
+    return depth_m, use
+
+
+def depth_range(
+    depth_m: Any, valid: Any = None, near: float | None = None, far: float | None = None
+) -> tuple[float, float]:
+    """The depths at the two ends of the colours.
+
+    Args:
+        depth_m: ``(H, W)`` metres, numpy or torch.
+        valid: ``(H, W)`` boolean; pixels that are not finite or not above 0 never count.
+        near: nearest depth in metres, > 0; ``None`` takes the 2nd percentile.
+        far: farthest depth in metres; ``None`` takes the 98th percentile.
+
+    Returns:
+        ``(near, far)`` metres with ``0 < near < far``.
+
+    Raises:
+        ValueError: ``near`` or ``far`` not above 0 and finite, or ``near >= far`` when both are given.
+    """
+    for name, value in (("near", near), ("far", far)):
+        if value is not None and not (0 < value < math.inf):
+            bad_value(name, "a depth in metres above 0", value)
+    if near is not None and far is not None and near >= far:
+        bad_value("near, far", "near < far, in metres", f"{near}, {far}")
+    depth_m, use = _as_map(depth_m, valid)
+    low, high = np.percentile(depth_m[use], (TAIL_PERCENT, 100 - TAIL_PERCENT)) if use.any() else (1.0, 2.0)
+    low, high = (low if near is None else near), (high if far is None else far)
+    if high <= low * (1 + 1e-6):  # a flat map, or a given end beyond the data: open the other end a little
+        low, high = (low, low * 1.01) if far is None else (high / 1.01, high)
+    return float(low), float(high)
+
+
+def _shade(depth_m: np.ndarray, near: float, far: float) -> np.ndarray:
+    """``(..., 3)`` uint8; logarithmic, so a step of colour is a step of relative depth, as in AbsRel."""
+    position = np.log(far / np.clip(depth_m, near, far)) / np.log(far / near) * (len(TABLE) - 1)
+    lower = np.minimum(position.astype(int), len(TABLE) - 2)
+    share = (position - lower)[..., None]
+    return np.rint(TABLE[lower] * (1 - share) + TABLE[lower + 1] * share).astype(np.uint8)
+
+
+def colour_depth(
+    depth_m: Any, valid: Any = None, near: float | None = None, far: float | None = None
+) -> np.ndarray:
+    """Colour a depth map: near is yellow, far is dark blue, unknown is grey.
+
+    Args:
+        depth_m: ``(H, W)`` metres, numpy or torch (axes of length 1 are dropped).
+        valid: ``(H, W)`` boolean; ``None`` means wherever the depth is finite and above 0.
+        near: depth of the last colour, metres; ``None`` takes the 2nd percentile.
+        far: depth of the first colour, metres; ``None`` takes the 98th percentile.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB; the colour goes with the logarithm of depth.
+
+    Raises:
+        ValueError: not one map, a mask of another shape, or a bad ``near``, ``far``.
+    """
+    near, far = depth_range(depth_m, valid, near, far)
+    depth_m, use = _as_map(depth_m, valid)
+    return np.where(use[..., None], _shade(np.where(use, depth_m, far), near, far), np.uint8(GREY[0]))
+
+
+def ticks(near: float, far: float, most: int = 8) -> list[float]:
+    """Round depths in ``[near, far]`` for a logarithmic scale.
+
+    Args:
+        near: metres, > 0.
+        far: metres, > near.
+        most: at most so many ticks.
+
+    Returns:
+        Rising depths: 1, 2, 5 (or denser) times powers of ten over wide ranges, equal steps over narrow ones.
+    """
+    if far / near >= 4:
+        powers = range(math.floor(math.log10(near)), math.ceil(math.log10(far)) + 1)
+        for digits in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7)):
+            inside = [d * 10.0**power for power in powers for d in digits if near <= d * 10.0**power <= far]
+            if len(inside) >= 4:
+                return inside[:: math.ceil(len(inside) / most)]
+    magnitude = 10.0 ** math.floor(math.log10((far - near) / most))
+    for step in (magnitude * factor for factor in (1, 2, 5, 10)):
+        inside = [i * step for i in range(math.ceil(near / step - 1e-9), math.floor(far / step + 1e-9) + 1)]
+        if len(inside) <= most:
+            return [float(f"{value:.6g}") for value in inside]
+    return [near, far]
+
+
+def text_font(size: int) -> Any:
+    """Pillow's own font at a size in pixels."""
+    return ImageFont.load_default(size=size)
+
+
+def _legend(height: int, near: float, far: float, unknown: bool, unit: str | None = "m") -> Image.Image:
+    """Colour bar with far on top, tick labels in metres, and a grey key where pixels are unknown."""
+    size = max(12, height // 26)
+    font, bar, gap = text_font(size), max(14, height // 24), size // 2
+    picture = Image.new("RGB", (gap + bar + 5 * size, height), WHITE)
+    draw = ImageDraw.Draw(picture)
+    top, bottom = 2 * size, height - size - (2 * size if unknown else 0)
+    draw.text((gap, size // 3), f"depth, {unit or 'no unit'}", font=font, fill=BLACK)
+    shares = np.linspace(1.0, 0.0, bottom - top)
+    shades = _shade(near * (far / near) ** shares, near, far)
+    picture.paste(Image.fromarray(np.repeat(shades[:, None], bar, axis=1)), (gap, top))
+    draw.rectangle((gap, top, gap + bar - 1, bottom - 1), outline=BLACK)
+    for value in ticks(near, far):
+        y = bottom - 1 - math.log(value / near) / math.log(far / near) * (bottom - 1 - top)
+        draw.line((gap + bar, y, gap + bar + size // 3, y), fill=BLACK)
+        draw.text((gap + bar + size // 2, y), f"{value:g}", font=font, fill=BLACK, anchor="lm")
+    if unknown:
+        box = (gap, height - 2 * size, gap + bar - 1, height - size - 1)
+        draw.rectangle(box, fill=GREY, outline=BLACK)
+        draw.text((gap + bar + size // 2, height - 1.5 * size), "none", font=font, fill=BLACK, anchor="lm")
+    return picture
+
+
+def depth_figure(
+    depth_m: Any,
+    valid: Any = None,
+    near: float | None = None,
+    far: float | None = None,
+    title: str | None = None,
+    unit: str | None = "m",
+) -> Image.Image:
+    """A coloured depth map beside a colour bar in metres.
+
+    Args:
+        depth_m: ``(H, W)`` metres, numpy or torch.
+        valid: ``(H, W)`` boolean; the rest is drawn grey.
+        near: as in ``colour_depth``.
+        far: as in ``colour_depth``.
+        title: a line above it.
+        unit: ``"m"``, or ``None`` for a depth without one, as the legend then says.
+
+    Returns:
+        RGB picture; small maps are enlarged by a whole factor, so pixels stay squares.
+
+    Raises:
+        ValueError: as ``colour_depth``.
+    """
+    near, far = depth_range(depth_m, valid, near, far)
+    use = _as_map(depth_m, valid)[1]
+    picture = Image.fromarray(colour_depth(depth_m, valid, near, far))
+    factor = math.ceil(FIGURE_MIN_HEIGHT / picture.height)
+    if factor > 1:
+        picture = picture.resize((picture.width * factor, picture.height * factor), Image.Resampling.NEAREST)
+    legend = _legend(picture.height, near, far, not use.all(), unit)
+    head = 0 if title is None else 2 * max(12, picture.height // 26)
+    figure = Image.new("RGB", (picture.width + legend.width, picture.height + head), WHITE)
+    figure.paste(picture, (0, head))
+    figure.paste(legend, (picture.width, head))
+    if title is not None:
+        _write(figure, title, (0, 0, figure.width, head), head // 2)
+    return figure
+
+
+def _write(picture: Image.Image, text: str, box: tuple[int, int, int, int], size: int) -> None:
+    """Text centred in a box, in a smaller font where it is too long."""
+    draw, width = ImageDraw.Draw(picture), box[2] - box[0]
+    while size > 7 and draw.textlength(text, font=text_font(size)) > width:
+        size -= 1
+    draw.text(
+        ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), text, font=text_font(size), fill=BLACK, anchor="mm"
+    )
+
+
+def _as_picture(image: Any) -> Image.Image:
+    if isinstance(image, Image.Image):
+        return image.convert("RGB")
+    values = np.asarray(image)
+    if values.dtype.kind == "f":
+        values = np.rint(np.clip(np.nan_to_num(values), 0.0, 1.0) * 255).astype(np.uint8)
+    if values.dtype == bool:
+        values = values.astype(np.uint8) * 255
+    if values.dtype != np.uint8 or not (values.ndim == 2 or (values.ndim == 3 and values.shape[-1] == 3)):
+        bad_value(
+            "images", "PIL, or (H, W) or (H, W, 3) of uint8, bool or [0, 1]", f"{values.dtype} {values.shape}"
+        )
+    return Image.fromarray(values).convert("RGB")
+
+
+def grid(
+    images: Sequence[Any],
+    titles: Sequence[str] | None = None,
+    *,
+    columns: int | None = None,
+    cell_width: int = 320,
+) -> Image.Image:
+    """A contact sheet: pictures side by side, each under its title.
+
+    Args:
+        images: PIL images, or ``(H, W)`` or ``(H, W, 3)`` arrays of uint8, bool or floats in [0, 1].
+        titles: one a picture; ``None`` leaves no room for them.
+        columns: pictures in a row; ``None`` takes all, up to 4.
+        cell_width: pixels that each is scaled to; heights follow, and a row is as high as its highest.
+
+    Returns:
+        RGB picture.
+
+    Raises:
+        ValueError: no pictures, another number of titles, an array that is no picture, no columns.
+    """
+    pictures = [_as_picture(image) for image in images]
+    if not pictures:
+        bad_value("images", "at least one picture", "none")
+    if titles is not None and len(titles) != len(pictures):
+        bad_value("titles", f"one for each of {len(pictures)} pictures", f"{len(titles)}")
+    if columns is not None and columns < 1:
+        bad_value("columns", "at least 1", columns)
+    columns, gap = min(len(pictures), 4) if columns is None else columns, 6
+    head = 0 if titles is None else 24
+    cells = [p.resize((cell_width, max(1, round(p.height * cell_width / p.width)))) for p in pictures]
+    rows = [range(start, min(start + columns, len(cells))) for start in range(0, len(cells), columns)]
+    heights = [head + max(cells[i].height for i in row) for row in rows]
+    sheet_size = (gap + columns * (cell_width + gap), gap + sum(height + gap for height in heights))
+    sheet, top = Image.new("RGB", sheet_size, WHITE), gap
+    for row, height in zip(rows, heights, strict=True):
+        for column, index in enumerate(row):
+            left = gap + column * (cell_width + gap)
+            sheet.paste(cells[index], (left, top + head))
+            if titles is not None:
+                _write(sheet, titles[index], (left, top, left + cell_width, top + head), 15)
+        top += height + gap
+    return sheet

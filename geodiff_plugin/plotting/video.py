@@ -1,0 +1,97 @@
+"""A moving picture of a sequence of depth maps, all in one range of colours, beside one legend in metres.
+
+Hop: depth maps in metres -> frames -> GIF, WebP or MP4.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from geodiff_plugin._checks import InputFileError, bad_value, check_number
+from geodiff_plugin.plotting.figures import depth_figure, depth_range, grid
+
+__all__ = ["SUFFIXES", "depth_frames", "write_depth_video"]
+
+SUFFIXES = (".mp4", ".webp", ".gif")
+CELL_WIDTH = 480
+
+
+def depth_frames(
+    depths_m: Sequence[np.ndarray],
+    photographs: Sequence[Image.Image] | None = None,
+    near: float | None = None,
+    far: float | None = None,
+) -> list[Image.Image]:
+    """One picture a depth map, all of one size and in the same colours.
+
+    Args:
+        depths_m: ``(H, W)`` metres each, of one shape.
+        photographs: one a map, shown on its left.
+        near: depth of the last colour, metres; ``None`` takes the 2nd percentile over all maps.
+        far: depth of the first colour, metres; ``None`` takes the 98th.
+
+    Raises:
+        ValueError: no maps, maps of several shapes, or another number of photographs.
+    """
+    shapes = sorted({depth_m.shape for depth_m in depths_m})
+    if len(shapes) != 1:
+        bad_value("depths_m", "at least one map, all of one shape", shapes or "none")
+    if photographs is not None and len(photographs) != len(depths_m):
+        bad_value("photographs", f"one for each of {len(depths_m)} maps", len(photographs))
+    stack = np.concatenate([np.asarray(depth_m).reshape(1, -1) for depth_m in depths_m])
+    near, far = depth_range(stack, near=near, far=far)
+    figures = [depth_figure(depth_m, near=near, far=far) for depth_m in depths_m]
+    if photographs is None:
+        return figures
+    return [
+        grid([photograph, figure], cell_width=CELL_WIDTH)
+        for photograph, figure in zip(photographs, figures, strict=True)
+    ]
+
+
+def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
+    if importlib.util.find_spec("cv2") is None:
+        cure = "pip install opencv-python-headless, or write .webp or .gif, which need nothing."
+        bad_value("the video", "a kind that can be written here", path.suffix, cure)
+    import cv2
+
+    # H.264 and its like want even sides.
+    width, height = (side // 2 * 2 for side in frames[0].size)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, (width, height))
+    if not writer.isOpened():
+        raise InputFileError(f"the video must be a file that can be written; got {path}.")
+    for frame in frames:
+        writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))
+    writer.release()
+
+
+def write_depth_video(path: str | os.PathLike[str], frames: Sequence[Image.Image], fps: float = 10.0) -> None:
+    """Write frames as a video, of the kind that the file's name ends in.
+
+    Args:
+        path: ends in .mp4 (OpenCV writes it), .webp or .gif.
+        frames: of one size.
+        fps: frames a second, in [0.1, 120].
+
+    Raises:
+        ValueError: another ending, no frames, or MP4 without OpenCV.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        bad_value("the video", f"a file that ends in {', '.join(SUFFIXES)}", path.name)
+    if not frames:
+        bad_value("frames", "at least one picture", "none")
+    check_number(fps, "fps", 0.1, 120)
+    if path.suffix.lower() == ".mp4":
+        _write_mp4(path, frames, fps)
+        return
+    more = {"quality": 85} if path.suffix.lower() == ".webp" else {}
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, **more)

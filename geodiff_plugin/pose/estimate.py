@@ -1,0 +1,196 @@
+"""The pose of a second photograph from matches alone, up to the length of its baseline.
+
+Hop: tracks + K's -> rotation and direction of the baseline, or a sentence on why there is none to be had.
+Paper: none. Robust five-point estimation by PoseLib (Larsson).
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
+
+__all__ = ["EstimatedPose", "estimate_pose", "parallax_deg"]
+
+#: An inlier lies nearer to its epipolar line, or to its place under a simpler motion, than this.
+INLIER_PX = 2.0
+#: Fewer inliers, or a smaller share of the matches, make no pose.
+FEWEST_INLIERS, LEAST_SHARE = 30, 0.3
+#: Median angle between the two rays of a point below which no depth is to be had, and below which little.
+NO_PARALLAX_DEG, LITTLE_PARALLAX_DEG = 0.3, 0.6
+#: Rows that agree this well, without any turn, are those of a rectified pair.
+RECTIFIED_PX = 0.45
+#: A simpler motion that explains this share of the inliers is the motion.
+SIMPLER = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedPose:
+    """A relative pose of two photographs.
+
+    Attributes:
+        T: ``(4, 4)``, ``T_right_from_left`` with a baseline of length 1.
+        inliers: ``(N,)`` bool, the tracks that it explains.
+        parallax_deg: median angle between the two rays of an inlier.
+        residual_px: median distance of the inliers from their epipolar lines.
+        rectified: whether the pair is rectified, which no two photographs by hand are by chance.
+        warnings: sentences for the user.
+    """
+
+    T: np.ndarray
+    inliers: np.ndarray
+    parallax_deg: float
+    residual_px: float
+    rectified: bool
+    warnings: tuple[str, ...]
+
+
+def _poselib() -> Any:
+    try:
+        return importlib.import_module("poselib")
+    except ImportError:
+        cure = "pip install 'geodiff-plugin[pose]', or pip install poselib."
+        bad_value("PoseLib", "installed, to estimate poses", "no module poselib", cure)
+
+
+def _camera(K: np.ndarray) -> dict[str, Any]:
+    width, height = (max(1, int(2 * c + 1)) for c in K[:2, 2])
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    return {"model": "PINHOLE", "width": width, "height": height, "params": params}
+
+
+def _right_rays(tracks: Tracks) -> np.ndarray:
+    pixels = np.c_[tracks.right_px[0], np.ones(len(tracks))]
+    return np.linalg.solve(tracks.K_rights[0], pixels.T).T
+
+
+def parallax_deg(tracks: Tracks, R: np.ndarray) -> np.ndarray:
+    """Angle between the two rays of every track, ``(N,)`` degrees.
+
+    Args:
+        tracks: of one right view.
+        R: ``(3, 3)`` of ``T_right_from_left``.
+    """
+    one, other = tracks.rays @ R.T, _right_rays(tracks)
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), (one * other).sum(1)))
+
+
+def estimate_pose(
+    tracks: Tracks, name: str = "the two photographs", mirrored_matches: int = 0
+) -> EstimatedPose:
+    """Rotation and direction of the baseline of one right view.
+
+    Args:
+        tracks: of one right view, outliers among them.
+        name: what they are of, for messages.
+        mirrored_matches: how many matches there are once the right image is mirrored, for the message.
+
+    Raises:
+        ValueError: PoseLib is not installed; no pose is to be had: too few matches or inliers, a pure
+            rotation, too little parallax.
+    """
+    _check_matches(len(tracks), name, mirrored_matches)
+    found, info = _poselib().estimate_relative_pose(
+        tracks.left_px,
+        tracks.right_px[0],
+        _camera(tracks.K_left),
+        _camera(tracks.K_rights[0]),
+        {"max_epipolar_error": INLIER_PX / 2, "seed": 0, "min_iterations": 1000},
+        {},
+    )
+    T = np.eye(4)
+    T[:3] = found.Rt
+    T[:3, 3] /= max(np.linalg.norm(T[:3, 3]), 1e-12)
+    sideways = _rectified(tracks, residuals_px(tracks, T[None])[0] < INLIER_PX)
+    T = T if sideways is None else sideways
+    residual = residuals_px(tracks, T[None])[0]
+    inverse_depth = solve_inverse_depth(tracks, T[None])
+    near = residual < INLIER_PX
+    inliers = near & (inverse_depth > 0)
+    count, share = int(inliers.sum()), float(inliers.mean())
+    if count < FEWEST_INLIERS or share < LEAST_SHARE:
+        bad_value(
+            name,
+            "of one scene that stands still, seen by two cameras",
+            f"{count} matches of {len(tracks)} that one pose explains",
+            "Are they of the same place, taken at the same time, neither mirrored nor edited? Is K right?",
+        )
+    parallax = float(np.median(parallax_deg(tracks, T[:3, :3])[inliers]))
+    _check_parallax(tracks, near, parallax, name)
+    warnings = []
+    if parallax < LITTLE_PARALLAX_DEG:
+        warnings.append(
+            f"The parallax between {name} is {parallax:.2f} degrees in the median: depth rests on little. "
+            "Move the camera further sideways."
+        )
+    if _homography_share(tracks, near) > SIMPLER:
+        warnings.append(
+            f"Nearly all matches of {name} lie on one plane: several poses explain them about as well. "
+            "Take photographs with things at different depths, or give the pose."
+        )
+    return EstimatedPose(
+        T, inliers, parallax, float(np.median(residual[inliers])), sideways is not None, tuple(warnings)
+    )
+
+
+def _rectified(tracks: Tracks, near: np.ndarray) -> np.ndarray | None:
+    """The pose of a rectified pair, where that explains the inliers of a free one as well."""
+    own = tracks.kept(near)
+    for way in (-1.0, 1.0):
+        T = np.eye(4)
+        T[0, 3] = way
+        if len(own) >= FEWEST_INLIERS and np.median(residuals_px(own, T[None])) < RECTIFIED_PX:
+            if (solve_inverse_depth(own, T[None]) > 0).mean() > SIMPLER:
+                return T
+    return None
+
+
+def _check_matches(count: int, name: str, mirrored: int) -> None:
+    if count >= FEWEST_INLIERS:
+        return
+    cure = "Are they of the same place, sharp and well lit? Half of what one shows should be in the other."
+    if mirrored >= max(2 * count, FEWEST_INLIERS):
+        cure = f"With the right one mirrored there are {mirrored}: is one of them a mirror image (a selfie)?"
+    bad_value(name, f"photographs with at least {FEWEST_INLIERS} matches", f"{count}", cure)
+
+
+def _check_parallax(tracks: Tracks, near: np.ndarray, parallax: float, name: str) -> None:
+    """Refuse a camera that only turned: then every direction of a baseline explains the matches."""
+    turned = _rotation_residuals(tracks)
+    share = float((turned[near] < INLIER_PX).mean())
+    if share > SIMPLER or parallax < NO_PARALLAX_DEG:
+        bad_value(
+            name,
+            "taken from two places",
+            f"a camera that only turned ({share:.0%} of the matches say so, parallax {parallax:.2f} degrees)",
+            "Without a step to the side two photographs carry no depth.",
+        )
+
+
+def _rotation_residuals(tracks: Tracks) -> np.ndarray:
+    """Distance ``(N,)`` px from where a rotation alone, fitted robustly, puts the tracks."""
+    one, other = (
+        rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (tracks.rays, _right_rays(tracks))
+    )
+    weights, off = np.ones(len(one)), np.zeros(len(one))
+    for _ in range(10):
+        R = Rotation.align_vectors(other, one, weights=weights)[0].as_matrix()
+        p = one @ (tracks.K_rights[0] @ R).T
+        off = np.linalg.norm(p[:, :2] / np.maximum(p[:, 2:], 1e-6) - tracks.right_px[0], axis=1)
+        weights = 1.0 / (1.0 + (off / INLIER_PX) ** 2)
+    return off
+
+
+def _homography_share(tracks: Tracks, near: np.ndarray) -> float:
+    """Share of the inliers that one homography explains."""
+    cv2.setRNGSeed(0)
+    one, other = (px[near].astype(np.float32) for px in (tracks.left_px, tracks.right_px[0]))
+    _, mask = cv2.findHomography(one, other, cv2.RANSAC, INLIER_PX)
+    return 0.0 if mask is None else float(mask.mean())

@@ -1,0 +1,121 @@
+"""The usual mistakes of a given pose, recognised by which of them would make it fit.
+
+Hop: matches + cameras as given -> the name of a mistake, or nothing.
+Paper: none. A mistake is named, never repaired: what the user meant only the user knows.
+
+What epipolar lines do not show is not told here: the unit of a translation, and for a rectified pair K.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
+
+__all__ = ["INVERSE", "find_mistake", "implausible_unit"]
+
+INVERSE = (
+    "The inverse pose explains the views better than the given one: are left and right swapped, "
+    "is the sign of the baseline wrong, or is E world-to-camera?"
+)
+_OPENGL = (
+    "The pose fits with the y and z axes of the cameras turned around: E seems to be in the axes of OpenGL "
+    "or Blender (y up, z backward). Give diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1)."
+)
+_OPENGL_INVERSE = _OPENGL + " It also seems to be world-to-camera: invert it as well."
+_TRANSPOSED = "The pose fits with its rotation transposed: check the order of rows and columns in E."
+_KEPT_T = (
+    "The pose fits with its rotation as it is and its translation that of the inverse: "
+    "E mixes camera-to-world with world-to-camera."
+)
+_K_SWAPPED = "The views fit with the two camera matrices exchanged: K seems to be (K_right, K_left)."
+_K_SCALED = (
+    "The views fit with K times {factor:g}: it seems to be for images of {size} the width and height of "
+    "these. With s = {factor:g} take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy."
+)
+_FACTORS = {
+    0.25: "4 times",
+    1 / 3: "3 times",
+    0.5: "twice",
+    2.0: "half",
+    3.0: "a third of",
+    4.0: "a quarter of",
+}
+#: Within so many pixels of its line, and in front of both cameras, a match speaks for a pose.
+NEAR_PX = 4.0
+_CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _share(tracks: Tracks, T: np.ndarray) -> float:
+    """How many of the matches speak for a pose, [0, 1]."""
+    inverse_depth = solve_inverse_depth(tracks, T[None])
+    ahead = (inverse_depth > 0) & ((tracks.rays @ T[2, :3] + inverse_depth * T[2, 3]) > 0)
+    return float((ahead & (residuals_px(tracks, T[None])[0] < NEAR_PX)).mean())
+
+
+def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
+    K = K.copy()
+    K[..., :2, :2] *= factor
+    K[..., :2, 2] = (K[..., :2, 2] + 0.5) * factor - 0.5
+    return K
+
+
+def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np.ndarray]]:
+    inverse = np.linalg.inv(T)
+    yield INVERSE, tracks, inverse
+    yield _OPENGL, tracks, _FLIP @ T @ _FLIP
+    yield _OPENGL_INVERSE, tracks, _FLIP @ inverse @ _FLIP
+    E, turned, mixed = inverse.copy(), inverse.copy(), inverse.copy()
+    turned[:3, :3] = E[:3, :3].T
+    yield _TRANSPOSED, tracks, np.linalg.inv(turned)
+    mixed[:3, 3] = T[:3, 3]
+    yield _KEPT_T, tracks, np.linalg.inv(mixed)
+    if not np.allclose(tracks.K_left, tracks.K_rights[0], rtol=0.02):
+        yield _K_SWAPPED, replace(tracks, K_left=tracks.K_rights[0], K_rights=tracks.K_left[None]), T
+    for factor, size in _FACTORS.items():
+        scaled = replace(
+            tracks, K_left=_scaled(tracks.K_left, factor), K_rights=_scaled(tracks.K_rights, factor)
+        )
+        yield _K_SCALED.format(factor=factor, size=size), scaled, T
+
+
+def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
+    """A sentence on the mistake that would make the matches fit, or ``None``.
+
+    Args:
+        tracks: of one right view.
+        T: ``(4, 4)``, ``T_right_from_left`` as given.
+        near: ``(4, 4)``, the pose near it that fits best: where only that fits, the pose is inexact.
+    """
+    given = _share(tracks, T)
+    found = [(_share(own, pose), sentence) for sentence, own, pose in _candidates(tracks, T)]
+    best, sentence = max(found, key=lambda entry: entry[0])
+    least = max(_AT_LEAST, _CLEARLY * given, _NEARLY * _share(tracks, near))
+    return sentence if best > least else None
+
+
+def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
+    """A sentence where baseline and scene are both a thousand times too large, or ``None``.
+
+    Epipolar lines do not know the unit of a translation; only the size of what comes out does.
+
+    Args:
+        tracks: of one right view.
+        T: ``(4, 4)``, ``T_right_from_left``, in what is said to be metres.
+    """
+    baseline = float(np.linalg.norm(T[:3, 3]))
+    inverse_depth = solve_inverse_depth(tracks, T[None])
+    ahead = inverse_depth > 0
+    if baseline < 5.0 or ahead.sum() < 20:
+        return None
+    depth_m = float(np.median(1.0 / inverse_depth[ahead]))
+    if depth_m < 200.0 or depth_m / baseline > 200.0:
+        return None
+    return (
+        f"With a baseline of {baseline:.4g} m the matches lie {depth_m:.0f} m away in the median. "
+        "If the translation is in millimetres, divide it by 1000."
+    )

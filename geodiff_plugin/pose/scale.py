@@ -1,0 +1,123 @@
+"""What unit an estimated baseline is in: the one thing that photographs do not show.
+
+Hop: tracks, poses up to scale, one known length -> factor to metres and how sure it is.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin.pose.tracks import Tracks, project_tracks, residuals_px, solve_inverse_depth
+
+__all__ = ["NO_UNIT", "Scale", "find_scale"]
+
+NO_UNIT = (
+    "No length is known, so the result has no unit: all depths are in baselines of the first two cameras. "
+    "Give their distance (baseline), a known length in the left photograph, or known points."
+)
+#: A pixel's depth is that of the matches this near, pixels of their grid.
+_NEAR_PX = 40.0
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Where the unit comes from.
+
+    Attributes:
+        source: ``"baseline"``, ``"known length"``, ``"points"`` or ``"none"``.
+        factor: metres a unit of the estimation; 1 without a source.
+        spread: relative standard error of it as the matches show; ``None`` where they cannot.
+        warnings: sentences for the user.
+    """
+
+    source: str
+    factor: float
+    spread: float | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def unit(self) -> str | None:
+        """``"m"``, or ``None`` where there is no unit."""
+        return None if self.source == "none" else "m"
+
+
+def _point_at(
+    px: np.ndarray, tracks: Tracks, inverse_depth: np.ndarray, name: str
+) -> tuple[np.ndarray, float]:
+    """The point ``(3,)`` of a left pixel in units, and the relative spread of its depth."""
+    away = np.linalg.norm(tracks.left_px - px, axis=1)
+    near = np.argsort(away)[:8]
+    near = near[away[near] < _NEAR_PX]
+    if len(near) < 3:
+        cure = "Choose ends on something with texture that both photographs show."
+        bad_value(name, "near matched points", f"({px[0]:.0f}, {px[1]:.0f}) with {len(near)} around it", cure)
+    w = inverse_depth[near]
+    middle = float(np.median(w))
+    spread = 1.4826 * float(np.median(np.abs(w / middle - 1)))
+    ray = np.linalg.solve(tracks.K_left, (*px, 1.0))
+    return ray / middle, spread
+
+
+def find_scale(
+    tracks: Tracks,
+    Ts: np.ndarray,
+    factor: float,
+    baseline_m: float | None,
+    known_length: tuple[float, float, float, float, float] | None,
+    points: Any,
+) -> Scale:
+    """Metres a unit, from whichever length is known.
+
+    Args:
+        tracks: the matches.
+        Ts: ``(V, 4, 4)``, ``T_right_from_left`` in units.
+        factor: pixels of the tracks' grid a pixel of the left photograph.
+        baseline_m: distance of the first right camera, or ``None``.
+        known_length: ``(x1, y1, x2, y2, metres)`` in the left photograph, or ``None``.
+        points: ``(N, 3)`` metres in the left camera's frame, or ``None``.
+
+    Raises:
+        ValueError: more than one of them, or ends of a length where nothing is matched.
+    """
+    given = [name for name, v in (("baseline", baseline_m), ("known length", known_length)) if v is not None]
+    if len(given) > 1:
+        bad_value("scale", "given once", " and ".join(given), "Drop one; points may be given beside.")
+    if baseline_m is not None:
+        return Scale("baseline", baseline_m / float(np.linalg.norm(Ts[0, :3, 3])))
+    fits = (np.nan_to_num(residuals_px(tracks, Ts), nan=0.0) < 1.5).all(0)
+    tracks = tracks.kept(fits)
+    inverse_depth = solve_inverse_depth(tracks, Ts)
+    tracks, inverse_depth = tracks.kept(inverse_depth > 0), inverse_depth[inverse_depth > 0]
+    if known_length is not None:
+        *ends, metres = known_length
+        check_number(metres, "known length", 1e-6, 1e6)
+        (one, s1), (other, s2) = (
+            _point_at((np.array(ends[i : i + 2]) + 0.5) * factor - 0.5, tracks, inverse_depth, "known length")
+            for i in (0, 2)
+        )
+        length = float(np.linalg.norm(one - other))
+        if length < 1e-9:
+            bad_value("known length", "between two places", "the same place twice")
+        return Scale("known length", metres / length, float(np.hypot(s1, s2)))
+    if points is not None:
+        return _by_points(tracks, inverse_depth, np.asarray(points, dtype=np.float64))
+    return Scale("none", 1.0, None, (NO_UNIT,))
+
+
+def _by_points(tracks: Tracks, inverse_depth: np.ndarray, points: np.ndarray) -> Scale:
+    ahead = points[points[:, 2] > 0]
+    px = project_tracks(ahead, np.zeros(len(ahead)), tracks.K_left, np.eye(4)).px
+    away = np.linalg.norm(px[:, None] - tracks.left_px[None], axis=2)
+    nearest = away.argmin(1)
+    close = away[np.arange(len(px)), nearest] < _NEAR_PX / 4
+    if close.sum() < 5:
+        bad_value("points", "with at least 5 near matched points", f"{int(close.sum())}")
+    ratios = ahead[close, 2] * inverse_depth[nearest[close]]
+    factor = float(np.median(ratios))
+    spread = 1.4826 * float(np.median(np.abs(ratios / factor - 1))) / np.sqrt(close.sum())
+    return Scale("points", factor, spread)

@@ -1,0 +1,156 @@
+"""Small robust least squares over the poses of right cameras, under a prior that holds the given ones.
+
+Hop: tracks + poses as given -> poses that fit the tracks.
+Paper: none. Minimises, over 6 degrees of freedom a right view and one inverse depth a track,
+    trust * sum log(1 + (residual / scale)^2)
+    + mean |moved|^2 / sd^2 + |turned|^2 / 3 deg^2 + |shifted|^2 / (.3 |t|)^2 + (change of log |t|)^2 / .05^2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
+
+__all__ = ["Prior", "solve_poses"]
+
+_STEPS = 12
+
+
+@dataclass(frozen=True)
+class Prior:
+    """How far the poses as given are believed.
+
+    What two views cannot tell, above all the length of the baseline and a turn that a shift makes up for,
+    stays where it was given: such a move costs here and gains nothing in the residuals.
+
+    Attributes:
+        moved_px: ``(V,)``, standard deviation of where the tracks' points project to.
+        turned_rad: of the rotation.
+        shifted_share: of the camera's centre, as a share of the baseline.
+        longer_share: of the baseline's length, likewise.
+    """
+
+    moved_px: np.ndarray
+    turned_rad: float = np.radians(3.0)
+    shifted_share: float = 0.3
+    longer_share: float = 0.05
+
+
+def _turned(T: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """The right camera turned about its own centre by ``step[:3]`` and its origin moved by ``step[3:]``."""
+    by = np.eye(4)
+    by[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
+    moved = by @ T
+    moved[:3, 3] += step[3:]
+    return moved
+
+
+def _jacobian(at, inverse_depth: np.ndarray) -> np.ndarray:
+    """``(N, 2, 6)``: derivative of the projected pixels by ``_turned``'s step."""
+    x, y, z = at.scaled.T
+    zero = np.zeros_like(x)
+    by_turn = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).reshape(-1, 3, 3)
+    return np.concatenate([at.by_point @ by_turn, at.by_point * inverse_depth[:, None, None]], axis=2)
+
+
+def _data_terms(tracks: Tracks, Ts: np.ndarray, scale: float):
+    """Cost, gradient and normal matrix of the residuals with the inverse depths eliminated."""
+    views = len(Ts)
+    w = solve_inverse_depth(tracks, Ts)
+    for _ in range(2 if views > 1 else 0):
+        w = solve_inverse_depth(tracks, Ts, _weights(tracks, Ts, w, scale)[0])
+    weights, offs, ats = _weights(tracks, Ts, w, scale)
+    J = np.zeros((len(tracks), views, 2, 6 * views))
+    j = np.zeros((len(tracks), views, 2))
+    for v, at in enumerate(ats):
+        root = np.sqrt(weights[v])[:, None]
+        J[:, v, :, 6 * v : 6 * v + 6] = _jacobian(at, w) * root[..., None]
+        j[:, v] = at.by_inverse_depth * root
+    r = (offs * np.sqrt(weights)[..., None]).transpose(1, 0, 2).reshape(len(tracks), -1)
+    J, j = J.reshape(len(tracks), 2 * views, -1), j.reshape(len(tracks), -1)
+    j /= np.maximum(np.linalg.norm(j, axis=1, keepdims=True), 1e-12)
+    J = J - j[..., None] * np.einsum("nk,nkp->np", j, J)[:, None]  # what a change of depth cannot make up for
+    cost = np.log1p((offs**2).sum(-1) / scale**2)[tracks.seen].sum()
+    return cost, np.einsum("nkp,nk->p", J, r), np.einsum("nkp,nkq->pq", J, J)
+
+
+def _weights(tracks: Tracks, Ts: np.ndarray, w: np.ndarray, scale: float):
+    ats = [project_tracks(tracks.rays, w, K, T) for K, T in zip(tracks.K_rights, Ts, strict=True)]
+    offs = np.stack([at.px - px for at, px in zip(ats, tracks.right_px, strict=True)])
+    weights = tracks.seen / (scale**2 + (offs**2).sum(-1))
+    return weights, offs, ats
+
+
+def _prior_terms(tracks: Tracks, Ts: np.ndarray, given: np.ndarray, w: np.ndarray, prior: Prior):
+    """Cost, gradient and normal matrix of the prior."""
+    size = 6 * len(Ts)
+    cost, gradient, normal = 0.0, np.zeros(size), np.zeros((size, size))
+    for v, (T, T_given) in enumerate(zip(Ts, given, strict=True)):
+        at, before = (project_tracks(tracks.rays, w, tracks.K_rights[v], P) for P in (T, T_given))
+        seen = tracks.seen[v]
+        unit = 1.0 / (prior.moved_px[v] * np.sqrt(max(seen.sum(), 1)))
+        moved = ((at.px - before.px)[seen] * unit).reshape(-1)
+        J = (_jacobian(at, w)[seen] * unit).reshape(-1, 6)
+        change = T @ np.linalg.inv(T_given)
+        turn = Rotation.from_matrix(change[:3, :3]).as_rotvec()
+        length, baseline = (np.linalg.norm(P[:3, 3]) for P in (T, T_given))
+        slope = np.repeat([1.0 / prior.turned_rad, 1.0 / (prior.shifted_share * baseline)], 3)
+        pulls = slope * np.r_[turn, change[:3, 3]]
+        longer = np.log(length / baseline) / prior.longer_share
+        by_step = np.r_[np.zeros(3), T[:3, 3] / (length**2 * prior.longer_share)]
+        own = slice(6 * v, 6 * v + 6)
+        cost += moved @ moved + pulls @ pulls + longer**2
+        gradient[own] += J.T @ moved + slope * pulls + by_step * longer
+        normal[own, own] += J.T @ J + np.diag(slope**2) + np.outer(by_step, by_step)
+    return cost, gradient, normal
+
+
+def solve_poses(
+    tracks: Tracks,
+    given: np.ndarray,
+    prior: Prior,
+    *,
+    start: np.ndarray | None = None,
+    scale_px: float = 1.0,
+    trust: float = 1.0,
+) -> np.ndarray:
+    """The poses that fit the tracks best under the prior.
+
+    Args:
+        tracks: of V right views.
+        given: ``(V, 4, 4)``, ``T_right_from_left`` as given: the middle of the prior.
+        prior: how far they are believed.
+        start: where to begin; ``None`` for ``given``.
+        scale_px: residual from which on an observation counts for less, pixels of the right view.
+        trust: what the residuals count against the prior, (0, 1]; see ``noise.independent_share``.
+
+    Returns:
+        ``(V, 4, 4)``.
+    """
+    Ts = np.array(given if start is None else start, dtype=np.float64)
+    w_given = np.clip(solve_inverse_depth(tracks, Ts), 0.0, None)
+
+    def terms(at: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        own = _data_terms(tracks, at, scale_px)
+        return tuple(
+            trust * data + held
+            for data, held in zip(own, _prior_terms(tracks, at, given, w_given, prior), strict=True)
+        )
+
+    damping, (cost, gradient, normal) = 1e-3, terms(Ts)
+    for _ in range(_STEPS):
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
+        tried = np.stack([_turned(T, step[6 * v : 6 * v + 6]) for v, T in enumerate(Ts)])
+        new = terms(tried)
+        if new[0] >= cost:
+            damping *= 8.0
+            continue
+        settled = cost - new[0] < 1e-6 * max(cost, 1.0)
+        Ts, (cost, gradient, normal), damping = tried, new, damping * 0.2
+        if settled:
+            break
+    return Ts

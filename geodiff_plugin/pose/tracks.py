@@ -1,0 +1,172 @@
+"""Points of the left image with their places in the right ones, and how poses explain them.
+
+Hop: left pixels, right pixels, K's, poses -> inverse depths -> residuals in pixels.
+Paper: S7.2 Eq. 25 (eq:forward-warp_supp), with inverse depth in place of depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+__all__ = ["Tracks", "merge_tracks", "project_tracks", "residuals_px", "solve_inverse_depth"]
+
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Points seen in the left image and in one right image or several.
+
+    Attributes:
+        left_px: ``(N, 2)`` float64, pixels of the left image.
+        right_px: ``(V, N, 2)`` float64, pixels of every right image.
+        seen: ``(V, N)`` bool, where ``right_px`` says something.
+        K_left: ``(3, 3)`` float64, pixels of the left image.
+        K_rights: ``(V, 3, 3)`` float64.
+    """
+
+    left_px: np.ndarray
+    right_px: np.ndarray
+    seen: np.ndarray
+    K_left: np.ndarray
+    K_rights: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.left_px)
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """``(N, 3)`` left rays with z = 1."""
+        return np.linalg.solve(self.K_left, np.c_[self.left_px, np.ones(len(self))].T).T
+
+    def view(self, v: int) -> Tracks:
+        """The tracks that right view ``v`` sees, of that view alone."""
+        kept = self.seen[v]
+        return Tracks(
+            self.left_px[kept],
+            self.right_px[v : v + 1, kept],
+            self.seen[v : v + 1, kept],
+            self.K_left,
+            self.K_rights[v : v + 1],
+        )
+
+    def kept(self, mask: np.ndarray) -> Tracks:
+        """The tracks of a boolean mask or an index."""
+        return replace(
+            self,
+            left_px=self.left_px[mask],
+            right_px=self.right_px[:, mask],
+            seen=self.seen[:, mask],
+        )
+
+
+def merge_tracks(parts: Sequence[Tracks]) -> Tracks:
+    """Tracks of the same views one after the other."""
+    return replace(
+        parts[0],
+        left_px=np.concatenate([p.left_px for p in parts]),
+        right_px=np.concatenate([p.right_px for p in parts], axis=1),
+        seen=np.concatenate([p.seen for p in parts], axis=1),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """Tracks in one right view, at given inverse depths.
+
+    Attributes:
+        px: ``(N, 2)`` pixels.
+        scaled: ``(N, 3)``, the points in the right frame times their inverse left depth.
+        by_point: ``(N, 2, 3)``, derivative of ``px`` by ``scaled``.
+        by_inverse_depth: ``(N, 2)``, derivative of ``px`` by inverse depth.
+    """
+
+    px: np.ndarray
+    scaled: np.ndarray
+    by_point: np.ndarray
+    by_inverse_depth: np.ndarray
+
+
+def project_tracks(rays: np.ndarray, inverse_depth: np.ndarray, K: np.ndarray, T: np.ndarray) -> Projected:
+    """Where a right camera sees points on left rays.
+
+    Args:
+        rays: ``(N, 3)`` with z = 1.
+        inverse_depth: ``(N,)``, 1/m; 0 is infinity.
+        K: ``(3, 3)`` of the right view, pixels.
+        T: ``(4, 4)``, ``T_right_from_left``.
+    """
+    scaled = rays @ T[:3, :3].T + inverse_depth[:, None] * T[:3, 3]
+    z = scaled[:, 2]
+    z = np.where(np.abs(z) < 1e-6, 1e-6, z)
+    flat = scaled[:, :2] / z[:, None]
+    px = flat @ K[:2, :2].T + K[:2, 2]
+    by_point = np.empty((len(rays), 2, 3))
+    by_point[:, :, :2] = K[:2, :2] / z[:, None, None]
+    by_point[:, :, 2] = -(flat @ K[:2, :2].T) / z[:, None]
+    return Projected(px, scaled, by_point, by_point @ T[:3, 3])
+
+
+def _linear_inverse_depth(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
+    """The inverse depth with the least algebraic error, ``(N,)``."""
+    above, below = np.zeros(len(tracks)), np.zeros(len(tracks))
+    for right_px, seen, K, T in zip(tracks.right_px, tracks.seen, tracks.K_rights, Ts, strict=True):
+        A, b = tracks.rays @ (K @ T[:3, :3]).T, K @ T[:3, 3]
+        c = A[:, :2] - right_px * A[:, 2:]
+        d = b[:2] - right_px * b[2]
+        above -= np.where(seen, (c * d).sum(1), 0.0)
+        below += np.where(seen, (d * d).sum(1), 0.0)
+    return above / np.maximum(below, _TINY)
+
+
+def solve_inverse_depth(
+    tracks: Tracks, Ts: np.ndarray, weights: np.ndarray | None = None, steps: int = 3
+) -> np.ndarray:
+    """The inverse depth of every track that its right pixels want most.
+
+    Args:
+        tracks: of V right views.
+        Ts: ``(V, 4, 4)``, ``T_right_from_left``.
+        weights: ``(V, N)`` of the observations, or ``None`` for equal ones.
+        steps: of Gauss and Newton, after a linear start.
+
+    Returns:
+        ``(N,)`` 1/m; negative where the rays diverge.
+    """
+    weights = tracks.seen.astype(float) if weights is None else weights * tracks.seen
+    inverse_depth = _linear_inverse_depth(tracks, Ts)
+    for _ in range(steps):
+        above, below = np.zeros(len(tracks)), np.full(len(tracks), _TINY)
+        for v, T in enumerate(Ts):
+            at = project_tracks(tracks.rays, inverse_depth, tracks.K_rights[v], T)
+            off = tracks.right_px[v] - at.px
+            above += weights[v] * (at.by_inverse_depth * off).sum(1)
+            below += weights[v] * (at.by_inverse_depth**2).sum(1)
+        inverse_depth = inverse_depth + above / below
+    return inverse_depth
+
+
+def residuals_px(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
+    """How far every observation lies from where the poses can put it.
+
+    With one right view that is the distance from the epipolar line of the left pixel.
+
+    Args:
+        tracks: of V right views.
+        Ts: ``(V, 4, 4)``, ``T_right_from_left``.
+
+    Returns:
+        ``(V, N)`` pixels of the right views, NaN where not seen.
+    """
+    inverse_depth = solve_inverse_depth(tracks, Ts)
+    off = np.stack(
+        [
+            np.linalg.norm(project_tracks(tracks.rays, inverse_depth, K, T).px - px, axis=1)
+            for px, K, T in zip(tracks.right_px, tracks.K_rights, Ts, strict=True)
+        ]
+    )
+    return np.where(tracks.seen, off, np.nan)

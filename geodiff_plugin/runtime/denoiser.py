@@ -1,0 +1,98 @@
+"""Hook on the denoiser that keeps its graph for the full gradient, inside the pipeline's ``no_grad``.
+
+Hop: the network's first argument -> a detached leaf of its depth channels -> the output with its graph.
+Paper: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from geodiff_plugin.runtime.channels import put_channels
+
+__all__ = ["DenoiserTap"]
+
+
+class DenoiserTap:
+    """Runs the network with gradients to its depth latent, and can run it again at another one.
+
+    Args:
+        owner: object whose method the loop calls: the U-Net, or a pipeline of ours.
+        method: name of the method, ``"forward"`` of a module; its first argument holds the latent.
+        channels: which channels of that argument are the depth latent.
+
+    Used as a context manager: the method is as it was afterwards, whatever happened. The instance gets an
+    attribute that hides its class's method, so that hooks and compiled forwards below are called as ever.
+
+    Attributes:
+        leaf: ``(B, C, h, w)`` the depth latent of the latest call, float32 or wider, requires a gradient.
+    """
+
+    def __init__(self, owner: Any, method: str, channels: slice) -> None:
+        self._owner, self._method, self._channels = owner, method, channels
+        self._call: tuple[Callable[..., Any], Tensor, tuple, dict] | None = None
+        self.leaf: Tensor | None = None
+        self._output: Tensor | None = None
+
+    def __enter__(self) -> DenoiserTap:
+        own = getattr(self._owner, self._method)
+        self._hidden = self._owner.__dict__.get(self._method)  # of another hook, put back at the end
+
+        thread = threading.get_ident()
+
+        @functools.wraps(own)
+        def tapped(model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != thread:  # a stock call of another pipeline with the same network
+                return own(model_input, *args, **kwargs)
+            return self.run(own, model_input, *args, **kwargs)
+
+        setattr(self._owner, self._method, tapped)
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._hidden is None:
+            delattr(self._owner, self._method)
+        else:
+            setattr(self._owner, self._method, self._hidden)
+        self.release()
+
+    def release(self) -> None:
+        """Drop the graph and everything that it holds."""
+        self._call = self.leaf = self._output = None
+
+    def run(self, forward: Callable[..., Any], model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
+        """The tapped call: same result, detached; the graph is kept until ``release``."""
+        model_input = model_input.detach()
+        wide = torch.promote_types(model_input.dtype, torch.float32)
+        self.leaf = model_input[:, self._channels].to(wide).requires_grad_()
+        self._call = (forward, model_input, args, kwargs)
+        result = self._forward_at(self.leaf)
+        self._output = _first(result)
+        detached = self._output.detach()
+        if isinstance(result, Tensor):
+            return detached
+        return (detached, *result[1:]) if isinstance(result, tuple) else type(result)(detached)
+
+    def output_at(self, z_t: Tensor) -> Tensor:
+        """Network output with its graph to ``z_t (B, C, h, w)`` float32.
+
+        The pipeline's own forward is reused for its own input: one update costs no second network call.
+        """
+        return self._output if z_t is self.leaf else _first(self._forward_at(z_t))
+
+    def _forward_at(self, z_t: Tensor) -> Any:
+        forward, model_input, args, kwargs = self._call
+        with torch.enable_grad():
+            joined = put_channels(model_input, self._channels, z_t.to(model_input.dtype))
+            return forward(joined, *args, **kwargs)
+
+
+def _first(result: Any) -> Tensor:
+    """The tensor out of a tensor, a tuple or a ``BaseOutput``."""
+    return result if isinstance(result, Tensor) else result[0]

@@ -1,0 +1,96 @@
+"""The machine that a result was made on: its devices, its packages, the memory that a call takes.
+
+Hop: name of a device -> ``torch.device``; a ``with`` block -> bytes.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import platform
+import threading
+from importlib.metadata import PackageNotFoundError, version
+
+import psutil  # comes with accelerate
+import torch
+
+from geodiff_plugin._checks import bad_value
+
+__all__ = ["PeakMemory", "pick_device", "versions"]
+
+PACKAGES = ("geodiff-plugin", "torch", "diffusers", "transformers", "accelerate", "kornia", "numpy", "pillow")
+SAMPLING_INTERVAL_S = 0.05
+
+
+def versions() -> dict[str, str]:
+    """Version of Python and of every package that a result depends on."""
+    found = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def pick_device(name: str) -> torch.device:
+    """The device of that name; ``"auto"`` takes CUDA, then MPS, then the CPU.
+
+    Raises:
+        ValueError: no such device on this machine.
+    """
+    if name == "auto":
+        if torch.cuda.is_available():
+            return torch.device("cuda")
+        return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
+    expected = "auto, cpu, cuda, cuda:N or mps"
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        bad_value("--device", expected, repr(name))
+    here = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if device.type not in here:
+        bad_value("--device", expected, repr(name))
+    if not here[device.type]:
+        bad_value("--device", "a device of this machine", repr(name), f"PyTorch finds no {device.type} here.")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        bad_value(
+            "--device", f"one of the {torch.cuda.device_count()} CUDA devices of this machine", repr(name)
+        )
+    return device
+
+
+class PeakMemory:
+    """The most memory in use inside a ``with`` block, in ``peak_bytes`` after it.
+
+    CUDA: ``max_memory_allocated``, weights included. CPU: resident set of the process, sampled every
+    50 ms, as increase over the start.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device, self.peak_bytes = device, 0
+        self._start = self._highest = 0
+        self._process, self._done = psutil.Process(), threading.Event()
+        self._sampler = threading.Thread(target=self._sample, daemon=True)
+
+    def _resident(self) -> int:
+        return int(self._process.memory_info().rss)
+
+    def _sample(self) -> None:
+        while not self._done.wait(SAMPLING_INTERVAL_S):
+            self._highest = max(self._highest, self._resident())
+
+    def __enter__(self) -> PeakMemory:
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+        else:
+            self._start = self._highest = self._resident()
+            self._sampler.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.device.type == "cuda":
+            self.peak_bytes = torch.cuda.max_memory_allocated(self.device)
+            return
+        self._done.set()
+        self._sampler.join()
+        self.peak_bytes = max(self._highest, self._resident()) - self._start

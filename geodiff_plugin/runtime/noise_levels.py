@@ -1,0 +1,132 @@
+"""Noise level of a live scheduler at a timestep, one function per family.
+
+Hop: scheduler, timestep -> ``NoiseLevel``.
+Paper: alpha_bar of Eq. 6 (eq:tweedie) and Algorithm 1.
+
+A new scheduler is one line in ``FAMILIES``; everything else goes through the scheduler's own ``step``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from diffusers import (
+    DDIMScheduler,
+    DDPMScheduler,
+    DPMSolverMultistepScheduler,
+    FlowMatchEulerDiscreteScheduler,
+    LCMScheduler,
+)
+from torch import Tensor
+
+from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin.algorithm.denoising import NoiseLevel
+from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+
+__all__ = ["FAMILIES", "check_scheduler", "noise_level", "trailing_timesteps"]
+
+
+def _clip(scheduler: Any) -> float | None:
+    if getattr(scheduler.config, "clip_sample", False):
+        return float(getattr(scheduler.config, "clip_sample_range", 1.0))
+    return None
+
+
+def _discrete(scheduler: Any, timestep: Tensor) -> NoiseLevel:
+    """Schedulers that index ``alphas_cumprod`` by the timestep."""
+    # Indexed where the table lies, which diffusers leaves on the CPU.
+    table = scheduler.alphas_cumprod
+    alpha_bar = table[timestep.to(table.device)].float()
+    return NoiseLevel(
+        alpha_bar.sqrt(), (1.0 - alpha_bar).sqrt(), scheduler.config.prediction_type, _clip(scheduler)
+    )
+
+
+def _sigmas_vp(scheduler: Any, timestep: Tensor) -> NoiseLevel:
+    """DPM solvers: sigma / alpha by step index, variance preserving."""
+    index = scheduler.step_index
+    sigma = scheduler.sigmas[scheduler.index_for_timestep(timestep) if index is None else index].float()
+    alpha_t, sigma_t = scheduler._sigma_to_alpha_sigma_t(sigma)
+    return NoiseLevel(alpha_t, sigma_t, scheduler.config.prediction_type)
+
+
+def _flow(scheduler: Any, timestep: Tensor) -> NoiseLevel:
+    """Rectified flow: ``z_t = (1 - sigma) z_0 + sigma eps``."""
+    index = scheduler.step_index
+    sigma = scheduler.sigmas[scheduler.index_for_timestep(timestep) if index is None else index].float()
+    return NoiseLevel(1.0 - sigma, sigma, "flow_prediction")
+
+
+def _direct(scheduler: Any, timestep: Tensor) -> NoiseLevel:
+    """The output is the clean latent; its difference to the input stands for the noise."""
+    one = torch.ones((), device=timestep.device)
+    return NoiseLevel(one, one, scheduler.config.prediction_type)
+
+
+FAMILIES: dict[type, Callable[[Any, Tensor], NoiseLevel]] = {
+    DDIMScheduler: _discrete,
+    DDPMScheduler: _discrete,
+    LCMScheduler: _discrete,
+    DPMSolverMultistepScheduler: _sigmas_vp,
+    FlowMatchEulerDiscreteScheduler: _flow,
+    DirectScheduler: _direct,
+}
+
+
+def noise_level(scheduler: Any, timestep: Tensor) -> NoiseLevel:
+    """Signal and noise level that the scheduler's next ``step`` assumes.
+
+    Args:
+        scheduler: a member (or subclass) of ``FAMILIES``, before its ``step`` of this timestep.
+        timestep: 0-d tensor out of ``scheduler.timesteps``.
+
+    Raises:
+        TypeError: no family fits.
+    """
+    for cls, family in FAMILIES.items():
+        if isinstance(scheduler, cls):
+            return family(scheduler, torch.as_tensor(timestep))
+    names = ", ".join(cls.__name__ for cls in FAMILIES)
+    bad_type(
+        "pipe.scheduler",
+        f"one of {names}",
+        scheduler,
+        "Use pipe.scheduler = DDIMScheduler.from_config(pipe.scheduler.config).",
+    )
+
+
+def check_scheduler(scheduler: Any) -> None:
+    """Refuse a scheduler that guidance (or the stock pipeline) cannot run, before anything is computed.
+
+    Raises:
+        TypeError: no family.
+        ValueError: noise prediction with zero terminal SNR: its first step is 0 / 0, NaN in diffusers too.
+    """
+    if not isinstance(scheduler, tuple(FAMILIES)):
+        noise_level(scheduler, torch.tensor(0))
+    if (
+        getattr(scheduler.config, "rescale_betas_zero_snr", False)
+        and scheduler.config.prediction_type == "epsilon"
+    ):
+        bad_value(
+            "pipe.scheduler",
+            "able to tell the clean latent from the network's output at every step",
+            f"{type(scheduler).__name__} with prediction_type='epsilon' and rescale_betas_zero_snr=True",
+            "With no signal left a noise prediction says nothing; "
+            "set rescale_betas_zero_snr=False or use v_prediction.",
+        )
+
+
+def trailing_timesteps(scheduler: Any, num_inference_steps: int) -> Tensor | None:
+    """Timesteps of the same schedule with trailing spacing, for a DDIM that is ``leading``; else ``None``.
+
+    A leading schedule never visits t = 999 and starts from pure noise at a level that is none:
+    with one step it runs at t = 1. Every serious user of Marigold v1-0 switches.
+    """
+    if not isinstance(scheduler, DDIMScheduler) or scheduler.config.timestep_spacing != "leading":
+        return None
+    twin = type(scheduler).from_config(scheduler.config, timestep_spacing="trailing")
+    twin.set_timesteps(num_inference_steps)
+    return twin.timesteps

@@ -1,0 +1,227 @@
+"""Assemble everything known about a guided call on the grid of its output.
+
+Hop: stock output in metres + ``GuidedRun`` -> ``MetricDepthOutput``.
+Paper: Eq. 14's re-rendered left image, as a per-pixel report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from diffusers.pipelines.marigold import MarigoldDepthOutput
+from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
+from torch import Tensor
+
+from geodiff_plugin.algorithm.evidence import as_fine_as
+from geodiff_plugin.algorithm.terms.exposure import match_exposure
+from geodiff_plugin.geometry.cameras import resize_intrinsics
+from geodiff_plugin.geometry.warping import warp_right_to_left
+from geodiff_plugin.guidance.config import TermsConfig
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.pose.mistakes import INVERSE
+from geodiff_plugin.runtime.confidence import depth_confidence
+from geodiff_plugin.runtime.ensembling import median, spread_around
+from geodiff_plugin.runtime.judgement import Judgement, agreement_of_points, judge
+from geodiff_plugin.runtime.run import GuidedRun
+from geodiff_plugin.runtime.signs import read_signs
+from geodiff_plugin.types import CameraView, MetricDepthOutput
+
+__all__ = ["assemble_output"]
+
+#: A visible share below this is told to the user: scale then rests on little.
+LITTLE_OVERLAP = 0.3
+#: Metres; what a metric prior may say of its nearest pixel is 0.
+LEAST_M = 1e-6
+
+
+def assemble_output(
+    stock: MarigoldDepthOutput,
+    run: GuidedRun,
+    guidance: GeometryGuidance,
+    lefts_01: Tensor,
+    call: Mapping[str, Any],
+) -> MetricDepthOutput:
+    """Everything of ``MetricDepthOutput`` but ``latent``.
+
+    Args:
+        stock: output of the stock call, already in metres.
+        run: the finished run.
+        guidance: what was configured.
+        lefts_01: ``(N, 3, H, W)`` left images at native size.
+        call: arguments of the stock call by name.
+    """
+    count, size = lefts_01.shape[0], tuple(lefts_01.shape[-2:])
+    depth_m = _as_maps(stock.prediction).to(lefts_01.device)  # (N, 1, H, W) or the processing grid
+    depth_m, support = _refined(run, depth_m, lefts_01)
+    uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
+    if uncertainty is not None and support is not None:
+        uncertainty = _uncertainty(run, depth_m, lefts_01, call)
+    grid = tuple(depth_m.shape[-2:])
+    lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
+    known = [own.on(depth_m.device) for own in guidance.inputs]
+    K = resize_intrinsics(torch.stack([K_left for _, K_left, _ in known]), size, grid)
+    seen = [
+        _reprojection(own.native, *(x[i : i + 1] for x in (depth_m, lefts, K)), run.config.terms)
+        for i, own in enumerate(run.evidence)
+        if own.native
+    ]
+    visible, error = (torch.cat(maps) for maps in zip(*seen, strict=True)) if seen else (None, None)
+    confidence = None
+    if support is not None:
+        spread = None if uncertainty is None else uncertainty / depth_m
+        nowhere = torch.zeros_like(depth_m)
+        shown = (nowhere, nowhere.bool()) if error is None else (error, visible)
+        confidence = depth_confidence(support, *shown, spread)
+    judgements = [_judged(run, i, lefts_01[i], known[i][1], confidence) for i in range(count)]
+    if confidence is not None:
+        agreed = confidence.new_tensor([agreement_of_points(each.signs) for each in judgements])
+        confidence = confidence * agreed.view(-1, 1, 1, 1)
+    relative = torch.cat(run.relative)
+    relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
+    if call["match_input_resolution"]:
+        relative = F.interpolate(relative, size, mode="bilinear", align_corners=False)
+    affine = [t.affine for t in run.trajectories]
+
+    def members(name: str) -> Tensor:
+        return torch.cat([getattr(a, name) for a in affine]).reshape(count, -1).cpu()
+
+    def out(x: Tensor | None) -> Any:
+        return x if call["output_type"] == "pt" or x is None else x.permute(0, 2, 3, 1).cpu().numpy()
+
+    return MetricDepthOutput(
+        prediction=out(depth_m),
+        uncertainty=out(uncertainty),
+        relative=out(relative),
+        scale=members("scale"),
+        shift=members("shift"),
+        global_scale=members("g_s"),
+        own_scale=_own_scale(run, depth_m),
+        visible=out(visible),
+        photometric_error=out(error),
+        confidence=out(confidence),
+        support=out(support),
+        K=K if call["output_type"] == "pt" else K.cpu().numpy(),
+        history=[report for t in run.trajectories for report in t.history],
+        poses=[own.pose for own in run.evidence if own.pose is not None],
+        extras=getattr(stock, "extras", {}),
+        judgements=judgements,
+        unit=guidance.unit,
+        warnings=_warnings(run, visible, judgements)
+        + ([] if guidance.estimated is None else list(guidance.estimated.warnings)),
+    )
+
+
+def _own_scale(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
+    """``(N, E)`` median of the depth ``(N, 1, H, W)`` over a metric prior's own, on the prior's grid."""
+    if any(t.own_depth is None for t in run.trajectories):
+        return None
+    own = torch.cat([t.own_depth for t in run.trajectories])
+    found = F.interpolate(depth_m, own.shape[-2:], mode="bilinear", align_corners=False)
+    owners = [owner for t in run.trajectories for owner in t.owners]
+    ratio = (found[owners] / own.clamp_min(LEAST_M)).flatten(1)
+    return ratio.median(1).values.reshape(len(depth_m), -1).cpu()
+
+
+def _judged(
+    run: GuidedRun,
+    image: int,
+    left_01: Tensor,
+    K_left: Tensor,
+    confidence: Tensor | None,
+) -> Judgement:
+    """What the signs of one image's run say of it."""
+    own = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
+    order = torch.stack([t.order[i] for t, i in own]).nanmean()
+    signs = read_signs(
+        run.evidence[image],
+        left_01,
+        run.evidence[image].native,
+        K_left,
+        order=float(order),
+        confidence=None if confidence is None else confidence[image],
+        on_edge=any(bool(t.on_edge[i]) for t, i in own),
+        range_given=run.config.depth_range is not None,
+    )
+    return judge(signs)
+
+
+def _as_maps(values: Any) -> Tensor:
+    """``(N, 1, H, W)`` float32 of what the pipeline gives, numpy or torch."""
+    if isinstance(values, Tensor):
+        return values.float()
+    return torch.from_numpy(values).permute(0, 3, 1, 2).float()
+
+
+def _refined(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> tuple[Tensor, Tensor | None]:
+    """The depth of every image brought to what is known, and how far that decided it."""
+    if not run.config.correction.refine:
+        return depth_m, None
+    pairs = enumerate(zip(depth_m.split(1), lefts_01.split(1), strict=True))
+    refined = [one for i, (depth, left) in pairs if (one := run.known(i).bring(depth, left)) is not None]
+    if len(refined) < len(depth_m):
+        return depth_m, None
+    return torch.cat([r.depth_m for r in refined]), torch.cat([r.support for r in refined])
+
+
+def _uncertainty(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: Mapping[str, Any]) -> Tensor:
+    """How far the members of every ensemble, refined one by one, lie from its result: ``(N, 1, H, W)`` m.
+
+    It costs a refinement a member: their spread before it is that of a map that is not given out.
+    """
+    size, method = tuple(depth_m.shape[-2:]), call["resample_method_output"]
+    reduction = (call["ensembling_kwargs"] or {}).get("reduction", "median")
+    spreads = []
+    for i, members in enumerate(run.members):
+        members = members.float().to(depth_m.device)
+        if tuple(members.shape[-2:]) != size:  # as the stock call brings the ensemble to its output
+            members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
+        left = lefts_01[i : i + 1]
+        refined = [run.known(i, m).bring(member, left).depth_m for m, member in enumerate(members.split(1))]
+        spreads.append(spread_around(depth_m[i : i + 1], torch.cat(refined), reduction))
+    return torch.cat(spreads)
+
+
+def _reprojection(
+    views: Sequence[CameraView], depth_m: Tensor, left_01: Tensor, K_left: Tensor, config: TermsConfig
+) -> tuple[Tensor, Tensor]:
+    """Where any right view sees the pixel, and the least mean absolute error to the re-rendered left image.
+
+    The error is that of the view that explains the pixel best, compared in the left image's exposure; both
+    are at the output's resolution.
+    """
+    best, visible = torch.full_like(depth_m, torch.inf), torch.zeros_like(depth_m, dtype=torch.bool)
+    for image, K_right, T in views:
+        image, K_right = as_fine_as(image, K_right, K_left[0])
+        warped = warp_right_to_left(image[None], depth_m, K_left, K_right[None], T[None])
+        matched = match_exposure(
+            warped.image,
+            left_01,
+            warped.visible,
+            gain_range=config.exposure_gain,
+            cells=(config.exposure_rows, config.exposure_columns),
+            prior=config.exposure_prior,
+        )
+        error = (matched - left_01).abs().mean(1, keepdim=True)
+        best = torch.where(warped.visible, torch.minimum(best, error), best)
+        visible |= warped.visible
+    return visible, best.where(visible, torch.zeros_like(best))
+
+
+def _warnings(run: GuidedRun, visible: Tensor | None, judgements: Sequence[Judgement]) -> list[str]:
+    found = []
+    for i, judgement in enumerate(judgements):
+        which = "" if len(judgements) == 1 else f"Image {i + 1}: "
+        spoken = [judgement.sentence] if judgement.reasons else []
+        found += [which + sentence for sentence in (*spoken, *judgement.remarks)]
+    share = 1.0 if visible is None else visible.float().mean().item()
+    if share < LITTLE_OVERLAP:
+        found.append(
+            f"Only {share:.0%} of the left image is seen by a right camera at this depth; "
+            "scale rests on little."
+        )
+    # That the inverse pose fits better is a reason of the judgement already.
+    found.extend(sentence for e in run.evidence for sentence in e.warnings if sentence != INVERSE)
+    return found

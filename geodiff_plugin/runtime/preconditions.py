@@ -1,0 +1,86 @@
+"""Preconditions of a guided call: what a pipeline must fulfil, checked before anything is computed.
+
+Hop: pipeline, adapter, gradient -> nothing, or one clear error.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.priors import DepthPrior
+from geodiff_plugin.runtime.noise_levels import check_scheduler
+
+__all__ = ["check_guidable", "check_network_input", "check_offloading", "needs_network"]
+
+
+def check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) -> None:
+    """Refuse a pipeline that cannot be guided as configured, while nothing has been computed yet.
+
+    Args:
+        pipe: the pipeline.
+        prior: its adapter.
+        guidance: what was configured.
+
+    Raises:
+        TypeError, ValueError: a scheduler, offloading or network that cannot be guided.
+    """
+    check_scheduler(pipe.scheduler)
+    check_offloading(pipe, guidance.config.gradient)
+    if needs_network(guidance):
+        check_network_input(prior)
+
+
+def needs_network(guidance: GeometryGuidance) -> bool:
+    """Whether gradients of z_t are taken through the network."""
+    config = guidance.config
+    moved = config.updates.optimize_latents and guidance.updates.inner_steps > 0
+    return config.gradient == "full" and moved
+
+
+def check_network_input(prior: DepthPrior) -> None:
+    """Refuse the full gradient where the network is not told z_t.
+
+    Raises:
+        ValueError: it is not, so that there is no gradient through it.
+    """
+    if prior.network_input is None:
+        cure = "Its network is not told z_t, so only the clean latent can be moved."
+        bad_value("gradient", "'denoised' with this prior", "'full'", cure)
+
+
+def check_offloading(pipe: Any, gradient: str) -> None:
+    """Refuse offloading that takes weights away before the backward pass needs them.
+
+    Raises:
+        ValueError: sequential or group offloading, or model offloading with the full gradient.
+    """
+    modules = [m for m in pipe.components.values() if isinstance(m, torch.nn.Module)]
+    for module in modules:
+        for child in module.modules():
+            hook = getattr(child, "_hf_hook", None)
+            names = {type(h).__name__ for h in getattr(hook, "hooks", [hook] if hook else [])}
+            sequential = "AlignDevicesHook" in names and any(
+                getattr(h, "offload", False) for h in getattr(hook, "hooks", [hook])
+            )
+            registry = getattr(child, "_diffusers_hook", None)
+            grouped = registry is not None and any("group_offloading" in name for name in registry.hooks)
+            if sequential or grouped:
+                bad_value(
+                    "pipe",
+                    "without sequential or group CPU offloading while guided",
+                    f"{type(module).__name__} whose weights leave the device after each forward",
+                    "The backward pass needs them: use pipe.enable_model_cpu_offload() or pipe.to(device).",
+                )
+    if gradient == "full" and getattr(pipe, "_all_hooks", None):
+        bad_value(
+            "gradient",
+            "'denoised' with enable_model_cpu_offload()",
+            "'full'",
+            "Decoding pushes the U-Net to the CPU before its backward pass; "
+            "use gradient='denoised' or pipe.to(device).",
+        )

@@ -1,0 +1,300 @@
+"""State of one guided call: what is set up for it on the pipeline and taken down after it.
+
+Hop: pipeline + ``GeometryGuidance`` -> hooks on -> trajectories -> metric depth of every member -> hooks off.
+Paper: Algorithm 1 around ``algorithm.guided_step``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
+from geodiff_plugin.algorithm.evidence import Evidence
+from geodiff_plugin.algorithm.known import Known
+from geodiff_plugin.algorithm.state import Trajectory
+from geodiff_plugin.algorithm.step import StepContext, guided_step
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.priors import DepthPrior
+from geodiff_plugin.runtime.channels import put_channels
+from geodiff_plugin.runtime.denoiser import DenoiserTap
+from geodiff_plugin.runtime.exclusive import Exclusive
+from geodiff_plugin.runtime.half import ImagesInFloat32
+from geodiff_plugin.runtime.marks import FrozenWeights, Running
+from geodiff_plugin.runtime.noise_levels import noise_level
+from geodiff_plugin.runtime.preconditions import needs_network
+from geodiff_plugin.runtime.scheduler import GuidedScheduler
+
+__all__ = ["GuidedRun", "plan_steps"]
+
+StepCallback = Callable[[Any, int, Any, dict[str, Tensor]], dict[str, Tensor] | None]
+
+
+class GuidedRun:
+    """State of one guided call.
+
+    Args:
+        pipe: the live pipeline.
+        prior: its adapter.
+        guidance: what the user configured.
+        evidence: one entry per image.
+        ensemble_size: members per image.
+        batch_size: samples per chunk, as the pipeline slices them.
+        content_size: ``(H, W)`` of the processing grid without padding.
+        padding: rows at the bottom and columns at the right that were added to it.
+        rounds: times that every denoising step makes its updates, see ``plan_steps``.
+        callback: ``callback_on_step_end`` or ``None``.
+        held: what the call holds against other threads, given back while the callback runs.
+
+    Attributes:
+        trajectories: one a chunk.
+        relative: the decoded maps of the final latents, one a chunk, without padding.
+        members: of every image with an ensemble, ``(E, 1, H, W)`` metres without padding.
+    """
+
+    def __init__(
+        self,
+        pipe: Any,
+        prior: DepthPrior,
+        guidance: GeometryGuidance,
+        evidence: list[Evidence],
+        ensemble_size: int,
+        batch_size: int,
+        content_size: tuple[int, int],
+        padding: tuple[int, int],
+        rounds: int,
+        callback: StepCallback | None,
+        held: Exclusive,
+    ) -> None:
+        self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
+        self.full = needs_network(guidance)
+        self.owners = [i for i in range(len(evidence)) for _ in range(ensemble_size)]
+        self.batch_size, self.content_size, self.padding = batch_size, content_size, padding
+        self.rounds, self.callback, self._held = rounds, callback, held
+        self.trajectories: list[Trajectory] = []
+        self.relative: list[Tensor] = []
+        self.members: list[Tensor] = []
+        self.step_index, self.timesteps = 0, []
+        self._decoded_chunks = 0
+        self._stack, self._bar = ExitStack(), None
+        self._tap = DenoiserTap(*prior.network(), prior.network_input) if self.full else None
+        self._hooks = [
+            FrozenWeights(pipe),
+            ImagesInFloat32(pipe.image_processor, pipe._execution_device),
+            *([self._tap] if self._tap else []),
+            GuidedScheduler(pipe, self._on_trajectory, self._on_step, self._on_done, self.config.respace),
+            Running(pipe, self),
+        ]
+
+    def __enter__(self) -> GuidedRun:
+        with ExitStack() as stack:
+            for hook in self._hooks:
+                stack.enter_context(hook)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stack.close()
+        if self._bar is not None:
+            self._bar.close()
+
+    @contextmanager
+    def _suspended(self) -> Iterator[None]:
+        """The pipeline as the user left it, for the length of a callback: stock, guided or saved there."""
+        self._stack.close()
+        try:
+            with self._held.given_back():
+                yield
+        finally:
+            self.__enter__()
+
+    @property
+    def spans(self) -> list[tuple[float, float]]:
+        """Begin and end of the rounds of the current step in the schedule, [0, 1] each."""
+        first, count = self.step_index * self.rounds, len(self.timesteps) * self.rounds
+        return [(i / count, (i + 1) / count) for i in range(first, first + self.rounds)]
+
+    def decode(self, z0: Tensor) -> Tensor:
+        """Unclipped relative map without padding, ``(B, 1, H, W)`` float32, with its graph."""
+        height, width = self.content_size
+        return self._decode_padded(z0)[:, :, :height, :width]
+
+    def _decode_padded(self, z0: Tensor) -> Tensor:
+        """The same on the padded grid; beyond the last whole cell of the latent the last row repeats."""
+        x = self.prior.decode(z0)
+        bottom, right = (
+            content + added - side
+            for content, added, side in zip(self.content_size, self.padding, x.shape[-2:], strict=True)
+        )
+        return F.pad(x, (0, right, 0, bottom), mode="replicate") if bottom or right else x
+
+    def encode(self, x: Tensor) -> Tensor:
+        """Clean latent of a relative map without padding, which is made as the image's was."""
+        bottom, right = self.padding
+        return self.prior.encode(F.pad(x, (0, right, 0, bottom), mode="replicate"))
+
+    def metric_prediction(self, latents: Tensor) -> Tensor:
+        """Metric depth of the next chunk of final latents; takes the place of the clipping decode.
+
+        Args:
+            latents: ``(B, C, h, w)``, chunks in the order in which they were denoised.
+
+        Returns:
+            ``(B, 1, H, W)`` metres on the padded processing grid, in float32.
+        """
+        trajectory = self.trajectories[self._decoded_chunks]
+        self._decoded_chunks += 1
+        # What was encoded last, before the autoencoder's loss and the noise that SD-2's schedulers leave.
+        bottom, right = self.padding
+        x = trajectory.result
+        if x is None:
+            x = self._decode_padded(latents[:, self.prior.latents])
+        else:
+            x = F.pad(x, (0, right, 0, bottom), mode="replicate")
+        height, width = self.content_size
+        self.relative.append(x[:, :, :height, :width])
+        trajectory.watch.note("the map of the final latent", len(self.timesteps) - 1, x)
+        return trajectory.metric(x, trajectory.affine)
+
+    def known(self, image: int, member: int | None = None) -> Known:
+        """What is known of one image on the grid of the sweep.
+
+        Args:
+            image: its index in the call.
+            member: as the judgement of this one says; ``None`` for that of all members, on average.
+        """
+        own = [t.known.of_sample(i) for t in self.trajectories for i, o in enumerate(t.owners) if o == image]
+        chosen = own if member is None else own[member : member + 1]
+        means = []
+        for judged in zip(*chosen, strict=True):  # what is kept of each match, and the prior's error
+            given = [one for one in judged if one is not None]
+            means.append(torch.stack(given).mean(0, keepdim=True) if given else None)
+        return Known.of([self.evidence[image]], self.config, "sweep", *means)
+
+    def check_finite(self) -> None:
+        """Ask, once and after the loop, whether everything that was computed is finite.
+
+        Raises:
+            ValueError: naming the step, the tensor and the cure.
+        """
+        for trajectory in self.trajectories:
+            trajectory.watch.check(self.pipe.dtype)
+
+    def _on_trajectory(self, timesteps: Tensor) -> None:
+        first = len(self.trajectories) * self.batch_size
+        chunk = slice(first, first + self.batch_size)
+        own_range = self.prior.metric_range(chunk)
+        self.trajectories.append(
+            Trajectory(self.config, self.evidence, self.owners[chunk], self.prior.space, own_range)
+        )
+        self.step_index, self.timesteps = 0, timesteps.tolist()
+        if self._bar is None:
+            told = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
+            chunks = -(-len(self.owners) // self.batch_size)
+            self._bar = tqdm(total=chunks * len(self.timesteps), **told)
+
+    def _on_step(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        level = noise_level(self.pipe.scheduler, timestep)
+        trajectory, depth = self.trajectories[-1], self.prior.latents
+        wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
+        wide_output, wide_z_t = output[:, depth].to(wide), z_t[:, depth].to(wide)
+        if self.step_index == 0:  # one wait a trajectory
+            trajectory.watch.note("the prior's output", 0, wide_output)
+            trajectory.watch.check(self.pipe.dtype)
+        eps = noise_from(wide_output, wide_z_t, level)
+        full = self._tap is not None
+        if full:
+            leaf = self._tap.leaf
+
+            def z0_of(z: Tensor) -> Tensor:
+                return z0_from(self._tap.output_at(z)[:, depth].to(wide), z, level)
+        else:
+            leaf, z0_of = z0_from(wide_output, wide_z_t, level), _identity
+        encode = None if full else self.encode
+        timestep_now = self.timesteps[self.step_index]
+        at = StepContext(self.step_index, timestep_now, self.spans, eps, z0_of, self.decode, encode)
+        with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
+            move = guided_step(trajectory, leaf, at)
+        updates = self.config.updates
+        if not updates.optimize_latents or not any(trajectory.is_active(begin) for begin, _ in self.spans):
+            result = output, z_t, None  # bit for bit the pipeline's own step
+        elif full and self.prior.max_steps == 1:
+            # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
+            moved = (leaf + move).detach()
+            result = self._tap.output_at(moved).detach(), put_channels(z_t, depth, moved.to(z_t.dtype)), None
+        elif full and updates.step_from == "updated":
+            moved = (leaf + move).detach().to(z_t.dtype)
+            result = output, put_channels(z_t, depth, moved), None
+        elif full:
+            result = output, z_t, put_channels(torch.zeros_like(z_t, dtype=wide), depth, move)
+        else:
+            moved_output, moved_z_t = output_from(leaf + move, eps, level)
+            result = (
+                put_channels(output, depth, moved_output.to(output.dtype)),
+                put_channels(z_t, depth, moved_z_t.to(z_t.dtype)),
+                None,
+            )
+        if full:
+            self._tap.release()
+        return result
+
+    def _on_done(self, timestep: Tensor, latents: Tensor) -> Tensor:
+        if self.callback is not None:
+            trajectory = self.trajectories[-1]
+            affine = trajectory.affine
+            depth = latents[:, self.prior.latents]
+            x = self.decode(depth) if self.step_index == len(self.timesteps) - 1 else trajectory.last_x
+            values = {
+                "latents": latents,
+                "metric_depth": trajectory.metric(x, affine),
+                "loss": trajectory.history[-1].loss,
+                "scale": affine.scale,
+                "shift": affine.shift,
+            }
+            with self._suspended():
+                answer = self.callback(self.pipe, self.step_index, timestep, values) or {}
+            if "latents" in answer:
+                latents, trajectory.result = answer["latents"], None
+        self.step_index += 1
+        if self._bar is not None and not self._bar.disable:  # a disabled one waits for no device
+            loss = float(self.trajectories[-1].history[-1].loss.mean())
+            self._bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
+            self._bar.update()
+        return latents
+
+
+def _identity(z: Tensor) -> Tensor:
+    return z
+
+
+def plan_steps(
+    guidance: GeometryGuidance, prior: DepthPrior, asked: int | None, pipeline_default: int | None
+) -> tuple[int, int]:
+    """Denoising steps of a guided call, and how often each makes its updates.
+
+    A prior that can only take fewer steps than guidance wants makes the updates of all of them in those
+    that it has, each round with its own search and gate on matches, as a step would have.
+
+    Args:
+        guidance: says how many steps it wants.
+        prior: says how many make sense.
+        asked: ``num_inference_steps`` of the call.
+        pipeline_default: when none was asked for.
+
+    Raises:
+        ValueError: more steps were asked for than the prior has.
+    """
+    wanted = guidance.denoising_steps(asked, pipeline_default)
+    if prior.max_steps is None or wanted <= prior.max_steps:
+        return wanted, 1
+    if asked is not None:
+        cure = "Leave it out: the prior was trained for so few."
+        bad_value("num_inference_steps", f"at most {prior.max_steps} with this prior", asked, cure)
+    return prior.max_steps, -(-wanted // prior.max_steps)

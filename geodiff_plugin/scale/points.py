@@ -1,0 +1,190 @@
+"""Metres of a relative map from matches and known points: which basin is right, and the fit within it.
+
+Hop: matches or points, relative map ``x (B, 1, h, w)`` -> depths of its nearest and farthest end, per sample.
+Paper: none; the range of the points is where Marigold-DC starts (Viola et al. 2024, Eq. 2).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.guidance.config import FitConfig
+from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.matching import Matches
+from geodiff_plugin.matching.points import UNIT
+from geodiff_plugin.scale.space import SPACES, MetricMap, Space
+
+__all__ = [
+    "depth_span",
+    "fit_to_points",
+    "ordered",
+    "refine_to_matches",
+    "sure_matches",
+    "weighted_median",
+]
+
+
+def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
+    """Metres, ``()`` each, of the nearest and the farthest known point."""
+    known = points.inverse_depth[points.confidence > 0]
+    return 1.0 / known.amax(), 1.0 / known.amin()
+
+
+def sure_matches(matches: Matches, config: FitConfig = DEFAULT.fit) -> Matches | None:
+    """The matches that are more likely right than wrong, as if they were points; ``None`` for too few."""
+    believed = (matches.confidence > config.sure_confidence) & (matches.inverse_depth > matches.plane_step)
+    if int(believed.sum()) < config.min_sure:
+        return None
+    unit = UNIT * matches.inverse_depth[believed].median()
+    return replace(matches, confidence=believed.float(), plane_step=unit)
+
+
+@torch.no_grad()
+def fit_to_points(
+    x: Tensor,
+    points: Matches,
+    metric: MetricMap,
+    current: tuple[Tensor, Tensor] | None = None,
+    config: FitConfig = DEFAULT.fit,
+) -> tuple[Tensor, Tensor]:
+    """Depths of the two ends of a relative map that explain the points best.
+
+    Args:
+        x: ``(B, 1, h, w)`` relative maps of one image.
+        points: of that image.
+        metric: the prior's metric parametrisation.
+        current: ``(near_m, far_m)``, ``(B,)`` each, in use; they stay unless a better basin shows up.
+        config: the fit's numbers.
+
+    Returns:
+        ``near_m, far_m``, ``(B,)``: the best of 1128 (by default) log-spaced pairs in mean Cauchy cost of
+        inverse depth, so that some points may be wrong. Coarse: ``refine_to_matches`` does the rest.
+    """
+    at = (points.confidence.flatten() > 0).nonzero()[:, 0]
+    at = at[:: max(1, -(-len(at) // config.basin_samples))]
+    target = points.inverse_depth.flatten()[at]
+    values = F.interpolate(x.float(), points.size, mode="bilinear", align_corners=False).flatten(1)[:, at]
+    nearest, farthest = depth_span(points)
+    low, high = (nearest / config.basin_reach).log(), (farthest * config.basin_reach).log()
+    grid = torch.exp(low + (high - low) * torch.linspace(0, 1, config.basin_candidates, device=x.device))
+    i, j = torch.triu_indices(len(grid), len(grid), 1, device=x.device)
+    found = []
+    for b, row in enumerate(values):
+        near, far = grid[i], grid[j]
+        if current is not None:
+            near, far = torch.cat([current[0][b : b + 1], near]), torch.cat([current[1][b : b + 1], far])
+        depth_m = metric(row.expand(len(near), 1, 1, -1), metric.from_range(near, far))[:, 0, 0]
+        e = (1.0 / depth_m - target) / (config.basin_cauchy * points.plane_step)
+        cost = torch.log1p(e * e).mean(1)
+        best = cost.argmin()
+        if current is not None:
+            best = torch.where(cost[0] <= config.basin_keep * cost[best], torch.zeros_like(best), best)
+        found.append(torch.stack([near[best], far[best]]))
+    return torch.stack(found).unbind(1)
+
+
+@torch.no_grad()
+def refine_to_matches(
+    x: Tensor,
+    matches: Matches,
+    near_m: Tensor,
+    far_m: Tensor,
+    space: str,
+    config: FitConfig = DEFAULT.fit,
+) -> tuple[Tensor, Tensor]:
+    """Robust fit of the two ends of a relative map to matches, started from the search's result.
+
+    Args:
+        x: ``(B, 1, h, w)`` relative maps of one image.
+        matches: of that image; or known points.
+        near_m: ``(B,)`` metres, start.
+        far_m: ``(B,)`` metres, start.
+        space: as in ``search_scale``.
+        config: the fit's numbers.
+
+    Returns:
+        ``near_m, far_m``, far within a factor of 2 of the start: matches alone have outliers, so they
+        refine what the lookup found and never replace it. Residuals are in log depth, each in units of its
+        match's own noise and of what the map leaves over, which is measured at every iteration: a map that is
+        right is fitted to the noise of its matches, one that errs as a whole.
+    """
+    height, width = matches.size
+    at = (matches.confidence.flatten() > 0).nonzero()[:, 0]  # known points are few: not one may be missed
+    if not len(at):
+        return near_m, far_m
+    at = at[:: max(1, len(at) // config.fit_samples)]
+    inverse = matches.inverse_depth.flatten()[at].clamp_min(1e-9)
+    # A match at infinity constrains nothing, and a wrong one would push far without end.
+    trusted = matches.confidence.flatten()[at] * (inverse > matches.plane_step)
+    noise = (config.fit_noise * matches.plane_step / inverse) ** 2
+    values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
+    form = SPACES[space]
+    start = _ends(form, near_m, far_m)
+    reach = _ends(form, near_m / math.exp(config.fit_near_reach), far_m / math.exp(config.fit_far_reach))
+    other = _ends(form, near_m * math.exp(config.fit_near_reach), far_m * math.exp(config.fit_far_reach))
+    low, high = torch.minimum(reach, other), torch.maximum(reach, other)
+    ends = start
+    for _ in range(config.fit_iterations):
+        ends = _refine_once(form, ends, values, inverse, trusted, noise, (low, high), config)
+    at_zero, at_one = (form.forward(end, torch.ones_like(end)) for end in ends.unbind(1))
+    return ordered(*form.ends(at_zero, at_one))
+
+
+def _ends(form: Space, near_m: Tensor, far_m: Tensor) -> Tensor:
+    """``(B, 2)``: what the space is affine in, at ``x = 0`` and at ``x = 1``."""
+    return torch.stack([form.inverse(end) for end in form.ends(near_m, far_m)], 1)
+
+
+def ordered(near_m: Tensor, far_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Both ends, near at most 0.98 of far: a range of nothing has no scale."""
+    return torch.minimum(near_m, far_m * 0.98), far_m
+
+
+def _refine_once(
+    form: Space,
+    ends: Tensor,
+    values: Tensor,
+    inverse: Tensor,
+    trusted: Tensor,
+    noise: Tensor,
+    bounds: tuple[Tensor, Tensor],
+    config: FitConfig,
+) -> Tensor:
+    """One reweighted Gauss-Newton step on ``ends (B, 2)``, kept within ``bounds``."""
+
+    def log_depth(v: Tensor) -> Tensor:
+        return form.forward(v, torch.ones_like(v)).clamp_min(1e-9).log()
+
+    shares = torch.stack([1.0 - values, values], -1)  # (B, P, 2)
+    v, gap = (shares @ ends[:, :, None])[..., 0], (ends[:, 1:] - ends[:, :1]).abs()
+    h = 1e-3 * torch.maximum(gap, 1e-2 * ends.abs().amax(1, keepdim=True))
+    residual = (log_depth(v) + inverse.log()).clamp(-1.0, 1.0)
+    slope = (log_depth(v + h) - log_depth(v - h)) / (2.0 * h)
+    left_over = 1.4826 * weighted_median(residual.abs(), trusted.expand_as(residual))
+    variance = noise + left_over.clamp_min(config.fit_floor)[:, None] ** 2
+    weight = trusted / (variance * (1.0 + residual**2 / (config.fit_cauchy**2 * variance)))
+    J = slope[..., None] * shares
+    normal = torch.einsum("bpi,bp,bpj->bij", J, weight, J)
+    gradient = torch.einsum("bpi,bp,bp->bi", J, weight, residual)
+    diagonal = normal.diagonal(dim1=1, dim2=2)
+    damped = normal + torch.diag_embed(1e-6 * diagonal + 1e-12 * diagonal.sum(1, keepdim=True) + 1e-20)
+    free = ends - torch.linalg.solve(damped, gradient)
+    bound = torch.minimum(torch.maximum(free, bounds[0]), bounds[1])
+    # Where one end is stopped by its bound, the other one is the best for that.
+    moved = bound - ends
+    alone = ends - (gradient + normal.flip(2).diagonal(dim1=1, dim2=2) * moved.flip(1)) / (diagonal + 1e-20)
+    fitted = torch.where((bound != free).flip(1), alone, bound)
+    return torch.minimum(torch.maximum(fitted, bounds[0]), bounds[1])
+
+
+def weighted_median(values: Tensor, weight: Tensor) -> Tensor:
+    """``(B,)`` of rows ``(B, P)`` with weights >= 0 of the same shape."""
+    values, order = values.sort(dim=1)
+    share = weight.gather(1, order).cumsum(1)
+    at = torch.searchsorted(share, 0.5 * share[:, -1:]).clamp_max(values.shape[1] - 1)
+    return values.gather(1, at)[:, 0]

@@ -1,0 +1,241 @@
+"""Turn a relative map into metres: an affine map with positive scale and shift, times a global scale.
+
+Hop: ``x (B, 1, H, W)`` unclipped relative map, ``s_hat, t_hat, g_s (B,)`` -> ``depth_m (B, 1, H, W)``.
+Paper: S4.1, Eq. 10 and 13 (eq:metric), Eq. 16 (no label); ``square`` is Marigold-DC's (its Eq. 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin._checks import check_choice
+
+__all__ = ["SPACES", "AffineState", "MetricMap", "Space", "SquareAffine", "inverse_softplus", "smooth_floor"]
+
+#: Half-width of the smooth floor, in units of the relative map (whose range is about [0, 1]): so small that a
+#: street from 6 to 330 m gains a third of a metre at its nearest point and nothing elsewhere.
+FLOOR_EPS = 0.001
+
+
+def smooth_floor(x: Tensor, eps: float = FLOOR_EPS) -> Tensor:
+    """Keep ``x`` above 0 with a gradient that is never zero.
+
+    Args:
+        x: any shape, relative values, about [0, 1] but unbounded.
+        eps: value at ``x = 0``; far above 0 the result exceeds ``x`` by ``eps**2 / x``.
+
+    Returns:
+        ``(x + sqrt(x^2 + 4 eps^2)) / 2``, same shape, > 0. Its slope falls only as ``(eps / x)^2``
+        below 0, so that a clipped pixel can still be pulled back (a softplus would underflow).
+
+    Source: not in the paper, which needs ``D(z) >= 0`` for Eq. 13 and never says why it would be.
+    """
+    root = torch.sqrt(x * x + 4.0 * eps * eps)
+    # Below 0 the sum would cancel, and neighbouring values become equal in float32.
+    return torch.where(x > 0, 0.5 * (x + root), 2.0 * eps * eps / (root - x.clamp_max(0.0)))
+
+
+def inverse_softplus(y: Tensor) -> Tensor:
+    """Raw value whose softplus is ``y``; ``y > 0``, any shape."""
+    return y + torch.log(-torch.expm1(-y))
+
+
+@dataclass(frozen=True)
+class AffineState:
+    """The three numbers per sample that make a relative map metric, all ``(B,)`` float32.
+
+    Attributes:
+        s_hat: raw scale, before softplus.
+        t_hat: raw shift, before softplus.
+        g_s: global scale; metres, in every space.
+    """
+
+    s_hat: Tensor
+    t_hat: Tensor
+    g_s: Tensor
+
+    @property
+    def scale(self) -> Tensor:
+        """``softplus(s_hat)``, dimensionless."""
+        return F.softplus(self.s_hat)
+
+    @property
+    def shift(self) -> Tensor:
+        """``softplus(t_hat)``, dimensionless."""
+        return F.softplus(self.t_hat)
+
+
+@dataclass(frozen=True)
+class SquareAffine(AffineState):
+    """Scale and shift as squares that start at 1, as Marigold-DC has them.
+
+    Attributes:
+        unit_scale: ``(B,)`` what a raw scale of 1 stands for.
+        unit_shift: ``(B,)`` the same for the shift.
+    """
+
+    unit_scale: Tensor
+    unit_shift: Tensor
+
+    @property
+    def scale(self) -> Tensor:
+        """``s_hat^2 unit_scale``, dimensionless."""
+        return self.s_hat**2 * self.unit_scale
+
+    @property
+    def shift(self) -> Tensor:
+        """``t_hat^2 unit_shift``, dimensionless."""
+        return self.t_hat**2 * self.unit_shift
+
+
+@dataclass(frozen=True)
+class Space:
+    """What a prior's output is affine in: ``v = s x + t`` is a function of depth in units of g_s.
+
+    Attributes:
+        forward: ``v, g_s`` -> metres; monotone, linear in ``g_s``, > 0 for every ``v > 0``.
+        inverse: depth in units of g_s -> ``v``.
+        grows_with_depth: whether a greater value is farther away.
+        from_ends: metres at ``x = 0`` and at ``x = 1`` -> ``s, t, g_s``, all > 0 and ``s, t`` of order 1.
+    """
+
+    forward: Callable[[Tensor, Tensor], Tensor]
+    inverse: Callable[[Tensor], Tensor]
+    grows_with_depth: bool
+    from_ends: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+
+    def ends(self, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+        """Nearest and farthest depth as those at ``x = 0`` and ``x = 1``; the same way back."""
+        return (near, far) if self.grows_with_depth else (far, near)
+
+    def depth_at(self, x: Tensor, near: Tensor, far: Tensor) -> Tensor:
+        """Metres at relative values ``x (..., P)`` of ranges ``(..., 1)``; monotone between near and far."""
+        at_zero, at_one = (self.inverse(end) for end in self.ends(near, far))
+        return self.forward(at_zero + (at_one - at_zero) * x, torch.ones_like(at_zero))
+
+
+def _depth_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return (b - a) / b, a / b, b.clone()
+
+
+def _disparity_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    g = torch.sqrt(a * b)
+    return g / b - g / a, g / a, g
+
+
+def _sqrt_disparity_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    g = torch.sqrt(a * b)
+    t = torch.sqrt(g / a)
+    return torch.sqrt(g / b) - t, t, g
+
+
+def _log_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    g = a * 0.9  # the shift must stay positive: log(a / g) = 0.105
+    return torch.log(b / a), torch.log(a / g), g
+
+
+def _log1p_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    t = torch.log1p(a)
+    return torch.log1p(b) - t, t, torch.ones_like(a)  # the 1 is a metre
+
+
+#: Space in which a prior's output is affine -> its formulas. A new space is one entry.
+SPACES: dict[str, Space] = {
+    "depth": Space(lambda v, g: g * v, lambda units: units, True, _depth_ends),
+    "disparity": Space(lambda v, g: g / v, torch.reciprocal, False, _disparity_ends),
+    "log": Space(lambda v, g: g * torch.exp(v), torch.log, True, _log_ends),
+    "log1p": Space(lambda v, g: g * torch.expm1(v), torch.log1p, True, _log1p_ends),
+    "sqrt_disparity": Space(lambda v, g: g / v**2, torch.rsqrt, False, _sqrt_disparity_ends),
+}
+
+#: Field ``positive`` of the configuration that squares instead of taking the softplus.
+SQUARE = "square"
+
+
+@dataclass(frozen=True)
+class MetricMap:
+    """The metric parametrisation of one prior.
+
+    Attributes:
+        space: key of ``SPACES``: what the prior's output is affine in. With ``s = softplus(s_hat)``
+            and ``t = softplus(t_hat)``: depth ``g_s (s x + t)``, disparity ``g_s / (s x + t)``,
+            log ``g_s exp(s x + t)``, log1p ``g_s (exp(s x + t) - 1)``, sqrt_disparity
+            ``g_s / (s x + t)^2``. All positive and monotone.
+        positive: ``"softplus"`` with the smooth floor, or ``"square"`` with ``x`` clipped to [0, 1], whose
+            gradient is zero where it clips.
+
+    Raises:
+        InputError: unknown space.
+
+    Source: Eq. 16 with Eq. 13 (eq:metric). Deviation: the smooth floor, and the spaces beside depth.
+    """
+
+    space: str = "depth"
+    positive: str = "softplus"
+
+    def __post_init__(self) -> None:
+        check_choice(self.space, "space", SPACES)
+
+    def confine(self, x: Tensor) -> Tensor:
+        """``x`` as it may be resampled: clipped with ``"square"``, as it is with ``"softplus"``."""
+        return x.clamp(0.0, 1.0) if self.positive == SQUARE else x
+
+    def __call__(self, x: Tensor, affine: AffineState) -> Tensor:
+        """Metric depth of a relative map.
+
+        Args:
+            x: ``(B, 1, H, W)`` unclipped relative map.
+            affine: per-sample scale, shift and global scale.
+
+        Returns:
+            ``(B, 1, H, W)`` metres, > 0, differentiable in ``x``, ``s_hat`` and ``t_hat``; linear in ``g_s``.
+        """
+        s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
+        confined = self.confine(x) if self.positive == SQUARE else smooth_floor(x)
+        return SPACES[self.space].forward(s * confined + t, g)
+
+    def relative(self, depth_m: Tensor, affine: AffineState) -> Tensor:
+        """The relative map of a metric depth; inverse of the call.
+
+        Args:
+            depth_m: ``(B, 1, H, W)`` metres, > 0.
+            affine: per-sample scale, shift and global scale.
+
+        Returns:
+            ``(B, 1, H, W)``; below 0 no further than where the smooth floor has lost half of its height.
+        """
+        s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
+        floored = (SPACES[self.space].inverse(depth_m / g) - t) / s
+        if self.positive == SQUARE:
+            return self.confine(floored)
+        floored = floored.clamp_min(0.5 * FLOOR_EPS)
+        return floored - FLOOR_EPS**2 / floored
+
+    def from_range(self, near_m: Tensor, far_m: Tensor) -> AffineState:
+        """The affine state under which the two ends of the map have the given depths.
+
+        Args:
+            near_m: ``(B,)`` metres, depth of the nearest end: of ``x = 0`` where the space grows with depth,
+                of ``x = 1`` where it falls.
+            far_m: ``(B,)`` metres, depth of the other end.
+
+        Returns:
+            State with ``g_s`` as ``Space.from_ends`` chooses it.
+        """
+        s, t, g = SPACES[self.space].from_ends(*SPACES[self.space].ends(near_m.float(), far_m.float()))
+        tiny = 1e-4  # a flat map is legal; softplus cannot reach 0
+        s, t = s.clamp_min(tiny), t.clamp_min(tiny)
+        if self.positive == SQUARE:
+            return SquareAffine(torch.ones_like(s), torch.ones_like(t), g, s, t)
+        return AffineState(inverse_softplus(s), inverse_softplus(t), g)
+
+    def range_of(self, affine: AffineState) -> tuple[Tensor, Tensor]:
+        """Nearest and farthest depth in metres, ``(B,)`` each; inverse of ``from_range``."""
+        space, s, t, g = SPACES[self.space], affine.scale, affine.shift, affine.g_s
+        zero, one = torch.zeros_like(s), torch.ones_like(s)
+        return space.ends(space.forward(s * zero + t, g), space.forward(s * one + t, g))

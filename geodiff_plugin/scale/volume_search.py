@@ -1,0 +1,165 @@
+"""Find the metres of a relative map by lookup in a plane-sweep volume.
+
+Hop: ``CostVolume``, relative map ``x (B, 1, h, w)`` -> depths of ``x = 0`` and ``x = 1``, per sample.
+Paper: S7.3 (pre-selection of g_s, "a variant of the traditional Plane Sweep Volume technique").
+
+The paper's one number, x = g_s x_rel, prefers depths at which every pixel leaves the right image;
+(near, far) jointly, on pixels that stay in view, does not (docs/reference/paper-map.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.guidance.config import SearchConfig
+from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.matching import CostVolume
+from geodiff_plugin.scale.space import SPACES
+
+__all__ = ["ScaleSearch", "argmin_over", "search_scale"]
+
+
+@dataclass(frozen=True)
+class ScaleSearch:
+    """Result of a search, ``(B,)`` each.
+
+    Attributes:
+        near_m: metres, depth of the nearest end of the relative map.
+        far_m: metres, depth of its farthest end.
+        cost: mean clamped census cost there, [0, ``cost_clamp``].
+        on_edge: the best pair touches the far end of the range, or the near end of a given range.
+    """
+
+    near_m: Tensor
+    far_m: Tensor
+    cost: Tensor
+    on_edge: Tensor
+
+
+def _sample_positions(height: int, width: int, samples: int, device: torch.device) -> Tensor:
+    """Flat indices of about ``samples`` pixels on a regular, offset grid: the same ones every time."""
+    stride = max(1, round((height * width / samples) ** 0.5))
+    rows = torch.arange(stride // 2, height, stride, device=device)
+    columns = torch.arange(stride // 2, width, stride, device=device)
+    return (rows[:, None] * width + columns[None]).flatten()
+
+
+def _lookup(
+    volume_cost: Tensor, in_view: Tensor, inverse_depth: Tensor, depth_m: Tensor, clamp: float
+) -> tuple[Tensor, Tensor]:
+    """Mean clamped cost and share in view ``(M,)`` of candidate depths ``(M, P)``, linear between planes."""
+    planes = inverse_depth.shape[0]
+    step = (inverse_depth[-1] - inverse_depth[0]) / (planes - 1)
+    position = (1.0 / depth_m - inverse_depth[0]) / step
+    inside = (position >= 0) & (position <= planes - 1)
+    # NaN is no index; what computed it is told by name after the loop (``algorithm.gradient.FiniteWatch``).
+    position = position.clamp(0, planes - 1).nan_to_num(0.0)
+    below = position.floor().clamp_max(planes - 2).long()
+    weight = position - below
+    cost = torch.lerp(volume_cost.gather(0, below), volume_cost.gather(0, below + 1), weight)
+    cost = cost.clamp_max(clamp)
+    # Beyond the nearest plane nothing is known: as bad as an outlier, and not out of view.
+    cost = torch.where(inside, cost, torch.full_like(cost, clamp))
+    counted = in_view.gather(0, below) | ~inside
+    count = counted.sum(1)
+    return (cost * counted).sum(1) / count.clamp_min(1), count / depth_m.shape[1]
+
+
+@torch.no_grad()
+def search_scale(
+    volume: CostVolume,
+    x: Tensor,
+    space: str,
+    *,
+    depth_range: tuple[float, float] | None = None,
+    current: tuple[Tensor, Tensor] | None = None,
+    config: SearchConfig = DEFAULT.search,
+) -> ScaleSearch:
+    """Depths of the two ends of a relative map that the two views agree on best.
+
+    Args:
+        volume: plane-sweep costs of the image.
+        x: ``(B, 1, h, w)`` relative maps of that image, about [0, 1], >= 0.
+        space: what ``x`` is affine in, key of ``SPACES``; in disparity spaces ``x = 1`` is near.
+        depth_range: ``(near, far)`` metres, bounds of the search; by default from the volume's nearest
+            plane to where the shift is 0.3 px.
+        current: nearest and farthest depth in use, ``(B,)`` each, to be kept unless a better basin shows up.
+        config: the search's numbers.
+
+    Returns:
+        ``ScaleSearch``. 1128 pairs (near, far) by default, log-spaced, then two finer grids around the best.
+
+    Source: S7.3. Deviation: two numbers instead of one, clamped census cost instead of L_geo.
+    """
+    low, high = volume.reach_m if depth_range is None else depth_range
+    height, width = volume.size
+    at = _sample_positions(height, width, config.search_samples, x.device)
+    cost, in_view = volume.at_pixels(at)
+    least = config.min_in_view_rectified if volume.rectified else config.min_in_view_posed
+    values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
+    coarse, fine = config.coarse_grid, config.fine_grid
+    grid = torch.linspace(0, 1, coarse, device=x.device)
+    log_low, log_span = math.log(low), math.log(high / low)
+    i, j = torch.triu_indices(coarse, coarse, 1, device=x.device)
+    offsets = torch.linspace(-1, 1, fine, device=x.device)
+    found = []
+    for b in range(x.shape[0]):
+
+        def best_of(
+            near: Tensor, far: Tensor, row: Tensor = values[b], every: int = 1
+        ) -> tuple[Tensor, Tensor, Tensor]:
+            depth = SPACES[space].depth_at(row[None, ::every], near[:, None], far[:, None])
+            mean, share = _lookup(
+                cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth, config.cost_clamp
+            )
+            mean = mean + (share < least) * 1.0  # only if no pair keeps enough in view does one of these win
+            k = mean.argmin()
+            return near[k], far[k], mean[k]
+
+        def to_m(u: Tensor) -> Tensor:
+            return torch.exp(log_low + log_span * u)
+
+        near, far, mean = best_of(
+            to_m(grid[i]), to_m(grid[j]), every=max(1, len(at) // config.coarse_samples)
+        )
+        reach = log_span / (coarse - 1)
+        for _ in range(2):
+            n = near.log() + reach * offsets.repeat_interleave(fine)
+            f = far.log() + reach * offsets.repeat(fine)
+            n, f = n.exp().clamp(low, high), f.exp().clamp(low, high)
+            near, far, mean = best_of(torch.minimum(n, f), torch.maximum(n, f))
+            reach = reach / (fine - 1) * 2
+        if current is not None:
+            a, c = (v[b : b + 1] for v in current)
+            now = best_of(torch.minimum(a, c), torch.maximum(a, c))
+            kept = now[2] <= mean + config.keep_margin
+            near, far, mean = (
+                torch.where(kept, old, new) for old, new in zip(now, (near, far, mean), strict=True)
+            )
+        # The volume's own near end lies nearer than anything seen, so only a given one can cut a scene off.
+        on_edge = (far >= high * 0.98) | ((near <= low * 1.02) & (depth_range is not None))
+        found.append((near, far, mean, on_edge))
+    return ScaleSearch(*(torch.stack(column) for column in zip(*found, strict=True)))
+
+
+def argmin_over(candidates: Tensor, cost: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """The candidate of least cost per sample, and whether it is the first or the last one.
+
+    Args:
+        candidates: ``(M,)``.
+        cost: one candidate (0-d) -> ``(B,)``.
+
+    Returns:
+        best ``(B,)`` and ``on_edge (B,)`` bool.
+
+    Source: S7.3, ``g_s* = argmin L_geo``.
+    """
+    with torch.no_grad():
+        index = torch.stack([cost(c) for c in candidates]).argmin(0)
+    return candidates[index], (index == 0) | (index == len(candidates) - 1)

@@ -1,0 +1,121 @@
+"""A served page and a headless Chromium; without either the tests are skipped with the reason."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.conftest import plane_pair
+
+CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-angle=swiftshader",  # WebGL without a GPU, for the point cloud
+    "--enable-unsafe-swiftshader",
+]
+SERVER_STARTS_S = 600
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    found = next(filter(None, map(shutil.which, CHROMIUM_NAMES)), None)
+    if found is None:
+        pytest.skip(f"no browser is installed ({', '.join(CHROMIUM_NAMES)})")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture(scope="session")
+def address(chromium, tmp_path_factory):
+    """Address of ``geodiff app`` in a process of its own."""
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    folder, port = tmp_path_factory.mktemp("app"), free_port()
+    log = (folder / "log.txt").open("w")
+    environment = os.environ | {"GRADIO_TEMP_DIR": str(folder / "gradio"), "TMPDIR": str(folder)}
+    command = [sys.executable, "-m", "geodiff_plugin", "app", "--device", "cpu", "--port", str(port)]
+    process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+    try:
+        url, end = f"http://127.0.0.1:{port}/", time.monotonic() + SERVER_STARTS_S
+        while True:
+            assert process.poll() is None and time.monotonic() < end, (folder / "log.txt").read_text()
+            try:
+                urllib.request.urlopen(url, timeout=5).close()
+                break
+            except OSError:
+                time.sleep(0.3)
+        yield url
+    finally:
+        process.kill()  # it keeps nothing that a kinder end would save
+        process.wait()
+        log.close()
+
+
+@pytest.fixture
+def visitor(chromium, address):
+    """``visitor()`` opens the page as another visitor; what it asks of other hosts is a failure."""
+    contexts, foreign = [], []
+
+    def note(request) -> None:
+        if not request.url.startswith((address, "data:", "blob:")):
+            foreign.append(request.url)
+
+    def come(height: int = 1000):
+        context = chromium.new_context(viewport={"width": 1400, "height": height}, accept_downloads=True)
+        contexts.append(context)
+        context.set_default_timeout(90_000)  # of a machine that does other things as well
+        page = context.new_page()
+        page.on("request", note)
+        page.goto(address)
+        page.wait_for_selector("#run")
+        return page
+
+    yield come
+    for context in contexts:
+        context.close()
+    assert foreign == []
+
+
+@pytest.fixture(scope="session")
+def plane_files(tmp_path_factory):
+    """``plane_files(baseline_m)`` writes a small pair of a tilted plane with its calibration."""
+    made: dict[float, list[Path]] = {}
+
+    def make(baseline_m: float = 0.12) -> list[Path]:
+        if baseline_m not in made:
+            folder = tmp_path_factory.mktemp("plane")
+            pair = plane_pair(size=(96, 128), focal=120.0, baseline=0.12)
+            Image.fromarray(pair.left).save(folder / "left.png")
+            Image.fromarray(pair.right).save(folder / "right.png")
+            numbers = " ".join(f"{value:g}" for value in pair.K.ravel())
+            (folder / "K.txt").write_text(f"{numbers}\n{baseline_m}\n")
+            np.save(folder / "depth.npy", pair.depth_m * baseline_m / 0.12)
+            made[baseline_m] = [folder / name for name in ("left.png", "right.png", "K.txt", "depth.npy")]
+        return made[baseline_m]
+
+    return make

@@ -1,0 +1,176 @@
+"""The page in a real browser: upload, run, slide, measure, download; bad input; two visitors at once.
+
+``GEODIFF_SCREENSHOT=docs/images/app.png pytest tests/browser`` also makes the picture of the docs.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+RUN_MS = 600_000
+NUMBER = r"(\d+\.\d+)"
+
+
+def upload(page, paths) -> None:
+    for name, path in zip(("left", "right", "calibration"), paths, strict=False):
+        page.locator(f"#{name} input[type=file]").first.set_input_files(str(path))
+        page.wait_for_selector(
+            f"#{name} img" if name != "calibration" else f"#{name} >> text={Path(path).name}"
+        )
+
+
+def run(page) -> None:
+    page.click("#run")
+    page.wait_for_selector("#status .figures", timeout=RUN_MS)
+
+
+def tab(page, name: str) -> None:
+    page.get_by_role("tab", name=name).click()
+
+
+def download(page, name: str, folder: Path) -> Path:
+    tab(page, "Downloads")
+    stem = name.rpartition(".")[0]
+    link = page.locator("#files a", has_text=re.compile(r"\d")).locator(
+        f"xpath=self::*[contains(@href, '{stem}')]"
+    )
+    with page.expect_download() as started:
+        link.locator(f"xpath=self::*[contains(@href, '{name}')]").first.click()
+    started.value.save_as(folder / name)
+    return folder / name
+
+
+def click_picture(page, x: float, y: float) -> None:
+    """At a share of the picture's width and height."""
+    box = page.locator("#measure-picture img").bounding_box()
+    page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+
+
+def test_upload_run_slide_measure_and_take_home(visitor, plane_files, tmp_path):
+    files = plane_files()
+    page = visitor()
+    upload(page, files)
+    run(page)
+
+    # The slider.
+    handle = page.locator("#slider [role=slider], #slider .outer").first
+    box = handle.bounding_box()
+    before = page.locator("#slider").inner_html()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] - 100, box["y"] + box["height"] / 2, steps=5)
+    page.mouse.up()
+    assert page.locator("#slider").inner_html() != before
+    assert " m</span>" in page.locator("#depth-legend").inner_html()
+
+    # Two points, against the map that the visitor takes home.
+    tab(page, "Measure")
+    page.wait_for_selector("#measure-picture img")
+    click_picture(page, 0.25, 0.5)
+    page.wait_for_selector("#readings >> text=Click a second point")
+    click_picture(page, 0.75, 0.625)
+    words = page.wait_for_selector("#readings .distance").inner_text()
+    rows = page.locator("#readings td").all_inner_texts()
+    depth_m = np.load(download(page, "depth.npy", tmp_path))
+    truth_m = np.load(files[3])
+    assert depth_m.shape == truth_m.shape
+    assert np.median(np.abs(depth_m - truth_m) / truth_m) < 0.1
+    K = np.loadtxt(files[2].read_text().splitlines()[:1]).reshape(3, 3)
+    pixels = [(32, 48), (96, 60)]
+    points = [depth_m[y, x] * np.linalg.inv(K) @ (x, y, 1) for x, y in pixels]
+    slope = 2 * float(np.abs(np.gradient(depth_m)).max())  # a click may be a pixel off
+    shown = [float(re.search(NUMBER, text).group(1)) for text in rows if "m" in text]
+    for value, (x, y) in zip(shown, pixels, strict=True):
+        assert value == pytest.approx(depth_m[y, x], abs=slope + 0.01)
+    distance, spread = map(float, re.search(rf"{NUMBER} ± {NUMBER} m", words).groups())
+    assert distance == pytest.approx(np.linalg.norm(points[0] - points[1]), abs=2 * slope + 0.05)
+    assert 0 < spread < distance
+
+    # The cloud.
+    raw = download(page, "cloud.ply", tmp_path).read_bytes()
+    head, _, body = raw.partition(b"end_header\n")
+    count = int(re.search(rb"element vertex (\d+)", head).group(1))
+    vertices = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    assert len(vertices) == count > 0.9 * depth_m.size
+    assert vertices["xyz"][:, 2].max() == pytest.approx(depth_m.max(), rel=0.1)
+    assert download(page, "cloud.glb", tmp_path).read_bytes()[:4] == b"glTF"
+
+    # Its view, and fewer points of it.
+    tab(page, "Point cloud")
+    page.wait_for_selector("#scene canvas", timeout=60_000)
+    page.wait_for_selector("#points >> text=points")
+
+
+def test_a_bad_calibration_shows_its_sentence(visitor, plane_files, tmp_path):
+    bad = tmp_path / "notes.txt"
+    bad.write_text("the rig on the roof\n")
+    page = visitor()
+    upload(page, [*plane_files()[:2], bad])
+    page.click("#run")
+    sentence = page.wait_for_selector("#status [role=alert]", timeout=RUN_MS).inner_text()
+    assert "calibration must be in a known format" in sentence and "notes.txt" in sentence
+
+
+def test_a_missing_photograph_and_a_word_for_a_number(visitor, plane_files):
+    page = visitor()
+    page.click("#run")
+    sentence = page.wait_for_selector("#status [role=alert]").inner_text()
+    assert "the left photograph must be given" in sentence
+    upload(page, plane_files()[:2])
+    page.get_by_text("Focal length and baseline").click()
+    page.locator("#fx textarea, #fx input").fill("about 700")
+    page.click("#run")
+    page.wait_for_selector("#status >> text=fx, px must be a number")
+
+
+def test_two_visitors_at_once_do_not_mix(visitor, plane_files, tmp_path):
+    pages = {0.12: visitor(), 0.24: visitor()}
+    for baseline_m, page in pages.items():
+        upload(page, plane_files(baseline_m))
+    for page in pages.values():
+        page.click("#run")
+    medians = []
+    for number, page in enumerate(pages.values()):
+        page.wait_for_selector("#status .figures", timeout=RUN_MS)
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        medians.append(np.median(np.load(download(page, "depth.npy", folder))))
+    assert medians[1] / medians[0] == pytest.approx(2, rel=0.02)
+    tab(pages[0.12], "Measure")
+    click_picture(pages[0.12], 0.5, 0.5)
+    text = pages[0.12].wait_for_selector("#readings td >> nth=1").inner_text()
+    assert float(re.search(NUMBER, text).group(1)) < 1.5 * medians[0]
+
+
+def test_stop(visitor, plane_files):
+    page = visitor()
+    upload(page, plane_files())
+    page.click("#run")
+    page.wait_for_timeout(300)
+    page.click("#stop")
+    page.wait_for_selector("#status >> text=Stopped.", timeout=RUN_MS)
+    page.wait_for_function("!document.querySelector('#run').disabled")
+    assert page.locator("#status .figures").count() == 0
+
+
+@pytest.mark.skipif("GEODIFF_SCREENSHOT" not in os.environ, reason="GEODIFF_SCREENSHOT names no picture")
+def test_picture_for_the_docs(visitor):
+    page = visitor(height=940)
+    page.get_by_text("A room, 12 cm apart").click()
+    page.wait_for_selector("#right img")
+    run(page)
+    tab(page, "Measure")
+    page.wait_for_selector("#measure-picture img")
+    click_picture(page, 0.34, 0.36)  # the bottle's top
+    page.wait_for_selector("#readings >> text=Click a second point")
+    click_picture(page, 0.355, 0.74)  # and its foot
+    page.wait_for_selector("#readings .distance")
+    page.mouse.move(5, 5)
+    page.evaluate("scrollTo(0, 0)")
+    page.wait_for_timeout(1500)
+    page.screenshot(path=os.environ["GEODIFF_SCREENSHOT"])

@@ -1,0 +1,236 @@
+"""Kinds of bad input to ``geodiff depth`` and its siblings: what is typed, and what lies in the files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+__all__ = ["KINDS"]
+
+Words = list[str]
+CAMERA = ("--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.12").split()
+OPENCV = "{}: !!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [{}]\n"
+P = "700 0 320 {} 0 700 240 0 0 0 1 0"
+
+
+def _with(*words: object) -> Callable[[Path], Words]:
+    """The good command and more."""
+    return lambda _: ["left.png", "right.png", "--calib", "calib.txt", *map(str, words)]
+
+
+def _bare(*words: object) -> Callable[[Path], Words]:
+    """Both images and what is given, without a calibration."""
+    return lambda _: ["left.png", "right.png", *map(str, words)]
+
+
+def _all(*words: object) -> Callable[[Path], Words]:
+    return lambda _: list(map(str, words))
+
+
+def _calib(text: str | bytes, name: str = "bad.txt") -> Callable[[Path], Words]:
+    """A calibration file of this content."""
+
+    def write(folder: Path) -> Words:
+        (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+        return ["left.png", "right.png", "--calib", name]
+
+    return write
+
+
+def _image(make: Callable[[Path], None], which: str = "left.png") -> Callable[[Path], Words]:
+    """A spoilt image in place of a good one."""
+
+    def write(folder: Path) -> Words:
+        make(folder / which)
+        return ["left.png", "right.png", "--calib", "calib.txt"]
+
+    return write
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _camera(**changes: object) -> Callable[[Path], Words]:
+    values = {"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "baseline": 0.12} | changes
+    return _bare(*(word for name, value in values.items() for word in (f"--{name}", value)))
+
+
+def _matrices(K: object = None, E: object = None, **more: object) -> Callable[[Path], Words]:
+    """Files of K and E."""
+    good_K = [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]
+    good_E = np.eye(4) + 0.12 * np.eye(4, k=3)
+
+    def write(folder: Path) -> Words:
+        np.savetxt(folder / "K.txt", np.asarray(good_K if K is None else K, dtype=float))
+        np.savetxt(folder / "E.txt", np.asarray(good_E if E is None else E, dtype=float))
+        words = ["left.png", "right.png", "--K", "K.txt", "--E", "E.txt"]
+        for option, content in more.items():
+            (folder / f"{option}.txt").write_text(str(content))
+            words += [f"--{option.replace('_', '-')}", f"{option}.txt"]
+        return words
+
+    return write
+
+
+def _points(
+    content: str | bytes | np.ndarray, name: str = "points.txt", *more: object
+) -> Callable[[Path], Words]:
+    """A file of known depths."""
+
+    def write(folder: Path) -> Words:
+        if isinstance(content, np.ndarray):
+            np.save(folder / name, content)
+        else:
+            (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        return ["left.png", "right.png", "--calib", "calib.txt", "--points", name, *map(str, more)]
+
+    return write
+
+
+def _out(make: Callable[[Path], object], out: str) -> Callable[[Path], Words]:
+    def write(folder: Path) -> Words:
+        make(folder)
+        return ["left.png", "right.png", "--calib", "calib.txt", "--out", out]
+
+    return write
+
+
+def _changed(matrix: object, index: tuple[int, int], value: float) -> np.ndarray:
+    matrix = np.array(matrix, dtype=float)
+    matrix[index] = value
+    return matrix
+
+
+MOVED = np.eye(4) + 0.12 * np.eye(4, k=3)
+GOOD_K = [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]
+
+#: Kind -> what is done in a folder with a good pair and calibration, and the words behind ``geodiff depth``.
+KINDS: dict[str, Callable[[Path], Words]] = {
+    # options
+    "steps-zero": _with("--steps", 0),
+    "steps-many": _with("--steps", 100_000),
+    "ensemble-zero": _with("--ensemble", 0),
+    "resolution-odd": _with("--resolution", 100),
+    "resolution-small": _with("--resolution", 8),
+    "resolution-huge": _with("--resolution", 80_000),
+    "seed-negative": _with("--seed", -1),
+    "seed-beyond": _with("--seed", 2**63),
+    "seed-endless": _with("--seed", 10**60),
+    "near-alone": _with("--near", 1),
+    "far-alone": _with("--far", 9),
+    "near-beyond-far": _with("--near", 5, "--far", 2),
+    "near-nan": _with("--near", "nan", "--far", 2),
+    "far-infinite": _with("--near", 1, "--far", "inf"),
+    "near-zero": _with("--near", 0, "--far", 2),
+    "device-unknown": _with("--device", "tpu"),
+    "device-number": _with("--device", "cuda:99"),
+    "dtype-unknown": _with("--dtype", "float64"),
+    "preset-unknown": _with("--preset", "best"),
+    "space-unknown": _with("--space", "banana"),
+    "cameras-one": _with("--cameras", "2"),
+    "cameras-same": _with("--cameras", "2,2"),
+    "cameras-words": _with("--cameras", "left,right"),
+    "cameras-of-two": _with("--cameras", "0,1"),
+    "cameras-without-file": _bare(*CAMERA, "--cameras", "2,3"),
+    "option-form": _with("--option", "domain"),
+    "confidence-percent": _with("--min-confidence", 80),
+    "knob-form": _with("--knob", "inner_steps"),
+    "knob-unknown": _with("--knob", "speed=9"),
+    "knob-range": _with("--knob", "inner_steps=-1"),
+    "knob-type": _with("--knob", "refine=maybe"),
+    "knob-nested": _with("--knob", "gate=" + "[" * 100_000),
+    "knob-depth-range": _with("--knob", "depth_range=[1,2]"),
+    "paper-with-points": _with("--preset", "paper", "--points", "calib.txt"),
+    "paper-with-view": _with("--preset", "paper", "--view", "left.png"),
+    "points-scale-alone": _with("--points-scale", 256),
+    "points-calib-alone": _with("--points-calib", "calib.txt"),
+    # calibration, chosen
+    "calibration-none": _bare(),
+    "calibration-twice": _with("--fx", 60),
+    "calibration-parts": _bare("--fx", 60, "--baseline", 0.12),
+    "calibration-pair": _with("--calib", "left.png"),
+    "fx-zero": _camera(fx=0),
+    "fy-negative": _camera(fy=-60),
+    "fx-nan": _camera(fx="nan"),
+    "cx-outside": _camera(cx=131.5),
+    "cx-infinite": _camera(cx="inf"),
+    "baseline-zero": _camera(baseline=0),
+    "baseline-nan": _camera(baseline="nan"),
+    "K-alone": lambda f: _matrices()(f)[:4],
+    "E-alone": lambda f: [*_matrices()(f)[:2], "--E", "E.txt"],
+    "K-shape": _matrices(K=np.eye(4)),
+    "K-focal": _matrices(K=_changed(GOOD_K, (0, 0), 0)),
+    "K-nan": _matrices(K=_changed(GOOD_K, (1, 1), np.nan)),
+    "K-last-row": _matrices(K=_changed(GOOD_K, (2, 0), 1)),
+    "K-of-another-size": _matrices(K=4 * np.diag([60, 60, 0.25]) + 128 * np.eye(3, k=2)),
+    "K-right-words": _matrices(K_right="fx fy cx cy"),
+    "E-shape": _matrices(E=np.eye(3)),
+    "E-ragged": lambda f: [*_matrices()(f)[:4], "--E", (f / "r.txt").write_text("1 0 0\n1 0\n") and "r.txt"],
+    "E-infinite": _matrices(E=_changed(MOVED, (0, 3), np.inf)),
+    "E-scaled": _matrices(E=np.diag([1.0, 1, 1.1, 1])),
+    "E-mirrored": _matrices(E=np.diag([1.0, 1, -1, 1])),
+    "E-transposed": _matrices(E=MOVED.T),
+    "E-still": _matrices(E=np.eye(4)),
+    # calibration files
+    "calib-missing": _bare("--calib", "nothing.txt"),
+    "calib-folder": _bare("--calib", "."),
+    "calib-empty": _calib(b""),
+    "calib-blank": _calib(" \n\n"),
+    "calib-binary": _calib(b"\x00\x01\x02"),
+    "calib-words": _calib("my camera is a good one\n"),
+    "calib-middlebury-cut": _calib("cam0=[700 0 320; 0 700\n"),
+    "calib-middlebury-no-baseline": _calib(
+        "cam0=[60 0 32; 0 60 24; 0 0 1]\ncam1=[60 0 32; 0 60 24; 0 0 1]\n"
+    ),
+    "calib-kitti-cut": _calib(f"P_rect_02: {P.format(0)}\nP_rect_03: 700 0\n"),
+    "calib-kitti-one": _calib(f"P2: {P.format(0)}\n"),
+    "calib-numbers": _calib("1 2 3 4 5\n"),
+    "calib-json-cut": _calib('{"fx": 700, "fy": 7'),
+    "calib-json-nested": _calib('{"fx": ' + "[" * 100_000),
+    "calib-json-missing": _calib('{"fx": 700}'),
+    "calib-opencv-cut": _calib("%YAML:1.0\n---\nP1: !!opencv-matrix\n   rows: 3\n"),
+    "calib-entities": _calib('<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage></opencv_storage>'),
+    "calib-mvsnet-one": _calib("extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
+    "calib-of-another-size": _calib(
+        "cam0=[60 0 32; 0 60 24; 0 0 1]\ncam1=[60 0 32; 0 60 24; 0 0 1]\ndoffs=0\nbaseline=120\nwidth=128\n"
+        "height=96\n"
+    ),
+    # images
+    "left-missing": _all("nothing.png", "right.png", "--calib", "calib.txt"),
+    "right-missing": _all("left.png", "nothing.png", "--calib", "calib.txt"),
+    "left-folder": _all(".", "right.png", "--calib", "calib.txt"),
+    "left-text": _all("calib.txt", "right.png", "--calib", "calib.txt"),
+    "left-cut": _image(_cut),
+    "right-empty": _image(lambda path: path.write_bytes(b""), "right.png"),
+    "left-small": _image(lambda path: Image.new("RGB", (64, 31)).save(path)),
+    "same-twice": _all("left.png", "left.png", "--calib", "calib.txt"),
+    "right-none": _all("left.png", "--calib", "calib.txt"),
+    "alone-with-baseline": lambda f: ["left.png", *_points("0 0 2\n")(f)[-2:], *CAMERA],
+    "view-without-pose": _with("--view", "calib.txt"),
+    "pose-without-view": _with("--view-E", "calib.txt"),
+    # points
+    "points-missing": _with("--points", "nothing.npy"),
+    "points-empty": _points(b""),
+    "points-words": _points("lidar\n"),
+    "points-ragged": _points("1 2 3\n1 2\n"),
+    "points-two-columns": _points("1 2\n3 4\n"),
+    "points-pickled": _points(b"\x80\x04K\x01.", "points.npy"),
+    "points-cut": _points(b"\x93NUMPY\x01\x00", "points.npy"),
+    "points-integers": _points(np.full((48, 64), 2500, np.uint16), "points.npy"),
+    "points-unknown": _points(np.zeros((48, 64)), "points.npy"),
+    "points-ply": _points("ply\nformat ascii 1.0\nend_header\n", "points.ply"),
+    "points-bin": _points(bytes(16), "points.bin"),
+    "points-jpeg": _points(b"\xff\xd8", "points.jpg"),
+    "points-8-bit": _with("--points", "left.png"),
+    "points-scale-zero": _points("0 0 2\n", "points.txt", "--points-scale", 0),
+    # output
+    "out-file": _with("--out", "left.png"),
+    "out-below-file": _with("--out", "left.png/out"),
+    "out-full": _with("--out", "."),
+    "out-long": _with("--out", "x" * 300),
+    "out-dangling": _out(lambda f: (f / "link").symlink_to("nothing"), "link"),
+}

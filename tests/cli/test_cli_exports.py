@@ -1,0 +1,161 @@
+"""``--export``, ``--show`` and ``geodiff video``."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import types
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from geodiff_plugin.formats import read_calibration
+
+
+@pytest.fixture
+def prior(make_pipeline, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("prior")
+    make_pipeline().save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture
+def quick(pair_files, prior):
+    return [*pair_files.command, "--prior", prior, "--device", "cpu", "--steps", 1, "--preset", "paper"]
+
+
+class Recorder(types.ModuleType):
+    """A module whose every function notes its calls."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.calls: list[tuple] = []
+        self.__spec__ = importlib.util.spec_from_loader(name, None)
+
+    def __getattr__(self, name: str):
+        if name.startswith("__"):
+            raise AttributeError(name)
+
+        def call(*args, **kwargs):
+            self.calls.append((name, args, kwargs))
+            return self
+
+        call.RDF = "RDF"
+        return call
+
+    @property
+    def scene(self):
+        return self
+
+    def of(self, name: str) -> list[tuple]:
+        return [call for call in self.calls if call[0] == name]
+
+
+def test_exports_stand_beside_the_ply(geodiff, quick, pair_files, textured_plane):
+    answer = geodiff(*quick, "--export", "glb", "--export", "colmap", "-q")
+    assert answer.code == 0, answer.err
+    out = pair_files.folder / "geodiff-out"
+    assert (out / "cloud.glb").read_bytes()[:4] == b"glTF"
+    rig = read_calibration(out, image_names=("left.png", "right.png"), baseline_m=0.12)
+    np.testing.assert_allclose(rig.E, textured_plane.E, atol=1e-6)
+    # A later run without them leaves none of them behind.
+    assert geodiff(*quick, "-q", "--overwrite").code == 0
+    assert not (out / "cloud.glb").exists() and not (out / "cameras.txt").exists()
+
+
+def test_unknown_export_is_refused_before_anything_is_read(geodiff, quick):
+    answer = geodiff(*quick, "--export", "fbx")
+    assert answer.code == 2 and "--export must be one of ['colmap', 'glb']" in answer.err
+
+
+def test_show_in_rerun(geodiff, quick, monkeypatch, textured_plane):
+    rerun = Recorder("rerun")
+    monkeypatch.setitem(sys.modules, "rerun", rerun)
+    assert geodiff(*quick, "--show", "rerun", "-q").code == 0
+    (_, _, cloud), *_ = rerun.of("Points3D")
+    assert len(cloud["colors"]) > 0
+    pinholes = [call[2] for call in rerun.of("Pinhole")]
+    assert [(p["width"], p["height"]) for p in pinholes] == [(64, 48)] * 2
+    np.testing.assert_allclose(rerun.of("Transform3D")[1][2]["translation"], [0.12, 0, 0])
+
+
+def test_show_in_viser(geodiff, quick, monkeypatch):
+    viser = Recorder("viser")
+    monkeypatch.setitem(sys.modules, "viser", viser)
+    assert geodiff(*quick, "--show", "viser", "-q").code == 0
+    frusta = [call[2] for call in viser.of("add_camera_frustum")]
+    assert frusta[0]["fov"] == pytest.approx(2 * np.arctan(24 / 60))
+    np.testing.assert_allclose(frusta[0]["wxyz"], (1, 0, 0, 0))
+    assert viser.of("sleep_forever")
+
+
+def test_show_without_a_viewer_says_what_to_install(geodiff, quick, monkeypatch):
+    found = importlib.util.find_spec
+    hidden = ("rerun", "viser")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n in hidden else found(n, *a))
+    answer = geodiff(*quick, "--show", "auto")
+    assert answer.code == 2 and "pip install rerun-sdk or viser" in answer.err
+
+
+# Videos
+
+
+@pytest.fixture
+def maps(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    paths = []
+    for number in range(3):
+        path = tmp_path / f"{number}.npy"
+        np.save(path, np.linspace(1 + number, 4 + number, 48 * 64, dtype=np.float32).reshape(48, 64))
+        paths.append(path)
+    return paths
+
+
+@pytest.mark.parametrize("name", ["depth.webp", "depth.gif"])
+def test_video_without_any_codec(geodiff, maps, name):
+    answer = geodiff("video", *maps, "--out", name, "--fps", 4)
+    assert answer.code == 0 and "3 frames, 0.8 s" in answer.out, answer.err
+    with Image.open(name) as video:
+        video.load()
+        assert video.n_frames == 3 and video.info["duration"] == 250
+        frames = []
+        for index in range(3):
+            video.seek(index)
+            frames.append(np.asarray(video.convert("RGB")).astype(int))
+    assert np.abs(frames[0] - frames[2]).mean() > 10  # one range: later frames are farther
+
+
+def test_video_as_mp4(geodiff, maps):
+    cv2 = pytest.importorskip("cv2")
+    assert geodiff("video", *maps, "--out", "depth.mp4").code == 0
+    video = cv2.VideoCapture("depth.mp4")
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3 and video.get(cv2.CAP_PROP_FPS) == 10
+    assert video.read()[0]
+
+
+def test_video_of_results_with_photographs(geodiff, quick, pair_files):
+    for name in ("a", "b"):
+        assert geodiff(*quick, "-q", "--out", name).code == 0
+    assert geodiff("video", "a", "b", "--photographs", "--out", "both.webp").code == 0
+    assert geodiff("video", "a", "b", "--out", "depth.webp").code == 0
+    with Image.open("both.webp") as both, Image.open("depth.webp") as depth:
+        assert both.width > 1.5 * depth.width
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["0.npy", "--out", "depth.avi"], "ends in .mp4, .webp, .gif"),
+        (["0.npy", "nothing.npy"], "nothing.npy, which does not exist"),
+        (["0.npy", "other.npy"], "all of one shape"),
+        (["0.npy", "--near", "3", "--far", "2"], "near < far"),
+        (["0.npy", "--fps", "0"], "fps must be between"),
+        (["integers.npy"], "of floats in metres"),
+    ],
+)
+def test_video_bad_input(geodiff, maps, arguments, said):
+    np.save("other.npy", np.ones((4, 4), np.float32))
+    np.save("integers.npy", np.ones((4, 4), np.int32))
+    answer = geodiff("video", *arguments)
+    assert answer.code == 2 and said in answer.err

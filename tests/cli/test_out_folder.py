@@ -1,0 +1,249 @@
+"""``--out`` is tried before the work, held during it, and no finished result is lost."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from geodiff_plugin.cli.arguments import OUTPUT_FILES
+from geodiff_plugin.formats import out_folder
+from geodiff_plugin.formats.out_folder import LOCK, PARTIAL, OutFolder, free_folder
+
+
+def fill(folder: Path) -> str:
+    (folder / "depth.npy").write_text("new")
+    (folder / "report.json").write_text("{}")
+    return "filled"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_new_folder_appears_whole(tmp_path):
+    out = tmp_path / "deep" / "er" / "out"
+
+    def watched(folder):
+        assert not out.exists()
+        return fill(folder)
+
+    with OutFolder(out) as held:
+        assert held.write(watched) == "filled" and held.path == out and held.elsewhere is None
+    assert [path.name for path in sorted(tmp_path.rglob("*"))] == [
+        "deep",
+        "er",
+        "out",
+        "depth.npy",
+        "report.json",
+    ]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_nothing_half_written(tmp_path, error):
+    def broken(folder):
+        (folder / "depth.npy").write_text("x")
+        raise error
+
+    with pytest.raises(error), OutFolder(tmp_path / "deep" / "out") as held:
+        held.write(broken)
+    assert names(tmp_path) == []
+
+
+def test_own_files_are_replaced_and_others_stay(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    for name in OUTPUT_FILES:
+        (tmp_path / name).write_text("old")
+
+    def watched(folder):
+        assert (tmp_path / "depth.npy").read_text() == "old"
+        return fill(folder)
+
+    with OutFolder(tmp_path, OUTPUT_FILES, overwrite=True) as held:
+        held.write(watched)
+    assert names(tmp_path) == ["depth.npy", "notes.txt", "report.json"]
+    assert (tmp_path / "depth.npy").read_text() == "new"
+
+
+def test_the_unfinished_files_lie_inside_a_folder_that_exists(tmp_path):
+    """So that a mounted folder, or a link to another disk, is no border between them."""
+    disk, link = tmp_path / "disk", tmp_path / "link"
+    disk.mkdir()
+    link.symlink_to(disk)
+
+    def watched(folder):
+        assert folder.parent == disk.resolve()
+        return fill(folder)
+
+    with OutFolder(link) as held:
+        held.write(watched)
+    assert names(disk) == ["depth.npy", "report.json"] and link.is_symlink()
+
+
+def test_a_border_of_file_systems_is_crossed_by_a_copy(tmp_path, monkeypatch):
+    real = os.replace
+
+    def replace(source, target):
+        if PARTIAL in str(Path(source).parent):
+            raise OSError(errno.EXDEV, "Invalid cross-device link")
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    with OutFolder(tmp_path) as held:
+        held.write(fill)
+    assert names(tmp_path) == ["depth.npy", "report.json"]
+    out = tmp_path / "new"
+    monkeypatch.setattr(os, "rename", lambda *_: replace(f"{PARTIAL}/x", None))
+    with OutFolder(out) as held:
+        held.write(fill)
+    assert names(out) == ["depth.npy", "report.json"]
+
+
+def refused(path: Path, **options) -> str:
+    with pytest.raises(ValueError, match="--out must be") as caught, OutFolder(path, **options):
+        pass
+    return str(caught.value)
+
+
+def test_what_cannot_be_a_folder_is_refused_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "nothing")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "x").write_text("")
+    before = names(tmp_path)
+    assert "the file" in refused(tmp_path / "file")
+    assert "below a file" in refused(tmp_path / "file" / "out")
+    assert "nothing, which does not exist" in refused(tmp_path / "link")
+    assert "name too long" in refused(tmp_path / ("x" * 300))
+    assert "name too long" in refused(tmp_path / ("x" * 250))  # only its hidden neighbour has too long a name
+    assert "--overwrite" in refused(tmp_path / "full")
+    assert names(tmp_path) == before
+
+
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EROFS, errno.ENOSPC])
+def test_a_folder_that_takes_no_file_is_refused_before_the_work(tmp_path, monkeypatch, code):
+    """By the first byte: whether a folder is read-only or a disk full shows no sooner to everybody."""
+
+    def no_file(*_, **__):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(out_folder, "open", no_file, raising=False)
+    assert os.strerror(code) in refused(tmp_path / "out")
+    assert names(tmp_path) == []
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_read_only_parent(tmp_path):
+    tmp_path.chmod(0o500)
+    assert "ermission" in refused(tmp_path / "out")
+
+
+def test_a_second_run_is_refused(tmp_path):
+    out = tmp_path / "out"
+    with OutFolder(out) as held:
+        assert f"process {os.getpid()}" in refused(out)
+        assert f"process {os.getpid()}" in refused(tmp_path / "." / "out")
+        assert free_folder(out) == tmp_path / "out-2"
+        out.mkdir()  # somebody makes it meanwhile
+        assert f"process {os.getpid()}" in refused(out)
+        held.write(fill)
+    assert names(out) == ["depth.npy", "report.json"] and names(tmp_path) == ["out"]
+    with OutFolder(out, overwrite=True):
+        assert f"process {os.getpid()}" in refused(out, overwrite=True)
+    with OutFolder(out, resume=True):
+        assert f"process {os.getpid()}" in refused(out, resume=True)
+    assert names(out) == ["depth.npy", "report.json"]
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_what_a_killed_run_left_is_recognised_and_cleared(tmp_path, exists, capsys):
+    out = tmp_path / "out"
+    if exists:
+        out.mkdir()
+    code = (
+        "import os, sys\nfrom pathlib import Path\nfrom geodiff_plugin.formats.out_folder import OutFolder\n"
+        "def fill(folder):\n"
+        "    (folder / 'depth.npy').write_text('half')\n"
+        f"    os.kill(os.getpid(), {int(signal.SIGKILL)})\n"
+        "with OutFolder(Path(sys.argv[1])) as held:\n    held.write(fill)\n"
+    )
+    killed = subprocess.run([sys.executable, "-c", code, str(out)])
+    assert killed.returncode == -signal.SIGKILL
+    left = names(out if exists else tmp_path)
+    assert len(left) == 2 and any(LOCK in name for name in left) and any(PARTIAL in name for name in left)
+    assert free_folder(out) == out
+    with OutFolder(out) as held:
+        assert "killed" in capsys.readouterr().err
+        held.write(fill)
+    assert names(tmp_path) == ["out"] and names(out) == ["depth.npy", "report.json"]
+
+
+def test_a_result_that_does_not_fit_is_written_elsewhere(tmp_path, monkeypatch):
+    elsewhere, out = tmp_path / "elsewhere", tmp_path / "disk" / "out"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+
+    def full(folder):
+        (folder / "depth.npy").write_text("half")
+        if folder.is_relative_to(tmp_path / "disk"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return fill(folder)
+
+    with OutFolder(out) as held:
+        assert held.write(full) == "filled"
+    assert "No space left" in held.elsewhere and str(held.path) in held.elsewhere
+    assert held.path.parent == elsewhere and names(held.path) == ["depth.npy", "report.json"]
+    assert not (tmp_path / "disk").exists()
+
+
+def test_a_folder_that_vanishes_meanwhile_is_made_again_or_replaced(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with OutFolder(tmp_path / "deep" / "out") as held:
+        for path in (tmp_path / "deep").iterdir():
+            path.unlink()
+        (tmp_path / "deep").rmdir()
+        held.write(fill)
+    assert names(held.path) == ["depth.npy", "report.json"]
+
+
+def test_a_result_that_fits_nowhere(tmp_path, monkeypatch, capsys):
+    """On a terminal it is kept until there is room; else one sentence, since nobody is there to make any."""
+    tries = []
+
+    def full(folder):
+        tries.append(folder)
+        if len(tries) < 5:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return fill(folder)
+
+    with (
+        pytest.raises(OSError, match="out could not be written .No space left"),
+        OutFolder(tmp_path / "out") as held,
+    ):
+        held.write(full)
+    assert names(tmp_path) == []
+    tries.clear()
+    monkeypatch.setattr(out_folder, "RETRY_S", 0.0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    with OutFolder(tmp_path / "out") as held:
+        held.write(full)
+    assert "Trying again" in capsys.readouterr().err
+    assert names(tmp_path / "out") == ["depth.npy", "report.json"]
+
+
+def test_a_run_that_names_no_folder_takes_the_next_free_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    default = Path("geodiff-out")
+    assert free_folder(default) == default
+    default.mkdir()
+    assert free_folder(default) == default  # empty
+    (default / "x").write_text("")
+    assert free_folder(default) == Path("geodiff-out-2")
+    Path("geodiff-out-2").write_text("a file")
+    Path("geodiff-out-3").symlink_to("nothing")
+    assert free_folder(default) == Path("geodiff-out-4")

@@ -1,0 +1,171 @@
+"""The ComfyUI nodes, imported beside a stub of the host and run along the workflow that ships with them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from geodiff_plugin import Rig
+
+PACK = Path(__file__).resolve().parents[2] / "examples" / "comfyui"
+WORKFLOW = json.loads((PACK / "workflow.json").read_text())
+#: What the host's own nodes of the workflow take and give.
+HOST_OUTPUTS = {"LoadImage": ("IMAGE", "MASK"), "PreviewImage": (), "Preview3D": ()}
+
+
+class Interrupted(Exception):
+    pass
+
+
+@pytest.fixture
+def host(monkeypatch, tmp_path):
+    """Stubs of ``folder_paths`` and ``comfy``, as far as nodes use them."""
+    state = types.SimpleNamespace(bars=[], interrupt=False, folder=tmp_path)
+    folders = types.ModuleType("folder_paths")
+    folders.get_input_directory = lambda: str(tmp_path)
+    folders.get_output_directory = lambda: str(tmp_path / "output")
+
+    def save_path(prefix, output):
+        folder = Path(output) / Path(prefix).parent
+        folder.mkdir(parents=True, exist_ok=True)
+        return (
+            str(folder),
+            Path(prefix).name,
+            1 + len(list(folder.iterdir())),
+            str(Path(prefix).parent),
+            prefix,
+        )
+
+    folders.get_save_image_path = save_path
+
+    class ProgressBar:
+        def __init__(self, total):
+            self.total, self.done = total, 0
+            state.bars.append(self)
+
+        def update(self, count):
+            self.done += count
+
+    def throw():
+        if state.interrupt:
+            raise Interrupted
+
+    comfy, utils, management = (
+        types.ModuleType(n) for n in ("comfy", "comfy.utils", "comfy.model_management")
+    )
+    utils.ProgressBar, management.get_torch_device = ProgressBar, lambda: torch.device("cpu")
+    management.throw_exception_if_processing_interrupted = throw
+    comfy.utils, comfy.model_management = utils, management
+    for module in (folders, comfy, utils, management):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    return state
+
+
+@pytest.fixture
+def pack(host, monkeypatch):
+    """The node pack, imported as the host imports it: a folder of any name."""
+    spec = importlib.util.spec_from_file_location(
+        "custom_nodes_geodiff", PACK / "__init__.py", submodule_search_locations=[str(PACK)]
+    )
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    yield module
+    sys.modules.pop("custom_nodes_geodiff.nodes", None)
+
+
+@pytest.fixture
+def pair(textured_plane, host):
+    """Images as the host hands them over, and a calibration in its input folder."""
+    numbers = " ".join(f"{value:g}" for value in textured_plane.K.ravel())
+    (host.folder / "K.txt").write_text(f"{numbers}\n0.12\n")
+    left, right = (
+        torch.from_numpy(image)[None].float() / 255 for image in (textured_plane.left, textured_plane.right)
+    )
+    return left, right
+
+
+@pytest.fixture
+def prior(make_pipeline, tmp_path):
+    make_pipeline().save_pretrained(tmp_path / "prior")
+    return str(tmp_path / "prior")
+
+
+def widgets(node: type) -> dict:
+    """Inputs of a node that are typed in, in the order of the workflow's values."""
+    types_ = node.INPUT_TYPES()
+    every = types_["required"] | types_.get("optional", {})
+    return {
+        name: kind
+        for name, kind in every.items()
+        if isinstance(kind[0], list) or kind[0] in ("STRING", "INT", "FLOAT")
+    }
+
+
+def test_every_node_says_what_the_host_asks(pack):
+    assert set(pack.NODE_CLASS_MAPPINGS) == set(pack.NODE_DISPLAY_NAME_MAPPINGS)
+    for node in pack.NODE_CLASS_MAPPINGS.values():
+        assert callable(getattr(node, node.FUNCTION)) and node.CATEGORY
+        assert len(node.RETURN_TYPES) == len(node.RETURN_NAMES)
+        assert "required" in node.INPUT_TYPES()
+
+
+def test_the_workflow_fits_the_nodes(pack):
+    nodes = {node["id"]: node for node in WORKFLOW["nodes"]}
+    for _, source, slot, target, into, kind in WORKFLOW["links"]:
+        assert nodes[source]["outputs"][slot]["type"] == nodes[target]["inputs"][into]["type"] == kind
+    for node in nodes.values():
+        if node["type"] in HOST_OUTPUTS:
+            assert tuple(output["type"] for output in node["outputs"]) == HOST_OUTPUTS[node["type"]]
+            continue
+        made = pack.NODE_CLASS_MAPPINGS[node["type"]]
+        assert tuple(output["type"] for output in node["outputs"]) == made.RETURN_TYPES
+        known = made.INPUT_TYPES()
+        every = known["required"] | known.get("optional", {})
+        assert all(every[given["name"]][0] == given["type"] for given in node["inputs"])
+        fields = list(widgets(made))
+        # The host adds a field behind every seed: what becomes of it after a run.
+        assert len(node["widgets_values"]) == len(fields) + ("seed" in fields)
+
+
+def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plane):
+    classes = pack.NODE_CLASS_MAPPINGS
+    left, right = pair
+    with torch.inference_mode():  # as the host does
+        (rig,) = classes["GeoDiffCalibration"]().read("K.txt", image=left)
+        assert isinstance(rig, Rig) and rig.E[0, 3] == pytest.approx(0.12)
+        depth, coloured, near_is_white, confidence = classes["GeoDiffDepth"]().estimate(
+            left.repeat(2, 1, 1, 1), right.repeat(2, 1, 1, 1), rig, prior, 2, 1, "default", 2**64 - 1
+        )
+    size = textured_plane.depth_m.shape
+    assert depth["depth_m"].shape == (2, *size) and (depth["depth_m"] > 0).all()
+    assert coloured.shape == near_is_white.shape == (2, *size, 3) and coloured.dtype == torch.float32
+    assert confidence.shape == (2, *size) and 0 <= confidence.min() and confidence.max() <= 1
+    assert near_is_white.min() == 0 and near_is_white.max() == 1
+    nearest = np.unravel_index(depth["depth_m"][0].argmin(), size)
+    assert near_is_white[0][nearest].min() == 1
+    assert host.bars[0].done > 0
+    for kind, magic in (("glb", b"glTF"), ("ply", b"ply\n")):
+        answer = classes["GeoDiffPointCloud"]().write(depth, 0.0, kind, "geodiff/cloud")
+        assert (host.folder / "output" / answer["result"][0]).read_bytes()[:4] == magic
+        assert answer["ui"]["3d"][0]["subfolder"] == "geodiff"
+
+
+def test_numbers_make_a_rig(pack):
+    (rig,) = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"]().read("", 700.0, 320.0, 240.0, 0.12)
+    assert rig.E[0, 3] == pytest.approx(0.12) and rig.K_left[0, 0] == 700
+
+
+def test_the_host_can_interrupt(pack, pair, prior, host):
+    host.interrupt = True
+    node = pack.NODE_CLASS_MAPPINGS["GeoDiffDepth"]()
+    (rig,) = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"]().read("K.txt")
+    with pytest.raises(Interrupted):
+        node.estimate(*pair, rig, prior, 2, 1, "default", 0)

@@ -1,0 +1,38 @@
+"""Guided calls of a prior in float16."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+
+
+@pytest.mark.parametrize("gradient", ["denoised", "full"])
+@pytest.mark.parametrize("count", [1, 20])
+def test_a_handful_of_known_points_is_enough(make_pipeline, textured_plane, count, gradient):
+    """The loss is a mean over so few pixels that each one's share is thousands of times an image's."""
+    pair, points = textured_plane, np.zeros((48, 64), np.float32)
+    at = np.random.default_rng(0).choice(48 * 64, count, replace=False)
+    points.flat[at] = pair.depth_m.flat[at]
+    results = []
+    for dtype in (torch.float16, torch.float32):
+        pipe = enable_geometry_guidance(make_pipeline().to(dtype))
+        guidance = GeometryGuidance.from_points(
+            points, pair.K, gradient=gradient, inner_steps=3, correct=False, updates_from=0.0
+        )
+        call = {"generator": torch.Generator().manual_seed(0), "num_inference_steps": 2}
+        results.append(pipe(pair.left, guidance=guidance, **call).prediction)
+    assert np.isfinite(results[0]).all()
+    assert np.median(np.abs(results[0] / results[1] - 1)) < 0.1
+
+
+def test_an_overflow_of_the_decoder_names_step_tensor_and_cure(make_pipeline, textured_plane):
+    pipe = enable_geometry_guidance(make_pipeline().to(torch.float16))
+    pipe.vae.decoder.conv_out.weight.data.fill_(6e4)
+    guidance = GeometryGuidance(
+        textured_plane.right, textured_plane.K, textured_plane.E, inner_steps=1, loss_resolution=64
+    )
+    with pytest.raises(ValueError, match=r"decoded map of denoising step 1 .* float16.*bfloat16"):
+        pipe(textured_plane.left, guidance=guidance)

@@ -1,0 +1,93 @@
+"""The Space's app, started as the Space starts it and asked through gradio's own client."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.conftest import plane_pair
+
+SPACE = Path(__file__).resolve().parents[2] / "examples" / "space"
+STARTS_S = 600
+
+
+@pytest.fixture
+def address(tmp_path):
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    environment = os.environ | {
+        "GRADIO_SERVER_PORT": str(port),
+        "GRADIO_TEMP_DIR": str(tmp_path / "gradio"),
+        "TMPDIR": str(tmp_path),
+    }
+    log = (tmp_path / "log.txt").open("w")
+    process = subprocess.Popen(
+        [sys.executable, "app.py"], cwd=SPACE, env=environment, stdout=log, stderr=subprocess.STDOUT
+    )
+    try:
+        url, end = f"http://127.0.0.1:{port}/", time.monotonic() + STARTS_S
+        while True:
+            assert process.poll() is None and time.monotonic() < end, (tmp_path / "log.txt").read_text()
+            try:
+                urllib.request.urlopen(url, timeout=5).close()
+                break
+            except OSError:
+                time.sleep(0.3)
+        yield url
+    finally:
+        process.kill()  # it keeps nothing that a kinder end would save
+        process.wait()
+        log.close()
+
+
+def test_card_has_what_a_space_needs():
+    yaml = pytest.importorskip("yaml")
+    _, head, text = (SPACE / "README.md").read_text().split("---", 2)
+    card = yaml.safe_load(head)
+    assert card["sdk"] == "gradio" and (SPACE / card["app_file"]).exists() and text.strip()
+    pinned = next(
+        line
+        for line in (SPACE.parents[1] / "constraints.txt").read_text().splitlines()
+        if line.startswith("gradio==")
+    )
+    assert pinned == f"gradio=={card['sdk_version']}"
+    assert len(card["short_description"]) <= 60
+
+
+@pytest.mark.filterwarnings("ignore")  # the client's own
+def test_it_answers_the_client(address, tmp_path):
+    client_module = pytest.importorskip("gradio_client")
+    pair = plane_pair(size=(96, 128), focal=120.0)
+    Image.fromarray(pair.left).save(tmp_path / "left.png")
+    Image.fromarray(pair.right).save(tmp_path / "right.png")
+    numbers = " ".join(f"{value:g}" for value in pair.K.ravel())
+    (tmp_path / "K.txt").write_text(f"{numbers}\n0.12\n")
+    client = client_module.Client(address, verbose=False, download_files=str(tmp_path / "home"))
+    asked = client.view_api(return_format="dict")["named_endpoints"]["/estimate"]["parameters"]
+    by_label = {entry["label"]: entry["parameter_name"] for entry in asked}
+    given = {entry["parameter_name"]: None for entry in asked if not entry["parameter_has_default"]}
+    given |= {
+        by_label["Left photograph"]: client_module.handle_file(str(tmp_path / "left.png")),
+        by_label["Right photograph"]: client_module.handle_file(str(tmp_path / "right.png")),
+        by_label["Calibration file"]: client_module.handle_file(str(tmp_path / "K.txt")),
+    }
+    answer = client.predict(**given, api_name="/estimate")
+    client.close()
+    status = answer[0]
+    assert "median depth" in str(status)
+    files = next(
+        entry for entry in answer if isinstance(entry, list) and any("depth.npy" in str(e) for e in entry)
+    )
+    depth_m = np.load(next(path for path in files if str(path).endswith("depth.npy")))
+    assert np.median(np.abs(depth_m - pair.depth_m) / pair.depth_m) < 0.1

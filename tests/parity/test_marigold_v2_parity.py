@@ -1,0 +1,121 @@
+"""Marigold V2: ``geodiff convert`` and our pipeline against the authors' own step on the same weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from diffusers import AutoencoderKLQwenImage, QwenImageTransformer2DModel
+from diffusers.models.autoencoders import vae as vae_module
+from safetensors.torch import save_file
+
+from geodiff_plugin.cli.convert import run_convert
+from geodiff_plugin.priors import find_prior
+from tests.parity import marigold_v2_reference as reference
+
+FIXTURE = Path(__file__).parent / "fixtures" / "marigold_v2.npz"
+TOLERANCE = {"rtol": 0, "atol": 1e-4}
+SPACES = {"Log": "log", "Uniform": "depth", "Disparity": "disparity"}
+
+
+@pytest.fixture(scope="module")
+def theirs():
+    with np.load(FIXTURE) as file:
+        return dict(file)
+
+
+@pytest.fixture(scope="module")
+def downloads(tmp_path_factory):
+    """Base, checkpoints and prompts, laid out as the authors' download lays them out."""
+    folder = tmp_path_factory.mktemp("assets")
+    transformer = QwenImageTransformer2DModel(**reference.TRANSFORMER)
+    vae = AutoencoderKLQwenImage(**reference.VAE)
+    transformer.load_state_dict(reference.base_state(transformer, "transformer."))
+    vae.load_state_dict(reference.base_state(vae, "vae."))
+    transformer.save_pretrained(folder / "base" / "transformer")
+    vae.save_pretrained(folder / "base" / "vae")
+    for name in reference.CHECKPOINTS:
+        own = folder / "Marigold-V2" / "depth" / name
+        own.mkdir(parents=True)
+        save_file(reference.trainables(name, transformer, vae), own / "trainables.safetensors")
+    prompts = folder / "Marigold-V2" / "qwen_text_embeddings"
+    prompts.mkdir()
+    for part, value in zip(("embeds", "mask"), reference.prompts(), strict=True):
+        torch.save(value, prompts / f"{reference.PREFIX}_prompt_{part}.pt")
+    return folder
+
+
+def converted(downloads, name, dtype=torch.float32, **options):
+    """By the command, then by ``find_prior``."""
+    target = downloads / f"converted-{name}-{options.get('lora', 'merged')}"
+    if not target.exists():
+        checkpoint = downloads / "Marigold-V2" / "depth" / name
+        run_convert([Path("marigold-v2"), downloads / "base", checkpoint, target], None, **options)
+    found = find_prior(target)
+    assert found.key == "marigold-v2" and found.licence == "apache-2.0"
+    pipe = found.load(dtype=dtype)
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
+@torch.no_grad()
+def compare(pipe, theirs, label, **tolerance):
+    image = reference.picture().to(pipe.dtype)
+    told = pipe.prepare_condition(image, 1, 1, None)
+    np.testing.assert_allclose(
+        reference.keep_latent(told["image_latent"][0]), theirs[f"{label}/image_latent"], **tolerance
+    )
+    call = {"processing_resolution": 0, "output_type": "pt", "output_latent": True}
+    out = pipe(reference.picture() / 2 + 0.5, **call)
+    np.testing.assert_allclose(reference.keep_latent(out.latent[0]), theirs[f"{label}/z0"], **tolerance)
+    unclipped = 2 * pipe.decode_relative(out.latent) - 1  # theirs is about [-1, 1], ours about [0, 1]
+    np.testing.assert_allclose(reference.keep(unclipped[0, 0]), theirs[f"{label}/unclipped"], **tolerance)
+    final = 2 * out.prediction.float() - 1
+    np.testing.assert_allclose(reference.keep(final[0, 0]), theirs[f"{label}/final"], **tolerance)
+    return final
+
+
+@pytest.mark.parametrize("name", reference.CHECKPOINTS)
+def test_every_checkpoint_equals_the_authors(name, downloads, theirs, monkeypatch):
+    pipe = converted(downloads, name)
+    assert pipe.config.prediction_type == SPACES[name.split("-")[0]]
+    pipe.register_to_config(sample_latent=True)  # as their inference draws it
+    monkeypatch.setattr(
+        vae_module, "randn_tensor", lambda shape, **_: reference.posterior(tuple(shape)), raising=True
+    )
+    compare(pipe, theirs, name, **TOLERANCE)
+
+
+def test_the_mode_equals_theirs(downloads, theirs):
+    compare(converted(downloads, "Log-stage2"), theirs, "mode", **TOLERANCE)
+
+
+def test_the_checkpoints_differ(theirs):
+    finals = [theirs[f"{name}/final"] for name in reference.CHECKPOINTS]
+    assert min(np.abs(a - b).max() for i, a in enumerate(finals) for b in finals[:i]) > 0.05
+    assert any(
+        np.abs(theirs[f"{n}/final"] - theirs[f"{n}/unclipped"]).max() > 0.05 for n in reference.CHECKPOINTS
+    )
+
+
+def test_bfloat16_behaves(downloads, theirs):
+    exact = compare(converted(downloads, "Log-stage2"), theirs, "mode", **TOLERANCE)
+    pipe = converted(downloads, "Log-stage2", torch.bfloat16)
+    out = pipe(reference.picture() / 2 + 0.5, processing_resolution=0, output_type="pt")
+    final = 2 * out.prediction.float() - 1
+    spread = theirs["mode/final"].std()
+    own = (final - exact).abs()[0, 0, ::5, ::5].numpy()
+    authors = np.abs(theirs["bfloat16/final"] - theirs["mode/final"])
+    assert own.mean() < 1.5 * authors.mean() and own.mean() < 0.05 * spread
+    pipe.set_timesteps(1, torch.device("cpu"))
+    told = (pipe.scheduler.timesteps[0] / 1000).to(torch.bfloat16)
+    assert told == 0.5 == torch.full((), 499.0, dtype=torch.bfloat16) / 1000  # as theirs comes out
+
+
+def test_a_lora_kept_apart_gives_the_same(downloads, theirs):
+    pytest.importorskip("peft", reason="peft is an extra")
+    pipe = converted(downloads, "Log-stage2", lora="apart")
+    assert pipe.config.lora == "apart"
+    compare(pipe, theirs, "mode", **TOLERANCE)

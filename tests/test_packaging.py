@@ -1,0 +1,80 @@
+"""What a user of the wheel gets: light imports, the prior, the pair, types; no tools of the maintainers."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = ("torch", "diffusers", "transformers", "scipy")
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import geodiff_plugin",
+        "import geodiff_plugin.cli.app",
+        "from geodiff_plugin.cli.app import main\ntry:\n    main(['eval', 'pairs', '--help'])\n"
+        "except SystemExit:\n    pass",
+    ],
+)
+def test_start_is_light(code: str) -> None:
+    code += f"\nimport sys\nassert not set({HEAVY!r}) & set(sys.modules), set({HEAVY!r}) & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_constraints_pin_what_types_are_checked_with() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "optional-dependencies"
+    ]
+    pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    for requirement in extras["dev"]:
+        name = requirement.split(">=")[0]
+        assert name == "geodiff-plugin[test]" or any(line.startswith(f"{name}==") for line in pinned)
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel of this checkout, unpacked as an installer would."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = (
+        folder / "source"
+    )  # a copy, since setuptools would take what an earlier build left in the checkout
+    shutil.copytree(ROOT / "geodiff_plugin", source / "geodiff_plugin")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--wheel-dir", str(folder), str(source)]
+    subprocess.run(command, check=True, capture_output=True)
+    (wheel,) = folder.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "site")
+    return folder / "site"
+
+
+@pytest.mark.slow
+def test_wheel_holds_what_users_need_and_no_more(unpacked: Path) -> None:
+    package = unpacked / "geodiff_plugin"
+    for name in (
+        "py.typed",
+        "bundled/prior/unet/diffusion_pytorch_model.safetensors",
+        "bundled/pair/left.png",
+    ):
+        assert (package / name).is_file()
+    assert not (package / "development").exists() and not (unpacked / "tests").exists()
+
+
+@pytest.mark.slow
+def test_demo_of_the_wheel_runs_offline_outside_the_checkout(unpacked: Path, tmp_path: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": str(unpacked), "HF_HUB_OFFLINE": "1"}
+    command = [sys.executable, "-m", "geodiff_plugin", "demo", "--quiet"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "geodiff-demo" / "depth.npy").stat().st_size > 0 and "guided" in done.stdout

@@ -1,0 +1,73 @@
+"""Refitting what is promised: known coefficients come back, signs hold, and the other half judges."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geodiff_plugin.evaluation.calibrate import Observed, calibrate, main
+from geodiff_plugin.evaluation.logistic import deciles, fit_log_odds, promised
+
+TRUE = (-0.5, 1.2, -0.7)
+
+
+def _pair(seed: int, count: int = 4000) -> Observed:
+    rng = np.random.default_rng(seed)
+    evidence = np.column_stack([np.ones(count), 2.0 * rng.normal(size=count), rng.exponential(size=count)])
+    return Observed(evidence, rng.uniform(size=count) < promised(evidence, TRUE))
+
+
+def test_known_coefficients_come_back_whatever_the_half():
+    coefficients, halves, _ = calibrate([_pair(i) for i in range(10)], (0, 1, -1))
+    np.testing.assert_allclose(coefficients, TRUE, atol=0.06)
+    for half in halves:
+        np.testing.assert_allclose(half, TRUE, atol=0.09)
+
+
+def test_weights_count_as_repetitions():
+    pair, other = _pair(0), _pair(1, 500)
+    evidence, right = (
+        np.concatenate([pair.evidence, other.evidence]),
+        np.concatenate([pair.right, other.right]),
+    )
+    weights = np.concatenate([np.ones(4000), np.full(500, 3.0)])
+    repeated = np.repeat(np.arange(4500), weights.astype(int))
+    weighted = fit_log_odds(evidence, right, weights, (0, 0, 0))
+    counted = fit_log_odds(evidence[repeated], right[repeated], np.ones(len(repeated)), (0, 0, 0))
+    np.testing.assert_allclose(weighted, counted, atol=1e-3)
+
+
+def test_a_sign_holds_against_the_data():
+    pair = _pair(0)
+    found = fit_log_odds(pair.evidence, pair.right, np.ones(len(pair.right)), (0, 1, 1))
+    assert found[2] == 0.0 and found[1] > 1.0
+
+
+def test_the_half_that_was_not_fitted_on_judges():
+    """Every second pair lies: each half promises what the other does not keep."""
+    honest = [_pair(i) for i in range(6)]
+    lying = [Observed(p.evidence, ~p.right) if i % 2 else p for i, p in enumerate(honest)]
+
+    def gap(pairs):
+        return max(
+            abs(d.promised - d.kept) for d in deciles(*calibrate(pairs, (0, 0, 0))[2]) if d.share > 0.02
+        )
+
+    assert gap(honest) < 0.05 and gap(lying) > 0.5
+
+
+def test_deciles_of_a_promise_that_is_kept_by_half():
+    found = deciles(np.array([0.05, 0.95, 0.95, 1.0]), np.array([0, 1, 0, 1]), np.array([1.0, 1.0, 1.0, 2.0]))
+    assert [round(d.share, 2) for d in found] == [0.2, 0.8]
+    assert found[1].kept == pytest.approx(0.75) and found[1].promised == pytest.approx(0.975)
+
+
+def test_the_command_prints_constants_that_can_be_pasted(capsys):
+    main(data=["synthetic:2@160x120"], resolution=64)
+    printed, names = capsys.readouterr().out, {}
+    for line in printed.splitlines():
+        if line.startswith(("LOG_ODDS", "BY_EVIDENCE")):
+            exec(line, names)  # as pasted
+    assert len(names["LOG_ODDS"]) == 4 and len(names["BY_EVIDENCE"]) == 6
+    assert names["BY_EVIDENCE"][-1] == -15.0  # one member has no spread: the shipped number stays
+    assert "largest gap between promised and kept" in printed

@@ -1,0 +1,68 @@
+"""What ``geodiff eval trust`` makes wrong, counts and prints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.evaluation import trust
+from geodiff_plugin.evaluation.baselines import Settings
+from geodiff_plugin.evaluation.datasets import find_pairs, load
+from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, cases_of
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory):
+    return [load(ref) for ref in find_pairs("synthetic:2@64x48", None)]
+
+
+def test_every_kind_changes_what_it_says(samples):
+    sample, other = samples
+    cases = {case.kind: case for case in cases_of(sample, other, (*WRONG, *WRONG_POINTS))}
+    assert set(cases) == {"right", "right, points", *WRONG, *WRONG_POINTS}
+    for kind in WRONG:
+        made = cases[kind].sample
+        same = all(
+            np.array_equal(getattr(made, name), getattr(sample, name))
+            for name in ("left", "right", "K_left", "K_right", "E")
+        )
+        assert not same, kind
+        assert cases[kind].truth == np.array_equal(made.left, sample.left)
+    assert cases["millimetres"].sample.E[0, 3] == pytest.approx(1000 * sample.E[0, 3])
+    assert cases["K-2"].sample.K_left[0, 0] == pytest.approx(2 * sample.K_left[0, 0])
+    assert cases["K-2"].sample.K_left[0, 2] == sample.K_left[0, 2]
+    np.testing.assert_allclose(cases["inverse"].sample.E @ sample.E, np.eye(4), atol=1e-12)
+    points = cases["right, points"].points
+    uv = points @ sample.K_left.T / points[:, 2:]
+    column, row = np.rint(uv[0, :2]).astype(int)
+    assert points[0, 2] == pytest.approx(sample.depth_m[row, column], rel=1e-6)
+    np.testing.assert_allclose(cases["points-3"].points, 3 * points)
+
+
+def test_counts_and_resumption(tmp_path, monkeypatch, capsys):
+    """Caught are all but the rectified pair's K; one right pair is doubted."""
+    asked = []
+
+    def measure(case, pipe, settings):
+        asked.append(case.kind)
+        missed = case.kind == "K-2" and case.sample.rectified
+        doubted = case.kind == "right" and not case.sample.rectified
+        bad = doubted or (case.kind != "right" and not missed)
+        return {
+            "status": "not trusted" if bad else "trusted",
+            "said": [],
+            "off": 0.01 if case.kind == "right" else 0.5,
+        }
+
+    monkeypatch.setattr(trust, "_measure", measure)
+    monkeypatch.setattr(trust.PriorCache, "get", lambda *_: None)
+    options = trust.TrustOptions(None, 2, 64, ("swapped", "K-2"), None, Settings("bundled"), tmp_path, True)
+    trust.run_trust(options)
+    assert len(asked) == 6
+    trust.run_trust(options)
+    assert len(asked) == 6 and capsys.readouterr().out == ""
+    page = (tmp_path / "trust.md").read_text()
+    assert "3 of 4 (75 %)" in page and "1 of 2 (50 %)" in page and "2 of 2 (100 %)" in page
+    with pytest.raises(InputError, match="--kinds must be some of swapped"):
+        trust.run_trust(trust.TrustOptions(None, 1, 64, ("bent",), None, Settings("bundled"), tmp_path, True))

@@ -1,0 +1,220 @@
+"""Readers of the calibrations of rigs that people own: directions, units, resolutions, lenses, names."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin import GeometryGuidance
+from geodiff_plugin.formats import read_calibration
+from tests.contracts import factory_calibrations as factory
+
+
+@pytest.fixture
+def reading(tmp_path):
+    """``reading(text, ..., **choice)`` writes the texts to files and reads them."""
+
+    def read(*texts: str, **choice):
+        paths = [tmp_path / f"file{number}" for number in range(len(texts))]
+        for path, text in zip(paths, texts, strict=True):
+            path.write_text(text)
+        return read_calibration(paths[0] if len(paths) == 1 else paths, **choice)
+
+    return read
+
+
+# ZED
+
+
+@pytest.mark.parametrize(("size", "focal"), [((2208, 1242), 1400), ((1280, 720), 700)])
+def test_zed_takes_the_section_of_the_image(reading, size, focal):
+    rig = reading(factory.ZED, image_size=size)
+    assert rig.K_left[0, 0] == focal and rig.size_left == size
+
+
+@pytest.mark.parametrize("choice", [{}, {"image_size": (2560, 720)}])
+def test_zed_without_a_fitting_image_lists_its_resolutions(reading, choice):
+    with pytest.raises(ValueError, match="2208x1242, 1280x720"):
+        reading(factory.ZED, **choice)
+
+
+def test_zed_rotation_and_offsets_point_from_left_to_right(reading):
+    text = factory.ZED.replace("TY=0", "TY=0.5").replace("TZ=0", "TZ=-2").replace("CV_HD=0", "CV_HD=0.01")
+    rig = reading(text, image_size=(1280, 720))
+    R = Rotation.from_rotvec([0, 0.01, 0]).as_matrix()
+    np.testing.assert_allclose(rig.E[:3, :3], R.T, atol=1e-12)
+    np.testing.assert_allclose(rig.E[:3, 3], R.T @ [0.12, 0.0005, -0.002], atol=1e-12)
+
+
+def test_zed_lens_is_named_by_side(reading):
+    with pytest.raises(ValueError, match="Lens distortion of the left camera .* Undistort"):
+        reading(factory.ZED.replace("k1=0", "k1=-0.17", 3), image_size=(1280, 720))
+
+
+# RealSense
+
+
+def test_realsense_prints_many_resolutions(reading):
+    other = factory.REALSENSE_PRINTED.replace("640x480", "1280x720").replace("640", "1280")
+    text = other.replace("480", "720").replace("700", "1100") + factory.REALSENSE_PRINTED
+    assert reading(text, image_size=(1280, 720)).K_right[1, 1] == 1100
+    assert reading(text, image_size=(640, 480)).K_right[1, 1] == 700
+    with pytest.raises(ValueError, match="640x480, 1280x720"):
+        reading(text)
+
+
+def test_realsense_json_rotation_is_column_by_column(reading):
+    data = json.loads(factory.REALSENSE_JSON)
+    R = Rotation.from_rotvec([0.01, -0.02, 0.03]).as_matrix()
+    data["extrinsics"]["infra1_to_infra2"]["rotation"] = R.T.ravel().tolist()
+    rig = reading(json.dumps(data))
+    np.testing.assert_allclose(rig.T_right_from_left[:3, :3], R, atol=1e-9)
+
+
+def test_realsense_json_the_other_way_round_is_inverted(reading):
+    data = json.loads(factory.REALSENSE_JSON)
+    data["extrinsics"] = {"right_to_left": {**factory.RS2_EXTRINSICS, "translation": [0.12, 0, 0]}}
+    assert reading(json.dumps(data)).E[0, 3] == pytest.approx(0.12)
+
+
+def test_realsense_json_without_extrinsics(reading):
+    data = json.loads(factory.REALSENSE_JSON)
+    del data["extrinsics"]
+    with pytest.raises(ValueError, match="their extrinsics; got 2 and 0"):
+        reading(json.dumps(data))
+
+
+# OAK-D
+
+
+def test_oak_scales_to_the_image_and_refuses_a_crop(reading):
+    rig = reading(factory.OAK, image_size=(640, 400))
+    assert rig.size_left == (640, 400)
+    assert rig.K_left[0].tolist() == [350, 0, pytest.approx((640 + 0.5) / 2 - 0.5)]
+    with pytest.raises(ValueError, match="1280x800 pixels.*crop"):
+        reading(factory.OAK, image_size=(1280, 720))
+
+
+def test_oak_rectified_images_have_the_right_cameras_intrinsics(reading):
+    data = copy.deepcopy(factory.OAK_DATA)
+    dict(data["cameraData"])[2]["intrinsicMatrix"][0][0] = 712.5
+    rig = reading(json.dumps(data))
+    assert rig.K_left[0, 0] == rig.K_right[0, 0] == 712.5
+
+
+def test_oak_without_rectification_needs_images_without_a_lens(reading):
+    data = copy.deepcopy(factory.OAK_DATA)
+    data["stereoRectificationData"]["rectifiedRotationLeft"] = []
+    with pytest.raises(ValueError, match="Lens distortion of the left camera"):
+        reading(json.dumps(data))
+
+
+def test_oak_other_sockets_go_along_the_links(reading):
+    data = copy.deepcopy(factory.OAK_DATA)
+    for _, camera in data["cameraData"]:
+        camera["distortionCoeff"] = [0.0] * 14
+    # 1 -> 2 is -0.12 m in x, 2 -> 0 is +0.04: socket 0 stands 0.08 m to the right of socket 1.
+    assert reading(json.dumps(data), cameras=(1, 0)).E[0, 3] == pytest.approx(0.08)
+    assert reading(json.dumps(data), cameras=(0, 1)).E[0, 3] == pytest.approx(-0.08)
+    with pytest.raises(ValueError, match=r"sockets of .* \(0, 1, 2\)"):
+        reading(json.dumps(data), cameras=(1, 5))
+
+
+# ROS, Kalibr
+
+
+def test_ros_needs_both_files_and_a_baseline(reading):
+    with pytest.raises(ValueError, match="two files"):
+        reading(factory.ROS_RIGHT)
+    with pytest.raises(ValueError, match="single cameras"):
+        reading(factory.ROS_LEFT, factory.ROS_LEFT)
+
+
+def test_ros_swapped_files_put_the_camera_on_the_other_side(reading):
+    assert reading(factory.ROS_RIGHT, factory.ROS_LEFT).E[0, 3] == pytest.approx(-0.12)
+
+
+def test_kalibr_chain_of_three(reading):
+    third = factory.KALIBR[factory.KALIBR.index("cam1:") :].replace("cam1:", "cam2:")
+    rig = reading(factory.KALIBR + third.replace("-0.12", "-0.3"), cameras=(0, 2))
+    assert rig.E[0, 3] == pytest.approx(0.42)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("distortion_coeffs: [0.0", "distortion_coeffs: [-0.28", "Lens distortion of the left camera"),
+        ("camera_model: pinhole", "camera_model: omni", "camera_model of cam0.*pinhole.*omni"),
+        ("cam1:", "cam3:", "'cam1'"),
+        ("intrinsics: [700.0", "intrinsics: [.nan", "intrinsics of cam0"),
+    ],
+)
+def test_kalibr_bad_entries_are_named(reading, old, new, said):
+    with pytest.raises(ValueError, match=said):
+        reading(factory.KALIBR.replace(old, new))
+
+
+# COLMAP
+
+
+def test_colmap_pixel_centres_and_size(reading):
+    rig = reading(factory.COLMAP_IMAGES, factory.COLMAP_CAMERAS, **factory.COLMAP_CHOICE)  # in any order
+    assert rig.K_left[:2, 2].tolist() == [300, 200] and rig.size_left == (640, 480)
+
+
+def test_colmap_without_a_measured_distance_warns_and_keeps_its_unit(reading):
+    with pytest.warns(UserWarning, match="has no unit.*--baseline"):
+        rig = reading(
+            factory.COLMAP_CAMERAS,
+            factory.COLMAP_IMAGES,
+            image_names=("/home/x/rig/left.jpg", "rig/right.jpg"),
+        )
+    assert rig.E[0, 3] == pytest.approx(0.5)
+
+
+def test_colmap_rotation_is_world_to_camera(reading):
+    q = Rotation.from_rotvec([0.1, 0.2, -0.3]).as_quat()
+    turned = "3 {3} {0} {1} {2} -0.25 1 -2 1 rig/right.jpg".format(*q)
+    text = factory.COLMAP_IMAGES.replace("3 1 0 0 0 -0.25 1 -2 1 rig/right.jpg", turned)
+    rig = reading(factory.COLMAP_CAMERAS, text, image_names=("rig/left.jpg", "rig/right.jpg"), baseline_m=1)
+    np.testing.assert_allclose(
+        rig.T_right_from_left[:3, :3], Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix()
+    )
+
+
+def test_colmap_unknown_image_and_lens(reading):
+    with pytest.raises(ValueError, match=r"one of the 3 in .*rig/left.jpg.*elsewhere.jpg"):
+        reading(factory.COLMAP_CAMERAS, factory.COLMAP_IMAGES, image_names=("elsewhere.jpg", "rig/right.jpg"))
+    radial = factory.COLMAP_CAMERAS.replace(
+        "PINHOLE 640 480 700 700 300.5 200.5", "SIMPLE_RADIAL 640 480 700 300.5 200.5 -0.1"
+    )
+    with pytest.raises(ValueError, match="Lens distortion"):
+        reading(radial, factory.COLMAP_IMAGES, **factory.COLMAP_CHOICE)
+
+
+def test_colmap_folder(tmp_path):
+    (tmp_path / "images.bin").write_bytes(b"\0")
+    with pytest.raises(IsADirectoryError, match="model_converter"):
+        read_calibration(tmp_path)
+    (tmp_path / "cameras.txt").write_text(factory.COLMAP_CAMERAS)
+    (tmp_path / "images.txt").write_text(factory.COLMAP_IMAGES)
+    assert read_calibration(tmp_path, **factory.COLMAP_CHOICE).E[0, 3] == pytest.approx(0.12)
+
+
+# The doors
+
+
+def test_a_measured_distance_replaces_that_of_any_file(reading):
+    assert reading(factory.KALIBR, baseline_m=0.24).E[0, 3] == pytest.approx(0.24)
+    with pytest.raises(ValueError, match="baseline_m"):
+        reading(factory.KALIBR, baseline_m=-1.0)
+
+
+def test_from_calibration_knows_the_resolution_by_the_image(tmp_path):
+    (tmp_path / "SN1.conf").write_text(factory.ZED)
+    guidance = GeometryGuidance.from_calibration(np.zeros((720, 1280, 3)), tmp_path / "SN1.conf")
+    assert guidance.rigs[0].K_left[0, 0] == 700

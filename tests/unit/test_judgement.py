@@ -1,0 +1,163 @@
+"""What is wrong is named; what is right is left in peace."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.runtime.judgement import agreement_of_points, judge
+from geodiff_plugin.runtime.signs import Signs
+from geodiff_plugin.scale.order import order_agreement
+from geodiff_plugin.synthetic import render_pair
+
+GOOD = Signs(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0)
+
+
+def test_a_good_run_is_trusted_in_silence():
+    judgement = judge(GOOD)
+    assert judgement.trusted and not judgement.reasons and not judgement.remarks and judgement.sentence == ""
+    assert judge(Signs()).trusted  # nothing is known, as of a search without matches
+
+
+@pytest.mark.parametrize(
+    ("signs", "words"),
+    [
+        ({"same": True}, "same picture"),
+        ({"flat": True, "spread": 0.01, "order": 0.05}, "shifted copy"),
+        ({"inverse_fits": True}, "swapped"),
+        ({"order": -0.57}, "swapped"),
+        ({"order": 0.05, "matched": 0.45}, "hardly agree"),
+        ({"confidence": 0.25}, "Likely causes"),
+        ({"matched": 0.05}, "5 % of the left image is matched"),
+        ({"confidence": 0.4, "matched": 0.25}, "Likely causes"),
+        ({"confidence": 0.4, "order": 0.3}, "Likely causes"),
+        ({"points_ratio": 0.256, "points": 99}, "read as millimetres: give the points' scale as 256"),
+        ({"points_ratio": 1000.0, "points": 99}, "millimetres taken for metres"),
+        ({"points_ratio": 0.001, "points": 99}, "scale as 1"),
+        ({"points_ratio": 3.0, "points": 99}, "3 times as far"),
+        ({"points": 1, "matched": math.nan, "confidence": math.nan}, "One known depth does not fix"),
+    ],
+)
+def test_reasons(signs, words):
+    judgement = judge(replace(GOOD, **signs))
+    assert not judgement.trusted
+    assert words in judgement.sentence and judgement.sentence.startswith("Do not trust this depth: ")
+
+
+@pytest.mark.parametrize(
+    ("signs", "words"),
+    [
+        ({"baseline_m": 120.0}, "millimetres"),
+        ({"baseline_m": 0.00012}, "0.12 mm"),
+        ({"view_deg": 5.0}, "5 degrees"),
+        ({"points_ratio": 1.15, "points": 99}, "1.15 times as far"),
+        ({"points": 1}, "Only 1 known depth lie"),
+        ({"epipolar_px": 4.2}, "4.2 px beside"),
+        ({"on_edge": True, "at_end": 0.2}, "ended on the edge"),
+    ],
+)
+def test_remarks(signs, words):
+    judgement = judge(replace(GOOD, **signs))
+    assert judgement.trusted and any(words in remark for remark in judgement.remarks)
+
+
+def test_the_edge_of_the_search_only_where_it_matters():
+    assert judge(replace(GOOD, on_edge=True)).remarks == ()  # a street's sky
+    assert "edge" in judge(replace(GOOD, on_edge=True, matched=0.05)).remarks[0]
+
+
+def test_a_poor_prior_is_no_fault_of_good_matches():
+    assert judge(replace(GOOD, order=0.0, spread=0.1)).trusted  # a scene that is nearly flat
+    assert judge(replace(GOOD, order=0.1, matched=0.95)).trusted
+
+
+def test_confidence_falls_with_disagreement():
+    factors = [agreement_of_points(replace(GOOD, points_ratio=r)) for r in (1.0, 1.05, 1.12, 1.2, 3.0, 1 / 3)]
+    assert factors[:2] == [1.0, 1.0] and factors[3:] == pytest.approx([0.25] * 3)
+    assert 0.25 < factors[2] < 1.0 and agreement_of_points(GOOD) == 1.0
+
+
+def test_rank_correlation(textured_plane):
+    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E)
+    left = torch.from_numpy(textured_plane.left).permute(2, 0, 1)[None].float() / 255
+    (evidence,) = guidance.prepare(left)
+    depth = torch.from_numpy(textured_plane.depth_m)[None, None]
+    assert float(order_agreement(depth, evidence.matches, "depth")) > 0.9
+    assert float(order_agreement(1 / depth, evidence.matches, "disparity")) > 0.9
+    assert float(order_agreement(-depth, evidence.matches, "depth")) < -0.9
+    nothing = replace(evidence.matches, confidence=torch.zeros_like(evidence.matches.confidence))
+    assert order_agreement(depth, nothing, "depth").isnan().all()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A rendered, rectified pair, and its inverse relative depth, as an oracle prior has it."""
+    pair = render_pair(0, size=(96, 128), posed=False)
+    left, right = (
+        np.rint(v.image_01.permute(1, 2, 0).numpy() * 255).astype(np.uint8) for v in (pair.left, pair.right)
+    )
+    depth = pair.left.depth_m[0].numpy()
+    return left, right, pair.K_left.numpy(), pair.E.numpy(), depth
+
+
+@pytest.fixture
+def run(scene, make_oracle):
+    """One guided call by a prior that knows near from far; what is changed is wrong."""
+    left, right, K, E, depth = scene
+    inverse = 1.0 / depth
+    relative = (inverse - inverse.min()) / (inverse.max() - inverse.min())
+    pipe = enable_geometry_guidance(make_oracle(relative, "disparity"))
+
+    def call(left=left, right=right, K=K, E=E, strict=False, **options):
+        guidance = GeometryGuidance(right, K, E, inner_steps=0, **options)
+        return pipe(left, guidance=guidance, strict=strict)
+
+    return call
+
+
+def said(out) -> str:
+    return " ".join(out.warnings)
+
+
+def test_a_rendered_pair_right_and_wrong(run, scene):
+    left, right, _, E, _ = scene
+    good = run(strict=True)
+    assert good.judgements[0].trusted and good.warnings == []
+    for wrong in (run(left=right, right=left), run(E=np.linalg.inv(E))):
+        assert not wrong.judgements[0].trusted and "swapped" in said(wrong)
+    mirrored = run(right=np.ascontiguousarray(right[:, ::-1]))
+    assert not mirrored.judgements[0].trusted
+    assert "same picture" in said(run(right=left.copy()))
+    assert "shifted copy" in said(run(right=np.roll(left, -6, axis=1)))
+    with pytest.raises(InputError, match="Do not trust this depth"):
+        run(right=np.ascontiguousarray(right[:, ::-1]), strict=True)
+
+
+def test_units_of_the_baseline(run, scene):
+    E = scene[3]
+    for factor, words in ((1e-3, "0.* mm"), (1e3, "millimetres")):
+        scaled = E.copy()
+        scaled[:3, 3] *= factor
+        with pytest.warns(UserWarning) if factor > 1 else np.errstate():
+            out = run(E=scaled)
+        assert out.judgements[0].trusted and any("baseline is" in line for line in out.warnings), words
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(0.256, "1/256"), (1000.0, "millimetres"), (3.0, "times as far")]
+)
+def test_points_that_contradict_the_views(run, scene, factor, words):
+    depth = scene[4]
+    known = np.zeros_like(depth)
+    known[4::9, 4::9] = depth[4::9, 4::9]
+    right = run(points=known)
+    assert right.judgements[0].trusted
+    wrong = run(points=factor * known)
+    assert not wrong.judgements[0].trusted and words in said(wrong)
+    assert wrong.confidence.mean() < 0.6 * right.confidence.mean()

@@ -1,0 +1,73 @@
+"""What is known beside the prior: one object for both grids, for the step and for the output."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from geodiff_plugin.algorithm.evidence import Evidence
+from geodiff_plugin.algorithm.known import Known
+from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.matching import Matches
+
+K, FINE, COARSE = torch.eye(3), (24, 32), (12, 16)
+
+
+def matches_at(depth_m: float, size: tuple[int, int], confidence: float = 1.0) -> Matches:
+    inverse = torch.full((1, *size), 1.0 / depth_m)
+    return Matches(inverse, torch.full((1, *size), confidence), torch.tensor(0.01), K, size)
+
+
+def evidence(points: Matches | None = None, sweep_points: Matches | None = None) -> Evidence:
+    coarse, fine = matches_at(2.0, COARSE), matches_at(2.0, FINE)
+    return Evidence(torch.rand(3, *COARSE), K, (), None, coarse, fine, points, sweep_points)
+
+
+GREY = torch.full((1, 3, *COARSE), 0.5)
+
+
+def depth(metres: float, size: tuple[int, int] = COARSE) -> torch.Tensor:
+    return torch.full((1, 1, *size), metres)
+
+
+@pytest.mark.parametrize(("grid", "size"), [("loss", COARSE), ("sweep", FINE)])
+def test_each_grid_has_its_own_matches(grid, size):
+    known = Known.of([evidence(), evidence()], DEFAULT, grid)
+    assert known.matches.confidence.shape == (2, 1, *size) and known.points is None
+
+
+def test_matches_outside_of_the_gate_are_not_believed():
+    known = Known.of([evidence()], DEFAULT.changed(gate=1.5), "loss").judged(depth(2.0), GREY)
+    assert (known.believed(depth(2.5)).confidence == 1).all()
+    assert (known.believed(depth(3.1)).confidence == 0).all()
+    # Whatever grid the estimate is on.
+    assert known.believed(depth(2.5, FINE)).confidence.shape == (1, 1, *COARSE)
+
+
+def test_reflections_are_rejected_once_by_the_first_estimate():
+    known = Known.of([evidence()], DEFAULT, "loss")
+    assert known.believed(depth(2.0)) is None  # nothing is believed before the prior has spoken
+    first = known.judged(depth(0.8), GREY)  # all lie far behind it
+    assert (first.believed(depth(0.8)).confidence < 0.1).all()
+    assert first.judged(depth(2.0), GREY) is first
+    off = Known.of([evidence()], DEFAULT.changed(reject_reflections=False), "loss")
+    assert (off.judged(depth(0.8), GREY).believed(depth(0.8)).confidence == 1).all()
+
+
+def test_what_was_kept_on_one_grid_holds_on_the_other():
+    kept = torch.zeros(1, 1, *COARSE)
+    kept[..., :8] = 1.0
+    fine = Known.of([evidence()], DEFAULT, "sweep", kept).believed(depth(2.0))
+    assert (fine.confidence[..., :14] == 1).all() and (fine.confidence[..., 18:] == 0).all()
+
+
+def test_an_estimate_is_brought_to_matches_and_points():
+    points = matches_at(2.2, COARSE, confidence=0.0)
+    points.confidence[0, 6, 8] = 1.0
+    known = Known.of([evidence(points)], DEFAULT, "loss").judged(depth(2.1), GREY)
+    target = known.target(depth(2.1))
+    assert float(target.inverse_depth[0, 0, 6, 8]) == pytest.approx(1 / 2.2)
+    brought = known.bring(depth(2.1), GREY)
+    assert float(brought.depth_m.median()) == pytest.approx(2.0, rel=0.1) and (brought.support > 0.9).all()
+    nothing = Known(DEFAULT, None, None)
+    assert nothing.judged(depth(2.0), GREY) is nothing and nothing.bring(depth(2.0), GREY) is None

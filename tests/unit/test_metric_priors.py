@@ -1,0 +1,154 @@
+"""Priors that are metric by themselves: the search starts from their metres, and the run says how far off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.algorithm.evidence import prepare_evidence
+from geodiff_plugin.cli.report import summary_line
+from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.runtime.prompting import PROMPT_LONG_EDGE, prompt_of
+from geodiff_plugin.types import CameraView
+from tests.contracts.tiny_transformers import make_transformers
+
+FAST = {"inner_steps": 1, "min_steps": 1, "loss_resolution": 64}
+
+
+def knows(pipe, depth_m, factor=1.0):
+    """Let the model answer with the truth, in its own unit, times a factor."""
+    kind = type(pipe.model).__name__
+    answer = torch.from_numpy(depth_m)[None] * factor
+    told = []
+
+    def forward(pixel_values, prompt_depth=None):
+        told.append(prompt_depth)
+        fov = {}
+        if kind.startswith("DepthPro"):
+            values, fov = 1 / answer, {"field_of_view": torch.tensor([2 * np.degrees(np.arctan(0.5))])}
+        else:
+            values = answer
+        return type("Output", (), {"predicted_depth": values, **fov})()
+
+    pipe.model.forward = forward
+    return told
+
+
+def guided(pipe, pair, **knobs):
+    enable_geometry_guidance(pipe)
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, **FAST | knobs)
+    return pipe(Image.fromarray(pair.left), guidance=guidance, processing_resolution=64)
+
+
+@pytest.mark.parametrize("kind", ["zoedepth", "glpn", "tipsv2", "depth_pro"])
+def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
+    pipe = make_transformers(kind)
+    knows(pipe, textured_plane.depth_m, factor=0.5)
+    out = guided(pipe, textured_plane)
+    assert out.own_scale.shape == (1, 1)
+    assert float(out.own_scale) == pytest.approx(2.0, rel=0.05)
+    assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.05)
+
+
+def test_the_summary_names_the_factor_of_a_metric_prior_alone():
+    depth = {"min_m": 1.0, "median_m": 2.0, "max_m": 3.0, "visible_fraction": 1.0}
+    signs = {"confidence": 0.9, "matched": 0.5, "points": 0}
+    report = {"depth": depth, "seconds": {"all": 1.0}, "own_scale": [[1.2]], "unit": "m"}
+    report["judgement"] = {"trusted": True, "signs": signs}
+    assert "prior's own metres x 1.20" in summary_line(report, "out/")
+    assert "own metres" not in summary_line(report | {"own_scale": None}, "out/")
+
+
+def test_a_relative_prior_has_no_metres_to_be_off(textured_plane):
+    assert guided(make_transformers("depth_anything"), textured_plane).own_scale is None
+
+
+@pytest.mark.parametrize("kind", ["tipsv2", "depth_pro"])
+def test_the_search_starts_from_the_priors_own_metres(kind, textured_plane, monkeypatch):
+    from geodiff_plugin.algorithm import state
+
+    started = []
+    own = state.search_scale
+
+    def watched(*arguments, current=None, **options):
+        started.append(current)
+        return own(*arguments, current=current, **options)
+
+    monkeypatch.setattr(state, "search_scale", watched)
+    pipe = make_transformers(kind)
+    knows(pipe, textured_plane.depth_m)
+    out = guided(pipe, textured_plane, refine=False)
+    ends = sorted(float(v) for v in started[0])
+    assert ends[0] == pytest.approx(textured_plane.depth_m.min(), rel=0.1)
+    assert ends[1] == pytest.approx(textured_plane.depth_m.max(), rel=0.1)
+    assert float(out.own_scale) == pytest.approx(1.0, abs=0.02)
+
+
+def test_where_the_views_say_nothing_the_priors_metres_stand(textured_plane):
+    pipe = make_transformers("zoedepth")
+    knows(pipe, textured_plane.depth_m)
+    pipe = enable_geometry_guidance(pipe)
+    grey = np.full_like(textured_plane.left, 128)
+    guidance = GeometryGuidance(grey, textured_plane.K, textured_plane.E, **FAST)
+    out = pipe(Image.fromarray(grey), guidance=guidance, processing_resolution=64)
+    assert float(out.own_scale) == pytest.approx(1.0, abs=0.05)
+
+
+def evidence_of(pair, points=None, rights=True):
+    def image(x):
+        return torch.from_numpy(x).permute(2, 0, 1) / 255.0
+
+    T = torch.tensor(np.linalg.inv(pair.E)).float()
+    right = CameraView(image(pair.right), torch.tensor(pair.K).float(), T)
+    return prepare_evidence(
+        image(pair.left),
+        [right] if rights else [],
+        torch.tensor(pair.K).float(),
+        points,
+        GuidanceConfig().changed(loss_resolution=512),
+        needs_matches=rights,
+    )
+
+
+def test_matches_become_a_dense_prompt(textured_plane):
+    prompt = prompt_of([evidence_of(textured_plane)])
+    assert prompt.shape[:2] == (1, 1) and max(prompt.shape[-2:]) <= PROMPT_LONG_EDGE
+    truth = torch.from_numpy(textured_plane.depth_m)[None, None]
+    truth = torch.nn.functional.interpolate(truth, prompt.shape[-2:], mode="bilinear", antialias=True)
+    assert ((prompt - truth).abs() / truth).median() < 0.03
+
+
+def test_points_alone_become_a_prompt_and_nothing_becomes_none(textured_plane):
+    points = torch.zeros(textured_plane.depth_m.shape)
+    points[::8, ::8] = torch.from_numpy(textured_plane.depth_m)[::8, ::8]
+    prompt = prompt_of([evidence_of(textured_plane, points, rights=False)])
+    assert prompt.isfinite().all() and 0.9 < prompt.median() / np.median(textured_plane.depth_m) < 1.1
+    bare = evidence_of(textured_plane, points, rights=False)
+    assert prompt_of([bare, type(bare)(bare.left_01, bare.K_left, (), None, None, None)]) is None
+
+
+def test_prompt_depth_anything_is_given_what_is_known(textured_plane):
+    pipe = make_transformers("prompt_depth_anything")
+    told = knows(pipe, textured_plane.depth_m)
+    out = guided(pipe, textured_plane)
+    assert told[0] is not None and told[0].isfinite().all()
+    middle = float(np.median(textured_plane.depth_m))
+    assert float(told[0].median()) == pytest.approx(middle, rel=0.1)
+    assert float(out.own_scale) == pytest.approx(1.0, abs=0.05)  # its map is in metres with a prompt
+    pipe(Image.fromarray(textured_plane.left), processing_resolution=64)
+    assert told[-1] is None  # without guidance it is a relative prior
+
+
+def test_a_prompt_of_ones_own_goes_before_ours_and_only_where_it_is_taken(textured_plane):
+    pipe = make_transformers("prompt_depth_anything")
+    told = knows(pipe, textured_plane.depth_m)
+    own = torch.full((1, 1, 4, 6), 7.0)
+    pipe(Image.fromarray(textured_plane.left), processing_resolution=64, prompt_depth=own)
+    assert told[-1].mean() == pytest.approx(7.0) and told[-1].std() > 0  # not flat: it divides by its span
+    with pytest.raises(ValueError, match="prompt_depth"):
+        make_transformers("zoedepth")(
+            Image.fromarray(textured_plane.left), processing_resolution=64, prompt_depth=own
+        )

@@ -1,0 +1,182 @@
+"""Photographs without poses: cameras, poses, scale, and what cannot be had."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from geodiff_plugin import GeometryGuidance
+from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.pose.estimate import estimate_pose
+from geodiff_plugin.pose.scale import find_scale
+from geodiff_plugin.pose.tracks import Tracks
+from geodiff_plugin.synthetic import render_pair
+from tests.unit.test_pose_refine import TRUE, K, angle_deg, make_tracks, pose
+
+pytest.importorskip("poselib")
+
+
+def test_rotation_and_direction_come_back() -> None:
+    tracks, Ts, _ = make_tracks([TRUE], outliers=0.3)
+    found = estimate_pose(tracks)
+    assert angle_deg(found.T[:3, :3] @ Ts[0, :3, :3].T) < 0.3
+    assert found.T[:3, 3] @ Ts[0, :3, 3] / np.linalg.norm(Ts[0, :3, 3]) > 0.999
+    assert 0.6 < found.inliers.mean() < 0.8 and found.residual_px < 0.5 and not found.warnings
+    assert not found.rectified
+
+
+def test_a_rectified_pair_is_taken_for_one() -> None:
+    tracks, _, _ = make_tracks([pose((0, 0, 0), (0.2, 0, 0))], noise_px=0.3)
+    found = estimate_pose(tracks)
+    assert found.rectified and np.allclose(
+        found.T[:3],
+        np.eye(4)[:3] - np.eye(4)[0:3, 3:] @ [[0, 0, 0, 0]] + [[0, 0, 0, -1], [0, 0, 0, 0], [0, 0, 0, 0]],
+    )
+
+
+def test_a_camera_that_only_turned_is_refused() -> None:
+    tracks, _, _ = make_tracks([pose((1, -6, 2), (1e-5, 0, 0))])
+    with pytest.raises(ValueError, match="only turned"):
+        estimate_pose(tracks)
+
+
+def test_unrelated_photographs_are_refused() -> None:
+    tracks, _, _ = make_tracks([TRUE], outliers=1.0, seed=3)
+    tracks.right_px[0] = np.random.default_rng(0).uniform(0, 380, (len(tracks), 2))
+    with pytest.raises(ValueError, match="one scene that stands still"):
+        estimate_pose(tracks)
+    with pytest.raises(ValueError, match="at least 30 matches; got 12"):
+        estimate_pose(tracks.kept(slice(12)))
+    with pytest.raises(ValueError, match="mirror image"):
+        estimate_pose(tracks.kept(slice(12)), mirrored_matches=200)
+
+
+def test_a_plane_and_little_parallax_are_told() -> None:
+    tracks, Ts, depth_m = make_tracks([TRUE], noise_px=0.2, outliers=0.0)
+    points = tracks.rays * 4.0
+    p = (points @ Ts[0, :3, :3].T + Ts[0, :3, 3]) @ K.T
+    flat = Tracks(tracks.left_px, (p[:, :2] / p[:, 2:])[None], tracks.seen, K, tracks.K_rights)
+    assert any("one plane" in sentence for sentence in estimate_pose(flat).warnings)
+    near, _, _ = make_tracks([pose((1, -2, 0.5), (0.05, 0.01, 0))], noise_px=0.05, outliers=0.0)
+    assert any("parallax" in sentence for sentence in estimate_pose(near).warnings)
+
+
+def in_units(tracks: Tracks, T: np.ndarray) -> np.ndarray:
+    unit = T.copy()
+    unit[:3, 3] /= np.linalg.norm(T[:3, 3])
+    return unit[None]
+
+
+def test_each_known_length_gives_the_scale() -> None:
+    tracks, Ts, depth_m = make_tracks([TRUE], noise_px=0.05, outliers=0.0, count=900)
+    points = tracks.rays * depth_m[:, None]
+    true = float(np.linalg.norm(Ts[0, :3, 3]))
+    units = in_units(tracks, Ts[0])
+    assert find_scale(tracks, units, 1.0, 0.25, None, None).factor == pytest.approx(0.25)
+    by_points = find_scale(tracks, units, 1.0, None, None, points[::10])
+    assert by_points.factor == pytest.approx(true, rel=0.02) and by_points.spread < 0.02
+    flat, Tf, _ = make_tracks([TRUE], noise_px=0.0, outliers=0.0, count=900)
+    plane = flat.rays * 4.0
+    p = (plane @ Tf[0, :3, :3].T + Tf[0, :3, 3]) @ K.T
+    flat = Tracks(flat.left_px, (p[:, :2] / p[:, 2:])[None], flat.seen, K, flat.K_rights)
+    # 200 px of a plane 4 m away and parallel to the image are 200 / 500 * 4 m.
+    length = find_scale(flat, in_units(flat, Tf[0]), 1.0, None, (150, 190, 350, 190, 1.6), None)
+    assert length.factor == pytest.approx(true, rel=0.01) and length.unit == "m"
+    nothing = find_scale(tracks, units, 1.0, None, None, None)
+    assert nothing.unit is None and "no unit" in nothing.warnings[0]
+    with pytest.raises(ValueError, match="given once"):
+        find_scale(tracks, units, 1.0, 0.25, (0, 0, 1, 1, 1), None)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return render_pair(3, size=(240, 320), exposure=True, posed=True)
+
+
+def as_pil(view) -> Image.Image:
+    return Image.fromarray(np.rint(view.image_01.permute(1, 2, 0).numpy() * 255).astype(np.uint8))
+
+
+def test_photographs_become_a_guidance(pair) -> None:
+    E = pair.E.numpy()
+    baseline = float(np.linalg.norm(E[:3, 3]))
+    guidance = GeometryGuidance.from_photographs(
+        as_pil(pair.left), as_pil(pair.right), baseline_m=baseline, K=pair.K_left.numpy()
+    )
+    found = guidance.rigs[0].E
+    assert angle_deg(found[:3, :3].T @ E[:3, :3]) < 0.3
+    assert np.linalg.norm(found[:3, 3]) == pytest.approx(baseline, rel=1e-6)
+    assert found[:3, 3] @ E[:3, 3] / baseline**2 > 0.995
+    assert guidance.unit == "m" and guidance.estimated.inliers[0] > 30
+    with pytest.raises(ValueError, match="320x240"):
+        guidance.prepare(torch.rand(1, 3, 120, 160))
+
+
+def test_without_a_length_there_is_no_unit(pair) -> None:
+    fov = math.degrees(2 * math.atan(160 / float(pair.K_left[0, 0])))
+    guidance = GeometryGuidance.from_photographs(as_pil(pair.left), as_pil(pair.right), fov=fov)
+    assert guidance.unit is None and np.linalg.norm(guidance.rigs[0].E[:3, 3]) == pytest.approx(1.0)
+    assert any("no unit" in sentence for sentence in guidance.estimated.warnings)
+
+
+def test_no_intrinsics_is_an_error_with_the_cures(pair) -> None:
+    with pytest.raises(ValueError, match="field of view"):
+        GeometryGuidance.from_photographs(as_pil(pair.left), as_pil(pair.right), baseline_m=0.1)
+
+
+def with_exif(size, **tags) -> Image.Image:
+    image = Image.new("RGB", size)
+    codes = {
+        "focal": 0x920A,
+        "focal35": 0xA405,
+        "width": 0xA002,
+        "height": 0xA003,
+        "xres": 0xA20E,
+        "unit": 0xA210,
+    }
+    entries = image.getexif().get_ifd(0x8769)
+    for name, value in tags.items():
+        entries[codes[name]] = value
+    return image
+
+
+def test_focal_length_of_35_mm_equivalent() -> None:
+    found, notes = intrinsics_from_exif(with_exif((4000, 3000), focal35=26), "left")
+    assert found[0, 0] == pytest.approx(26 * 5000 / math.hypot(36, 24))
+    assert found[0, 2] == 1999.5 and "26 mm" in notes[0]
+    half, _ = intrinsics_from_exif(with_exif((2000, 1500), focal35=26, width=4000, height=3000), "left")
+    assert half[0, 0] == pytest.approx(found[0, 0] / 2)
+
+
+def test_focal_length_by_the_sensor() -> None:
+    # 4000 px on 8 mm of sensor: 500 px a mm, 12700 px an inch.
+    image = with_exif((2000, 1500), focal=5.0, xres=12700.0, unit=2, width=4000, height=3000)
+    assert intrinsics_from_exif(image, "left")[0][0, 0] == pytest.approx(5 * 500 / 2)
+
+
+def test_cropped_and_bare_photographs_are_refused() -> None:
+    with pytest.raises(ValueError, match="cropped"):
+        intrinsics_from_exif(with_exif((3000, 3000), focal35=26, width=4000, height=3000), "left")
+    with pytest.raises(ValueError, match="no focal length.*--fov"):
+        intrinsics_from_exif(with_exif((400, 300)), "left")
+
+
+def test_a_turned_file_has_turned_intrinsics(tmp_path) -> None:
+    image = Image.new("RGB", (400, 300))
+    exif = image.getexif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 30
+    image.save(tmp_path / "turned.jpg", exif=exif)
+    found, _ = intrinsics_from_exif(tmp_path / "turned.jpg", "left")
+    assert (found[0, 2], found[1, 2]) == (149.5, 199.5)
+
+
+def test_field_of_view() -> None:
+    found = intrinsics_from_fov(90.0, (640, 480))
+    assert found[0, 0] == pytest.approx(320.0) and found[1, 2] == 239.5
+    with pytest.raises(ValueError, match="fov"):
+        intrinsics_from_fov(0.1, (640, 480))

@@ -1,0 +1,267 @@
+"""Poses as given against matches: residuals, refinement, straightening, the usual mistakes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin import GeometryGuidance
+from geodiff_plugin.guidance.posing import coarse_depth, pose_views
+from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
+from geodiff_plugin.pose.noise import independent_share
+from geodiff_plugin.pose.solve import Prior, solve_poses
+from geodiff_plugin.pose.straighten import fit_displacement, straightened
+from geodiff_plugin.pose.tracks import Tracks, merge_tracks, residuals_px, solve_inverse_depth
+from geodiff_plugin.synthetic import render_pair
+from geodiff_plugin.types import CameraView
+
+K = np.array([[500.0, 0, 255.5], [0, 500.0, 191.5], [0, 0, 1]])
+SIZE = (384, 512)
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def pose(turn_deg, centre) -> np.ndarray:
+    """``E`` of a camera turned by a rotation vector in degrees, at a place."""
+    E = np.eye(4)
+    E[:3, :3] = Rotation.from_rotvec(np.radians(turn_deg)).as_matrix()
+    E[:3, 3] = centre
+    return E
+
+
+def make_tracks(
+    poses, noise_px=0.15, count=600, outliers=0.1, seed=0
+) -> tuple[Tracks, np.ndarray, np.ndarray]:
+    """Tracks of a cloud of points between 2 and 8 m, ``T_right_from_left`` of the poses, and the depths."""
+    rng = np.random.default_rng(seed)
+    left_px = rng.uniform((5, 5), (506, 378), (count, 2))
+    depth_m = rng.uniform(2.0, 8.0, count)
+    points = np.linalg.solve(K, np.c_[left_px, np.ones(count)].T) * depth_m
+    Ts = np.stack([np.linalg.inv(E) for E in poses])
+    right_px = []
+    for T in Ts:
+        p = K @ (T[:3, :3] @ points + T[:3, 3:])
+        right_px.append((p[:2] / p[2]).T + noise_px * rng.normal(size=(count, 2)))
+    right_px = np.stack(right_px)
+    wild = rng.random(count) < outliers
+    right_px[:, wild] += rng.uniform(-60, 60, (len(Ts), wild.sum(), 2))
+    seen = np.ones(right_px.shape[:2], bool)
+    return Tracks(left_px, right_px, seen, K, np.stack([K] * len(Ts))), Ts, depth_m
+
+
+def angle_deg(R: np.ndarray) -> float:
+    return float(np.degrees(np.linalg.norm(Rotation.from_matrix(R).as_rotvec())))
+
+
+TRUE = pose((1.0, -6.0, 2.0), (0.3, 0.05, -0.08))
+
+
+def test_residual_is_the_distance_from_the_epipolar_line() -> None:
+    tracks, Ts, _ = make_tracks([TRUE], noise_px=1.0, outliers=0.0)
+    R, t = Ts[0, :3, :3], Ts[0, :3, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    F = np.linalg.inv(K).T @ cross @ R @ np.linalg.inv(K)
+    lines = np.c_[tracks.left_px, np.ones(len(tracks))] @ F.T
+    places = np.c_[tracks.right_px[0], np.ones(len(tracks))]
+    distance = np.abs((lines * places).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+    assert np.allclose(residuals_px(tracks, Ts)[0], distance, atol=1e-3)
+
+
+def test_inverse_depth_of_exact_tracks() -> None:
+    tracks, Ts, depth_m = make_tracks([TRUE], noise_px=0.0, outliers=0.0)
+    assert np.allclose(1.0 / solve_inverse_depth(tracks, Ts), depth_m, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_perturbed_pose_comes_back(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tracks, Ts, depth_m = make_tracks([TRUE], seed=seed)
+    axis = rng.normal(size=3)
+    wrong = TRUE @ pose(1.2 * axis / np.linalg.norm(axis), (0, 0, 0))
+    wrong[:3, 3] += np.cross(wrong[:3, 3], rng.normal(size=3)) * 0.05  # across the baseline: its length stays
+    given = np.linalg.inv(wrong)[None]
+    prior = Prior(np.array([10.0]))
+    solved = solve_poses(tracks, given, prior, start=solve_poses(tracks, given, prior, scale_px=8.0))
+    assert angle_deg(solved[0, :3, :3] @ Ts[0, :3, :3].T) < 0.1
+    inlier = residuals_px(tracks, Ts)[0] < 1.0
+    errors = [np.abs(solve_inverse_depth(tracks, T) * depth_m - 1)[inlier] for T in (given, solved)]
+    assert np.median(errors[1]) < 0.03 < np.median(errors[0])
+
+
+def test_what_the_views_cannot_tell_stays_as_given() -> None:
+    tracks, _, _ = make_tracks([TRUE])
+    longer = TRUE.copy()
+    longer[:3, 3] *= 1.2
+    solved = solve_poses(tracks, np.linalg.inv(longer)[None], Prior(np.array([0.5])))
+    assert np.linalg.norm(np.linalg.inv(solved[0])[:3, 3]) == pytest.approx(
+        np.linalg.norm(longer[:3, 3]), rel=0.01
+    )
+
+
+def test_several_views_are_solved_together() -> None:
+    poses = [TRUE, pose((-2.0, 5.0, 0.0), (-0.3, 0.1, 0.05))]
+    tracks, Ts, _ = make_tracks(poses)
+    tracks = Tracks(
+        tracks.left_px,
+        tracks.right_px,
+        np.stack([np.arange(len(tracks)) % 3 > 0, np.arange(len(tracks)) % 3 < 2]),
+        tracks.K_left,
+        tracks.K_rights,
+    )
+    wrong = [E @ pose((0.4, -0.5, 0.3), (0, 0, 0)) for E in poses]
+    wrong[1][:3, 3] *= 1.1  # two baselines: their ratio shows in points that all views see
+    given = np.stack([np.linalg.inv(E) for E in wrong])
+    solved = solve_poses(tracks, given, Prior(np.array([6.0, 6.0])))
+    for T, T_true in zip(solved, Ts, strict=True):
+        assert angle_deg(T[:3, :3] @ T_true[:3, :3].T) < 0.1
+    lengths = [np.linalg.norm(T[:3, 3]) for T in (*solved, *Ts)]
+    assert lengths[0] / lengths[1] == pytest.approx(lengths[2] / lengths[3], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (np.linalg.inv(TRUE), "swapped"),
+        (FLIP @ TRUE @ FLIP, "OpenGL"),
+        (FLIP @ np.linalg.inv(TRUE) @ FLIP, "world-to-camera: invert"),
+        (pose((-1.0, 6.0, -2.0), TRUE[:3, 3]), "transposed"),
+    ],
+)
+def test_a_mistake_is_named(given: np.ndarray, words: str) -> None:
+    tracks, Ts, _ = make_tracks([TRUE])
+    assert words in find_mistake(tracks, np.linalg.inv(given), np.linalg.inv(given))
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.5, "half"), (2.0, "twice")])
+def test_intrinsics_of_another_size_are_named(factor: float, words: str) -> None:
+    tracks, Ts, _ = make_tracks([TRUE])
+    other = K * np.array([[factor], [factor], [1.0]])
+    tracks = Tracks(tracks.left_px, tracks.right_px, tracks.seen, other, other[None])
+    assert words in find_mistake(tracks, Ts[0], Ts[0])
+
+
+def test_right_and_inexact_poses_are_no_mistakes() -> None:
+    tracks, Ts, _ = make_tracks([TRUE])
+    inexact = np.linalg.inv(TRUE @ pose((1.0, 1.5, -1.0), (0.02, 0.02, 0)))
+    assert find_mistake(tracks, Ts[0], Ts[0]) is None
+    assert find_mistake(tracks, inexact, Ts[0]) is None
+
+
+def test_millimetres_show_in_the_size_of_the_scene_only() -> None:
+    tracks, Ts, _ = make_tracks([TRUE])
+    in_mm = Ts[0].copy()
+    in_mm[:3, 3] *= 1000
+    assert np.allclose(residuals_px(tracks, Ts), residuals_px(tracks, in_mm[None]), atol=1e-4)
+    assert "millimetres" in implausible_unit(tracks, in_mm)
+    assert implausible_unit(tracks, Ts[0]) is None
+
+
+def bent(tracks: Tracks, px: float) -> Tracks:
+    x = (tracks.right_px[0, :, 0] - 255.5) / 256
+    moved = tracks.right_px.copy()
+    moved[0, :, 1] += px * x**2
+    return Tracks(tracks.left_px, moved, tracks.seen, tracks.K_left, tracks.K_rights)
+
+
+def test_a_smooth_residual_is_straightened() -> None:
+    tracks, Ts, _ = make_tracks([pose((0, 0, 0), (0.3, 0, 0))])
+    off = bent(tracks, 2.0)
+    displacement = fit_displacement(off, Ts[0], SIZE)
+    straight = Tracks(
+        off.left_px, off.right_px + displacement.at(off.right_px[0]), off.seen, off.K_left, off.K_rights
+    )
+    before, after = (np.median(residuals_px(t, Ts)) for t in (off, straight))
+    assert after < 0.3 * before
+    assert fit_displacement(tracks, Ts[0], SIZE) is None, "there is nothing smooth in noise"
+
+
+def test_straightening_moves_pixels_where_matches_go() -> None:
+    tracks, Ts, _ = make_tracks([pose((0, 0, 0), (0.3, 0, 0))])
+    displacement = fit_displacement(bent(tracks, 2.0), Ts[0], SIZE)
+    ramp = torch.arange(SIZE[0], dtype=torch.float32).view(1, -1, 1).expand(3, *SIZE) / 1000
+    moved = straightened(ramp, displacement)
+    at = np.array([[500.0, 200.0]])
+    assert moved[0, 200, 500] * 1000 == pytest.approx(200 - displacement.at(at)[0, 1], abs=0.05)
+
+
+def test_residuals_alike_in_neighbours_count_for_less() -> None:
+    tracks, Ts, _ = make_tracks([TRUE], outliers=0.0)
+    assert independent_share(tracks, Ts[0]) > 0.5
+    assert independent_share(bent(tracks, 2.0), Ts[0]) < 0.2
+
+
+def test_merged_tracks_keep_their_views() -> None:
+    tracks, _, _ = make_tracks([TRUE, TRUE])
+    assert len(merge_tracks([tracks.kept(slice(10)), tracks.kept(slice(10, 30))])) == 30
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return render_pair(3, size=(240, 320), exposure=True, posed=True)
+
+
+def posed(pair, E):
+    T = torch.from_numpy(np.linalg.inv(E)).float()
+    rights = [(pair.right.image_01.float(), pair.K_right.float(), T)]
+    return pair.left.image_01.float(), rights, pair.K_left.float()
+
+
+def test_images_bring_a_perturbed_pose_back(pair) -> None:
+    E = pair.E.numpy()
+    wrong = E @ pose((0.8, -0.9, 0.5), (0, 0, 0))
+    found = pose_views(*posed(pair, wrong), "refine")
+    report = found.report
+    assert report.status == "refined"
+    assert report.residual_px[0] < 0.3 < 1.0 < report.residual_px_given[0]
+    assert "px off their epipolar lines" in report.warnings[0]
+    assert angle_deg(report.E[0][:3, :3].T @ E[:3, :3]) < 0.2
+    assert np.allclose(np.linalg.inv(found.rights[0][2].numpy()), report.E[0], atol=1e-5)
+    assert np.allclose(report.E_given[0], wrong, atol=1e-6)
+
+
+def test_a_pose_that_fits_is_not_touched(pair) -> None:
+    left, rights, K_left = posed(pair, pair.E.numpy())
+    found = pose_views(left, rights, K_left, "refine")
+    assert found.report.status == "fits" and not found.report.warnings
+    assert all(a is b for a, b in zip(found.rights[0], rights[0], strict=True))
+
+
+def test_a_mistaken_pose_is_named_and_kept(pair) -> None:
+    left, rights, K_left = posed(pair, np.linalg.inv(pair.E.numpy()))
+    found = pose_views(left, rights, K_left, "refine")
+    assert found.report.status == "mistaken" and "world-to-camera" in found.report.warnings[0]
+    assert found.rights[0][2] is rights[0][2]
+
+
+def test_given_poses_are_not_looked_at(pair) -> None:
+    left, rights, K_left = posed(pair, np.linalg.inv(pair.E.numpy()))
+    found = pose_views(left, rights, K_left, "given")
+    assert found.report.status == "given" and found.report.residual_px == ()
+
+
+def test_blank_images_say_that_nothing_was_checked(pair) -> None:
+    left, rights, K_left = posed(pair, pair.E.numpy())
+    rights = [CameraView(torch.full_like(rights[0][0], 0.5), *rights[0][1:])]
+    found = pose_views(torch.full_like(left, 0.5), rights, K_left, "refine")
+    assert found.report.status == "not checked" and found.rights[0] is rights[0]
+
+
+def test_a_first_depth_has_no_holes(pair) -> None:
+    depth_m = coarse_depth(*posed(pair, pair.E.numpy()))
+    assert depth_m.isfinite().all() and (depth_m > 0).all()
+
+
+def test_everything_downstream_sees_the_refined_pose(pair) -> None:
+    wrong = pair.E.numpy() @ pose((0.8, -0.9, 0.5), (0, 0, 0))
+    Ks = (pair.K_left.numpy(), pair.K_right.numpy())
+    left = pair.left.image_01.float()[None]
+    (refined,) = GeometryGuidance(pair.right.image_01, Ks, wrong).prepare(left)
+    (given,) = GeometryGuidance(pair.right.image_01, Ks, wrong, pose="given").prepare(left)
+    E = np.linalg.inv(refined.native[0][2].numpy())
+    for T in (refined.views[0][2], refined.volume.rights[0][2]):
+        assert np.allclose(np.linalg.inv(T.numpy()), E, atol=1e-6)
+    assert np.allclose(np.linalg.inv(given.native[0][2].numpy()), wrong, atol=1e-5)
+    assert refined.pose.status == "refined" and refined.warnings
+    with pytest.raises(ValueError, match="pose"):
+        GeometryGuidance(pair.right.image_01, Ks, wrong, pose="guess")
