@@ -107,21 +107,17 @@ class Known:
         matches = self.believed(depth_m)
         return matches if self.points is None else with_points(matches, self.points)
 
-    def bring(self, depth_m: Tensor, left_01: Tensor, carried: Tensor | None = None) -> Refined | None:
+    def bring(self, depth_m: Tensor, left_01: Tensor) -> Refined | None:
         """An estimate brought to what is known, edge-aware; ``None`` where nothing is.
 
         Args:
             depth_m: ``(B, 1, H, W)`` metres, at any resolution.
             left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
-            carried: field of an earlier pass that the estimate has not in it, as ``refine_depth`` takes it.
         """
         target = self.target(depth_m)
         if target is None or self.error is None:
             return None
-        fit = self.config.correction
-        if self.matches is None:  # points are sparse and right: what lies between them is theirs as well
-            fit = replace(fit, least_inertia=0.01 * fit.least_inertia, outlier_width=10.0 * fit.outlier_width)
-        return refine_depth(depth_m, target, left_01, self.error, fit, carried)
+        return refine_depth(depth_m, target, left_01, self.error, self.config.correction)
 
 
 def _resized(values: Tensor, size: tuple[int, ...]) -> Tensor:

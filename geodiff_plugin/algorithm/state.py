@@ -47,8 +47,9 @@ class Trajectory:
         history: one ``StepReport`` a step.
         watch: whether what the steps computed was finite.
         last_x: ``(B, 1, h, w)`` the relative map of the latest evaluation, no graph.
-        result: ``(B, 1, h, w)`` the corrected relative map of the latest step, which its clean latent is the
-            code of; ``None`` where something else than the correction moved that latent, or nothing did.
+        result: ``(B, 1, h, w)`` the relative map of the latest step that the output starts from: the
+            corrected one, or, of the last step, the one that the output's own refinement corrects; ``None``
+            where something else than the correction moved the latent, or nothing did.
         known: matches and points on the grid of the losses.
         matches: those of them that the latest estimate believes, or ``None``.
         hidden: ``(B, V, 1, H, W)`` bool, what the estimate hides from the right cameras, or ``None``.
@@ -86,7 +87,6 @@ class Trajectory:
         self.last_x: Tensor | None = None
         self.result: Tensor | None = None
         self.history: list[StepReport] = []
-        self._pass: tuple[Tensor, Tensor] | None = None  # log depth before the last correction, its field
         self.watch = FiniteWatch()
 
     def is_active(self, fraction: float) -> bool:
@@ -223,26 +223,12 @@ class Trajectory:
             ``(B, 1, h, w)``; ``x`` where no match or point is near.
         """
         depth_m = self.objective.metric_depth(x, self.affine)
-        carried = self._left_to_carry(depth_m)
-        brought = self.known.bring(depth_m, self.objective.views.left_01, carried)
+        brought = self.known.bring(depth_m, self.objective.views.left_01)
         if brought is None:
             return x
-        self._pass = (depth_m.log(), brought.field)
         # A factor, not a difference of maps: interpolated over an edge the latter is an error on either side.
         field = F.interpolate(brought.field, x.shape[-2:], mode="bilinear", antialias=True)
         return self.metric.relative(self.metric(x, self.affine) * torch.exp(-field), self.affine)
-
-    def _left_to_carry(self, depth_m: Tensor) -> Tensor | None:
-        """What of the last pass's field the network's new estimate has not taken up, ``(B, 1, H, W)``."""
-        if self._pass is None:
-            return None
-        log_before, field = self._pass
-        moved = log_before - depth_m.log()
-        dims = (1, 2, 3)
-        share = (moved * field).sum(dims, keepdim=True) / field.square().sum(dims, keepdim=True).clamp_min(
-            1e-12
-        )
-        return (1.0 - share.clamp(0.0, 1.0)) * field
 
     def loss(self, x: Tensor, affine: AffineState, z0: Tensor, anchor: Tensor) -> Loss:
         """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""

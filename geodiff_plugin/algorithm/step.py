@@ -65,7 +65,7 @@ def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor:
     corrects = config.correction.correct and config.updates.optimize_latents and bool(rounds)
     for _, end in rounds or at.spans[:1]:
         if corrects and at.encode is not None:
-            moved = _corrected(state, z, at)
+            moved = _corrected(state, z, at, config.correction.refine and end >= 1.0)
             anchor = moved if anchor is None else anchor + moved - z
             z = moved
         updates = state.plan.inner_steps if rounds and end > state.plan.updates_from else 0
@@ -74,11 +74,12 @@ def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor:
     return (z - leaf).detach()
 
 
-def _corrected(state: Trajectory, z0: Tensor, at: StepContext) -> Tensor:
+def _corrected(state: Trajectory, z0: Tensor, at: StepContext, refined_later: bool) -> Tensor:
     """``z0`` moved by what the correction of its map changes in the code.
 
     A difference of two codes, so that what the autoencoder loses is not lost again at every step, and a map
-    that needs no correction leaves the latent as it is.
+    that needs no correction leaves the latent as it is. The last map is given out as it is where a refinement
+    follows: brought to the matches twice it would follow their noise.
     """
     with torch.no_grad():
         x0 = at.decode(z0)
@@ -86,7 +87,7 @@ def _corrected(state: Trajectory, z0: Tensor, at: StepContext) -> Tensor:
         state.watch.note("the decoded map", at.step, x0)
         state.settle_scale(x0)
         corrected = state.corrected(x0)
-        state.result = corrected
+        state.result = x0 if refined_later else corrected
         moved = z0 if corrected is x0 else z0 + at.encode(corrected) - at.encode(x0)
         state.watch.note("the encoded correction", at.step, moved)
         return moved

@@ -63,7 +63,7 @@ has known points, so their term has none); ``parts`` is what the default has bey
 _NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
 
 NUMBERS = (
-    *("gate", "min_steps", "outlier_width", "carry_error", "stiffness_power"),
+    *("gate", "min_steps", "outlier_width", "broad_smoothness", "passes", "stiffness_power"),
     *("weights.photometric", "weights.matches", "weights.anchor", "loss_resolution"),
     *("match_noise", "correction_cauchy", "smoothness", "inertia", "image_edge", "depth_edge"),
     *("reflection_region", "reflection_spreads", "reflection_floor", "basin_cauchy", "fit_cauchy"),

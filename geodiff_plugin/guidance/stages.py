@@ -149,14 +149,14 @@ class CorrectionConfig(Checked):
         paper="-",
     )
     correction_cauchy: float = number(
-        2.0,
+        2.5,
         TINY,
         1e6,
         "residual, in standard deviations of a match, from which it counts for less",
         paper="-",
     )
     smoothness: float = number(
-        200.0,
+        50.0,
         TINY,
         1e6,
         "weight of the correction's slope against a sure match, on a grid 512 pixels long, for a prior that "
@@ -166,7 +166,7 @@ class CorrectionConfig(Checked):
     stiffness_power: float = number(
         4.0, 0, 10, "power of the prior's error that smoothness falls with", paper="-"
     )
-    loosest: float = number(0.1, TINY, 1e6, "and never below this, however wrong the prior is", paper="-")
+    loosest: float = number(0.03, TINY, 1e6, "and never below this, however wrong the prior is", paper="-")
     stiffest: float = number(2000.0, TINY, 1e6, "or above this", paper="-")
     inertia: float = number(
         0.05,
@@ -176,8 +176,20 @@ class CorrectionConfig(Checked):
         "keeps its depth; it falls with the fourth power of that error",
         paper="-",
     )
-    least_inertia: float = number(1e-3, 0, 1e6, "and is never below this,", paper="-")
+    least_inertia: float = number(5e-4, TINY, 1e6, "and is never below this,", paper="-")
     most_inertia: float = number(3.0, TINY, 1e6, "or above this", paper="-")
+    broad_smoothness: float = number(
+        100.0,
+        TINY,
+        1e6,
+        "smoothness of the first pass of a fit, if the prior's own is not above it: it brings whole regions, "
+        "with what no match is near",
+        paper="-",
+    )
+    broad_inertia: float = number(1e-4, TINY, 1e6, "least inertia of that pass", paper="-")
+    passes: int = integer(
+        3, 1, 100, "passes of a fit, in even ratios from `broad_smoothness` to the prior's own", paper="-"
+    )
     outlier_width: float = number(
         3.0,
         TINY,
@@ -194,14 +206,6 @@ class CorrectionConfig(Checked):
         paper="-",
     )
     stiff_inertia: float = number(1.3e-3, TINY, 1e6, "its inertia, as a share of it", paper="-")
-    carry_error: float = number(
-        0.1,
-        TINY,
-        1e3,
-        "error of the prior up to which a pass starts from all that the earlier ones found; above it the "
-        "share falls with the square",
-        paper="-",
-    )
     block: float = number(
         0.08,
         TINY,

@@ -25,7 +25,7 @@ __all__ = [
     "ordered",
     "refine_to_matches",
     "sure_matches",
-    "weighted_median",
+    "weighted_quantile",
 ]
 
 
@@ -165,7 +165,7 @@ def _refine_once(
     h = 1e-3 * torch.maximum(gap, 1e-2 * ends.abs().amax(1, keepdim=True))
     residual = (log_depth(v) + inverse.log()).clamp(-1.0, 1.0)
     slope = (log_depth(v + h) - log_depth(v - h)) / (2.0 * h)
-    left_over = 1.4826 * weighted_median(residual.abs(), trusted.expand_as(residual))
+    left_over = 1.4826 * weighted_quantile(residual.abs(), trusted.expand_as(residual), 0.5)
     variance = noise + left_over.clamp_min(config.fit_floor)[:, None] ** 2
     weight = trusted / (variance * (1.0 + residual**2 / (config.fit_cauchy**2 * variance)))
     J = slope[..., None] * shares
@@ -182,9 +182,9 @@ def _refine_once(
     return torch.minimum(torch.maximum(fitted, bounds[0]), bounds[1])
 
 
-def weighted_median(values: Tensor, weight: Tensor) -> Tensor:
-    """``(B,)`` of rows ``(B, P)`` with weights >= 0 of the same shape."""
+def weighted_quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
+    """``(B,)`` of rows ``(B, P)`` with weights >= 0 of the same shape; ``share`` .5 is the median."""
     values, order = values.sort(dim=1)
-    share = weight.gather(1, order).cumsum(1)
-    at = torch.searchsorted(share, 0.5 * share[:, -1:]).clamp_max(values.shape[1] - 1)
+    below = weight.gather(1, order).cumsum(1)
+    at = torch.searchsorted(below, share * below[:, -1:]).clamp_max(values.shape[1] - 1)
     return values.gather(1, at)[:, 0]

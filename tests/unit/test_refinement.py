@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from geodiff_plugin.algorithm.correction import prior_error, refine_depth
 from geodiff_plugin.algorithm.terms import MatchTarget
+from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.scale.space import SPACES, AffineState, MetricMap, inverse_softplus
 
 SIZE = (40, 60)
@@ -44,9 +47,9 @@ def test_a_correction_spreads_over_its_surface_and_stops_at_an_edge():
     refined = refine_depth(1.2 * truth, _target(truth, confidence), left, error)
     own, other = refined.depth_m[..., 10:14], refined.depth_m[..., 31:]
     assert (own / 2.0 - 1.0).abs().max() < 0.09
-    assert (other / 2.4 - 1.0).abs().max() < 0.05
-    assert refined.support[..., 10:14].min() > 0.5
-    assert refined.support[..., 31:].max() < 0.3
+    assert (other / 2.4 - 1.0).abs().max() < 0.07  # a third of what the surface beside it moved by
+    assert refined.support[..., 10:14].min() > 0.3
+    assert refined.support[..., 31:].max() < 0.1
 
 
 def test_an_outlier_among_matches_loses():
@@ -105,14 +108,17 @@ def test_matches_that_a_good_prior_contradicts_over_a_region_lose():
     assert (strong / 2.0 - 1.0).abs().max() < 0.02
 
 
-def test_a_second_pass_fits_what_the_first_left_over():
+def test_what_no_match_is_near_follows_its_region_in_the_broad_passes():
     truth = torch.full((1, 1, *SIZE), 2.0)
-    prior, target = _wavy(truth, 0.2), _target(truth, torch.ones_like(truth))
-    error = torch.full((1, 1, 1, 1), 0.1)
-    first = refine_depth(prior, target, _grey(), error)
-    second = refine_depth(prior, target, _grey(), error, carried=first.field)
-    left_over = [float((r.depth_m / truth).log().abs().mean()) for r in (first, second)]
-    assert left_over[1] < 0.8 * left_over[0]
+    confidence = torch.ones_like(truth)
+    confidence[..., 10:30, 20:40] = 0.0
+    target = _target(truth, confidence)
+    narrow = replace(DEFAULT.correction, passes=1)
+    left_over = [
+        float((refine_depth(1.5 * truth, target, _grey(), WEAK, fit).depth_m / truth).log().abs().max())
+        for fit in (narrow, DEFAULT.correction)
+    ]
+    assert left_over[1] < 0.5 * left_over[0]
 
 
 @pytest.mark.parametrize("space", sorted(SPACES))

@@ -262,7 +262,9 @@ def test_no_function_that_takes_a_camera_matrix_is_left_out():
     }
     found = set()
     for module in pkgutil.walk_packages(geodiff_plugin.__path__, "geodiff_plugin."):
-        if module.name.endswith("__main__") or (module.name.startswith("geodiff_plugin.app.") and not HAS_GRADIO):
+        if module.name.endswith("__main__") or (
+            module.name.startswith("geodiff_plugin.app.") and not HAS_GRADIO
+        ):
             continue
         for name, value in vars(importlib.import_module(module.name)).items():
             if inspect.isfunction(value) and value.__module__ == module.name:
