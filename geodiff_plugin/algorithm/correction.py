@@ -96,11 +96,13 @@ def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: CorrectionCo
 def _stiff(asked: _Asked, trusted: Tensor, error: Tensor, config: CorrectionConfig) -> Tensor:
     """The field ``(B, 1, h, w)`` that only says what matches say over wide regions."""
     stiff = torch.full_like(error, config.stiff_smoothness)
-    system, weight, field = asked.system(stiff), trusted, None
+    system, weight = asked.system(stiff), trusted
+    field: Tensor | None = None
     for _ in range(config.reweightings + 1):
         own = reweighted(system, weight, asked.wanted, config.stiff_inertia * stiff)
         field = solve_field(own, config.solver_steps, field)
         weight = trusted * _robust(field - asked.wanted, asked.noise, error, config)
+    assert field is not None  # it was solved for once at least
     return field
 
 
@@ -180,11 +182,13 @@ def refine_depth(
     for smoothness, inertia in _levels(error, config):
         # Two right-hand sides in one solve: the correction, and ones, which show where it is decided.
         data = torch.cat([asked.wanted - found, torch.ones_like(found)], 1)
-        system, part = asked.system(smoothness), None
+        system = asked.system(smoothness)
+        part: Tensor | None = None
         for _ in range(config.reweightings):
             part = solve_field(reweighted(system, weight, data, inertia), config.solver_steps, part)
             residual = part[:, :1] - data[:, :1]
             weight = trusted / (1.0 + (residual / (config.correction_cauchy * asked.noise)) ** 2)
+        assert part is not None  # reweightings >= 1
         found = found + part[:, :1]
     size = tuple(depth_m.shape[-2:])
     change, support = (

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.objective import FurtherView, Views
-from geodiff_plugin.geometry.cameras import resize_intrinsics
+from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.geometry.projection import plane_rays
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.matching import (
@@ -109,9 +109,9 @@ def prepare_evidence(
         InputError: views that do not overlap; points of which none is in the image.
     """
     left, K_loss = resize_long_edge(left_01, K_left, config.loss_resolution)
-    size, size_loss = tuple(left_01.shape[-2:]), tuple(left.shape[-2:])
-    volume, found, matches, known, sweep_known, warnings = None, None, None, None, None, []
-    warnings += [] if pose is None else pose.warnings
+    size, size_loss = image_size(left_01), image_size(left)
+    volume, found, matches, known, sweep_known = None, None, None, None, None
+    warnings: list[str] = [] if pose is None else list(pose.warnings)
     if views and (config.search.search == "volume" or needs_matches):
         # The sweep chooses its own grid, finer than that of the losses for wide images.
         sweep = config.sweep
@@ -132,8 +132,8 @@ def prepare_evidence(
             warnings.append(INVERSE)
     if points is not None:
         known, left_out = points_to_matches(points, K_left, size, K_loss, size_loss)
-        grid = (K_loss, size_loss) if found is None else (found.K, found.size)
-        sweep_known, _ = points_to_matches(points, K_left, size, *grid)
+        K_grid, size_grid = (K_loss, size_loss) if found is None else (found.K, found.size)
+        sweep_known, _ = points_to_matches(points, K_left, size, K_grid, size_grid)
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
     return Evidence(
@@ -163,15 +163,15 @@ def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tenso
 
 def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
     """Matches of the sweep's grid on that of the losses."""
-    size = (left_01.shape[-2], left_01.shape[-1])
+    size = image_size(left_01)
     if matches.size == size:
         return matches
     # Nearest centre: a mean of two inverse depths across an edge is the depth of neither surface.
-    maps = (
+    inverse_depth, confidence = (
         F.interpolate(m[None], size, mode="nearest-exact")[0]
         for m in (matches.inverse_depth, matches.confidence)
     )
-    return Matches(*maps, matches.plane_step, K_left, size)
+    return Matches(inverse_depth, confidence, matches.plane_step, K_left, size)
 
 
 def chunk_views(evidence: Sequence[Evidence], owners: Sequence[int]) -> Views:
@@ -191,7 +191,7 @@ def chunk_views(evidence: Sequence[Evidence], owners: Sequence[int]) -> Views:
     K_left = torch.stack([e.K_left for e in own])
     most = max(len(e.views) for e in own)
     further = tuple(
-        _stack([e.views[v if v < len(e.views) else 0] for e in own], K_left, tuple(left.shape[-2:]))
+        _stack([e.views[v if v < len(e.views) else 0] for e in own], K_left, image_size(left))
         for v in range(most)
     )
     return Views(left, K_left, further)
@@ -203,7 +203,7 @@ def _stack(views: Sequence[CameraView], K_left: Tensor, size_left: tuple[int, in
     width = max(view.image_01.shape[-1] for view in views)
     images, Ks = [], []
     for image, K, _ in views:
-        size = tuple(image.shape[-2:])
+        size = image_size(image)
         if size != (height, width):
             image = F.interpolate(image[None], (height, width), mode="bilinear", align_corners=False)[0]
             K = resize_intrinsics(K[None], size, (height, width))[0]

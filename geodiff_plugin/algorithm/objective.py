@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.terms import TERMS, Estimate, MatchTarget
+from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.geometry.projection import PlaneRays
 from geodiff_plugin.geometry.warping import hidden_in_right, warp_right_to_left
 from geodiff_plugin.guidance.config import TermsConfig
@@ -39,6 +40,11 @@ class FurtherView:
     T_right_from_left: Tensor
     rays: PlaneRays
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(Hr, Wr)``."""
+        return image_size(self.image_01)
+
 
 @dataclass(frozen=True)
 class Views:
@@ -57,7 +63,7 @@ class Views:
     @property
     def size(self) -> tuple[int, int]:
         """``(H, W)`` of the loss grid."""
-        return self.left_01.shape[-2], self.left_01.shape[-1]
+        return image_size(self.left_01)
 
 
 @dataclass(frozen=True)
@@ -164,9 +170,7 @@ class Objective:
         depth_m, v = self.metric_depth(x, affine), self.views
         return torch.stack(
             [
-                hidden_in_right(
-                    depth_m, v.K_left, r.K, r.T_right_from_left, tuple(r.image_01.shape[-2:]), rays=r.rays
-                )
+                hidden_in_right(depth_m, v.K_left, r.K, r.T_right_from_left, r.size, rays=r.rays)
                 for r in v.further
             ],
             1,

@@ -6,13 +6,15 @@ Paper: Algorithm 1 (plain step); S5.1 (learning rate 1e-2, no optimiser); ``adam
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-__all__ = ["RULES", "Adam", "NormMatched", "Plain"]
+__all__ = ["RULES", "Adam", "NormMatched", "Plain", "Rule"]
 
 
 def _per_sample_norm(x: Tensor) -> Tensor:
@@ -83,8 +85,15 @@ class Adam:
         return -self.rate * (first / (1 - b1**self.count)) / (corrected.sqrt() + self.eps)
 
 
+class Rule(Protocol):
+    """What the entries of ``RULES`` make of a rate."""
+
+    def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
+        """What to add, for ``gradient`` (B, ...); ``reference`` (B, ...) is there for rules that need it."""
+
+
 #: Name in the configuration -> rule. A rule is made anew for every trajectory.
-RULES = {
+RULES: dict[str, Callable[[float], Rule]] = {
     "plain": Plain,
     "adam": Adam,
     "norm": NormMatched,

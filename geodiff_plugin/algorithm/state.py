@@ -43,7 +43,6 @@ class Trajectory:
             the search starts; ``None`` for a relative one.
 
     Attributes:
-        affine: current scale, shift and g_s, ``(B,)`` each; ``None`` before the first search.
         history: one ``StepReport`` a step.
         watch: whether what the steps computed was finite.
         last_x: ``(B, 1, h, w)`` the relative map of the latest evaluation, no graph.
@@ -76,10 +75,13 @@ class Trajectory:
         self.scale_rule = RULES[updates.affine_rule](updates.step_affine)
         self.shift_rule = RULES[updates.affine_rule](updates.step_affine)
         # Of a disparity, x = 1 is the nearest end.
-        self.own_range = None if own_range is None else torch.stack(own_range).sort(0).values.unbind(0)
+        self.own_range: tuple[Tensor, Tensor] | None = None
+        if own_range is not None:
+            least, most = torch.stack(own_range).sort(0).values.unbind(0)
+            self.own_range = (least, most)
         self.own_depth: Tensor | None = None
-        self.affine: AffineState | None = None
-        self.affine_start: AffineState | None = None
+        self._affine: AffineState | None = None
+        self._start: AffineState | None = None  # what the search found, which the loss pulls towards
         self.matches: MatchTarget | None = None
         self.hidden: Tensor | None = None
         self.order: Tensor | None = None
@@ -88,6 +90,16 @@ class Trajectory:
         self.result: Tensor | None = None
         self.history: list[StepReport] = []
         self.watch = FiniteWatch()
+
+    @property
+    def affine(self) -> AffineState:
+        """Scale, shift and g_s of the latest update; ``settle_scale`` comes first."""
+        assert self._affine is not None
+        return self._affine
+
+    @affine.setter
+    def affine(self, moved: AffineState) -> None:
+        self._affine = moved
 
     def is_active(self, fraction: float) -> bool:
         """Whether steps at this fraction of the schedule, [0, 1), are updated."""
@@ -106,7 +118,7 @@ class Trajectory:
         search = self.config.search.search
         if search not in ONCE:
             self._search_volume(x)
-        elif self.affine is None:
+        elif self._affine is None:
             (self._search_one_number if search == "one-number" else self._span_points)(x)
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         self.known = self.known.judged(depth_m, self.objective.views.left_01)
@@ -134,14 +146,13 @@ class Trajectory:
             return loss.terms["photometric"].where(shown, torch.inf)
 
         best, self.on_edge = argmin_over(candidates, cost)
-        self.affine = self.affine_start = AffineState(zero, zero, best)
+        self._affine = self._start = AffineState(zero, zero, best)
 
     def _span_points(self, x: Tensor) -> None:
         """From the nearest known point to the farthest."""
-        nearest, farthest = zip(
-            *(depth_span(self.evidence[owner].points) for owner in self.owners), strict=True
-        )
-        self.affine = self.affine_start = self.metric.from_range(torch.stack(nearest), torch.stack(farthest))
+        known = [points for owner in self.owners if (points := self.evidence[owner].points) is not None]
+        nearest, farthest = zip(*map(depth_span, known), strict=True)
+        self._affine = self._start = self.metric.from_range(torch.stack(nearest), torch.stack(farthest))
         self.on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
 
     def _search_volume(self, x: Tensor) -> None:
@@ -149,17 +160,17 @@ class Trajectory:
 
         The current state, at first a metric prior's own, stays unless a better basin shows up.
         """
-        ends = self.own_range if self.affine is None else self.metric.range_of(self.affine)
+        ends = self.own_range if self._affine is None else self.metric.range_of(self._affine)
         near, far = x.new_empty(x.shape[0]), x.new_empty(x.shape[0])
         on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
         for image in sorted(set(self.owners)):
             members = [i for i, owner in enumerate(self.owners) if owner == image]
-            current = None if ends is None else tuple(v[members] for v in ends)
+            current = None if ends is None else (ends[0][members], ends[1][members])
             near[members], far[members], on_edge[members] = self._range_of_image(
                 x[members], self.evidence[image], current, members
             )
         self.on_edge = on_edge
-        self.affine = self.affine_start = self.metric.from_range(near, far)
+        self._affine = self._start = self.metric.from_range(near, far)
 
     def _range_of_image(
         self,
@@ -174,6 +185,7 @@ class Trajectory:
         """
         space, floored = self.metric.space, smooth_floor(x)
         if evidence.volume is None:
+            assert evidence.points is not None  # without views there are points
             near_far = fit_to_points(x, evidence.points, self.metric, current, self.config.fit)
             on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
         elif current is not None and evidence.sure is not None and self.on_edge is not None:
@@ -190,7 +202,7 @@ class Trajectory:
             )
             near_far, on_edge = (found.near_m, found.far_m), found.on_edge
         fit, sure = self.config.fit, evidence.sure
-        if sure is not None:
+        if sure is not None and evidence.matches is not None:
             # A poor prior's true basin is shallow in raw costs; matches tell basins apart at a prior's error.
             near_far = refine_to_matches(floored, evidence.matches, *near_far, space, fit)
             near_far = fit_to_points(x, sure, self.metric, near_far, fit)
@@ -232,8 +244,9 @@ class Trajectory:
 
     def loss(self, x: Tensor, affine: AffineState, z0: Tensor, anchor: Tensor) -> Loss:
         """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""
+        assert self._start is not None  # as in ``affine``
         return self.objective(
-            x, affine, self.affine_start, z0, anchor, self.matches, self.known.points, self.hidden
+            x, affine, self._start, z0, anchor, self.matches, self.known.points, self.hidden
         )
 
     def report(self, step: int, timestep: float, loss: Loss) -> None:

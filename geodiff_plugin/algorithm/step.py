@@ -65,7 +65,7 @@ def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor:
     corrects = config.correction.correct and config.updates.optimize_latents and bool(rounds)
     for _, end in rounds or at.spans[:1]:
         if corrects and at.encode is not None:
-            moved = _corrected(state, z, at, config.correction.refine and end >= 1.0)
+            moved = _corrected(state, z, at, at.encode, config.correction.refine and end >= 1.0)
             anchor = moved if anchor is None else anchor + moved - z
             z = moved
         updates = state.plan.inner_steps if rounds and end > state.plan.updates_from else 0
@@ -74,7 +74,13 @@ def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor:
     return (z - leaf).detach()
 
 
-def _corrected(state: Trajectory, z0: Tensor, at: StepContext, refined_later: bool) -> Tensor:
+def _corrected(
+    state: Trajectory,
+    z0: Tensor,
+    at: StepContext,
+    encode: Callable[[Tensor], Tensor],
+    refined_later: bool,
+) -> Tensor:
     """``z0`` moved by what the correction of its map changes in the code.
 
     A difference of two codes, so that what the autoencoder loses is not lost again at every step, and a map
@@ -88,7 +94,7 @@ def _corrected(state: Trajectory, z0: Tensor, at: StepContext, refined_later: bo
         state.settle_scale(x0)
         corrected = state.corrected(x0)
         state.result = x0 if refined_later else corrected
-        moved = z0 if corrected is x0 else z0 + at.encode(corrected) - at.encode(x0)
+        moved = z0 if corrected is x0 else z0 + encode(corrected) - encode(x0)
         state.watch.note("the encoded correction", at.step, moved)
         return moved
 
@@ -114,10 +120,10 @@ def _update(
             z0 = z0_hat.detach().requires_grad_(moves)
             x0 = at.decode(z0)  # (B, 1, h', w'), D(z0_hat)
             x = x0.detach().requires_grad_(moves)
+            anchor = z0.detach() if anchor is None else anchor
             if k == 0:
                 watch.note("the network's clean latent", at.step, z0)
                 watch.note("the decoded map", at.step, x)
-                anchor = z0.detach() if anchor is None else anchor
                 if updates or state.result is None:  # else the correction settled it, and nothing moved since
                     state.settle_scale(x.detach())  # g_s*, S7.3
                     state.test_visibility(x.detach())
@@ -142,4 +148,5 @@ def _update(
         if k == 0:
             first = loss
     state.last_x = x.detach()
+    assert anchor is not None  # there is one pass at least
     return z, anchor, first

@@ -149,7 +149,7 @@ def _from_photographs(views: Views, fields: CameraFields, knobs: dict[str, Any])
     K = None  # of the EXIF of the photographs
     if fields.fx is not None:
         K = _intrinsics(views, fields)
-    names = views.names if views.third is None else (*views.names, views.third_name)
+    names = views.names if views.third_name is None else (*views.names, views.third_name)
     photographs = [ImageOps.exif_transpose(Image.open(name)) for name in names]
     return GeometryGuidance.from_photographs(photographs, baseline_m=fields.baseline_m, K=K, **knobs)
 

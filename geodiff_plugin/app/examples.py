@@ -39,8 +39,8 @@ SCENES = {"table": ("tabletop", 21, 0.06), "street": ("street", 5, 0.5)}
 
 
 def _example(label: str, folder: Path, suffix: str) -> Example:
-    names = (f"left.{suffix}", f"right.{suffix}", "calib.txt")
-    return Example(label, tuple(str(folder / name) for name in names))
+    left, right = (str(folder / f"{side}.{suffix}") for side in ("left", "right"))
+    return Example(label, (left, right, str(folder / "calib.txt")))
 
 
 EXAMPLES = (

@@ -52,13 +52,14 @@ class Form:
         for name, label in NUMBERS.items():
             named[name] = _number(named[name], label)
         cameras = CameraFields(**{name: named.pop(name) or None for name in CAMERA_NAMES})
-        whole = {name: int(named.pop(name) or 0) for name in ("steps", "members", "resolution", "seed")}
-        return Request(**named, **whole, cameras=cameras)
+        for name in ("steps", "members", "resolution", "seed"):
+            named[name] = int(named[name] or 0)
+        return Request(**named, cameras=cameras)
 
 
 def _number(text: str | None, label: str) -> float | None:
     """The number of an optional field, or ``None``; a number field of gradio shows 0 where it is empty."""
-    if not (text or "").strip():
+    if text is None or not text.strip():
         return None
     try:
         return float(text.replace(",", "."))
@@ -73,7 +74,7 @@ def _optional(name: str, placeholder: str, **more: Any) -> gr.Textbox:
 
 
 def _photographs() -> dict[str, Any]:
-    found = {}
+    found: dict[str, Any] = {}
     with gr.Row():
         for name, label in (("left", "Left photograph"), ("right", "Right photograph")):
             found[name] = gr.Image(
@@ -101,7 +102,8 @@ def _photographs() -> dict[str, Any]:
 
 def _cameras() -> dict[str, Any]:
     ways = [(way.label, name) for name, way in CAMERA_WAYS.items()]
-    found = {"way": gr.Radio(ways, value=ways[0][1], label="Where the cameras are", elem_id="way")}
+    way = gr.Radio(ways, value=ways[0][1], label="Where the cameras are", elem_id="way")
+    found: dict[str, Any] = {"way": way}
     with gr.Column(visible=True) as files:
         found["calibration"] = gr.File(label="Calibration file", height=140, elem_id="calibration")
         with gr.Accordion("One file per camera (MVSNet, ROS, COLMAP)", open=False):
@@ -111,11 +113,11 @@ def _cameras() -> dict[str, Any]:
             found[name] = _optional(name, placeholder)
     found["baseline_m"] = _optional("baseline_m", "as the calibration file says")
 
-    def show(way: str) -> tuple[Any, Any]:
-        asked = CAMERA_WAYS[way].fields
+    def show(chosen: str) -> tuple[Any, Any]:
+        asked = CAMERA_WAYS[chosen].fields
         return gr.update(visible="calibration" in asked), gr.update(visible="fx" in asked)
 
-    found["way"].change(show, found["way"], [files, lens], queue=False, api_visibility="private")
+    way.change(show, way, [files, lens], queue=False, api_visibility="private")
     return found
 
 

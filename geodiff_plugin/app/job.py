@@ -128,20 +128,19 @@ class Priors:
         return self._loaded[name]
 
 
-def _photograph(path: str | None, name: str) -> tuple[np.ndarray | None, list[str]]:
-    return (None, []) if path is None else read_image(path, name)
+def _given(path: str | None, name: str) -> str:
+    if path is None:
+        bad_value(name, "given", "nothing", "Drop a picture into its field.")
+    return path
 
 
 def _views(request: Request) -> tuple[Views, list[str]]:
-    for name, path in (("left", request.left), ("right", request.right)):
-        if path is None:
-            bad_value(f"the {name} photograph", "given", "nothing", "Drop a picture into its field.")
-    read = [
-        _photograph(path, f"the {name} photograph")
-        for name, path in (("left", request.left), ("right", request.right), ("third", request.third))
-    ]
-    notes = [note for _, found in read for note in found]
-    return Views(*(image for image, _ in read), (request.left, request.right), request.third), notes
+    names = "the left photograph", "the right photograph", "the third photograph"
+    paths = _given(request.left, names[0]), _given(request.right, names[1])
+    left, notes = read_image(paths[0], names[0])
+    right, of_right = read_image(paths[1], names[1])
+    third, of_third = (None, []) if request.third is None else read_image(request.third, names[2])
+    return Views(left, right, third, paths, request.third), [*notes, *of_right, *of_third]
 
 
 def _knobs(request: Request) -> dict[str, Any]:
@@ -167,9 +166,13 @@ def _call_options(request: Request) -> dict[str, Any]:
     }
 
 
-def _map(value: Any) -> np.ndarray | None:
+def _map(value: Any) -> np.ndarray:
     """``(H, W)`` of one map of an output."""
-    return None if value is None else np.asarray(value)[0, ..., 0]
+    return np.asarray(value)[0, ..., 0]
+
+
+def _map_if_any(value: Any) -> np.ndarray | None:
+    return None if value is None else _map(value)
 
 
 def _call(pipe: Any, request: Request, views: Views, **more: Any) -> MetricDepthOutput:
@@ -192,10 +195,10 @@ def _result(
         depth_m=_map(output.prediction).astype(np.float32),
         K=np.asarray(output.K)[0].astype(np.float64),
         prior_map=prior_map,
-        confidence=_map(output.confidence),
-        uncertainty_m=_map(output.uncertainty),
-        error=_map(output.photometric_error),
-        visible=_map(output.visible),
+        confidence=_map_if_any(output.confidence),
+        uncertainty_m=_map_if_any(output.uncertainty),
+        error=_map_if_any(output.photometric_error),
+        visible=_map_if_any(output.visible),
         warnings=warnings,
         seconds=seconds,
         request=request,

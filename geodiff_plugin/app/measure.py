@@ -109,5 +109,7 @@ def distance_m(a: Reading, b: Reading) -> tuple[float, float | None]:
         return length, None
     if length == 0:
         return 0.0, float(np.hypot(a.spread, b.spread) * np.linalg.norm(a.point_m))
-    along = [float(between @ reading.point_m) / length * reading.spread for reading in (a, b)]
-    return length, float(np.hypot(*along))
+    of_a, of_b = (
+        float(between @ each.point_m) / length * spread for each, spread in ((a, a.spread), (b, b.spread))
+    )
+    return length, float(np.hypot(of_a, of_b))

@@ -10,9 +10,10 @@ import sys
 import tempfile
 import threading
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from shutil import rmtree
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 import gradio as gr
 
@@ -41,8 +42,16 @@ THEME = gr.themes.Soft(
     font=["system-ui", "sans-serif"],
     font_mono=["ui-monospace", "monospace"],
 )
+
+
+class _Handling(TypedDict):
+    queue: bool
+    show_progress: Literal["hidden"]
+    api_visibility: Literal["private"]
+
+
 #: Handlers that only the page itself calls.
-QUICK = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
+QUICK: _Handling = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
 
 
 class _Desk:
@@ -50,17 +59,17 @@ class _Desk:
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
-        self._stops: dict[str, threading.Event] = {}
+        self._stops: dict[str | None, threading.Event] = {}  # by session; a call over the API may have none
 
-    def come(self, visitor: str) -> None:
+    def come(self, visitor: str | None) -> None:
         self._stops[visitor] = threading.Event()
 
-    def leave(self, visitor: str) -> None:
+    def leave(self, visitor: str | None) -> None:
         stop = self._stops.get(visitor)
         if stop is not None:
             stop.set()
 
-    def serve(self, visitor: str, job: Any) -> Result:
+    def serve(self, visitor: str | None, job: Callable[[threading.Event], Result]) -> Result:
         stop = self._stops.setdefault(visitor, threading.Event())
         try:
             with self._turn:
@@ -119,10 +128,10 @@ def _wire_run(
             return {panels.status: look.failed(_sentence(error))}
         _forget(before)
         shown = _shown(result)
-        values = {state: shown, clicks: [], **everything(panels, shown, beside, under)}
+        found = {state: shown, clicks: [], **everything(panels, shown, beside, under)}
         if tab == CLOUD_TAB:
-            values[panels.scene], values[panels.points] = scene(shown, least)
-        return values
+            found[panels.scene], found[panels.points] = scene(shown, least)
+        return found
 
     asked = (panels.beside, panels.under, panels.least_confidence)
     outputs = [

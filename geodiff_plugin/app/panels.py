@@ -95,7 +95,7 @@ def _cloud() -> dict[str, Any]:
 
 
 def _doubt() -> dict[str, Any]:
-    found = {}
+    found: dict[str, Any] = {}
     with gr.Row():
         for name, label in (("confidence", "Confidence"), ("error", "Photometric error")):
             with gr.Column():

@@ -122,7 +122,10 @@ def marked(picture: np.ndarray, points: Sequence[tuple[tuple[int, int], Reading]
 
 
 def _label(
-    draw: ImageDraw.ImageDraw, centre: tuple[float, float], text: str, font: ImageFont.ImageFont
+    draw: ImageDraw.ImageDraw,
+    centre: tuple[float, float],
+    text: str,
+    font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
 ) -> None:
     left, top, right, bottom = draw.textbbox(centre, text, font=font, anchor="mm")
     draw.rounded_rectangle((left - 3, top - 2, right + 3, bottom + 2), radius=3, fill=(20, 20, 20))

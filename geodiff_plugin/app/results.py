@@ -53,23 +53,31 @@ class Shown:
 
     def picture(self, name: str) -> np.ndarray:
         """``(h, w, 3)`` uint8, as large as the page shows it."""
-        result = self.result
-        full = {
-            "photograph": lambda: np.rint(np.clip(result.views.left, 0, 1) * 255).astype(np.uint8),
-            "depth": lambda: in_metres(result.depth_m),
-            "prior": lambda: colour_relative(result.prior_map, result.depth_m),
-            "confidence": lambda: colour_share(result.confidence),
-            "error": lambda: colour_share(result.error, self.most_error),
-        }[name]()
+        full = self._full(name)
         if self.scale == 1:
             return full
         size = (round(full.shape[1] * self.scale), round(full.shape[0] * self.scale))
         return np.asarray(Image.fromarray(full).resize(size, Image.Resampling.LANCZOS))
 
+    def _full(self, name: str) -> np.ndarray:
+        result = self.result
+        if name == "photograph":
+            return np.rint(np.clip(result.views.left, 0, 1) * 255).astype(np.uint8)
+        if name == "depth":
+            return in_metres(result.depth_m)
+        if name == "prior" and result.prior_map is not None:
+            return colour_relative(result.prior_map, result.depth_m)
+        if name == "confidence" and result.confidence is not None:
+            return colour_share(result.confidence)
+        if name == "error" and result.error is not None:
+            return colour_share(result.error, self.most_error)
+        raise KeyError(name)
+
     @property
     def most_error(self) -> float:
         """The error at the upper end of its colours."""
-        return max(float(np.percentile(self.result.error, 99)), 1e-3)
+        error = self.result.error
+        return 1.0 if error is None else max(float(np.percentile(error, 99)), 1e-3)
 
     def reading(self, pixel: tuple[int, int]) -> Reading:
         """What the map says at a pixel of a picture on the page."""
@@ -142,7 +150,7 @@ def everything(panels: Panels, shown: Shown, beside: str, under: str) -> dict[An
     legend = legend_of_depth(result.depth_m)
     sure = "probability that a depth is within 10 % of the truth"
     differ = "difference between the photograph and the other view brought to it; dark where they agree"
-    values = {
+    values: dict[Any, Any] = {
         panels.status: look.finished(_figures(shown), result.warnings),
         panels.slider: comparison(shown, beside),
         panels.depth_legend: legend,

@@ -217,8 +217,11 @@ def _check_together(arguments: DepthArguments) -> None:
             if given:
                 cure = f"Algorithm 1 has {what}."
                 bad_value(option, "given with the default preset", "--preset paper", cure)
-    for option, given in (("--fov", arguments.fov), ("--known-length", arguments.known_length)):
-        if given is not None and not arguments.estimate_pose:
+    for option, given in (
+        ("--fov", arguments.fov is not None),
+        ("--known-length", arguments.known_length is not None),
+    ):
+        if given and not arguments.estimate_pose:
             bad_value(option, "given together with --estimate-pose", "no --estimate-pose")
     for option, given in (
         ("--points-scale", arguments.points_scale is not None),

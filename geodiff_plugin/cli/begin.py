@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments, check_arguments
@@ -68,7 +68,7 @@ def _check_photographs(arguments: DepthArguments) -> None:
         try:
             with Image.open(found):  # the head alone; the rest when it is read
                 pass
-        except (Image.UnidentifiedImageError, Image.DecompressionBombError):
+        except (UnidentifiedImageError, Image.DecompressionBombError):
             cure = "Convert it to PNG or JPEG."
             bad_value(name, "an image file", f"{found}, which is none that Pillow knows", cure)
         except (OSError, SyntaxError, ValueError, EOFError) as error:

@@ -70,7 +70,7 @@ def compare_completions(
         resolution: longer side for the prior, pixels.
         options: of the fitted LoRA.
     """
-    enable_geometry_guidance(pipe)
+    guided_pipe = enable_geometry_guidance(pipe)
     pipe.set_progress_bar_config(disable=True)
     scored = pair.valid & (points == 0)
 
@@ -81,8 +81,9 @@ def compare_completions(
 
     def guided(**knobs: Any) -> Callable[[], np.ndarray]:
         guidance = GeometryGuidance.from_points(points, pair.rig.K_left, **knobs)
-        call = {"guidance": guidance, "processing_resolution": resolution}
-        return lambda: pipe(pair.left, **call).prediction[0, ..., 0]
+        return lambda: guided_pipe(pair.left, guidance=guidance, processing_resolution=resolution).prediction[
+            0, ..., 0
+        ]
 
     passes: list[int] = []
     counter = pipe.transformer.register_forward_hook(lambda *_: passes.append(1))

@@ -176,15 +176,15 @@ def _read_further_views(
 def _make_guidance(
     arguments: DepthArguments, settings: Settings, right: np.ndarray | None, rig: Rig
 ) -> GeometryGuidance:
-    config, points = settings.config, None
+    config, points, cropped = settings.config, None, arguments.cropped
     if arguments.points is not None:
-        given = {"scale": arguments.points_scale, "calibration": arguments.points_calib}
-        points = read_points(arguments.points, "--points", **given)
-    common = {"config": config, "points": points, "cropped": arguments.cropped}
+        scale, calibration = arguments.points_scale, arguments.points_calib
+        points = read_points(arguments.points, "--points", scale=scale, calibration=calibration)
     if right is None:
-        return GeometryGuidance(None, rig.K_left, **common)
-    views = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E)]
-    return GeometryGuidance.from_views(views + _read_further_views(arguments, rig.K_left), **common)
+        return GeometryGuidance(None, rig.K_left, points=points, cropped=cropped, config=config)
+    further = _read_further_views(arguments, rig.K_left)
+    views = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E), *further]
+    return GeometryGuidance.from_views(views, points=points, cropped=cropped, config=config)
 
 
 def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:
@@ -197,10 +197,11 @@ def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:
     right = None if arguments.right is None else _read_view(arguments.right, "RIGHT")
     rig = read_rig(arguments, settings.cameras, _size(left), None if right is None else _size(right))
     lenses = lenses_of(arguments, rig.distortion)
-    left, right = (
-        image if lens is None or image is None else undistorted(image, K, lens)
-        for image, K, lens in zip((left, right), (rig.K_left, rig.K_right), lenses, strict=True)
-    )
+    of_left, of_right = lenses
+    if of_left is not None:
+        left = undistorted(left, rig.K_left, of_left)
+    if of_right is not None and right is not None:
+        right = undistorted(right, rig.K_right, of_right)
     guidance = _make_guidance(arguments, settings, right, rig)
     return Inputs(left, right, rig, guidance, any(lens is not None for lens in lenses))
 
@@ -216,8 +217,10 @@ def lenses_of(
     typed = [distortion_from_text(text) for text in arguments.distortion]
     if len(typed) > 2:
         bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
-    found = (typed[0], typed[-1]) if typed else own
-    lenses = tuple(lens if lens is not None and is_distorted(lens.coefficients) else None for lens in found)
-    if arguments.view and any(lens is not None for lens in lenses):
+    left, right = (
+        lens if lens is not None and is_distorted(lens.coefficients) else None
+        for lens in ((typed[0], typed[-1]) if typed else own)
+    )
+    if arguments.view and not (left is None and right is None):
         bad_value("--view", "left out with lens distortion", "given", "Undistort the further views first.")
-    return lenses
+    return left, right

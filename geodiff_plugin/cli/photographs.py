@@ -26,7 +26,7 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance
 __all__ = ["known_length", "read_photographs"]
 
 
-def known_length(text: str | None) -> tuple[float, ...] | None:
+def known_length(text: str | None) -> tuple[float, float, float, float, float] | None:
     """``X1,Y1,X2,Y2,METRES`` as typed.
 
     Raises:
@@ -35,13 +35,11 @@ def known_length(text: str | None) -> tuple[float, ...] | None:
     if text is None:
         return None
     try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != 5:
+        x1, y1, x2, y2, metres = (float(part) for part in text.split(","))
+    except ValueError:  # not numbers, or not five of them
         cure = "Two pixels of LEFT and the distance of the two places, such as 100,200,400,210,1.5."
         bad_value("--known-length", "X1,Y1,X2,Y2,METRES", repr(text), cure)
-    return numbers
+    return x1, y1, x2, y2, metres
 
 
 def _intrinsics(arguments: DepthArguments, path: Path, i: int, size: tuple[int, int]) -> np.ndarray:
@@ -77,7 +75,8 @@ def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
     if arguments.baseline is not None:
         check_positive(arguments.baseline, "--baseline", "metres")
     images, Ks, lenses = [], [], lenses_of(arguments)
-    for i, path in enumerate((arguments.left, arguments.right, *arguments.view)):
+    paths = [path for path in (arguments.left, arguments.right, *arguments.view) if path is not None]
+    for i, path in enumerate(paths):
         image, notes = read_image(path, ("LEFT", "RIGHT")[i] if i < 2 else f"--view {path}")
         for note in notes:
             warnings.warn(note, stacklevel=2)

@@ -36,7 +36,9 @@ class _Buffer:
     """The binary chunk while it grows, with the accessors into it."""
 
     def __init__(self) -> None:
-        self.data, self.views, self.accessors = bytearray(), [], []
+        self.data = bytearray()
+        self.views: list[dict[str, int]] = []
+        self.accessors: list[dict[str, object]] = []
 
     def add(self, array: np.ndarray, kind: str, component: int, target: int, **more: object) -> int:
         """Append an array; returns the number of its accessor."""
@@ -125,7 +127,7 @@ def write_glb(
         temporary.write_bytes(_container(scene, bytes(buffer.data)))
 
 
-def _container(scene: dict, data: bytes) -> bytes:
+def _container(scene: dict[str, object], data: bytes) -> bytes:
     """Header and chunks, each padded to 4 bytes: JSON with blanks, binary with zeros."""
     text = json.dumps(scene, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)

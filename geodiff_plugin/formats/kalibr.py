@@ -66,9 +66,9 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     path = files[0].path
     chain = parse_yaml(files[0].text, path)
     left, right = choice.cameras or (0, 1)
-    cameras = [_camera(chain, f"cam{number}", path) for number in (left, right)]
+    first, second = (_camera(chain, f"cam{number}", path) for number in (left, right))
     E = pose_from_world_to_camera(*(_from_first(chain, number, path) for number in (left, right)))
-    return rig_of_cameras(*cameras, E, str(path))
+    return rig_of_cameras(first, second, E, str(path))
 
 
 KALIBR = CalibrationFormat("Kalibr camchain.yaml (cam0, cam1)", matches, read, uses_cameras=True)

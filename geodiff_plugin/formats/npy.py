@@ -29,14 +29,13 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
     Raises:
         ValueError: numpy cannot load it, or it holds something else.
     """
+    reason: str | None = None
     try:
         value = np.load(path, allow_pickle=False)
     except Exception as error:  # a damaged head is parsed as Python, which may fail in any way
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         if "pickle" in reason:  # numpy's own words tell how to run what is in there
             reason = "pickled objects, which are never loaded"
-    else:
-        reason = None
     if reason is not None:
         bad_value(name, expected, f"{path}, which numpy cannot load ({reason})", "Save it with numpy.save.")
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":

@@ -92,14 +92,14 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     pair = (stereo.get("leftCameraSocket", LEFT), stereo.get("rightCameraSocket", RIGHT))
     pair = pair if min(pair) >= 0 else (LEFT, RIGHT)
     left, right = choice.cameras or pair
-    views = [
+    first, second = (
         scaled_to(_camera(cameras, socket, path), choice.image_size, str(path)) for socket in (left, right)
-    ]
+    )
     E = _pose(cameras, left, right, path)
     if (left, right) == pair and stereo.get("rectifiedRotationLeft"):
-        rectified = FactoryCamera(views[1].K, np.zeros(0), views[1].size)
-        views, E = [rectified] * 2, pose_to_the_right(float(np.linalg.norm(E[:3, 3])))
-    return rig_of_cameras(*views, E, str(path))
+        first = second = FactoryCamera(second.K, np.zeros(0), second.size)
+        E = pose_to_the_right(float(np.linalg.norm(E[:3, 3])))
+    return rig_of_cameras(first, second, E, str(path))
 
 
 OAK = CalibrationFormat("OAK-D calibration JSON (cameraData)", matches, read, uses_cameras=True)

@@ -34,6 +34,11 @@ def _first(entries: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray
     return next((entries[name] for name in names if name in entries), None)
 
 
+def _lens(entries: dict[str, np.ndarray], names: tuple[str, ...]) -> Distortion | None:
+    coefficients = _first(entries, names)
+    return None if coefficients is None else Distortion("opencv", coefficients.ravel())
+
+
 def _merged(files: tuple[CalibrationFile, ...]) -> dict[str, np.ndarray]:
     entries: dict[str, np.ndarray] = {}
     for file in files:
@@ -106,10 +111,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     if {"p1", "p2"} <= entries.keys():
         return make_rig(*_rectified(entries, source), source, size=_size(entries))
     rig = make_rig(*_as_taken(entries, source), source, size=_size(entries))
-    lenses = [_first(entries, names) for names in (LEFT_D, RIGHT_D)]
-    return replace(
-        rig, distortion=tuple(None if d is None else Distortion("opencv", d.ravel()) for d in lenses)
-    )
+    return replace(rig, distortion=(_lens(entries, LEFT_D), _lens(entries, RIGHT_D)))
 
 
 OPENCV = CalibrationFormat(

@@ -110,11 +110,10 @@ def _parse_json(text: str, path: Path) -> dict[str, np.ndarray]:
     entries = {}
     for key, value in content.items() if isinstance(content, dict) else ():
         if isinstance(value, dict) and value.get("type_id") == "opencv-matrix":
-            shape = [str(value.get(side, "")) for side in ("rows", "cols")]
-            data = value.get("data")
-            if not all(map(str.isdecimal, shape)) or not isinstance(data, list):
+            rows, cols, data = str(value.get("rows", "")), str(value.get("cols", "")), value.get("data")
+            if not (rows.isdecimal() and cols.isdecimal() and isinstance(data, list)):
                 bad_value(f"{key} in {path}", "a matrix with rows, cols and data", "none")
-            entries[key.lower()] = _matrix(key, *shape, " ".join(map(str, data)), path)
+            entries[key.lower()] = _matrix(key, rows, cols, " ".join(map(str, data)), path)
         elif isinstance(value, (int, float, list)) and not isinstance(value, bool):
             numbers = _numbers(str(value).strip("[]"))
             if numbers is not None:

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Collection
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -135,7 +135,8 @@ class OutFolder:
         resume: bool = False,
         option: str = "--out",
     ) -> None:
-        self.path, self.elsewhere = Path(path), None
+        self.path = Path(path)
+        self.elsewhere: str | None = None
         self._names, self._overwrite, self._resume, self._option = set(names), overwrite, resume, option
         self._made: list[Path] = []
         self._stack = ExitStack()
@@ -233,8 +234,8 @@ class OutFolder:
                 shutil.rmtree(self._staging, ignore_errors=True)
                 reason = f"{self.path} could not be written ({_reason(error)})"
             for base in (Path.cwd(), Path(tempfile.gettempdir()), Path.home()):
-                result, done = self._fill_in(base, fill)
-                if done:
+                with suppress(OSError):
+                    result = self._fill_in(base, fill)
                     self.elsewhere = f"{reason}; the result is in {self.path}."
                     return result
             if not sys.stderr.isatty():
@@ -242,18 +243,15 @@ class OutFolder:
             _say(f"geodiff: {reason}, nor any other folder; make room. Trying again in {RETRY_S:g} s.")
             time.sleep(RETRY_S)
 
-    def _fill_in(self, base: Path, fill: Callable[[Path], Result]) -> tuple[Result | None, bool]:
-        try:
-            folder = Path(tempfile.mkdtemp(prefix=f"{self._target.name[:64]}-", dir=base))
-        except OSError:
-            return None, False
+    def _fill_in(self, base: Path, fill: Callable[[Path], Result]) -> Result:
+        folder = Path(tempfile.mkdtemp(prefix=f"{self._target.name[:64]}-", dir=base))
         try:
             result = fill(folder)
         except OSError:
             shutil.rmtree(folder, ignore_errors=True)
-            return None, False
+            raise
         self.path = folder
-        return result, True
+        return result
 
     def _fill_and_move(self, fill: Callable[[Path], Result]) -> Result:
         self._staging.mkdir()

@@ -49,7 +49,7 @@ def _camera(values: dict[str, Any], where: str) -> FactoryCamera:
 
 
 def _of_size(cameras: list[FactoryCamera], choice: CameraChoice, path: Path) -> FactoryCamera:
-    sizes = sorted({camera.size for camera in cameras})
+    sizes = sorted({camera.size for camera in cameras if camera.size is not None})
     if choice.image_size is None and len(sizes) == 1:
         return cameras[0]
     fitting = [camera for camera in cameras if camera.size == choice.image_size]
@@ -114,12 +114,12 @@ def _json(file: CalibrationFile, choice: CameraChoice) -> tuple[FactoryCamera, F
             f"{len(views)} and {len(between)}",
             "Is the file cut off?",
         )
-    (where, extrinsics), T = between[0], np.eye(4)
+    (where, extrinsics), pose = between[0], np.eye(4)
     where = f"{where.strip('/') or 'extrinsics'} in {file.path}"
     rotation = array_of(entry(extrinsics, "rotation", where), (9,), f"rotation of {where}")
-    T[:3, :3] = rotation.reshape(3, 3).T  # rs2 keeps it column by column
-    T[:3, 3] = array_of(extrinsics["translation"], (3,), f"translation of {where}")
-    T = check_rigid(T, where)
+    pose[:3, :3] = rotation.reshape(3, 3).T  # rs2 keeps it column by column
+    pose[:3, 3] = array_of(extrinsics["translation"], (3,), f"translation of {where}")
+    T = check_rigid(pose, where)
     # From the left to the right one x becomes smaller; a file that says it the other way round is inverted.
     T = T if T[0, 3] <= 0 else np.linalg.inv(T)
     left, right = (_camera(values, f"{name.strip('/')} in {file.path}") for name, values in views)

@@ -93,7 +93,7 @@ def check_no_distortion(coefficients: np.ndarray | None, name: str) -> None:
     Raises:
         ValueError: a coefficient that is not zero.
     """
-    if not is_distorted(coefficients):
+    if coefficients is None or not is_distorted(coefficients):
         return
     bad_value(
         name,

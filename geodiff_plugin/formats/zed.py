@@ -53,8 +53,8 @@ def _sections(file: CalibrationFile) -> configparser.ConfigParser:
 def _number(sections: configparser.ConfigParser, section: str, key: str, path: Path) -> float:
     text = sections.get(section, key, fallback=None)
     try:
-        value = float(text)
-    except (TypeError, ValueError):
+        value = float(text or "nan")
+    except ValueError:
         value = np.nan
     if not np.isfinite(value):
         got = "none" if text is None else repr(text)

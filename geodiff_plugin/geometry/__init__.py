@@ -5,6 +5,7 @@ Paper: S3.3, S7.2.
 """
 
 from geodiff_plugin.geometry.cameras import (
+    image_size,
     invert_rigid,
     is_rectified,
     nearest_rotation,
@@ -28,6 +29,7 @@ __all__ = [
     "PlaneRays",
     "Warped",
     "hidden_in_right",
+    "image_size",
     "invert_rigid",
     "is_rectified",
     "nearest_rotation",

@@ -21,6 +21,11 @@ __all__ = [
 ANGLE_TOLERANCE, SIDEWAYS_TOLERANCE = 1e-3, 0.01
 
 
+def image_size(image: torch.Tensor) -> tuple[int, int]:
+    """``(H, W)`` of an image or a map ``(..., H, W)``."""
+    return image.shape[-2], image.shape[-1]
+
+
 def resize_intrinsics(K: torch.Tensor, size_from: tuple[int, int], size_to: tuple[int, int]) -> torch.Tensor:
     """Intrinsics after the image is resized, per axis and with the half-pixel shift.
 

@@ -74,7 +74,8 @@ class EvidenceStore:
 
     def __init__(self, size: int = 2) -> None:
         """Keep the evidence of the last ``size`` images; about 100 MB each with its cost volume."""
-        self._size, self._entries, self._spared = size, [], 0.0
+        self._size, self._spared = size, 0.0
+        self._entries: list[_Entry] = []
 
     def get(
         self,

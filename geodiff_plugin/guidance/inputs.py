@@ -121,7 +121,7 @@ def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int, cropp
     )
 
 
-def _is_nested_matrix(value: list) -> bool:
+def _is_nested_matrix(value: list[Any]) -> bool:
     """A matrix written as nested lists of numbers, as opposed to a list with one entry per image."""
     rows = bool(value) and all(isinstance(row, (list, tuple)) for row in value)
     return rows and all(isinstance(entry, (int, float)) for row in value for entry in row)
@@ -209,13 +209,15 @@ def _as_points(value: Any, name: str) -> Tensor:
         known = len(array)
     else:
         array = np.where(finite & (array > 0), array, np.float32(0))
-        known = np.count_nonzero(array)
+        known = int(np.count_nonzero(array))
     if not known:
         bad_value(name, forms + ", at least one of them known", "none: all are 0, NaN or infinite")
     return torch.from_numpy(np.ascontiguousarray(array))
 
 
-def split_views(views: Any) -> tuple[tuple[int, int] | None, tuple, tuple, tuple]:
+def split_views(
+    views: Any,
+) -> tuple[tuple[int, int] | None, tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
     """Take ``[(image, K, E), ...]`` apart, the left view first.
 
     Args:

@@ -6,7 +6,7 @@ Paper: none; it takes known cameras for granted (S3.3).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from geodiff_plugin.pose.refine import polished
 from geodiff_plugin.pose.scale import Scale, find_scale
 from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
 from geodiff_plugin.pose.views import GreyViews, grey_views, sparse_tracks
+from geodiff_plugin.types import CameraView
 
 __all__ = ["EstimatedRig", "estimate_rig"]
 
@@ -56,7 +57,7 @@ class EstimatedRig:
 
 def _cameras(
     photographs: Sequence[Any], images: Sequence[Tensor], K: Any, fov: float | None
-) -> tuple[list, list]:
+) -> tuple[list[np.ndarray], list[str]]:
     """K of every photograph, and what was assumed for it."""
     given = list(K) if isinstance(K, (tuple, list)) and np.ndim(K[0]) == 2 else [K] * len(images)
     if len(given) != len(images):
@@ -156,9 +157,11 @@ def estimate_rig(
         check_number(baseline_m, "baseline_m", 1e-6, 1e6)
     K_left = torch.as_tensor(Ks[0], dtype=torch.float32)
 
-    def posed(Ts: Sequence[np.ndarray]) -> list:
-        matrices = [torch.as_tensor(m, dtype=torch.float32) for m in (*Ks[1:], *Ts)]
-        return list(zip(images[1:], matrices[: len(Ts)], matrices[len(Ts) :], strict=True))
+    def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
+        return [
+            CameraView(image, *(torch.as_tensor(m, dtype=torch.float32) for m in matrices))
+            for image, *matrices in zip(images[1:], Ks[1:], Ts, strict=True)
+        ]
 
     nowhere = posed([np.eye(4)] * (len(images) - 1))
     tracks, poses = _tracks(grey_views(images[0], nowhere, K_left))
@@ -170,7 +173,7 @@ def estimate_rig(
             rights,
             K_left,
             lambda views: coarse_depth(images[0], views, K_left),
-            tracks.kept(tracks.seen.any(0)),
+            tracks.seen_anywhere(),
         )
     factor = tracks.K_left[0, 0] / Ks[0][0, 0]
     scale = find_scale(tracks, Ts, factor, baseline_m, known_length, points)

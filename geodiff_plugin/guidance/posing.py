@@ -7,7 +7,6 @@ Paper: none; it takes exact poses for granted (S3.3).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch.nn.functional as F
 from torch import Tensor
@@ -35,8 +34,7 @@ def pose_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, po
     """
     if pose == "given":
         return untouched(rights)
-    found = refine_views(left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left))
-    return replace(found, rights=tuple(_named(view) for view in found.rights))
+    return refine_views(left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left))
 
 
 def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> Tensor:
@@ -47,7 +45,7 @@ def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) 
         rights: with poses that fit roughly.
         K_left: ``(3, 3)`` pixels of ``left_01``.
     """
-    matches = match_volume(pilot_volume(left_01, [_named(view) for view in rights], K_left))
+    matches = match_volume(pilot_volume(left_01, rights, K_left))
     weight = matches.confidence[None] ** 2 + 1e-9
     values = matches.inverse_depth[None] * weight
     above, below = values.clone(), weight.clone()
@@ -57,8 +55,3 @@ def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) 
         below += share * F.avg_pool2d(weight, window, 1, window // 2, count_include_pad=False)
     inverse = F.avg_pool2d(above / below, 5, 1, 2, count_include_pad=False)
     return 1.0 / inverse.clamp_min(_FARTHEST * float(inverse.max()))
-
-
-def _named(view: Sequence[Tensor]) -> CameraView:
-    """A view that was not touched stays the very one."""
-    return view if isinstance(view, CameraView) else CameraView(*view)

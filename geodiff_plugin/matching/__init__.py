@@ -6,7 +6,8 @@ Paper: S7.3 (the search is a lookup in this volume); the matches go beyond it.
 
 from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.build import build_cost_volume, find_matches
-from geodiff_plugin.matching.consistency import Matches, gate_matches, match_volume
+from geodiff_plugin.matching.consistency import match_volume
+from geodiff_plugin.matching.matches import Matches, MatchTarget, gate_matches
 from geodiff_plugin.matching.mirrored import PoseCheck, mirrored_pose_preferred
 from geodiff_plugin.matching.points import points_to_matches, with_points
 from geodiff_plugin.matching.reflections import reject_reflections
@@ -14,6 +15,7 @@ from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
 
 __all__ = [
     "CostVolume",
+    "MatchTarget",
     "Matches",
     "PoseCheck",
     "aggregate",

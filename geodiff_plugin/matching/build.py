@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import plane_rays, resize_intrinsics
 from geodiff_plugin.matching.census import grey
-from geodiff_plugin.matching.consistency import Matches, match_volume
+from geodiff_plugin.matching.consistency import match_volume
+from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import (
     CostVolume,
     inverse_depth_at_shift,
@@ -40,7 +41,8 @@ def _shrink(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Image and K, height and width smaller by ``factors`` < 1 (antialiased); as they are for 1 and above."""
     size = (image_01.shape[-2], image_01.shape[-1])
-    size_to = tuple(max(1, round(side * min(1.0, f))) for side, f in zip(size, factors, strict=True))
+    height, width = (max(1, round(side * min(1.0, f))) for side, f in zip(size, factors, strict=True))
+    size_to = (height, width)
     if size_to == size:
         return image_01, K
     small = F.interpolate(image_01[None], size_to, mode="bilinear", align_corners=False, antialias=True)[0]

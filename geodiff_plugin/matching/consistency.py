@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from geodiff_plugin.matching.aggregation import NEVER, PATHS, Room, aggregate
 from geodiff_plugin.matching.alignment import AlignedView
 from geodiff_plugin.matching.census import COST_LEVELS
+from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import UNSEEN_LEVEL, CostVolume
 
 __all__ = [
@@ -22,9 +23,7 @@ __all__ = [
     "RIGHT_WITHIN_PLANES",
     "SIGNS",
     "CheckedMatches",
-    "Matches",
     "checked_matches",
-    "gate_matches",
     "match_volume",
 ]
 
@@ -44,25 +43,6 @@ _WINDOW_PX, _LEAST_CONTRAST = 31, 0.03
 _EVERY_ROW = 2
 # A sum over the paths and its plane in one integer, so that one minimum finds both.
 _PLANES = 1 << 12
-
-
-@dataclass(frozen=True)
-class Matches:
-    """What the views alone say about depth, with how far to believe it.
-
-    Attributes:
-        inverse_depth: ``(1, H, W)`` float32, 1/m; defined everywhere, to be read where ``confidence > 0``.
-        confidence: ``(1, H, W)`` float32 in [0, 1].
-        plane_step: ``()`` float32, 1/m, the unit in which errors of matches are measured.
-        K: ``(3, 3)`` pixels of this grid.
-        size: ``(H, W)``.
-    """
-
-    inverse_depth: torch.Tensor
-    confidence: torch.Tensor
-    plane_step: torch.Tensor
-    K: torch.Tensor
-    size: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -192,7 +172,9 @@ def _evidence(asked: _Asked, difference: torch.Tensor) -> tuple[torch.Tensor, ..
 
 def _confidence(asked: _Asked, difference: torch.Tensor) -> torch.Tensor:
     """Probability ``(H, W)`` that the winner is right, given the left-right difference in planes."""
-    odds = sum(weight * x for weight, x in zip(LOG_ODDS, _evidence(asked, difference), strict=True))
+    odds = torch.zeros_like(difference)
+    for weight, x in zip(LOG_ODDS, _evidence(asked, difference), strict=True):
+        odds = odds + weight * x
     probability = torch.sigmoid(odds)
     probability = probability * (asked.contrast / _LEAST_CONTRAST).clamp_max(1.0)
     return torch.where(difference <= _TOLERANCE, probability, torch.zeros_like(probability))
@@ -240,18 +222,3 @@ def match_volume(volume: CostVolume) -> Matches:
         confidence = torch.maximum(confidence, _confidence(asked, difference))
     inverse_depth = volume.inverse_depth[0] + asked.position * volume.plane_step
     return Matches(inverse_depth[None], confidence[None], volume.plane_step, volume.K, volume.size)
-
-
-def gate_matches(matches: Matches, depth_m: torch.Tensor, factor: float) -> torch.Tensor:
-    """Confidence of the matches that a depth map does not contradict.
-
-    Args:
-        matches: of one image, or of a chunk of samples (``terms.MatchTarget``).
-        depth_m: ``(B, 1, H, W)`` metres, > 0, on the matches' grid.
-        factor: > 1; a match further than this factor from ``depth_m`` is dropped.
-
-    Returns:
-        ``(B, 1, H, W)`` in [0, 1].
-    """
-    ratio = matches.inverse_depth * depth_m
-    return matches.confidence * ((ratio < factor) & (ratio > 1.0 / factor))

@@ -13,7 +13,8 @@ import torch
 
 from geodiff_plugin.geometry import invert_rigid
 from geodiff_plugin.matching.build import pilot_volume
-from geodiff_plugin.matching.consistency import Matches, match_volume
+from geodiff_plugin.matching.consistency import match_volume
+from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.types import CameraView
 
 __all__ = ["PoseCheck", "mirrored_pose_preferred"]

@@ -7,17 +7,20 @@ Paper: none; what Marigold-DC (Viola et al. 2024) completes.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import NEAREST_M, project
-from geodiff_plugin.matching.consistency import Matches
+from geodiff_plugin.matching.matches import Matches, MatchTarget
 
 __all__ = ["UNIT", "points_to_matches", "with_points"]
 
 #: The unit in which errors at points are measured, as a share of their median inverse depth.
 UNIT = 0.01
+
+Target = TypeVar("Target", bound=MatchTarget)
 
 
 def points_to_matches(
@@ -74,7 +77,7 @@ def points_to_matches(
     return Matches(inverse_depth, (inverse_depth > 0).float(), unit, K_grid, size_grid), left_out
 
 
-def with_points(matches: Matches | None, points: Matches) -> Matches:
+def with_points(matches: Target | None, points: Target) -> Target:
     """Matches with known points in their place: what the refinement follows.
 
     Args:

@@ -6,28 +6,20 @@ Paper: S5.2 (transparent and mirroring surfaces are where a second view misleads
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.guidance.config import ReflectionsConfig
 from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.matching.matches import MatchTarget
 
 __all__ = ["reject_reflections"]
 
 
-class _Known(Protocol):
-    """``Matches`` or ``terms.MatchTarget``."""
-
-    inverse_depth: Tensor
-    confidence: Tensor
-
-
 @torch.no_grad()
 def reject_reflections(
-    matches: _Known, depth_m: Tensor, config: ReflectionsConfig = DEFAULT.reflections
+    matches: MatchTarget, depth_m: Tensor, config: ReflectionsConfig = DEFAULT.reflections
 ) -> Tensor:
     """What remains of each match, given the depth that the prior saw before any match moved it.
 

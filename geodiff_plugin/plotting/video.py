@@ -10,6 +10,7 @@ import importlib.util
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -64,7 +65,7 @@ def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
 
     # H.264 and its like want even sides.
     width, height = (side // 2 * 2 for side in frames[0].size)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, (width, height))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
     if not writer.isOpened():
         raise InputFileError(f"the video must be a file that can be written; got {path}.")
     for frame in frames:
@@ -93,5 +94,5 @@ def write_depth_video(path: str | os.PathLike[str], frames: Sequence[Image.Image
     if path.suffix.lower() == ".mp4":
         _write_mp4(path, frames, fps)
         return
-    more = {"quality": 85} if path.suffix.lower() == ".webp" else {}
+    more: dict[str, Any] = {"quality": 85} if path.suffix.lower() == ".webp" else {}
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, **more)

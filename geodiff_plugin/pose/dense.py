@@ -28,7 +28,7 @@ def cell_centres(size: tuple[int, int]) -> np.ndarray:
 
 
 def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
     return dis.calc(one, other, None)
 

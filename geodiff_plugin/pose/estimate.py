@@ -107,7 +107,7 @@ def estimate_pose(
     )
     T = np.eye(4)
     T[:3] = found.Rt
-    T[:3, 3] /= max(np.linalg.norm(T[:3, 3]), 1e-12)
+    T[:3, 3] /= max(float(np.linalg.norm(T[:3, 3])), 1e-12)
     sideways = _rectified(tracks, residuals_px(tracks, T[None])[0] < INLIER_PX)
     T = T if sideways is None else sideways
     residual = residuals_px(tracks, T[None])[0]

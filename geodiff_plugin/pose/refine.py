@@ -18,14 +18,8 @@ from geodiff_plugin.pose.noise import independent_share
 from geodiff_plugin.pose.solve import Prior, solve_poses
 from geodiff_plugin.pose.straighten import Displacement, fit_displacement, straightened
 from geodiff_plugin.pose.tracks import Tracks, merge_tracks, residuals_px
-from geodiff_plugin.pose.views import (
-    FirstDepth,
-    PosedView,
-    dense_tracks,
-    grey_views,
-    sparse_tracks,
-)
-from geodiff_plugin.types import PoseReport
+from geodiff_plugin.pose.views import FirstDepth, dense_tracks, grey_views, sparse_tracks
+from geodiff_plugin.types import CameraView, PoseReport
 
 __all__ = ["FITS_PX", "WARNS_PX", "RefinedViews", "polished", "refine_views", "untouched"]
 
@@ -60,18 +54,18 @@ class RefinedViews:
         report: what was found.
     """
 
-    rights: tuple[PosedView, ...]
+    rights: tuple[CameraView, ...]
     report: PoseReport
 
 
-def untouched(rights: Sequence[PosedView], status: str = "given") -> RefinedViews:
+def untouched(rights: Sequence[CameraView], status: str = "given") -> RefinedViews:
     """The views as they were given, and a report that says why."""
     poses = _as_E(_poses(rights))
     return RefinedViews(tuple(rights), PoseReport(status, poses, poses))
 
 
 def refine_views(
-    left_01: Tensor, rights: Sequence[PosedView], K_left: Tensor, first_depth: FirstDepth
+    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, first_depth: FirstDepth
 ) -> RefinedViews:
     """Check the poses against the images, and refine them together where they do not fit.
 
@@ -126,7 +120,7 @@ def refine_views(
 
 
 def polished(
-    left_01: Tensor, rights: Sequence[PosedView], K_left: Tensor, first_depth: FirstDepth, sparse: Tracks
+    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, first_depth: FirstDepth, sparse: Tracks
 ) -> tuple[np.ndarray, Tracks]:
     """Estimated poses fitted once more to all matches, every view's to all that it shares with others.
 
@@ -185,7 +179,7 @@ def _on_grid(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.nn.functional.interpolate(depth_m, size, mode="bilinear", align_corners=False)
 
 
-def _poses(rights: Sequence[PosedView]) -> np.ndarray:
+def _poses(rights: Sequence[CameraView]) -> np.ndarray:
     return np.stack([T.detach().cpu().double().numpy() for _, _, T in rights])
 
 
@@ -226,11 +220,11 @@ def _acceptable(given: np.ndarray, Ts: np.ndarray, before: np.ndarray, after: np
 
 
 def _applied(
-    rights: Sequence[PosedView], Ts: np.ndarray, bends: Sequence[Displacement | None] | None = None
-) -> tuple[PosedView, ...]:
+    rights: Sequence[CameraView], Ts: np.ndarray, bends: Sequence[Displacement | None] | None = None
+) -> tuple[CameraView, ...]:
     bends = bends or [None] * len(rights)
     return tuple(
-        (image if bend is None else straightened(image, bend), K, torch.as_tensor(T).to(given))
+        CameraView(image if bend is None else straightened(image, bend), K, torch.as_tensor(T).to(given))
         for (image, K, given), T, bend in zip(rights, Ts, bends, strict=True)
     )
 

@@ -13,11 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
+from geodiff_plugin.pose.tracks import Projected, Tracks, project_tracks, solve_inverse_depth
 
 __all__ = ["Prior", "solve_poses"]
 
 _STEPS = 12
+
+_Terms = tuple[float, np.ndarray, np.ndarray]
+"""Cost, gradient ``(6V,)`` and normal matrix ``(6V, 6V)``."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ def _turned(T: np.ndarray, step: np.ndarray) -> np.ndarray:
     return moved
 
 
-def _jacobian(at, inverse_depth: np.ndarray) -> np.ndarray:
+def _jacobian(at: Projected, inverse_depth: np.ndarray) -> np.ndarray:
     """``(N, 2, 6)``: derivative of the projected pixels by ``_turned``'s step."""
     x, y, z = at.scaled.T
     zero = np.zeros_like(x)
@@ -57,35 +60,38 @@ def _jacobian(at, inverse_depth: np.ndarray) -> np.ndarray:
     return np.concatenate([at.by_point @ by_turn, at.by_point * inverse_depth[:, None, None]], axis=2)
 
 
-def _data_terms(tracks: Tracks, Ts: np.ndarray, scale: float):
+def _data_terms(tracks: Tracks, Ts: np.ndarray, scale: float) -> _Terms:
     """Cost, gradient and normal matrix of the residuals with the inverse depths eliminated."""
     views = len(Ts)
     w = solve_inverse_depth(tracks, Ts)
     for _ in range(2 if views > 1 else 0):
         w = solve_inverse_depth(tracks, Ts, _weights(tracks, Ts, w, scale)[0])
     weights, offs, ats = _weights(tracks, Ts, w, scale)
-    J = np.zeros((len(tracks), views, 2, 6 * views))
-    j = np.zeros((len(tracks), views, 2))
+    by_pose = np.zeros((len(tracks), views, 2, 6 * views))
+    by_depth = np.zeros((len(tracks), views, 2))
     for v, at in enumerate(ats):
         root = np.sqrt(weights[v])[:, None]
-        J[:, v, :, 6 * v : 6 * v + 6] = _jacobian(at, w) * root[..., None]
-        j[:, v] = at.by_inverse_depth * root
+        by_pose[:, v, :, 6 * v : 6 * v + 6] = _jacobian(at, w) * root[..., None]
+        by_depth[:, v] = at.by_inverse_depth * root
     r = (offs * np.sqrt(weights)[..., None]).transpose(1, 0, 2).reshape(len(tracks), -1)
-    J, j = J.reshape(len(tracks), 2 * views, -1), j.reshape(len(tracks), -1)
+    J, j = by_pose.reshape(len(tracks), 2 * views, -1), by_depth.reshape(len(tracks), -1)
     j /= np.maximum(np.linalg.norm(j, axis=1, keepdims=True), 1e-12)
     J = J - j[..., None] * np.einsum("nk,nkp->np", j, J)[:, None]  # what a change of depth cannot make up for
     cost = np.log1p((offs**2).sum(-1) / scale**2)[tracks.seen].sum()
     return cost, np.einsum("nkp,nk->p", J, r), np.einsum("nkp,nkq->pq", J, J)
 
 
-def _weights(tracks: Tracks, Ts: np.ndarray, w: np.ndarray, scale: float):
+def _weights(
+    tracks: Tracks, Ts: np.ndarray, w: np.ndarray, scale: float
+) -> tuple[np.ndarray, np.ndarray, list[Projected]]:
+    """Robust weights ``(V, N)`` of the observations, their residuals ``(V, N, 2)`` and where they fall."""
     ats = [project_tracks(tracks.rays, w, K, T) for K, T in zip(tracks.K_rights, Ts, strict=True)]
     offs = np.stack([at.px - px for at, px in zip(ats, tracks.right_px, strict=True)])
     weights = tracks.seen / (scale**2 + (offs**2).sum(-1))
     return weights, offs, ats
 
 
-def _prior_terms(tracks: Tracks, Ts: np.ndarray, given: np.ndarray, w: np.ndarray, prior: Prior):
+def _prior_terms(tracks: Tracks, Ts: np.ndarray, given: np.ndarray, w: np.ndarray, prior: Prior) -> _Terms:
     """Cost, gradient and normal matrix of the prior."""
     size = 6 * len(Ts)
     cost, gradient, normal = 0.0, np.zeros(size), np.zeros((size, size))
@@ -134,12 +140,9 @@ def solve_poses(
     Ts = np.array(given if start is None else start, dtype=np.float64)
     w_given = np.clip(solve_inverse_depth(tracks, Ts), 0.0, None)
 
-    def terms(at: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        own = _data_terms(tracks, at, scale_px)
-        return tuple(
-            trust * data + held
-            for data, held in zip(own, _prior_terms(tracks, at, given, w_given, prior), strict=True)
-        )
+    def terms(at: np.ndarray) -> _Terms:
+        data, held = _data_terms(tracks, at, scale_px), _prior_terms(tracks, at, given, w_given, prior)
+        return trust * data[0] + held[0], trust * data[1] + held[1], trust * data[2] + held[2]
 
     damping, (cost, gradient, normal) = 1e-3, terms(Ts)
     for _ in range(_STEPS):

@@ -28,7 +28,7 @@ def sift_features(grey: np.ndarray) -> Features:
     Args:
         grey: ``(H, W)`` uint8.
     """
-    sift = cv2.SIFT_create(nfeatures=MOST_POINTS, contrastThreshold=CONTRAST)
+    sift = cv2.SIFT.create(nfeatures=MOST_POINTS, contrastThreshold=CONTRAST)
     points, descriptors = sift.detectAndCompute(grey, None)
     if not points:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)

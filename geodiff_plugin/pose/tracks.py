@@ -63,6 +63,10 @@ class Tracks:
             seen=self.seen[:, mask],
         )
 
+    def seen_anywhere(self) -> Tracks:
+        """The tracks that one right view has at least."""
+        return self.kept(np.any(self.seen, axis=0))
+
 
 def merge_tracks(parts: Sequence[Tracks]) -> Tracks:
     """Tracks of the same views one after the other."""

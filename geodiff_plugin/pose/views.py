@@ -18,16 +18,14 @@ from geodiff_plugin.geometry import plane_rays, project_rays
 from geodiff_plugin.pose.dense import cell_centres, dense_matches
 from geodiff_plugin.pose.sparse import match_features, sift_features
 from geodiff_plugin.pose.tracks import Tracks
+from geodiff_plugin.types import CameraView
 
 __all__ = ["LONG_SIDE", "FirstDepth", "GreyViews", "dense_tracks", "grey_views", "sparse_tracks"]
 
 #: Longer side of the left image that matches are sought on, pixels; residuals are in pixels of this grid.
 LONG_SIDE = 832
 
-PosedView = tuple[Tensor, Tensor, Tensor]
-"""``(image_01 (3, Hr, Wr), K_right (3, 3), T_right_from_left (4, 4))``."""
-
-FirstDepth = Callable[[Sequence[PosedView]], Tensor]
+FirstDepth = Callable[[Sequence[CameraView]], Tensor]
 """Right views with poses -> a rough depth ``(1, 1, h, w)`` of the left image, metres, without holes."""
 
 
@@ -48,11 +46,11 @@ class GreyViews:
     K_rights: np.ndarray
 
 
-def _grey(image_01: Tensor, K: Tensor, factor: float) -> tuple[np.ndarray, np.ndarray]:
+def _grey(image_01: Tensor, K_image: Tensor, factor: float) -> tuple[np.ndarray, np.ndarray]:
     """A grey image shrunk by a factor <= 1, and its K."""
     pixels = image_01.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.shape[-1] == 3 else pixels[..., 0]
-    K = K.detach().cpu().double().numpy().copy()
+    K = K_image.detach().cpu().double().numpy().copy()
     height, width = grey.shape
     size = max(1, round(width * factor)), max(1, round(height * factor))
     if factor < 1.0:
@@ -63,7 +61,7 @@ def _grey(image_01: Tensor, K: Tensor, factor: float) -> tuple[np.ndarray, np.nd
     return np.rint(grey * 255.0).clip(0, 255).astype(np.uint8), K
 
 
-def grey_views(left_01: Tensor, rights: Sequence[PosedView], K_left: Tensor) -> GreyViews:
+def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> GreyViews:
     """Images as matches are sought in them.
 
     Args:
@@ -88,7 +86,7 @@ def sparse_tracks(views: GreyViews) -> Tracks:
         right = sift_features(image)
         of_left, of_right = match_features(left, right).T
         right_px[v, of_left], seen[v, of_left] = right[0][of_right], True
-    return Tracks(left[0], right_px, seen, views.K_left, views.K_rights).kept(seen.any(0))
+    return Tracks(left[0], right_px, seen, views.K_left, views.K_rights).seen_anywhere()
 
 
 def dense_tracks(views: GreyViews, depth_m: Tensor, Ts: np.ndarray) -> Tracks:
@@ -103,9 +101,12 @@ def dense_tracks(views: GreyViews, depth_m: Tensor, Ts: np.ndarray) -> Tracks:
     right_px = np.zeros((len(Ts), len(centres), 2))
     seen = np.zeros((len(Ts), len(centres)), bool)
     for v, (image, K, T) in enumerate(zip(views.rights, views.K_rights, Ts, strict=True)):
-        matrices = (torch.as_tensor(m, dtype=torch.float32)[None] for m in (views.K_left, K, T))
-        uv, z = project_rays(depth_m, plane_rays(*matrices, views.left.shape))
-        uv, z = uv[0].numpy(), z[0].numpy()
+        K_left, K_right, T_right = (
+            torch.as_tensor(m, dtype=torch.float32)[None] for m in (views.K_left, K, T)
+        )
+        height, width = views.left.shape
+        projected = project_rays(depth_m, plane_rays(K_left, K_right, T_right, (height, width)))
+        uv, z = (part[0].numpy() for part in projected)
         inside = (uv >= 0).all(-1) & (uv <= np.array(image.shape[::-1]) - 1).all(-1)
         right_px[v], seen[v] = dense_matches(views.left, image, uv, inside & (z > 0))
-    return Tracks(centres, right_px, seen, views.K_left, views.K_rights).kept(seen.any(0))
+    return Tracks(centres, right_px, seen, views.K_left, views.K_rights).seen_anywhere()

@@ -64,7 +64,8 @@ def find_adapter(pipe: Any) -> type[DepthPrior]:
     Raises:
         TypeError: none does.
     """
-    for adapter in (*PRIORS.values(), OwnPipelinePrior):
+    adapters: list[type[DepthPrior]] = [*PRIORS.values(), OwnPipelinePrior]
+    for adapter in adapters:
         if adapter.matches(pipe):
             return adapter
     bad_type(

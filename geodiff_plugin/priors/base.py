@@ -111,6 +111,11 @@ class OwnPipelinePrior:
         """Any instance of ``pipeline_class``."""
         return isinstance(pipe, cls.pipeline_class)
 
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """No folder: which are of its kind is for a subclass to say."""
+        return False
+
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> DepthDiffusionPipeline:
         """Components by the names of the constructor, each from its own subfolder."""

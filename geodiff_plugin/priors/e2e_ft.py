@@ -20,7 +20,7 @@ __all__ = ["E2EFTPrior"]
 class E2EFTPrior(MarigoldPrior):
     """Adapter of ``E2EFTPipeline``; network, input and decoder are Marigold's."""
 
-    max_steps = 1
+    max_steps: int | None = 1
     deterministic = True
     licence: dict[str, str] = {}  # the authors' repository does not say
 

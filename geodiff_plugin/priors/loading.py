@@ -53,15 +53,15 @@ def check_weights(missing: Any, unexpected: Any, where: str) -> None:
         bad_value(f"weights in {where}", "those of its config, name by name", "; ".join(parts), cure)
 
 
-def component_class(layout: Layout, name: str) -> type:
+def component_class(layout: Layout, name: str) -> type[Any]:
     """The class of a component as ``model_index.json`` names it, out of diffusers or transformers.
 
     Raises:
         ValueError: not named, or of another library.
     """
     entry = layout.index.get(name)
-    library, cls = entry if isinstance(entry, list) and len(entry) == 2 else (None, None)
-    found = getattr(LIBRARIES.get(library), str(cls), None)
+    library, cls = entry if isinstance(entry, list) and len(entry) == 2 else ("", "")
+    found = getattr(LIBRARIES.get(str(library)), str(cls), None)
     if not isinstance(found, type) or not hasattr(found, "from_pretrained"):
         bad_value(
             f"component {name!r} in {layout.folder / 'model_index.json'}",
@@ -73,7 +73,7 @@ def component_class(layout: Layout, name: str) -> type:
 
 
 def load_component(
-    layout: Layout, name: str, cls: type, dtype: torch.dtype, extra: dict[str, Any] | None = None
+    layout: Layout, name: str, cls: type[Any], dtype: torch.dtype, extra: dict[str, Any] | None = None
 ) -> Any:
     """One component of a folder; a module's weights are checked name by name, and it is in eval mode.
 
@@ -91,7 +91,8 @@ def load_component(
     damaged = reading(f"component {name or 'model'!r} of {layout.name}", "one that can be read", folder, CURE)
     # Said aloud, since transformers asks at the terminal where it is not.
     untrusted = {"trust_remote_code": False} if cls.__module__.startswith("transformers.") else {}
-    if not issubclass(cls, torch.nn.Module):
+    is_module = issubclass(cls, torch.nn.Module)
+    if not is_module:
         with damaged:
             return cls.from_pretrained(folder, local_files_only=True, **untrusted)
     if not any((layout.folder / name).glob("*.safetensors")):
@@ -112,10 +113,10 @@ def load_component(
 
 
 def build_pipeline(
-    cls: type,
+    cls: type[Any],
     layout: Layout,
     dtype: torch.dtype,
-    classes: dict[str, type] | None = None,
+    classes: dict[str, type[Any]] | None = None,
     **options: Any,
 ) -> Any:
     """A pipeline from the components that its constructor names and the options that the index holds.
@@ -132,11 +133,12 @@ def build_pipeline(
     """
     options = {name: value for name, value in options.items() if value is not None}
     arguments: dict[str, Any] = {}
+    classes = classes or {}
     for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:
         entry = layout.index.get(name)
         if name in options:
             arguments[name] = options[name]
-        elif name in (classes or {}):
+        elif name in classes:
             arguments[name] = load_component(layout, name, classes[name], dtype)
         elif isinstance(entry, list) and entry[0] is not None:
             arguments[name] = load_component(layout, name, component_class(layout, name), dtype)

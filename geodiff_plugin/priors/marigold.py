@@ -49,7 +49,8 @@ class MarigoldPrior:
         self.space = pipe.config.get("prediction_type") or "depth"
         if self.space not in SPACES:
             bad_value("the pipeline's prediction_type", f"one of {sorted(SPACES)}", repr(self.space))
-        self.network_input = slice(pipe.vae.config.latent_channels, None)  # after the image latent
+        # After the image latent.
+        self.network_input: slice | None = slice(pipe.vae.config.latent_channels, None)
 
     @staticmethod
     def matches(pipe: object) -> bool:

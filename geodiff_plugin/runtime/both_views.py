@@ -87,15 +87,21 @@ def _guidance(other: Any, rig: Rig, knobs: dict[str, Any], points: Tensor | None
     return GeometryGuidance(other, (rig.K_left, rig.K_right), rig.E, points=points, **knobs)
 
 
-def _believed_points(output: MetricDepthOutput, rig: Rig, min_confidence: float) -> Tensor:
-    """Points ``(N, 3)`` of a view's depth in the other view's frame, metres; only those that are sure."""
+def _confidence(output: MetricDepthOutput) -> Tensor:
+    """``(1, 1, H, W)``."""
     if output.confidence is None:
         cure = "Keep refine=True and a weight for matches."
         bad_value("knobs", "of a preset that knows how sure it is", "one without confidence", cure)
-    K = torch.as_tensor(rig.K_left, dtype=torch.float32, device=output.prediction.device)[None]
+    return torch.as_tensor(output.confidence)
+
+
+def _believed_points(output: MetricDepthOutput, rig: Rig, min_confidence: float) -> Tensor:
+    """Points ``(N, 3)`` of a view's depth in the other view's frame, metres; only those that are sure."""
+    confidence, depth_m = _confidence(output), torch.as_tensor(output.prediction).float()
+    K = torch.as_tensor(rig.K_left, dtype=torch.float32, device=depth_m.device)[None]
     T = torch.as_tensor(rig.T_right_from_left, dtype=torch.float32, device=K.device)[None]
-    points = transform(unproject(output.prediction.float(), K), T)  # (1, H, W, 3)
-    return points[output.confidence[:, 0] >= min_confidence]
+    points = transform(unproject(depth_m, K), T)  # (1, H, W, 3)
+    return points[confidence[:, 0] >= min_confidence]
 
 
 def _news(points: Tensor, rig: Rig, alone: MetricDepthOutput, min_confidence: float) -> Tensor:
@@ -105,7 +111,7 @@ def _news(points: Tensor, rig: Rig, alone: MetricDepthOutput, min_confidence: fl
     """
     K = torch.as_tensor(rig.K_left, dtype=torch.float32, device=points.device)[None]
     uv, z = (x[0, 0] for x in project(points[None, None], K))
-    confidence = alone.confidence[0, 0]
+    confidence = _confidence(alone)[0, 0]
     height, width = confidence.shape
     column, row = uv.round().long().unbind(1)
     inside = (z > NEAREST_M) & (column >= 0) & (column < width) & (row >= 0) & (row < height)

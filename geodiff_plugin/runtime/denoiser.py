@@ -36,8 +36,8 @@ class DenoiserTap:
 
     def __init__(self, owner: Any, method: str, channels: slice) -> None:
         self._owner, self._method, self._channels = owner, method, channels
-        self._call: tuple[Callable[..., Any], Tensor, tuple, dict] | None = None
-        self.leaf: Tensor | None = None
+        self._at: Callable[[Tensor], Any] | None = None  # the latest call at another latent
+        self._leaf: Tensor | None = None
         self._output: Tensor | None = None
 
     def __enter__(self) -> DenoiserTap:
@@ -62,17 +62,28 @@ class DenoiserTap:
             setattr(self._owner, self._method, self._hidden)
         self.release()
 
+    @property
+    def leaf(self) -> Tensor:
+        """Of the latest call, which was not released yet."""
+        assert self._leaf is not None
+        return self._leaf
+
     def release(self) -> None:
         """Drop the graph and everything that it holds."""
-        self._call = self.leaf = self._output = None
+        self._at = self._leaf = self._output = None
 
     def run(self, forward: Callable[..., Any], model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
         """The tapped call: same result, detached; the graph is kept until ``release``."""
         model_input = model_input.detach()
         wide = torch.promote_types(model_input.dtype, torch.float32)
-        self.leaf = model_input[:, self._channels].to(wide).requires_grad_()
-        self._call = (forward, model_input, args, kwargs)
-        result = self._forward_at(self.leaf)
+
+        def at(z_t: Tensor) -> Any:
+            with torch.enable_grad():
+                joined = put_channels(model_input, self._channels, z_t.to(model_input.dtype))
+                return forward(joined, *args, **kwargs)
+
+        self._at, self._leaf = at, model_input[:, self._channels].to(wide).requires_grad_()
+        result = at(self._leaf)
         self._output = _first(result)
         detached = self._output.detach()
         if isinstance(result, Tensor):
@@ -84,13 +95,8 @@ class DenoiserTap:
 
         The pipeline's own forward is reused for its own input: one update costs no second network call.
         """
-        return self._output if z_t is self.leaf else _first(self._forward_at(z_t))
-
-    def _forward_at(self, z_t: Tensor) -> Any:
-        forward, model_input, args, kwargs = self._call
-        with torch.enable_grad():
-            joined = put_channels(model_input, self._channels, z_t.to(model_input.dtype))
-            return forward(joined, *args, **kwargs)
+        assert self._at is not None and self._output is not None
+        return self._output if z_t is self._leaf else _first(self._at(z_t))
 
 
 def _first(result: Any) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.evidence import as_fine_as
 from geodiff_plugin.algorithm.terms.exposure import match_exposure
-from geodiff_plugin.geometry.cameras import resize_intrinsics
+from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.guidance.config import TermsConfig
 from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -53,27 +53,28 @@ def assemble_output(
         lefts_01: ``(N, 3, H, W)`` left images at native size.
         call: arguments of the stock call by name.
     """
-    count, size = lefts_01.shape[0], tuple(lefts_01.shape[-2:])
+    count, size = lefts_01.shape[0], image_size(lefts_01)
     depth_m = _as_maps(stock.prediction).to(lefts_01.device)  # (N, 1, H, W) or the processing grid
     depth_m, support = _refined(run, depth_m, lefts_01)
     uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
     if uncertainty is not None and support is not None:
         uncertainty = _uncertainty(run, depth_m, lefts_01, call)
-    grid = tuple(depth_m.shape[-2:])
+    grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
     known = [own.on(depth_m.device) for own in guidance.inputs]
     K = resize_intrinsics(torch.stack([K_left for _, K_left, _ in known]), size, grid)
     seen = [
-        _reprojection(own.native, *(x[i : i + 1] for x in (depth_m, lefts, K)), run.config.terms)
+        _reprojection(own.native, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1], run.config.terms)
         for i, own in enumerate(run.evidence)
         if own.native
     ]
-    visible, error = (torch.cat(maps) for maps in zip(*seen, strict=True)) if seen else (None, None)
+    visible = torch.cat([where for where, _ in seen]) if seen else None
+    error = torch.cat([difference for _, difference in seen]) if seen else None
     confidence = None
     if support is not None:
         spread = None if uncertainty is None else uncertainty / depth_m
         nowhere = torch.zeros_like(depth_m)
-        shown = (nowhere, nowhere.bool()) if error is None else (error, visible)
+        shown = nowhere if error is None else error, nowhere.bool() if visible is None else visible
         confidence = depth_confidence(support, *shown, spread)
     judgements = [_judged(run, i, lefts_01[i], known[i][1], confidence) for i in range(count)]
     if confidence is not None:
@@ -116,9 +117,10 @@ def assemble_output(
 
 def _own_scale(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
     """``(N, E)`` median of the depth ``(N, 1, H, W)`` over a metric prior's own, on the prior's grid."""
-    if any(t.own_depth is None for t in run.trajectories):
+    known = [t.own_depth for t in run.trajectories if t.own_depth is not None]
+    if len(known) < len(run.trajectories):
         return None
-    own = torch.cat([t.own_depth for t in run.trajectories])
+    own = torch.cat(known)
     found = F.interpolate(depth_m, own.shape[-2:], mode="bilinear", align_corners=False)
     owners = [owner for t in run.trajectories for owner in t.owners]
     ratio = (found[owners] / own.clamp_min(LEAST_M)).flatten(1)
@@ -134,7 +136,7 @@ def _judged(
 ) -> Judgement:
     """What the signs of one image's run say of it."""
     own = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
-    order = torch.stack([t.order[i] for t, i in own]).nanmean()
+    order = torch.stack([t.order[i] for t, i in own if t.order is not None]).nanmean()
     signs = read_signs(
         run.evidence[image],
         left_01,
@@ -142,7 +144,7 @@ def _judged(
         K_left,
         order=float(order),
         confidence=None if confidence is None else confidence[image],
-        on_edge=any(bool(t.on_edge[i]) for t, i in own),
+        on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in own),
         range_given=run.config.depth_range is not None,
     )
     return judge(signs)
@@ -171,16 +173,17 @@ def _uncertainty(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: Mappin
 
     It costs a refinement a member: their spread before it is that of a map that is not given out.
     """
-    size, method = tuple(depth_m.shape[-2:]), call["resample_method_output"]
+    size, method = image_size(depth_m), call["resample_method_output"]
     reduction = (call["ensembling_kwargs"] or {}).get("reduction", "median")
     spreads = []
     for i, members in enumerate(run.members):
         members = members.float().to(depth_m.device)
-        if tuple(members.shape[-2:]) != size:  # as the stock call brings the ensemble to its output
+        if image_size(members) != size:  # as the stock call brings the ensemble to its output
             members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
         left = lefts_01[i : i + 1]
-        refined = [run.known(i, m).bring(member, left).depth_m for m, member in enumerate(members.split(1))]
-        spreads.append(spread_around(depth_m[i : i + 1], torch.cat(refined), reduction))
+        brought = [run.known(i, m).bring(member, left) for m, member in enumerate(members.split(1))]
+        refined = torch.cat([one.depth_m for one in brought if one is not None])
+        spreads.append(spread_around(depth_m[i : i + 1], refined, reduction))
     return torch.cat(spreads)
 
 

@@ -10,7 +10,7 @@ import functools
 import inspect
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from diffusers import DiffusionPipeline, MarigoldDepthPipeline
@@ -32,7 +32,13 @@ from geodiff_plugin.runtime.run import GuidedRun, plan_steps
 __all__ = ["GuidedMarigoldDepthPipeline", "disable_geometry_guidance", "enable_geometry_guidance"]
 
 
-class _GuidedCall:
+if TYPE_CHECKING:  # mixed in before a class that has all of a stock pipeline
+    from diffusers import MarigoldDepthPipeline as _Stock
+else:
+    _Stock = object
+
+
+class _GuidedCall(_Stock):
     """What a pipeline class gains: a ``__call__`` that takes ``guidance``, metric ensembling while guided.
 
     Mixed in before the stock class, whose call does all the rest: preprocessing, latents, loop, resizing.
@@ -232,7 +238,7 @@ def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
     """
     find_adapter(pipe)
     if not isinstance(pipe, _GuidedCall):
-        pipe.__class__ = _guided_class(type(pipe))
+        pipe.__class__ = _guided_class(pipe.__class__)
     return pipe
 
 

@@ -33,8 +33,8 @@ def prompt_of(evidence: Sequence[Evidence]) -> Tensor | None:
         ``(N, 1, h, w)`` metres everywhere, the median of what is known far from all of it; ``None`` where of
         an image nothing is known.
     """
-    maps = [_dense(one) for one in evidence]
-    return None if any(m is None for m in maps) else torch.cat(maps)
+    maps = [found for one in evidence if (found := _dense(one)) is not None]
+    return torch.cat(maps) if len(maps) == len(evidence) else None
 
 
 def _dense(evidence: Evidence) -> Tensor | None:

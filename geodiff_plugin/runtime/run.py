@@ -7,7 +7,7 @@ Paper: Algorithm 1 around ``algorithm.guided_step``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any
 
 import torch
@@ -81,11 +81,14 @@ class GuidedRun:
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
         self.members: list[Tensor] = []
-        self.step_index, self.timesteps = 0, []
+        self.step_index = 0
+        self.timesteps: list[float] = []
         self._decoded_chunks = 0
         self._stack, self._bar = ExitStack(), None
-        self._tap = DenoiserTap(*prior.network(), prior.network_input) if self.full else None
-        self._hooks = [
+        self._tap = None
+        if self.full and prior.network_input is not None:
+            self._tap = DenoiserTap(*prior.network(), prior.network_input)
+        self._hooks: list[AbstractContextManager[object]] = [
             FrozenWeights(pipe),
             ImagesInFloat32(pipe.image_processor, pipe._execution_device),
             *([self._tap] if self._tap else []),
@@ -209,30 +212,29 @@ class GuidedRun:
             trajectory.watch.note("the prior's output", 0, wide_output)
             trajectory.watch.check(self.pipe.dtype)
         eps = noise_from(wide_output, wide_z_t, level)
-        full = self._tap is not None
-        if full:
-            leaf = self._tap.leaf
+        tap = self._tap
+        leaf = z0_from(wide_output, wide_z_t, level) if tap is None else tap.leaf
 
-            def z0_of(z: Tensor) -> Tensor:
-                return z0_from(self._tap.output_at(z)[:, depth].to(wide), z, level)
-        else:
-            leaf, z0_of = z0_from(wide_output, wide_z_t, level), _identity
-        encode = None if full else self.encode
+        def z0_of(z: Tensor) -> Tensor:
+            return z if tap is None else z0_from(tap.output_at(z)[:, depth].to(wide), z, level)
+
+        encode = self.encode if tap is None else None
         timestep_now = self.timesteps[self.step_index]
         at = StepContext(self.step_index, timestep_now, self.spans, eps, z0_of, self.decode, encode)
         with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
             move = guided_step(trajectory, leaf, at)
         updates = self.config.updates
+        result: tuple[Tensor, Tensor, Tensor | None]
         if not updates.optimize_latents or not any(trajectory.is_active(begin) for begin, _ in self.spans):
             result = output, z_t, None  # bit for bit the pipeline's own step
-        elif full and self.prior.max_steps == 1:
+        elif tap is not None and self.prior.max_steps == 1:
             # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
             moved = (leaf + move).detach()
-            result = self._tap.output_at(moved).detach(), put_channels(z_t, depth, moved.to(z_t.dtype)), None
-        elif full and updates.step_from == "updated":
+            result = tap.output_at(moved).detach(), put_channels(z_t, depth, moved.to(z_t.dtype)), None
+        elif tap is not None and updates.step_from == "updated":
             moved = (leaf + move).detach().to(z_t.dtype)
             result = output, put_channels(z_t, depth, moved), None
-        elif full:
+        elif tap is not None:
             result = output, z_t, put_channels(torch.zeros_like(z_t, dtype=wide), depth, move)
         else:
             moved_output, moved_z_t = output_from(leaf + move, eps, level)
@@ -241,16 +243,16 @@ class GuidedRun:
                 put_channels(z_t, depth, moved_z_t.to(z_t.dtype)),
                 None,
             )
-        if full:
-            self._tap.release()
+        if tap is not None:
+            tap.release()
         return result
 
     def _on_done(self, timestep: Tensor, latents: Tensor) -> Tensor:
         if self.callback is not None:
             trajectory = self.trajectories[-1]
-            affine = trajectory.affine
-            depth = latents[:, self.prior.latents]
-            x = self.decode(depth) if self.step_index == len(self.timesteps) - 1 else trajectory.last_x
+            affine, x = trajectory.affine, trajectory.last_x
+            if x is None or self.step_index == len(self.timesteps) - 1:
+                x = self.decode(latents[:, self.prior.latents])
             values = {
                 "latents": latents,
                 "metric_depth": trajectory.metric(x, affine),
@@ -268,10 +270,6 @@ class GuidedRun:
             self._bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
             self._bar.update()
         return latents
-
-
-def _identity(z: Tensor) -> Tensor:
-    return z
 
 
 def plan_steps(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypedDict
 
 import torch
 import torch.nn.functional as F
@@ -69,6 +70,17 @@ class Signs:
     on_edge: bool = False
 
 
+class _OfMatches(TypedDict, total=False):
+    """Those of the ``Signs`` that need matches."""
+
+    matched: float
+    spread: float
+    flat: bool
+    at_end: float
+    points_ratio: float
+    points_spread: float
+
+
 def _is_same(left_01: Tensor, rights: Sequence[CameraView]) -> bool:
     return any(
         image.shape == left_01.shape and float((image - left_01).abs().max()) < SAME for image, _, _ in rights
@@ -78,9 +90,9 @@ def _is_same(left_01: Tensor, rights: Sequence[CameraView]) -> bool:
 def _points_against(matches: Matches, points: Matches) -> tuple[float, float]:
     """Median ratio of points to matched depths, and its spread; NaN for too few that can be compared."""
     sure = (matches.confidence > SURE).float()
-    window = {"kernel_size": 2 * REACH_PX + 1, "stride": 1, "padding": REACH_PX}
-    near = F.avg_pool2d(sure[None], **window)[0]
-    mean = F.avg_pool2d((sure * matches.inverse_depth)[None], **window)[0] / near.clamp_min(1e-6)
+    window = (2 * REACH_PX + 1, 1, REACH_PX)
+    near = F.avg_pool2d(sure[None], *window)[0]
+    mean = F.avg_pool2d((sure * matches.inverse_depth)[None], *window)[0] / near.clamp_min(1e-6)
     at = (points.confidence > 0) & (near > 0) & (mean > matches.plane_step)
     if int(at.sum()) < FEWEST_COMPARED:
         return math.nan, math.nan
@@ -89,9 +101,9 @@ def _points_against(matches: Matches, points: Matches) -> tuple[float, float]:
     return float(middle.exp()), float((ratio - middle).abs().median())
 
 
-def _of_matches(matches: Matches, planes: Tensor | None) -> dict[str, float]:
+def _of_matches(matches: Matches, planes: Tensor | None) -> _OfMatches:
     sure = matches.confidence > SURE
-    found = {"matched": float(sure.float().mean())}
+    found: _OfMatches = {"matched": float(sure.float().mean())}
     inverse_depth = matches.inverse_depth[sure & (matches.inverse_depth > 0)]
     if len(inverse_depth) >= FEWEST_MATCHES:
         some = inverse_depth[:: max(1, len(inverse_depth) // 100_000)]
@@ -131,7 +143,7 @@ def read_signs(
     """
     matches, points = evidence.sweep_matches, evidence.sweep_points
     planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
-    found: dict[str, float] = {} if matches is None else _of_matches(matches, planes)
+    found: _OfMatches = {} if matches is None else _of_matches(matches, planes)
     if matches is not None and points is not None:
         found["points_ratio"], found["points_spread"] = _points_against(matches, points)
     known = evidence.points

@@ -85,7 +85,8 @@ def fit_to_points(
         if current is not None:
             best = torch.where(cost[0] <= config.basin_keep * cost[best], torch.zeros_like(best), best)
         found.append(torch.stack([near[best], far[best]]))
-    return torch.stack(found).unbind(1)
+    nearest, farthest = torch.stack(found).unbind(1)
+    return nearest, farthest
 
 
 @torch.no_grad()

@@ -203,7 +203,7 @@ def pair():
 
 def posed(pair, E):
     T = torch.from_numpy(np.linalg.inv(E)).float()
-    rights = [(pair.right.image_01.float(), pair.K_right.float(), T)]
+    rights = [CameraView(pair.right.image_01.float(), pair.K_right.float(), T)]
     return pair.left.image_01.float(), rights, pair.K_left.float()
 
 

@@ -37,8 +37,15 @@ class Term:
     needs_points: bool = False
 
 
-PHOTOMETRIC_OPTIONS = ("eta", "pyramid_levels", "exposure", "exposure_gain", "exposure_rows")
-PHOTOMETRIC_OPTIONS += ("exposure_columns", "exposure_prior")
+PHOTOMETRIC_OPTIONS = (
+    "eta",
+    "pyramid_levels",
+    "exposure",
+    "exposure_gain",
+    "exposure_rows",
+    "exposure_columns",
+    "exposure_prior",
+)
 
 TERMS: dict[str, Term] = {
     "photometric": Term(photometric, PHOTOMETRIC_OPTIONS, needs_warp=True),

@@ -11,25 +11,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from geodiff_plugin.matching.matches import MatchTarget
 from geodiff_plugin.scale.space import AffineState
 
 __all__ = ["Estimate", "MatchTarget", "cauchy", "masked_mean"]
-
-
-@dataclass(frozen=True)
-class MatchTarget:
-    """Matches between the views, or known points, on the grid of the loss.
-
-    Attributes:
-        inverse_depth: ``(B, 1, H, W)`` 1/m.
-        confidence: ``(B, 1, H, W)`` in [0, 1]; 0 where nothing is known or the gate closed.
-        plane_step: ``(B,)`` 1/m, the unit of the residual: between two planes of the sweep, or
-            ``matching.points.UNIT`` of the points' median inverse depth.
-    """
-
-    inverse_depth: Tensor
-    confidence: Tensor
-    plane_step: Tensor
 
 
 @dataclass(frozen=True)

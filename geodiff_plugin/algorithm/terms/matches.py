@@ -27,5 +27,6 @@ def matches(estimate: Estimate, *, matches_cauchy: float = DEFAULT.terms.matches
         0 where a sample has no match. The gradient falls as 1 / e and is never zero.
     """
     target = estimate.matches
+    assert target is not None  # of Term.needs_matches
     e = (1.0 / estimate.depth_m - target.inverse_depth) / target.plane_step.view(-1, 1, 1, 1)
     return masked_mean(cauchy(e, matches_cauchy), target.confidence)

@@ -83,7 +83,7 @@ def photometric(
         warped = match_exposure(
             warped, left, mask, gain_range=exposure_gain, cells=cells, prior=exposure_prior
         )
-    total, levels = 0.0, 0
+    total, levels = left.new_zeros(()), 0
     for level in range(pyramid_levels):
         if level:
             if min(left.shape[-2:]) < 2 * MIN_SIDE:

@@ -34,6 +34,7 @@ def points(
         in metres the far ones decide.
     """
     target = estimate.points
+    assert target is not None  # of Term.needs_points
     if points_loss == "robust":
         e = (1.0 / estimate.depth_m - target.inverse_depth) / target.plane_step.view(-1, 1, 1, 1)
         return masked_mean(cauchy(e, points_cauchy), target.confidence)

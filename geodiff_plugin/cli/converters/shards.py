@@ -83,7 +83,7 @@ def rewrite_shards(files: list[Path], folder: Path, change: Callable[[str, Tenso
     """
     known = shapes_of(files)
     shards = _plan({name: size for name, (_, _, size) in known.items()})
-    weight_map = {}
+    weight_map: dict[str, str] = {}
     for i, names in enumerate(shards):
         suffix = "" if len(shards) == 1 else f"-{i + 1:05d}-of-{len(shards):05d}"
         target, held = f"{STEM}{suffix}.safetensors", {}

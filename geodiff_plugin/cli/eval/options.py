@@ -102,13 +102,12 @@ def pairs_options(typed: dict[str, Any]) -> PairsOptions:
     rest = {name: value for name, value in typed.items() if name not in (*_SETTINGS, "prior")}
     given = typed.get("prior")
     prior, *further = [given] if isinstance(given, str) else list(dict.fromkeys(given or ["bundled"]))
-    lists = {name: names(typed.get(name)) for name in ("methods", "datasets", "scenes")}
-    lists["pose"] = names(typed.get("pose"))
-    perturb = typed.get("perturb")
-    lists["perturb"] = None if perturb is None else perturbation(perturb)
+    lists = {name: names(typed.get(name)) for name in ("methods", "datasets", "scenes", "pose")}
+    perturb = None if typed.get("perturb") is None else perturbation(typed["perturb"])
     chosen = {name: typed[name] for name in _SETTINGS if name in typed}
     settings = Settings(prior, **chosen | {"device": str(pick_device(typed["device"]))})
-    return PairsOptions(**neutral | rest | lists, settings=settings, priors=tuple(further))
+    found = neutral | rest | lists | {"perturb": perturb}
+    return PairsOptions(**found, settings=settings, priors=tuple(further))
 
 
 def run_and_print(command: Callable[[PairsOptions], Page | None], options: PairsOptions) -> None:

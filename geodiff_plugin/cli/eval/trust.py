@@ -41,8 +41,9 @@ def _trust(
     from geodiff_plugin.evaluation.trust import TEN, TrustOptions, run_trust
     from geodiff_plugin.runtime.machine import pick_device
 
-    chosen = {"seed": seed, "steps": steps, "space": space, "dtype": dtype}
-    settings = Settings(prior, **chosen, device=str(pick_device(device)))
+    settings = Settings(
+        prior, seed=seed, steps=steps, space=space, dtype=dtype, device=str(pick_device(device))
+    )
     kinds_given = o.names(kinds) or TEN
     page = run_trust(TrustOptions(data, rendered, width, kinds_given, limit, settings, out, quiet))
     if not quiet:

@@ -18,6 +18,7 @@ from geodiff_plugin.evaluation.figures.canvas import new_figure, show_image
 from geodiff_plugin.guidance.posing import pose_views
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, residuals_px
 from geodiff_plugin.pose.views import grey_views, sparse_tracks
+from geodiff_plugin.types import CameraView
 
 __all__ = ["draw_epipolar"]
 
@@ -53,8 +54,9 @@ def draw_epipolar(options: FigureOptions) -> Drawing:
     K_left, K_right, T = (
         torch.as_tensor(m).float() for m in (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
     )
-    report = pose_views(left, [(right, K_right, T)], K_left, "refine").report
-    views = grey_views(left, [(right, K_right, T)], K_left)
+    rights = [CameraView(right, K_right, T)]
+    report = pose_views(left, rights, K_left, "refine").report
+    views = grey_views(left, rights, K_left)
     tracks = sparse_tracks(views)
     Ts = {"as given": np.linalg.inv(report.E_given[0]), "as refined": np.linalg.inv(report.E[0])}
     residuals = {name: residuals_px(tracks, pose[None])[0] for name, pose in Ts.items()}

@@ -67,7 +67,7 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
         output_latent: bool = False,
         return_dict: bool = True,
         **options: Any,
-    ) -> DepthOutput | tuple:
+    ) -> DepthOutput | tuple[Any, ...]:
         """Estimate relative depth; arguments as ``MarigoldDepthPipeline`` takes them.
 
         Args:
@@ -208,5 +208,5 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
             )
             for members in maps.split(ensemble_size)
         ]
-        maps, spread = zip(*pairs, strict=True)
-        return torch.cat(maps), torch.cat(spread) if output_uncertainty else None
+        depths, spreads = zip(*pairs, strict=True)
+        return torch.cat(depths), torch.cat(spreads) if output_uncertainty else None

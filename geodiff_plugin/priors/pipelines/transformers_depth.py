@@ -80,7 +80,8 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
         wrapped = HFDepthModel(model, Preparation.from_config(preparation or {}), prediction_type)
         # A space that the model's class is known for says nothing new: what is saved with it stays metric.
         self._said = None if wrapped.space == _space_of(model) else wrapped.space
-        self.takes_prompt, self.own_range = wrapped.takes_prompt, None
+        self.takes_prompt = wrapped.takes_prompt
+        self.own_range: Tensor | None = None
         self.register_prior(
             {"model": model, "scheduler": scheduler},
             wrapped.space,

@@ -19,7 +19,8 @@ __all__ = ["frame_of", "latents_of", "pack", "unpack"]
 def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of the latents by channel, ``(1, C, 1, 1)`` each."""
     numbers = vae.config.latents_mean, vae.config.latents_std
-    return tuple(like.new_tensor(values).view(1, -1, 1, 1) for values in numbers)
+    mean, deviation = (like.new_tensor(values).view(1, -1, 1, 1) for values in numbers)
+    return mean, deviation
 
 
 def latents_of(

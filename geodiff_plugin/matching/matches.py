@@ -1,0 +1,60 @@
+"""What the views say about depth: inverse depths with their confidence.
+
+Hop: ``match_volume`` -> ``Matches`` of one image -> ``MatchTarget`` of a chunk of samples.
+Paper: none; the evidence that a photometric loss does not have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+__all__ = ["MatchTarget", "Matches", "gate_matches"]
+
+
+@dataclass(frozen=True)
+class MatchTarget:
+    """Matches between the views, or known points, on one grid of the left view.
+
+    Attributes:
+        inverse_depth: ``(B, 1, H, W)`` 1/m, ``(1, H, W)`` of one image; to be read where ``confidence > 0``.
+        confidence: of the same shape, in [0, 1]; 0 where nothing is known or the gate closed.
+        plane_step: ``(B,)`` 1/m, ``()`` of one image, the unit of the residual: between two planes of the
+            sweep, or ``matching.points.UNIT`` of the points' median inverse depth.
+    """
+
+    inverse_depth: torch.Tensor
+    confidence: torch.Tensor
+    plane_step: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Matches(MatchTarget):
+    """What the views alone say about the depth of one image, with its grid.
+
+    Attributes:
+        inverse_depth: ``(1, H, W)`` float32, 1/m; defined everywhere, to be read where ``confidence > 0``.
+        confidence: ``(1, H, W)`` float32 in [0, 1].
+        plane_step: ``()`` float32, 1/m, the unit in which errors of matches are measured.
+        K: ``(3, 3)`` pixels of this grid.
+        size: ``(H, W)``.
+    """
+
+    K: torch.Tensor
+    size: tuple[int, int]
+
+
+def gate_matches(matches: MatchTarget, depth_m: torch.Tensor, factor: float) -> torch.Tensor:
+    """Confidence of the matches that a depth map does not contradict.
+
+    Args:
+        matches: of one image, or of a chunk of samples.
+        depth_m: ``(B, 1, H, W)`` metres, > 0, on the matches' grid.
+        factor: > 1; a match further than this factor from ``depth_m`` is dropped.
+
+    Returns:
+        ``(B, 1, H, W)`` in [0, 1].
+    """
+    ratio = matches.inverse_depth * depth_m
+    return matches.confidence * ((ratio < factor) & (ratio > 1.0 / factor))
