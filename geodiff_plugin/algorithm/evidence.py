@@ -29,7 +29,28 @@ from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.scale.points import sure_matches
 from geodiff_plugin.types import CameraView, PoseReport
 
-__all__ = ["Evidence", "as_fine_as", "chunk_views", "prepare_evidence", "resize_long_edge"]
+__all__ = ["Evidence", "EvidenceInputs", "as_fine_as", "chunk_views", "prepare_evidence", "resize_long_edge"]
+
+
+@dataclass(frozen=True, eq=False)
+class EvidenceInputs:
+    """What evidence is made from.
+
+    Attributes:
+        left_01: ``(3, H, W)`` float32 in [0, 1], native size.
+        views: the further views, native, of any size.
+        K_left: ``(3, 3)`` pixels of the native left image.
+        points: as ``points_to_matches`` takes them, or ``None``.
+        config: says how large the grids are, what the sweep spans, and whether the search needs it.
+        needs_matches: aggregate the volume and check it against each view.
+    """
+
+    left_01: Tensor
+    views: Sequence[CameraView]
+    K_left: Tensor
+    points: Tensor | None
+    config: GuidanceConfig
+    needs_matches: bool
 
 
 @dataclass(frozen=True)
@@ -85,29 +106,18 @@ def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tenso
     return small, resize_intrinsics(K[None], (height, width), size)[0]
 
 
-def prepare_evidence(
-    left_01: Tensor,
-    views: Sequence[CameraView],
-    K_left: Tensor,
-    points: Tensor | None,
-    config: GuidanceConfig,
-    needs_matches: bool,
-    pose: PoseReport | None = None,
-) -> Evidence:
+def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> Evidence:
     """Bring all views and points to the loss grid and let them speak for themselves.
 
     Args:
-        left_01: ``(3, H, W)`` float32 in [0, 1], native size.
-        views: the further views, native, of any size.
-        K_left: ``(3, 3)`` pixels of the native left image.
-        points: as ``points_to_matches`` takes them, or ``None``.
-        config: says how large the grids are, what the sweep spans, and whether the search needs it.
-        needs_matches: aggregate the volume and check it against each view.
-        pose: how the poses of ``views`` came about.
+        given: images, cameras, points and settings.
+        pose: how the poses of the views came about.
 
     Raises:
         InputError: views that do not overlap; points of which none is in the image.
     """
+    left_01, views, K_left, points = given.left_01, given.views, given.K_left, given.points
+    config, needs_matches = given.config, given.needs_matches
     left, K_loss = resize_long_edge(left_01, K_left, config.loss_resolution)
     size, size_loss = image_size(left_01), image_size(left)
     volume, found, matches, known, sweep_known = None, None, None, None, None

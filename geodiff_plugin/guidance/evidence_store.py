@@ -7,42 +7,32 @@ Paper: none.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from geodiff_plugin.algorithm.evidence import Evidence, prepare_evidence
-from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs, prepare_evidence
 from geodiff_plugin.guidance.posing import pose_views
-from geodiff_plugin.types import CameraView
 
 __all__ = ["EvidenceStore", "make_evidence"]
 
 
-def make_evidence(
-    left_01: Tensor,
-    views: Sequence[CameraView],
-    K_left: Tensor,
-    points: Tensor | None,
-    config: GuidanceConfig,
-    needs_matches: bool,
-) -> Evidence:
-    """Poses as the knob ``pose`` says, then ``prepare_evidence``, whose arguments these are."""
-    if not views:
-        return prepare_evidence(left_01, views, K_left, points, config, needs_matches)
-    posed = pose_views(left_01, views, K_left, config.pose)
-    return prepare_evidence(left_01, posed.rights, K_left, points, config, needs_matches, posed.report)
+def make_evidence(given: EvidenceInputs) -> Evidence:
+    """Poses as the knob ``pose`` says, then ``prepare_evidence``."""
+    if not given.views:
+        return prepare_evidence(given)
+    posed = pose_views(given.left_01, given.views, given.K_left, given.config.pose)
+    return prepare_evidence(replace(given, views=posed.rights), posed.report)
 
 
-def _settings(config: GuidanceConfig, needs_matches: bool) -> tuple[Any, ...]:
+def _settings(given: EvidenceInputs) -> tuple[Any, ...]:
     """What of a configuration evidence depends on."""
-    swept = config.search.search == "volume"
+    config, swept = given.config, given.config.search.search == "volume"
     return (
         *(config.pose, config.loss_resolution, config.depth_range, config.sweep, config.fit),
-        *(swept, needs_matches),
+        *(swept, given.needs_matches),
     )
 
 
@@ -77,24 +67,21 @@ class EvidenceStore:
         self._size, self._spared = size, 0.0
         self._entries: list[_Entry] = []
 
-    def get(
-        self,
-        left_01: Tensor,
-        views: Sequence[CameraView],
-        K_left: Tensor,
-        points: Tensor | None,
-        config: GuidanceConfig,
-        needs_matches: bool,
-    ) -> Evidence:
-        """What ``make_evidence`` gives for these arguments; not to be changed by who gets it."""
-        tensors = [left_01, K_left, points, *(value for view in views for value in view)]
-        settings = _settings(config, needs_matches)
+    def get(self, given: EvidenceInputs) -> Evidence:
+        """What ``make_evidence`` gives for these inputs; not to be changed by who gets it."""
+        tensors = [
+            given.left_01,
+            given.K_left,
+            given.points,
+            *(value for view in given.views for value in view),
+        ]
+        settings = _settings(given)
         for entry in self._entries:
             if entry.fits(tensors, settings):
                 self._spared += entry.seconds
                 return entry.evidence
         start = time.perf_counter()
-        evidence = make_evidence(left_01, views, K_left, points, config, needs_matches)
+        evidence = make_evidence(given)
         # Copies, so that who changes an image in place asks anew.
         held = [None if value is None else value.clone() for value in tensors]
         entry = _Entry(held, settings, evidence, time.perf_counter() - start)

@@ -23,7 +23,7 @@ from geodiff_plugin._checks import (
     check_size,
     warn_of_other_size,
 )
-from geodiff_plugin.algorithm.evidence import Evidence
+from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs
 from geodiff_plugin.formats import as_image_01, read_calibration
 from geodiff_plugin.guidance.config import GuidanceConfig, UpdatePlan
 from geodiff_plugin.guidance.evidence_store import EvidenceStore, make_evidence
@@ -329,8 +329,10 @@ class GeometryGuidance:
                 fit = (own.K_left, size[1], size[0], name, "the left image")
                 check_intrinsics_fit(*fit)
                 warn_of_other_size(*fit)
-            known = own.on(lefts_01.device)
-            evidence.append(make(lefts_01[i], *known, self.config, self._asks_for_matches))
+            views, K_left, points = own.on(lefts_01.device)
+            evidence.append(
+                make(EvidenceInputs(lefts_01[i], views, K_left, points, self.config, self._asks_for_matches))
+            )
         return evidence
 
     @property

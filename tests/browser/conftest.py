@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import socket
-import subprocess
 import sys
-import time
-import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +11,7 @@ import pytest
 from PIL import Image
 
 from tests.conftest import plane_pair
+from tests.serving import free_port, served
 
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = [
@@ -30,7 +26,6 @@ FLAGS = [
     "--use-angle=swiftshader",  # WebGL without a GPU, for the point cloud
     "--enable-unsafe-swiftshader",
 ]
-SERVER_STARTS_S = 600
 
 
 @pytest.fixture(scope="session")
@@ -45,35 +40,14 @@ def chromium():
         browser.close()
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 @pytest.fixture(scope="session")
 def address(chromium, tmp_path_factory):
     """Address of ``geodiff app`` in a process of its own."""
     pytest.importorskip("gradio", reason="gradio is not installed")
     folder, port = tmp_path_factory.mktemp("app"), free_port()
-    log = (folder / "log.txt").open("w")
-    environment = os.environ | {"GRADIO_TEMP_DIR": str(folder / "gradio"), "TMPDIR": str(folder)}
     command = [sys.executable, "-m", "geodiff_plugin", "app", "--device", "cpu", "--port", str(port)]
-    process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
-    try:
-        url, end = f"http://127.0.0.1:{port}/", time.monotonic() + SERVER_STARTS_S
-        while True:
-            assert process.poll() is None and time.monotonic() < end, (folder / "log.txt").read_text()
-            try:
-                urllib.request.urlopen(url, timeout=5).close()
-                break
-            except OSError:
-                time.sleep(0.3)
+    with served(command, port, folder) as url:
         yield url
-    finally:
-        process.kill()  # it keeps nothing that a kinder end would save
-        process.wait()
-        log.close()
 
 
 @pytest.fixture

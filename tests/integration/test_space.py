@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import socket
-import subprocess
 import sys
-import time
-import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -15,40 +10,18 @@ import pytest
 from PIL import Image
 
 from tests.conftest import plane_pair
+from tests.serving import free_port, served
 
 SPACE = Path(__file__).resolve().parents[2] / "examples" / "space"
-STARTS_S = 600
 
 
 @pytest.fixture
 def address(tmp_path):
     pytest.importorskip("gradio", reason="gradio is not installed")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    environment = os.environ | {
-        "GRADIO_SERVER_PORT": str(port),
-        "GRADIO_TEMP_DIR": str(tmp_path / "gradio"),
-        "TMPDIR": str(tmp_path),
-    }
-    log = (tmp_path / "log.txt").open("w")
-    process = subprocess.Popen(
-        [sys.executable, "app.py"], cwd=SPACE, env=environment, stdout=log, stderr=subprocess.STDOUT
-    )
-    try:
-        url, end = f"http://127.0.0.1:{port}/", time.monotonic() + STARTS_S
-        while True:
-            assert process.poll() is None and time.monotonic() < end, (tmp_path / "log.txt").read_text()
-            try:
-                urllib.request.urlopen(url, timeout=5).close()
-                break
-            except OSError:
-                time.sleep(0.3)
+    port = free_port()
+    environment = {"GRADIO_SERVER_PORT": str(port)}
+    with served([sys.executable, "app.py"], port, tmp_path, environment, cwd=SPACE) as url:
         yield url
-    finally:
-        process.kill()  # it keeps nothing that a kinder end would save
-        process.wait()
-        log.close()
 
 
 def test_card_has_what_a_space_needs():

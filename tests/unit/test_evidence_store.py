@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance
+from geodiff_plugin.algorithm.evidence import EvidenceInputs
 from geodiff_plugin.development.benchmarks.matching import textured_pair
 from geodiff_plugin.guidance import evidence_store
 from geodiff_plugin.guidance.config import GuidanceConfig
@@ -37,8 +38,8 @@ def pair(seed=0):
 
 def test_equal_values_are_made_once(made):
     store = EvidenceStore()
-    assert store.get(*pair(), *SETTINGS) == 1
-    assert store.get(*pair(), *SETTINGS) == 1
+    assert store.get(EvidenceInputs(*pair(), *SETTINGS)) == 1
+    assert store.get(EvidenceInputs(*pair(), *SETTINGS)) == 1
     assert len(made) == 1 and store.take_spared_seconds() > 0 and store.take_spared_seconds() == 0
 
 
@@ -57,24 +58,24 @@ def test_any_other_value_is_made_anew(made):
         (left[:, :, :6], rights, K, None),
     ]
     for given in [(left, rights, K, None), *others]:
-        store.get(*given, *SETTINGS)
+        store.get(EvidenceInputs(*given, *SETTINGS))
     assert len(made) == 1 + len(others)
-    store.get(left, rights, K, None, GuidanceConfig().changed(loss_resolution=320), True)
+    store.get(EvidenceInputs(left, rights, K, None, GuidanceConfig().changed(loss_resolution=320), True))
     # What happens after evidence is made says nothing of it.
-    store.get(left, rights, K, None, GuidanceConfig().changed(inner_steps=0), True)
+    store.get(EvidenceInputs(left, rights, K, None, GuidanceConfig().changed(inner_steps=0), True))
     assert len(made) == 2 + len(others)
 
 
 def test_an_image_changed_in_place_is_made_anew(made):
     store, given = EvidenceStore(), pair()
-    store.get(*given, *SETTINGS)
+    store.get(EvidenceInputs(*given, *SETTINGS))
     given[0].mul_(0.5)
-    assert store.get(*given, *SETTINGS) == 2
+    assert store.get(EvidenceInputs(*given, *SETTINGS)) == 2
 
 
 def test_the_oldest_is_forgotten(made):
     store = EvidenceStore(size=2)
-    assert [store.get(*pair(seed), *SETTINGS) for seed in (0, 1, 2, 1, 0)] == [1, 2, 3, 2, 4]
+    assert [store.get(EvidenceInputs(*pair(seed), *SETTINGS)) for seed in (0, 1, 2, 1, 0)] == [1, 2, 3, 2, 4]
 
 
 def test_guidance_asks_the_store_that_it_was_given():

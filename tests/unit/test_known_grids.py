@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.evidence import chunk_views, prepare_evidence
+from geodiff_plugin.algorithm.evidence import EvidenceInputs, chunk_views, prepare_evidence
 from geodiff_plugin.algorithm.objective import Objective
 from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.guidance.config import GuidanceConfig, TermsConfig
@@ -33,7 +33,8 @@ def wide_pair(size_right, focal_right, at_m=0.1):
     T = torch.from_numpy(np.linalg.inv(E)).float()
     views = [CameraView(images[1], torch.from_numpy(K_right).float(), T)]
     config = GuidanceConfig().changed(loss_resolution=640, search="one-number")
-    return prepare_evidence(images[0], views, torch.from_numpy(K).float(), None, config, needs_matches=False)
+    K_left = torch.from_numpy(K).float()
+    return prepare_evidence(EvidenceInputs(images[0], views, K_left, None, config, needs_matches=False))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.algorithm.evidence import prepare_evidence
+from geodiff_plugin.algorithm.evidence import EvidenceInputs, prepare_evidence
 from geodiff_plugin.cli.report import summary_line
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.runtime.prompting import PROMPT_LONG_EDGE, prompt_of
@@ -104,12 +104,14 @@ def evidence_of(pair, points=None, rights=True):
     T = torch.tensor(np.linalg.inv(pair.E)).float()
     right = CameraView(image(pair.right), torch.tensor(pair.K).float(), T)
     return prepare_evidence(
-        image(pair.left),
-        [right] if rights else [],
-        torch.tensor(pair.K).float(),
-        points,
-        GuidanceConfig().changed(loss_resolution=512),
-        needs_matches=rights,
+        EvidenceInputs(
+            image(pair.left),
+            [right] if rights else [],
+            torch.tensor(pair.K).float(),
+            points,
+            GuidanceConfig().changed(loss_resolution=512),
+            needs_matches=rights,
+        )
     )
 
 

@@ -17,7 +17,7 @@ import torch
 import geodiff_plugin
 from geodiff_plugin import GeometryGuidance, geometry
 from geodiff_plugin._checks import check_intrinsics, check_intrinsics_fit, warn_of_other_size
-from geodiff_plugin.algorithm.evidence import as_fine_as, prepare_evidence, resize_long_edge
+from geodiff_plugin.algorithm.evidence import EvidenceInputs, as_fine_as, prepare_evidence, resize_long_edge
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.figures.clouds import render_cloud
 from geodiff_plugin.formats.pointcloud import write_ply
@@ -46,7 +46,6 @@ HAND_ON = {
     "evaluation.datasets.booster._quarter_intrinsics",  # by resize_intrinsics
     "formats.rigs.make_rig",
     "guidance.inputs.read_inputs",
-    "algorithm.evidence.prepare_evidence",
     "matching.mirrored.mirrored_pose_preferred",
     "matching.build.find_matches",
     "matching.build.pilot_volume",
@@ -54,7 +53,6 @@ HAND_ON = {
     "app.measure.read_pixel",
     "formats.distortion.undistorted",
     "formats.pointcloud.make_cloud",
-    "guidance.evidence_store.make_evidence",
     "guidance.photographs.estimate_rig",
     "guidance.posing.coarse_depth",
     "guidance.posing.pose_views",
@@ -188,7 +186,7 @@ def test_the_sweep_and_all_that_is_made_of_it():
         assert float((1 / found.inverse_depth[sure]).median()) == pytest.approx(2.0, rel=0.04)
     assert not mirrored_pose_preferred(left, rights, camera).preferred
     config = GuidanceConfig().changed(loss_resolution=48)
-    known = prepare_evidence(left, rights, camera, None, config, needs_matches=True)
+    known = prepare_evidence(EvidenceInputs(left, rights, camera, None, config, needs_matches=True))
     matched = known.sweep_matches.confidence > 0.5
     assert float((1 / known.sweep_matches.inverse_depth[matched]).median()) == pytest.approx(2.0, rel=0.04)
     np.testing.assert_allclose(

@@ -9,7 +9,7 @@ Torch and diffusers are imported inside the commands, so that ``--help`` answers
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -31,44 +31,24 @@ eval_app = typer.Typer(
 
 
 @eval_app.command("pairs")
+@o.takes(
+    *o.SAMPLES,
+    *("sample", "pairs", "pixel_centre", "crop", "prior", *o.SETTINGS, "seeds", "pose", "perturb"),
+    *("out", "results", "skip_broken", "save_depth", "quiet"),
+)
 def pairs(
     data: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of data sets, or synthetic:N.")],
     methods: Annotated[
         str | None, typer.Option(help="Comma-separated, see geodiff eval list; five of them by default.")
     ] = None,
-    datasets: o.Datasets = None,
-    scenes: o.Scenes = None,
-    limit: o.Limit = None,
-    sample: o.Sample = None,
-    view_pairs: o.ViewPairs = "default",
-    pixel_centre: o.PixelCentre = None,
-    crop: o.Crop = "none",
-    prior: o.Priors = None,
-    space: o.Space = None,
-    ensemble: o.Ensemble = 1,
-    seed: o.Seed = 0,
-    seeds: o.Seeds = 1,
-    steps: o.Steps = None,
-    resolution: o.Resolution = None,
-    views: o.Views = 2,
-    pose: o.Pose = None,
-    perturb: o.Perturb = None,
-    device: o.Device = "auto",
-    dtype: o.Dtype = "float32",
-    out: o.Out = Path("geodiff-eval"),
-    results: Annotated[Path | None, typer.Option(help="Write the Markdown page here as well.")] = None,
-    skip_broken: o.SkipBroken = False,
-    save_depth: o.SaveDepth = False,
-    quiet: o.Quiet = False,
+    **shared: Any,
 ) -> None:
     """Measure methods side by side on every metric pair below DIR."""
-    typed = locals()
     from geodiff_plugin.evaluation.commands import run_pairs
     from geodiff_plugin.evaluation.options import PAIRS_METHODS
 
-    typed["pairs"] = typed.pop("view_pairs")
-    typed["methods"] = methods or ",".join(PAIRS_METHODS)
-    o.run_and_print(run_pairs, o.pairs_options(typed))
+    chosen = methods or ",".join(PAIRS_METHODS)
+    o.run_and_print(run_pairs, o.pairs_options({"data": data, "methods": chosen, **shared}))
 
 
 add_tables(eval_app)

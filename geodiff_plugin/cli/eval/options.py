@@ -7,6 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from geodiff_plugin.evaluation.options import PairsOptions
     from geodiff_plugin.evaluation.report import Page
 
-__all__ = ["names", "pairs_options", "run_and_print"]
+__all__ = ["SAMPLES", "SETTINGS", "names", "pairs_options", "run_and_print", "takes"]
 
 
 def _checked(out: Path) -> Path:
@@ -77,12 +78,73 @@ SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Go on after a b
 SaveDepth = Annotated[bool, typer.Option("--save-depth", help="Write every depth map as .npy.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No bar and nothing on the screen.")]
 
+Results = Annotated[Path | None, typer.Option(help="Write the Markdown page here as well.")]
+
+#: Every option that more than one command has: its type and help, and its default.
+_SHARED: dict[str, tuple[Any, Any]] = {
+    "methods": (Methods, None),
+    "datasets": (Datasets, None),
+    "scenes": (Scenes, None),
+    "limit": (Limit, None),
+    "sample": (Sample, None),
+    "pairs": (ViewPairs, "default"),
+    "pixel_centre": (PixelCentre, None),
+    "crop": (Crop, "none"),
+    "prior": (Priors, None),
+    "space": (Space, None),
+    "ensemble": (Ensemble, 1),
+    "seed": (Seed, 0),
+    "seeds": (Seeds, 1),
+    "steps": (Steps, None),
+    "resolution": (Resolution, None),
+    "views": (Views, 2),
+    "pose": (Pose, None),
+    "perturb": (Perturb, None),
+    "device": (Device, "auto"),
+    "dtype": (Dtype, "float32"),
+    "out": (Out, Path("geodiff-eval")),
+    "results": (Results, None),
+    "skip_broken": (SkipBroken, False),
+    "save_depth": (SaveDepth, False),
+    "quiet": (Quiet, False),
+}
+#: Those that choose samples, and those of ``Settings`` that every command with a prior has.
+SAMPLES = ("datasets", "scenes", "limit")
+SETTINGS = ("space", "ensemble", "seed", "steps", "resolution", "views", "device", "dtype")
+
 _SETTINGS = ("ensemble", "seed", "steps", "resolution", "device", "dtype", "space", "views")
 
 
 def names(text: str | None) -> tuple[str, ...]:
     """Parts of a comma-separated list, empty for ``None``."""
     return tuple(part.strip() for part in (text or "").split(",") if part.strip())
+
+
+def takes(*shared: str, **defaults: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command options of ``_SHARED`` behind its own; they arrive as its keywords.
+
+    Args:
+        *shared: their names, in the order of the help.
+        **defaults: values by default that are other than in the table; ``prior="bundled"`` takes one alone.
+    """
+
+    def parameter(name: str) -> Parameter:
+        kind, default = _SHARED[name]
+        if name == "prior" and name in defaults:
+            kind = Prior
+        return Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=defaults.get(name, default))
+
+    def with_options(command: Callable[..., None]) -> Callable[..., None]:
+        own = [
+            one
+            for one in signature(command, eval_str=True).parameters.values()
+            if one.kind is not Parameter.VAR_KEYWORD
+        ]
+        # Typer asks for the signature; this is where one that is put together is looked for.
+        vars(command)["__signature__"] = Signature([*own, *map(parameter, shared)])
+        return command
+
+    return with_options
 
 
 def pairs_options(typed: dict[str, Any]) -> PairsOptions:

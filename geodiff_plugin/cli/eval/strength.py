@@ -9,13 +9,16 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from geodiff_plugin.cli.eval import options as o
 
 __all__ = ["add_strength"]
 
 
+@o.takes("out", "results", "quiet")
 def strength(
     data: Annotated[
         list[Path] | None,
@@ -36,41 +39,34 @@ def strength(
     resolution: Annotated[int, typer.Option(min=64, help="Longer side for the prior, px.")] = 384,
     seed: Annotated[int, typer.Option(help="Of the noise, and of the prior's error.")] = 0,
     limit: Annotated[int | None, typer.Option(min=1, help="Pairs of each --data at most.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the records; a run goes on where it stopped.")] = Path(
-        "geodiff-eval"
-    ),
-    results: Annotated[Path | None, typer.Option(help="Write the Markdown page here as well.")] = None,
     figure: Annotated[
         Path | None,
         typer.Option(help="PNG: error against the prior's error, and lit surfaces."),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+    **shared: Any,
 ) -> None:
     """Emulated priors from exact to weak: plain with oracle, fitted once, and guided."""
     from geodiff_plugin.cli.eval.printing import print_page
     from geodiff_plugin.evaluation.emulated import STRENGTHS
     from geodiff_plugin.evaluation.strength import METHODS, StrengthOptions, run_strength
 
-    def names(text: str | None, default: tuple[str, ...]) -> tuple[str, ...]:
-        return default if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
-
     options = StrengthOptions(
         data=tuple(data or [Path("synthetic:4")]),
         command=shlex.join(["geodiff", *sys.argv[1:]]),
-        strengths=names(strengths, tuple(STRENGTHS)),
+        strengths=tuple(STRENGTHS) if strengths is None else o.names(strengths),
         space=space,
         follow=follow,
-        methods=names(methods, METHODS),
+        methods=METHODS if methods is None else o.names(methods),
         steps=steps,
         resolution=resolution,
         seed=seed,
         limit=limit,
-        out=out,
-        results=results,
         figure=figure,
-        quiet=quiet,
+        **shared,
     )
-    print_page(run_strength(options))
+    page = run_strength(options)
+    if not options.quiet:
+        print_page(page)
 
 
 def add_strength(app: typer.Typer) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -32,7 +33,7 @@ _DATA = {
 """Data by default; the paper's tables have none, since their sets must be obtained first."""
 
 
-def _run(name: str, typed: dict[str, object]) -> None:
+def _run(name: str, typed: dict[str, Any]) -> None:
     from geodiff_plugin.evaluation.cost import run_cost
     from geodiff_plugin.evaluation.experiments import how_to_obtain, run_changes, run_experiment
 
@@ -49,33 +50,15 @@ def _run(name: str, typed: dict[str, object]) -> None:
 
 def _command(name: str) -> Callable[..., None]:
     default_data = _DATA.get(name)
-    default_pairs = "all" if name == "table3" else "default"
 
-    def command(
-        data: o.Data = default_data,
-        methods: o.Methods = None,
-        datasets: o.Datasets = None,
-        scenes: o.Scenes = None,
-        limit: o.Limit = None,
-        sample: o.Sample = None,
-        pairs: o.ViewPairs = default_pairs,
-        pixel_centre: o.PixelCentre = None,
-        crop: o.Crop = "none",
-        prior: o.Priors = None,
-        space: o.Space = None,
-        ensemble: o.Ensemble = 1,
-        seed: o.Seed = 0,
-        steps: o.Steps = None,
-        resolution: o.Resolution = None,
-        views: o.Views = 2,
-        device: o.Device = "auto",
-        dtype: o.Dtype = "float32",
-        out: o.Out = Path("geodiff-eval"),
-        skip_broken: o.SkipBroken = False,
-        save_depth: o.SaveDepth = False,
-        quiet: o.Quiet = False,
-    ) -> None:
-        _run(name, {option: value for option, value in locals().items() if option != "name"})
+    @o.takes(
+        *("methods", *o.SAMPLES),
+        *("sample", "pairs", "pixel_centre", "crop", "prior", *o.SETTINGS),
+        *("out", "skip_broken", "save_depth", "quiet"),
+        pairs="all" if name == "table3" else "default",
+    )
+    def command(data: o.Data = default_data, **shared: Any) -> None:
+        _run(name, {"data": data, **shared})
 
     command.__doc__ = _HELP[name]
     return command

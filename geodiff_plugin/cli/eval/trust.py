@@ -7,7 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,7 +15,10 @@ from geodiff_plugin.cli.eval import options as o
 
 __all__ = ["add_trust"]
 
+_SETTINGS = ("space", "seed", "steps", "dtype")
 
+
+@o.takes("limit", "prior", *_SETTINGS, "device", "out", "quiet", prior="bundled", out=Path("geodiff-trust"))
 def _trust(
     data: Annotated[
         Path | None, typer.Option("--data", help="Folder of real pairs; none by default.")
@@ -25,15 +28,7 @@ def _trust(
     kinds: Annotated[
         str | None, typer.Option(help="Comma-separated kinds of wrong calibration; ten by default.")
     ] = None,
-    limit: o.Limit = None,
-    prior: o.Prior = "bundled",
-    space: o.Space = None,
-    seed: o.Seed = 0,
-    steps: o.Steps = None,
-    device: o.Device = "auto",
-    dtype: o.Dtype = "float32",
-    out: o.Out = Path("geodiff-trust"),
-    quiet: o.Quiet = False,
+    **shared: Any,
 ) -> None:
     """How many wrong calibrations are caught, and how many right ones are doubted."""
     from geodiff_plugin.cli.eval.printing import print_page
@@ -41,9 +36,9 @@ def _trust(
     from geodiff_plugin.evaluation.trust import TEN, TrustOptions, run_trust
     from geodiff_plugin.runtime.machine import pick_device
 
-    settings = Settings(
-        prior, seed=seed, steps=steps, space=space, dtype=dtype, device=str(pick_device(device))
-    )
+    chosen = {name: shared[name] for name in _SETTINGS}
+    settings = Settings(shared["prior"], **chosen, device=str(pick_device(shared["device"])))
+    limit, out, quiet = (shared[name] for name in ("limit", "out", "quiet"))
     kinds_given = o.names(kinds) or TEN
     page = run_trust(TrustOptions(data, rendered, width, kinds_given, limit, settings, out, quiet))
     if not quiet:
