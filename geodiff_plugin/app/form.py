@@ -14,7 +14,8 @@ import gradio as gr
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields
 from geodiff_plugin.app.examples import EXAMPLES
-from geodiff_plugin.app.job import MOST_MEMBERS, MOST_STEPS, PRESETS, Priors, Request
+from geodiff_plugin.app.job import MOST_MEMBERS, MOST_STEPS, PRESETS, Request
+from geodiff_plugin.app.priors import Priors
 
 __all__ = ["Form", "build_form"]
 

@@ -17,15 +17,14 @@ import torch
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
+from geodiff_plugin.app.priors import Priors
 from geodiff_plugin.cli.voice import collected_warnings
 from geodiff_plugin.formats import read_image
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.guidance.presets import DEFAULT, PAPER
-from geodiff_plugin.priors import load_prior
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["PRESETS", "Priors", "Request", "Result", "Stopped", "run_job"]
+__all__ = ["PRESETS", "Request", "Result", "Stopped", "run_job"]
 
 PRESETS = {"default": DEFAULT, "paper": PAPER}
 MOST_STEPS, MOST_MEMBERS, LARGEST_RESOLUTION = 100, 20, 4096
@@ -104,28 +103,6 @@ class Result:
     warnings: list[str]
     seconds: dict[str, float]
     request: Request
-
-
-class Priors:
-    """The priors that this page offers, each loaded once, when it is first used.
-
-    Args:
-        names: as ``load_prior`` takes them; a visitor can choose among these alone.
-        device: where they run.
-    """
-
-    def __init__(self, names: tuple[str, ...], device: torch.device) -> None:
-        self.names, self.device = names, device
-        self._loaded: dict[str, Any] = {}
-
-    def get(self, name: str) -> Any:
-        """The pipeline, with guidance enabled and its bars off."""
-        check_choice(name, "prior", self.names)
-        if name not in self._loaded:
-            pipe = load_prior(name).to(self.device)
-            pipe.set_progress_bar_config(disable=True)
-            self._loaded[name] = enable_geometry_guidance(pipe)
-        return self._loaded[name]
 
 
 def _given(path: str | None, name: str) -> str:

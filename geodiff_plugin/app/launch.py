@@ -65,9 +65,9 @@ def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **
     """
     _check_gradio()
     os.environ.update(QUIET)  # gradio looks at it when it is imported
-    from geodiff_plugin.app.job import Priors
     from geodiff_plugin.app.look import CSS
     from geodiff_plugin.app.page import THEME, build_page
+    from geodiff_plugin.app.priors import Priors
     from geodiff_plugin.runtime.machine import pick_device
 
     page = build_page(Priors(priors, pick_device(device)))

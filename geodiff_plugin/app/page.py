@@ -20,8 +20,9 @@ import gradio as gr
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.app import look
 from geodiff_plugin.app.form import Form, build_form
-from geodiff_plugin.app.job import Priors, Result, Stopped, run_job
+from geodiff_plugin.app.job import Result, Stopped, run_job
 from geodiff_plugin.app.panels import CLOUD_TAB, Panels, build_panels
+from geodiff_plugin.app.priors import Priors
 from geodiff_plugin.app.results import (
     LARGEST_SIDE,
     Shown,

@@ -14,7 +14,8 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments, check_arguments
+from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments
+from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.out_folder import OutFolder
 

@@ -22,7 +22,8 @@ from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out_folder import EXIT_ELSEWHERE, OutFolder
-from geodiff_plugin.plotting.figures import colour_depth, depth_range, grid
+from geodiff_plugin.plotting.figures import colour_depth, depth_range
+from geodiff_plugin.plotting.sheets import grid
 
 __all__ = ["run_demo"]
 

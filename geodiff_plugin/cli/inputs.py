@@ -21,8 +21,9 @@ from geodiff_plugin._checks import (
     check_number,
     check_pose,
 )
-from geodiff_plugin.cli.arguments import DepthArguments, check_positive
+from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.begin import PARAMETERS, calibration_way
+from geodiff_plugin.cli.checks import check_positive
 from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import bad_value, check_intrinsics
-from geodiff_plugin.cli.arguments import DepthArguments, check_positive
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.checks import check_positive
 from geodiff_plugin.cli.inputs import Inputs, lenses_of
 from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.cli.voice import say

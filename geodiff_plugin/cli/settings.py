@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import torch
 
 from geodiff_plugin._checks import refuse
-from geodiff_plugin.cli.arguments import DepthArguments, camera_pair
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.checks import camera_pair
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.knobs import config_from_text
 from geodiff_plugin.guidance.presets import PRESETS

@@ -23,20 +23,24 @@ from typing import Self, TypeVar
 from tqdm import tqdm
 
 from geodiff_plugin._checks import InputFileError, bad_value
+from geodiff_plugin.formats.out_place import (
+    CAN_LOCK,
+    LOCK,
+    PARTIAL,
+    check_out,
+    held_by_another,
+    hidden_path,
+    holds_files,
+    reason_of,
+    take_lock,
+)
 
-try:
-    import fcntl
-except ImportError:  # where there is no flock, two runs with one folder are not told apart
-    fcntl = None  # type: ignore[assignment]
-
-__all__ = ["EXIT_ELSEWHERE", "OutFolder", "check_out", "free_folder"]
+__all__ = ["EXIT_ELSEWHERE", "OutFolder"]
 
 #: Exit code of a run whose result could not be written where it was asked for, and was written elsewhere.
 EXIT_ELSEWHERE = 3
-LOCK, PARTIAL = ".geodiff-lock", ".geodiff-partial"
 #: How long a run on a terminal waits before it tries again to write a result that fits nowhere.
 RETRY_S = 10.0
-MOST_NUMBERED = 10_000
 
 Result = TypeVar("Result")
 
@@ -44,67 +48,6 @@ Result = TypeVar("Result")
 def _say(line: str) -> None:
     tqdm.write(line, file=sys.stderr)  # above a progress bar, if there is one
     sys.stderr.flush()
-
-
-def _hidden(target: Path, kind: str) -> Path:
-    """Where the lock or the unfinished files of a folder lie: inside it, or beside it until it is there."""
-    return target / kind if target.is_dir() else target.with_name(f".{target.name}{kind}")
-
-
-def _reason(error: OSError) -> str:
-    return error.strerror or str(error)
-
-
-def check_out(path: Path, name: str = "--out") -> Path:
-    """The place that an output folder has or will have, links followed.
-
-    Args:
-        path: as typed.
-        name: the option, for messages.
-
-    Raises:
-        ValueError: a file, a link to nothing, below a file, or a name that the file system refuses.
-    """
-    try:
-        if path.is_symlink() and not path.exists():
-            cure = "Make that folder, or remove the link."
-            bad_value(name, "a folder", f"{path}, a link to {os.readlink(path)}, which does not exist", cure)
-        target = path.absolute() if not path.exists() else path.resolve()
-        if target.exists() and not target.is_dir():
-            bad_value(name, "a folder", f"the file {path}", "Name a folder.")
-        os.stat(target.with_name(f".{target.name}{PARTIAL}"))  # the longest name that will be needed
-    except FileNotFoundError:
-        pass
-    except NotADirectoryError:
-        bad_value(name, "a folder that can be made", f"{path}, which lies below a file")
-    except OSError as error:
-        bad_value(name, "a folder that can be made", f"{path} ({_reason(error)})", "Name another.")
-    return target
-
-
-def _holds_files(target: Path) -> bool:
-    return target.is_dir() and any(path.name not in (LOCK, PARTIAL) for path in target.iterdir())
-
-
-def free_folder(default: Path) -> Path:
-    """A folder for a run that named none: ``default``, or ``default-2`` and so on where that is taken."""
-    for number in range(1, MOST_NUMBERED):
-        path = default if number == 1 else default.with_name(f"{default.name}-{number}")
-        taken = os.path.lexists(path) and (not path.is_dir() or _holds_files(path))
-        if not taken and not _held_by_another(_hidden(path.absolute(), LOCK)):
-            return path
-    bad_value("--out", "given, as a new folder", f"{MOST_NUMBERED} folders {default}-N that hold files")
-
-
-def _held_by_another(lock: Path) -> bool:
-    if fcntl is None or not lock.is_file():
-        return False
-    with open(lock, "rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return True
-    return False
 
 
 class OutFolder:
@@ -143,7 +86,7 @@ class OutFolder:
 
     def __enter__(self) -> Self:
         self._target = check_out(self.path, self._option)
-        if _holds_files(self._target) and not (self._overwrite or self._resume):
+        if holds_files(self._target) and not (self._overwrite or self._resume):
             cure = "Name another, or add --overwrite."
             bad_value(self._option, "a new or empty folder", f"{self.path}, which holds files", cure)
         with ExitStack() as stack:
@@ -151,12 +94,12 @@ class OutFolder:
             try:
                 self._make(self._target if self._resume else self._target.parent)
                 self._lock(stack)
-                self._staging = _hidden(self._target, PARTIAL)
+                self._staging = hidden_path(self._target, PARTIAL)
                 self._clear_leftovers()
             except OSError as error:
                 cure = "Name another with --out, or make room and see to its permissions."
                 bad_value(
-                    self._option, "a folder that can be written to", f"{self.path} ({_reason(error)})", cure
+                    self._option, "a folder that can be written to", f"{self.path} ({reason_of(error)})", cure
                 )
             stack.callback(shutil.rmtree, self._staging, ignore_errors=True)
             self._stack = stack.pop_all()
@@ -183,16 +126,14 @@ class OutFolder:
     def _lock(self, stack: ExitStack) -> None:
         """Take the folder's lock; the kernel gives it back when the process ends, however it ends."""
         beside = self._target.with_name(f".{self._target.name}{LOCK}")
-        lock = _hidden(self._target, LOCK)
-        if lock != beside and _held_by_another(beside):  # a run that began before the folder was there
+        lock = hidden_path(self._target, LOCK)
+        if lock != beside and held_by_another(beside):  # a run that began before the folder was there
             self._refuse_held(beside)
         while True:
             file = stack.enter_context(open(lock, "a+b", buffering=0))
-            if fcntl is None:
+            if not CAN_LOCK:
                 break
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not take_lock(file):
                 self._refuse_held(lock)
             # A run that ended meanwhile has taken the file away: what we hold is then nobody's lock.
             if lock.exists() and os.path.samestat(os.fstat(file.fileno()), lock.stat()):
@@ -232,7 +173,7 @@ class OutFolder:
                 return self._fill_and_move(fill)
             except OSError as error:
                 shutil.rmtree(self._staging, ignore_errors=True)
-                reason = f"{self.path} could not be written ({_reason(error)})"
+                reason = f"{self.path} could not be written ({reason_of(error)})"
             for base in (Path.cwd(), Path(tempfile.gettempdir()), Path.home()):
                 with suppress(OSError):
                     result = self._fill_in(base, fill)

@@ -250,7 +250,7 @@ class UpdatesConfig(Checked):
         0,
         10_000,
         "updates in each denoising step that makes some; 0 leaves the search and the correction",
-        unset="5 after a correction, else 40",
+        unset="0 after a correction, else 40",
     )
     updates_from: float | None = number(
         None,

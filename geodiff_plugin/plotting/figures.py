@@ -1,4 +1,4 @@
-"""Pictures of depth maps: colours, a legend in metres, contact sheets; with Pillow alone.
+"""Pictures of depth maps: colours and a legend in metres, with Pillow alone.
 
 Hop: depth in metres, mask -> RGB picture.
 Paper: Figures of S5 (coloured depth).
@@ -7,7 +7,6 @@ Paper: Figures of S5 (coloured depth).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["colour_depth", "depth_figure", "depth_range", "grid", "text_font", "ticks"]
+__all__ = ["WHITE", "colour_depth", "depth_figure", "depth_range", "text_font", "ticks", "write_centred"]
 
 # The map "plasma" of matplotlib (public domain, CC0), at 17 equal steps. Its lightness grows evenly, so equal
 # steps look equal; far is dark blue, near is bright yellow, and no entry is near the grey of "no depth".
@@ -207,11 +206,11 @@ def depth_figure(
     figure.paste(picture, (0, head))
     figure.paste(legend, (picture.width, head))
     if title is not None:
-        _write(figure, title, (0, 0, figure.width, head), head // 2)
+        write_centred(figure, title, (0, 0, figure.width, head), head // 2)
     return figure
 
 
-def _write(picture: Image.Image, text: str, box: tuple[int, int, int, int], size: int) -> None:
+def write_centred(picture: Image.Image, text: str, box: tuple[int, int, int, int], size: int) -> None:
     """Text centred in a box, in a smaller font where it is too long."""
     draw, width = ImageDraw.Draw(picture), box[2] - box[0]
     while size > 7 and draw.textlength(text, font=text_font(size)) > width:
@@ -219,63 +218,3 @@ def _write(picture: Image.Image, text: str, box: tuple[int, int, int, int], size
     draw.text(
         ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), text, font=text_font(size), fill=BLACK, anchor="mm"
     )
-
-
-def _as_picture(image: Any) -> Image.Image:
-    if isinstance(image, Image.Image):
-        return image.convert("RGB")
-    values = np.asarray(image)
-    if values.dtype.kind == "f":
-        values = np.rint(np.clip(np.nan_to_num(values), 0.0, 1.0) * 255).astype(np.uint8)
-    if values.dtype == bool:
-        values = values.astype(np.uint8) * 255
-    if values.dtype != np.uint8 or not (values.ndim == 2 or (values.ndim == 3 and values.shape[-1] == 3)):
-        bad_value(
-            "images", "PIL, or (H, W) or (H, W, 3) of uint8, bool or [0, 1]", f"{values.dtype} {values.shape}"
-        )
-    return Image.fromarray(values).convert("RGB")
-
-
-def grid(
-    images: Sequence[Any],
-    titles: Sequence[str] | None = None,
-    *,
-    columns: int | None = None,
-    cell_width: int = 320,
-) -> Image.Image:
-    """A contact sheet: pictures side by side, each under its title.
-
-    Args:
-        images: PIL images, or ``(H, W)`` or ``(H, W, 3)`` arrays of uint8, bool or floats in [0, 1].
-        titles: one a picture; ``None`` leaves no room for them.
-        columns: pictures in a row; ``None`` takes all, up to 4.
-        cell_width: pixels that each is scaled to; heights follow, and a row is as high as its highest.
-
-    Returns:
-        RGB picture.
-
-    Raises:
-        ValueError: no pictures, another number of titles, an array that is no picture, no columns.
-    """
-    pictures = [_as_picture(image) for image in images]
-    if not pictures:
-        bad_value("images", "at least one picture", "none")
-    if titles is not None and len(titles) != len(pictures):
-        bad_value("titles", f"one for each of {len(pictures)} pictures", f"{len(titles)}")
-    if columns is not None and columns < 1:
-        bad_value("columns", "at least 1", columns)
-    columns, gap = min(len(pictures), 4) if columns is None else columns, 6
-    head = 0 if titles is None else 24
-    cells = [p.resize((cell_width, max(1, round(p.height * cell_width / p.width)))) for p in pictures]
-    rows = [range(start, min(start + columns, len(cells))) for start in range(0, len(cells), columns)]
-    heights = [head + max(cells[i].height for i in row) for row in rows]
-    sheet_size = (gap + columns * (cell_width + gap), gap + sum(height + gap for height in heights))
-    sheet, top = Image.new("RGB", sheet_size, WHITE), gap
-    for row, height in zip(rows, heights, strict=True):
-        for column, index in enumerate(row):
-            left = gap + column * (cell_width + gap)
-            sheet.paste(cells[index], (left, top + head))
-            if titles is not None:
-                _write(sheet, titles[index], (left, top, left + cell_width, top + head), 15)
-        top += height + gap
-    return sheet

@@ -17,9 +17,9 @@ from geodiff_plugin.plotting.figures import (
     GREY,
     WHITE,
     depth_figure,
-    grid,
     text_font,
 )
+from geodiff_plugin.plotting.sheets import grid
 
 __all__ = ["overview", "share_figure"]
 

@@ -16,7 +16,8 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import InputFileError, bad_value, check_number
-from geodiff_plugin.plotting.figures import depth_figure, depth_range, grid
+from geodiff_plugin.plotting.figures import depth_figure, depth_range
+from geodiff_plugin.plotting.sheets import grid
 
 __all__ = ["SUFFIXES", "depth_frames", "write_depth_video"]
 

@@ -24,10 +24,12 @@ from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.runtime.ensembling import ensemble_metric
 from geodiff_plugin.runtime.exclusive import Exclusive, exclusive_call
+from geodiff_plugin.runtime.grid import ProcessingGrid
 from geodiff_plugin.runtime.output import assemble_output
 from geodiff_plugin.runtime.preconditions import check_guidable
 from geodiff_plugin.runtime.prompting import prompt_of
-from geodiff_plugin.runtime.run import GuidedRun, plan_steps
+from geodiff_plugin.runtime.rounds import plan_steps
+from geodiff_plugin.runtime.run import GuidedRun
 
 __all__ = ["GuidedMarigoldDepthPipeline", "disable_geometry_guidance", "enable_geometry_guidance"]
 
@@ -131,6 +133,7 @@ class _GuidedCall(_Stock):
         resolution = self.default_processing_resolution if resolution is None else resolution
         padded, padding, _ = processor.preprocess(image, resolution, call["resample_method_input"], device)
         content = (padded.shape[-2] - padding[0], padded.shape[-1] - padding[1])
+        grid = ProcessingGrid(content, padding)
         with torch.autocast(device.type, enabled=False):
             evidence = guidance.prepare(lefts_01)
             if prior.takes_prompt and call.get("prompt_depth") is None:
@@ -142,8 +145,7 @@ class _GuidedCall(_Stock):
             evidence,
             call["ensemble_size"],
             call["batch_size"],
-            content,
-            padding,
+            grid,
             rounds,
             callback,
             held,

@@ -11,11 +11,9 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from geodiff_plugin._checks import bad_value
 from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.known import Known
@@ -26,13 +24,14 @@ from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.channels import put_channels
 from geodiff_plugin.runtime.denoiser import DenoiserTap
 from geodiff_plugin.runtime.exclusive import Exclusive
+from geodiff_plugin.runtime.grid import ProcessingGrid
 from geodiff_plugin.runtime.half import ImagesInFloat32
 from geodiff_plugin.runtime.marks import FrozenWeights, Running
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.preconditions import needs_network
 from geodiff_plugin.runtime.scheduler import GuidedScheduler
 
-__all__ = ["GuidedRun", "plan_steps"]
+__all__ = ["GuidedRun"]
 
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor]], dict[str, Tensor] | None]
 
@@ -47,9 +46,8 @@ class GuidedRun:
         evidence: one entry per image.
         ensemble_size: members per image.
         batch_size: samples per chunk, as the pipeline slices them.
-        content_size: ``(H, W)`` of the processing grid without padding.
-        padding: rows at the bottom and columns at the right that were added to it.
-        rounds: times that every denoising step makes its updates, see ``plan_steps``.
+        grid: that the pipeline works on.
+        rounds: times that every denoising step makes its updates, see ``rounds.plan_steps``.
         callback: ``callback_on_step_end`` or ``None``.
         held: what the call holds against other threads, given back while the callback runs.
 
@@ -67,8 +65,7 @@ class GuidedRun:
         evidence: list[Evidence],
         ensemble_size: int,
         batch_size: int,
-        content_size: tuple[int, int],
-        padding: tuple[int, int],
+        grid: ProcessingGrid,
         rounds: int,
         callback: StepCallback | None,
         held: Exclusive,
@@ -76,7 +73,7 @@ class GuidedRun:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
         self.full = needs_network(guidance)
         self.owners = [i for i in range(len(evidence)) for _ in range(ensemble_size)]
-        self.batch_size, self.content_size, self.padding = batch_size, content_size, padding
+        self.batch_size, self.grid = batch_size, grid
         self.rounds, self.callback, self._held = rounds, callback, held
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
@@ -126,22 +123,11 @@ class GuidedRun:
 
     def decode(self, z0: Tensor) -> Tensor:
         """Unclipped relative map without padding, ``(B, 1, H, W)`` float32, with its graph."""
-        height, width = self.content_size
-        return self._decode_padded(z0)[:, :, :height, :width]
-
-    def _decode_padded(self, z0: Tensor) -> Tensor:
-        """The same on the padded grid; beyond the last whole cell of the latent the last row repeats."""
-        x = self.prior.decode(z0)
-        bottom, right = (
-            content + added - side
-            for content, added, side in zip(self.content_size, self.padding, x.shape[-2:], strict=True)
-        )
-        return F.pad(x, (0, right, 0, bottom), mode="replicate") if bottom or right else x
+        return self.grid.cropped(self.grid.filled(self.prior.decode(z0)))
 
     def encode(self, x: Tensor) -> Tensor:
         """Clean latent of a relative map without padding, which is made as the image's was."""
-        bottom, right = self.padding
-        return self.prior.encode(F.pad(x, (0, right, 0, bottom), mode="replicate"))
+        return self.prior.encode(self.grid.padded(x))
 
     def metric_prediction(self, latents: Tensor) -> Tensor:
         """Metric depth of the next chunk of final latents; takes the place of the clipping decode.
@@ -155,14 +141,12 @@ class GuidedRun:
         trajectory = self.trajectories[self._decoded_chunks]
         self._decoded_chunks += 1
         # What was encoded last, before the autoencoder's loss and the noise that SD-2's schedulers leave.
-        bottom, right = self.padding
         x = trajectory.result
         if x is None:
-            x = self._decode_padded(latents[:, self.prior.latents])
+            x = self.grid.filled(self.prior.decode(latents[:, self.prior.latents]))
         else:
-            x = F.pad(x, (0, right, 0, bottom), mode="replicate")
-        height, width = self.content_size
-        self.relative.append(x[:, :, :height, :width])
+            x = self.grid.padded(x)
+        self.relative.append(self.grid.cropped(x))
         trajectory.watch.note("the map of the final latent", len(self.timesteps) - 1, x)
         return trajectory.metric(x, trajectory.affine)
 
@@ -270,29 +254,3 @@ class GuidedRun:
             self._bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
             self._bar.update()
         return latents
-
-
-def plan_steps(
-    guidance: GeometryGuidance, prior: DepthPrior, asked: int | None, pipeline_default: int | None
-) -> tuple[int, int]:
-    """Denoising steps of a guided call, and how often each makes its updates.
-
-    A prior that can only take fewer steps than guidance wants makes the updates of all of them in those
-    that it has, each round with its own search and gate on matches, as a step would have.
-
-    Args:
-        guidance: says how many steps it wants.
-        prior: says how many make sense.
-        asked: ``num_inference_steps`` of the call.
-        pipeline_default: when none was asked for.
-
-    Raises:
-        ValueError: more steps were asked for than the prior has.
-    """
-    wanted = guidance.denoising_steps(asked, pipeline_default)
-    if prior.max_steps is None or wanted <= prior.max_steps:
-        return wanted, 1
-    if asked is not None:
-        cure = "Leave it out: the prior was trained for so few."
-        bad_value("num_inference_steps", f"at most {prior.max_steps} with this prior", asked, cure)
-    return prior.max_steps, -(-wanted // prior.max_steps)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
-from geodiff_plugin.cli.arguments import DTYPES, SPACES, demo_arguments
+from geodiff_plugin.cli.arguments import demo_arguments
+from geodiff_plugin.cli.checks import DTYPES, SPACES
 from geodiff_plugin.scale import space
 
 #: Fails on the first import of what takes seconds.

@@ -13,7 +13,8 @@ import pytest
 
 from geodiff_plugin.cli.arguments import OUTPUT_FILES
 from geodiff_plugin.formats import out_folder
-from geodiff_plugin.formats.out_folder import LOCK, PARTIAL, OutFolder, free_folder
+from geodiff_plugin.formats.out_folder import OutFolder
+from geodiff_plugin.formats.out_place import LOCK, PARTIAL, free_folder
 
 
 def fill(folder: Path) -> str:

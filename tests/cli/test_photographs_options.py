@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from geodiff_plugin.cli.arguments import DepthArguments, check_arguments
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.cli.photographs import known_length
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
-from geodiff_plugin.formats.out_folder import check_out
+from geodiff_plugin.formats.out_place import check_out
 from geodiff_plugin.guidance.config import GuidanceConfig
 from tests.fuzz.strategies import (
     CALIBRATIONS,

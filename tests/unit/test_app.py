@@ -16,10 +16,11 @@ from geodiff_plugin.app import cameras
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
 from geodiff_plugin.app.examples import EXAMPLES
 from geodiff_plugin.app.files import write_files
-from geodiff_plugin.app.job import Priors, Request, Stopped, run_job
+from geodiff_plugin.app.job import Request, Stopped, run_job
 from geodiff_plugin.app.launch import launch_page
 from geodiff_plugin.app.measure import distance_m, read_pixel
 from geodiff_plugin.app.pictures import colour_relative, legend_of_depth, legend_of_share, marked, metres
+from geodiff_plugin.app.priors import Priors
 from geodiff_plugin.formats import read_calibration, read_image
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])

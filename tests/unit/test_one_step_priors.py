@@ -15,7 +15,7 @@ from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.rules import RULES, Plain
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from geodiff_plugin.runtime.noise_levels import check_scheduler, noise_level
-from geodiff_plugin.runtime.run import plan_steps
+from geodiff_plugin.runtime.rounds import plan_steps
 from tests.conftest import SCHEDULER
 from tests.contracts.tiny_priors import make_e2e_ft
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.plotting.figures import colour_depth, depth_figure, depth_range, grid, ticks
+from geodiff_plugin.plotting.figures import colour_depth, depth_figure, depth_range, ticks
+from geodiff_plugin.plotting.sheets import grid
 
 
 def test_near_is_yellow_far_is_blue_unknown_is_grey():

@@ -1,0 +1,190 @@
+"""``geodiff depth``: every option with its help.
+
+Hop: argv -> ``DepthArguments`` -> ``cli.depth``.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geodiff_plugin.cli.options import CAMERAS, OUT, OUTPUT, RUN, Device, Overwrite, out_folder
+from geodiff_plugin.cli.options import option as _option
+
+__all__ = ["add_depth"]
+
+
+def _depth(
+    left: Annotated[
+        Path, typer.Argument(metavar="LEFT", help="Left image; it gets the depth. EXIF turns are applied.")
+    ],
+    right: Annotated[
+        Path | None,
+        typer.Argument(metavar="RIGHT", help="Right image, of any size; not needed with --points."),
+    ] = None,
+    calib: Annotated[
+        list[Path] | None,
+        _option(
+            "Calibration file in any known format, or COLMAP folder; twice if each view has its own.",
+            CAMERAS,
+            "--calib",
+        ),
+    ] = None,
+    cameras: Annotated[
+        str | None, _option("Left and right camera of a file of many, as 2,3.", CAMERAS, "--cameras")
+    ] = None,
+    fx: Annotated[float | None, _option("Focal length, pixels.", CAMERAS, "--fx")] = None,
+    fy: Annotated[float | None, _option("Focal length, pixels.", CAMERAS, "--fy")] = None,
+    cx: Annotated[float | None, _option("Principal point, pixels.", CAMERAS, "--cx")] = None,
+    cy: Annotated[float | None, _option("Principal point, pixels.", CAMERAS, "--cy")] = None,
+    baseline: Annotated[
+        float | None,
+        _option(
+            "Distance of the cameras, metres, right one to the right; also scales --calib.",
+            CAMERAS,
+            "--baseline",
+        ),
+    ] = None,
+    k: Annotated[Path | None, _option("3x3 intrinsics, text or .npy.", CAMERAS, "--K")] = None,
+    e: Annotated[
+        Path | None, _option("4x4 pose of the right camera in the left one's frame, metres.", CAMERAS, "--E")
+    ] = None,
+    k_right: Annotated[
+        Path | None, _option("3x3 intrinsics of the right image, if they differ.", CAMERAS, "--K-right")
+    ] = None,
+    distortion: Annotated[
+        list[str] | None,
+        _option(
+            "Lens: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; twice for two lenses.", CAMERAS, "--distortion"
+        ),
+    ] = None,
+    estimate_pose: Annotated[
+        bool,
+        _option(
+            "Find the cameras' poses from the photographs (needs the extra pose).", CAMERAS, "--estimate-pose"
+        ),
+    ] = False,
+    fov: Annotated[
+        float | None,
+        _option("Horizontal field of view, degrees, where EXIF tells no focal length.", CAMERAS, "--fov"),
+    ] = None,
+    known_length: Annotated[
+        str | None,
+        _option(
+            "Distance of two pixels of LEFT, X1,Y1,X2,Y2,METRES, for --baseline.", CAMERAS, "--known-length"
+        ),
+    ] = None,
+    view: Annotated[
+        list[Path] | None, _option("A further view, with --view-E; repeat both for each.", CAMERAS, "--view")
+    ] = None,
+    view_k: Annotated[
+        list[Path] | None, _option("3x3 intrinsics of each --view; LEFT's if none.", CAMERAS, "--view-K")
+    ] = None,
+    view_e: Annotated[
+        list[Path] | None,
+        _option("4x4 pose of each --view in the left camera's frame, metres.", CAMERAS, "--view-E"),
+    ] = None,
+    prior: Annotated[
+        str, _option("'bundled', a hub id or a folder; KEY:folder says which kind.", RUN, "--prior")
+    ] = "bundled",
+    space: Annotated[
+        str | None,
+        _option(
+            "Space in which the prior's map is affine, if its folder does not say: depth, disparity ...",
+            RUN,
+            "--space",
+        ),
+    ] = None,
+    option: Annotated[
+        list[str] | None,
+        _option(
+            "An option that only this prior has, as NAME=VALUE (GeoWizard: domain=outdoor).", RUN, "--option"
+        ),
+    ] = None,
+    steps: Annotated[
+        int | None, _option("Denoising steps; by default the prior's own, at least 4.", RUN, "--steps")
+    ] = None,
+    ensemble: Annotated[
+        int, _option("Members; from 2 on their spread is written as uncertainty.", RUN, "--ensemble")
+    ] = 1,
+    resolution: Annotated[
+        int | None,
+        _option("Longer side for the prior, pixels; 0: as the image.", RUN, "--resolution"),
+    ] = None,
+    points: Annotated[
+        Path | None,
+        _option(
+            "Known depths: a map of LEFT (PNG, PFM, .npy) or points (.npy, text, .ply, .bin).",
+            RUN,
+            "--points",
+        ),
+    ] = None,
+    points_scale: Annotated[
+        float | None,
+        _option("Units of that file in a metre: 1000 for mm, 256 for KITTI's PNG.", RUN, "--points-scale"),
+    ] = None,
+    points_calib: Annotated[
+        list[Path] | None,
+        _option("KITTI's lidar calibration, for a .bin; twice for one of two files.", RUN, "--points-calib"),
+    ] = None,
+    cropped: Annotated[
+        bool, _option("The principal point may lie outside: the images are crops.", CAMERAS, "--cropped")
+    ] = False,
+    near: Annotated[float | None, _option("Nearest depth to search, metres.", RUN, "--near")] = None,
+    far: Annotated[float | None, _option("Farthest depth to search, metres.", RUN, "--far")] = None,
+    seed: Annotated[int, _option("Seed of the noise.", RUN, "--seed")] = 0,
+    device: Device = "auto",
+    dtype: Annotated[str, _option("float32, float16 or bfloat16.", RUN, "--dtype")] = "float32",
+    preset: Annotated[
+        str, _option("default, or paper (Algorithm 1 as printed).", RUN, "--preset")
+    ] = "default",
+    knob: Annotated[
+        list[str] | None,
+        _option(
+            "A knob of the guidance (geodiff info --knobs), as inner_steps=0; repeatable.", RUN, "--knob"
+        ),
+    ] = None,
+    min_confidence: Annotated[
+        float, _option("Least confidence of a point in the cloud, 0 to 1.", OUTPUT, "--min-confidence")
+    ] = 0.0,
+    out: Annotated[
+        Path | None,
+        _option("Folder for the results; geodiff-out, or -2 and so on where it is taken.", OUTPUT, *OUT),
+    ] = None,
+    overwrite: Overwrite = False,
+    strict: Annotated[
+        bool, _option("A result that is not to be trusted is an error.", OUTPUT, "--strict")
+    ] = False,
+    export: Annotated[
+        list[str] | None,
+        _option("Also write the cloud and cameras as glb or colmap; repeatable.", OUTPUT, "--export"),
+    ] = None,
+    show: Annotated[
+        str | None,
+        _option(
+            "Open the cloud and cameras in rerun or viser, or auto for what is installed.", OUTPUT, "--show"
+        ),
+    ] = None,
+    quiet: Annotated[bool, _option("No progress bar, no summary.", OUTPUT, "--quiet", "-q")] = False,
+    json: Annotated[bool, _option("Print the report instead of the summary.", OUTPUT, "--json")] = False,
+) -> None:
+    """Estimate the metric depth of LEFT with RIGHT as its guide."""
+    typed = locals()
+    from geodiff_plugin.cli.arguments import DepthArguments
+    from geodiff_plugin.cli.begin import begun
+
+    typed["out"] = out_folder(out, "geodiff-out", overwrite)
+    repeated = ("calib", "view", "view_k", "view_e", "option", "knob", "points_calib", "export", "distortion")
+    arguments = DepthArguments(**typed | {name: tuple(typed[name] or ()) for name in repeated})
+    with begun(arguments) as held:
+        from geodiff_plugin.cli.depth import run_depth
+
+        run_depth(arguments, held)
+
+
+def add_depth(app: typer.Typer) -> None:
+    """Add the command to ``geodiff``."""
+    app.command("depth")(_depth)
