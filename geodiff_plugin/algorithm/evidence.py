@@ -130,15 +130,14 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
             views,
             K_left,
             depth_range=config.depth_range,
-            planes=sweep.planes,
-            max_side=sweep.sweep_side,
-            max_pixels=sweep.sweep_pixels,
-            step_px=sweep.plane_step_px,
+            config=sweep,
+            matching=config.matching,
         )
         if needs_matches:
-            found = find_matches(left_01, views, K_left, volume=volume)
+            found = find_matches(left_01, views, K_left, volume=volume, matching=config.matching)
             matches = _on_grid(found, left, K_loss)
-        if mirrored_pose_preferred(left_01, views, K_left, found).preferred:
+        check = mirrored_pose_preferred(left_01, views, K_left, found, sweep, config.matching)
+        if check.preferred:
             warnings.append(INVERSE)
     if points is not None:
         known, left_out = points_to_matches(points, K_left, size, K_loss, size_loss)

@@ -14,12 +14,12 @@ from typing import Any, Self
 
 from geodiff_plugin._checks import bad_type, bad_value, check_number
 from geodiff_plugin.guidance.fields import Checked, by_name, choice, close_names, flag, integer, number, pair
-from geodiff_plugin.guidance.scale_stages import FitConfig, SearchConfig, SweepConfig
+from geodiff_plugin.guidance.scale_stages import FitConfig, MatchingConfig, SearchConfig, SweepConfig
 from geodiff_plugin.guidance.stages import CorrectionConfig, ReflectionsConfig, TermsConfig, UpdatesConfig
 
 __all__ = ["DEFAULT_WEIGHTS", "GuidanceConfig", "UpdatePlan"]
-__all__ += ["CorrectionConfig", "FitConfig", "ReflectionsConfig", "SearchConfig", "SweepConfig"]
-__all__ += ["TermsConfig", "UpdatesConfig"]
+__all__ += ["CorrectionConfig", "FitConfig", "MatchingConfig", "ReflectionsConfig", "SearchConfig"]
+__all__ += ["SweepConfig", "TermsConfig", "UpdatesConfig"]
 
 #: Weights of the default preset.
 DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
@@ -92,6 +92,7 @@ class GuidanceConfig(Checked):
     )
     terms: TermsConfig = TermsConfig()
     sweep: SweepConfig = SweepConfig()
+    matching: MatchingConfig = MatchingConfig()
     search: SearchConfig = SearchConfig()
     fit: FitConfig = FitConfig()
     reflections: ReflectionsConfig = ReflectionsConfig()

@@ -23,7 +23,7 @@ def make_evidence(given: EvidenceInputs) -> Evidence:
     """Poses as the knob ``pose`` says, then ``prepare_evidence``."""
     if not given.views:
         return prepare_evidence(given)
-    posed = pose_views(given.left_01, given.views, given.K_left, given.config.pose)
+    posed = pose_views(given.left_01, given.views, given.K_left, given.config)
     return prepare_evidence(replace(given, views=posed.rights), posed.report)
 
 
@@ -31,7 +31,8 @@ def _settings(given: EvidenceInputs) -> tuple[Any, ...]:
     """What of a configuration evidence depends on."""
     config, swept = given.config, given.config.search.search == "volume"
     return (
-        *(config.pose, config.loss_resolution, config.depth_range, config.sweep, config.fit),
+        *(config.pose, config.loss_resolution, config.depth_range),
+        *(config.sweep, config.matching, config.fit),
         *(swept, given.needs_matches),
     )
 

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.pose.refine import RefinedViews, refine_views, untouched
@@ -23,29 +25,34 @@ _WINDOWS = (3, 7, 15, 31, 63)
 _FARTHEST = 1e-3
 
 
-def pose_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, pose: str) -> RefinedViews:
+def pose_views(
+    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, config: GuidanceConfig = DEFAULT
+) -> RefinedViews:
     """The right views with the poses of the knob ``pose``.
 
     Args:
         left_01: ``(3, H, W)`` float32 in [0, 1], native size.
         rights: as the user gave them.
         K_left: ``(3, 3)`` pixels of ``left_01``.
-        pose: ``"refine"`` or ``"given"``.
+        config: whether they are refined, and the coarse sweep that this starts from.
     """
-    if pose == "given":
+    if config.pose == "given":
         return untouched(rights)
-    return refine_views(left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left))
+    return refine_views(left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left, config))
 
 
-def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> Tensor:
+def coarse_depth(
+    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, config: GuidanceConfig = DEFAULT
+) -> Tensor:
     """A rough, smooth depth without holes, ``(1, 1, h, w)`` metres: a coarse sweep, its sure matches spread.
 
     Args:
         left_01: ``(3, H, W)`` float32 in [0, 1].
         rights: with poses that fit roughly.
         K_left: ``(3, 3)`` pixels of ``left_01``.
+        config: of the sweep and its matches.
     """
-    matches = match_volume(pilot_volume(left_01, rights, K_left))
+    matches = match_volume(pilot_volume(left_01, rights, K_left, config.sweep), config.matching)
     weight = matches.confidence[None] ** 2 + 1e-9
     values = matches.inverse_depth[None] * weight
     above, below = values.clone(), weight.clone()

@@ -1,4 +1,4 @@
-"""The stages of the configuration that find metres: sweep, search in it, fit to matches and points.
+"""The stages of the configuration that find metres: sweep, matches of it, search in it, fit to points.
 
 Hop: named values -> a stage, checked.
 Paper: S7.3 has a search and a range, no numbers of it; a leaf that the paper has no place for says so.
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from geodiff_plugin.guidance.fields import TINY, Checked, choice, integer, number, pair
 
-__all__ = ["FitConfig", "SearchConfig", "SweepConfig"]
+__all__ = ["FitConfig", "MatchingConfig", "SearchConfig", "SweepConfig"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,76 @@ class SweepConfig(Checked):
         1 << 32,
         "bound of the number of its pixels: 828 x 250 for KITTI, 530 x 397 for 4:3",
         paper="-",
+    )
+    pilot_pixels: int = integer(
+        20_000,
+        1024,
+        1 << 32,
+        "the same for the coarse sweep that comes first and finds how near the planes must reach",
+        paper="-",
+    )
+    pilot_planes: int = integer(160, 24, 4096, "the most planes of the coarse sweep", paper="-")
+    pilot_step_px: float = number(
+        1.0, TINY, 1e6, "how far the median pixel moves from one of them to the next, px", paper="-"
+    )
+    pilot_shift: float = number(
+        0.4, TINY, 1, "shift of the nearest depth that the coarse sweep looks at, in image widths", paper="-"
+    )
+    pilot_sure: float = number(
+        0.8, 0, 1, "confidence above which a match of the coarse sweep is sure", paper="-"
+    )
+    pilot_quantile: float = number(
+        0.995,
+        0,
+        1,
+        "quantile of the inverse depths of its sure matches that counts as the nearest",
+        paper="-",
+    )
+    pilot_least_sure: float = number(
+        0.03,
+        0,
+        1,
+        "share of its pixels that must be sure; else the planes reach as near as it looked",
+        paper="-",
+    )
+    headroom: float = number(
+        1.25, TINY, 1e3, "the planes reach this factor nearer than the nearest of its matches", paper="-"
+    )
+    least_shift: float = number(
+        0.03, 0, 1, "and at least to the depth of this shift, in image widths", paper="-"
+    )
+
+
+@dataclass(frozen=True)
+class MatchingConfig(Checked):
+    """The matches of the sweep: aggregation of its costs, and the check of one view by the other."""
+
+    step_penalty: float = number(
+        0.15,
+        0,
+        7.5,
+        "cost of a step of one plane between neighbouring pixels, in units of the largest matching cost",
+        paper="-",
+    )
+    jump_penalty: float = number(
+        1.2, 0, 15, "the same for any larger step where the image is flat", paper="-"
+    )
+    jump_contrast: float = number(
+        0.1, TINY, 1e6, "difference in brightness that halves the cost of such a step", paper="-"
+    )
+    agreement_planes: float = number(
+        1.5, 0, 1e6, "planes by which what the two views say may differ", paper="-"
+    )
+    contrast_reach: int = integer(
+        15,
+        0,
+        1000,
+        "half the window over which a match's plane must be better than the mean plane, px: aggregation "
+        "carries matches over blank walls for ever",
+        paper="-",
+    )
+    least_contrast: float = number(
+        0.03, TINY, 1, "and by how much, as a share of the largest cost, for full confidence", paper="-"
     )
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import torch
 
+from geodiff_plugin.guidance.config import MatchingConfig
+from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching.census import COST_LEVELS
 
 __all__ = ["NEVER", "PATHS", "Room", "aggregate", "cells"]
@@ -71,13 +73,14 @@ def _scan_rows(cost: torch.Tensor, p1: int, p2: torch.Tensor, total: torch.Tenso
             total[:, row] += path[i]
 
 
-def _limits(grey: torch.Tensor, p1: float, p2: float, contrast: float) -> tuple[torch.Tensor, torch.Tensor]:
+def _limits(grey: torch.Tensor, config: MatchingConfig) -> tuple[torch.Tensor, torch.Tensor]:
     """Edge-adaptive P2 for vertical ``(H, W)`` and horizontal ``(W, H)`` paths: cheap jumps at edges."""
     limits = []
     for image in (grey, grey.T):
         difference = torch.zeros_like(image)
         difference[1:] = (image[1:] - image[:-1]).abs()
-        limit = (p2 / (1.0 + difference / contrast)).clamp_min(2.0 * p1)
+        limit = config.jump_penalty / (1.0 + difference / config.jump_contrast)
+        limit = limit.clamp_min(2.0 * config.step_penalty)
         limits.append((COST_LEVELS * limit).round().to(torch.int16))
     return limits[0], limits[1]
 
@@ -86,10 +89,8 @@ def _limits(grey: torch.Tensor, p1: float, p2: float, contrast: float) -> tuple[
 def aggregate(
     levels: torch.Tensor,
     grey: torch.Tensor,
+    config: MatchingConfig = DEFAULT.matching,
     *,
-    p1: float = 0.15,
-    p2: float = 1.2,
-    contrast: float = 0.1,
     room: Room | None = None,
 ) -> torch.Tensor:
     """Semi-global aggregation along four paths.
@@ -97,9 +98,7 @@ def aggregate(
     Args:
         levels: ``(D, H, W)`` uint8, costs of 0 to ``COST_LEVELS``.
         grey: ``(H, W)`` of the same view in [0, 1]: a brightness edge makes a jump in depth cheaper there.
-        p1: penalty of a step of one plane between neighbouring pixels, as a share of ``COST_LEVELS``.
-        p2: penalty of any larger step where the image is flat, likewise; at most 15.
-        contrast: brightness difference that halves ``p2``.
+        config: penalties of steps between neighbouring pixels.
         room: memory to work in, which holds the result until its next use; its own by default.
 
     Returns:
@@ -107,8 +106,8 @@ def aggregate(
 
     Source: Hirschmueller 2008, Eq. 13 with paths up, down, left, right.
     """
-    vertical, horizontal = _limits(grey, p1, p2, contrast)
-    step = round(COST_LEVELS * p1)
+    vertical, horizontal = _limits(grey, config)
+    step = round(COST_LEVELS * config.step_penalty)
     planes, height, width = levels.shape
     room, paths = room or Room(), levels.new_empty(0, dtype=torch.int16)
     turned = room.cells("turned", planes, (width, height), levels)

@@ -13,7 +13,9 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.geometry import plane_rays, resize_intrinsics
+from geodiff_plugin.geometry import image_size, plane_rays, resize_intrinsics
+from geodiff_plugin.guidance.config import MatchingConfig, SweepConfig
+from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -27,11 +29,6 @@ from geodiff_plugin.types import CameraView
 
 __all__ = ["build_cost_volume", "find_matches", "pilot_volume"]
 
-# The first, coarse sweep: pixels of its grid, and how far it looks in fractions of the width.
-_PILOT_PIXELS = 20_000
-_PILOT_SHIFT = 0.4
-# Planes reach this factor nearer than anything that the coarse sweep is sure of, and at least to this shift.
-_HEADROOM, _LEAST_SHIFT = 1.25, 0.03
 # Fewer planes than this make no parabola worth the name.
 _FEWEST_PLANES = 24
 
@@ -40,7 +37,7 @@ def _shrink(
     image_01: torch.Tensor, K: torch.Tensor, factors: tuple[float, float]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Image and K, height and width smaller by ``factors`` < 1 (antialiased); as they are for 1 and above."""
-    size = (image_01.shape[-2], image_01.shape[-1])
+    size = image_size(image_01)
     height, width = (max(1, round(side * min(1.0, f))) for side, f in zip(size, factors, strict=True))
     size_to = (height, width)
     if size_to == size:
@@ -83,15 +80,18 @@ def _even_planes(
 
 @torch.no_grad()
 def pilot_volume(
-    left_01: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, pixels: int = _PILOT_PIXELS
+    left_01: torch.Tensor,
+    rights: Sequence[CameraView],
+    K_left: torch.Tensor,
+    config: SweepConfig = DEFAULT.sweep,
 ) -> CostVolume:
-    """A coarse sweep of all depths from infinity to a shift of 40 % of the width.
+    """A coarse sweep of all depths from infinity to the shift ``pilot_shift``, 40 % of the width.
 
     Args:
         left_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1].
         rights: as for ``build_cost_volume``.
         K_left: ``(3, 3)`` pixels of ``left_01``.
-        pixels: bound on the grid's size.
+        config: how large its grid is and how far it looks.
 
     Returns:
         ``CostVolume``.
@@ -100,10 +100,12 @@ def pilot_volume(
         ValueError: the views do not overlap, or both cameras stand at one place.
     """
     views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
+    pixels = config.pilot_pixels
     left, small, K = _to_grid(grey(left_01), views, K_left.float(), pixels, pixels)
-    size = (left.shape[-2], left.shape[-1])
-    limit = _at_shift(small, K, size, _PILOT_SHIFT)
-    planes = _even_planes((torch.zeros_like(limit), limit), size, small, K, 1.0, 160)
+    size = image_size(left)
+    limit = _at_shift(small, K, size, config.pilot_shift)
+    span, step_px = (torch.zeros_like(limit), limit), config.pilot_step_px
+    planes = _even_planes(span, size, small, K, step_px, config.pilot_planes)
     return sweep_planes(left, small, K, planes)
 
 
@@ -115,15 +117,15 @@ def _at_shift(
     return torch.stack([inverse_depth_at_shift(rays, fraction * size[1]) for rays in all_rays]).amin()
 
 
-def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
+def _nearest_inverse_depth(pilot: CostVolume, config: SweepConfig, matching: MatchingConfig) -> torch.Tensor:
     """The inverse depth that a coarse sweep says nothing is nearer than."""
-    matches = match_volume(pilot)
-    sure, limit = matches.confidence > 0.8, pilot.inverse_depth[-1]
+    matches = match_volume(pilot, matching)
+    sure, limit = matches.confidence > config.pilot_sure, pilot.inverse_depth[-1]
     believed = torch.where(sure, matches.inverse_depth, torch.nan)
-    least = _at_shift(pilot.rights, pilot.K, pilot.size, _LEAST_SHIFT)
-    nearest = (_HEADROOM * torch.nanquantile(believed, 0.995)).clamp(least, limit)
+    least = _at_shift(pilot.rights, pilot.K, pilot.size, config.least_shift)
+    nearest = (config.headroom * torch.nanquantile(believed, config.pilot_quantile)).clamp(least, limit)
     # With little to go by, the search must see everything.
-    return torch.where(sure.float().mean() < 0.03, limit, nearest)
+    return torch.where(sure.float().mean() < config.pilot_least_sure, limit, nearest)
 
 
 @torch.no_grad()
@@ -132,11 +134,9 @@ def build_cost_volume(
     rights: Sequence[CameraView],
     K_left: torch.Tensor,
     *,
-    planes: int = 160,
     depth_range: tuple[float, float] | None = None,
-    max_side: int = 828,
-    max_pixels: int = 210_000,
-    step_px: float = 0.75,
+    config: SweepConfig = DEFAULT.sweep,
+    matching: MatchingConfig = DEFAULT.matching,
 ) -> CostVolume:
     """Sweep planes through the left view and compare it with the right views.
 
@@ -145,15 +145,12 @@ def build_cost_volume(
         rights: one or several ``(image_01, K_right (3, 3), T_right_from_left (4, 4))``, images of any size.
             Costs are averaged over the views that see a pixel.
         K_left: ``(3, 3)`` pixels of ``left_01``.
-        planes: the most planes, >= 24.
         depth_range: ``(near, far)`` metres, 0 < near < far, that the planes span. By default they reach from
-            infinity to a quarter nearer than anything that a coarse sweep (up to a shift of 40 % of the
-            width) is sure of, so that a street gets finer planes than a table top.
-        max_side: longer side of the volume's grid; larger images are shrunk to it, right ones to as many
-            pixels per radian.
-        max_pixels: the same for the number of its pixels: 828 x 250 for KITTI, 530 x 397 for 4:3.
-        step_px: how far the median pixel moves in the right view from one plane to the next, if ``planes``
-            allows.
+            infinity to somewhat nearer than anything that a coarse sweep is sure of, so that a street gets
+            finer planes than a table top.
+        config: bounds of the grid, to which larger images are shrunk, right ones to as many pixels per
+            radian; how many planes; the coarse sweep.
+        matching: how the coarse sweep is read.
 
     Returns:
         ``CostVolume``; not differentiable.
@@ -165,14 +162,15 @@ def build_cost_volume(
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
     views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
-    left, small, K = _to_grid(grey(left_01), views, K_left.float(), max_side, max_pixels)
+    bounds = config.sweep_side, config.sweep_pixels
+    left, small, K = _to_grid(grey(left_01), views, K_left.float(), *bounds)
     if depth_range is None:
-        nearest = _nearest_inverse_depth(pilot_volume(left, small, K))
+        nearest = _nearest_inverse_depth(pilot_volume(left, small, K, config), config, matching)
         span = (torch.zeros_like(nearest), nearest)
     else:
         span = (K.new_tensor(1.0 / depth_range[1]), K.new_tensor(1.0 / depth_range[0]))
-    size = (left.shape[-2], left.shape[-1])
-    return sweep_planes(left, small, K, _even_planes(span, size, small, K, step_px, planes))
+    planes = _even_planes(span, image_size(left), small, K, config.plane_step_px, config.planes)
+    return sweep_planes(left, small, K, planes)
 
 
 def find_matches(
@@ -182,6 +180,8 @@ def find_matches(
     *,
     volume: CostVolume | None = None,
     depth_range: tuple[float, float] | None = None,
+    config: SweepConfig = DEFAULT.sweep,
+    matching: MatchingConfig = DEFAULT.matching,
 ) -> Matches:
     """What the views alone say about depth.
 
@@ -191,6 +191,8 @@ def find_matches(
         K_left: ``(3, 3)`` pixels of ``left_01``.
         volume: what ``build_cost_volume`` gave for the same views, if it was called already.
         depth_range: as for ``build_cost_volume``.
+        config: likewise.
+        matching: penalties of the aggregation, and how far the views may differ.
 
     Returns:
         ``Matches`` on the volume's grid.
@@ -199,5 +201,7 @@ def find_matches(
         ValueError: as ``build_cost_volume``.
     """
     if volume is None:
-        volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range)
-    return match_volume(volume)
+        volume = build_cost_volume(
+            left_01, rights, K_left, depth_range=depth_range, config=config, matching=matching
+        )
+    return match_volume(volume, matching)

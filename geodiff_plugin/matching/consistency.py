@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 
+from geodiff_plugin.guidance.config import MatchingConfig
+from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching.aggregation import NEVER, PATHS, Room, aggregate
 from geodiff_plugin.matching.alignment import AlignedView
 from geodiff_plugin.matching.census import COST_LEVELS
@@ -27,8 +29,6 @@ __all__ = [
     "match_volume",
 ]
 
-# Left and right may differ by this many planes.
-_TOLERANCE = 1.5
 #: Planes of the truth within which a match counts as right.
 RIGHT_WITHIN_PLANES = 3.0
 #: Log-odds that a checked match is right, linear in ``_evidence``, by logistic regression on pairs with truth
@@ -36,9 +36,6 @@ RIGHT_WITHIN_PLANES = 3.0
 LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
 #: Which sign each of them may have; 0 for any.
 SIGNS = (0, 1, -1, -1)
-# Aggregation carries matches over blank walls for ever. Where, within this window, the best planes are no
-# better than the average plane by this much, there is no evidence.
-_WINDOW_PX, _LEAST_CONTRAST = 31, 0.03
 # The right view is asked in every such row.
 _EVERY_ROW = 2
 # A sum over the paths and its plane in one integer, so that one minimum finds both.
@@ -70,7 +67,7 @@ def _winner(total: torch.Tensor) -> _Winner:
     return _Winner(index, position, around, best)
 
 
-def _right_opinion(volume: CostVolume, view: AlignedView, room: Room) -> torch.Tensor:
+def _right_opinion(volume: CostVolume, view: AlignedView, config: MatchingConfig, room: Room) -> torch.Tensor:
     """The position between planes that a right view takes for the best, ``(ceil(h / 2), w)`` of its canvas.
 
     Its costs are those of the same sweep, looked up along its own pixels, and aggregated along its own edges:
@@ -85,7 +82,7 @@ def _right_opinion(volume: CostVolume, view: AlignedView, room: Room) -> torch.T
     for k, own in enumerate(volume.levels):
         plane[:height, :width] = own
         levels[k] = plane.index_select(0, rows[k]).index_select(1, columns[k])
-    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], room=room)).position
+    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], config, room=room)).position
 
 
 def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
@@ -118,7 +115,7 @@ def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor
     return torch.where(inside, difference, torch.full_like(difference, torch.inf))
 
 
-def _contrast(volume: CostVolume, index: torch.Tensor) -> torch.Tensor:
+def _contrast(volume: CostVolume, index: torch.Tensor, reach: int) -> torch.Tensor:
     """How much better than the mean plane the chosen one is, before aggregation, averaged over a window."""
     total, seen = (torch.zeros_like(index, dtype=torch.int32) for _ in range(2))
     for levels, in_view in zip(volume.levels, volume.in_view, strict=True):
@@ -126,7 +123,7 @@ def _contrast(volume: CostVolume, index: torch.Tensor) -> torch.Tensor:
         seen += in_view
     mean = (total - UNSEEN_LEVEL * (len(volume.levels) - seen)) / seen.clamp_min(1)
     gain = (mean - volume.levels.gather(0, index[None])[0]).clamp_min(0.0)[None] / COST_LEVELS
-    for window in ((_WINDOW_PX, 1), (1, _WINDOW_PX)):
+    for window in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
         padding = (window[0] // 2, window[1] // 2)
         gain = F.avg_pool2d(gain, window, 1, padding, count_include_pad=False)
     return gain[0]
@@ -151,33 +148,37 @@ class _Asked:
     differences: Iterator[torch.Tensor]
 
 
-def _ask(volume: CostVolume, views: Sequence[AlignedView]) -> _Asked:
+def _ask(volume: CostVolume, views: Sequence[AlignedView], config: MatchingConfig) -> _Asked:
     """Aggregate, take the winner, and ask right views whether they agree."""
     room = Room()
-    total = aggregate(volume.levels, volume.left_01[0], room=room)
+    total = aggregate(volume.levels, volume.left_01[0], config, room=room)
     winner = _winner(total)
     second = total.scatter_(0, winner.around, NEVER).amin(dim=0)
     unit = 1.0 / (PATHS * COST_LEVELS)
     margin, cost = (second - winner.best) * unit, winner.best * unit
-    differences = (_disagreement(view, _right_opinion(volume, view, room), winner.position) for view in views)
-    return _Asked(winner.position, margin, cost, _contrast(volume, winner.index), differences)
+    differences = (
+        _disagreement(view, _right_opinion(volume, view, config, room), winner.position) for view in views
+    )
+    contrast = _contrast(volume, winner.index, config.contrast_reach)
+    return _Asked(winner.position, margin, cost, contrast, differences)
 
 
-def _evidence(asked: _Asked, difference: torch.Tensor) -> tuple[torch.Tensor, ...]:
+def _evidence(asked: _Asked, difference: torch.Tensor, config: MatchingConfig) -> tuple[torch.Tensor, ...]:
     """1, log of the margin (0.03 + second best cost - best cost), best cost, left-right difference."""
     margin = asked.margin.clamp(0.0, 0.5)
     ones = torch.ones_like(margin)
-    return ones, (margin + 0.03).log(), asked.cost.clamp(0.0, 0.8), difference.clamp_max(_TOLERANCE)
+    differs = difference.clamp_max(config.agreement_planes)
+    return ones, (margin + 0.03).log(), asked.cost.clamp(0.0, 0.8), differs
 
 
-def _confidence(asked: _Asked, difference: torch.Tensor) -> torch.Tensor:
+def _confidence(asked: _Asked, difference: torch.Tensor, config: MatchingConfig) -> torch.Tensor:
     """Probability ``(H, W)`` that the winner is right, given the left-right difference in planes."""
     odds = torch.zeros_like(difference)
-    for weight, x in zip(LOG_ODDS, _evidence(asked, difference), strict=True):
+    for weight, x in zip(LOG_ODDS, _evidence(asked, difference, config), strict=True):
         odds = odds + weight * x
     probability = torch.sigmoid(odds)
-    probability = probability * (asked.contrast / _LEAST_CONTRAST).clamp_max(1.0)
-    return torch.where(difference <= _TOLERANCE, probability, torch.zeros_like(probability))
+    probability = probability * (asked.contrast / config.least_contrast).clamp_max(1.0)
+    return torch.where(difference <= config.agreement_planes, probability, torch.zeros_like(probability))
 
 
 @dataclass(frozen=True)
@@ -196,29 +197,30 @@ class CheckedMatches:
 
 
 @torch.no_grad()
-def checked_matches(volume: CostVolume) -> CheckedMatches:
+def checked_matches(volume: CostVolume, config: MatchingConfig = DEFAULT.matching) -> CheckedMatches:
     """Matches of a cost volume and their evidence, by its first right view."""
-    asked = _ask(volume, volume.aligned[:1])
+    asked = _ask(volume, volume.aligned[:1], config)
     (difference,) = asked.differences
-    checked = (difference <= _TOLERANCE) & (asked.contrast >= _LEAST_CONTRAST)
+    checked = (difference <= config.agreement_planes) & (asked.contrast >= config.least_contrast)
     inverse_depth = volume.inverse_depth[0] + asked.position * volume.plane_step
-    return CheckedMatches(inverse_depth, torch.stack(_evidence(asked, difference)), checked)
+    return CheckedMatches(inverse_depth, torch.stack(_evidence(asked, difference, config)), checked)
 
 
 @torch.no_grad()
-def match_volume(volume: CostVolume) -> Matches:
+def match_volume(volume: CostVolume, config: MatchingConfig = DEFAULT.matching) -> Matches:
     """Matches of a cost volume: aggregate, take the winner, and ask every right view whether it agrees.
 
     Args:
         volume: of any number of right views.
+        config: penalties of the aggregation, and how far the views may differ.
 
     Returns:
         ``Matches``; zero confidence where no right view agrees, else about the probability that the match is
         within ``RIGHT_WITHIN_PLANES`` of the truth (that of the right view most sure of it).
     """
-    asked = _ask(volume, volume.aligned)
+    asked = _ask(volume, volume.aligned, config)
     confidence = torch.zeros_like(asked.cost)
     for difference in asked.differences:
-        confidence = torch.maximum(confidence, _confidence(asked, difference))
+        confidence = torch.maximum(confidence, _confidence(asked, difference, config))
     inverse_depth = volume.inverse_depth[0] + asked.position * volume.plane_step
     return Matches(inverse_depth[None], confidence[None], volume.plane_step, volume.K, volume.size)

@@ -7,11 +7,13 @@ Paper: none; a check of the user's input.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from geodiff_plugin.geometry import invert_rigid
+from geodiff_plugin.guidance.config import MatchingConfig, SweepConfig
+from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -48,6 +50,8 @@ def mirrored_pose_preferred(
     rights: Sequence[CameraView],
     K_left: torch.Tensor,
     matches: Matches | None = None,
+    config: SweepConfig = DEFAULT.sweep,
+    matching: MatchingConfig = DEFAULT.matching,
 ) -> PoseCheck:
     """Compare the pose as given with its inverse.
 
@@ -59,6 +63,8 @@ def mirrored_pose_preferred(
         rights: as for ``build_cost_volume``.
         K_left: ``(3, 3)`` pixels of ``left_01``.
         matches: what ``find_matches`` gave for the pose as given, if it was called already.
+        config: of the coarse sweeps, but for their size.
+        matching: how they are read.
 
     Returns:
         ``PoseCheck``; two coarse sweeps, or none where the matches leave no doubt.
@@ -66,8 +72,10 @@ def mirrored_pose_preferred(
     if matches is not None and (found := float(matches.confidence.mean())) > _PLAINLY:
         return PoseCheck(False, found, None)
 
+    small = replace(config, pilot_pixels=_PIXELS)
+
     def confidence(views: Sequence[CameraView]) -> float:
-        return float(match_volume(pilot_volume(left_01, views, K_left, _PIXELS)).confidence.mean())
+        return float(match_volume(pilot_volume(left_01, views, K_left, small), matching).confidence.mean())
 
     given = confidence(rights)
     try:

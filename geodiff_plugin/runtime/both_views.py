@@ -79,7 +79,7 @@ def _refined_rig(guidance: GeometryGuidance, left: Any) -> Rig:
     The right image stays as it is: it gets depth too.
     """
     rights, K_left, _ = guidance.inputs[0].on(torch.device("cpu"))
-    found = pose_views(as_image_01(left, "left"), rights, K_left, guidance.config.pose)
+    found = pose_views(as_image_01(left, "left"), rights, K_left, guidance.config)
     return replace(guidance.rigs[0], E=found.report.E[0])
 
 

@@ -61,9 +61,10 @@ def test_any_other_value_is_made_anew(made):
         store.get(EvidenceInputs(*given, *SETTINGS))
     assert len(made) == 1 + len(others)
     store.get(EvidenceInputs(left, rights, K, None, GuidanceConfig().changed(loss_resolution=320), True))
+    store.get(EvidenceInputs(left, rights, K, None, GuidanceConfig().changed(step_penalty=0.3), True))
     # What happens after evidence is made says nothing of it.
     store.get(EvidenceInputs(left, rights, K, None, GuidanceConfig().changed(inner_steps=0), True))
-    assert len(made) == 2 + len(others)
+    assert len(made) == 3 + len(others)
 
 
 def test_an_image_changed_in_place_is_made_anew(made):

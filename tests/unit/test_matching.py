@@ -12,6 +12,7 @@ from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
 from geodiff_plugin.development.benchmarks.matching import main as benchmark_main
 from geodiff_plugin.development.benchmarks.matching import textured_pair
+from geodiff_plugin.guidance.config import MatchingConfig, SweepConfig
 from geodiff_plugin.matching.aggregation import NEVER, Room
 from geodiff_plugin.matching.alignment import align_view
 from geodiff_plugin.matching.build import pilot_volume
@@ -64,7 +65,9 @@ def test_a_rectified_pair_stays_one_on_the_grid(size):
     image = torch.rand(1, *size, generator=torch.Generator().manual_seed(0))
     K, T = torch.tensor([[700.0, 0, 300], [0, 700, 200], [0, 0, 1]]), torch.eye(4)
     T[0, 3] = -0.2
-    assert m.build_cost_volume(image, [(image, K, T)], K, depth_range=(2.0, 50.0), planes=24).rectified
+    assert m.build_cost_volume(
+        image, [(image, K, T)], K, depth_range=(2.0, 50.0), config=SweepConfig(planes=24)
+    ).rectified
 
 
 def test_a_range_behind_the_right_camera_is_swept():
@@ -253,17 +256,19 @@ def test_other_size_and_intrinsics_of_the_right_view():
 
 def test_large_images_are_shrunk_and_K_with_them():
     left, (texture, K, T), _, _, _ = scene()
-    volume = m.build_cost_volume(left, [(texture, K, T)], K, max_side=72)
+    volume = m.build_cost_volume(left, [(texture, K, T)], K, config=SweepConfig(sweep_side=72))
     assert volume.size == (48, 72) and volume.left_01.shape == (1, 48, 72)
     torch.testing.assert_close(volume.K, g.resize_intrinsics(K[None], SIZE, (48, 72))[0])
     assert volume.rights[0][0].shape == (1, 48, 72)
-    bounded = m.build_cost_volume(left, [(texture, K, T)], K, max_pixels=4000)
+    bounded = m.build_cost_volume(left, [(texture, K, T)], K, config=SweepConfig(sweep_pixels=4000))
     assert bounded.size[0] * bounded.size[1] <= 4100
 
 
 def test_depth_range_and_number_of_planes():
     left, right, K, _, _ = scene()
-    volume = m.build_cost_volume(left, [right], K, depth_range=(1.0, 20.0), planes=40, step_px=0.1)
+    volume = m.build_cost_volume(
+        left, [right], K, depth_range=(1.0, 20.0), config=SweepConfig(planes=40, plane_step_px=0.1)
+    )
     assert len(volume.inverse_depth) == 40
     assert volume.inverse_depth[0] == pytest.approx(0.05) and volume.inverse_depth[-1] == pytest.approx(1.0)
 
@@ -347,7 +352,9 @@ def test_aggregation_against_a_plain_loop():
                         path[d, y, x] += min(options) - before.min()
             expected += path
         flat = torch.full((height, width), 0.5)
-        out = m.aggregate(levels.to(torch.uint8), flat, p1=p1, p2=p2, room=room)
+        out = m.aggregate(
+            levels.to(torch.uint8), flat, MatchingConfig(step_penalty=p1, jump_penalty=p2), room=room
+        )
         assert torch.equal(out.long(), expected)
 
 
@@ -358,6 +365,24 @@ def test_the_worst_costs_do_not_overflow():
     assert out.min() >= 0 and out.max() < NEVER
 
 
+def test_the_knobs_of_the_matches_and_of_the_coarse_sweep_count():
+    left, right, K, _, _ = scene()
+    volume = m.build_cost_volume(left, [right], K)
+
+    def believed(**knobs) -> float:
+        return float(m.match_volume(volume, MatchingConfig(**knobs)).confidence.mean())
+
+    assert believed(agreement_planes=0.1) < believed() < believed(agreement_planes=3.0)
+    assert believed(least_contrast=0.9) < believed()
+    assert believed(contrast_reach=0) != believed() != believed(step_penalty=1.0)
+
+    def nearest(**knobs) -> float:
+        return float(m.build_cost_volume(left, [right], K, config=SweepConfig(**knobs)).inverse_depth[-1])
+
+    assert nearest(headroom=1.0) == pytest.approx(nearest(headroom=1.2) / 1.2)
+    assert nearest(pilot_least_sure=1.0) > nearest()
+
+
 def test_an_edge_makes_a_jump_cheap():
     cost = torch.full((6, 1, 20), 0.3)
     cost[1, :, :10] = 0.1
@@ -365,8 +390,9 @@ def test_an_edge_makes_a_jump_cheap():
     cost[1, :, 12:] = 0.1
     edge = torch.zeros(1, 20)
     edge[:, 10:12] = 1.0
-    with_edge = m.aggregate(as_levels(cost), edge, p1=0.05, p2=0.6)[:, 0, 10:12].argmin(0)
-    without = m.aggregate(as_levels(cost), torch.zeros(1, 20), p1=0.05, p2=0.6)[:, 0, 10:12].argmin(0)
+    loose = MatchingConfig(step_penalty=0.05, jump_penalty=0.6)
+    with_edge = m.aggregate(as_levels(cost), edge, loose)[:, 0, 10:12].argmin(0)
+    without = m.aggregate(as_levels(cost), torch.zeros(1, 20), loose)[:, 0, 10:12].argmin(0)
     assert (with_edge == 4).all() and (without == 1).all()
 
 

@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
+from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.posing import coarse_depth, pose_views
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.noise import independent_share
@@ -210,7 +211,7 @@ def posed(pair, E):
 def test_images_bring_a_perturbed_pose_back(pair) -> None:
     E = pair.E.numpy()
     wrong = E @ pose((0.8, -0.9, 0.5), (0, 0, 0))
-    found = pose_views(*posed(pair, wrong), "refine")
+    found = pose_views(*posed(pair, wrong))
     report = found.report
     assert report.status == "refined"
     assert report.residual_px[0] < 0.3 < 1.0 < report.residual_px_given[0]
@@ -222,28 +223,28 @@ def test_images_bring_a_perturbed_pose_back(pair) -> None:
 
 def test_a_pose_that_fits_is_not_touched(pair) -> None:
     left, rights, K_left = posed(pair, pair.E.numpy())
-    found = pose_views(left, rights, K_left, "refine")
+    found = pose_views(left, rights, K_left)
     assert found.report.status == "fits" and not found.report.warnings
     assert all(a is b for a, b in zip(found.rights[0], rights[0], strict=True))
 
 
 def test_a_mistaken_pose_is_named_and_kept(pair) -> None:
     left, rights, K_left = posed(pair, np.linalg.inv(pair.E.numpy()))
-    found = pose_views(left, rights, K_left, "refine")
+    found = pose_views(left, rights, K_left)
     assert found.report.status == "mistaken" and "world-to-camera" in found.report.warnings[0]
     assert found.rights[0][2] is rights[0][2]
 
 
 def test_given_poses_are_not_looked_at(pair) -> None:
     left, rights, K_left = posed(pair, np.linalg.inv(pair.E.numpy()))
-    found = pose_views(left, rights, K_left, "given")
+    found = pose_views(left, rights, K_left, GuidanceConfig(pose="given"))
     assert found.report.status == "given" and found.report.residual_px == ()
 
 
 def test_blank_images_say_that_nothing_was_checked(pair) -> None:
     left, rights, K_left = posed(pair, pair.E.numpy())
     rights = [CameraView(torch.full_like(rights[0][0], 0.5), *rights[0][1:])]
-    found = pose_views(torch.full_like(left, 0.5), rights, K_left, "refine")
+    found = pose_views(torch.full_like(left, 0.5), rights, K_left)
     assert found.report.status == "not checked" and found.rights[0] is rights[0]
 
 

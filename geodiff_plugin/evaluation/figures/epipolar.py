@@ -55,7 +55,7 @@ def draw_epipolar(options: FigureOptions) -> Drawing:
         torch.as_tensor(m).float() for m in (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
     )
     rights = [CameraView(right, K_right, T)]
-    report = pose_views(left, rights, K_left, "refine").report
+    report = pose_views(left, rights, K_left).report
     views = grey_views(left, rights, K_left)
     tracks = sparse_tracks(views)
     Ts = {"as given": np.linalg.inv(report.E_given[0]), "as refined": np.linalg.inv(report.E[0])}
