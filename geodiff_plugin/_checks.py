@@ -138,7 +138,8 @@ def check_intrinsics_fit(
             name,
             f"for {image} of {width}x{height} pixels",
             f"principal point ({cx:.1f}, {cy:.1f}) outside of it",
-            f"It probably belongs to another resolution: {SCALED_K}. Of a crop say so with cropped=True.",
+            f"It probably belongs to another resolution: {SCALED_K}. "
+            "If it is a crop, say so with cropped=True.",
         )
 
 
@@ -201,7 +202,8 @@ def check_baseline(E: np.ndarray, name: str = "E") -> None:
             name,
             "a pose whose camera centre differs from the left one's (a baseline)",
             f"a translation of {baseline:.1g} m",
-            "Without a baseline two views carry no scale; give the distance between the cameras in metres.",
+            "Without a baseline two views do not tell the scale; "
+            "give the distance between the cameras in metres.",
         )
     if baseline > LONG_BASELINE_M:
         warnings.warn(

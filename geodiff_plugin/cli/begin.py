@@ -45,7 +45,7 @@ def calibration_way(arguments: DepthArguments) -> str:
     taken = [way for way, is_taken in ways.items() if is_taken]
     known = CAMERA_WAYS if arguments.right is None else CALIBRATION_WAYS
     if not taken:
-        bad_value("calibration", f"given: {known}", "none", "Without cameras two images carry no metres.")
+        bad_value("calibration", f"given: {known}", "none", "Without cameras two images do not tell metres.")
     if len(taken) > 1:
         bad_value("calibration", f"given in one way: {known}", " and ".join(taken), "Drop the others.")
     if arguments.cameras is not None and taken != ["file"]:
@@ -71,7 +71,7 @@ def _check_photographs(arguments: DepthArguments) -> None:
                 pass
         except (UnidentifiedImageError, Image.DecompressionBombError):
             cure = "Convert it to PNG or JPEG."
-            bad_value(name, "an image file", f"{found}, which is none that Pillow knows", cure)
+            bad_value(name, "an image file", f"{found}, which Pillow does not recognise as an image", cure)
         except (OSError, SyntaxError, ValueError, EOFError) as error:
             cure = "Is it cut off? Fetch it again."
             bad_value(name, "a whole image file", f"{found}, which does not decode ({error})", cure)

@@ -136,7 +136,7 @@ def _check_together(arguments: DepthArguments) -> None:
 def _check_alone(arguments: DepthArguments) -> None:
     """LEFT without RIGHT: known points, and nothing that is of a second camera."""
     if arguments.points is None:
-        cure = "One photograph has no metres: give a second one, or known depths with --points."
+        cure = "One photograph alone does not tell metres: give a second one, or known depths with --points."
         bad_value("RIGHT", "given, or --points instead of it", "neither", cure)
     for option, given in (
         ("--baseline", arguments.baseline is not None),
@@ -147,7 +147,7 @@ def _check_alone(arguments: DepthArguments) -> None:
         ("--preset paper", arguments.preset == "paper"),
     ):
         if given:
-            bad_value(option, "given with RIGHT", "no RIGHT", "It is of a second view.")
+            bad_value(option, "given with RIGHT", "no RIGHT", "It belongs to a second view.")
 
 
 def check_arguments(arguments: DepthArguments) -> None:

@@ -88,7 +88,10 @@ def _rig_from_options(arguments: DepthArguments, size: tuple[int, int]) -> Rig:
     if alone:
         K = intrinsics(*values.values())
         return Rig(K, K, np.eye(4))
-    cure = "Two views from one place carry no scale; if the right camera is the left one, swap the images."
+    cure = (
+        "Two views from one place do not tell the scale; "
+        "if the right camera is the left one, swap the images."
+    )
     check_positive(values["baseline"], "--baseline", "metres", cure)
     return rig_from_parameters(*values.values())
 

@@ -39,7 +39,7 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
         bad_type(name, f"the path of {what}", path)
     found = Path(path)
     if found.is_dir():
-        raise FolderError(f"{name} must be {what}; got the folder {found}. Name the file inside of it.")
+        raise FolderError(f"{name} must be {what}; got the folder {found}. Name the file inside it.")
     if not found.exists():
         raise MissingFileError(
             f"{name} must be {what}; got {found}, which does not exist. Check the spelling."

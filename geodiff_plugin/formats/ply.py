@@ -48,7 +48,7 @@ def _head(data: bytes, path: Path, name: str) -> tuple[str, int, list[tuple[str,
             properties.append((words[2], TYPES[words[1]]))
     names = [key for key, _ in properties]
     if kind not in ORDERS or not count or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
-        bad_value(name, "a PLY file with points (element vertex with x, y, z)", f"{path} without")
+        bad_value(name, "a PLY file with points (element vertex with x, y, z)", f"{path}, which has none")
     if count > MOST_POINTS:
         bad_value(name, f"at most {MOST_POINTS} points", f"{path} with {count}")
     return kind, count, properties, begin

@@ -74,7 +74,7 @@ def _model_files(folder: Path) -> tuple[Path, ...]:
     """The two text files of a COLMAP model, the one kind of calibration that is a folder."""
     files = (folder / "cameras.txt", folder / "images.txt")
     if not all(file.exists() for file in files):
-        cure = "Name the file inside of it."
+        cure = "Name the file inside it."
         if (folder / "images.bin").exists():
             cure = "Write it as text first: colmap model_converter --output_type TXT."
         raise FolderError(
@@ -101,9 +101,7 @@ def _check_cameras(cameras: tuple[int, int] | None, name: str) -> None:
     if cameras is None:
         return
     if not CALIBRATION_FORMATS[name].uses_cameras:
-        bad_value(
-            "cameras", "left out for a file of two cameras", cameras, "It chooses where there are more."
-        )
+        bad_value("cameras", "left out for a file of two cameras", cameras, "It chooses among more than two.")
     if (
         not isinstance(cameras, (tuple, list))
         or len(cameras) != 2
