@@ -19,6 +19,7 @@ from torch import Tensor
 from geodiff_plugin.algorithm.correction import Refined, prior_error, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.terms.base import MatchTarget
+from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.matching import Matches, gate_matches, reject_reflections, with_points
 
@@ -98,7 +99,7 @@ class Known:
         """
         if self.matches is None or self.kept is None:
             return None
-        size = tuple(self.matches.confidence.shape[-2:])
+        size = image_size(self.matches.confidence)
         gated = gate_matches(self.matches, _resized(depth_m, size), self.config.gate)
         return replace(self.matches, confidence=_resized(self.kept, size) * gated)
 
@@ -120,8 +121,8 @@ class Known:
         return refine_depth(depth_m, target, left_01, self.error, self.config.correction)
 
 
-def _resized(values: Tensor, size: tuple[int, ...]) -> Tensor:
-    if tuple(values.shape[-2:]) == size:
+def _resized(values: Tensor, size: tuple[int, int]) -> Tensor:
+    if image_size(values) == size:
         return values
     return F.interpolate(values, size, mode="bilinear", align_corners=False)
 

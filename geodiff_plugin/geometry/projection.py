@@ -11,6 +11,8 @@ from typing import NamedTuple
 import torch
 from kornia.geometry.linalg import transform_points
 
+from geodiff_plugin.geometry.cameras import image_size
+
 __all__ = ["NEAREST_M", "PlaneRays", "plane_rays", "project", "project_rays", "transform", "unproject"]
 
 # Nearer than this a point counts as behind the camera: its pixel would be a division by almost 0.
@@ -45,7 +47,7 @@ def unproject(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
         The pixel at the principal point has ``x = y = 0``; one focal length to its right has ``x = z``.
         A skew ``K[0, 1]`` is obeyed, here and everywhere else that a ``K`` is taken.
     """
-    return _rays((depth_m.shape[-2], depth_m.shape[-1]), K.to(depth_m.dtype)) * depth_m[:, 0, ..., None]
+    return _rays(image_size(depth_m), K.to(depth_m.dtype)) * depth_m[:, 0, ..., None]
 
 
 def _rays(size: tuple[int, int], K: torch.Tensor) -> torch.Tensor:

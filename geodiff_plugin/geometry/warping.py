@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 
+from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.geometry.projection import NEAREST_M, PlaneRays, plane_rays, project_rays
 
 __all__ = ["Warped", "hidden_in_right", "sample_at", "warp_right_to_left"]
@@ -97,9 +98,9 @@ def warp_right_to_left(
         the wrong way round for camera-to-world matrices (docs/reference/paper-map.md, E1).
     """
     if rays is None:
-        rays = plane_rays(K_left, K_right, T_right_from_left, (depth_m.shape[-2], depth_m.shape[-1]))
+        rays = plane_rays(K_left, K_right, T_right_from_left, image_size(depth_m))
     uv, z_right = project_rays(depth_m, rays)
-    visible = _inside(uv, z_right, (right.shape[-2], right.shape[-1]))
+    visible = _inside(uv, z_right, image_size(right))
     return Warped(sample_at(right, uv), visible, uv, z_right)
 
 

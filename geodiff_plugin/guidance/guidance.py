@@ -25,6 +25,7 @@ from geodiff_plugin._checks import (
 )
 from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs
 from geodiff_plugin.formats import as_image_01, read_calibration
+from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.guidance.config import GuidanceConfig, UpdatePlan
 from geodiff_plugin.guidance.evidence_store import EvidenceStore, make_evidence
 from geodiff_plugin.guidance.inputs import ImageInputs, read_inputs, split_views
@@ -314,7 +315,7 @@ class GeometryGuidance:
         Raises:
             InputError: not one right view per left image; a left K that is not for images of this size.
         """
-        count, size = lefts_01.shape[0], tuple(lefts_01.shape[-2:])
+        count, size = lefts_01.shape[0], image_size(lefts_01)
         if len(self._inputs) != count:
             name, kind = ("right", "images") if self.rights else ("points", "entries")
             bad_value(name, f"a list of {count} {kind}, one per left image", f"{len(self._inputs)}")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from geodiff_plugin.geometry import sample_at
+from geodiff_plugin.geometry import image_size, sample_at
 
 __all__ = ["AlignedView", "align_view"]
 
@@ -110,7 +110,7 @@ def align_view(
     offset = _translation(to_right, size)
     if offset is not None:
         return AlignedView(image[0], None, scale, shift + offset)
-    low, high = _extent(to_right, size, (image.shape[-2], image.shape[-1]), scale, shift)
+    low, high = _extent(to_right, size, image_size(image), scale, shift)
     return AlignedView(*_turned(image, to_right, low, high), scale, shift - low)
 
 

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.geometry import NEAREST_M, PlaneRays, is_rectified, plane_rays
+from geodiff_plugin.geometry import NEAREST_M, PlaneRays, image_size, is_rectified, plane_rays
 from geodiff_plugin.matching.aggregation import cells
 from geodiff_plugin.matching.alignment import AlignedView, align_view
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, census, grey_levels
@@ -178,7 +178,7 @@ def sweep_planes(
         ``CostVolume``; not differentiable. Planes go one by one, so memory is that of the result, two bytes a
         cell, and of what describes the right views.
     """
-    size = (left_01.shape[-2], left_01.shape[-1])
+    size = image_size(left_01)
     aligned = tuple(align_view(right, K_left, size, inverse_depth) for right in rights)
     left = census(grey_levels(F.pad(left_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0]))
     compared = [ComparedView(left, view) for view in aligned]
