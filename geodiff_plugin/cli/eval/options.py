@@ -77,7 +77,6 @@ Out = Annotated[
 SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Go on after a broken sample and count it.")]
 SaveDepth = Annotated[bool, typer.Option("--save-depth", help="Write every depth map as .npy.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No bar and nothing on the screen.")]
-
 Results = Annotated[Path | None, typer.Option(help="Write the Markdown page here as well.")]
 
 #: Every option that more than one command has: its type and help, and its default.
@@ -111,8 +110,6 @@ _SHARED: dict[str, tuple[Any, Any]] = {
 #: Those that choose samples, and those of ``Settings`` that every command with a prior has.
 SAMPLES = ("datasets", "scenes", "limit")
 SETTINGS = ("space", "ensemble", "seed", "steps", "resolution", "views", "device", "dtype")
-
-_SETTINGS = ("ensemble", "seed", "steps", "resolution", "device", "dtype", "space", "views")
 
 
 def names(text: str | None) -> tuple[str, ...]:
@@ -161,12 +158,12 @@ def pairs_options(typed: dict[str, Any]) -> PairsOptions:
 
     neutral: dict[str, Any] = {"sample": None, "pairs": "default", "pixel_centre": None, "results": None}
     neutral |= {"skip_broken": False, "save_depth": False, "quiet": False}
-    rest = {name: value for name, value in typed.items() if name not in (*_SETTINGS, "prior")}
+    rest = {name: value for name, value in typed.items() if name not in (*SETTINGS, "prior")}
     given = typed.get("prior")
     prior, *further = [given] if isinstance(given, str) else list(dict.fromkeys(given or ["bundled"]))
     lists = {name: names(typed.get(name)) for name in ("methods", "datasets", "scenes", "pose")}
     perturb = None if typed.get("perturb") is None else perturbation(typed["perturb"])
-    chosen = {name: typed[name] for name in _SETTINGS if name in typed}
+    chosen = {name: typed[name] for name in SETTINGS if name in typed}
     settings = Settings(prior, **chosen | {"device": str(pick_device(typed["device"]))})
     found = neutral | rest | lists | {"perturb": perturb}
     return PairsOptions(**found, settings=settings, priors=tuple(further))
