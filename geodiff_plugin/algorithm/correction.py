@@ -179,6 +179,7 @@ def refine_depth(
     broad = _stiff(asked, asked.trusted, error, config)
     trusted = asked.trusted * _robust(broad - asked.wanted, asked.noise, error, config)
     found, weight = torch.zeros_like(asked.wanted), trusted
+    decided = torch.zeros_like(found)
     for smoothness, inertia in _levels(error, config):
         # Two right-hand sides in one solve: the correction, and ones, which show where it is decided.
         data = torch.cat([asked.wanted - found, torch.ones_like(found)], 1)
@@ -189,13 +190,13 @@ def refine_depth(
             residual = part[:, :1] - data[:, :1]
             weight = trusted / (1.0 + (residual / (config.correction_cauchy * asked.noise)) ** 2)
         assert part is not None  # reweightings >= 1
-        found = found + part[:, :1]
+        found, decided = found + part[:, :1], part[:, 1:]
     size = tuple(depth_m.shape[-2:])
     change, support = (
         F.interpolate(
             field, size, mode="bilinear", align_corners=False, antialias=size < tuple(field.shape[-2:])
         )
-        for field in (found, part[:, 1:])
+        for field in (found, decided)
     )
     refined_m = depth_m.float() * torch.exp(-change)
     return Refined(refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), found)
