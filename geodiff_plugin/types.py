@@ -168,6 +168,12 @@ class MetricDepthOutput(BaseOutput):
             (``runtime.judgement.Judgement``).
         unit: ``"m"``, or ``None`` where poses were estimated and no length is known: what is said to be in
             metres is then in baselines of the first two cameras.
+        scale_from: where the unit of estimated poses comes from: ``"baseline"``, ``"known length"``,
+            ``"points"``, ``"prior"`` or ``"none"``; ``None`` for given poses.
+        scale_spread: relative spread of that scale, as matches or the prior's map show it; ``None`` where
+            they cannot.
+        rescaled: what the lengths of ``GeometryGuidance`` are to be multiplied with to be metres, where the
+            prior alone knew the unit.
         warnings: what the user should know about this result, as sentences; those of the judgements too.
     """
 
@@ -187,6 +193,9 @@ class MetricDepthOutput(BaseOutput):
     history: list[StepReport] = field(default_factory=list)
     poses: list[PoseReport] = field(default_factory=list)
     unit: str | None = "m"
+    scale_from: str | None = None
+    scale_spread: float | None = None
+    rescaled: float = 1.0
     extras: dict[str, np.ndarray | torch.Tensor] = field(default_factory=dict)
     judgements: list[Any] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)

@@ -51,9 +51,11 @@ class DepthArguments:
     e: Path | None = None
     k_right: Path | None = None
     distortion: tuple[str, ...] = ()
+    view_distortion: tuple[str, ...] = ()
     estimate_pose: bool = False
     fov: float | None = None
     known_length: str | None = None
+    matcher: str | None = None
     view: tuple[Path, ...] = ()
     view_k: tuple[Path, ...] = ()
     view_e: tuple[Path, ...] = ()

@@ -114,6 +114,7 @@ def _check_together(arguments: DepthArguments) -> None:
     for option, given in (
         ("--fov", arguments.fov is not None),
         ("--known-length", arguments.known_length is not None),
+        ("--matcher", arguments.matcher is not None),
     ):
         if given and not arguments.estimate_pose:
             bad_value(option, "given together with --estimate-pose", "no --estimate-pose")
@@ -128,6 +129,7 @@ def _check_together(arguments: DepthArguments) -> None:
     for option, files, counts in (
         ("--view-E", arguments.view_e, {0 if arguments.estimate_pose else len(arguments.view)}),
         ("--view-K", arguments.view_k, {0, len(arguments.view)}),
+        ("--view-distortion", arguments.view_distortion, {0, len(arguments.view)}),
     ):
         if len(files) not in counts:
             bad_value(option, f"given once for each of {len(arguments.view)} --view", f"{len(files)} times")

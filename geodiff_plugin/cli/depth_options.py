@@ -77,6 +77,12 @@ def _depth(
             "Distance of two pixels of LEFT, X1,Y1,X2,Y2,METRES, for --baseline.", CAMERAS, "--known-length"
         ),
     ] = None,
+    matcher: Annotated[
+        str | None,
+        _option(
+            "Finds points in the photographs: sift, lightglue, superglue, a folder.", CAMERAS, "--matcher"
+        ),
+    ] = None,
     view: Annotated[
         list[Path] | None, _option("A further view, with --view-E; repeat both for each.", CAMERAS, "--view")
     ] = None,
@@ -86,6 +92,10 @@ def _depth(
     view_e: Annotated[
         list[Path] | None,
         _option("4x4 pose of each --view in the left camera's frame, metres.", CAMERAS, "--view-E"),
+    ] = None,
+    view_distortion: Annotated[
+        list[str] | None,
+        _option("Lens of each --view, 0,0,0,0 for none; LEFT's if not given.", CAMERAS, "--view-distortion"),
     ] = None,
     prior: Annotated[
         str, _option("'bundled', a hub id or a folder; KEY:folder says which kind.", RUN, "--prior")
@@ -177,7 +187,8 @@ def _depth(
     from geodiff_plugin.cli.begin import begun
 
     typed["out"] = out_folder(out, "geodiff-out", overwrite)
-    repeated = ("calib", "view", "view_k", "view_e", "option", "knob", "points_calib", "export", "distortion")
+    views = ("view", "view_k", "view_e", "view_distortion")
+    repeated = ("calib", *views, "option", "knob", "points_calib", "export", "distortion")
     arguments = DepthArguments(**typed | {name: tuple(typed[name] or ()) for name in repeated})
     with begun(arguments) as held:
         from geodiff_plugin.cli.depth import run_depth

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.cli.inputs import Inputs
-from geodiff_plugin.cli.report import single_map
+from geodiff_plugin.cli.report import rescaled_pose, single_map
 from geodiff_plugin.cli.voice import say
 from geodiff_plugin.formats import Cloud, flying_points, make_cloud, write_colmap, write_glb
 from geodiff_plugin.types import MetricDepthOutput
@@ -58,7 +58,7 @@ def make_scene(
         keep &= single_map(output.confidence) >= min_confidence
     cameras = [(K, np.eye(4), (depth_m.shape[1], depth_m.shape[0]))]
     for rig, image in zip(inputs.guidance.rigs, inputs.guidance.rights, strict=True):
-        cameras.append((rig.K_right, rig.E, (image.shape[-1], image.shape[-2])))
+        cameras.append((rig.K_right, rescaled_pose(rig.E, output), (image.shape[-1], image.shape[-2])))
     cloud = make_cloud(depth_m, inputs.left, K, keep)
     return Scene(cloud, tuple(cameras), tuple(path.name for path in names), inputs.left)
 

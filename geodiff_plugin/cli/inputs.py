@@ -31,7 +31,10 @@ from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Distortion, Rig
 
-__all__ = ["Inputs", "read_inputs", "read_rig"]
+__all__ = ["Inputs", "lenses_of", "pinhole", "read_inputs", "read_rig"]
+
+Lenses = tuple[Distortion | None, ...]
+"""One entry a photograph, or one a further view; ``None`` for a pinhole camera."""
 
 MOST_PIXELS = 1e6
 
@@ -159,9 +162,9 @@ def read_rig(
 
 
 def _read_further_views(
-    arguments: DepthArguments, K_left: np.ndarray
+    arguments: DepthArguments, K_left: np.ndarray, lenses: Lenses
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Image, K and pose of every ``--view``, checked under its own name."""
+    """Image without lens distortion, K and pose of every ``--view``, checked under its own name."""
     images, poses, matrices = arguments.view, arguments.view_e, arguments.view_k
     views = []
     for i, path in enumerate(images):
@@ -173,12 +176,12 @@ def _read_further_views(
             check_intrinsics_fit(K, *_size(image), f"K of {option}", "its image")
         E = check_pose(read_matrix(poses[i], "--view-E"), f"--view-E {poses[i]}")
         check_baseline(E, f"--view-E {poses[i]}")
-        views.append((image, K, E))
+        views.append((pinhole(image, K, lenses[i]), K, E))
     return views
 
 
 def _make_guidance(
-    arguments: DepthArguments, settings: Settings, right: np.ndarray | None, rig: Rig
+    arguments: DepthArguments, settings: Settings, right: np.ndarray | None, rig: Rig, lenses: Lenses
 ) -> GeometryGuidance:
     config, points, cropped = settings.config, None, arguments.cropped
     if arguments.points is not None:
@@ -186,7 +189,7 @@ def _make_guidance(
         points = read_points(arguments.points, "--points", scale=scale, calibration=calibration)
     if right is None:
         return GeometryGuidance(None, rig.K_left, points=points, cropped=cropped, config=config)
-    further = _read_further_views(arguments, rig.K_left)
+    further = _read_further_views(arguments, rig.K_left, lenses)
     views = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E), *further]
     return GeometryGuidance.from_views(views, points=points, cropped=cropped, config=config)
 
@@ -201,30 +204,38 @@ def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:
     right = None if arguments.right is None else _read_view(arguments.right, "RIGHT")
     rig = read_rig(arguments, settings.cameras, _size(left), None if right is None else _size(right))
     lenses = lenses_of(arguments, rig.distortion)
-    of_left, of_right = lenses
-    if of_left is not None:
-        left = undistorted(left, rig.K_left, of_left)
-    if of_right is not None and right is not None:
-        right = undistorted(right, rig.K_right, of_right)
-    guidance = _make_guidance(arguments, settings, right, rig)
+    left = pinhole(left, rig.K_left, lenses[0])
+    right = None if right is None else pinhole(right, rig.K_right, lenses[1])
+    guidance = _make_guidance(arguments, settings, right, rig, lenses[2:])
     return Inputs(left, right, rig, guidance, any(lens is not None for lens in lenses))
+
+
+def pinhole(image: np.ndarray, K: np.ndarray, lens: Distortion | None) -> np.ndarray:
+    """The image as a pinhole camera would have taken it: the very one where the lens has no distortion."""
+    return image if lens is None else undistorted(image, K, lens)
 
 
 def lenses_of(
     arguments: DepthArguments, own: tuple[Distortion | None, Distortion | None] = (None, None)
-) -> tuple[Distortion | None, Distortion | None]:
-    """Distortion of both lenses: as typed, else the calibration's own; ``None`` where a lens has none.
+) -> Lenses:
+    """Distortion of the lens of every photograph, the left one first; ``None`` where a lens has none.
+
+    As typed, else the calibration's own; of a further view as typed, else the left one's, as its K is.
 
     Raises:
-        ValueError: more than two lenses, malformed coefficients, or further views, whose lenses are not told.
+        ValueError: more than two lenses, malformed coefficients, or a further view with a K of its own and a
+            lens that is not told.
     """
     typed = [distortion_from_text(text) for text in arguments.distortion]
     if len(typed) > 2:
         bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
-    left, right = (
-        lens if lens is not None and is_distorted(lens.coefficients) else None
-        for lens in ((typed[0], typed[-1]) if typed else own)
+    found = (typed[0], typed[-1]) if typed else own
+    further = [distortion_from_text(text, "--view-distortion") for text in arguments.view_distortion]
+    if not further:
+        if arguments.view_k and any(lens is not None and is_distorted(lens.coefficients) for lens in found):
+            cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
+            bad_value("--view-distortion", "given for each --view", "none", cure)
+        further = [found[0]] * len(arguments.view)
+    return tuple(
+        lens if lens is not None and is_distorted(lens.coefficients) else None for lens in (*found, *further)
     )
-    if arguments.view and not (left is None and right is None):
-        bad_value("--view", "left out with lens distortion", "given", "Undistort the further views first.")
-    return left, right

@@ -58,7 +58,7 @@ def write_maps(
         np.save(folder / "confidence.npy", confidence)
         share_figure(confidence, "confidence", 1.0).save(folder / "confidence.png")
         doubtful = confidence < min_confidence
-    overview(left, depth_m, confidence, error).save(folder / "overview.png")
+    overview(left, depth_m, confidence, error, output.unit).save(folder / "overview.png")
     points = write_ply(folder / "cloud.ply", depth_m, left, K, valid=~(flying | doubtful), unit=output.unit)
     return {
         "depth_mm_zero_pixels": zeros,

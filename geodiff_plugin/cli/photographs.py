@@ -15,11 +15,10 @@ import numpy as np
 from geodiff_plugin._checks import bad_value, check_intrinsics
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_positive
-from geodiff_plugin.cli.inputs import Inputs, lenses_of
+from geodiff_plugin.cli.inputs import Inputs, lenses_of, pinhole
 from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.cli.voice import say
 from geodiff_plugin.formats import read_image, read_matrix, read_points
-from geodiff_plugin.formats.distortion import undistorted
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.rigs import intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -45,6 +44,9 @@ def known_length(text: str | None) -> tuple[float, float, float, float, float] |
 
 def _intrinsics(arguments: DepthArguments, path: Path, i: int, size: tuple[int, int]) -> np.ndarray:
     """K of photograph ``i``, 0 being the left one, from the options, else from its EXIF."""
+    if i > 1 and arguments.view_k:
+        path = arguments.view_k[i - 2]
+        return check_intrinsics(read_matrix(path, "--view-K"), f"--view-K {path}")
     typed = [getattr(arguments, name) for name in ("fx", "fy", "cx", "cy")]
     if arguments.k is not None:
         own = arguments.k_right if i > 0 and arguments.k_right is not None else arguments.k
@@ -82,8 +84,7 @@ def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
         for note in notes:
             warnings.warn(note, stacklevel=2)
         Ks.append(_intrinsics(arguments, path, i, (image.shape[1], image.shape[0])))
-        lens = lenses[min(i, 1)]
-        images.append(image if lens is None else undistorted(image, Ks[-1], lens))
+        images.append(pinhole(image, Ks[-1], lenses[i]))
     points = None if arguments.points is None else read_points(arguments.points, "--points")
     guidance = GeometryGuidance.from_photographs(
         images,
@@ -91,6 +92,7 @@ def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
         baseline_m=arguments.baseline,
         known_length=known_length(arguments.known_length),
         points=points,
+        matcher=arguments.matcher or "sift",
         config=settings.config,
     )
     sizes = [(image.shape[1], image.shape[0]) for image in images[:2]]

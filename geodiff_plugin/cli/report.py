@@ -19,7 +19,7 @@ from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["build_report", "depth_summary", "single_map", "summary_line"]
+__all__ = ["build_report", "depth_summary", "rescaled_pose", "single_map", "summary_line"]
 
 
 def single_map(value: Any) -> np.ndarray:
@@ -77,7 +77,7 @@ def _history(output: MetricDepthOutput) -> list[dict[str, Any]]:
     ]
 
 
-def _estimated(inputs: Inputs) -> dict[str, Any] | None:
+def _estimated(inputs: Inputs, output: MetricDepthOutput) -> dict[str, Any] | None:
     """What was found out about cameras that nobody measured; ``None`` for given ones."""
     found = inputs.guidance.estimated
     if found is None:
@@ -86,10 +86,15 @@ def _estimated(inputs: Inputs) -> dict[str, Any] | None:
         "inliers": found.inliers,
         "parallax_deg": found.parallax_deg,
         "residual_px": found.residual_px,
-        "scale_from": found.scale.source,
-        "scale_spread": found.scale.spread,
+        "scale_from": output.scale_from,
+        "scale_spread": output.scale_spread,
         "assumed": found.notes,
     }
+
+
+def rescaled_pose(E: np.ndarray, output: MetricDepthOutput) -> np.ndarray:
+    """A pose of the guidance in the unit of the output."""
+    return E * np.array([1.0, 1.0, 1.0, output.rescaled])
 
 
 def build_report(
@@ -134,7 +139,7 @@ def build_report(
         "warnings": warnings,
         "unit": output.unit,
         "undistorted": inputs.undistorted,
-        "estimated_pose": _estimated(inputs),
+        "estimated_pose": _estimated(inputs, output),
         "pose": None if not output.poses else vars(output.poses[0]),
         "inputs": {
             "left_size": rig.size_left,
@@ -142,9 +147,12 @@ def build_report(
             "calibration": rig.source,
             "K_left": rig.K_left,
             "K_right": rig.K_right,
-            "E": rig.E,
-            "baseline_m": float(np.linalg.norm(rig.E[:3, 3])),
-            "further_views": [{"K": other.K_right, "E": other.E} for other in inputs.guidance.rigs[1:]],
+            "E": rescaled_pose(rig.E, output),
+            "baseline_m": output.rescaled * float(np.linalg.norm(rig.E[:3, 3])),
+            "further_views": [
+                {"K": other.K_right, "E": rescaled_pose(other.E, output)}
+                for other in inputs.guidance.rigs[1:]
+            ],
         },
         "prior": {
             "name": arguments.prior,

@@ -1,7 +1,9 @@
 """How often a wrong calibration is caught, and how often a right one is doubted: ``geodiff eval trust``.
 
-Hop: pairs, right and made wrong -> guided calls -> judgements -> one table.
+Hop: pairs, right and made wrong -> guided calls -> signs -> judgements -> one table.
 Paper: none.
+
+The folder keeps the signs of every call, so that other thresholds need no new calls.
 """
 
 from __future__ import annotations
@@ -23,14 +25,17 @@ from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.evaluation.baselines import Settings
 from geodiff_plugin.evaluation.baselines._guidance import call_arguments
 from geodiff_plugin.evaluation.baselines.base import PriorCache
+from geodiff_plugin.evaluation.cells import count_of_pairs
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
 from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, Case, cases_of
 from geodiff_plugin.formats.out_folder import OutFolder
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.runtime.judgement import judge
+from geodiff_plugin.runtime.signs import Signs
 
 __all__ = ["TEN", "TrustOptions", "run_trust"]
 
@@ -42,6 +47,10 @@ TEN = (
 #: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.
 OFF = 0.2
 RECORDS = "trust.jsonl"
+NOTE = (
+    "Median error of the depth as a share of the truth; left and right exchanged, there is no truth. A wrong "
+    "focal length of a rectified pair scales the depth and changes nothing else: no two views tell it."
+)
 
 
 @dataclass(frozen=True)
@@ -57,6 +66,7 @@ class TrustOptions:
         settings: prior, device, seed.
         out: folder of records and table; resumed.
         quiet: no bar.
+        results: Markdown page to write beside; ``None`` for none.
     """
 
     data: Path | None
@@ -67,6 +77,7 @@ class TrustOptions:
     settings: Settings
     out: Path
     quiet: bool
+    results: Path | None = None
 
 
 def _measure(case: Case, pipe: Any, settings: Settings) -> dict[str, Any]:
@@ -82,12 +93,23 @@ def _measure(case: Case, pipe: Any, settings: Settings) -> dict[str, Any]:
             return {"status": "refused", "said": [str(error)], "off": None}
         said += [str(warning.message) for warning in caught if warning.category is UserWarning]
     judgement, depth_m = out.judgements[0], out.prediction[0, ..., 0]
+    of_judgement = {judgement.sentence, *judgement.remarks}
+    said += [sentence for sentence in out.warnings if sentence not in of_judgement]
     off = None
     if case.truth:
         off = float(np.median(np.abs(depth_m[sample.valid] / sample.depth_m[sample.valid] - 1.0)))
     signs = {name: None if value != value else value for name, value in asdict(judgement.signs).items()}
+    return {"status": "finished", "said": said, "off": off, "signs": signs}
+
+
+def _judged(record: dict[str, Any]) -> dict[str, Any]:
+    """The record with what today's judgement makes of its signs."""
+    if record["status"] == "refused":
+        return record
+    signs = {name: math.nan if value is None else value for name, value in record["signs"].items()}
+    judgement = judge(Signs(**signs | {"mistakes": tuple(signs["mistakes"])}))
     status = "trusted" if judgement.trusted else "not trusted"
-    return {"status": status, "said": said + out.warnings, "off": off, "signs": signs}
+    return record | {"status": status, "said": [*record["said"], *judgement.reasons, *judgement.remarks]}
 
 
 def _refs(options: TrustOptions) -> dict[str, list[SampleRef]]:
@@ -107,7 +129,8 @@ def _records(options: TrustOptions) -> Iterator[dict[str, Any]]:
     for group, refs in _refs(options).items():
         for i, ref in enumerate(tqdm(refs, desc=group, disable=options.quiet, file=sys.stderr)):
             other = load(refs[(i + 1) % len(refs)])
-            for case in cases_of(load(ref), other, options.kinds):
+            sample = load(ref)
+            for case in cases_of(sample, other, options.kinds):
                 settings = asdict(options.settings) | {"width": options.width if group == "rendered" else 0}
                 key = json.dumps([ref.label, case.kind, settings], sort_keys=True)
                 if key not in done:
@@ -115,7 +138,12 @@ def _records(options: TrustOptions) -> Iterator[dict[str, Any]]:
                     head = {"key": key, "group": group, "sample": ref.label, "kind": case.kind}
                     done[key] = head | found
                     append_record(path, done[key])
-                yield done[key]
+                yield _judged(done[key]) | {"rectified": sample.rectified}
+
+
+def _beyond_views(record: dict[str, Any]) -> bool:
+    """Whether nothing in two views shows the mistake: rectified rows stay rows under any focal length."""
+    return record["rectified"] and record["kind"].startswith("K-")
 
 
 def _share(part: int, whole: int) -> str:
@@ -125,7 +153,8 @@ def _share(part: int, whole: int) -> str:
 def _table(group: str, records: Sequence[dict[str, Any]], kinds: Sequence[str]) -> Table:
     names = {kind: WRONG[kind][0] for kind in kinds if kind in WRONG}
     names |= {kind: f"points {WRONG_POINTS[kind]:g} times too far" for kind in kinds if kind in WRONG_POINTS}
-    rows, all_off, all_told = [], 0, 0
+    rows: list[list[str]] = []
+    counted = {"all wrong ones": [0, 0], "without focal lengths of rectified pairs": [0, 0]}
     for kind in ("right", "right, points", *kinds):
         own = [record for record in records if record["kind"] == kind]
         if not own:
@@ -133,8 +162,11 @@ def _table(group: str, records: Sequence[dict[str, Any]], kinds: Sequence[str]) 
         right = kind.startswith("right")
         off = [r for r in own if r["off"] is None or r["off"] > OFF]
         told = [r for r in off if r["status"] != "trusted" or r["said"]]
-        if not right:
-            all_off, all_told = all_off + len(off), all_told + len(told)
+        for count, some in zip(
+            counted.values(), (lambda r: True, lambda r: not _beyond_views(r)), strict=True
+        ):
+            count[0] += 0 if right else sum(map(some, told))
+            count[1] += 0 if right else sum(map(some, off))
         doubted = sum(r["status"] != "trusted" for r in own)
         median = np.median([r["off"] for r in own if r["off"] is not None] or [math.nan])
         warned = sum(r["status"] != "trusted" or bool(r["said"]) for r in own)
@@ -147,9 +179,11 @@ def _table(group: str, records: Sequence[dict[str, Any]], kinds: Sequence[str]) 
                 _share(len(told), len(off)),
             ]
         )
-    rows.append(["all wrong ones", "", "", "", _share(all_told, all_off)])
+    rows += [[name, "", "", "", _share(*count)] for name, count in counted.items()]
     head = ["given as", "median error", "not trusted", "anything said", f"said, of those > {OFF:.0%} off"]
-    return Table(f"Wrong calibrations caught, right ones doubted: {group} pairs", head, rows)
+    count = len({record["sample"] for record in records})
+    title = f"Wrong calibrations caught, right ones doubted: {count_of_pairs(count, f'{group} ')}"
+    return Table(title, tuple(head), tuple(map(tuple, rows)), NOTE)
 
 
 def run_trust(options: TrustOptions) -> Page:
@@ -166,8 +200,11 @@ def run_trust(options: TrustOptions) -> Page:
         records = list(_records(options))
         words = ["geodiff eval trust", f"--rendered {options.rendered}@{options.width}"]
         words += [] if options.data is None else [f"--data {options.data.name}"]
+        words += [] if options.limit is None else [f"--limit {options.limit}"]
         groups = dict.fromkeys(record["group"] for record in records)
         tables = [_table(g, [r for r in records if r["group"] == g], options.kinds) for g in groups]
         page = Page("Trust", run_facts(" ".join(words)), tuple(tables))
         write_page(page, options.out, "trust")
+        if options.results is not None:
+            write_text(options.results, page.markdown())
     return page

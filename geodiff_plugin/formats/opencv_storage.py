@@ -6,7 +6,6 @@ Paper: none.
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.structured import parse_json
 
 __all__ = ["is_storage", "parse_storage"]
 
@@ -101,12 +101,7 @@ def _parse_xml(text: str, path: Path) -> dict[str, np.ndarray]:
 def _parse_json(text: str, path: Path) -> dict[str, np.ndarray]:
     names = {"Nan": "NaN", "Inf": "Infinity"}
     text = NOT_FINITE.sub(lambda found: found[1] + names[found[2]], BARE_POINT.sub(".0", text))
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
-        bad_value(f"{path}", "JSON", f"{error.msg} in line {error.lineno}", "Is the file cut off?")
-    except RecursionError:
-        bad_value(f"{path}", "OpenCV's JSON", "lists within lists without end")
+    content = parse_json(text, path)
     entries = {}
     for key, value in content.items() if isinstance(content, dict) else ():
         if isinstance(value, dict) and value.get("type_id") == "opencv-matrix":

@@ -6,6 +6,7 @@ Paper: S3.3; E as in docs/reference/calibration.md.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from geodiff_plugin.types import Rig
 
 __all__ = [
     "check_no_distortion",
+    "finite",
     "check_rigid",
     "intrinsics",
     "is_distorted",
@@ -48,10 +50,27 @@ def positive(value: Any, name: str) -> float:
     """
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # a whole number of any length is JSON
         bad_value(name, "a number above 0", repr(value))
     if not (np.isfinite(number) and number > 0):
         bad_value(name, "a finite number above 0", number, "Check the calibration file.")
+    return number
+
+
+def finite(value: Any, name: str) -> float:
+    """A finite number, as float; text is none.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        bad_value(name, "a number", repr(value))
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        bad_value(name, "a finite number", repr(value), "Check the calibration file.")
     return number
 
 

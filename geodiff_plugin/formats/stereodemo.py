@@ -6,12 +6,12 @@ Paper: none.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.rigs import intrinsics, make_rig, pose_to_the_right, positive
+from geodiff_plugin.formats.rigs import finite, intrinsics, make_rig, pose_to_the_right, positive
+from geodiff_plugin.formats.structured import parse_json
 from geodiff_plugin.types import Rig
 
 __all__ = ["STEREODEMO", "matches", "read"]
@@ -32,12 +32,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
         ValueError: not JSON, or a key is missing or not a number.
     """
     path = files[0].path
-    try:
-        data = json.loads(files[0].text)
-    except json.JSONDecodeError as error:
-        bad_value(f"{path}", "JSON", f"{error.msg} in line {error.lineno}", "Is the file cut off?")
-    except RecursionError:
-        bad_value(f"{path}", "a JSON object of numbers", "lists within lists without end")
+    data = parse_json(files[0].text, path)
     if not isinstance(data, dict):
         bad_value(f"{path}", "a JSON object", type(data).__name__)
     if "cx" in data:  # older files: one principal point for both images
@@ -45,17 +40,14 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     missing = [key for key in KEYS if key not in data]
     if missing:
         bad_value(f"{path}", f"a stereodemo calibration with {', '.join(KEYS)}", f"no {', '.join(missing)}")
-    not_numbers = [
-        key for key in KEYS if isinstance(data[key], bool) or not isinstance(data[key], (int, float))
-    ]
-    if not_numbers:
-        bad_value(f"{not_numbers[0]} in {path}", "a number", repr(data[not_numbers[0]]))
-    baseline_m = positive(data["baseline_meters"], f"baseline_meters in {path}")
+    numbers = {key: finite(data[key], f"{key} in {path}") for key in KEYS}
+    baseline_m = positive(numbers["baseline_meters"], f"baseline_meters in {path}")
     size = None
     if "width" in data and "height" in data:
         width, height = (int(positive(data[key], f"{key} in {path}")) for key in ("width", "height"))
         size = (width, height)
-    K_left, K_right = (intrinsics(data["fx"], data["fy"], data[cx], data["cy"]) for cx in ("cx0", "cx1"))
+    focal, cy = (numbers["fx"], numbers["fy"]), numbers["cy"]
+    K_left, K_right = (intrinsics(*focal, numbers[cx], cy) for cx in ("cx0", "cx1"))
     return make_rig(K_left, K_right, pose_to_the_right(baseline_m), path, size=size)
 
 

@@ -30,6 +30,10 @@ def parse_json(text: str, path: Path) -> Any:
         return json.loads(text)
     except json.JSONDecodeError as error:
         bad_value(f"{path}", "JSON", f"{error.msg} in line {error.lineno}", CUT_OFF)
+    except RecursionError:
+        bad_value(f"{path}", "a JSON object of numbers", "lists within lists without end")
+    except ValueError:
+        bad_value(f"{path}", "a JSON object of numbers", "a whole number of thousands of digits")
 
 
 def parse_yaml(text: str, path: Path) -> dict[str, Any]:
@@ -73,7 +77,7 @@ def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     """
     try:
         numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = None
     expected = "numbers" if shape == (-1,) else f"{int(np.prod(shape))} numbers"
     if numbers is None or not np.isfinite(numbers).all():

@@ -176,6 +176,7 @@ class GeometryGuidance:
         fov: float | None = None,
         known_length: tuple[float, float, float, float, float] | None = None,
         points: Any = None,
+        matcher: str = "sift",
         **knobs: Any,
     ) -> Self:
         """Two photographs or more without poses: cameras are estimated from their matches (extra ``pose``).
@@ -191,6 +192,8 @@ class GeometryGuidance:
             known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left photograph, and how far apart
                 the two places are; instead of ``baseline_m``.
             points: ``(N, 3)`` as in the constructor; they give the scale where nothing else does.
+            matcher: what finds distinct points in both: ``"sift"``, or ``"lightglue"``, ``"superglue"`` or a
+                folder with such weights, where this machine has them.
             **knobs: what else the constructor takes.
 
         Returns:
@@ -204,7 +207,13 @@ class GeometryGuidance:
         photographs = list(left) if right is None and isinstance(left, (list, tuple)) else [left, right]
         Ks = K if K_right is None else [K, K_right]
         found = estimate_rig(
-            photographs, K=Ks, fov=fov, baseline_m=baseline_m, known_length=known_length, points=points
+            photographs,
+            K=Ks,
+            fov=fov,
+            baseline_m=baseline_m,
+            known_length=known_length,
+            points=points,
+            matcher=matcher,
         )
         views = zip((None, *photographs[1:]), found.Ks, (np.eye(4), *found.Es), strict=True)
         points = points if found.scale.unit else None

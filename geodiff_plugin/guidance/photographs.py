@@ -19,10 +19,11 @@ from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.guidance.posing import coarse_depth
 from geodiff_plugin.pose.estimate import EstimatedPose, estimate_pose
+from geodiff_plugin.pose.matchers import Matcher, find_matcher
 from geodiff_plugin.pose.refine import polished
 from geodiff_plugin.pose.scale import Scale, find_scale
 from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
-from geodiff_plugin.pose.views import GreyViews, grey_views, sparse_tracks
+from geodiff_plugin.pose.views import GreyViews, grey_views
 from geodiff_plugin.types import CameraView
 
 __all__ = ["EstimatedRig", "estimate_rig"]
@@ -83,9 +84,9 @@ def _cameras(
     return found, notes
 
 
-def _tracks(views: GreyViews) -> tuple[Tracks, list[EstimatedPose]]:
+def _tracks(views: GreyViews, matcher: Matcher) -> tuple[Tracks, list[EstimatedPose]]:
     """The inliers of all views, and the pose of each, the first baseline of length 1."""
-    tracks, poses = sparse_tracks(views), []
+    tracks, poses = matcher(views), []
     for v in range(len(views.rights)):
         name = "the two photographs" if len(views.rights) == 1 else f"the left and right photograph {v + 1}"
         own, mirrored = tracks.view(v), 0
@@ -93,7 +94,7 @@ def _tracks(views: GreyViews) -> tuple[Tracks, list[EstimatedPose]]:
             turned = replace(
                 views, rights=(views.rights[v][:, ::-1].copy(),), K_rights=views.K_rights[v : v + 1]
             )
-            mirrored = len(sparse_tracks(turned))
+            mirrored = len(matcher(turned))
         poses.append(estimate_pose(own, name, mirrored))
     seen = tracks.seen.copy()
     for v, pose in enumerate(poses):
@@ -134,6 +135,7 @@ def estimate_rig(
     baseline_m: float | None = None,
     known_length: tuple[float, float, float, float, float] | None = None,
     points: Any = None,
+    matcher: str = "sift",
 ) -> EstimatedRig:
     """Cameras of two photographs or more, left one first.
 
@@ -144,6 +146,7 @@ def estimate_rig(
         baseline_m: distance of the first right camera from the left one.
         known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left photograph and their distance.
         points: ``(N, 3)`` metres in the left camera's frame.
+        matcher: of distinct points, see ``pose.matchers.find_matcher``.
 
     Raises:
         TypeError, ValueError: PoseLib is not installed; no K, or no pose to be had (``pose.estimate``).
@@ -164,7 +167,7 @@ def estimate_rig(
         ]
 
     nowhere = posed([np.eye(4)] * (len(images) - 1))
-    tracks, poses = _tracks(grey_views(images[0], nowhere, K_left))
+    tracks, poses = _tracks(grey_views(images[0], nowhere, K_left), find_matcher(matcher))
     Ts = np.stack([pose.T for pose in poses])
     rights = posed(Ts)
     if not all(pose.rectified for pose in poses):

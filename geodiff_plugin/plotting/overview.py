@@ -83,7 +83,11 @@ def _beside_bar(image_01: np.ndarray, like: Image.Image, width: int) -> Image.Im
 
 
 def overview(
-    left_01: np.ndarray, depth_m: np.ndarray, confidence: np.ndarray | None, error: np.ndarray | None
+    left_01: np.ndarray,
+    depth_m: np.ndarray,
+    confidence: np.ndarray | None,
+    error: np.ndarray | None,
+    unit: str | None = "m",
 ) -> Image.Image:
     """Left image, depth with legend, and where there are any confidence and photometric error.
 
@@ -92,11 +96,12 @@ def overview(
         depth_m: ``(H, W)`` metres.
         confidence: ``(H, W)`` in [0, 1], or ``None``.
         error: ``(H, W)`` in [0, 1], not finite where no right view sees the pixel, or ``None``.
+        unit: of the depth, as in ``depth_figure``.
 
     Returns:
         RGB picture, two cells a row.
     """
-    depth = depth_figure(depth_m)
+    depth = depth_figure(depth_m, unit=unit)
     enlarged = math.ceil(FIGURE_MIN_HEIGHT / depth_m.shape[0])
     cells = [_beside_bar(left_01, depth, enlarged * depth_m.shape[1]), depth]
     titles = ["left image", "depth"]

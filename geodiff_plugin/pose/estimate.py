@@ -29,6 +29,10 @@ NO_PARALLAX_DEG, LITTLE_PARALLAX_DEG = 0.3, 0.6
 RECTIFIED_PX = 0.45
 #: A simpler motion that explains this share of the inliers is the motion.
 SIMPLER = 0.9
+#: Matches this far from their lines are no noise of the pose found; a second motion that explains this share
+#: of all matches, and of those, is one of the scene. Above the last, as a share of the first motion's
+#: matches, nobody can tell which of the two the camera made.
+APART_PX, SECOND_SHARE, SECOND_OF_REST, RIVAL = 6.0, 0.1, 0.5, 0.45
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,20 +98,10 @@ def estimate_pose(
 
     Raises:
         ValueError: PoseLib is not installed; no pose is to be had: too few matches or inliers, a pure
-            rotation, too little parallax.
+            rotation, too little parallax, two motions.
     """
     _check_matches(len(tracks), name, mirrored_matches)
-    found, info = _poselib().estimate_relative_pose(
-        tracks.left_px,
-        tracks.right_px[0],
-        _camera(tracks.K_left),
-        _camera(tracks.K_rights[0]),
-        {"max_epipolar_error": INLIER_PX / 2, "seed": 0, "min_iterations": 1000},
-        {},
-    )
-    T = np.eye(4)
-    T[:3] = found.Rt
-    T[:3, 3] /= max(float(np.linalg.norm(T[:3, 3])), 1e-12)
+    T = _five_points(tracks)
     sideways = _rectified(tracks, residuals_px(tracks, T[None])[0] < INLIER_PX)
     T = T if sideways is None else sideways
     residual = residuals_px(tracks, T[None])[0]
@@ -124,7 +118,7 @@ def estimate_pose(
         )
     parallax = float(np.median(parallax_deg(tracks, T[:3, :3])[inliers]))
     _check_parallax(tracks, near, parallax, name)
-    warnings = []
+    warnings = _of_second_motion(tracks, T, inliers, name)
     if parallax < LITTLE_PARALLAX_DEG:
         warnings.append(
             f"The parallax between {name} is {parallax:.2f} degrees in the median: depth rests on little. "
@@ -138,6 +132,49 @@ def estimate_pose(
     return EstimatedPose(
         T, inliers, parallax, float(np.median(residual[inliers])), sideways is not None, tuple(warnings)
     )
+
+
+def _five_points(tracks: Tracks) -> np.ndarray:
+    """``T_right_from_left`` that explains the most tracks, its baseline of length 1."""
+    found, _ = _poselib().estimate_relative_pose(
+        tracks.left_px,
+        tracks.right_px[0],
+        _camera(tracks.K_left),
+        _camera(tracks.K_rights[0]),
+        {"max_epipolar_error": INLIER_PX / 2, "seed": 0, "min_iterations": 1000},
+        {},
+    )
+    T = np.eye(4)
+    T[:3] = found.Rt
+    T[:3, 3] /= max(np.linalg.norm(T[:3, 3]), 1e-12)
+    return T
+
+
+def _of_second_motion(tracks: Tracks, T: np.ndarray, inliers: np.ndarray, name: str) -> list[str]:
+    """Refuse, or say, that part of the scene moved on its own: a second pose explains what the first leaves.
+
+    Wrong matches are explained by no pose. What moves along its epipolar lines is not seen here, nor by
+    anything else that knows two photographs only; it then lies at a wrong depth.
+    """
+    rest = tracks.kept(residuals_px(tracks, T[None])[0] > APART_PX)
+    if len(rest) < FEWEST_INLIERS:
+        return []
+    second = _five_points(rest)
+    fit = (residuals_px(rest, second[None])[0] < INLIER_PX) & (solve_inverse_depth(rest, second[None]) > 0)
+    count = int(fit.sum())
+    if count < max(FEWEST_INLIERS, SECOND_SHARE * len(tracks), SECOND_OF_REST * len(rest)):
+        return []
+    cure = (
+        "Something moved between the photographs, or a pattern repeats. Take both at one moment, or of a "
+        "scene that stands still."
+    )
+    if count > RIVAL * inliers.sum():
+        got = f"two motions, of {int(inliers.sum())} and {count} of its {len(tracks)} matches"
+        bad_value(name, "of one scene that stands still", got, cure)
+    return [
+        f"{100 * count / len(tracks):.0f} % of the matches of {name} follow a motion of their own: they lie "
+        f"at wrong depths, and the pose may be wrong as well. {cure}"
+    ]
 
 
 def _rectified(tracks: Tracks, near: np.ndarray) -> np.ndarray | None:

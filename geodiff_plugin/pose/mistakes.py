@@ -36,10 +36,16 @@ _K_SCALED = (
     "The views fit with K times {factor:g}: it seems to be for images of {size} the width and height of "
     "these. With s = {factor:g} take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy."
 )
+_FOCAL_SCALED = (
+    "The views fit with the focal lengths times {factor:.3g} and the principal point as it is: K seems to be "
+    "for images of {size} the width and height of these, with its principal point set to the middle."
+)
 _FACTORS = {
     0.25: "4 times",
     1 / 3: "3 times",
     0.5: "twice",
+    2 / 3: "1.5 times",
+    1.5: "two thirds of",
     2.0: "half",
     3.0: "a third of",
     4.0: "a quarter of",
@@ -64,6 +70,12 @@ def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
     return K
 
 
+def _refocused(K: np.ndarray, factor: float) -> np.ndarray:
+    K = K.copy()
+    K[..., :2, :2] *= factor
+    return K
+
+
 def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np.ndarray]]:
     inverse = np.linalg.inv(T)
     yield INVERSE, tracks, inverse
@@ -77,10 +89,11 @@ def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np
     if not np.allclose(tracks.K_left, tracks.K_rights[0], rtol=0.02):
         yield _K_SWAPPED, replace(tracks, K_left=tracks.K_rights[0], K_rights=tracks.K_left[None]), T
     for factor, size in _FACTORS.items():
-        scaled = replace(
-            tracks, K_left=_scaled(tracks.K_left, factor), K_rights=_scaled(tracks.K_rights, factor)
-        )
-        yield _K_SCALED.format(factor=factor, size=size), scaled, T
+        for sentence, change in ((_K_SCALED, _scaled), (_FOCAL_SCALED, _refocused)):
+            other = replace(
+                tracks, K_left=change(tracks.K_left, factor), K_rights=change(tracks.K_rights, factor)
+            )
+            yield sentence.format(factor=factor, size=size), other, T
 
 
 def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:

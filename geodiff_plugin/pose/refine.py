@@ -88,16 +88,17 @@ def refine_views(
     found = PoseReport("fits", poses, poses, _numbers(before), _numbers(before), _numbers(counts))
     misfit = bool((before > FITS_PX).any())
     near = _nearby(sparse, given, before) if misfit else given
+    units = _units(sparse, given)
     mistakes = _mistakes(sparse, given, near)
     if mistakes:
         return RefinedViews(tuple(rights), found.changed(status="mistaken", warnings=mistakes))
     if not misfit:
-        return RefinedViews(tuple(rights), found)
+        return RefinedViews(tuple(rights), found.changed(warnings=units))
     depth_m = _on_grid(first_depth(_applied(rights, near)), views.left.shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     Ts = _settled(tracks, given, near)
     before, after = _medians(tracks, given), _medians(tracks, Ts)
-    warnings = _warnings(before, after)
+    warnings = _warnings(before, after) + units
     found = found.changed(
         residual_px_given=_numbers(before),
         residual_px=_numbers(before),
@@ -146,11 +147,15 @@ def polished(
 
 def _mistakes(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> tuple[str, ...]:
     """Sentences on the mistakes that explain the poses as given."""
-    found = []
-    for v, (T, T_near) in enumerate(zip(given, near, strict=True)):
-        own = tracks.view(v)
-        if len(own) >= FEWEST:
-            found.append(find_mistake(own, T, T_near) or implausible_unit(own, T))
+    views = [(tracks.view(v), *poses) for v, poses in enumerate(zip(given, near, strict=True))]
+    found = [find_mistake(own, T, T_near) for own, T, T_near in views if len(own) >= FEWEST]
+    return tuple(dict.fromkeys(sentence for sentence in found if sentence))
+
+
+def _units(tracks: Tracks, given: np.ndarray) -> tuple[str, ...]:
+    """Questions about the unit of the translations, which no residual answers."""
+    views = [(tracks.view(v), T) for v, T in enumerate(given)]
+    found = [implausible_unit(own, T) for own, T in views if len(own) >= FEWEST]
     return tuple(dict.fromkeys(sentence for sentence in found if sentence))
 
 

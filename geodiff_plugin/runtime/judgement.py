@@ -29,8 +29,9 @@ LEAST_SPREAD = 0.15
 POINTS_SAID, POINTS_WRONG = math.log(1.08), math.log(1.2)
 #: A rig's baseline in metres lies between these, and a lens's horizontal field of view, in degrees.
 BASELINES_M, VIEWS_DEG = (1e-3, 20.0), (8.0, 140.0)
-#: Matches that lie further beside their epipolar lines, pixels of the left image, are no rounding.
-EPIPOLAR_PX = 2.0
+#: Matches that lie further beside their epipolar lines, with the best pose that was found near the given
+#: one, are weak, are said, and cost trust; pixels of the grid of the matches.
+EPIPOLAR_WEAK, EPIPOLAR_PX, EPIPOLAR_WRONG = 1.0, 2.0, 4.0
 #: Known depths that fix a scale and a shift, and tell when one of them is wrong.
 LEAST_POINTS = 3
 #: Share of the matches on the first or last plane of a range from which it is too narrow.
@@ -109,7 +110,12 @@ def _of_order(signs: Signs) -> str | None:
 
 def _of_matches(signs: Signs) -> str | None:
     few = signs.matched < LEAST_MATCHED
-    weak = [signs.matched < WEAK_MATCHED, signs.confidence < WEAK_CONFIDENCE, signs.order < WEAK_ORDER]
+    weak = [
+        signs.matched < WEAK_MATCHED,
+        signs.confidence < WEAK_CONFIDENCE,
+        signs.order < WEAK_ORDER,
+        signs.epipolar_px > EPIPOLAR_WEAK,
+    ]
     if not (few or signs.confidence < LEAST_CONFIDENCE or sum(weak) > 1):
         return None
     said = [] if math.isnan(signs.matched) else [f"{100 * signs.matched:.0f} % of the left image is matched"]
@@ -122,10 +128,19 @@ def _of_matches(signs: Signs) -> str | None:
     return f"Only {' and '.join(said)}. {cause}" if said else None
 
 
+def _of_lines(signs: Signs) -> str | None:
+    if not signs.epipolar_px > EPIPOLAR_PX:
+        return None
+    return (
+        f"Matches lie {signs.epipolar_px:.1f} px beside their epipolar lines, and no pose near the given one "
+        "brings them closer: are the images rectified or the poses right, and is K for them?"
+    )
+
+
 def _bad(signs: Signs) -> list[str]:
     if signs.same:
         return ["The left and a right view are the same picture, pixel by pixel; two places are needed."]
-    found = []
+    found = list(signs.mistakes)
     if signs.flat:
         found.append(
             "All matches have one depth: the right image looks like a shifted copy of the left one. (Of a "
@@ -138,8 +153,9 @@ def _bad(signs: Signs) -> list[str]:
         number = "One known depth does" if signs.points == 1 else f"{signs.points} known depths do"
         found.append(f"{number} not fix both scale and shift; give at least {LEAST_POINTS}.")
     order = _of_order(signs)
+    lines = _of_lines(signs) if signs.epipolar_px > EPIPOLAR_WRONG else None
     matches = _of_matches(signs)
-    return found + [sentence for sentence in (order, matches) if sentence is not None]
+    return found + [sentence for sentence in (order, lines, matches) if sentence is not None]
 
 
 def _odd(signs: Signs, trusted: bool) -> list[str]:
@@ -164,11 +180,9 @@ def _odd(signs: Signs, trusted: bool) -> list[str]:
         found.append(points)
     if 0 < signs.points < LEAST_POINTS and not math.isnan(signs.matched):
         found.append(f"Only {signs.points} known depth{'s' * (signs.points > 1)} lie in the image.")
-    if signs.epipolar_px > EPIPOLAR_PX:
-        found.append(
-            f"Matches lie {signs.epipolar_px:.1f} px beside their epipolar lines: are the images rectified, "
-            "and is K for them?"
-        )
+    lines = _of_lines(signs)
+    if lines is not None and not signs.epipolar_px > EPIPOLAR_WRONG:
+        found.append(lines)
     if signs.on_edge and (not trusted or signs.at_end > MOST_AT_END):
         found.append(
             "The search for the scale ended on the edge of its range: the depth may lie beyond it. Check the "

@@ -7,8 +7,10 @@ Paper: Eq. 14's re-rendered left image, as a per-pixel report.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from diffusers.pipelines.marigold import MarigoldDepthOutput
@@ -22,6 +24,7 @@ from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.guidance.config import TermsConfig
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.mistakes import INVERSE
+from geodiff_plugin.pose.scale import NO_UNIT
 from geodiff_plugin.runtime.confidence import depth_confidence
 from geodiff_plugin.runtime.ensembling import median, spread_around
 from geodiff_plugin.runtime.judgement import Judgement, agreement_of_points, judge
@@ -84,6 +87,7 @@ def assemble_output(
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
     if call["match_input_resolution"]:
         relative = F.interpolate(relative, size, mode="bilinear", align_corners=False)
+    over_own = _over_own(run, depth_m)
     affine = [t.affine for t in run.trajectories]
 
     def members(name: str) -> Tensor:
@@ -92,14 +96,15 @@ def assemble_output(
     def out(x: Tensor | None) -> Any:
         return x if call["output_type"] == "pt" or x is None else x.permute(0, 2, 3, 1).cpu().numpy()
 
-    return MetricDepthOutput(
+    estimated = guidance.estimated
+    output = MetricDepthOutput(
         prediction=out(depth_m),
         uncertainty=out(uncertainty),
         relative=out(relative),
         scale=members("scale"),
         shift=members("shift"),
         global_scale=members("g_s"),
-        own_scale=_own_scale(run, depth_m),
+        own_scale=None if over_own is None else over_own.median(1).values.reshape(count, -1).cpu(),
         visible=out(visible),
         photometric_error=out(error),
         confidence=out(confidence),
@@ -110,21 +115,54 @@ def assemble_output(
         extras=getattr(stock, "extras", {}),
         judgements=judgements,
         unit=guidance.unit,
-        warnings=_warnings(run, visible, judgements)
-        + ([] if guidance.estimated is None else list(guidance.estimated.warnings)),
+        warnings=_warnings(run, visible, judgements) + list([] if estimated is None else estimated.warnings),
+        scale_from=None if estimated is None else estimated.scale.source,
+        scale_spread=None if estimated is None else estimated.scale.spread,
     )
+    if guidance.unit is None and over_own is not None:
+        return _in_the_priors_metres(output, over_own)
+    return output
 
 
-def _own_scale(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
-    """``(N, E)`` median of the depth ``(N, 1, H, W)`` over a metric prior's own, on the prior's grid."""
+def _over_own(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
+    """``(N * E, h w)`` the depth ``(N, 1, H, W)`` over a metric prior's own, on the prior's grid."""
     known = [t.own_depth for t in run.trajectories if t.own_depth is not None]
     if len(known) < len(run.trajectories):
         return None
     own = torch.cat(known)
     found = F.interpolate(depth_m, own.shape[-2:], mode="bilinear", align_corners=False)
     owners = [owner for t in run.trajectories for owner in t.owners]
-    ratio = (found[owners] / own.clamp_min(LEAST_M)).flatten(1)
-    return ratio.median(1).values.reshape(len(depth_m), -1).cpu()
+    return (found[owners] / own.clamp_min(LEAST_M)).flatten(1)
+
+
+def _in_the_priors_metres(output: MetricDepthOutput, over_own: Tensor) -> MetricDepthOutput:
+    """The output of estimated poses without a unit, in the metres of a prior that has some.
+
+    Everything that is a length is multiplied by one number, that which brings the depth to the prior's at
+    half of the pixels; how much it differs from pixel to pixel says how sure it is.
+    """
+    factor = 1.0 / float(over_own.median())
+    spread = 1.4826 * float((over_own * factor).clamp_min(1e-9).log().abs().median())
+
+    def moved(E: np.ndarray) -> np.ndarray:
+        return np.block([[E[:3, :3], factor * E[:3, 3:]], [E[3:]]])
+
+    said = (
+        f"No length is known: the metres are the prior's own, and as wrong as those. From pixel to pixel its "
+        f"depth and that of the views differ by {100 * spread:.0f} % in the middle."
+    )
+    output.prediction = output.prediction * factor
+    output.uncertainty = None if output.uncertainty is None else output.uncertainty * factor
+    output.global_scale = output.global_scale * factor
+    output.own_scale = output.own_scale * factor
+    output.history = [replace(step, g_s=step.g_s * factor) for step in output.history]
+    output.poses = [
+        pose.changed(E=tuple(map(moved, pose.E)), E_given=tuple(map(moved, pose.E_given)))
+        for pose in output.poses
+    ]
+    output.unit, output.scale_from, output.scale_spread, output.rescaled = "m", "prior", spread, factor
+    output.warnings = [said if sentence == NO_UNIT else sentence for sentence in output.warnings]
+    return output
 
 
 def _judged(
@@ -225,6 +263,7 @@ def _warnings(run: GuidedRun, visible: Tensor | None, judgements: Sequence[Judge
             f"Only {share:.0%} of the left image is seen by a right camera at this depth; "
             "scale rests on little."
         )
-    # That the inverse pose fits better is a reason of the judgement already.
-    found.extend(sentence for e in run.evidence for sentence in e.warnings if sentence != INVERSE)
+    # Mistakes of a pose are reasons of the judgement already.
+    named = {INVERSE, *(sentence for judgement in judgements for sentence in judgement.signs.mistakes)}
+    found.extend(sentence for e in run.evidence for sentence in e.warnings if sentence not in named)
     return found

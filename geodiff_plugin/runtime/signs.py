@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +18,7 @@ from torch import Tensor
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PoseReport
 
 __all__ = ["Signs", "read_signs"]
 
@@ -46,7 +46,9 @@ class Signs:
         at_end: share of the sure matches that lie on the first or the last plane of a given range, [0, 1].
         baseline_m: distance of the first right camera; 0 without one.
         view_deg: horizontal field of view that K gives the left image.
-        epipolar_px: how far matches lie beside their epipolar lines, pixels, where somebody measured it.
+        epipolar_px: how far matches lie beside their epipolar lines, pixels, with the poses as used; of the
+            worst right view.
+        mistakes: sentences on mistakes of a given pose that would explain its misfit (``pose.mistakes``).
         flat: all sure matches lie within two planes of the sweep, and near enough that it says something.
         same: the left and a right view are one picture.
         inverse_fits: the inverse pose matches clearly more.
@@ -64,6 +66,7 @@ class Signs:
     baseline_m: float = 0.0
     view_deg: float = math.nan
     epipolar_px: float = math.nan
+    mistakes: tuple[str, ...] = ()
     flat: bool = False
     same: bool = False
     inverse_fits: bool = False
@@ -116,6 +119,15 @@ def _of_matches(matches: Matches, planes: Tensor | None) -> _OfMatches:
     return found
 
 
+def _of_pose(pose: PoseReport) -> dict[str, Any]:
+    """How the poses fit, and mistakes that explain why they do not; that the inverse fits is asked apart."""
+    measured = [px for px in pose.residual_px if not math.isnan(px)]
+    found: dict[str, Any] = {"epipolar_px": max(measured)} if measured else {}
+    if pose.status == "mistaken":
+        found["mistakes"] = tuple(sentence for sentence in pose.warnings if sentence != INVERSE)
+    return found
+
+
 def read_signs(
     evidence: Evidence,
     left_01: Tensor,
@@ -126,7 +138,6 @@ def read_signs(
     confidence: Tensor | None,
     on_edge: bool,
     range_given: bool = False,
-    epipolar_px: float = math.nan,
 ) -> Signs:
     """The signs of one image.
 
@@ -139,14 +150,14 @@ def read_signs(
         confidence: ``(1, H, W)``, or ``None``.
         on_edge: whether the search for the scale ended on the edge of its range.
         range_given: whether that range was given by the user.
-        epipolar_px: median distance of matches from their epipolar lines, where it was measured.
     """
     matches, points = evidence.sweep_matches, evidence.sweep_points
     planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
-    found: _OfMatches = {} if matches is None else _of_matches(matches, planes)
+    found: dict[str, Any] = {} if matches is None else {**_of_matches(matches, planes)}
     if matches is not None and points is not None:
         found["points_ratio"], found["points_spread"] = _points_against(matches, points)
     known = evidence.points
+    found |= {} if evidence.pose is None else _of_pose(evidence.pose)
     return Signs(
         **found,
         confidence=math.nan if confidence is None else float(confidence.mean()),
@@ -154,7 +165,6 @@ def read_signs(
         points=0 if known is None else int((known.confidence > 0).sum()),
         baseline_m=float(rights[0][2][:3, 3].norm()) if rights else 0.0,
         view_deg=2.0 * math.degrees(math.atan(0.5 * left_01.shape[-1] / float(K_left[0, 0]))),
-        epipolar_px=epipolar_px,
         same=_is_same(left_01, rights),
         inverse_fits=INVERSE in evidence.warnings,
         on_edge=on_edge,

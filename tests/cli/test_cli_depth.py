@@ -69,6 +69,20 @@ def test_a_further_view_takes_part(geodiff, command, pair_files, textured_plane)
     assert np.isfinite(np.load(out / "depth.npy")).all()
 
 
+def test_a_further_view_has_a_lens_of_its_own(geodiff, command, pair_files, textured_plane):
+    """Distorted as its lens says, the view is the one that a pinhole camera would have taken."""
+    third, pose = pair_files.folder / "third.png", pair_files.folder / "pose.txt"
+    Image.fromarray(textured_plane.right).save(third)
+    np.savetxt(pose, textured_plane.E)
+    view = [*command, *QUICK[:2], "--knob", "inner_steps=0", "--view", third, "--view-E", pose, "-q"]
+    for name, lens in (("straight", "0,0,0,0"), ("bent", "0.3,0,0,0")):
+        answer = geodiff(*view, "--view-distortion", lens, "--out", pair_files.folder / name)
+        assert answer.code == 0, answer.err
+    reports = [json.loads((pair_files.folder / n / "report.json").read_text()) for n in ("straight", "bent")]
+    assert [report["undistorted"] for report in reports] == [False, True]
+    assert reports[0]["depth"]["median_m"] != reports[1]["depth"]["median_m"]
+
+
 def test_knobs_reach_the_guidance(geodiff, command, pair_files):
     knobs = ["--knob", "inner_steps=0", "--knob", "weights.photometric=0.5", "--knob", "search=volume"]
     answer = geodiff(*command, "--steps", 1, *knobs, "-q")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.cli.eval.options import pairs_options
-from geodiff_plugin.evaluation.baselines import find_method, with_poses
+from geodiff_plugin.evaluation import poses
+from geodiff_plugin.evaluation.baselines import Settings, find_method, with_poses
 from geodiff_plugin.evaluation.commands import command_line
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.evaluation.datasets.perturbed import perturbation, perturbed_pose, perturbed_ref
+from geodiff_plugin.evaluation.datasets.perturbed import (
+    drift_of,
+    drifted_ref,
+    perturbation,
+    perturbed_pose,
+    perturbed_ref,
+)
+from geodiff_plugin.evaluation.poses import PosesOptions, run_poses
 
 
 def test_perturbed_poses_stay_within_what_was_asked() -> None:
@@ -65,3 +74,63 @@ def test_options_come_back_as_a_command_line() -> None:
     assert "--pose refine,given --perturb 1.5,0.1" in command_line(options, ("eval", "pairs", "d"))
     with pytest.raises(ValueError, match="pose"):
         pairs_options(typed | {"pose": "guess"})
+
+
+def test_a_drifted_rig_keeps_its_calibration_and_moves_its_right_image() -> None:
+    (ref,) = find_pairs("synthetic:1@96x72")
+    sample, same = load(ref), load(drifted_ref(ref, (0.0, 0.0)))
+    moved, turned = load(drifted_ref(ref, (0.0, 2.0))), load(drifted_ref(ref, (0.3, 1.5)))
+    assert sample.rectified and np.array_equal(same.right, sample.right)
+    for other in (moved, turned):
+        assert np.array_equal(other.left, sample.left) and np.array_equal(other.E, sample.E)
+        assert np.array_equal(other.K_right, sample.K_right)
+    down, up = (np.array_equal(moved.right[10:60], sample.right[10 - px : 60 - px]) for px in (2, -2))
+    assert down or up, "by whole pixels nothing is interpolated"
+    assert np.abs(turned.right.astype(int) - sample.right).mean() > 1
+    assert turned.name == "seed0000-drift0.3-1.5px"
+
+
+@pytest.mark.parametrize("text", ["0.3", "a,b", "9,1", "0.3,99"])
+def test_a_drift_that_is_none(text: str) -> None:
+    with pytest.raises(ValueError, match="--drift"):
+        drift_of(text)
+
+
+def record(ref, method: str, error: float | None, warned: bool) -> dict:
+    both = {"raw": {"abs_rel": error}}
+    status = "not applicable" if error is None else "ok"
+    notes = {"method": {"warnings": ["said"] * warned, "residual_px_given": [1.25], "residual_px": [0.5]}}
+    head = {"dataset": ref.dataset, "sample": ref.name, "method": method, "rectified": False}
+    return head | {"status": status, "all_pixels": both, "notes": notes}
+
+
+def test_the_page_of_poses(tmp_path, monkeypatch) -> None:
+    """Two rendered pairs: estimated, one has no pose and the other is off by half without a word."""
+    errors = {"given": 0.1, "refine": 0.06}
+
+    def run(refs, methods, settings, out, progress):
+        found = []
+        for i, ref in enumerate(refs):
+            for method in methods:
+                pose = method.partition("=")[2]
+                error = errors.get(pose, None if i else 0.5)
+                if "perturbed" not in ref.files and pose == "given":
+                    error = 0.05
+                found.append(record(ref, method, error, warned=pose != "estimated"))
+        return found
+
+    monkeypatch.setattr(poses, "run", run)
+    page = tmp_path / "docs" / "results-pose.md"
+    options = PosesOptions(
+        None, 2, (1.5, 0.1), (0.3, 1.5), None, Settings("bundled"), tmp_path / "out", page, True
+    )
+    run_poses(options)
+    text = page.read_text()
+    assert text == (tmp_path / "out" / "poses.md").read_text()
+    assert "geodiff eval poses --rendered 2 --perturb 1.5,0.1 --drift 0.3,1.5" in text
+    assert "| pair | true, given | perturbed, given | perturbed, refined | estimated |" in text
+    assert "| mean of 2 pairs | 0.050 | 0.100 | 0.060 | - |" in text
+    assert "| without a result | 0 | 0 | 0 | 1 |" in text
+    assert "| off by more than 0.25 in silence | 0 | 0 | 0 | 1 |" in text
+    with pytest.raises(ValueError, match="--data"):
+        run_poses(replace(options, rendered=0))

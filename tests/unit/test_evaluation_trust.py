@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from geodiff_plugin.evaluation import trust
 from geodiff_plugin.evaluation.baselines import Settings
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, cases_of
+from geodiff_plugin.runtime.signs import Signs
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +52,10 @@ def test_counts_and_resumption(tmp_path, monkeypatch, capsys):
         missed = case.kind == "K-2" and case.sample.rectified
         doubted = case.kind == "right" and not case.sample.rectified
         bad = doubted or (case.kind != "right" and not missed)
-        return {
-            "status": "not trusted" if bad else "trusted",
-            "said": [],
-            "off": 0.01 if case.kind == "right" else 0.5,
-        }
+        signs = asdict(Signs(confidence=0.1 if bad else 0.9, matched=0.8, order=0.8))
+        signs = {name: None if value != value else value for name, value in signs.items()}
+        off = 0.01 if case.kind == "right" else 0.5
+        return {"status": "finished", "said": [], "off": off, "signs": signs}
 
     monkeypatch.setattr(trust, "_measure", measure)
     monkeypatch.setattr(trust.PriorCache, "get", lambda *_: None)

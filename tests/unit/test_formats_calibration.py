@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
+from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import read_calibration, read_matrix, rig_from_parameters
 
 K_TEXT = "[700 0 300; 0 700 200; 0 0 1]"
@@ -503,3 +506,14 @@ def test_opencv_json_is_read_as_its_yaml(tmp_path):
         old.write_text(broken)
         with pytest.raises(ValueError, match="must be"):
             read_calibration(old)
+
+
+@pytest.mark.parametrize("key", ["fx", "cy", "baseline_meters", "width"])
+@pytest.mark.parametrize("digits", [400, 5000])
+def test_whole_numbers_beyond_any_float_are_a_sentence(tmp_path, key, digits):
+    numbers = {"fx": 700, "fy": 700, "cx0": 320, "cx1": 320, "cy": 240, "baseline_meters": 0.12}
+    numbers |= {"width": 640, "height": 480, key: "HERE"}
+    path = tmp_path / "calib.json"
+    path.write_text(json.dumps(numbers).replace('"HERE"', "9" * digits))
+    with pytest.raises(InputError, match="number"):
+        read_calibration(path)

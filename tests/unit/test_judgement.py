@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
+from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.runtime.judgement import agreement_of_points, judge
-from geodiff_plugin.runtime.signs import Signs
+from geodiff_plugin.runtime.signs import Signs, read_signs
 from geodiff_plugin.scale.order import order_agreement
 from geodiff_plugin.synthetic import render_pair
+from geodiff_plugin.types import PoseReport
 
 GOOD = Signs(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0)
 
@@ -41,6 +44,9 @@ def test_a_good_run_is_trusted_in_silence():
         ({"points_ratio": 1000.0, "points": 99}, "millimetres taken for metres"),
         ({"points_ratio": 0.001, "points": 99}, "scale as 1"),
         ({"points_ratio": 3.0, "points": 99}, "3 times as far"),
+        ({"epipolar_px": 9.5}, "9.5 px beside"),
+        ({"epipolar_px": 1.5, "confidence": 0.45}, "Likely causes"),
+        ({"mistakes": ("E seems to be in the axes of OpenGL.",)}, "OpenGL"),
         ({"points": 1, "matched": math.nan, "confidence": math.nan}, "One known depth does not fix"),
     ],
 )
@@ -58,13 +64,39 @@ def test_reasons(signs, words):
         ({"view_deg": 5.0}, "5 degrees"),
         ({"points_ratio": 1.15, "points": 99}, "1.15 times as far"),
         ({"points": 1}, "Only 1 known depth lie"),
-        ({"epipolar_px": 4.2}, "4.2 px beside"),
+        ({"epipolar_px": 2.4}, "2.4 px beside"),
         ({"on_edge": True, "at_end": 0.2}, "ended on the edge"),
     ],
 )
 def test_remarks(signs, words):
     judgement = judge(replace(GOOD, **signs))
     assert judgement.trusted and any(words in remark for remark in judgement.remarks)
+
+
+def test_a_residual_alone_that_is_a_pixel_is_no_fault():
+    judgement = judge(replace(GOOD, epipolar_px=1.5))
+    assert judgement.trusted and not judgement.remarks
+
+
+def signs_of(pose) -> Signs:
+    evidence = SimpleNamespace(
+        sweep_matches=None, sweep_points=None, volume=None, points=None, warnings=(), pose=pose
+    )
+    left = torch.zeros(3, 8, 8)
+    return read_signs(evidence, left, (), torch.eye(3), order=math.nan, confidence=None, on_edge=False)
+
+
+def test_signs_of_poses():
+    sentences = ("The pose fits with its rotation transposed.", INVERSE)
+    refined = PoseReport("refined", (), (), (3.0, math.nan, 1.0), (0.4, math.nan, 0.6), warnings=sentences)
+    assert signs_of(refined).epipolar_px == 0.6, "of the poses as used, the worst view's"
+    assert signs_of(refined).mistakes == (), "what is said of a refined pose is no mistake"
+    mistaken = refined.changed(status="mistaken", residual_px=(9.0,))
+    assert signs_of(mistaken).mistakes == sentences[:1], "the inverse is asked apart"
+    judgement = judge(signs_of(mistaken))
+    assert not judgement.trusted and judgement.reasons[0] == sentences[0]
+    assert math.isnan(signs_of(PoseReport("given", (), ())).epipolar_px)
+    assert math.isnan(signs_of(None).epipolar_px)
 
 
 def test_the_edge_of_the_search_only_where_it_matters():

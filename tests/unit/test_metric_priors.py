@@ -12,6 +12,7 @@ from geodiff_plugin.algorithm.evidence import EvidenceInputs, prepare_evidence
 from geodiff_plugin.cli.report import summary_line
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.runtime.prompting import PROMPT_LONG_EDGE, prompt_of
+from geodiff_plugin.synthetic import render_pair
 from geodiff_plugin.types import CameraView
 from tests.contracts.tiny_transformers import make_transformers
 
@@ -154,3 +155,30 @@ def test_a_prompt_of_ones_own_goes_before_ours_and_only_where_it_is_taken(textur
         make_transformers("zoedepth")(
             Image.fromarray(textured_plane.left), processing_resolution=64, prompt_depth=own
         )
+
+
+def test_without_a_length_the_metres_are_those_of_a_metric_prior():
+    """An estimated pose has no unit; the prior knows the depth in metres, so everything is in metres."""
+    pytest.importorskip("poselib")
+    pair = render_pair(3, size=(240, 320), posed=True)
+    depth_m, E = pair.left.depth_m[0].numpy(), pair.E.numpy()
+    left, right = (
+        np.rint(v.image_01.permute(1, 2, 0).numpy() * 255).astype(np.uint8) for v in (pair.left, pair.right)
+    )
+    runs = {}
+    for kind in ("zoedepth", "depth_anything"):
+        pipe = enable_geometry_guidance(make_transformers(kind))
+        knows(pipe, depth_m)
+        guidance = GeometryGuidance.from_photographs(left, right, K=pair.K_left.numpy(), **FAST)
+        runs[kind] = pipe(Image.fromarray(left), guidance=guidance, processing_resolution=64)
+    metric, relative = runs["zoedepth"], runs["depth_anything"]
+    baseline = float(np.linalg.norm(E[:3, 3]))
+    assert metric.unit == "m" and metric.scale_from == "prior" and 0 < metric.scale_spread < 0.5
+    assert metric.rescaled == pytest.approx(baseline, rel=0.15)
+    assert np.median(metric.prediction[0, ..., 0] / depth_m) == pytest.approx(1.0, rel=0.1)
+    assert np.linalg.norm(metric.poses[0].E[0][:3, 3]) == pytest.approx(metric.rescaled, rel=0.05)
+    assert float(metric.own_scale) == pytest.approx(1.0, rel=1e-5)
+    assert any("metres are the prior's own" in sentence for sentence in metric.warnings)
+    assert not any("no unit" in sentence for sentence in metric.warnings)
+    assert relative.unit is None and relative.scale_from == "none" and relative.rescaled == 1.0
+    assert any("no unit" in sentence for sentence in relative.warnings)

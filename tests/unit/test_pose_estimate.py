@@ -11,6 +11,7 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.guidance.photographs import estimate_rig
 from geodiff_plugin.pose.estimate import estimate_pose
 from geodiff_plugin.pose.scale import find_scale
 from geodiff_plugin.pose.tracks import Tracks
@@ -63,6 +64,40 @@ def test_a_plane_and_little_parallax_are_told() -> None:
     assert any("one plane" in sentence for sentence in estimate_pose(flat).warnings)
     near, _, _ = make_tracks([pose((1, -2, 0.5), (0.05, 0.01, 0))], noise_px=0.05, outliers=0.0)
     assert any("parallax" in sentence for sentence in estimate_pose(near).warnings)
+
+
+def two_motions(share: float, seed: int = 0) -> Tracks:
+    """Tracks of which this share moved on its own: as if another camera had seen them."""
+    tracks, _, _ = make_tracks([TRUE, pose((4.0, 3.0, -2.0), (-0.1, 0.25, 0.05))], outliers=0.05, seed=seed)
+    own = np.random.default_rng(seed).random(len(tracks)) < share
+    right_px = np.where(own[:, None], tracks.right_px[1], tracks.right_px[0])
+    return Tracks(tracks.left_px, right_px[None], tracks.seen[:1], K, tracks.K_rights[:1])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_moving_part_is_told_and_two_motions_refused(seed: int) -> None:
+    still = estimate_pose(two_motions(0.0, seed))
+    moved = estimate_pose(two_motions(0.25, seed))
+    assert not any("motion of their own" in sentence for sentence in still.warnings)
+    assert any("motion of their own" in sentence for sentence in moved.warnings)
+    assert angle_deg(moved.T[:3, :3] @ np.linalg.inv(TRUE)[:3, :3].T) < 0.3, "the larger part decides"
+    with pytest.raises(ValueError, match="two motions"):
+        estimate_pose(two_motions(0.45, seed))
+
+
+def test_a_moving_camera_in_a_moving_scene() -> None:
+    """A rendered scene whose right half has moved by itself until the second photograph was taken."""
+    first = render_pair(5, size=(240, 320), posed=True)
+    E = first.E.numpy()
+    other = E @ pose((3.0, 2.0, 4.0), (0.0, 0.0, 0.0))
+    other[:3, 3] = (E[1, 3], -E[0, 3], E[2, 3])
+    second = render_pair(5, size=(240, 320), E=other)
+    right = first.right.image_01.clone()
+    still = estimate_rig([first.left.image_01, right], K=first.K_left.numpy())
+    assert not any("motion of their own" in sentence for sentence in still.warnings)
+    right[..., 160:] = second.right.image_01[..., 160:]
+    moving = estimate_rig([first.left.image_01, right], K=first.K_left.numpy())
+    assert any("motion of their own" in sentence for sentence in moving.warnings)
 
 
 def in_units(tracks: Tracks, T: np.ndarray) -> np.ndarray:

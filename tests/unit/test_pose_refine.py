@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
@@ -120,6 +121,31 @@ def test_several_views_are_solved_together() -> None:
     assert lengths[0] / lengths[1] == pytest.approx(lengths[2] / lengths[3], rel=0.02)
 
 
+def test_the_refinement_is_joint_and_reaches_the_optimum() -> None:
+    """Poses of both views and the points that both see, as SciPy's least squares finds them all at once."""
+    poses = [TRUE, pose((-2.0, 5.0, 0.0), (-0.3, 0.1, 0.05))]
+    tracks, _, _ = make_tracks(poses, noise_px=0.4, count=40, outliers=0.0)
+    given = np.stack([np.linalg.inv(E @ pose((0.3, -0.4, 0.2), (0, 0, 0))) for E in poses])
+    loose = Prior(np.full(2, 1e4), 1e3, 1e3, 1e3)
+    solved = solve_poses(tracks, given, loose, scale_px=1e3)
+
+    def offs(x: np.ndarray) -> np.ndarray:
+        Ts = given.copy()
+        for v, step in enumerate(x[:12].reshape(2, 6)):
+            Ts[v, :3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ given[v, :3, :3]
+            Ts[v, :3, 3] = given[v, :3, 3] + step[3:]
+        points = np.exp(-x[12:])[:, None] * tracks.rays
+        p = np.einsum("vij,nj->vni", K @ Ts[:, :3, :3], points) + (K @ Ts[:, :3, 3:])[:, None, :, 0]
+        return (p[..., :2] / p[..., 2:] - tracks.right_px).reshape(-1)
+
+    start = np.r_[np.zeros(12), np.log(np.clip(solve_inverse_depth(tracks, given), 0.05, None))]
+    best = least_squares(offs, start).fun
+    ours = np.nansum(residuals_px(tracks, solved) ** 2)
+    alone = np.stack([solve_poses(tracks.view(v), given[v : v + 1], loose)[0] for v in range(2)])
+    assert ours == pytest.approx((best**2).sum(), rel=0.02)
+    assert np.nansum(residuals_px(tracks, alone) ** 2) > 2 * ours, "pair by pair they do not agree on points"
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -134,12 +160,19 @@ def test_a_mistake_is_named(given: np.ndarray, words: str) -> None:
     assert words in find_mistake(tracks, np.linalg.inv(given), np.linalg.inv(given))
 
 
-@pytest.mark.parametrize(("factor", "words"), [(0.5, "half"), (2.0, "twice")])
-def test_intrinsics_of_another_size_are_named(factor: float, words: str) -> None:
-    tracks, Ts, _ = make_tracks([TRUE])
+@pytest.mark.parametrize(
+    ("factor", "words"), [(0.5, "half"), (2.0, "twice"), (1.5, "1.5 times"), (2 / 3, "two thirds")]
+)
+@pytest.mark.parametrize("centred", [False, True])
+def test_intrinsics_of_another_size_are_named(factor: float, words: str, centred: bool) -> None:
+    turned = pose((4.0, -9.0, 6.0), (0.3, 0.05, -0.08))
+    tracks, Ts, _ = make_tracks([turned])
     other = K * np.array([[factor], [factor], [1.0]])
+    if centred:
+        other[:2, 2] = K[:2, 2]
     tracks = Tracks(tracks.left_px, tracks.right_px, tracks.seen, other, other[None])
-    assert words in find_mistake(tracks, Ts[0], Ts[0])
+    found = find_mistake(tracks, Ts[0], Ts[0])
+    assert words in found and ("set to the middle" in found) == centred
 
 
 def test_right_and_inexact_poses_are_no_mistakes() -> None:

@@ -18,7 +18,17 @@ __all__ = ["add_trust"]
 _SETTINGS = ("space", "seed", "steps", "dtype")
 
 
-@o.takes("limit", "prior", *_SETTINGS, "device", "out", "quiet", prior="bundled", out=Path("geodiff-trust"))
+@o.takes(
+    "limit",
+    "prior",
+    *_SETTINGS,
+    "device",
+    "out",
+    "results",
+    "quiet",
+    prior="bundled",
+    out=Path("geodiff-trust"),
+)
 def _trust(
     data: Annotated[
         Path | None, typer.Option("--data", help="Folder of real pairs; none by default.")
@@ -38,9 +48,10 @@ def _trust(
 
     chosen = {name: shared[name] for name in _SETTINGS}
     settings = Settings(shared["prior"], **chosen, device=str(pick_device(shared["device"])))
-    limit, out, quiet = (shared[name] for name in ("limit", "out", "quiet"))
+    limit, out, quiet, results = (shared[name] for name in ("limit", "out", "quiet", "results"))
     kinds_given = o.names(kinds) or TEN
-    page = run_trust(TrustOptions(data, rendered, width, kinds_given, limit, settings, out, quiet))
+    options = TrustOptions(data, rendered, width, kinds_given, limit, settings, out, quiet, results)
+    page = run_trust(options)
     if not quiet:
         print_page(page)
 

@@ -17,7 +17,7 @@ from geodiff_plugin.evaluation.datasets.kitti2012 import KITTI2012
 from geodiff_plugin.evaluation.datasets.kitti2015 import KITTI2015
 from geodiff_plugin.evaluation.datasets.middlebury import ETH3D, MIDDEVAL3, MIDDLEBURY2014
 from geodiff_plugin.evaluation.datasets.mvsnet import MVSNET
-from geodiff_plugin.evaluation.datasets.perturbed import with_perturbed_poses
+from geodiff_plugin.evaluation.datasets.perturbed import with_drifted_rig, with_perturbed_poses
 from geodiff_plugin.evaluation.datasets.robustmvd import ROBUSTMVD
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 from geodiff_plugin.evaluation.datasets.synthetic import SYNTHETIC
@@ -45,7 +45,11 @@ DATASETS: dict[str, Dataset] = {
 def load(ref: SampleRef) -> StereoSample:
     """Read the sample that ``ref`` points to with its data set's loader, and change it as ``ref`` asks."""
     sample = DATASETS[ref.dataset].load(ref)
-    for key, changed in (("right_exposure", with_exposure), ("perturbed", with_perturbed_poses)):
+    for key, changed in (
+        ("right_exposure", with_exposure),
+        ("perturbed", with_perturbed_poses),
+        ("drifted", with_drifted_rig),
+    ):
         if key in ref.files:
             sample = changed(sample, ref.files[key], ref.name)
     return sample

@@ -1,6 +1,6 @@
-"""A sample whose pose is given wrongly, by a known amount.
+"""A sample whose pose is given wrongly, or whose rig has drifted, by a known amount.
 
-Hop: ``StereoSample`` + degrees + share of the baseline -> ``StereoSample``.
+Hop: ``StereoSample`` + degrees + share of the baseline, or pixels -> ``StereoSample``.
 Paper: none; it takes exact poses for granted (S3.3).
 """
 
@@ -11,16 +11,76 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 
-__all__ = ["perturbation", "perturbed_pose", "perturbed_ref", "with_perturbed_poses"]
+__all__ = [
+    "drift_of",
+    "drifted_ref",
+    "perturbation",
+    "perturbed_pose",
+    "perturbed_ref",
+    "with_drifted_rig",
+    "with_perturbed_poses",
+]
 
 #: Errors are drawn between this share of the asked ones and all of them.
 LEAST = 0.3
+
+
+def _two_numbers(text: str) -> tuple[float, float]:
+    """Two numbers with a comma as typed; negative ones for what is none."""
+    found = re.fullmatch(r"\s*([\d.]+)\s*,\s*([\d.]+)\s*", text)
+    try:
+        one, other = (float(number) for number in found.groups()) if found else (-1.0, -1.0)
+    except ValueError:
+        return -1.0, -1.0
+    return one, other
+
+
+def drift_of(text: str) -> tuple[float, float]:
+    """``DEGREES,PIXELS`` as typed.
+
+    Raises:
+        ValueError: not two numbers, an angle outside [0, 5], or pixels outside [0, 20].
+    """
+    degrees, px = _two_numbers(text)
+    if not (0 <= degrees <= 5 and 0 <= px <= 20):
+        cure = "0.3,1.5 turns the right camera by 0.3 degrees and moves its image by 1.5 pixels."
+        bad_value("--drift", "DEGREES,PIXELS with numbers in [0, 5] and [0, 20]", repr(text), cure)
+    return degrees, px
+
+
+def drifted_ref(ref: SampleRef, change: tuple[float, float]) -> SampleRef:
+    """The reference to a sample whose right camera has drifted; it is named by how far."""
+    name = f"{ref.name}-drift{change[0]:g}-{change[1]:g}px"
+    return replace(ref, name=name, files={**ref.files, "drifted": change})
+
+
+def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
+    """What a rig gives whose right camera has turned since it was calibrated, and whose image has moved.
+
+    Both are a homography of the right image, whatever the depth: calibration and truth stay.
+
+    Args:
+        sample: as it was taken.
+        change: degrees, about an axis that is drawn, and pixels up or down.
+        name: of the result; the axis and the way are drawn from it.
+    """
+    degrees, px = change
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    axis = rng.normal(size=3)
+    R = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+    moved = np.eye(3)
+    moved[1, 2] = px * rng.choice((-1.0, 1.0))
+    H = moved @ sample.K_right @ R @ np.linalg.inv(sample.K_right)
+    size = sample.right.shape[1::-1]
+    right = cv2.warpPerspective(sample.right, H, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return replace(sample, name=name, right=right)
 
 
 def perturbation(text: str) -> tuple[float, float]:
@@ -29,11 +89,7 @@ def perturbation(text: str) -> tuple[float, float]:
     Raises:
         ValueError: not two numbers, an angle outside [0, 30], or a share outside [0, 0.9].
     """
-    found = re.fullmatch(r"\s*([\d.]+)\s*,\s*([\d.]+)\s*", text)
-    try:
-        degrees, share = (float(number) for number in found.groups()) if found else (-1.0, -1.0)
-    except ValueError:
-        degrees, share = -1.0, -1.0
+    degrees, share = _two_numbers(text)
     if not (0 <= degrees <= 30 and 0 <= share <= 0.9):
         cure = "1.5,0.1 turns by up to 1.5 degrees and shifts by up to a tenth of the baseline."
         bad_value("--perturb", "DEGREES,SHARE with numbers in [0, 30] and [0, 0.9]", repr(text), cure)

@@ -1,0 +1,55 @@
+"""``geodiff eval poses``: options and their help.
+
+Hop: argv -> ``PosesOptions`` -> ``evaluation.poses``.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from geodiff_plugin.cli.eval import options as o
+
+__all__ = ["add_poses"]
+
+_SETTINGS = ("space", "seed", "steps", "resolution", "dtype")
+_SHARED = ("limit", "prior", *_SETTINGS, "device", "out", "results", "quiet")
+
+
+@o.takes(*_SHARED, prior="bundled", out=Path("geodiff-poses"))
+def _poses(
+    data: Annotated[
+        Path | None, typer.Option("--data", help="Folder of real pairs; none by default.")
+    ] = None,
+    rendered: Annotated[int, typer.Option(help="Rendered pairs in a general pose.", min=0)] = 60,
+    perturb: Annotated[
+        str, typer.Option(metavar="DEGREES,SHARE", help="Rendered: largest turn, and shift / baseline.")
+    ] = "1.5,0.1",
+    drift: Annotated[
+        str,
+        typer.Option(metavar="DEGREES,PIXELS", help="Rectified: turn, shift of the right image; 0,0: none."),
+    ] = "0.3,1.5",
+    **shared: Any,
+) -> None:
+    """What inexact poses cost, what refining them gains, and what estimated ones are worth."""
+    from geodiff_plugin.cli.eval.printing import print_page
+    from geodiff_plugin.evaluation.baselines import Settings
+    from geodiff_plugin.evaluation.datasets.perturbed import drift_of, perturbation
+    from geodiff_plugin.evaluation.poses import PosesOptions, run_poses
+    from geodiff_plugin.runtime.machine import pick_device
+
+    chosen = {name: shared[name] for name in _SETTINGS}
+    settings = Settings(shared["prior"], **chosen, device=str(pick_device(shared["device"])))
+    limit, out, results, quiet = (shared[name] for name in ("limit", "out", "results", "quiet"))
+    changes = perturbation(perturb), drift_of(drift)
+    page = run_poses(PosesOptions(data, rendered, *changes, limit, settings, out, results, quiet))
+    if not quiet:
+        print_page(page)
+
+
+def add_poses(app: typer.Typer) -> None:
+    """Add the command to ``geodiff eval``."""
+    app.command("poses")(_poses)
