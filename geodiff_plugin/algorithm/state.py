@@ -41,6 +41,8 @@ class Trajectory:
         space: what the prior's output is affine in.
         own_range: metres ``(B,)`` of ``x = 0`` and of ``x = 1`` that a metric prior says itself, from which
             the search starts; ``None`` for a relative one.
+        start_range: metres ``(B,)`` of the nearest and of the farthest end that another frame's call ended
+            with; where matches are sure, they take the place of the first search.
 
     Attributes:
         history: one ``StepReport`` a step.
@@ -64,6 +66,7 @@ class Trajectory:
         owners: Sequence[int],
         space: str,
         own_range: tuple[Tensor, Tensor] | None = None,
+        start_range: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         self.config, self.evidence, self.owners = config, evidence, list(owners)
         self.metric = MetricMap(space, config.search.positive)
@@ -79,6 +82,7 @@ class Trajectory:
         if own_range is not None:
             least, most = torch.stack(own_range).sort(0).values.unbind(0)
             self.own_range = (least, most)
+        self._start_range = self.own_range if start_range is None else start_range
         self.own_depth: Tensor | None = None
         self._affine: AffineState | None = None
         self._start: AffineState | None = None  # what the search found, which the loss pulls towards
@@ -86,6 +90,8 @@ class Trajectory:
         self.hidden: Tensor | None = None
         self.order: Tensor | None = None
         self.on_edge: Tensor | None = None
+        if start_range is not None:  # the frame before has searched
+            self.on_edge = torch.zeros_like(start_range[0], dtype=torch.bool)
         self.last_x: Tensor | None = None
         self.result: Tensor | None = None
         self.history: list[StepReport] = []
@@ -160,7 +166,7 @@ class Trajectory:
 
         The current state, at first a metric prior's own, stays unless a better basin shows up.
         """
-        ends = self.own_range if self._affine is None else self.metric.range_of(self._affine)
+        ends = self._start_range if self._affine is None else self.metric.range_of(self._affine)
         near, far = x.new_empty(x.shape[0]), x.new_empty(x.shape[0])
         on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
         for image in sorted(set(self.owners)):

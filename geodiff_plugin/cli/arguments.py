@@ -80,6 +80,7 @@ class DepthArguments:
     out: Path = Path("geodiff-out")
     overwrite: bool = False
     strict: bool = False
+    warm_start: bool = False
     export: tuple[str, ...] = ()
     show: str | None = None
     quiet: bool = False

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
@@ -16,10 +17,12 @@ from PIL import Image, UnidentifiedImageError
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments
 from geodiff_plugin.cli.checks import check_arguments
+from geodiff_plugin.cli.many.pairs import PairRef, arguments_of, find_pairs
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.out_folder import OutFolder
+from geodiff_plugin.formats.out_place import check_out
 
-__all__ = ["CALIBRATION_WAYS", "PARAMETERS", "begun", "calibration_way"]
+__all__ = ["CALIBRATION_WAYS", "PARAMETERS", "begun", "begun_many", "calibration_way", "check_files"]
 
 CALIBRATION_WAYS = "--calib FILE, or --fx --fy --cx --cy --baseline, or --K FILE --E FILE"
 CAMERA_WAYS = "--calib FILE, or --fx --fy --cx --cy, or --K FILE"
@@ -101,6 +104,53 @@ def _check_other_files(arguments: DepthArguments) -> None:
                 check_file(path, name, "a calibration file" if name == "calibration" else "a file")
 
 
+def check_files(arguments: DepthArguments, videos: bool = False) -> None:
+    """Look at every file that was named, and see that the cameras are given in one way.
+
+    Args:
+        arguments: checked by ``check_arguments``.
+        videos: the views are frames of videos, which are looked at when they are counted.
+
+    Raises:
+        OSError, TypeError, ValueError: naming the option or the file.
+    """
+    if not arguments.estimate_pose:
+        calibration_way(arguments)
+    if not videos:
+        _check_photographs(arguments)
+    _check_other_files(arguments)
+
+
+def begun_many(arguments: DepthArguments) -> list[PairRef]:
+    """The pairs of a run of many, and everything that can be said of their options at once.
+
+    Raises:
+        OSError, TypeError, ValueError: naming the option or the file.
+    """
+    for option, given in (
+        ("--show", arguments.show is not None),
+        ("--points", arguments.points is not None),
+        ("--view", bool(arguments.view)),
+        ("--known-length", arguments.known_length is not None),
+    ):
+        if given:
+            bad_value(option, "left out with many pairs", "given", "It is of one pair.")
+    refs = find_pairs(arguments)
+    if arguments.estimate_pose and refs[0].frame is not None:
+        bad_value(
+            "--estimate-pose", "left out with a video", "given", "Extract some frames, and try it there."
+        )
+    first = arguments_of(refs[0], arguments)
+    check_arguments(first if first.right is not None else replace(first, right=first.left))
+    if not arguments.estimate_pose and all(ref.calib is None for ref in refs):
+        calibration_way(first)
+    _check_other_files(arguments)
+    if (check_out(arguments.out) / "report.json").exists():
+        got = f"{arguments.out}, which holds the result of one pair"
+        bad_value("--out", "a folder for the folders of many pairs", got, "Name another.")
+    return refs
+
+
 @contextmanager
 def begun(arguments: DepthArguments) -> Iterator[OutFolder]:
     """Check what can be checked at once, and hold the folder of the results meanwhile.
@@ -108,10 +158,9 @@ def begun(arguments: DepthArguments) -> Iterator[OutFolder]:
     Raises:
         OSError, TypeError, ValueError: naming the option or the file.
     """
+    if arguments.warm_start:
+        bad_value("--warm-start", "given with many pairs", "one pair", "It goes on from the pair before.")
     check_arguments(arguments)
-    if not arguments.estimate_pose:
-        calibration_way(arguments)
-    _check_photographs(arguments)
-    _check_other_files(arguments)
+    check_files(arguments)
     with OutFolder(arguments.out, OUTPUT_FILES, overwrite=arguments.overwrite) as out:
         yield out

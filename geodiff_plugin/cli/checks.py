@@ -111,6 +111,9 @@ def _check_together(arguments: DepthArguments) -> None:
             if given:
                 cure = f"Algorithm 1 has {what}."
                 bad_value(option, "given with the default preset", "--preset paper", cure)
+        if arguments.warm_start:
+            cure = "Its scale is settled once, by a search over one number."
+            bad_value("--warm-start", "given with the default preset", "--preset paper", cure)
     for option, given in (
         ("--fov", arguments.fov is not None),
         ("--known-length", arguments.known_length is not None),

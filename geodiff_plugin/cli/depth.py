@@ -23,7 +23,7 @@ from geodiff_plugin.cli.voice import collected_warnings, in_options, say
 from geodiff_plugin.formats.out_folder import EXIT_ELSEWHERE, OutFolder
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["DepthRun", "estimate_and_write", "run_depth"]
+__all__ = ["DepthRun", "estimate_and_write", "run_depth", "write_result"]
 
 
 @dataclass(frozen=True)
@@ -74,24 +74,48 @@ def estimate_and_write(arguments: DepthArguments, out: OutFolder) -> DepthRun:
                 warnings.append(sentence)
                 say(f"warning: {sentence}")
         report = build_report(inputs, output, pipe, arguments, settings, warnings)
-
-        def fill(folder: Path) -> str:
-            with watch.stage("write"):
-                report["files"] = write_maps(folder, output, inputs.left, arguments.min_confidence)
-                if inputs.undistorted:
-                    write_undistorted(folder, inputs.left)
-                if arguments.export:
-                    write_exports(folder, arguments.export, _scene(output, inputs, arguments))
-            report["files"]["names"] = [name for name in OUTPUT_FILES if (folder / name).exists()] + [
-                "report.json"
-            ]
-            report["seconds"] = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
-            return write_report(folder, report)
-
-        report_text = out.write(fill)
+        report_text = write_result(arguments, out, inputs, output, report, watch)
     if out.elsewhere is not None:
         say(f"geodiff: {out.elsewhere}")
     return DepthRun(inputs, output, pipe, settings, report, report_text)
+
+
+def write_result(
+    arguments: DepthArguments,
+    out: OutFolder,
+    inputs: Inputs,
+    output: MetricDepthOutput,
+    report: dict[str, Any],
+    watch: StopWatch,
+) -> str:
+    """Fill the folder: every map, what ``--export`` asks for, and the report.
+
+    Args:
+        arguments: of this pair.
+        out: its folder, held.
+        inputs: views and cameras.
+        output: of the guided call.
+        report: of ``build_report``; files and seconds are added to it.
+        watch: of the stages so far.
+
+    Returns:
+        The report as JSON.
+    """
+
+    def fill(folder: Path) -> str:
+        with watch.stage("write"):
+            report["files"] = write_maps(folder, output, inputs.left, arguments.min_confidence)
+            if inputs.undistorted:
+                write_undistorted(folder, inputs.left)
+            if arguments.export:
+                write_exports(folder, arguments.export, _scene(output, inputs, arguments))
+        report["files"]["names"] = [name for name in OUTPUT_FILES if (folder / name).exists()] + [
+            "report.json"
+        ]
+        report["seconds"] = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
+        return write_report(folder, report)
+
+    return out.write(fill)
 
 
 def _scene(output: MetricDepthOutput, inputs: Inputs, arguments: DepthArguments) -> Scene:

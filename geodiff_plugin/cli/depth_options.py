@@ -19,11 +19,20 @@ __all__ = ["add_depth"]
 
 def _depth(
     left: Annotated[
-        Path, typer.Argument(metavar="LEFT", help="Left image; it gets the depth. EXIF turns are applied.")
+        Path,
+        typer.Argument(
+            metavar="LEFT",
+            help="Left image; it gets the depth. EXIF turns are applied. Or a folder of them, a video, or a "
+            "list (LEFT,RIGHT[,CALIB] a line).",
+        ),
     ],
     right: Annotated[
         Path | None,
-        typer.Argument(metavar="RIGHT", help="Right image, of any size; not needed with --points."),
+        typer.Argument(
+            metavar="RIGHT",
+            help="Right image, of any size; not needed with --points. Or a folder, or a video; a video "
+            "without it has both views side by side.",
+        ),
     ] = None,
     calib: Annotated[
         list[Path] | None,
@@ -165,6 +174,9 @@ def _depth(
         _option("Folder for the results; geodiff-out, or -2 and so on where it is taken.", OUTPUT, *OUT),
     ] = None,
     overwrite: Overwrite = False,
+    warm_start: Annotated[
+        bool, _option("Many pairs: go on from the frame before, in fewer steps.", RUN, "--warm-start")
+    ] = False,
     strict: Annotated[
         bool, _option("A result that is not to be trusted is an error.", OUTPUT, "--strict")
     ] = False,
@@ -181,15 +193,23 @@ def _depth(
     quiet: Annotated[bool, _option("No progress bar, no summary.", OUTPUT, "--quiet", "-q")] = False,
     json: Annotated[bool, _option("Print the report instead of the summary.", OUTPUT, "--json")] = False,
 ) -> None:
-    """Estimate the metric depth of LEFT with RIGHT as its guide."""
+    """Estimate the metric depth of LEFT with RIGHT as its guide; of one pair, or of many."""
     typed = locals()
     from geodiff_plugin.cli.arguments import DepthArguments
-    from geodiff_plugin.cli.begin import begun
+    from geodiff_plugin.cli.begin import begun, begun_many
+    from geodiff_plugin.cli.many.pairs import is_many
 
-    typed["out"] = out_folder(out, "geodiff-out", overwrite)
+    many = is_many(left)
+    typed["out"] = Path("geodiff-out") if many and out is None else out_folder(out, "geodiff-out", overwrite)
     views = ("view", "view_k", "view_e", "view_distortion")
     repeated = ("calib", *views, "option", "knob", "points_calib", "export", "distortion")
     arguments = DepthArguments(**typed | {name: tuple(typed[name] or ()) for name in repeated})
+    if many:
+        refs = begun_many(arguments)
+        from geodiff_plugin.cli.many.run import run_many
+
+        run_many(arguments, refs)
+        return
     with begun(arguments) as held:
         from geodiff_plugin.cli.depth import run_depth
 

@@ -88,9 +88,16 @@ def load_guided_prior(arguments: DepthArguments, settings: Settings) -> Any:
 
 
 def guided_call(
-    pipe: Any, inputs: Inputs, arguments: DepthArguments, settings: Settings
+    pipe: Any, inputs: Inputs, arguments: DepthArguments, settings: Settings, **further: Any
 ) -> MetricDepthOutput:
     """Call the pipeline as the options say; unless ``--quiet``, with the loss in a progress bar on stderr.
+
+    Args:
+        pipe: of ``load_guided_prior``.
+        inputs: views and cameras.
+        arguments: the options.
+        settings: what was understood of them.
+        **further: what else the call takes.
 
     Raises:
         InputError: what only both views together show, such as no overlap; with ``--strict`` a depth that is
@@ -103,6 +110,7 @@ def guided_call(
         "ensemble_size": arguments.ensemble,
         "output_uncertainty": arguments.ensemble > 1,
         "generator": torch.Generator("cpu").manual_seed(arguments.seed),
+        **further,
     }
     pipe.set_progress_bar_config(disable=arguments.quiet, file=sys.stderr, leave=False)
     try:

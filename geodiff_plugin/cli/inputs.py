@@ -7,6 +7,7 @@ Paper: S3.3 (two views with known cameras).
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -45,14 +46,12 @@ class Inputs:
 
     Attributes:
         left: ``(H, W, 3)`` float32 in [0, 1], EXIF orientation applied.
-        right: likewise, of its own size; ``None`` where known points stand in its place.
         rig: cameras of both, in pixels of these images; the left one's twice where there is no right one.
         guidance: the right view, and those beside it, with the settings of the preset.
         undistorted: whether lens distortion was taken out of the images.
     """
 
     left: np.ndarray
-    right: np.ndarray | None
     rig: Rig
     guidance: GeometryGuidance
     undistorted: bool = False
@@ -194,20 +193,35 @@ def _make_guidance(
     return GeometryGuidance.from_views(views, points=points, cropped=cropped, config=config)
 
 
-def read_inputs(arguments: DepthArguments, settings: Settings) -> Inputs:
+def read_inputs(
+    arguments: DepthArguments,
+    settings: Settings,
+    views: tuple[np.ndarray, np.ndarray] | None = None,
+    rig_of: Callable[..., Rig] = read_rig,
+) -> Inputs:
     """Read the images and the calibration, and see that they fit each other.
+
+    Args:
+        arguments: the options.
+        settings: what was understood of them.
+        views: left and right image, ``(H, W, 3)`` float32 in [0, 1], where they are no files of their own.
+        rig_of: ``read_rig``, or what remembers its answer.
 
     Raises:
         OSError, TypeError, ValueError: naming the option or the file.
     """
-    left = _read_view(arguments.left, "LEFT")
-    right = None if arguments.right is None else _read_view(arguments.right, "RIGHT")
-    rig = read_rig(arguments, settings.cameras, _size(left), None if right is None else _size(right))
+    right: np.ndarray | None = None
+    if views is not None:
+        left, right = views
+    else:
+        left = _read_view(arguments.left, "LEFT")
+        right = None if arguments.right is None else _read_view(arguments.right, "RIGHT")
+    rig = rig_of(arguments, settings.cameras, _size(left), None if right is None else _size(right))
     lenses = lenses_of(arguments, rig.distortion)
     left = pinhole(left, rig.K_left, lenses[0])
     right = None if right is None else pinhole(right, rig.K_right, lenses[1])
     guidance = _make_guidance(arguments, settings, right, rig, lenses[2:])
-    return Inputs(left, right, rig, guidance, any(lens is not None for lens in lenses))
+    return Inputs(left, rig, guidance, any(lens is not None for lens in lenses))
 
 
 def pinhole(image: np.ndarray, K: np.ndarray, lens: Distortion | None) -> np.ndarray:

@@ -32,4 +32,6 @@ def out_folder(typed: Path | None, default: str, overwrite: bool) -> Path:
 
 
 Device = Annotated[str, option("auto, cpu, cuda, cuda:N or mps.", RUN, "--device")]
-Overwrite = Annotated[bool, option("Write into a folder that holds files.", OUTPUT, "--overwrite")]
+Overwrite = Annotated[
+    bool, option("Write into a folder that holds files; do finished pairs anew.", OUTPUT, "--overwrite")
+]

@@ -97,4 +97,4 @@ def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
     )
     sizes = [(image.shape[1], image.shape[0]) for image in images[:2]]
     rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
-    return Inputs(images[0], images[1], rig, guidance, any(lens is not None for lens in lenses))
+    return Inputs(images[0], rig, guidance, any(lens is not None for lens in lenses))

@@ -14,6 +14,7 @@ from PIL import Image, ImageOps
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import check_file
+from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.plotting.video import depth_frames, write_depth_video
 
 __all__ = ["run_video"]
@@ -35,7 +36,14 @@ def _map(path: Path) -> np.ndarray:
 def _photograph(folder: Path) -> Image.Image:
     """The left image of a result, where it lay when the result was made."""
     report = check_file(folder / "report.json", "--photographs", "the report of a folder of geodiff depth")
-    left = Path(json.loads(report.read_text(encoding="utf-8"))["arguments"]["left"])
+    told = json.loads(report.read_text(encoding="utf-8"))
+    arguments, frame = told["arguments"], told.get("pair", {}).get("frame")
+    left = Path(arguments["left"])
+    if frame is not None:
+        with VideoReader(left, f"the left video of {folder}") as video:
+            image = video.read(frame)
+        view = both_halves(image)[0] if arguments["right"] is None else image
+        return Image.fromarray(np.rint(view * 255).astype(np.uint8))
     return ImageOps.exif_transpose(Image.open(check_file(left, f"the left image of {folder}")))
 
 

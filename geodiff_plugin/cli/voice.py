@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from tqdm import tqdm
 from typer.core import TyperGroup
@@ -29,6 +29,15 @@ def say(line: str) -> None:
     """Print one line on stderr, where it does not mix with what a command answers."""
     tqdm.write(line, file=sys.stderr)  # above a progress bar, if there is one
     sys.stderr.flush()
+
+
+class Sentences(Protocol):
+    """A list of sentences, as far as collecting them goes."""
+
+    def append(self, sentence: str, /) -> None:
+        """Add one."""
+
+    def __contains__(self, sentence: object, /) -> bool: ...
 
 
 #: What a keyword in Python is called on the command line.
@@ -62,9 +71,13 @@ class DoorGroup(TyperGroup):
             sys.exit(EXIT_BAD_INPUT)
 
 
+def _warn(sentence: str) -> None:
+    say(f"warning: {sentence}")
+
+
 @contextmanager
-def collected_warnings(into: list[str]) -> Iterator[None]:
-    """Take this package's warnings as sentences: each is said once and appended to ``into``.
+def collected_warnings(into: Sentences, tell: Callable[[str], None] = _warn) -> Iterator[None]:
+    """Take this package's warnings as sentences: each is told once and appended to ``into``.
 
     What other packages warn about is shown as ever, and the warning filters are restored at the end.
     """
@@ -79,7 +92,7 @@ def collected_warnings(into: list[str]) -> Iterator[None]:
                 shown_elsewhere(message, category, filename, lineno, file, line)
             elif (sentence := in_options(str(message))) not in into:
                 into.append(sentence)
-                say(f"warning: {sentence}")
+                tell(sentence)
 
         warnings.showwarning = collect
         yield

@@ -15,6 +15,7 @@ from PIL import Image
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.atomic import atomic_path
 from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.strips import row_strips
 
 __all__ = [
     "read_depth_mm_png",
@@ -128,11 +129,14 @@ def write_depth_mm_png(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | 
     """
     depth_m = _check_map(depth_m)
     keep = np.isfinite(depth_m) if valid is None else np.isfinite(depth_m) & np.asarray(valid, dtype=bool)
-    millimetres = np.rint(np.where(keep, depth_m, 0.0).astype(np.float64) * 1000.0)
-    millimetres[(millimetres < 0) | (millimetres > LARGEST_MM)] = 0
+    whole = np.empty(depth_m.shape, dtype=np.uint16)
+    for rows in row_strips(*depth_m.shape):
+        millimetres = np.rint(np.where(keep[rows], depth_m[rows], 0.0).astype(np.float64) * 1000.0)
+        millimetres[(millimetres < 0) | (millimetres > LARGEST_MM)] = 0
+        whole[rows] = millimetres
     with atomic_path(path) as temporary:
-        Image.fromarray(millimetres.astype(np.uint16)).save(temporary, format="PNG")
-    return int((millimetres == 0).sum())
+        Image.fromarray(whole).save(temporary, format="PNG")
+    return int((whole == 0).sum())
 
 
 def _read_png16(path: PathLike, name: str) -> np.ndarray:

@@ -65,7 +65,7 @@ def _check_floats(values: np.ndarray, name: str) -> np.ndarray:
     if low < -OVERSHOOT or high > 1 + OVERSHOOT:
         cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
         bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
-    return values.astype(np.float32).clip(0.0, 1.0)
+    return values.astype(np.float32, copy=False).clip(0.0, 1.0)
 
 
 def _check_sides(height: int, width: int, name: str) -> None:

@@ -7,12 +7,14 @@ Paper: Eq. 9 (unprojection).
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from geodiff_plugin._checks import bad_value, check_intrinsics
 from geodiff_plugin.formats.atomic import atomic_path
+from geodiff_plugin.formats.strips import row_strips
 
 __all__ = ["Cloud", "flying_points", "make_cloud", "write_ply"]
 
@@ -48,18 +50,22 @@ def flying_points(
         ``(H, W)`` boolean, True where a valid pixel flies.
     """
     depth_m = np.asarray(depth_m, dtype=np.float32)
-    use = np.isfinite(depth_m) & (np.where(np.isfinite(depth_m), depth_m, 0) > 0)
+    use = np.isfinite(depth_m) & (depth_m > 0)
     use = use if valid is None else use & np.asarray(valid, dtype=bool)
     height, width = depth_m.shape
     # NaN compares false with everything, so what is unknown or outside the image supports nobody.
     padded = np.pad(np.where(use, depth_m, np.nan), reach, constant_values=np.nan)
-    centre = padded[reach : reach + height, reach : reach + width]
-    support = np.zeros(depth_m.shape, dtype=np.int8)
-    shifts = (0, reach, 2 * reach)
-    for dy, dx in ((dy, dx) for dy in shifts for dx in shifts if (dy, dx) != (reach, reach)):
-        neighbour = padded[dy : dy + height, dx : dx + width]
-        support += np.abs(centre - neighbour) <= relative_step * np.minimum(centre, neighbour)
-    return use & (support < FEWEST_NEIGHBOURS)
+    flying, shifts = np.empty(depth_m.shape, dtype=bool), (0, reach, 2 * reach)
+    for rows in row_strips(height, width):
+        count = rows.stop - rows.start
+        strip = padded[rows.start : rows.stop + 2 * reach]
+        centre = strip[reach : reach + count, reach : reach + width]
+        support = np.zeros(centre.shape, dtype=np.int8)
+        for dy, dx in ((dy, dx) for dy in shifts for dx in shifts if (dy, dx) != (reach, reach)):
+            neighbour = strip[dy : dy + count, dx : dx + width]
+            support += np.abs(centre - neighbour) <= relative_step * np.minimum(centre, neighbour)
+        flying[rows] = use[rows] & (support < FEWEST_NEIGHBOURS)
+    return flying
 
 
 @dataclass(frozen=True)
@@ -102,16 +108,27 @@ def make_cloud(
     Convention:
         A pixel on the principal point at 2 m is (0, 0, 2).
     """
-    depth_m = np.asarray(depth_m, dtype=np.float64)
-    image_01 = np.asarray(image_01)
+    parts = list(_cloud_strips(depth_m, image_01, K, valid))
+    return Cloud(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("points_m", "colours"))
+    )
+
+
+def _cloud_strips(
+    depth_m: np.ndarray, image_01: np.ndarray, K: np.ndarray, valid: np.ndarray | None
+) -> Iterator[Cloud]:
+    """The points of ``make_cloud``, a strip of rows after the other."""
+    depth_m, image_01 = np.asarray(depth_m), np.asarray(image_01)
     if depth_m.ndim != 2 or image_01.shape != (*depth_m.shape, 3):
         bad_value("image_01", "(H, W, 3) over a depth of (H, W)", f"{image_01.shape} over {depth_m.shape}")
-    K = check_intrinsics(K)
-    use = np.isfinite(depth_m) & (np.where(np.isfinite(depth_m), depth_m, 0) > 0)
-    use = use if valid is None else use & np.asarray(valid, dtype=bool)
-    v, u = np.nonzero(use)
-    points = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T * depth_m[use][:, None]
-    return Cloud(points, np.rint(np.clip(image_01[use], 0.0, 1.0) * 255.0).astype(np.uint8))
+    unproject = np.linalg.inv(check_intrinsics(K)).T
+    for rows in row_strips(*depth_m.shape):
+        z = depth_m[rows].astype(np.float64)
+        use = np.isfinite(z) & (z > 0)
+        use = use if valid is None else use & np.asarray(valid[rows], dtype=bool)
+        v, u = np.nonzero(use)
+        points = np.stack([u, v + rows.start, np.ones_like(u)], axis=-1) @ unproject * z[use][:, None]
+        yield Cloud(points, np.rint(np.clip(image_01[rows][use], 0.0, 1.0) * 255.0).astype(np.uint8))
 
 
 def write_ply(
@@ -146,15 +163,24 @@ def write_ply(
     Convention:
         x right, y down, z forward, metres: a pixel on the principal point at 2 m is (0, 0, 2).
     """
-    cloud = make_cloud(depth_m, image_01, K, valid)
+    depth_m = np.asarray(depth_m)
+    use = np.isfinite(depth_m) & (depth_m > 0)
+    count = int(np.count_nonzero(use if valid is None else use & np.asarray(valid, dtype=bool)))
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(_ply_head(count, unit))
+        for cloud in _cloud_strips(depth_m, image_01, K, valid):
+            file.write(_vertices(cloud).tobytes())
+    return count
+
+
+def _vertices(cloud: Cloud) -> np.ndarray:
+    """``(N,)`` of ``VERTEX``."""
     vertices = np.empty(len(cloud.points_m), dtype=VERTEX)
     for column, name in enumerate(("x", "y", "z")):
         vertices[name] = cloud.points_m[:, column]
     for column, name in enumerate(("red", "green", "blue")):
         vertices[name] = cloud.colours[:, column]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(_ply_head(len(vertices), unit) + vertices.tobytes())
-    return len(vertices)
+    return vertices
 
 
 def _ply_head(count: int, unit: str | None) -> bytes:

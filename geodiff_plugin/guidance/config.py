@@ -71,6 +71,14 @@ class GuidanceConfig(Checked):
         paper="{} (not given)",
     )
     respace: bool = flag(True, "a leading DDIM schedule runs as trailing while guided")
+    warm_start: float = number(
+        0.25,
+        0.0,
+        0.99,
+        "share of the schedule that a call with `previous`, the output of the frame before, leaves out; 0 "
+        "takes over the scale alone ([sequences](../how-to/sequences.md))",
+        paper="-",
+    )
     loss_resolution: int = integer(
         640, 32, 1 << 16, "bound of the longer side of the grid that losses are computed on, px", paper="-"
     )

@@ -63,9 +63,12 @@ class EvidenceStore:
     Give one to the ``GeometryGuidance`` of every call that is to share: ``guidance.evidence_store = store``.
     """
 
-    def __init__(self, size: int = 2) -> None:
-        """Keep the evidence of the last ``size`` images; about 100 MB each with its cost volume."""
-        self._size, self._spared = size, 0.0
+    def __init__(self, size: int = 2, copies: bool = True) -> None:
+        """Keep the evidence of the last ``size`` images; about 100 MB each with its cost volume.
+
+        ``copies=False`` keeps the images themselves, for who changes none in place.
+        """
+        self._size, self._copies, self._spared = size, copies, 0.0
         self._entries: list[_Entry] = []
 
     def get(self, given: EvidenceInputs) -> Evidence:
@@ -84,7 +87,7 @@ class EvidenceStore:
         start = time.perf_counter()
         evidence = make_evidence(given)
         # Copies, so that who changes an image in place asks anew.
-        held = [None if value is None else value.clone() for value in tensors]
+        held = [value.clone() if self._copies and value is not None else value for value in tensors]
         entry = _Entry(held, settings, evidence, time.perf_counter() - start)
         self._entries = [entry, *self._entries][: self._size]
         return evidence

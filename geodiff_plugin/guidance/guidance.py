@@ -32,7 +32,7 @@ from geodiff_plugin.guidance.inputs import ImageInputs, read_inputs, split_views
 from geodiff_plugin.guidance.photographs import EstimatedRig, estimate_rig
 from geodiff_plugin.guidance.preconditions import check_fed, check_names
 from geodiff_plugin.guidance.presets import DEFAULT, MARIGOLD_DC, PAPER, SEARCH_ONLY
-from geodiff_plugin.types import Rig
+from geodiff_plugin.types import MetricDepthOutput, Rig
 
 __all__ = ["GeometryGuidance"]
 
@@ -53,6 +53,8 @@ class GeometryGuidance:
             infinity are unknown), or ``(N, 3)`` points in the left camera's frame; or a list of these.
         left_size: ``(width, height)`` that the left image must have; ``None`` takes any that ``K`` fits.
         cropped: the images are crops, so a principal point outside of its image is no mistake.
+        previous: the output of the frame before, of a call with ``output_latent=True``: the call then begins
+            in the middle of the schedule, from its latent, and the search for the scale at its scale.
         config: the hyperparameters; the default preset, or another of ``guidance.presets``.
         **knobs: leaves of ``config`` that shall differ, such as ``inner_steps=10``;
             docs/reference/knobs.md and ``geodiff info --knobs`` list them.
@@ -60,6 +62,7 @@ class GeometryGuidance:
     Attributes:
         evidence_store: where evidence is kept for further calls on the same images, cameras and settings;
             ``None``, the default, makes it anew at every call.
+        previous: as the argument; it may be set before every call.
 
     Raises:
         InputError: anything of the wrong type, rank, size, range or rigidity, naming the argument; it is a
@@ -83,6 +86,7 @@ class GeometryGuidance:
         points: Any = None,
         left_size: tuple[int, int] | None = None,
         cropped: bool = False,
+        previous: MetricDepthOutput | None = None,
         config: GuidanceConfig = DEFAULT,
         **knobs: Any,
     ) -> None:
@@ -92,6 +96,7 @@ class GeometryGuidance:
         check_names(self._config)
         self._inputs = read_inputs(right, K, E, points, cropped=cropped)
         self.evidence_store: EvidenceStore | None = None
+        self.previous = previous
         self._cropped, self._left_size = cropped, check_size(left_size, "left_size")
         check_fed(
             self._config, self.updates, views=bool(self.rights), points=self._inputs[0].points is not None
@@ -220,6 +225,19 @@ class GeometryGuidance:
         guidance = cls.from_views(list(views), points=points, left_size=found.size_left, **knobs)
         guidance.estimated = found
         return guidance
+
+    @property
+    def previous(self) -> MetricDepthOutput | None:
+        """The output of the frame before, that the next call goes on from; ``None`` for none."""
+        return self._previous
+
+    @previous.setter
+    def previous(self, output: MetricDepthOutput | None) -> None:
+        if output is not None and not isinstance(output, MetricDepthOutput):
+            bad_type("previous", "a MetricDepthOutput, of a guided call of the frame before", output)
+        if output is not None and (output.latent is None or output.scale is None):
+            bad_value("previous", "an output with its latent", "one without", "Call with output_latent=True.")
+        self._previous = output
 
     @property
     def unit(self) -> str | None:

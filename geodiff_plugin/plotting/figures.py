@@ -14,6 +14,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.strips import row_strips
 
 __all__ = ["WHITE", "colour_depth", "depth_figure", "depth_range", "text_font", "ticks", "write_centred"]
 
@@ -28,6 +29,8 @@ GREY = (128, 128, 128)
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
 #: Share of the pixels beyond either end of the colours, so that one outlier does not flatten the rest.
 TAIL_PERCENT = 2.0
+#: The ends of the colours are those of so many pixels of a larger map.
+MOST_FOR_RANGE = 1 << 22
 #: Maps lower than this are enlarged in a figure, so that the legend can be read.
 FIGURE_MIN_HEIGHT = 256
 
@@ -45,10 +48,10 @@ def _as_map(depth_m: Any, valid: Any) -> tuple[np.ndarray, np.ndarray]:
     depth_m, valid = (
         v.detach().cpu().numpy() if isinstance(v, torch.Tensor) else v for v in (depth_m, valid)
     )
-    depth_m = _plain(np.asarray(depth_m, dtype=np.float64))
+    depth_m = _plain(np.asarray(depth_m))
     if depth_m.ndim != 2:
         bad_value("depth_m", "one map of shape (H, W)", f"shape {depth_m.shape}")
-    use = np.isfinite(depth_m) & (np.where(np.isfinite(depth_m), depth_m, 0.0) > 0)
+    use = np.isfinite(depth_m) & (depth_m > 0)
     if valid is not None:
         mask = _plain(np.asarray(valid, dtype=bool))
         if mask.shape != depth_m.shape:
@@ -80,7 +83,11 @@ def depth_range(
     if near is not None and far is not None and near >= far:
         bad_value("near, far", "near < far, in metres", f"{near}, {far}")
     depth_m, use = _as_map(depth_m, valid)
-    low, high = np.percentile(depth_m[use], (TAIL_PERCENT, 100 - TAIL_PERCENT)) if use.any() else (1.0, 2.0)
+    every = math.isqrt(max(1, depth_m.size // MOST_FOR_RANGE))
+    if use[::every, ::every].any():
+        depth_m, use = depth_m[::every, ::every], use[::every, ::every]
+    known = depth_m[use].astype(np.float64)
+    low, high = np.percentile(known, (TAIL_PERCENT, 100 - TAIL_PERCENT)) if len(known) else (1.0, 2.0)
     low, high = (low if near is None else near), (high if far is None else far)
     if high <= low * (1 + 1e-6):  # a flat map, or a given end beyond the data: open the other end a little
         low, high = (low, low * 1.01) if far is None else (high / 1.01, high)
@@ -114,7 +121,12 @@ def colour_depth(
     """
     near, far = depth_range(depth_m, valid, near, far)
     depth_m, use = _as_map(depth_m, valid)
-    return np.where(use[..., None], _shade(np.where(use, depth_m, far), near, far), np.uint8(GREY[0]))
+    picture = np.empty((*depth_m.shape, 3), np.uint8)
+    for rows in row_strips(*depth_m.shape):
+        known = use[rows]
+        colours = _shade(np.where(known, depth_m[rows].astype(np.float64), far), near, far)
+        picture[rows] = np.where(known[..., None], colours, np.uint8(GREY[0]))
+    return picture
 
 
 def ticks(near: float, far: float, most: int = 8) -> list[float]:

@@ -11,6 +11,7 @@ import math
 import numpy as np
 from PIL import Image, ImageDraw
 
+from geodiff_plugin.formats.strips import row_strips
 from geodiff_plugin.plotting.figures import (
     BLACK,
     FIGURE_MIN_HEIGHT,
@@ -26,12 +27,21 @@ __all__ = ["overview", "share_figure"]
 #: Dark is 0; the middle and the end are told apart by every kind of eye.
 SHARE_COLOURS = np.array([(30, 30, 60), (60, 110, 160), (120, 190, 160), (250, 240, 150)], dtype=np.float64)
 CELL_WIDTH = 480
+#: Maps are thinned to no less than so many times the width of a cell.
+ENOUGH = 2
 #: The error's colours end at its 98 % quantile, and not below this.
 LEAST_ERROR = 0.05
 
 
-def _shade(values: np.ndarray) -> np.ndarray:
-    """``(..., 3)`` uint8 of shares in [0, 1]; grey where not finite."""
+def _shade(values: np.ndarray, top: float) -> np.ndarray:
+    """``(H, W, 3)`` uint8 of values in [0, ``top``]; grey where not finite."""
+    picture = np.empty((*values.shape, 3), np.uint8)
+    for rows in row_strips(*values.shape):
+        picture[rows] = _shade_strip(values[rows].astype(np.float64) / top)
+    return picture
+
+
+def _shade_strip(values: np.ndarray) -> np.ndarray:
     known = np.isfinite(values)
     position = np.clip(np.where(known, values, 0.0), 0.0, 1.0) * (len(SHARE_COLOURS) - 1)
     lower = np.minimum(position.astype(int), len(SHARE_COLOURS) - 2)
@@ -51,7 +61,7 @@ def share_figure(values: np.ndarray, label: str, top: float) -> Image.Image:
     Returns:
         RGB picture; small maps are enlarged by a whole factor.
     """
-    picture = Image.fromarray(_shade(np.asarray(values, dtype=np.float64) / top))
+    picture = Image.fromarray(_shade(np.asarray(values), top))
     factor = math.ceil(FIGURE_MIN_HEIGHT / picture.height)
     if factor > 1:
         size = (picture.width * factor, picture.height * factor)
@@ -64,8 +74,8 @@ def share_figure(values: np.ndarray, label: str, top: float) -> Image.Image:
     draw, left = ImageDraw.Draw(figure), picture.width + gap
     draw.text((left, text // 3), label, font=text_font(text), fill=BLACK)
     high, low = 2 * text, height - text
-    shades = _shade(np.linspace(1.0, 0.0, low - high))
-    figure.paste(Image.fromarray(np.repeat(shades[:, None], bar, axis=1)), (left, high))
+    shades = _shade(np.linspace(1.0, 0.0, low - high)[:, None], 1.0)
+    figure.paste(Image.fromarray(np.repeat(shades, bar, axis=1)), (left, high))
     draw.rectangle((left, high, left + bar - 1, low - 1), outline=BLACK)
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         y = low - 1 - share * (low - 1 - high)
@@ -101,6 +111,10 @@ def overview(
     Returns:
         RGB picture, two cells a row.
     """
+    every = max(1, depth_m.shape[1] // (ENOUGH * CELL_WIDTH))
+    if every > 1:  # a cell shows no more of a large picture
+        depth_m, left_01 = depth_m[::every, ::every], left_01[::every, ::every]
+        confidence, error = (None if v is None else v[::every, ::every] for v in (confidence, error))
     depth = depth_figure(depth_m, unit=unit)
     enlarged = math.ceil(FIGURE_MIN_HEIGHT / depth_m.shape[0])
     cells = [_beside_bar(left_01, depth, enlarged * depth_m.shape[1]), depth]

@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from geodiff_plugin.formats.strips import row_strips
+
 __all__ = ["BY_EVIDENCE", "RIGHT_WITHIN", "SIGNS", "depth_confidence", "depth_evidence"]
 
 #: What confidence is the probability of: a relative error below this.
@@ -65,6 +67,10 @@ def depth_confidence(support: Tensor, error: Tensor, visible: Tensor, spread: Te
     Returns:
         ``(B, 1, H, W)`` in (0, 1).
     """
-    evidence = depth_evidence(support, error, visible, spread)
-    weights = evidence.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
-    return torch.sigmoid((weights * evidence).sum(1, keepdim=True))
+    weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
+    confidence = torch.empty_like(support)
+    for rows in row_strips(*support.shape[-2:]):  # evidence is six times as large as what it says
+        own, at, seen = (part[:, :, rows] for part in (support, error, visible))
+        evidence = depth_evidence(own, at, seen, None if spread is None else spread[:, :, rows])
+        confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
+    return confidence

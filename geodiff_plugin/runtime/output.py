@@ -17,20 +17,17 @@ from diffusers.pipelines.marigold import MarigoldDepthOutput
 from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from torch import Tensor
 
-from geodiff_plugin.algorithm.evidence import as_fine_as
-from geodiff_plugin.algorithm.terms.exposure import match_exposure
 from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
-from geodiff_plugin.geometry.warping import warp_right_to_left
-from geodiff_plugin.guidance.config import TermsConfig
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.scale import NO_UNIT
 from geodiff_plugin.runtime.confidence import depth_confidence
 from geodiff_plugin.runtime.ensembling import median, spread_around
 from geodiff_plugin.runtime.judgement import Judgement, agreement_of_points, judge
+from geodiff_plugin.runtime.reprojection import reprojection
 from geodiff_plugin.runtime.run import GuidedRun
 from geodiff_plugin.runtime.signs import read_signs
-from geodiff_plugin.types import CameraView, MetricDepthOutput
+from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["assemble_output"]
 
@@ -67,7 +64,7 @@ def assemble_output(
     known = [own.on(depth_m.device) for own in guidance.inputs]
     K = resize_intrinsics(torch.stack([K_left for _, K_left, _ in known]), size, grid)
     seen = [
-        _reprojection(own.native, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1], run.config.terms)
+        reprojection(own.native, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1], run.config.terms)
         for i, own in enumerate(run.evidence)
         if own.native
     ]
@@ -223,32 +220,6 @@ def _uncertainty(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: Mappin
         refined = torch.cat([one.depth_m for one in brought if one is not None])
         spreads.append(spread_around(depth_m[i : i + 1], refined, reduction))
     return torch.cat(spreads)
-
-
-def _reprojection(
-    views: Sequence[CameraView], depth_m: Tensor, left_01: Tensor, K_left: Tensor, config: TermsConfig
-) -> tuple[Tensor, Tensor]:
-    """Where any right view sees the pixel, and the least mean absolute error to the re-rendered left image.
-
-    The error is that of the view that explains the pixel best, compared in the left image's exposure; both
-    are at the output's resolution.
-    """
-    best, visible = torch.full_like(depth_m, torch.inf), torch.zeros_like(depth_m, dtype=torch.bool)
-    for image, K_right, T in views:
-        image, K_right = as_fine_as(image, K_right, K_left[0])
-        warped = warp_right_to_left(image[None], depth_m, K_left, K_right[None], T[None])
-        matched = match_exposure(
-            warped.image,
-            left_01,
-            warped.visible,
-            gain_range=config.exposure_gain,
-            cells=(config.exposure_rows, config.exposure_columns),
-            prior=config.exposure_prior,
-        )
-        error = (matched - left_01).abs().mean(1, keepdim=True)
-        best = torch.where(warped.visible, torch.minimum(best, error), best)
-        visible |= warped.visible
-    return visible, best.where(visible, torch.zeros_like(best))
 
 
 def _warnings(run: GuidedRun, visible: Tensor | None, judgements: Sequence[Judgement]) -> list[str]:

@@ -30,8 +30,14 @@ from geodiff_plugin.runtime.preconditions import check_guidable
 from geodiff_plugin.runtime.prompting import prompt_of
 from geodiff_plugin.runtime.rounds import plan_steps
 from geodiff_plugin.runtime.run import GuidedRun
+from geodiff_plugin.runtime.warm_start import plan_warm_start
 
-__all__ = ["GuidedMarigoldDepthPipeline", "disable_geometry_guidance", "enable_geometry_guidance"]
+__all__ = [
+    "GuidedMarigoldDepthPipeline",
+    "disable_geometry_guidance",
+    "enable_geometry_guidance",
+    "native_images",
+]
 
 
 if TYPE_CHECKING:  # mixed in before a class that has all of a stock pipeline
@@ -126,9 +132,7 @@ class _GuidedCall(_Stock):
             )
         wants_dict, wants_latent = call["return_dict"], call["output_latent"]
         processor, device = self.image_processor, self._execution_device
-        as_given = MarigoldImageProcessor(vae_scale_factor=1, do_normalize=False)
-        lefts_01 = as_given.preprocess(image, 0, device=device, dtype=torch.float32)[0]
-        lefts_01 = lefts_01.contiguous()  # (N, 3, H, W)
+        lefts_01 = native_images(image, device)  # (N, 3, H, W)
         resolution = call["processing_resolution"]
         resolution = self.default_processing_resolution if resolution is None else resolution
         padded, padding, _ = processor.preprocess(image, resolution, call["resample_method_input"], device)
@@ -138,6 +142,10 @@ class _GuidedCall(_Stock):
             evidence = guidance.prepare(lefts_01)
             if prior.takes_prompt and call.get("prompt_depth") is None:
                 call["prompt_depth"] = prompt_of(evidence)
+        warm = plan_warm_start(self, prior, guidance, call, tuple(padded.shape[-2:]))
+        if warm is not None and warm.latents is not None:
+            # They hold what was to be drawn; beside latents Marigold takes no image with its channels last.
+            call |= {"image": lefts_01, "latents": warm.latents, "generator": None}
         run = GuidedRun(
             self,
             prior,
@@ -149,6 +157,7 @@ class _GuidedCall(_Stock):
             rounds,
             callback,
             held,
+            warm,
         )
         with run:
             stock = stock_call(**{**call, "return_dict": True, "output_latent": True})
@@ -198,6 +207,20 @@ class _GuidedCall(_Stock):
 
 class GuidedMarigoldDepthPipeline(_GuidedCall, MarigoldDepthPipeline):
     """``MarigoldDepthPipeline`` whose call takes ``guidance``; ``from_pretrained`` as always."""
+
+
+def native_images(image: Any, device: torch.device) -> Tensor:
+    """Left image(s) in any form that the stock call takes, as they go to ``GeometryGuidance.prepare``.
+
+    Args:
+        image: PIL, numpy or torch, or a list.
+        device: where the call runs.
+
+    Returns:
+        ``(N, 3, H, W)`` float32 in [0, 1], native size.
+    """
+    as_given = MarigoldImageProcessor(vae_scale_factor=1, do_normalize=False)
+    return as_given.preprocess(image, 0, device=device, dtype=torch.float32)[0].contiguous()
 
 
 def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:

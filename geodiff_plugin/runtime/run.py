@@ -30,6 +30,7 @@ from geodiff_plugin.runtime.marks import FrozenWeights, Running
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.preconditions import needs_network
 from geodiff_plugin.runtime.scheduler import GuidedScheduler
+from geodiff_plugin.runtime.warm_start import WarmStart
 
 __all__ = ["GuidedRun"]
 
@@ -50,6 +51,7 @@ class GuidedRun:
         rounds: times that every denoising step makes its updates, see ``rounds.plan_steps``.
         callback: ``callback_on_step_end`` or ``None``.
         held: what the call holds against other threads, given back while the callback runs.
+        warm: where the call goes on from another frame, or ``None``.
 
     Attributes:
         trajectories: one a chunk.
@@ -69,12 +71,14 @@ class GuidedRun:
         rounds: int,
         callback: StepCallback | None,
         held: Exclusive,
+        warm: WarmStart | None = None,
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
         self.full = needs_network(guidance)
         self.owners = [i for i in range(len(evidence)) for _ in range(ensemble_size)]
         self.batch_size, self.grid = batch_size, grid
         self.rounds, self.callback, self._held = rounds, callback, held
+        self.warm, self._skipped = warm, 0 if warm is None else warm.skipped
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
         self.members: list[Tensor] = []
@@ -89,7 +93,9 @@ class GuidedRun:
             FrozenWeights(pipe),
             ImagesInFloat32(pipe.image_processor, pipe._execution_device),
             *([self._tap] if self._tap else []),
-            GuidedScheduler(pipe, self._on_trajectory, self._on_step, self._on_done, self.config.respace),
+            GuidedScheduler(
+                pipe, self._on_trajectory, self._on_step, self._on_done, self.config.respace, self._skipped
+            ),
             Running(pipe, self),
         ]
 
@@ -118,7 +124,8 @@ class GuidedRun:
     @property
     def spans(self) -> list[tuple[float, float]]:
         """Begin and end of the rounds of the current step in the schedule, [0, 1] each."""
-        first, count = self.step_index * self.rounds, len(self.timesteps) * self.rounds
+        first = (self._skipped + self.step_index) * self.rounds
+        count = (self._skipped + len(self.timesteps)) * self.rounds
         return [(i / count, (i + 1) / count) for i in range(first, first + self.rounds)]
 
     def decode(self, z0: Tensor) -> Tensor:
@@ -178,8 +185,9 @@ class GuidedRun:
         first = len(self.trajectories) * self.batch_size
         chunk = slice(first, first + self.batch_size)
         own_range = self.prior.metric_range(chunk)
+        start = None if self.warm is None else (self.warm.near_m[chunk], self.warm.far_m[chunk])
         self.trajectories.append(
-            Trajectory(self.config, self.evidence, self.owners[chunk], self.prior.space, own_range)
+            Trajectory(self.config, self.evidence, self.owners[chunk], self.prior.space, own_range, start)
         )
         self.step_index, self.timesteps = 0, timesteps.tolist()
         if self._bar is None:

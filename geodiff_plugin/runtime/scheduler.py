@@ -40,6 +40,8 @@ class GuidedScheduler:
             step shall be given, and what to add to its ``z_{t-1}`` (``None`` for nothing).
         on_done: ``(timestep, z_{t-1}) -> z_{t-1}``, after the step.
         respace: run a leading DDIM as trailing.
+        skipped: steps at the beginning of the schedule that are left out; for a DDIM, whose step asks for the
+            timestep alone.
     """
 
     def __init__(
@@ -49,8 +51,9 @@ class GuidedScheduler:
         on_step: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor | None]],
         on_done: Callable[[Tensor, Tensor], Tensor],
         respace: bool,
+        skipped: int = 0,
     ) -> None:
-        self._pipe, self._respace = pipe, respace
+        self._pipe, self._respace, self._skipped = pipe, respace, skipped
         self._on_trajectory, self._on_step, self._on_done = on_trajectory, on_step, on_done
         theirs = pipe.scheduler
         replaced = any(name in vars(theirs) for name in _METHODS)
@@ -79,6 +82,7 @@ class GuidedScheduler:
             trailing = trailing_timesteps(scheduler, len(scheduler.timesteps)) if self._respace else None
             if trailing is not None:
                 scheduler.timesteps = trailing.to(scheduler.timesteps.device)
+            scheduler.timesteps = scheduler.timesteps[self._skipped :]
             self._on_trajectory(scheduler.timesteps)
 
         @functools.wraps(own_step)

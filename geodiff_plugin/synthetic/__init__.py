@@ -12,6 +12,7 @@ from geodiff_plugin.synthetic.mono import render_mono
 from geodiff_plugin.synthetic.pairs import SyntheticPair, render_pair
 from geodiff_plugin.synthetic.render import render_views
 from geodiff_plugin.synthetic.scene import Camera, Material, RenderedView, Scene
+from geodiff_plugin.synthetic.sequences import SyntheticSequence, render_sequence
 
 __all__ = [
     "KINDS",
@@ -21,8 +22,10 @@ __all__ = [
     "RenderedView",
     "Scene",
     "SyntheticPair",
+    "SyntheticSequence",
     "render_mono",
     "render_pair",
+    "render_sequence",
     "render_views",
     "sample_scene",
 ]

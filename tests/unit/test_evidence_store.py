@@ -93,3 +93,11 @@ def test_guidance_asks_the_store_that_it_was_given():
     second = GeometryGuidance(right, K, torch.linalg.inv(T), depth_range=(1.0, 20.0))
     second.evidence_store = store
     assert second.prepare(left[None])[0] is not shared
+
+
+def test_a_store_for_who_changes_nothing_keeps_the_images_themselves(made):
+    store, given = EvidenceStore(1, copies=False), pair()
+    for own in (given, pair()):
+        assert store.get(EvidenceInputs(*own, *SETTINGS)) == 1
+    assert store._entries[0].tensors[0] is given[0]
+    assert EvidenceStore(1).get(EvidenceInputs(*given, *SETTINGS)) == 2

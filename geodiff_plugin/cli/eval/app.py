@@ -16,6 +16,7 @@ import typer
 from geodiff_plugin.cli.eval import options as o
 from geodiff_plugin.cli.eval.figures import add_figures
 from geodiff_plugin.cli.eval.poses import add_poses
+from geodiff_plugin.cli.eval.sequence import add_sequence
 from geodiff_plugin.cli.eval.strength import add_strength
 from geodiff_plugin.cli.eval.tables import add_tables
 from geodiff_plugin.cli.eval.trust import add_trust
@@ -54,6 +55,7 @@ def pairs(
 
 add_tables(eval_app)
 add_strength(eval_app)
+add_sequence(eval_app)
 add_figures(eval_app)
 add_trust(eval_app)
 add_poses(eval_app)

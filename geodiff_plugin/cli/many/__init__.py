@@ -1,0 +1,1 @@
+"""``geodiff depth`` on many pairs: folders, lists and videos of one rig, stage beside stage."""

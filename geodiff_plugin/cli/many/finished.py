@@ -1,0 +1,57 @@
+"""Pairs that an earlier run has finished.
+
+Hop: the folder of a pair, what is asked of it -> its report, nothing, or why it cannot be gone on with.
+Paper: none.
+
+Nothing here imports torch.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.cli.arguments import DepthArguments
+
+__all__ = ["finished_report"]
+
+#: Options by which a finished result is no other one.
+NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "show", "strict", "device"}
+
+
+def finished_report(arguments: DepthArguments) -> dict[str, Any] | None:
+    """The report of a pair that is finished; ``None`` where it is still to be done.
+
+    The report is written last and names every file, so a folder that holds all of them is whole.
+
+    Args:
+        arguments: of this pair alone.
+
+    Raises:
+        ValueError: it was made with other options.
+    """
+    report = _report(arguments.out)
+    if report is None:
+        return None
+    asked, made = arguments.as_json(), report["arguments"]
+    others = sorted(
+        name for name in asked if name not in NOT_OF_THE_RESULT and asked[name] != made.get(name, asked[name])
+    )
+    if others:
+        told = ", ".join(f"{name} {made[name]!r} and not {asked[name]!r}" for name in others)
+        cure = "Name another --out, or add --overwrite."
+        bad_value("--out", "a folder of results of the same options", f"{arguments.out} with {told}", cure)
+    return report
+
+
+def _report(folder: Path) -> dict[str, Any] | None:
+    """What ``report.json`` says, where it can be read and every file that it names is there."""
+    try:
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        names, _ = report["files"]["names"], report["arguments"]
+        whole = all((folder / name).stat().st_size > 0 for name in names)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return report if whole else None

@@ -1,0 +1,188 @@
+"""One pair of many on its way: read, its evidence made, the prior guided by it, its folder written.
+
+Hop: ``PairRef`` -> ``Job`` -> four stages, each in a thread of its own -> files, and a row of the summary.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments
+from geodiff_plugin.cli.begin import check_files
+from geodiff_plugin.cli.checks import check_arguments
+from geodiff_plugin.cli.depth import write_result
+from geodiff_plugin.cli.estimate import StopWatch, guided_call
+from geodiff_plugin.cli.inputs import Inputs, read_inputs
+from geodiff_plugin.cli.many.pairs import PairRef, arguments_of
+from geodiff_plugin.cli.many.rigs import RigStore
+from geodiff_plugin.cli.photographs import read_photographs
+from geodiff_plugin.cli.report import build_report
+from geodiff_plugin.cli.settings import Settings
+from geodiff_plugin.cli.voice import in_options
+from geodiff_plugin.formats.out_folder import OutFolder
+from geodiff_plugin.formats.video import VideoReader, both_halves
+from geodiff_plugin.guidance.evidence_store import EvidenceStore
+from geodiff_plugin.runtime.pipeline import native_images
+from geodiff_plugin.types import MetricDepthOutput
+
+__all__ = ["Job", "Stages", "ThreadWarnings"]
+
+
+@dataclass(eq=False)
+class Job:
+    """A pair and what is known of it so far; what a stage no longer needs, it lets go of.
+
+    Attributes:
+        ref: the pair.
+        arguments: of ``geodiff depth`` for this pair alone.
+        warnings: sentences about it.
+        watch: its stages.
+        out: its folder, held from before the work.
+        inputs: views and cameras.
+        output: of the guided call.
+        began_from: name of the pair whose result the call went on from, or ``None``.
+        report: what ``report.json`` says.
+        error: why it failed.
+    """
+
+    ref: PairRef
+    arguments: DepthArguments
+    warnings: list[str] = field(default_factory=list)
+    watch: StopWatch = field(default_factory=StopWatch)
+    out: OutFolder | None = None
+    inputs: Inputs | None = None
+    output: MetricDepthOutput | None = None
+    began_from: str | None = None
+    report: dict[str, Any] | None = None
+    error: str | None = None
+    _held: ExitStack = field(default_factory=ExitStack)
+
+    @classmethod
+    def of(cls, ref: PairRef, arguments: DepthArguments) -> Job:
+        """The job of one pair of a run."""
+        return cls(ref, arguments_of(ref, arguments))
+
+    def hold(self) -> None:
+        """Take the pair's folder, as a run of this pair alone would."""
+        folder = OutFolder(self.arguments.out, OUTPUT_FILES, overwrite=self.arguments.overwrite)
+        self.out = self._held.enter_context(folder)
+
+    def let_go(self) -> None:
+        """Give the folder and the memory back."""
+        self._held.close()
+        self.inputs = self.output = None
+
+
+class ThreadWarnings:
+    """Sentences of the pair that a thread is at; each is one of the pair's once."""
+
+    def __init__(self) -> None:
+        self._own = threading.local()
+
+    def use(self, sentences: list[str]) -> None:
+        """What this thread is warned of from now on belongs here."""
+        self._own.sentences = sentences
+
+    def __contains__(self, sentence: object) -> bool:
+        return sentence in getattr(self._own, "sentences", ())
+
+    def append(self, sentence: str) -> None:
+        """Add a sentence to those of the pair that this thread is at."""
+        self._own.__dict__.setdefault("sentences", []).append(sentence)
+
+
+class Stages:
+    """The four stages of every job.
+
+    Args:
+        pipe: of ``load_guided_prior``.
+        settings: what was understood of the options.
+        warned: where the warnings of a thread go.
+        warm_start: go on from the pair before, where it has the same size.
+    """
+
+    def __init__(self, pipe: Any, settings: Settings, warned: ThreadWarnings, warm_start: bool) -> None:
+        self._pipe, self._settings, self._warned, self._warm_start = pipe, settings, warned, warm_start
+        self._rigs, self._videos, self._held = RigStore(), dict[Path, VideoReader](), ExitStack()
+        self._before: tuple[str, tuple[int, ...], MetricDepthOutput] | None = None
+
+    def close(self) -> None:
+        """Close the videos; to be called when the threads are done."""
+        self._held.close()
+
+    def read(self, job: Job) -> None:
+        """Look at the files, take the folder, decode the views."""
+        self._warned.use(job.warnings)
+        with job.watch.stage("calibration"):
+            check_arguments(_checkable(job))
+            check_files(job.arguments, videos=job.ref.frame is not None)
+            job.hold()
+            if job.arguments.estimate_pose:
+                job.inputs = read_photographs(job.arguments, self._settings)
+            else:
+                views = None if job.ref.frame is None else self._frames(job.ref, job.ref.frame)
+                job.inputs = read_inputs(job.arguments, self._settings, views, self._rigs.read)
+
+    def _frames(self, ref: PairRef, frame: int) -> Any:
+        views = [self._video(path).read(frame) for path in (ref.left, ref.right) if path is not None]
+        return both_halves(views[0], "LEFT") if ref.right is None else tuple(views)
+
+    def _video(self, path: Path) -> VideoReader:
+        if path not in self._videos:
+            self._videos[path] = self._held.enter_context(VideoReader(path))
+        return self._videos[path]
+
+    def evidence(self, job: Job) -> None:
+        """What the views say by themselves, into a store of the pair's own, where the call finds it."""
+        self._warned.use(job.warnings)
+        assert job.inputs is not None
+        device = self._pipe._execution_device
+        with job.watch.stage("evidence"), torch.no_grad(), torch.autocast(device.type, enabled=False):
+            job.inputs.guidance.evidence_store = EvidenceStore(1, copies=False)
+            job.inputs.guidance.prepare(native_images(job.inputs.left, device))
+
+    def guide(self, job: Job) -> None:
+        """The guided call, from the pair before where that is wanted."""
+        self._warned.use(job.warnings)
+        assert job.inputs is not None
+        guidance, size, before = job.inputs.guidance, job.inputs.left.shape, self._before
+        self._before = None  # whatever happens now: a sequence with a hole begins anew
+        if before is not None and before[1] == size:
+            job.began_from, guidance.previous = before[0], before[2]
+        with job.watch.stage("guided call"):
+            further = {"output_latent": self._warm_start}
+            quiet = replace(job.arguments, quiet=True)
+            job.output = guided_call(self._pipe, job.inputs, quiet, self._settings, **further)
+        guidance.evidence_store = guidance.previous = None
+        if self._warm_start:
+            self._before = job.ref.name, size, _small(job.output)
+
+    def write(self, job: Job) -> None:
+        """The files, the report last."""
+        self._warned.use(job.warnings)
+        assert job.inputs is not None and job.output is not None and job.out is not None
+        job.warnings += [w for w in map(in_options, job.output.warnings) if w not in job.warnings]
+        report = build_report(job.inputs, job.output, self._pipe, job.arguments, self._settings, job.warnings)
+        report["pair"] = {"name": job.ref.name, "frame": job.ref.frame, "began_from": job.began_from}
+        write_result(job.arguments, job.out, job.inputs, job.output, report, job.watch)
+        job.report = report
+
+
+def _checkable(job: Job) -> DepthArguments:
+    """The arguments with a right view where one video has both."""
+    if job.ref.frame is not None and job.ref.right is None:
+        return replace(job.arguments, right=job.ref.left)
+    return job.arguments
+
+
+def _small(output: MetricDepthOutput) -> MetricDepthOutput:
+    """What the next call needs of an output, without its maps."""
+    kept = {name: getattr(output, name) for name in ("latent", "scale", "shift", "global_scale")}
+    return MetricDepthOutput(prediction=output.prediction[:0], **kept)

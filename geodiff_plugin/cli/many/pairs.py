@@ -1,0 +1,167 @@
+"""Which pairs a run of many is about: two folders, a list, or the video of a rig.
+
+Hop: LEFT and RIGHT as typed -> one ``PairRef`` a pair -> the arguments that ``geodiff depth`` would have had.
+Paper: none.
+
+Nothing here imports torch: what is wrong with a list is said at once.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from PIL import Image
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.video import VIDEOS, count_frames, is_video
+
+__all__ = ["LISTS", "PairRef", "arguments_of", "find_pairs", "is_many"]
+
+LISTS = (".csv", ".tsv", ".txt")
+#: First words of a list's heading, which is no pair.
+HEADING = "left"
+
+
+@dataclass(frozen=True)
+class PairRef:
+    """One pair of many.
+
+    Attributes:
+        name: of its folder below ``--out``; no two pairs share one.
+        left: left image, or the video that it is a frame of.
+        right: likewise; ``None`` where the video has both views side by side.
+        calib: its own calibration, or ``None`` for that of the run.
+        frame: number in the video, from 0; ``None`` for images.
+    """
+
+    name: str
+    left: Path
+    right: Path | None
+    calib: Path | None = None
+    frame: int | None = None
+
+
+def is_many(left: Path) -> bool:
+    """Whether LEFT names many pairs: a folder, a list, or a video."""
+    return left.is_dir() or left.suffix.lower() in LISTS or is_video(left)
+
+
+def find_pairs(arguments: DepthArguments) -> list[PairRef]:
+    """The pairs of a run, in order.
+
+    Raises:
+        OSError, ValueError: a folder or list without pairs, views that have no partner, a line that is none.
+    """
+    left, right = arguments.left, arguments.right
+    if left.is_dir():
+        return _of_folders(left, right)
+    if is_video(left):
+        return _of_videos(left, right)
+    if right is not None:
+        bad_value("RIGHT", "left out with a list of pairs", right, "The list names both views of each.")
+    return _of_list(left)
+
+
+def arguments_of(ref: PairRef, arguments: DepthArguments) -> DepthArguments:
+    """What ``geodiff depth`` would have been asked for this pair alone."""
+    calib = arguments.calib if ref.calib is None else (ref.calib,)
+    return replace(arguments, left=ref.left, right=ref.right, calib=calib, out=arguments.out / ref.name)
+
+
+def _photographs(folder: Path) -> list[Path]:
+    Image.init()
+    paths = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    return [path for path in paths if path.suffix.lower() in Image.EXTENSION]
+
+
+def _of_folders(left: Path, right: Path | None) -> list[PairRef]:
+    if right is None or not right.is_dir():
+        got = "nothing" if right is None else right
+        bad_value("RIGHT", "a folder too, with the right view of each", got, "Or name a list of pairs.")
+    lefts, rights = _photographs(left), _photographs(right)
+    for name, folder, found in (("LEFT", left, lefts), ("RIGHT", right, rights)):
+        if not found:
+            bad_value(name, "a folder of images", f"{folder}, which holds none that Pillow knows")
+        twice = [stem for stem, count in Counter(path.stem for path in found).items() if count > 1]
+        if twice:
+            cure = "Keep one of them, or write a list of pairs."
+            bad_value(name, "a folder of images with different names", f"two {twice[0]} in {folder}", cure)
+    of_stem = {path.stem: path for path in rights}
+    shared = [path for path in lefts if path.stem in of_stem]
+    if not shared and len(lefts) == len(rights):  # im0_L.png beside im0_R.png
+        return [PairRef(a.stem, a, b) for a, b in zip(lefts, rights, strict=True)]
+    if len(shared) < max(len(lefts), len(rights)):
+        stems = {path.stem for path in lefts} ^ set(of_stem)
+        cure = "Remove it, or write a list of pairs: LEFT,RIGHT[,CALIB] a line."
+        got = f"{len(lefts)} left and {len(rights)} right images; {sorted(stems)[0]} has no partner"
+        bad_value("LEFT and RIGHT", "folders of images with the same names, or as many in order", got, cure)
+    return [PairRef(path.stem, path, of_stem[path.stem]) for path in shared]
+
+
+def _of_videos(left: Path, right: Path | None) -> list[PairRef]:
+    if right is not None and not is_video(right):
+        bad_value("RIGHT", f"a video too ({', '.join(VIDEOS)}), or left out", right)
+    frames = count_frames(left, "LEFT")
+    if right is not None and (others := count_frames(right, "RIGHT")) != frames:
+        cure = "Cut them to the same moments first."
+        bad_value("RIGHT", f"a video of {frames} frames, as the left one", f"{others} frames", cure)
+    digits = max(6, len(str(frames)))
+    return [PairRef(f"{frame:0{digits}d}", left, right, frame=frame) for frame in range(frames)]
+
+
+def _of_list(path: Path) -> list[PairRef]:
+    found = check_file(path, "LEFT", "a list of pairs")
+    try:
+        lines = found.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        bad_value("LEFT", "an image, a folder, a video or a list of pairs", f"{path}, which is no text")
+    rows: list[list[Path]] = []
+    for number, line in enumerate(lines, 1):
+        cells = _cells(line)
+        if not cells or (not rows and cells[0].lower() == HEADING):
+            continue
+        if len(cells) not in (2, 3):
+            cure = "Separate them by commas, tabs, or blanks where no name has one."
+            bad_value(f"line {number} of {path}", "LEFT RIGHT [CALIB]", repr(line.strip()), cure)
+        rows.append([found.parent / cell for cell in cells])
+    if not rows:
+        bad_value("LEFT", "a list with a pair a line: LEFT,RIGHT[,CALIB]", f"{path}, which names none")
+    names = _names([row[0] for row in rows])
+    return [
+        PairRef(name, row[0], row[1], row[2] if len(row) > 2 else None)
+        for name, row in zip(names, rows, strict=True)
+    ]
+
+
+def _cells(line: str) -> list[str]:
+    """What stands in a line, by commas, else tabs, else blanks; nothing of an empty one or a comment."""
+    line = line.strip()
+    if not line or line.startswith("#"):
+        return []
+    separator = next((mark for mark in (",", "\t") if mark in line), None)
+    if separator is None:
+        return line.split()
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator)) if cell.strip()]
+
+
+def _names(lefts: Sequence[Path]) -> list[str]:
+    """A folder name a pair: the left image's, with what tells it apart from others of that name."""
+    names = [path.stem for path in lefts]
+    if len(set(names)) < len(names):
+        absolute = [path.absolute() for path in lefts]
+        common = Path(os.path.commonpath([path.parent for path in absolute]))
+        names = ["_".join(path.relative_to(common).with_suffix("").parts) for path in absolute]
+    taken: set[str] = set()
+    for i, name in enumerate(names):  # one left view with several right ones
+        number = 2
+        while names[i] in taken:
+            names[i], number = f"{name}-{number}", number + 1
+        taken.add(names[i])
+    return names

@@ -1,0 +1,45 @@
+"""Cameras of a rig, read once for all of its pairs.
+
+Hop: arguments of a pair -> ``Rig``, read or remembered.
+Paper: none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.inputs import read_rig
+from geodiff_plugin.types import Rig
+
+__all__ = ["RigStore"]
+
+#: What stands before the number of a camera in names of KITTI.
+NUMBERED = "image_"
+COLMAP_FILES = ("cameras.txt", "images.txt", "cameras.bin", "images.bin")
+Size = tuple[int, int]
+#: What of the arguments cameras are read from, beside the images' names.
+CAMERA_OPTIONS = ("calib", "fx", "fy", "cx", "cy", "baseline", "k", "e", "k_right", "cropped")
+
+
+class RigStore:
+    """``read_rig`` that remembers what it read last; not for several threads at a time."""
+
+    def __init__(self) -> None:
+        self._key: Any = None
+        self._rig: Rig | None = None
+
+    def read(
+        self, arguments: DepthArguments, cameras: Size | None, left_size: Size, right_size: Size | None
+    ) -> Rig:
+        """As ``read_rig``; KITTI's asks names for the camera's number, and COLMAP has one for every image."""
+        views: tuple[Any, ...] = (arguments.left, arguments.right)
+        if not any(path.is_dir() or path.name in COLMAP_FILES for path in arguments.calib):
+            views = tuple(
+                path.parent if path is not None and NUMBERED not in path.name else path for path in views
+            )
+        options = tuple(getattr(arguments, name) for name in CAMERA_OPTIONS)
+        key = (views, options, cameras, left_size, right_size)
+        if self._rig is None or key != self._key:
+            self._rig, self._key = read_rig(arguments, cameras, left_size, right_size), key
+        return self._rig

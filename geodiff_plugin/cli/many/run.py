@@ -1,0 +1,188 @@
+"""``geodiff depth`` on many pairs: one process, one prior, four stages side by side.
+
+Hop: ``DepthArguments`` -> ``PairRef`` each -> ``Conveyor`` -> a folder a pair, a table, the exit code.
+Paper: Algorithm 1, pair after pair.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.text import Text
+from tqdm import tqdm
+
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.estimate import load_guided_prior
+from geodiff_plugin.cli.exports import check_exports
+from geodiff_plugin.cli.many.conveyor import Conveyor
+from geodiff_plugin.cli.many.finished import finished_report
+from geodiff_plugin.cli.many.job import Job, Stages, ThreadWarnings
+from geodiff_plugin.cli.many.pairs import PairRef
+from geodiff_plugin.cli.many.processes import Processes, join_processes
+from geodiff_plugin.cli.settings import Settings, read_settings
+from geodiff_plugin.cli.terminal import new_table, show
+from geodiff_plugin.cli.voice import collected_warnings, in_options, say
+from geodiff_plugin.formats.atomic import atomic_path
+
+__all__ = ["EXIT_SOME_FAILED", "run_many"]
+
+#: Exit code of a run of which some pairs have no result.
+EXIT_SOME_FAILED = 4
+#: Pairs in memory at a time: one in each of the four stages.
+MOST_ON_THE_WAY = 4
+#: A table of more pairs than this has only those that want to be looked at.
+MOST_ROWS = 20
+COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "trusted", "confidence", "seconds", "said")
+
+Row = dict[str, Any]
+
+
+def run_many(arguments: DepthArguments, refs: Sequence[PairRef]) -> None:
+    """Run the command on all pairs, answer on stdout, and leave with a code if one of them failed.
+
+    Args:
+        arguments: checked by ``begin.begun_many``.
+        refs: the pairs, in order.
+    """
+    settings = read_settings(arguments)
+    check_exports(arguments.export, None)
+    processes = join_processes(settings.device)
+    settings = replace(settings, device=processes.device(settings.device))
+    rows = [row for _, row in sorted(_work(arguments, settings, refs, processes))]
+    rows = processes.gather(rows)
+    if processes.index == 0:
+        _write_rows(arguments.out / "pairs.csv", rows)
+        if arguments.json:
+            print(json.dumps(rows, indent=2))
+        elif not arguments.quiet:
+            _print(rows, arguments.out)
+    if any(row["result"] == "failed" for row in rows):
+        sys.exit(EXIT_SOME_FAILED)
+
+
+def _work(
+    arguments: DepthArguments, settings: Settings, refs: Sequence[PairRef], processes: Processes
+) -> Iterator[tuple[int, Row]]:
+    """Number and row of every pair of this process's share."""
+    jobs = []
+    for number, ref in processes.share(list(enumerate(refs))):
+        job = Job.of(ref, arguments)
+        try:
+            report = None if arguments.overwrite else finished_report(job.arguments)
+        except InputError as error:
+            yield number, _failed(job, error)
+            continue
+        if report is not None:
+            yield number, _row(ref.name, "there", report)
+        else:
+            jobs.append((number, job))
+    if jobs:
+        yield from _run(arguments, settings, jobs, processes)
+
+
+def _run(
+    arguments: DepthArguments, settings: Settings, jobs: list[tuple[int, Job]], processes: Processes
+) -> Iterator[tuple[int, Row]]:
+    pipe = load_guided_prior(replace(arguments, quiet=arguments.quiet or processes.index > 0), settings)
+    warned = ThreadWarnings()
+    stages = Stages(pipe, settings, warned, arguments.warm_start)
+
+    def failed(job: Job, error: Exception) -> None:
+        job.error = _failed(job, error)["said"]
+
+    numbers = {job.ref.name: number for number, job in jobs}
+    conveyor = Conveyor([stages.read, stages.evidence, stages.guide, stages.write], failed, MOST_ON_THE_WAY)
+    bar = tqdm(total=len(jobs), desc="pairs", unit="pair", file=sys.stderr, disable=arguments.quiet)
+    bar.set_description("pairs" if processes.count == 1 else f"pairs of process {processes.index + 1}")
+    with ExitStack() as held:
+        held.enter_context(bar)
+        held.enter_context(collected_warnings(warned, _once()))
+        for _, job in jobs:  # those on the way when the run is stopped
+            held.callback(job.let_go)
+        held.enter_context(closing(stages))
+        for job in held.enter_context(closing(conveyor.run(job for _, job in jobs))):
+            elsewhere = None if job.out is None else job.out.elsewhere
+            if job.error is None and elsewhere is not None:
+                job.error = elsewhere
+                say(f"geodiff: {job.ref.name}: {elsewhere}")
+            row = _row(job.ref.name, "failed" if job.error else "done", job.report, job.error)
+            job.let_go()
+            bar.update()
+            yield numbers[job.ref.name], row
+
+
+def _once() -> Callable[[str], None]:
+    """Says a warning the first time that any pair gives rise to it; ``report.json`` has those of each."""
+    told: set[str] = set()
+
+    def tell(sentence: str) -> None:
+        if sentence not in told:
+            told.add(sentence)
+            say(f"warning: {sentence}")
+
+    return tell
+
+
+def _failed(job: Job, error: Exception) -> Row:
+    """Say why a pair failed; what is no fault of the input keeps its traceback."""
+    told = in_options(str(error)) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    if not isinstance(error, InputError):
+        say("".join(traceback.format_exception(error)).rstrip())
+    say(f"geodiff: {job.ref.name}: {told}")
+    return _row(job.ref.name, "failed", None, told)
+
+
+def _row(name: str, result: str, report: dict[str, Any] | None, said: str | None = None) -> Row:
+    """What the summary says of one pair."""
+    if report is None:
+        return dict.fromkeys(COLUMNS) | {"pair": name, "result": result, "said": said}
+    depth, judgement = report["depth"], report["judgement"]
+    return {
+        "pair": name,
+        "result": result,
+        "near_m": depth["min_m"],
+        "median_m": depth["median_m"],
+        "far_m": depth["max_m"],
+        "trusted": judgement["trusted"],
+        "confidence": judgement["signs"]["confidence"],
+        "seconds": round(sum(report["seconds"].values()), 3),
+        "said": said or " ".join(report["warnings"]) or None,
+    }
+
+
+def _write_rows(path: Path, rows: Sequence[Row]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _print(rows: Sequence[Row], out: Path) -> None:
+    """The table and what it comes to."""
+    shown = [row for row in rows if row["result"] == "failed" or row["trusted"] is False]
+    shown = list(rows) if len(rows) <= MOST_ROWS else shown
+    if shown:
+        table = new_table(("pair", "result", "near m", "median m", "far m", "confidence", "s"))
+        for row in shown:
+            numbers = [row[name] for name in ("near_m", "median_m", "far_m", "confidence", "seconds")]
+            result = "not to be trusted" if row["trusted"] is False else row["result"]
+            table.add_row(row["pair"], result, *("-" if v is None else f"{v:.2f}" for v in numbers))
+        show(table)
+    counts = {kind: sum(row["result"] == kind for row in rows) for kind in ("done", "there", "failed")}
+    doubtful = sum(row["trusted"] is False for row in rows)
+    told = [f"{len(rows)} pairs: {counts['done']} done, {counts['there']} there already"]
+    told.append(f"{counts['failed']} failed, {doubtful} not to be trusted -> {out}/")
+    show(Text(", ".join(told)))
+    for row in shown:
+        if row["result"] == "failed":
+            show(Text(f"{row['pair']}: {row['said']}"))

@@ -1,0 +1,101 @@
+"""A guided call that goes on from the frame before: its latent, noised again, and its scale.
+
+Hop: ``guidance.previous`` -> latents at a middle step, how many steps to leave out, depths of both ends.
+Paper: none; the start in the middle is SDEdit's (Meng et al. 2022), of another frame's result.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from diffusers import DDIMScheduler
+from diffusers.utils.torch_utils import randn_tensor
+from torch import Tensor
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.priors import DepthPrior
+from geodiff_plugin.runtime.noise_levels import noise_level, trailing_timesteps
+from geodiff_plugin.scale.space import SPACES
+from geodiff_plugin.types import MetricDepthOutput
+
+__all__ = ["WarmStart", "plan_warm_start"]
+
+
+@dataclass(frozen=True)
+class WarmStart:
+    """Where a call goes on.
+
+    Attributes:
+        near_m: ``(N * E,)`` metres, depth of the nearest end of the relative map.
+        far_m: ``(N * E,)`` metres, depth of its farthest end.
+        skipped: steps of the schedule that are left out.
+        latents: ``(N * E, C, h, w)`` what the first step that is left begins with; ``None`` for noise.
+    """
+
+    near_m: Tensor
+    far_m: Tensor
+    skipped: int = 0
+    latents: Tensor | None = None
+
+
+def plan_warm_start(
+    pipe: Any, prior: DepthPrior, guidance: GeometryGuidance, call: Mapping[str, Any], size: tuple[int, int]
+) -> WarmStart | None:
+    """What ``guidance.previous`` gives to a call; ``None`` without one.
+
+    The latent is taken over by a DDIM of two steps or more. Other schedulers, and priors of one step, take
+    over the scale alone.
+
+    Args:
+        pipe: the live pipeline.
+        prior: its adapter.
+        guidance: with the output of the frame before, and ``warm_start``.
+        call: arguments of the stock call by name, the number of steps settled.
+        size: ``(H, W)`` of the padded processing grid.
+
+    Raises:
+        ValueError: an output of another number of images or members, or of another size.
+    """
+    previous = guidance.previous
+    if previous is None:
+        return None
+    assert previous.latent is not None and previous.scale is not None  # as GeometryGuidance saw to
+    device, samples = pipe._execution_device, previous.scale.numel()
+    wanted = call["ensemble_size"] * len(guidance.inputs)
+    if samples != wanted:
+        bad_value("previous", f"the output of {wanted} images or members", f"one of {samples}")
+    near, far = (end.to(device) for end in _ends(previous, prior.space))
+    steps = call["num_inference_steps"]
+    skipped = min(steps - 1, round(steps * guidance.config.warm_start))
+    if skipped < 1 or not isinstance(pipe.scheduler, DDIMScheduler):
+        return WarmStart(near, far)
+    z0, factor = previous.latent.to(device), pipe.image_processor.config.vae_scale_factor
+    latent_size = tuple(side // factor for side in size)
+    if tuple(z0.shape[-2:]) != latent_size:
+        cure = "A frame of another size begins a sequence of its own."
+        got = f"{tuple(z0.shape[-2:])}"
+        bad_value("previous", f"an output with a latent of {latent_size}", got, cure)
+    noise = call["latents"]
+    if noise is None:
+        noise = randn_tensor(z0.shape, generator=call["generator"], device=device, dtype=z0.dtype)
+    scheduler = copy.deepcopy(pipe.scheduler)
+    scheduler.set_timesteps(steps)
+    trailing = trailing_timesteps(scheduler, steps) if guidance.config.respace else None
+    timesteps = scheduler.timesteps if trailing is None else trailing
+    level = noise_level(scheduler, timesteps[skipped])
+    latents = level.alpha.to(device) * z0.float() + level.sigma.to(device) * noise.to(device).float()
+    return WarmStart(near, far, skipped, latents.to(z0.dtype))
+
+
+def _ends(previous: MetricDepthOutput, space: str) -> tuple[Tensor, Tensor]:
+    """Nearest and farthest depth of every sample's map, ``(N * E,)`` metres."""
+    scale, shift, g_s = (
+        torch.as_tensor(v).flatten().float() for v in (previous.scale, previous.shift, previous.global_scale)
+    )
+    formulas = SPACES[space]
+    return formulas.ends(formulas.forward(shift, g_s), formulas.forward(scale + shift, g_s))

@@ -1,0 +1,410 @@
+"""Many pairs in one run: folders, lists and videos; overlap, resumption, failures, several processes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.many.conveyor import Conveyor
+from geodiff_plugin.cli.many.finished import finished_report
+from geodiff_plugin.cli.many.pairs import find_pairs
+from geodiff_plugin.cli.many.processes import Processes
+from geodiff_plugin.formats.video import VideoReader, both_halves, count_frames
+
+#: One update of one step: for tests of everything but the depth.
+QUICK = ["--steps", 1, "--preset", "paper", "--device", "cpu"]
+
+
+@pytest.fixture
+def prior(make_pipeline, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("prior")
+    make_pipeline().save_pretrained(folder)
+    return folder
+
+
+def write_folders(root: Path, pair, names) -> None:
+    for side in ("left", "right"):
+        (root / side).mkdir()
+        for i, name in enumerate(names):
+            image = np.roll(getattr(pair, side), i, axis=0)  # no two pairs alike
+            Image.fromarray(image).save(root / side / f"{name}.png")
+
+
+@pytest.fixture
+def folders(pair_files, textured_plane, prior):
+    """Three pairs in two folders, and the command for them."""
+    write_folders(pair_files.folder, textured_plane, ["a", "b", "c"])
+    command = ["depth", "left", "right", "--calib", pair_files.calib, "--prior", prior, "--out", "out"]
+    return pair_files.folder, [*command, *QUICK]
+
+
+# The conveyor
+
+
+def test_stages_work_side_by_side_in_order_and_within_bounds():
+    alive, most, threads, lock = set(), [], [set(), set()], threading.Lock()
+    met = threading.Barrier(2, timeout=10)
+
+    def items():
+        for i in range(6):
+            with lock:
+                alive.add(i)
+                most.append(len(alive))
+            yield [i]
+
+    def stage(number):
+        def work(item):
+            threads[number].add(threading.get_ident())
+            if item[0] + number == 1:  # item 1 in the first stage while item 0 is in the second
+                met.wait()
+            item.append(number)
+
+        return work
+
+    found = []
+    for item in Conveyor([stage(0), stage(1)], failed=pytest.fail, most=2).run(items()):
+        found.append(item)
+        with lock:
+            alive.remove(item[0])
+    assert found == [[i, 0, 1] for i in range(6)]
+    assert max(most) <= 3  # two on the way, and the one that waits to get in
+    assert len(threads[0] | threads[1]) == 2
+
+
+def test_an_item_that_fails_leaves_the_rest_alone():
+    told, seen = [], []
+
+    def first(item):
+        if item == "bad":
+            raise ValueError("broken")
+
+    conveyor = Conveyor([first, seen.append], failed=lambda item, error: told.append((item, str(error))))
+    assert list(conveyor.run(["good", "bad", "better"])) == ["good", "bad", "better"]
+    assert told == [("bad", "broken")] and seen == ["good", "better"]
+
+
+def test_leaving_early_ends_every_stage():
+    before, started = threading.active_count(), []
+
+    def slow(item):
+        started.append(item)
+        time.sleep(0.02)
+
+    run = Conveyor([slow, slow], failed=pytest.fail, most=2).run(range(1000))
+    next(run)
+    run.close()
+    assert threading.active_count() == before and len(started) < 20
+
+
+def test_what_the_source_raises_is_raised_behind_what_came_before():
+    def items():
+        yield 1
+        raise OSError("gone")
+
+    run = Conveyor([lambda item: None], failed=pytest.fail).run(items())
+    assert next(run) == 1
+    with pytest.raises(OSError, match="gone"):
+        next(run)
+
+
+# Which pairs
+
+
+def names_of(left, right=None):
+    return [ref.name for ref in find_pairs(DepthArguments(Path(left), right))]
+
+
+def test_folders_go_by_name_else_by_order(tmp_path, textured_plane):
+    write_folders(tmp_path, textured_plane, ["b", "a"])
+    left, right = tmp_path / "left", tmp_path / "right"
+    (left / "notes.md").write_text("no picture")
+    assert names_of(left, right) == ["a", "b"]
+    for path in right.iterdir():
+        path.rename(path.with_stem(f"{path.stem}_R"))
+    refs = find_pairs(DepthArguments(left, right))
+    assert [(ref.left.name, ref.right.name) for ref in refs] == [("a.png", "a_R.png"), ("b.png", "b_R.png")]
+
+
+@pytest.mark.parametrize("missing", ["left", "right"])
+def test_a_view_without_partner_is_named(tmp_path, textured_plane, missing):
+    write_folders(tmp_path, textured_plane, ["a", "b", "c"])
+    (tmp_path / missing / "b.png").unlink()
+    with pytest.raises(InputError, match="b has no partner"):
+        names_of(tmp_path / "left", tmp_path / "right")
+
+
+def test_lists_by_comma_tab_or_blank(tmp_path):
+    listed = tmp_path / "pairs.txt"
+    listed.write_text(
+        "left,right,calib\n# a comment\n\none/im 0.png,one/im1.png,one/calib.txt\n"
+        "two/im 0.png\ttwo/im1.png\nthree/x.png three/y.png\n"
+    )
+    refs = find_pairs(DepthArguments(listed))
+    assert [ref.name for ref in refs] == ["one_im 0", "two_im 0", "three_x"]
+    assert refs[0].calib == tmp_path / "one" / "calib.txt" and refs[1].calib is None
+    assert refs[2].right == tmp_path / "three" / "y.png"
+
+
+def test_one_left_view_with_two_right_ones_has_two_names(tmp_path):
+    listed = tmp_path / "pairs.csv"
+    listed.write_text("a.png,b.png\na.png,c.png\n")
+    assert names_of(listed) == ["a", "a-2"]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [("", "with a pair a line"), ("a.png\n", "line 1 of"), ("a.png,b.png\na.png,b.png,c,d\n", "line 2 of")],
+)
+def test_lists_that_are_none(tmp_path, text, told):
+    (tmp_path / "pairs.csv").write_text(text or "\n")
+    with pytest.raises(InputError, match=told):
+        names_of(tmp_path / "pairs.csv")
+
+
+# Runs
+
+
+def rows_of(out: Path):
+    with open(out / "pairs.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_two_folders_give_what_single_runs_give(geodiff, folders):
+    root, command = folders
+    answer = geodiff(*command)
+    assert answer.code == 0, answer.err
+    assert "3 pairs: 3 done, 0 there already, 0 failed" in answer.out and "pairs: 100%" in answer.err
+    single = [*command[:1], "left/b.png", "right/b.png", *command[3:]]
+    single[single.index("out")] = "single"
+    assert geodiff(*single, "-q").code == 0
+    many, one = (np.load(root / name / "depth.npy") for name in ("out/b", "single"))
+    np.testing.assert_array_equal(many, one)
+    assert [row["pair"] for row in rows_of(root / "out")] == ["a", "b", "c"]
+    assert {path.name for path in (root / "out" / "b").iterdir()} == {
+        path.name for path in (root / "single").iterdir()
+    }
+
+
+def test_the_prior_and_the_cameras_are_read_once(geodiff, folders, monkeypatch):
+    from geodiff_plugin.cli.many import rigs, run
+
+    counts = {"prior": 0, "rig": 0}
+
+    def counted(name, function):
+        def call(*arguments):
+            counts[name] += 1
+            return function(*arguments)
+
+        return call
+
+    monkeypatch.setattr(run, "load_guided_prior", counted("prior", run.load_guided_prior))
+    monkeypatch.setattr(rigs, "read_rig", counted("rig", rigs.read_rig))
+    assert geodiff(*folders[1], "-q").code == 0
+    assert counts == {"prior": 1, "rig": 1}
+
+
+def test_finished_pairs_are_skipped_and_overwrite_does_them_anew(geodiff, folders):
+    root, command = folders
+    assert geodiff(*command, "-q").code == 0
+    made = {name: (root / "out" / name / "depth.npy").stat().st_mtime_ns for name in "abc"}
+    for path in (root / "out" / "b").iterdir():
+        path.unlink()
+    answer = geodiff(*command)
+    assert answer.code == 0 and "1 done, 2 there already" in answer.out
+    now = {name: (root / "out" / name / "depth.npy").stat().st_mtime_ns for name in "abc"}
+    assert {name for name in "abc" if now[name] != made[name]} == {"b"}
+    answer = geodiff(*command, "--overwrite")
+    assert answer.code == 0 and "3 done, 0 there already" in answer.out
+
+
+def test_results_of_other_options_are_not_taken_for_these(geodiff, folders):
+    root, command = folders
+    assert geodiff(*command, "-q").code == 0
+    answer = geodiff(*command, "--seed", 1)
+    assert answer.code == 4 and "3 failed" in answer.out
+    assert "seed 0 and not 1" in answer.err and "--overwrite" in answer.err
+
+
+def test_a_result_is_whole_or_not_there(geodiff, folders):
+    root, command = folders
+    assert geodiff(*command, "-q").code == 0
+    report = json.loads((root / "out" / "a" / "report.json").read_text())
+    plain = DepthArguments(Path("left/a.png"))
+    typed = {name: report["arguments"][name] for name in ("prior", "steps", "preset")}
+    asked = replace(plain, right=Path("right/a.png"), out=root / "out" / "a", **typed)
+    asked = replace(asked, calib=tuple(Path(p) for p in report["arguments"]["calib"]))
+    assert finished_report(asked)["pair"]["name"] == "a"
+    (root / "out" / "a" / "depth.png").unlink()
+    assert finished_report(asked) is None
+
+
+def test_a_broken_pair_is_reported_and_the_rest_go_on(geodiff, folders):
+    root, command = folders
+    data = (root / "right" / "b.png").read_bytes()
+    (root / "right" / "b.png").write_bytes(data[: len(data) // 2])
+    answer = geodiff(*command)
+    assert answer.code == 4
+    assert "geodiff: b: RIGHT must be a whole image file" in answer.err and "Traceback" not in answer.err
+    assert "2 done, 0 there already, 1 failed" in answer.out
+    assert [row["result"] for row in rows_of(root / "out")] == ["done", "failed", "done"]
+    assert not (root / "out" / "b").exists()
+
+
+def test_a_defect_in_one_pair_keeps_its_traceback(geodiff, folders, monkeypatch):
+    from geodiff_plugin.cli.many import job
+
+    write = job.write_result
+
+    def broken(arguments, *rest):
+        if arguments.out.name == "a":
+            raise KeyError("nobody thought of this")
+        return write(arguments, *rest)
+
+    monkeypatch.setattr(job, "write_result", broken)
+    answer = geodiff(*folders[1])
+    assert answer.code == 4 and "Traceback" in answer.err and "nobody thought of this" in answer.err
+    assert "2 done" in answer.out
+
+
+def test_a_list_with_a_calibration_each(geodiff, folders):
+    root, command = folders
+    (root / "pairs.csv").write_text("left/a.png,right/a.png,calib.txt\nleft/b.png,right/b.png,calib.txt\n")
+    without = [word for word in command[3:] if word not in ("--calib", root / "calib.txt")]
+    answer = geodiff("depth", "pairs.csv", *without, "--json")
+    assert answer.code == 0, answer.err
+    assert [row["pair"] for row in json.loads(answer.out)] == ["a", "b"]
+    report = json.loads((root / "out" / "a" / "report.json").read_text())
+    assert report["arguments"]["calib"] == ["calib.txt"]
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        (["--show", "auto"], "--show must be left out with many pairs"),
+        (["--view", "x.png"], "--view must be left out"),
+        (["--steps", 0], "--steps"),
+        (["--warm-start"], "--warm-start must be given with the default preset"),
+        (["--calib", "gone.txt"], "gone.txt"),
+        (["--out", "one"], "holds the result of one pair"),
+    ],
+)
+def test_options_of_one_pair_are_refused_at_once(geodiff, folders, option, told):
+    (folders[0] / "one").mkdir()
+    (folders[0] / "one" / "report.json").write_text("{}")
+    answer = geodiff(*folders[1], *option)
+    assert answer.code == 2 and told in answer.err
+
+
+def test_warm_start_of_one_pair_and_no_cameras_of_many_are_refused(geodiff, folders):
+    root, command = folders
+    answer = geodiff("depth", "left/a.png", "right/a.png", *command[3:], "--warm-start")
+    assert answer.code == 2 and "--warm-start must be given with many pairs" in answer.err
+    answer = geodiff("depth", "left", "right", "--out", "out")
+    assert answer.code == 2 and "calibration must be given" in answer.err and not (root / "out").exists()
+
+
+def test_warm_start_goes_from_frame_to_frame(geodiff, folders):
+    root, command = folders
+    words = [word for word in command if word not in ("--preset", "paper")]
+    words[words.index("--steps") + 1] = 4
+    assert geodiff(*words, "--warm-start", "-q").code == 0
+    reports = [json.loads((root / "out" / name / "report.json").read_text()) for name in "abc"]
+    assert [report["pair"]["began_from"] for report in reports] == [None, "a", "b"]
+    assert [len(report["history"]) for report in reports] == [4, 3, 3]
+
+
+# Videos
+
+
+def write_video(path: Path, frames) -> None:
+    height, width = frames[0].shape[:2]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (width, height))
+    assert writer.isOpened()
+    for frame in frames:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+
+
+@pytest.fixture
+def views(textured_plane):
+    return [[np.roll(getattr(textured_plane, s), i, axis=0) for i in range(3)] for s in ("left", "right")]
+
+
+def test_frames_are_read_in_any_order(tmp_path, views):
+    write_video(tmp_path / "left.avi", views[0])
+    assert count_frames(tmp_path / "left.avi") == 3
+    with VideoReader(tmp_path / "left.avi") as video:
+        for frame in (0, 2, 1):
+            read = video.read(frame)
+            assert read.shape == views[0][frame].shape and read.dtype == np.float32
+            assert np.abs(read - views[0][frame] / 255).mean() < 0.05
+        with pytest.raises(OSError, match="frame 3"):
+            video.read(3)
+
+
+def test_halves_of_a_frame():
+    left, right = both_halves(np.arange(24, dtype=np.float32).reshape(2, 4, 3))
+    assert left.shape == right.shape == (2, 2, 3) and right[0, 0, 0] == 6
+    with pytest.raises(InputError, match="even width"):
+        both_halves(np.zeros((2, 3, 3), np.float32))
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_the_video_of_a_rig(geodiff, folders, views, beside):
+    root, command = folders
+    if beside:
+        write_video(root / "rig.avi", [np.concatenate(both, 1) for both in zip(*views, strict=True)])
+        words = ["depth", "rig.avi", *command[3:]]
+    else:
+        for name, frames in zip(("l.avi", "r.avi"), views, strict=True):
+            write_video(root / name, frames)
+        words = ["depth", "l.avi", "r.avi", *command[3:]]
+    answer = geodiff(*words)
+    assert answer.code == 0, answer.err
+    assert sorted(path.name for path in (root / "out").iterdir()) == [
+        "000000",
+        "000001",
+        "000002",
+        "pairs.csv",
+    ]
+    report = json.loads((root / "out" / "000002" / "report.json").read_text())
+    assert report["pair"]["frame"] == 2 and report["inputs"]["right_size"] == [64, 48]
+    answer = geodiff("video", *sorted(root.glob("out/0*")), "--photographs", "--out", "depth.gif")
+    assert answer.code == 0, answer.err
+
+
+# Several processes
+
+
+def test_shares_are_neighbours_and_together_everything():
+    entries = list(range(11))
+    shares = [list(Processes(index, 4).share(entries)) for index in range(4)]
+    assert sum(shares, []) == entries and {len(share) for share in shares} == {2, 3}
+
+
+@pytest.mark.slow
+def test_two_processes_share_the_pairs(folders):
+    root, command = folders
+    launch = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0"]
+    launch = [*launch[:-2], "--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0"]
+    package = Path(__file__).resolve().parents[2]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(package)}
+    words = [*launch, "-m", "geodiff_plugin", *map(str, command)]
+    done = subprocess.run(words, cwd=root, capture_output=True, text=True, timeout=300, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert "3 pairs: 3 done" in done.stdout and done.stdout.count("pairs:") == 1
+    assert "pairs of process 1" in done.stderr and "pairs of process 2" in done.stderr

@@ -1,0 +1,95 @@
+"""What works through a map in strips says what it says of the whole map; what is thinned keeps its look."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from geodiff_plugin.formats import flying_points, make_cloud, strips, write_depth_mm_png, write_ply
+from geodiff_plugin.formats.ply import read_ply_points
+from geodiff_plugin.formats.strips import row_strips
+from geodiff_plugin.guidance.config import TermsConfig
+from geodiff_plugin.plotting.figures import colour_depth, depth_range
+from geodiff_plugin.plotting.overview import overview, share_figure
+from geodiff_plugin.runtime.confidence import depth_confidence
+from geodiff_plugin.runtime.reprojection import reprojection
+from geodiff_plugin.types import CameraView
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (7, 5), (30, 1000), (3, 2000)])
+def test_strips_cover_every_row_once(monkeypatch, height, width):
+    monkeypatch.setattr(strips, "STRIP_PIXELS", 1500)
+    found = list(row_strips(height, width))
+    assert [row for s in found for row in range(s.start, s.stop)] == list(range(height))
+    assert all((s.stop - s.start) * width <= max(1500, width) for s in found)
+
+
+@pytest.fixture
+def scene(textured_plane):
+    """Depth with holes and a step, and the image over it."""
+    depth_m = textured_plane.depth_m.copy()
+    depth_m[10:20, 10:30] *= 0.5
+    depth_m[0, :5], depth_m[5, 5], depth_m[47, 63] = np.nan, 0.0, 90.0
+    return depth_m, textured_plane.left.astype(np.float32) / 255, textured_plane.K
+
+
+def written(folder, scene):
+    """Everything that is written of a map, as arrays."""
+    depth_m, image, K = scene
+    folder.mkdir()
+    valid = ~flying_points(depth_m)
+    zeros = write_depth_mm_png(folder / "mm.png", depth_m)
+    count = write_ply(folder / "cloud.ply", depth_m, image, K, valid=valid)
+    cloud = make_cloud(depth_m, image, K, valid)
+    counts = np.array([zeros, count, len(cloud.points_m)])
+    pictures = colour_depth(depth_m), np.asarray(share_figure(depth_m, "share", 5.0))
+    return valid, counts, np.asarray(Image.open(folder / "mm.png")), cloud.points_m, cloud.colours, *pictures
+
+
+def test_files_in_strips_are_those_in_one_piece(tmp_path, scene, monkeypatch):
+    whole = written(tmp_path / "whole", scene)
+    monkeypatch.setattr(strips, "STRIP_PIXELS", 64 * 7)  # 48 rows: the last strip is a short one
+    for one, other in zip(whole, written(tmp_path / "strips", scene), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    files = [(tmp_path / name / "cloud.ply").read_bytes() for name in ("whole", "strips")]
+    assert files[0] == files[1]
+    path = tmp_path / "whole" / "cloud.ply"
+    np.testing.assert_allclose(read_ply_points(path, "cloud"), whole[3], rtol=1e-6)
+    assert whole[1][1] == whole[1][2] > 2500
+
+
+def test_rerendering_and_confidence_in_strips(textured_plane, monkeypatch):
+    pair = textured_plane
+    left, right = (torch.from_numpy(x).permute(2, 0, 1).float() / 255 for x in (pair.left, pair.right))
+    T = torch.from_numpy(np.linalg.inv(pair.E)).float()
+    K = torch.from_numpy(pair.K).float()
+    depth_m = torch.from_numpy(pair.depth_m)[None, None]
+
+    def told():
+        view = CameraView(0.8 * right + 0.1, K, T)  # another exposure, which is taken out
+        visible, error = reprojection([view], depth_m, left[None], K[None], TermsConfig())
+        support = torch.linspace(0, 1, depth_m.numel()).view_as(depth_m)
+        return visible, error, depth_confidence(support, error, visible, None)
+
+    whole = told()
+    monkeypatch.setattr(strips, "STRIP_PIXELS", 64 * 7)
+    visible, error, confidence = told()
+    assert (visible == whole[0]).float().mean() > 0.999 and visible.float().mean() > 0.9
+    torch.testing.assert_close(error, whole[1], atol=1e-4, rtol=0)
+    torch.testing.assert_close(confidence, whole[2], atol=1e-3, rtol=0)
+    assert float(error[visible].mean()) < 0.02  # at the true depth the views agree
+
+
+def test_a_large_map_has_the_colours_and_the_overview_of_a_small_one():
+    rng = np.random.default_rng(0)
+    small = np.exp(rng.normal(size=(30, 40))).astype(np.float32) + 1
+    large = np.kron(small, np.ones((100, 100), np.float32))
+    assert depth_range(large) == pytest.approx(depth_range(small), rel=0.02)
+    image = np.zeros((*large.shape, 3), np.float32)
+    one, other = (
+        np.asarray(overview(image[k], large[k], large[k] / 9, None).resize((960, 660)), dtype=float)
+        for k in (np.s_[:, :], np.s_[::5, ::5])
+    )
+    assert np.abs(one - other).mean() < 6.0  # of 255; the legends are a pixel apart

@@ -1,0 +1,152 @@
+"""Rendered sequences, their flicker, and calls that go on from the frame before."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from diffusers import DDIMScheduler, LCMScheduler
+
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.evaluation.sequence import SequenceOptions, flicker, run_sequence
+from geodiff_plugin.runtime.warm_start import plan_warm_start
+from geodiff_plugin.synthetic import render_sequence
+from geodiff_plugin.types import MetricDepthOutput
+
+FAST = {"inner_steps": 0, "loss_resolution": 64}
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return render_sequence(3, 3, size=(48, 64))
+
+
+def test_frames_show_one_scene_from_a_moving_rig(sequence):
+    """A point of the first frame, carried by the poses, has the second frame's own depth and colour there."""
+    K, E = sequence.K.numpy(), sequence.E.numpy()
+    assert len(sequence.lefts) == len(sequence.rights) == 3 and E[0, 3] > 0
+    first, second = (np.linalg.inv(T.numpy()) for T in sequence.T_world_from_left[:2])
+    step = np.linalg.norm(np.linalg.inv(first)[:3, 3] - np.linalg.inv(second)[:3, 3])
+    assert step == pytest.approx(0.5 * E[0, 3], rel=1e-5)
+    move = second @ np.linalg.inv(first)
+    agree = []
+    for row, column in np.ndindex(48, 64):
+        z = float(sequence.lefts[0].depth_m[0, row, column])
+        if not np.isfinite(z):
+            continue
+        point = move[:3, :3] @ (np.linalg.inv(K) @ [column, row, 1.0] * z) + move[:3, 3]
+        u, v = (K @ point)[:2] / point[2]
+        if 0 <= round(u) < 64 and 0 <= round(v) < 48 and point[2] > 0:
+            there = float(sequence.lefts[1].depth_m[0, round(v), round(u)])
+            agree.append(abs(there / point[2] - 1) < 0.03)
+    assert len(agree) > 1000 and np.mean(agree) > 0.75  # the rest is hidden there, or beside an edge
+
+
+def test_flicker_is_what_changes_on_the_same_points(sequence):
+    still = [np.full((48, 64), 0.1)] * 3
+    assert flicker(still, sequence) == (0.0, 0.0)  # wrong, but steadily so
+    breathing = [np.full((48, 64), value) for value in (0.0, 0.02, 0.0)]
+    assert flicker(breathing, sequence) == pytest.approx((0.02, 0.02))
+    noise = np.random.default_rng(0).normal(size=(3, 48, 64)) * 0.1
+    points, breath = flicker(list(noise), sequence)
+    # The mean of |a - b| of two normal numbers of deviation s is 2 s / sqrt(pi).
+    assert points == pytest.approx(0.2 / np.sqrt(np.pi), rel=0.1) and breath < 0.02
+
+
+def test_the_command_measures_and_goes_on(tmp_path, monkeypatch):
+    options = SequenceOptions("x", 1, 2, (64, 96), ("alone", "warm"), steps=2, out=tmp_path, quiet=True)
+    page = run_sequence(options)
+    assert [row[0] for row in page.tables[0].rows] == ["each frame alone", "warm start, a quarter left out"]
+    records = [json.loads(line) for line in (tmp_path / "sequence.jsonl").read_text().splitlines()]
+    assert all(0 < record["abs_rel"] < 2 and record["seconds"] > 0 for record in records)
+    monkeypatch.setattr("geodiff_plugin.evaluation.sequence.load_prior", pytest.fail)  # nothing left to do
+    assert run_sequence(options).tables == page.tables
+
+
+# Calls that go on
+
+
+@pytest.fixture
+def pipe(make_pipeline):
+    return enable_geometry_guidance(make_pipeline())
+
+
+def call(pipe, pair, steps=4, previous=None, size=1, **knobs):
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, previous=previous, **FAST, **knobs)
+    return pipe(
+        pair.left,
+        guidance=guidance,
+        num_inference_steps=steps,
+        ensemble_size=size,
+        generator=torch.Generator().manual_seed(0),
+        output_latent=True,
+    )
+
+
+def test_a_call_goes_on_in_the_middle_of_the_schedule(pipe, textured_plane):
+    first = call(pipe, textured_plane)
+    for share, steps in ((0.5, 2), (0.25, 3), (0.99, 1), (0.0, 4)):
+        second = call(pipe, textured_plane, previous=first, warm_start=share)
+        assert [float(report.timestep) for report in second.history] == [
+            float(report.timestep) for report in first.history[4 - steps :]
+        ]
+    assert type(pipe.scheduler) is DDIMScheduler and len(pipe.scheduler.timesteps) == 1000  # as it was
+
+
+def test_its_latents_are_the_frame_before_at_the_level_of_that_step(pipe, textured_plane):
+    """Mean over many draws: alpha z0; spread: sigma, by the scheduler's own table."""
+    first = call(pipe, textured_plane)
+    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
+    from geodiff_plugin.priors import find_adapter
+
+    prior, draws = find_adapter(pipe)(pipe), []
+    generator = torch.Generator().manual_seed(1)
+    told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": generator}
+    for _ in range(100):
+        warm = plan_warm_start(pipe, prior, guidance, told, (48, 64))
+        draws.append(warm.latents)
+    assert warm.skipped == 1
+    alpha_bar = pipe.scheduler.alphas_cumprod[749]
+    drawn = torch.stack(draws)
+    torch.testing.assert_close(drawn.mean(0), alpha_bar.sqrt() * first.latent, atol=0.5, rtol=0)
+    assert float(drawn.std(0).mean()) == pytest.approx(float((1 - alpha_bar).sqrt()), rel=0.05)
+
+
+def test_its_scale_is_that_of_the_frame_before(pipe, textured_plane):
+    """With no search and no fit of its own, a call has the depths of the ends that it was given."""
+    first = call(pipe, textured_plane)
+    told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": torch.zeros_like(first.latent)}
+    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
+    from geodiff_plugin.priors import find_adapter
+
+    warm = plan_warm_start(pipe, find_adapter(pipe)(pipe), guidance, told, (48, 64))
+    scale, shift, g_s = first.scale[0, 0], first.shift[0, 0], first.global_scale[0, 0]
+    assert float(warm.near_m[0]) == pytest.approx(float(g_s * shift), rel=1e-5)
+    assert float(warm.far_m[0]) == pytest.approx(float(g_s * (scale + shift)), rel=1e-5)
+    second = call(pipe, textured_plane, previous=first)
+    ratio = second.prediction / first.prediction
+    assert abs(np.log(np.median(ratio))) < 0.05
+
+
+def test_another_scheduler_takes_over_the_scale_alone(make_pipeline, textured_plane):
+    scheduler = LCMScheduler.from_config(make_pipeline().scheduler.config)
+    pipe = enable_geometry_guidance(make_pipeline(scheduler))
+    first = call(pipe, textured_plane)
+    assert len(call(pipe, textured_plane, previous=first).history) == 4
+
+
+def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane):
+    first = call(pipe, textured_plane)
+    with pytest.raises(InputError, match="previous must be a MetricDepthOutput"):
+        call(pipe, textured_plane, previous=first.prediction)
+    with pytest.raises(InputError, match="output_latent=True"):
+        call(pipe, textured_plane, previous=MetricDepthOutput(first.prediction))
+    with pytest.raises(InputError, match="previous must be the output of 2 images or members"):
+        call(pipe, textured_plane, previous=first, size=2)
+    small = MetricDepthOutput(first.prediction, latent=first.latent[..., :-1], scale=first.scale)
+    small.shift, small.global_scale = first.shift, first.global_scale
+    with pytest.raises(InputError, match="a sequence of its own"):
+        call(pipe, textured_plane, previous=small)
