@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,8 +16,42 @@ from torch import Tensor
 from geodiff_plugin.algorithm.gradient import pull_back
 from geodiff_plugin.algorithm.objective import Loss
 from geodiff_plugin.algorithm.state import Trajectory
+from geodiff_plugin.guidance.config import GuidanceConfig
 
-__all__ = ["StepContext", "guided_step"]
+__all__ = ["Span", "StepContext", "guided_step", "plan_spans"]
+
+
+class Span(NamedTuple):
+    """A round of correction and updates.
+
+    Attributes:
+        begin: in the schedule, [0, 1].
+        end: likewise.
+        corrects: whether the estimate is corrected; without updates either, nothing is decoded in it.
+    """
+
+    begin: float
+    end: float
+    corrects: bool
+
+
+def plan_spans(config: GuidanceConfig, count: int) -> list[Span]:
+    """The rounds of a schedule.
+
+    Args:
+        config: says which are active, and how many of them correct: evenly spread, the first and the last
+            among them, since the first finds the scale and the last is the result.
+        count: rounds of the whole schedule.
+    """
+    updates = config.updates
+    spans = [Span(i / count, (i + 1) / count, False) for i in range(count)]
+    active = [i for i, span in enumerate(spans) if updates.start <= span.begin < updates.stop]
+    if not config.correction.correct or not updates.optimize_latents or config.gradient != "denoised":
+        return spans
+    wanted = min(config.correction.corrections, len(active))
+    last = len(active) - 1
+    chosen = {active[round(k * last / (wanted - 1))] for k in range(wanted)} if wanted > 1 else {*active[-1:]}
+    return [span._replace(corrects=i in chosen) for i, span in enumerate(spans)]
 
 
 @dataclass(frozen=True)
@@ -26,26 +61,30 @@ class StepContext:
     Attributes:
         step: index in the schedule.
         timestep: the scheduler's timestep.
-        spans: begin and end in the schedule, [0, 1], of each round of correction and ``inner_steps`` updates.
-            One round a step, but for priors that cannot take as many steps as are wanted.
+        spans: each round of correction and ``inner_steps`` updates, as ``plan_spans`` made them. One round a
+            step, but for priors that cannot take as many steps as are wanted.
         eps: ``(B, C, h, w)`` predicted noise, the yardstick of the norm-matched rule.
         z0_of: the clean latent of a guided one: Tweedie with the U-Net's graph in "full", identity in
             "denoised".
         decode: latent to unclipped relative map ``(B, 1, h', w')`` float32, D in the paper.
         encode: relative map to clean latent; ``None`` where the guided latent is no clean one, which then is
             moved by gradients alone.
+        decode_result: as ``decode``, for the correction whose map is the result, and whose latent nobody
+            reads: that of the last round, which then encodes nothing. ``None`` where another step follows, or
+            the latent is asked for.
     """
 
     step: int
     timestep: float
-    spans: Sequence[tuple[float, float]]
+    spans: Sequence[Span]
     eps: Tensor
     z0_of: Callable[[Tensor], Tensor]
     decode: Callable[[Tensor], Tensor]
     encode: Callable[[Tensor], Tensor] | None
+    decode_result: Callable[[Tensor], Tensor] | None = None
 
 
-def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor:
+def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor | None:
     """One pass of Algorithm 1's loop body: search, correction, gradient of L_geo, updates.
 
     Args:
@@ -54,38 +93,54 @@ def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor:
         at: what the denoising step gives.
 
     Returns:
-        ``(B, C, h, w)`` float32, what to add to the leaf; exactly 0 with ``optimize_latents=False``.
+        ``(B, C, h, w)`` float32, what to add to the leaf; exactly 0 with ``optimize_latents=False``; ``None``
+        for a step that is the prior's own.
 
     Source: Algorithm 1, with Eq. 16 and 17 (which it omits) and the decode of z0_hat (it prints z_0). The
     correction before the updates is ours, after SteeredMarigold's (Gregorek and Nalpantidis 2024): a
     corrected map, encoded.
     """
     config, z, anchor = state.config, leaf, None
-    rounds, state.result = [span for span in at.spans if state.is_active(span[0])], None
-    corrects = config.correction.correct and config.updates.optimize_latents and bool(rounds)
-    for _, end in rounds or at.spans[:1]:
-        if corrects and at.encode is not None:
-            moved = _corrected(state, z, at, config.correction.refine and end >= 1.0)
+    rounds, state.result = [span for span in at.spans if state.is_active(span.begin)], None
+    corrects = config.correction.correct and config.updates.optimize_latents and at.encode is not None
+    acted = False
+    for span in rounds or at.spans[:1]:
+        updates = state.plan.inner_steps if rounds and span.end > state.plan.updates_from else 0
+        if corrects and not (span.corrects or updates) and state.affine is not None:
+            continue
+        acted = True
+        if span.corrects and at.encode is not None:
+            last = at.decode_result if span is at.spans[-1] and not updates else None
+            moved = _corrected(state, z, at, config.correction.refine and span.end >= 1.0, last)
             anchor = moved if anchor is None else anchor + moved - z
             z = moved
-        updates = state.plan.inner_steps if rounds and end > state.plan.updates_from else 0
         z, anchor, loss = _update(state, z, anchor, at, updates)
         state.report(at.step, at.timestep, loss)
-    return (z - leaf).detach()
+    return (z - leaf).detach() if acted else None
 
 
-def _corrected(state: Trajectory, z0: Tensor, at: StepContext, refined_later: bool) -> Tensor:
+def _corrected(
+    state: Trajectory,
+    z0: Tensor,
+    at: StepContext,
+    refined_later: bool,
+    decode_result: Callable[[Tensor], Tensor] | None,
+) -> Tensor:
     """``z0`` moved by what the correction of its map changes in the code.
 
     A difference of two codes, so that what the autoencoder loses is not lost again at every step, and a map
     that needs no correction leaves the latent as it is. The last map is given out as it is where a refinement
-    follows: brought to the matches twice it would follow their noise.
+    follows: brought to the matches twice it would follow their noise. Where nobody reads its latent, that one
+    stays as it is.
     """
     with torch.no_grad():
-        x0 = at.decode(z0)
+        x0 = (decode_result or at.decode)(z0)
         state.watch.note("the network's clean latent", at.step, z0)
         state.watch.note("the decoded map", at.step, x0)
         state.settle_scale(x0)
+        if decode_result is not None:
+            state.result = x0 if refined_later else state.corrected(x0)
+            return z0
         corrected = state.corrected(x0)
         state.result = x0 if refined_later else corrected
         moved = z0 if corrected is x0 else z0 + at.encode(corrected) - at.encode(x0)
@@ -98,7 +153,8 @@ def _update(
 ) -> tuple[Tensor, Tensor, Loss]:
     """A round of gradient updates of latent, scale and shift.
 
-    With 0 updates the scale is settled and the loss evaluated, nothing moves.
+    With 0 updates the scale is settled and the loss evaluated, nothing moves; a correction has settled it and
+    made the map already.
 
     Returns:
         The moved latent; the clean latent that the step's network stands for, corrections included, which
@@ -112,13 +168,14 @@ def _update(
                 z = z.detach().requires_grad_()
             z0_hat = at.z0_of(z)  # (B, C, h, w), Tweedie
             z0 = z0_hat.detach().requires_grad_(moves)
-            x0 = at.decode(z0)  # (B, 1, h', w'), D(z0_hat)
+            settled = state.result if updates == 0 else None
+            x0 = at.decode(z0) if settled is None else settled  # (B, 1, h', w'), D(z0_hat)
             x = x0.detach().requires_grad_(moves)
             if k == 0:
                 watch.note("the network's clean latent", at.step, z0)
                 watch.note("the decoded map", at.step, x)
                 anchor = z0.detach() if anchor is None else anchor
-                if updates or state.result is None:  # else the correction settled it, and nothing moved since
+                if settled is None:
                     state.settle_scale(x.detach())  # g_s*, S7.3
                     state.test_visibility(x.detach())
             s_hat, t_hat = (

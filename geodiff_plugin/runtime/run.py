@@ -20,7 +20,7 @@ from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.known import Known
 from geodiff_plugin.algorithm.state import Trajectory
-from geodiff_plugin.algorithm.step import StepContext, guided_step
+from geodiff_plugin.algorithm.step import Span, StepContext, guided_step, plan_spans
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.channels import put_channels
@@ -51,6 +51,8 @@ class GuidedRun:
         padding: rows at the bottom and columns at the right that were added to it.
         rounds: times that every denoising step makes its updates, see ``plan_steps``.
         callback: ``callback_on_step_end`` or ``None``.
+        wants_latents: whether the caller is given the final latents.
+        tiny: what decodes and encodes in the loop; ``None`` for the pipeline's own autoencoder.
         held: what the call holds against other threads, given back while the callback runs.
 
     Attributes:
@@ -71,6 +73,8 @@ class GuidedRun:
         padding: tuple[int, int],
         rounds: int,
         callback: StepCallback | None,
+        wants_latents: bool,
+        tiny: Any | None,
         held: Exclusive,
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
@@ -78,6 +82,8 @@ class GuidedRun:
         self.owners = [i for i in range(len(evidence)) for _ in range(ensemble_size)]
         self.batch_size, self.content_size, self.padding = batch_size, content_size, padding
         self.rounds, self.callback, self._held = rounds, callback, held
+        self._reads_latents = wants_latents or callback is not None
+        self._tiny = tiny
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
         self.members: list[Tensor] = []
@@ -116,13 +122,31 @@ class GuidedRun:
             self.__enter__()
 
     @property
-    def spans(self) -> list[tuple[float, float]]:
-        """Begin and end of the rounds of the current step in the schedule, [0, 1] each."""
-        first, count = self.step_index * self.rounds, len(self.timesteps) * self.rounds
-        return [(i / count, (i + 1) / count) for i in range(first, first + self.rounds)]
+    def spans(self) -> list[Span]:
+        """The rounds of the current step."""
+        first = self.step_index * self.rounds
+        return plan_spans(self.config, len(self.timesteps) * self.rounds)[first : first + self.rounds]
+
+    @contextmanager
+    def _in_the_loop(self) -> Iterator[None]:
+        """The tiny autoencoder, if there is one, in the place of the pipeline's own."""
+        if self._tiny is None:
+            yield
+            return
+        own = self.pipe.vae
+        object.__setattr__(self.pipe, "vae", self._tiny)  # past the rewriting of the pipeline's config
+        try:
+            yield
+        finally:
+            object.__setattr__(self.pipe, "vae", own)
 
     def decode(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map without padding, ``(B, 1, H, W)`` float32, with its graph."""
+        """Unclipped relative map without padding, ``(B, 1, H, W)`` float32, with its graph; in the loop."""
+        with self._in_the_loop():
+            return self.decode_result(z0)
+
+    def decode_result(self, z0: Tensor) -> Tensor:
+        """The same by the pipeline's own autoencoder."""
         height, width = self.content_size
         return self._decode_padded(z0)[:, :, :height, :width]
 
@@ -136,9 +160,10 @@ class GuidedRun:
         return F.pad(x, (0, right, 0, bottom), mode="replicate") if bottom or right else x
 
     def encode(self, x: Tensor) -> Tensor:
-        """Clean latent of a relative map without padding, which is made as the image's was."""
+        """Clean latent of a relative map without padding, which is made as the image's was; in the loop."""
         bottom, right = self.padding
-        return self.prior.encode(F.pad(x, (0, right, 0, bottom), mode="replicate"))
+        with self._in_the_loop():
+            return self.prior.encode(F.pad(x, (0, right, 0, bottom), mode="replicate"))
 
     def metric_prediction(self, latents: Tensor) -> Tensor:
         """Metric depth of the next chunk of final latents; takes the place of the clipping decode.
@@ -205,9 +230,8 @@ class GuidedRun:
         trajectory, depth = self.trajectories[-1], self.prior.latents
         wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
         wide_output, wide_z_t = output[:, depth].to(wide), z_t[:, depth].to(wide)
-        if self.step_index == 0:  # one wait a trajectory
+        if self.step_index == 0:
             trajectory.watch.note("the prior's output", 0, wide_output)
-            trajectory.watch.check(self.pipe.dtype)
         eps = noise_from(wide_output, wide_z_t, level)
         full = self._tap is not None
         if full:
@@ -219,11 +243,18 @@ class GuidedRun:
             leaf, z0_of = z0_from(wide_output, wide_z_t, level), _identity
         encode = None if full else self.encode
         timestep_now = self.timesteps[self.step_index]
-        at = StepContext(self.step_index, timestep_now, self.spans, eps, z0_of, self.decode, encode)
+        last = self.step_index == len(self.timesteps) - 1
+        decode_result = self.decode_result if last and not self._reads_latents else None
+        at = StepContext(
+            self.step_index, timestep_now, self.spans, eps, z0_of, self.decode, encode, decode_result
+        )
         with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
             move = guided_step(trajectory, leaf, at)
         updates = self.config.updates
-        if not updates.optimize_latents or not any(trajectory.is_active(begin) for begin, _ in self.spans):
+        if self._tiny is not None and decode_result is None:
+            trajectory.result = None  # its map is a tiny decoder's
+        active = any(trajectory.is_active(span.begin) for span in at.spans)
+        if move is None or not updates.optimize_latents or not active:
             result = output, z_t, None  # bit for bit the pipeline's own step
         elif full and self.prior.max_steps == 1:
             # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
@@ -250,7 +281,8 @@ class GuidedRun:
             trajectory = self.trajectories[-1]
             affine = trajectory.affine
             depth = latents[:, self.prior.latents]
-            x = self.decode(depth) if self.step_index == len(self.timesteps) - 1 else trajectory.last_x
+            last = self.step_index == len(self.timesteps) - 1
+            x = self.decode_result(depth) if last else trajectory.last_x
             values = {
                 "latents": latents,
                 "metric_depth": trajectory.metric(x, affine),
@@ -263,9 +295,10 @@ class GuidedRun:
             if "latents" in answer:
                 latents, trajectory.result = answer["latents"], None
         self.step_index += 1
-        if self._bar is not None and not self._bar.disable:  # a disabled one waits for no device
-            loss = float(self.trajectories[-1].history[-1].loss.mean())
-            self._bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
+        if self._bar is not None:
+            loss = self.trajectories[-1].history[-1].loss
+            if not self._bar.disable and loss.device.type == "cpu":  # another device would be waited for
+                self._bar.set_postfix(loss=f"{float(loss.mean()):.4f}", refresh=False)
             self._bar.update()
         return latents
 
