@@ -6,9 +6,8 @@ Paper: Algorithm 1, with Eq. 16 and 17.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,40 +17,23 @@ from geodiff_plugin.algorithm.objective import Loss
 from geodiff_plugin.algorithm.state import Trajectory
 from geodiff_plugin.guidance.config import GuidanceConfig
 
-__all__ = ["Span", "StepContext", "guided_step", "plan_spans"]
+__all__ = ["StepContext", "corrected_rounds", "guided_step"]
 
 
-class Span(NamedTuple):
-    """A round of correction and updates.
-
-    Attributes:
-        begin: in the schedule, [0, 1].
-        end: likewise.
-        corrects: whether the estimate is corrected; without updates either, nothing is decoded in it.
-    """
-
-    begin: float
-    end: float
-    corrects: bool
-
-
-def plan_spans(config: GuidanceConfig, count: int) -> list[Span]:
-    """The rounds of a schedule.
+def corrected_rounds(config: GuidanceConfig, count: int, corrections: int | None) -> set[int]:
+    """Which rounds of a schedule correct the estimate; a round without updates either decodes nothing.
 
     Args:
-        config: says which are active, and how many of them correct: evenly spread, the first and the last
-            among them, since the first finds the scale and the last is the result.
+        config: says which are active.
         count: rounds of the whole schedule.
+        corrections: how many of them, evenly spread, the first and the last among them; ``None`` for all.
     """
     updates = config.updates
-    spans = [Span(i / count, (i + 1) / count, False) for i in range(count)]
-    active = [i for i, span in enumerate(spans) if updates.start <= span.begin < updates.stop]
-    if not config.correction.correct or not updates.optimize_latents or config.gradient != "denoised":
-        return spans
-    wanted = min(config.correction.corrections, len(active))
-    last = len(active) - 1
-    chosen = {active[round(k * last / (wanted - 1))] for k in range(wanted)} if wanted > 1 else {*active[-1:]}
-    return [span._replace(corrects=i in chosen) for i, span in enumerate(spans)]
+    active = [i for i in range(count) if updates.start <= i / count < updates.stop]
+    if not config.correction.correct or not updates.optimize_latents or not active:
+        return set()
+    wanted, last = min(corrections or count, len(active)), len(active) - 1
+    return {active[round(k * last / (wanted - 1))] for k in range(wanted)} if wanted > 1 else {active[-1]}
 
 
 @dataclass(frozen=True)
@@ -61,8 +43,9 @@ class StepContext:
     Attributes:
         step: index in the schedule.
         timestep: the scheduler's timestep.
-        spans: each round of correction and ``inner_steps`` updates, as ``plan_spans`` made them. One round a
-            step, but for priors that cannot take as many steps as are wanted.
+        rounds: numbers, in the schedule, of this step's rounds of correction and ``inner_steps`` updates. One
+            round a step, but for priors that cannot take as many steps as are wanted.
+        count: rounds of the whole schedule.
         eps: ``(B, C, h, w)`` predicted noise, the yardstick of the norm-matched rule.
         z0_of: the clean latent of a guided one: Tweedie with the U-Net's graph in "full", identity in
             "denoised".
@@ -76,7 +59,8 @@ class StepContext:
 
     step: int
     timestep: float
-    spans: Sequence[Span]
+    rounds: range
+    count: int
     eps: Tensor
     z0_of: Callable[[Tensor], Tensor]
     decode: Callable[[Tensor], Tensor]
@@ -101,17 +85,18 @@ def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor | No
     corrected map, encoded.
     """
     config, z, anchor = state.config, leaf, None
-    rounds, state.result = [span for span in at.spans if state.is_active(span.begin)], None
+    active, state.result = [i for i in at.rounds if state.is_active(i / at.count)], None
     corrects = config.correction.correct and config.updates.optimize_latents and at.encode is not None
     acted = False
-    for span in rounds or at.spans[:1]:
-        updates = state.plan.inner_steps if rounds and span.end > state.plan.updates_from else 0
-        if corrects and not (span.corrects or updates) and state.affine is not None:
+    for i in active or at.rounds[:1]:
+        end, chosen = (i + 1) / at.count, corrected_rounds(config, at.count, state.corrections)
+        updates = state.plan.inner_steps if active and end > state.plan.updates_from else 0
+        if corrects and not (i in chosen or updates) and state.affine is not None:
             continue
         acted = True
-        if span.corrects and at.encode is not None:
-            last = at.decode_result if span is at.spans[-1] and not updates else None
-            moved = _corrected(state, z, at, config.correction.refine and span.end >= 1.0, last)
+        if corrects and i in chosen:
+            last = at.decode_result if i == at.count - 1 and not updates else None
+            moved = _corrected(state, z, at, config.correction.refine and end >= 1.0, last)
             anchor = moved if anchor is None else anchor + moved - z
             z = moved
         z, anchor, loss = _update(state, z, anchor, at, updates)

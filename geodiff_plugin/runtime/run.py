@@ -20,7 +20,7 @@ from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.known import Known
 from geodiff_plugin.algorithm.state import Trajectory
-from geodiff_plugin.algorithm.step import Span, StepContext, guided_step, plan_spans
+from geodiff_plugin.algorithm.step import StepContext, guided_step
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.channels import put_channels
@@ -122,10 +122,10 @@ class GuidedRun:
             self.__enter__()
 
     @property
-    def spans(self) -> list[Span]:
-        """The rounds of the current step."""
+    def rounds_of_step(self) -> range:
+        """Numbers of the current step's rounds in the schedule."""
         first = self.step_index * self.rounds
-        return plan_spans(self.config, len(self.timesteps) * self.rounds)[first : first + self.rounds]
+        return range(first, first + self.rounds)
 
     @contextmanager
     def _in_the_loop(self) -> Iterator[None]:
@@ -245,15 +245,16 @@ class GuidedRun:
         timestep_now = self.timesteps[self.step_index]
         last = self.step_index == len(self.timesteps) - 1
         decode_result = self.decode_result if last and not self._reads_latents else None
+        rounds, count = self.rounds_of_step, len(self.timesteps) * self.rounds
         at = StepContext(
-            self.step_index, timestep_now, self.spans, eps, z0_of, self.decode, encode, decode_result
+            self.step_index, timestep_now, rounds, count, eps, z0_of, self.decode, encode, decode_result
         )
         with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
             move = guided_step(trajectory, leaf, at)
         updates = self.config.updates
         if self._tiny is not None and decode_result is None:
             trajectory.result = None  # its map is a tiny decoder's
-        active = any(trajectory.is_active(span.begin) for span in at.spans)
+        active = any(trajectory.is_active(i / count) for i in rounds)
         if move is None or not updates.optimize_latents or not active:
             result = output, z_t, None  # bit for bit the pipeline's own step
         elif full and self.prior.max_steps == 1:

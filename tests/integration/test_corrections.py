@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.algorithm.step import plan_spans
-from geodiff_plugin.guidance.presets import DEFAULT, MARIGOLD_DC
+from geodiff_plugin.algorithm.step import corrected_rounds
+from geodiff_plugin.guidance.presets import DEFAULT
 from tests.integration.test_tiny_decoder import Counted
 
 
@@ -21,19 +21,25 @@ def guided(pipe, pair, steps=5, **knobs):
     )
 
 
-def corrected(count, **knobs):
-    return [i for i, span in enumerate(plan_spans(DEFAULT.changed(**knobs), count)) if span.corrects]
+def corrected(count, corrections=None, **knobs):
+    return sorted(corrected_rounds(DEFAULT.changed(**knobs), count, corrections))
 
 
 def test_corrections_are_spread_over_what_is_active():
-    assert corrected(4, corrections=4) == corrected(4, corrections=9) == [0, 1, 2, 3]
-    assert corrected(9, corrections=3) == [0, 4, 8]
-    assert corrected(9, corrections=2) == [0, 8]
-    assert corrected(9, corrections=1) == [8]
-    assert corrected(8, corrections=2, start=0.25, stop=0.75) == [2, 5]
+    assert corrected(4) == corrected(4, 4) == corrected(4, 9) == [0, 1, 2, 3]
+    assert corrected(9, 3) == [0, 4, 8]
+    assert corrected(9, 2) == [0, 8]
+    assert corrected(9, 1) == [8]
+    assert corrected(8, 2, start=0.25, stop=0.75) == [2, 5]
     assert corrected(4, correct=False) == corrected(4, optimize_latents=False) == []
     assert corrected(4, start=1.0) == []
-    assert not any(span.corrects for span in plan_spans(MARIGOLD_DC, 4))
+
+
+@pytest.mark.parametrize(("few_error", "looked"), [(0.0, [0, 1, 2, 3, 4]), (1.0, [0, 4])])
+def test_a_good_prior_is_corrected_twice(make_pipeline, textured_plane, few_error, looked):
+    """The tiny one is as bad as can be; what counts as good is moved instead."""
+    found = guided(make_pipeline(), textured_plane, few_error=few_error)
+    assert [report.step for report in found.history] == looked
 
 
 @pytest.mark.parametrize("corrections", [1, 2, 3])

@@ -27,7 +27,9 @@ def tiny_folder(path, channels=4, stages=2):
 
 
 def guided(pipe, pair, decoder, **call):
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, decoder=decoder, loss_resolution=64)
+    guidance = GeometryGuidance(
+        pair.right, pair.K, pair.E, decoder=decoder, loss_resolution=64, corrections=3
+    )
     call = {"generator": torch.Generator().manual_seed(0), "num_inference_steps": 3} | call
     return enable_geometry_guidance(pipe)(pair.left, guidance=guidance, **call)
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 import pytest
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.algorithm.state import Trajectory
 from tests.pretended_device import Reached, pretended
 
-#: Read-backs, copies from the device and constants copied to it, between the first step and the last. A copy
-#: either way waits for all that the device was told before.
-ALLOWED = 0
-STEPS = 3
-
-KNOBS = {
-    "default": {},
-    "updates": {"inner_steps": 2, "updates_from": 0.0},
-    "full": {"gradient": "full", "inner_steps": 1},
+#: Knobs, and what is allowed with them: read-backs, copies from the device and constants copied to it, from the
+#: first step to the last. A copy either way waits for all that the device was told before.
+ALLOWED = {
+    "default": ({}, 1),  # how good the prior is, by which the number of corrections is chosen
+    "corrections given": ({"corrections": 2}, 0),
+    "updates": ({"corrections": 2, "inner_steps": 2, "updates_from": 0.0}, 0),
+    "full": ({"gradient": "full", "inner_steps": 1}, 0),
 }
+STEPS = 3
 
 
 def waits_of(pipe, pair, monkeypatch, points=None, **call):
@@ -27,7 +27,24 @@ def waits_of(pipe, pair, monkeypatch, points=None, **call):
     return waits
 
 
-@pytest.mark.parametrize("name", KNOBS)
+@pytest.mark.parametrize("name", ALLOWED)
 def test_no_step_waits(make_pipeline, textured_plane, monkeypatch, name):
-    waits = waits_of(make_pipeline(), textured_plane, monkeypatch, knobs=KNOBS[name])
-    assert sum(waits.found.values()) == ALLOWED, waits.found
+    knobs, allowed = ALLOWED[name]
+    waits = waits_of(make_pipeline(), textured_plane, monkeypatch, knobs=knobs)
+    assert sum(waits.found.values()) == allowed, waits.found
+
+
+def test_what_waits_is_found(make_pipeline, textured_plane, monkeypatch):
+    """A read-back, a mask and a list that a step may come to hold."""
+    corrected = Trajectory.corrected
+
+    def careless(self, x):
+        float(x.mean())
+        x[x > 0.5]
+        x.cpu()
+        return corrected(self, x)
+
+    monkeypatch.setattr(Trajectory, "corrected", careless)
+    waits = waits_of(make_pipeline(), textured_plane, monkeypatch, knobs={"corrections": 2})
+    assert list(waits.of_kind("read back").values()) == [2]
+    assert list(waits.of_kind("to here").values()) == [1]

@@ -17,11 +17,9 @@ def test_calls_of_every_way():
     image = {"encode": 1}
     assert calls["plain"] == image | {"network": 3, "decode": 1}
     # Every correction decodes once and encodes twice, but for the last one, whose map is the result.
-    guided = calls["guided"]
-    corrections = guided["decode"]
-    assert 1 <= corrections <= 3
-    assert guided == {"network": 3, "decode": corrections, "encode": 1 + 2 * (corrections - 1)}
-    tiny = {"tiny decode": corrections - 1, "tiny encode": 2 * (corrections - 1)}
+    assert calls["guided, a good prior"] == {"network": 3, "decode": 2, "encode": 3}
+    assert calls["guided, a weak prior"] == {"network": 3, "decode": 3, "encode": 5}
+    tiny = {"tiny decode": 1, "tiny encode": 2}
     assert calls["guided, tiny decoder"] == image | {"network": 3, "decode": 1} | tiny
     assert calls["Marigold-DC"] == image | {"network + back": 2, "decode + back": 2, "decode": 1}
 
