@@ -28,8 +28,6 @@ from geodiff_plugin.types import StepReport
 
 __all__ = ["Trajectory"]
 
-#: Corrections of a prior that is good enough: the first finds the scale, the last is the result.
-FEW = 2
 #: Searches that run at the first step only.
 ONCE = ("one-number", "points-range")
 
@@ -50,7 +48,6 @@ class Trajectory:
         history: one ``StepReport`` a step.
         watch: whether what the steps computed was finite.
         last_x: ``(B, 1, h, w)`` the relative map of the latest evaluation, no graph.
-        corrections: how many rounds of the schedule correct; ``None`` for all.
         result: ``(B, 1, h, w)`` the relative map of the latest step that the output starts from: the
             corrected one, or, of the last step, the one that the output's own refinement corrects; ``None``
             where something else than the correction moved the latent, or nothing did.
@@ -76,7 +73,6 @@ class Trajectory:
         known = Known.of([evidence[i] for i in owners], config, "loss")
         self.known, self._on_losses = known.coarser(config.correction.correction_scale), known
         updates = config.updates
-        self.corrections, self._decided = config.correction.corrections, False
         self.plan = config.plan_updates(points_given=self.known.points is not None)
         self.latent_rule = RULES[updates.rule](self.plan.step_latents)
         self.scale_rule = RULES[updates.affine_rule](updates.step_affine)
@@ -116,17 +112,7 @@ class Trajectory:
             (self._search_one_number if search == "one-number" else self._span_points)(x)
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         self.known = self.known.judged(self._on_known(depth_m), self.objective.views.left_01)
-        self._decide_corrections()
         self.matches = replace(self._on_losses, kept=self.known.kept).believed(depth_m)
-
-    def _decide_corrections(self) -> None:
-        """Once, by the first estimate, what the configuration leaves open: all that one call waits for."""
-        stage = self.config.correction
-        if self._decided or not stage.correct or self.config.gradient == "full":
-            return
-        self._decided, error = True, self.known.error
-        if self.corrections is None and (error is None or bool((error <= stage.few_error).all())):
-            self.corrections = FEW
 
     def _on_known(self, depth_m: Tensor) -> Tensor:
         """A metric map on the grid of the corrections."""

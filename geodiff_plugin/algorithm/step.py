@@ -20,19 +20,19 @@ from geodiff_plugin.guidance.config import GuidanceConfig
 __all__ = ["StepContext", "corrected_rounds", "guided_step"]
 
 
-def corrected_rounds(config: GuidanceConfig, count: int, corrections: int | None) -> set[int]:
+def corrected_rounds(config: GuidanceConfig, count: int) -> set[int]:
     """Which rounds of a schedule correct the estimate; a round without updates either decodes nothing.
 
     Args:
-        config: says which are active.
+        config: says which are active, and how many of them correct, evenly spread: the first, which finds the
+            scale, and the last, which is the result, among them.
         count: rounds of the whole schedule.
-        corrections: how many of them, evenly spread, the first and the last among them; ``None`` for all.
     """
     updates = config.updates
     active = [i for i in range(count) if updates.start <= i / count < updates.stop]
     if not config.correction.correct or not updates.optimize_latents or not active:
         return set()
-    wanted, last = min(corrections or count, len(active)), len(active) - 1
+    wanted, last = min(config.correction.corrections or count, len(active)), len(active) - 1
     return {active[round(k * last / (wanted - 1))] for k in range(wanted)} if wanted > 1 else {active[-1]}
 
 
@@ -89,7 +89,7 @@ def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor | No
     corrects = config.correction.correct and config.updates.optimize_latents and at.encode is not None
     acted = False
     for i in active or at.rounds[:1]:
-        end, chosen = (i + 1) / at.count, corrected_rounds(config, at.count, state.corrections)
+        end, chosen = (i + 1) / at.count, corrected_rounds(config, at.count)
         updates = state.plan.inner_steps if active and end > state.plan.updates_from else 0
         if corrects and not (i in chosen or updates) and state.affine is not None:
             continue

@@ -147,10 +147,7 @@ class CorrectionConfig(Checked):
         "steps (or rounds of a prior with fewer steps) that are corrected, evenly spread, the first and the "
         "last among them; a step with neither correction nor updates is the prior's own, and is not decoded",
         paper="-",
-        unset="2 for a prior that is measured to be wrong by at most `few_error`, else all",
-    )
-    few_error: float = number(
-        0.15, 0, 1e3, "error in log depth up to which a prior needs few corrections", paper="-"
+        unset="all",
     )
     correction_scale: float = number(
         1.0,

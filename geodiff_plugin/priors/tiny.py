@@ -22,7 +22,7 @@ __all__ = ["FULL", "KNOWN", "TINY", "tiny_autoencoder"]
 #: Values of ``decoder`` that are no folder and no hub id.
 FULL, TINY = "full", "tiny"
 #: Channels, pixels a cell and scaling factor of a latent -> hub id of the tiny autoencoder that knows it.
-KNOWN = {
+KNOWN: dict[tuple[Any, ...], str] = {
     (4, 8, 0.18215): "madebyollin/taesd",
     (4, 8, 0.13025): "madebyollin/taesdxl",
     (16, 8, 1.5305): "madebyollin/taesd3",

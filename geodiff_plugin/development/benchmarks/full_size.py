@@ -29,7 +29,6 @@ from diffusers import AutoencoderKL, UNet2DConditionModel
 from diffusers.utils import logging as diffusers_logging
 from torch.utils.flop_counter import FlopCounterMode
 
-from geodiff_plugin.algorithm.state import FEW
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.cli.bench_points import draw_points
 from geodiff_plugin.development.full_sizes import UNET, VAE
@@ -48,12 +47,12 @@ from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 __all__ = ["WAYS", "Found", "Size", "calls_of_all", "count_calls", "count_operations", "main", "measure"]
 
 #: Ways in the order of the table, with what the guidance is given; the first is what the others are compared
-#: with. Random weights make no good prior: what the default chooses for one is said here.
+#: with.
 WAYS: dict[str, dict[str, Any] | None] = {
     "plain": None,
-    "guided, a good prior": {"corrections": FEW},
-    "guided, a weak prior": {"few_error": 0.0},
-    "guided, tiny decoder": {"corrections": FEW, "decoder": TINY},
+    "guided, 2 corrections": {"corrections": 2},
+    "guided": {},
+    "guided, tiny decoder": {"decoder": TINY},
     "Marigold-DC": {},
 }
 PLAIN, MARIGOLD_DC = next(iter(WAYS)), list(WAYS)[-1]
