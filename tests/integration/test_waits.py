@@ -8,8 +8,8 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.algorithm.state import Trajectory
 from tests.pretended_device import Reached, pretended
 
-#: Read-backs, copies from the device and constants copied to it, from the first step to the last. A copy either
-#: way waits for all that the device was told before.
+#: Read-backs, copies from the device and constants copied to it, from the first step to the last. A copy
+#: either way waits for all that the device was told before.
 ALLOWED = 0
 KNOBS = {
     "default": {},
