@@ -26,6 +26,7 @@ from geodiff_plugin.matching import (
     points_to_matches,
 )
 from geodiff_plugin.pose.mistakes import INVERSE
+from geodiff_plugin.scale.order import SURE
 from geodiff_plugin.scale.points import sure_matches
 from geodiff_plugin.types import CameraView, PoseReport
 
@@ -145,6 +146,8 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
         sweep_known, _ = points_to_matches(points, K_left, size, K_grid, size_grid)
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
+    sure = None if matches is None else sure_matches(matches, config.fit)
+    _read_back_once(volume, [one for one in (matches, known, sure) if one is not None])
     return Evidence(
         left,
         K_loss,
@@ -154,11 +157,19 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
         found,
         known,
         sweep_known,
-        None if matches is None else sure_matches(matches, config.fit),
+        sure,
         tuple(views),
         pose,
         tuple(dict.fromkeys(warnings)),  # the same mistake may show in two ways
     )
+
+
+def _read_back_once(volume: CostVolume | None, known: Sequence[Matches]) -> None:
+    """Ask now for what only the device knows and these objects keep, so that no step waits for it."""
+    if volume is not None:
+        _ = volume.reach_m, volume.rectified
+    for one in known:
+        _ = one.above(0.0), one.above(SURE)
 
 
 def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:

@@ -67,6 +67,21 @@ class Known:
         points = [e.points if grid == "loss" else e.sweep_points for e in evidence]
         return cls(config, stacked(found), stacked(points), kept, error)
 
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """``(h, w)`` of the grid; ``None`` where nothing is known."""
+        target = self.matches or self.points
+        return None if target is None else (target.confidence.shape[-2], target.confidence.shape[-1])
+
+    def coarser(self, share: float) -> Self:
+        """On a grid whose sides are that share of this one's; of every cell the surest match or point.
+
+        A mean of two inverse depths across an edge is the depth of neither surface.
+        """
+        if share >= 1.0:
+            return self
+        return replace(self, matches=_pooled(self.matches, share), points=_pooled(self.points, share))
+
     def judged(self, depth_m: Tensor, left_01: Tensor) -> Self:
         """With ``kept`` and ``error`` by the prior's first estimate; later ones change nothing.
 
@@ -119,6 +134,15 @@ class Known:
         if target is None or self.error is None:
             return None
         return refine_depth(depth_m, target, left_01, self.error, self.config.correction)
+
+
+def _pooled(target: MatchTarget | None, share: float) -> MatchTarget | None:
+    if target is None:
+        return None
+    size = [max(1, round(share * side)) for side in target.confidence.shape[-2:]]
+    confidence, at = F.adaptive_max_pool2d(target.confidence, size, return_indices=True)
+    inverse_depth = target.inverse_depth.flatten(2).gather(2, at.flatten(2)).view_as(confidence)
+    return replace(target, inverse_depth=inverse_depth, confidence=confidence)
 
 
 def _resized(values: Tensor, size: tuple[int, int]) -> Tensor:

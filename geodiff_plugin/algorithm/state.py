@@ -7,6 +7,7 @@ Paper: Algorithm 1, S7.3.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -37,7 +38,7 @@ class Trajectory:
     Args:
         config: hyperparameters of ``GeometryGuidance``.
         evidence: one entry per image of the call.
-        owners: for every sample of the chunk the image that it belongs to.
+        owners: for every sample of the chunk the image that it belongs to; those of an image side by side.
         space: what the prior's output is affine in.
         own_range: metres ``(B,)`` of ``x = 0`` and of ``x = 1`` that a metric prior says itself, from which
             the search starts; ``None`` for a relative one.
@@ -51,8 +52,8 @@ class Trajectory:
         result: ``(B, 1, h, w)`` the relative map of the latest step that the output starts from: the
             corrected one, or, of the last step, the one that the output's own refinement corrects; ``None``
             where something else than the correction moved the latent, or nothing did.
-        known: matches and points on the grid of the losses.
-        matches: those of them that the latest estimate believes, or ``None``.
+        known: matches and points on the grid of the corrections.
+        matches: those that the latest estimate believes, on the grid of the losses, or ``None``.
         hidden: ``(B, V, 1, H, W)`` bool, what the estimate hides from the right cameras, or ``None``.
         order: ``(B,)`` in [-1, 1], rank correlation of the prior's first map and what is known, or ``None``.
         on_edge: ``(B,)`` bool, whether the last search ended on the edge of its range.
@@ -71,7 +72,8 @@ class Trajectory:
         self.config, self.evidence, self.owners = config, evidence, list(owners)
         self.metric = MetricMap(space, config.search.positive)
         self.objective = Objective(chunk_views(evidence, owners), self.metric, config.weights, config.terms)
-        self.known = Known.of([evidence[i] for i in owners], config, "loss")
+        known = Known.of([evidence[i] for i in owners], config, "loss")
+        self.known, self._on_losses = known.coarser(config.correction.correction_scale), known
         updates = config.updates
         self.plan = config.plan_updates(points_given=self.known.points is not None)
         self.latent_rule = RULES[updates.rule](self.plan.step_latents)
@@ -107,6 +109,11 @@ class Trajectory:
     def affine(self, moved: AffineState) -> None:
         self._affine = moved
 
+    @property
+    def has_scale(self) -> bool:
+        """Whether a search, or the frame before, has found scale and shift."""
+        return self._affine is not None
+
     def is_active(self, fraction: float) -> bool:
         """Whether steps at this fraction of the schedule, [0, 1), are updated."""
         return self.config.updates.start <= fraction < self.config.updates.stop
@@ -127,8 +134,15 @@ class Trajectory:
         elif self._affine is None:
             (self._search_one_number if search == "one-number" else self._span_points)(x)
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
-        self.known = self.known.judged(depth_m, self.objective.views.left_01)
-        self.matches = self.known.believed(depth_m)
+        self.known = self.known.judged(self._on_known(depth_m), self.objective.views.left_01)
+        self.matches = replace(self._on_losses, kept=self.known.kept).believed(depth_m)
+
+    def _on_known(self, depth_m: Tensor) -> Tensor:
+        """A metric map on the grid of the corrections."""
+        size = self.known.size
+        if size is None or size == tuple(depth_m.shape[-2:]):
+            return depth_m
+        return F.interpolate(depth_m, size, mode="bilinear", align_corners=False, antialias=True)
 
     def _order(self, x: Tensor) -> Tensor:
         """How far the prior alone agrees with matches or points on near and far; NaN where neither tells."""
@@ -170,7 +184,8 @@ class Trajectory:
         near, far = x.new_empty(x.shape[0]), x.new_empty(x.shape[0])
         on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
         for image in sorted(set(self.owners)):
-            members = [i for i, owner in enumerate(self.owners) if owner == image]
+            first = self.owners.index(image)
+            members = slice(first, first + self.owners.count(image))
             current = None if ends is None else (ends[0][members], ends[1][members])
             near[members], far[members], on_edge[members] = self._range_of_image(
                 x[members], self.evidence[image], current, members
@@ -183,7 +198,7 @@ class Trajectory:
         x: Tensor,
         evidence: Evidence,
         current: tuple[Tensor, Tensor] | None,
-        members: list[int],
+        members: slice,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Nearest and farthest metres of one image's samples, and whether they lie on the search's edge.
 
@@ -240,7 +255,7 @@ class Trajectory:
         Returns:
             ``(B, 1, h, w)``; ``x`` where no match or point is near.
         """
-        depth_m = self.objective.metric_depth(x, self.affine)
+        depth_m = self._on_known(self.objective.metric_depth(x, self.affine))
         brought = self.known.bring(depth_m, self.objective.views.left_01)
         if brought is None:
             return x
@@ -252,7 +267,7 @@ class Trajectory:
         """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""
         assert self._start is not None  # as in ``affine``
         return self.objective(
-            x, affine, self._start, z0, anchor, self.matches, self.known.points, self.hidden
+            x, affine, self._start, z0, anchor, self.matches, self._on_losses.points, self.hidden
         )
 
     def report(self, step: int, timestep: float, loss: Loss) -> None:

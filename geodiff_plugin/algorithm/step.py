@@ -6,7 +6,7 @@ Paper: Algorithm 1, with Eq. 16 and 17.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,8 +15,25 @@ from torch import Tensor
 from geodiff_plugin.algorithm.gradient import pull_back
 from geodiff_plugin.algorithm.objective import Loss
 from geodiff_plugin.algorithm.state import Trajectory
+from geodiff_plugin.guidance.config import GuidanceConfig
 
-__all__ = ["StepContext", "guided_step"]
+__all__ = ["StepContext", "corrected_rounds", "guided_step"]
+
+
+def corrected_rounds(config: GuidanceConfig, count: int) -> set[int]:
+    """Which rounds of a schedule correct the estimate; a round without updates either decodes nothing.
+
+    Args:
+        config: says which are active, and how many of them correct, evenly spread: the first, which finds the
+            scale, and the last, which is the result, among them.
+        count: rounds of the whole schedule.
+    """
+    updates = config.updates
+    active = [i for i in range(count) if updates.start <= i / count < updates.stop]
+    if not config.correction.correct or not updates.optimize_latents or not active:
+        return set()
+    wanted, last = min(config.correction.corrections or count, len(active)), len(active) - 1
+    return {active[round(k * last / (wanted - 1))] for k in range(wanted)} if wanted > 1 else {active[-1]}
 
 
 @dataclass(frozen=True)
@@ -26,26 +43,32 @@ class StepContext:
     Attributes:
         step: index in the schedule.
         timestep: the scheduler's timestep.
-        spans: begin and end in the schedule, [0, 1], of each round of correction and ``inner_steps`` updates.
-            One round a step, but for priors that cannot take as many steps as are wanted.
+        rounds: numbers, in the schedule, of this step's rounds of correction and ``inner_steps`` updates. One
+            round a step, but for priors that cannot take as many steps as are wanted.
+        count: rounds of the whole schedule.
         eps: ``(B, C, h, w)`` predicted noise, the yardstick of the norm-matched rule.
         z0_of: the clean latent of a guided one: Tweedie with the U-Net's graph in "full", identity in
             "denoised".
         decode: latent to unclipped relative map ``(B, 1, h', w')`` float32, D in the paper.
         encode: relative map to clean latent; ``None`` where the guided latent is no clean one, which then is
             moved by gradients alone.
+        decode_result: as ``decode``, for the correction whose map is the result, and whose latent nobody
+            reads: that of the last round, which then encodes nothing. ``None`` where another step follows, or
+            the latent is asked for.
     """
 
     step: int
     timestep: float
-    spans: Sequence[tuple[float, float]]
+    rounds: range
+    count: int
     eps: Tensor
     z0_of: Callable[[Tensor], Tensor]
     decode: Callable[[Tensor], Tensor]
     encode: Callable[[Tensor], Tensor] | None
+    decode_result: Callable[[Tensor], Tensor] | None = None
 
 
-def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor:
+def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor | None:
     """One pass of Algorithm 1's loop body: search, correction, gradient of L_geo, updates.
 
     Args:
@@ -54,47 +77,66 @@ def guided_step(state: Trajectory, leaf: Tensor, at: StepContext) -> Tensor:
         at: what the denoising step gives.
 
     Returns:
-        ``(B, C, h, w)`` float32, what to add to the leaf; exactly 0 with ``optimize_latents=False``.
+        ``(B, C, h, w)`` float32, what to add to the leaf; exactly 0 with ``optimize_latents=False``; ``None``
+        for a step that is the prior's own.
 
     Source: Algorithm 1, with Eq. 16 and 17 (which it omits) and the decode of z0_hat (it prints z_0). The
     correction before the updates is ours, after SteeredMarigold's (Gregorek and Nalpantidis 2024): a
     corrected map, encoded.
     """
-    config, z, anchor = state.config, leaf, None
-    rounds, state.result = [span for span in at.spans if state.is_active(span[0])], None
-    corrects = config.correction.correct and config.updates.optimize_latents and bool(rounds)
-    for _, end in rounds or at.spans[:1]:
+    z, anchor, rounds = leaf, None, _plan(state, at)
+    for k, (updates, corrects) in enumerate(rounds):
         if corrects and at.encode is not None:
-            moved = _corrected(state, z, at, at.encode, config.correction.refine and end >= 1.0)
+            ends = at.rounds[-1] == at.count - 1 and k == len(rounds) - 1 and not updates
+            moved = _corrected(state, z, at, at.encode, ends)
             anchor = moved if anchor is None else anchor + moved - z
             z = moved
-        updates = state.plan.inner_steps if rounds and end > state.plan.updates_from else 0
         z, anchor, loss = _update(state, z, anchor, at, updates)
         state.report(at.step, at.timestep, loss)
-    return (z - leaf).detach()
+    return (z - leaf).detach() if rounds else None
+
+
+def _plan(state: Trajectory, at: StepContext) -> list[tuple[int, bool]]:
+    """Updates of every round of a step in which anything happens, and whether it is corrected before them.
+
+    An estimate that was corrected in a round without updates is not corrected again in the next: it would be
+    brought to the same matches, which only follows their noise.
+    """
+    config, state.result = state.config, None
+    corrects = config.correction.correct and config.updates.optimize_latents and at.encode is not None
+    chosen = corrected_rounds(config, at.count) if corrects else set()
+    active = [i for i in at.rounds if state.is_active(i / at.count)]
+    rounds: list[tuple[int, bool]] = []
+    for i in active or at.rounds[:1]:
+        updates = state.plan.inner_steps if active and (i + 1) / at.count > state.plan.updates_from else 0
+        corrected = i in chosen and (not rounds or rounds[-1][0] > 0)
+        if corrected or updates or not corrects or (not rounds and not state.has_scale):
+            rounds.append((updates, corrected))
+    return rounds
 
 
 def _corrected(
-    state: Trajectory,
-    z0: Tensor,
-    at: StepContext,
-    encode: Callable[[Tensor], Tensor],
-    refined_later: bool,
+    state: Trajectory, z0: Tensor, at: StepContext, encode: Callable[[Tensor], Tensor], ends: bool
 ) -> Tensor:
     """``z0`` moved by what the correction of its map changes in the code.
 
     A difference of two codes, so that what the autoencoder loses is not lost again at every step, and a map
-    that needs no correction leaves the latent as it is. The last map is given out as it is where a refinement
-    follows: brought to the matches twice it would follow their noise.
+    that needs no correction leaves the latent as it is. The map that ends the schedule (``ends``) is given
+    out as it is where a refinement follows: brought to the matches twice it would follow their noise. Its
+    code is made only where the latent is asked for.
     """
     with torch.no_grad():
-        x0 = at.decode(z0)
+        unread = at.decode_result if ends else None
+        x0 = at.decode(z0) if unread is None else unread(z0)
         state.watch.note("the network's clean latent", at.step, z0)
         state.watch.note("the decoded map", at.step, x0)
         state.settle_scale(x0)
-        corrected = state.corrected(x0)
+        refined_later = ends and state.config.correction.refine
+        corrected = x0 if refined_later and unread is not None else state.corrected(x0)
         state.result = x0 if refined_later else corrected
-        moved = z0 if corrected is x0 else z0 + encode(corrected) - encode(x0)
+        if corrected is x0 or unread is not None:
+            return z0
+        moved = z0 + encode(corrected) - encode(x0)
         state.watch.note("the encoded correction", at.step, moved)
         return moved
 
@@ -104,7 +146,8 @@ def _update(
 ) -> tuple[Tensor, Tensor, Loss]:
     """A round of gradient updates of latent, scale and shift.
 
-    With 0 updates the scale is settled and the loss evaluated, nothing moves.
+    With 0 updates the scale is settled and the loss evaluated, nothing moves; a correction has settled it and
+    made the map already.
 
     Returns:
         The moved latent; the clean latent that the step's network stands for, corrections included, which
@@ -118,13 +161,14 @@ def _update(
                 z = z.detach().requires_grad_()
             z0_hat = at.z0_of(z)  # (B, C, h, w), Tweedie
             z0 = z0_hat.detach().requires_grad_(moves)
-            x0 = at.decode(z0)  # (B, 1, h', w'), D(z0_hat)
+            settled = state.result if updates == 0 else None
+            x0 = at.decode(z0) if settled is None else settled  # (B, 1, h', w'), D(z0_hat)
             x = x0.detach().requires_grad_(moves)
             anchor = z0.detach() if anchor is None else anchor
             if k == 0:
                 watch.note("the network's clean latent", at.step, z0)
                 watch.note("the decoded map", at.step, x)
-                if updates or state.result is None:  # else the correction settled it, and nothing moved since
+                if settled is None:
                     state.settle_scale(x.detach())  # g_s*, S7.3
                     state.test_visibility(x.detach())
             s_hat, t_hat = (

@@ -13,7 +13,16 @@ from kornia.geometry.linalg import transform_points
 
 from geodiff_plugin.geometry.cameras import image_size
 
-__all__ = ["NEAREST_M", "PlaneRays", "plane_rays", "project", "project_rays", "transform", "unproject"]
+__all__ = [
+    "NEAREST_M",
+    "PlaneRays",
+    "made_there",
+    "plane_rays",
+    "project",
+    "project_rays",
+    "transform",
+    "unproject",
+]
 
 # Nearer than this a point counts as behind the camera: its pixel would be a division by almost 0.
 NEAREST_M = 1e-4
@@ -31,6 +40,11 @@ class PlaneRays(NamedTuple):
 
     A: torch.Tensor
     b: torch.Tensor
+
+
+def made_there(like: torch.Tensor, *values: float) -> torch.Tensor:
+    """A small constant of ``like``'s dtype, made on its device: a list would be copied there, every time."""
+    return torch.stack([like.new_full((), value) for value in values])
 
 
 def unproject(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:

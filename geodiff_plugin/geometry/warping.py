@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin.geometry.cameras import image_size
-from geodiff_plugin.geometry.projection import NEAREST_M, PlaneRays, plane_rays, project_rays
+from geodiff_plugin.geometry.projection import NEAREST_M, PlaneRays, made_there, plane_rays, project_rays
 
 __all__ = ["Warped", "hidden_in_right", "sample_at", "warp_right_to_left"]
 
@@ -53,7 +53,7 @@ def sample_at(image: torch.Tensor, uv: torch.Tensor, *, mode: str = "bilinear") 
     """
     height, width = image.shape[-2:]
     # align_corners=True: -1 and 1 are the centres of the first and the last pixel, where uv counts from.
-    last = uv.new_tensor([max(width - 1, 1), max(height - 1, 1)])
+    last = made_there(uv, max(width - 1, 1), max(height - 1, 1))
     grid = (2.0 * uv / last - 1.0).clamp(-2.0, 2.0)
     return F.grid_sample(image, grid, mode=mode, padding_mode="border", align_corners=True)
 
@@ -139,7 +139,7 @@ def hidden_in_right(
     seen = _inside(uv, z, size_right)[:, 0]  # (B, H, W)
     # No finer than the left grid, else the splatted surface has holes that show what is behind it.
     rows, columns = min(size_right[0], height), min(size_right[1], width)
-    scale = uv.new_tensor([columns / size_right[1], rows / size_right[0]])
+    scale = made_there(uv, columns / size_right[1], rows / size_right[0])
     cell = (uv + 0.5) * scale - 0.5
     far = torch.finfo(z.dtype).max
     z_seen = torch.where(seen, z, torch.full_like(z, far))
@@ -150,7 +150,7 @@ def hidden_in_right(
 
     buffer = z.new_full((batch, rows * columns), far)
     for step in ((0, 0), (1, 0), (0, 1), (1, 1)):  # every cell within 3/4 px: slopes leave no holes
-        target = cell.floor() + cell.new_tensor(step)
+        target = cell.floor() + made_there(cell, *step)
         near = ((target - cell).abs() <= 0.75).all(dim=-1)
         z_splat = torch.where(near, z_seen, torch.full_like(z, far))
         buffer.scatter_reduce_(1, index(target), z_splat.flatten(1), "amin")

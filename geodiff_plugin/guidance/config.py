@@ -13,7 +13,17 @@ from pathlib import Path
 from typing import Any, Self
 
 from geodiff_plugin._checks import bad_type, bad_value, check_number
-from geodiff_plugin.guidance.fields import Checked, by_name, choice, close_names, flag, integer, number, pair
+from geodiff_plugin.guidance.fields import (
+    Checked,
+    by_name,
+    choice,
+    close_names,
+    flag,
+    integer,
+    number,
+    pair,
+    text,
+)
 from geodiff_plugin.guidance.scale_stages import FitConfig, MatchingConfig, SearchConfig, SweepConfig
 from geodiff_plugin.guidance.stages import CorrectionConfig, ReflectionsConfig, TermsConfig, UpdatesConfig
 
@@ -97,6 +107,14 @@ class GuidanceConfig(Checked):
         ("refine", "given"),
         "poses that leave matches more than 0.45 px off their epipolar lines are refined, all views "
         "together, and the right image is straightened ([poses](../how-to/poses.md))",
+    )
+    decoder: str = text(
+        "full",
+        "`full`, `tiny`, a folder or a hub id",
+        "what decodes and encodes between the steps: the prior's own autoencoder, the tiny one that is known "
+        "for its latent, or another `AutoencoderTiny`; the result is always decoded by the prior's own "
+        "([priors](../reference/priors.md#a-tiny-decoder))",
+        paper="-",
     )
     terms: TermsConfig = TermsConfig()
     sweep: SweepConfig = SweepConfig()

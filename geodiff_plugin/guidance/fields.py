@@ -10,6 +10,7 @@ import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import Field, dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_flag, check_number, check_range
@@ -26,7 +27,7 @@ __all__ = [
     "flag",
     "integer",
 ]
-__all__ += ["key_of", "number", "pair"]
+__all__ += ["key_of", "number", "pair", "text"]
 
 Check = Callable[[Any, str], Any]
 
@@ -142,6 +143,17 @@ def key_of(default: str, table: str, doc: str, *, paper: str = AS_SET) -> Any:
         return value if isinstance(value, str) else bad_type(name, f"a key of {table}", value)
 
     return _described(default, Knob(doc, f"key of `{table}`", check, paper))
+
+
+def text(default: str, values: str, doc: str, *, paper: str = AS_SET) -> Any:
+    """A text that is not empty; what it may be is only known where it is used."""
+
+    def check(value: Any, name: str) -> str:
+        if isinstance(value, Path):
+            value = str(value)
+        return value if isinstance(value, str) and value else bad_type(name, f"a text ({values})", value)
+
+    return _described(default, Knob(doc, values, check, paper))
 
 
 def pair(

@@ -140,6 +140,23 @@ class CorrectionConfig(Checked):
         'before the updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek and '
         "Nalpantidis 2024)",
     )
+    corrections: int | None = integer(
+        None,
+        1,
+        10_000,
+        "steps (or rounds of a prior with fewer steps) that are corrected, evenly spread, the first and the "
+        "last among them; a step with neither correction nor updates is the prior's own, and is not decoded",
+        paper="-",
+        unset="all",
+    )
+    correction_scale: float = number(
+        1.0,
+        0.05,
+        1,
+        "side of the grid that corrections in the loop are solved on, as a share of that of the losses; "
+        "their factor is upsampled, and the result is refined at full resolution whatever it is",
+        paper="-",
+    )
     refine: bool = flag(True, "the result is brought to its matches and points once more, at full resolution")
     match_noise: float = number(
         0.02,

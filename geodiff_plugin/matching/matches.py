@@ -6,7 +6,7 @@ Paper: none; the evidence that a photometric loss does not have.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -43,6 +43,17 @@ class Matches(MatchTarget):
 
     K: torch.Tensor
     size: tuple[int, int]
+    _above: dict[float, torch.Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def above(self, confidence: float) -> torch.Tensor:
+        """``(P,)`` flat indices of the pixels that are believed more than that.
+
+        To count them is to wait for the device, so it is done once; ``prepare_evidence`` does it for all that
+        the loop asks for.
+        """
+        if confidence not in self._above:
+            self._above[confidence] = (self.confidence.flatten() > confidence).nonzero()[:, 0]
+        return self._above[confidence]
 
 
 def gate_matches(matches: MatchTarget, depth_m: torch.Tensor, factor: float) -> torch.Tensor:

@@ -22,6 +22,7 @@ from geodiff_plugin._checks import bad_type, bad_value, refuse
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.priors.tiny import tiny_autoencoder
 from geodiff_plugin.runtime.ensembling import ensemble_metric
 from geodiff_plugin.runtime.exclusive import Exclusive, exclusive_call
 from geodiff_plugin.runtime.grid import ProcessingGrid
@@ -124,6 +125,7 @@ class _GuidedCall(_Stock):
         )
         call["resample_method_output"] = call["resample_method_output"] or "bilinear"
         check_guidable(self, prior, guidance)
+        tiny = tiny_autoencoder(self, prior, guidance.config.decoder)
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= {"ensemble_size": 1, "output_uncertainty": False}
             warnings.warn(
@@ -156,6 +158,8 @@ class _GuidedCall(_Stock):
             grid,
             rounds,
             callback,
+            wants_latent,
+            tiny,
             held,
             warm,
         )

@@ -50,6 +50,8 @@ class GuidedRun:
         grid: that the pipeline works on.
         rounds: times that every denoising step makes its updates, see ``rounds.plan_steps``.
         callback: ``callback_on_step_end`` or ``None``.
+        wants_latents: whether the caller is given the final latents.
+        tiny: what decodes and encodes in the loop; ``None`` for the pipeline's own autoencoder.
         held: what the call holds against other threads, given back while the callback runs.
         warm: where the call goes on from another frame, or ``None``.
 
@@ -70,6 +72,8 @@ class GuidedRun:
         grid: ProcessingGrid,
         rounds: int,
         callback: StepCallback | None,
+        wants_latents: bool,
+        tiny: Any | None,
         held: Exclusive,
         warm: WarmStart | None = None,
     ) -> None:
@@ -79,6 +83,8 @@ class GuidedRun:
         self.batch_size, self.grid = batch_size, grid
         self.rounds, self.callback, self._held = rounds, callback, held
         self.warm, self._skipped = warm, 0 if warm is None else warm.skipped
+        self._reads_latents = wants_latents or callback is not None
+        self._tiny = tiny
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
         self.members: list[Tensor] = []
@@ -122,19 +128,37 @@ class GuidedRun:
             self.__enter__()
 
     @property
-    def spans(self) -> list[tuple[float, float]]:
-        """Begin and end of the rounds of the current step in the schedule, [0, 1] each."""
+    def rounds_of_step(self) -> range:
+        """Numbers of the current step's rounds in the schedule; steps that a warm start leaves out count."""
         first = (self._skipped + self.step_index) * self.rounds
-        count = (self._skipped + len(self.timesteps)) * self.rounds
-        return [(i / count, (i + 1) / count) for i in range(first, first + self.rounds)]
+        return range(first, first + self.rounds)
+
+    @contextmanager
+    def _in_the_loop(self) -> Iterator[None]:
+        """The tiny autoencoder, if there is one, in the place of the pipeline's own."""
+        if self._tiny is None:
+            yield
+            return
+        own = self.pipe.vae
+        object.__setattr__(self.pipe, "vae", self._tiny)  # past the rewriting of the pipeline's config
+        try:
+            yield
+        finally:
+            object.__setattr__(self.pipe, "vae", own)
 
     def decode(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map without padding, ``(B, 1, H, W)`` float32, with its graph."""
+        """Unclipped relative map without padding, ``(B, 1, H, W)`` float32, with its graph; in the loop."""
+        with self._in_the_loop():
+            return self.decode_result(z0)
+
+    def decode_result(self, z0: Tensor) -> Tensor:
+        """The same by the pipeline's own autoencoder."""
         return self.grid.cropped(self.grid.filled(self.prior.decode(z0)))
 
     def encode(self, x: Tensor) -> Tensor:
-        """Clean latent of a relative map without padding, which is made as the image's was."""
-        return self.prior.encode(self.grid.padded(x))
+        """Clean latent of a relative map without padding, which is made as the image's was; in the loop."""
+        with self._in_the_loop():
+            return self.prior.encode(self.grid.padded(x))
 
     def metric_prediction(self, latents: Tensor) -> Tensor:
         """Metric depth of the next chunk of final latents; takes the place of the clipping decode.
@@ -200,9 +224,8 @@ class GuidedRun:
         trajectory, depth = self.trajectories[-1], self.prior.latents
         wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
         wide_output, wide_z_t = output[:, depth].to(wide), z_t[:, depth].to(wide)
-        if self.step_index == 0:  # one wait a trajectory
+        if self.step_index == 0:
             trajectory.watch.note("the prior's output", 0, wide_output)
-            trajectory.watch.check(self.pipe.dtype)
         eps = noise_from(wide_output, wide_z_t, level)
         tap = self._tap
         leaf = z0_from(wide_output, wide_z_t, level) if tap is None else tap.leaf
@@ -212,12 +235,20 @@ class GuidedRun:
 
         encode = self.encode if tap is None else None
         timestep_now = self.timesteps[self.step_index]
-        at = StepContext(self.step_index, timestep_now, self.spans, eps, z0_of, self.decode, encode)
+        last = self.step_index == len(self.timesteps) - 1
+        decode_result = self.decode_result if last and not self._reads_latents else None
+        rounds, count = self.rounds_of_step, (self._skipped + len(self.timesteps)) * self.rounds
+        at = StepContext(
+            self.step_index, timestep_now, rounds, count, eps, z0_of, self.decode, encode, decode_result
+        )
         with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
             move = guided_step(trajectory, leaf, at)
         updates = self.config.updates
         result: tuple[Tensor, Tensor, Tensor | None]
-        if not updates.optimize_latents or not any(trajectory.is_active(begin) for begin, _ in self.spans):
+        if self._tiny is not None and decode_result is None:
+            trajectory.result = None  # its map is a tiny decoder's
+        active = any(trajectory.is_active(i / count) for i in rounds)
+        if move is None or not updates.optimize_latents or not active:
             result = output, z_t, None  # bit for bit the pipeline's own step
         elif tap is not None and self.prior.max_steps == 1:
             # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
@@ -244,7 +275,7 @@ class GuidedRun:
             trajectory = self.trajectories[-1]
             affine, x = trajectory.affine, trajectory.last_x
             if x is None or self.step_index == len(self.timesteps) - 1:
-                x = self.decode(latents[:, self.prior.latents])
+                x = self.decode_result(latents[:, self.prior.latents])
             values = {
                 "latents": latents,
                 "metric_depth": trajectory.metric(x, affine),
@@ -257,8 +288,9 @@ class GuidedRun:
             if "latents" in answer:
                 latents, trajectory.result = answer["latents"], None
         self.step_index += 1
-        if self._bar is not None and not self._bar.disable:  # a disabled one waits for no device
-            loss = float(self.trajectories[-1].history[-1].loss.mean())
-            self._bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
+        if self._bar is not None:
+            loss = self.trajectories[-1].history[-1].loss
+            if not self._bar.disable and loss.device.type == "cpu":  # another device would be waited for
+                self._bar.set_postfix(loss=f"{float(loss.mean()):.4f}", refresh=False)
             self._bar.update()
         return latents

@@ -30,6 +30,9 @@ class GuidedScheduler:
     pipeline past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config. It may be left
     and entered again in the middle of a call, as callbacks are: then the trajectory goes on where it was.
 
+    Its ``step`` is told the timesteps on the CPU, where diffusers keeps the tables that they index: compared
+    and looked up on another device, each would be waited for several times a step.
+
     A scheduler of which the user replaced one of the two methods on the instance is used itself, since such a
     method usually holds on to the instance; all its attributes are put back.
 
@@ -78,22 +81,26 @@ class GuidedScheduler:
 
         @functools.wraps(own_set_timesteps)
         def set_timesteps(*args: Any, **kwargs: Any) -> None:
-            own_set_timesteps(*args, **kwargs)
+            device = kwargs.get("device")
+            own_set_timesteps(*args, **kwargs | ({} if device is None else {"device": "cpu"}))
             trailing = trailing_timesteps(scheduler, len(scheduler.timesteps)) if self._respace else None
-            if trailing is not None:
-                scheduler.timesteps = trailing.to(scheduler.timesteps.device)
-            scheduler.timesteps = scheduler.timesteps[self._skipped :]
-            self._on_trajectory(scheduler.timesteps)
+            self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()[self._skipped :]
+            self._done = 0
+            self._on_trajectory(self._timesteps)
+            scheduler.timesteps = self._timesteps.to(device=device)  # what the host's loop is about to take
 
         @functools.wraps(own_step)
         def step(model_output: Tensor, timestep: Any, sample: Tensor, *args: Any, **kwargs: Any) -> Any:
-            output, z_t, shift = self._on_step(model_output, torch.as_tensor(timestep), sample)
+            given = timestep
+            scheduler.timesteps, timestep = self._timesteps, self._timesteps[self._done]
+            self._done += 1
+            output, z_t, shift = self._on_step(model_output, timestep, sample)
             result = own_step(output, timestep, z_t, *args, **kwargs)
             is_tuple = isinstance(result, tuple)
             previous = result[0] if is_tuple else result.prev_sample
             if shift is not None:
                 previous = (previous.float() + shift).to(previous.dtype)
-            previous = self._on_done(torch.as_tensor(timestep), previous)
+            previous = self._on_done(torch.as_tensor(given), previous)
             if is_tuple:
                 return (previous, *result[1:])
             result.prev_sample = previous

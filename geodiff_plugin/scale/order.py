@@ -13,7 +13,7 @@ from torch import Tensor
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import SPACES
 
-__all__ = ["order_agreement"]
+__all__ = ["SURE", "order_agreement"]
 
 #: Matches that are looked at, how sure they must be, how few say nothing.
 SAMPLES, SURE, FEWEST = 4000, 0.5, 40
@@ -41,7 +41,7 @@ def order_agreement(x: Tensor, known: Matches, space: str) -> Tensor:
     Convention:
         Cameras in the wrong order turn near into far: -1 where +1 is right.
     """
-    at = (known.confidence.flatten() > SURE).nonzero()[:, 0]
+    at = known.above(SURE)
     if len(at) < FEWEST:
         return x.new_full((x.shape[0],), torch.nan)
     at = at[:: max(1, len(at) // SAMPLES)]

@@ -31,7 +31,7 @@ __all__ = [
 
 def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
     """Metres, ``()`` each, of the nearest and the farthest known point."""
-    known = points.inverse_depth[points.confidence > 0]
+    known = points.inverse_depth.flatten()[points.above(0.0)]
     return 1.0 / known.amax(), 1.0 / known.amin()
 
 
@@ -65,7 +65,7 @@ def fit_to_points(
         ``near_m, far_m``, ``(B,)``: the best of 1128 (by default) log-spaced pairs in mean Cauchy cost of
         inverse depth, so that some points may be wrong. Coarse: ``refine_to_matches`` does the rest.
     """
-    at = (points.confidence.flatten() > 0).nonzero()[:, 0]
+    at = points.above(0.0)
     at = at[:: max(1, -(-len(at) // config.basin_samples))]
     target = points.inverse_depth.flatten()[at]
     values = F.interpolate(x.float(), points.size, mode="bilinear", align_corners=False).flatten(1)[:, at]
@@ -81,10 +81,10 @@ def fit_to_points(
         depth_m = metric(row.expand(len(near), 1, 1, -1), metric.from_range(near, far))[:, 0, 0]
         e = (1.0 / depth_m - target) / (config.basin_cauchy * points.plane_step)
         cost = torch.log1p(e * e).mean(1)
-        best = cost.argmin()
+        best = cost.argmin(keepdim=True)  # a 0-d index would be read back
         if current is not None:
-            best = torch.where(cost[0] <= config.basin_keep * cost[best], torch.zeros_like(best), best)
-        found.append(torch.stack([near[best], far[best]]))
+            best = torch.where(cost[:1] <= config.basin_keep * cost[best], torch.zeros_like(best), best)
+        found.append(torch.cat([near[best], far[best]]))
     nearest, farthest = torch.stack(found).unbind(1)
     return nearest, farthest
 
@@ -115,7 +115,7 @@ def refine_to_matches(
         right is fitted to the noise of its matches, one that errs as a whole.
     """
     height, width = matches.size
-    at = (matches.confidence.flatten() > 0).nonzero()[:, 0]  # known points are few: not one may be missed
+    at = matches.above(0.0)  # known points are few: not one may be missed
     if not len(at):
         return near_m, far_m
     at = at[:: max(1, len(at) // config.fit_samples)]
@@ -174,7 +174,7 @@ def _refine_once(
     gradient = torch.einsum("bpi,bp,bp->bi", J, weight, residual)
     diagonal = normal.diagonal(dim1=1, dim2=2)
     damped = normal + torch.diag_embed(1e-6 * diagonal + 1e-12 * diagonal.sum(1, keepdim=True) + 1e-20)
-    free = ends - torch.linalg.solve(damped, gradient)
+    free = ends - torch.linalg.solve_ex(damped, gradient).result  # unchecked: a check waits for the device
     bound = torch.minimum(torch.maximum(free, bounds[0]), bounds[1])
     # Where one end is stopped by its bound, the other one is the best for that.
     moved = bound - ends

@@ -119,7 +119,7 @@ def search_scale(
                 cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth, config.cost_clamp
             )
             mean = mean + (share < least) * 1.0  # only if no pair keeps enough in view does one of these win
-            k = mean.argmin()
+            k = mean.argmin(keepdim=True)  # a 0-d index would be read back
             return near[k], far[k], mean[k]
 
         def to_m(u: Tensor) -> Tensor:
@@ -145,7 +145,7 @@ def search_scale(
         # The volume's own near end lies nearer than anything seen, so only a given one can cut a scene off.
         on_edge = (far >= high * 0.98) | ((near <= low * 1.02) & (depth_range is not None))
         found.append((near, far, mean, on_edge))
-    return ScaleSearch(*(torch.stack(column) for column in zip(*found, strict=True)))
+    return ScaleSearch(*(torch.cat(column) for column in zip(*found, strict=True)))
 
 
 def argmin_over(candidates: Tensor, cost: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:

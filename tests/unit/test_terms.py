@@ -1,10 +1,11 @@
 from __future__ import annotations
 
+import kornia.metrics
 import pytest
 import torch
 
 from geodiff_plugin.algorithm.terms import TERMS, Estimate, MatchTarget, masked_mean
-from geodiff_plugin.algorithm.terms.photometric import photometric, photometric_map
+from geodiff_plugin.algorithm.terms.photometric import photometric, photometric_map, ssim
 from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.scale.space import AffineState
 
@@ -167,3 +168,10 @@ def test_masked_mean():
     weight = torch.tensor([[1, 0, 1], [0, 0, 0]], dtype=torch.bool).view(1, 1, 2, 3)
     assert masked_mean(value, weight).item() == 1.0
     assert masked_mean(value, torch.zeros_like(weight)).item() == 0.0
+
+
+def test_ssim_is_kornias():
+    torch.manual_seed(0)
+    a, b = torch.rand(2, 2, 3, 25, 31)
+    b = 0.7 * a + 0.3 * b
+    torch.testing.assert_close(ssim(a, b), kornia.metrics.ssim(a, b, 3), atol=2e-5, rtol=0)

@@ -6,7 +6,8 @@ Paper: S4.2, Eq. 14 (eq:geo-loss).
 
 from __future__ import annotations
 
-import kornia.metrics
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -15,10 +16,14 @@ from geodiff_plugin.algorithm.terms.base import Estimate, masked_mean
 from geodiff_plugin.algorithm.terms.exposure import match_exposure
 from geodiff_plugin.guidance.presets import DEFAULT
 
-__all__ = ["photometric", "photometric_map"]
+__all__ = ["photometric", "photometric_map", "ssim"]
 
 #: A pyramid level with a shorter side than this says nothing that its parent does not.
 MIN_SIDE = 24
+#: SSIM's two constants for images in [0, 1], and the 3 taps of its Gaussian window of 1.5 pixels.
+C1, C2, LEAST = 0.01**2, 0.03**2, 1e-12
+BESIDE = math.exp(-0.5 / 1.5**2)
+BESIDE, CENTRE = BESIDE / (1.0 + 2.0 * BESIDE), 1.0 / (1.0 + 2.0 * BESIDE)
 #: More than any error of a view that sees the pixel.
 UNSEEN = 2.0
 
@@ -36,8 +41,32 @@ def photometric_map(left_01: Tensor, warped_01: Tensor, eta: float) -> Tensor:
 
     Source: Eq. 14 (eq:geo-loss). The paper gives no window; 3x3 follows the works it cites.
     """
-    ssim = kornia.metrics.ssim(left_01, warped_01, window_size=3)
-    return eta * ((1.0 - ssim) / 2.0).clamp(0.0, 1.0) + (1.0 - eta) * (left_01 - warped_01).abs()
+    return (
+        eta * ((1.0 - ssim(left_01, warped_01)) / 2.0).clamp(0.0, 1.0)
+        + (1.0 - eta) * (left_01 - warped_01).abs()
+    )
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Structural similarity of every pixel, in a Gaussian window of 3x3 pixels, reflected at the border.
+
+    Args:
+        a: ``(B, C, H, W)`` in [0, 1].
+        b: the same.
+
+    Returns:
+        ``(B, C, H, W)`` in [-1, 1]; as ``kornia.metrics.ssim(a, b, 3)``, which makes its window of a list at
+        every call, and so waits for the device.
+
+    Source: Wang et al. 2004, "Image quality assessment", Eq. 13.
+    """
+    moments = F.pad(torch.cat([a, b, a * a, b * b, a * b], 1), (1, 1, 1, 1), mode="reflect")
+    moments = BESIDE * (moments[..., :-2] + moments[..., 2:]) + CENTRE * moments[..., 1:-1]
+    moments = BESIDE * (moments[..., :-2, :] + moments[..., 2:, :]) + CENTRE * moments[..., 1:-1, :]
+    mean_a, mean_b, square_a, square_b, product = moments.chunk(5, 1)
+    means, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
+    covariance, variances = product - means, square_a + square_b - squares
+    return (2.0 * means + C1) * (2.0 * covariance + C2) / ((squares + C1) * (variances + C2) + LEAST)
 
 
 def photometric(

@@ -1,0 +1,92 @@
+"""Tiny autoencoders of the latents that priors work in, for what is decoded between the steps.
+
+Hop: ``decoder`` of the configuration + prior -> ``AutoencoderTiny`` of the same latent.
+Paper: none; TAESD and its relatives (O. Boer Bohan, github.com/madebyollin/taesd) are distilled from the
+autoencoders that they stand for.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from diffusers import AutoencoderTiny
+
+from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin.priors.base import DepthPrior
+
+__all__ = ["FULL", "KNOWN", "TINY", "tiny_autoencoder"]
+
+#: Values of ``decoder`` that are no folder and no hub id.
+FULL, TINY = "full", "tiny"
+#: Channels, pixels a cell and scaling factor of a latent -> hub id of the tiny autoencoder that knows it.
+KNOWN: dict[tuple[Any, ...], str] = {
+    (4, 8, 0.18215): "madebyollin/taesd",
+    (4, 8, 0.13025): "madebyollin/taesdxl",
+    (16, 8, 1.5305): "madebyollin/taesd3",
+    (16, 8, 0.3611): "madebyollin/taef1",
+}
+
+
+def _latent_of(vae: Any) -> tuple[int | None, int | None]:
+    """Channels of an autoencoder's latent, and pixels a cell; ``None`` where it does not say."""
+    config = vae.config
+    stages = config.get("decoder_block_out_channels") or config.get("block_out_channels")
+    return config.get("latent_channels", config.get("z_dim")), 2 ** (len(stages) - 1) if stages else None
+
+
+def tiny_autoencoder(pipe: Any, prior: DepthPrior, decoder: str) -> AutoencoderTiny | None:
+    """The autoencoder for the loop, on the pipeline's device and of its dtype, frozen; ``None`` for its own.
+
+    Args:
+        pipe: the live pipeline.
+        prior: its adapter, for messages.
+        decoder: as in ``GuidanceConfig``.
+
+    Raises:
+        InputError: a prior without latents, or without a known tiny autoencoder; a folder that holds none, or
+            one of another latent; a hub id that is neither cached nor reachable.
+    """
+    if decoder == FULL:
+        return None
+    vae = getattr(pipe, "vae", None)
+    if vae is None:
+        cure = "This prior works on pixels: there is nothing to decode."
+        bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(decoder), cure)
+    own = _latent_of(vae)
+    if own[1] is None:
+        cure = "No tiny autoencoder of images has the latent of one for videos."
+        bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(decoder), cure)
+    if decoder == TINY:
+        known = KNOWN.get((*own, vae.config.get("scaling_factor")))
+        if known is None:
+            cure = f"None is known for its latent of {own[0]} channels; give a folder or a hub id of one."
+            bad_value("decoder", f"{FULL!r} with {prior.__class__.__name__}", repr(decoder), cure)
+        decoder = known
+    tiny = _loaded(decoder, pipe.dtype, str(pipe._execution_device))
+    if _latent_of(tiny) != own:
+        channels, cell = own
+        got = "{} channels, {} px a cell, in {!r}".format(*_latent_of(tiny), decoder)
+        bad_value("decoder", f"of the prior's latent ({channels} channels, {cell} px a cell)", got)
+    return tiny
+
+
+@lru_cache(maxsize=1)
+def _loaded(name: str, dtype: torch.dtype, device: str) -> AutoencoderTiny:
+    folder = Path(name)
+    if not folder.is_dir() and (name.count("/") != 1 or name.startswith((".", "/", "~"))):
+        bad_value("decoder", f"{FULL!r}, {TINY!r}, a folder that is there, or a hub id", repr(name))
+    try:
+        tiny = AutoencoderTiny.from_pretrained(name, torch_dtype=dtype, use_safetensors=True)
+    except (OSError, ValueError, ConnectionError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        cure = (
+            "Fetch it once with `hf download ID` while online, or give a folder that save_pretrained wrote."
+        )
+        raise InputError(
+            "decoder must be a folder of an AutoencoderTiny, or a hub id of one that is cached or can be "
+            f"reached; got {name!r} ({reason}). {cure}"
+        ) from error
+    return tiny.to(device).eval().requires_grad_(False)

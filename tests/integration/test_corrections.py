@@ -1,0 +1,66 @@
+"""How many steps are corrected, on which grid, and what a corrected step decodes and encodes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.algorithm.step import corrected_rounds
+from geodiff_plugin.guidance.presets import DEFAULT
+from tests.integration.test_tiny_decoder import Counted
+
+
+def guided(pipe, pair, steps=5, **knobs):
+    call = {name: knobs.pop(name) for name in ("output_latent", "callback_on_step_end") if name in knobs}
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, loss_resolution=64, **knobs)
+    generator = torch.Generator().manual_seed(0)
+    return enable_geometry_guidance(pipe)(
+        pair.left, guidance=guidance, generator=generator, num_inference_steps=steps, **call
+    )
+
+
+def corrected(count, corrections=None, **knobs):
+    return sorted(corrected_rounds(DEFAULT.changed(corrections=corrections, **knobs), count))
+
+
+def test_corrections_are_spread_over_what_is_active():
+    assert corrected(4) == corrected(4, 4) == corrected(4, 9) == [0, 1, 2, 3]
+    assert corrected(9, 3) == [0, 4, 8]
+    assert corrected(9, 2) == [0, 8]
+    assert corrected(9, 1) == [8]
+    assert corrected(8, 2, start=0.25, stop=0.75) == [2, 5]
+    assert corrected(4, correct=False) == corrected(4, optimize_latents=False) == []
+    assert corrected(4, start=1.0) == []
+
+
+@pytest.mark.parametrize("corrections", [1, 2, 3])
+def test_a_step_that_is_not_corrected_is_the_priors_own(
+    make_pipeline, textured_plane, monkeypatch, corrections
+):
+    pipe = make_pipeline()
+    counted = Counted(pipe.vae, monkeypatch)
+    found = guided(pipe, textured_plane, corrections=corrections)
+    looked = [report.step for report in found.history]
+    # The first step is looked at in any case, for the scale.
+    assert looked == {1: [0, 4], 2: [0, 4], 3: [0, 2, 4]}[corrections]
+    # A correction decodes once and encodes twice, the last one not at all; the stock call encodes the image.
+    assert (counted.decoded, counted.encoded) == (len(looked), 1 + 2 * (corrections - 1))
+
+
+def test_the_result_does_not_depend_on_whether_the_latent_is_asked_for(make_pipeline, textured_plane):
+    plain = guided(make_pipeline(), textured_plane)
+    latent = guided(make_pipeline(), textured_plane, output_latent=True)
+    np.testing.assert_array_equal(plain.prediction, latent.prediction)
+
+
+def test_corrections_on_a_coarser_grid(make_pipeline, textured_plane):
+    results = [
+        guided(make_pipeline(), textured_plane, refine=False, correction_scale=share).prediction
+        for share in (1.0, 0.5, 0.05)
+    ]
+    error = [np.abs(np.log(r[0, ..., 0] / textured_plane.depth_m)).mean() for r in results]
+    assert not np.array_equal(results[0], results[1])
+    # Half the side sees the same plane; a grid of three cells still corrects, but less.
+    assert error[1] < 1.3 * error[0] + 0.01 and error[0] < error[2]

@@ -1,0 +1,59 @@
+"""What the maintainers' benchmarks count and fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.development.benchmarks import cost, full_size
+from geodiff_plugin.development.benchmarks.matrix import deviation
+from geodiff_plugin.development.full_sizes import UNET, VAE
+from geodiff_plugin.development.random_marigold import narrowed
+
+
+def test_calls_of_every_way():
+    calls = full_size.calls_of_all(full_size.Size(steps=3, dc_steps=2))
+    image = {"encode": 1}
+    assert calls["plain"] == image | {"network": 3, "decode": 1}
+    # Every correction decodes once and encodes twice, but for the last one, whose map is the result.
+    assert calls["guided, 2 corrections"] == {"network": 3, "decode": 2, "encode": 3}
+    assert calls["guided"] == {"network": 3, "decode": 3, "encode": 5}
+    tiny = {"tiny decode": 2, "tiny encode": 4}
+    assert calls["guided, tiny decoder"] == image | {"network": 3, "decode": 1} | tiny
+    assert calls["Marigold-DC"] == image | {"network + back": 2, "decode + back": 2, "decode": 1}
+
+
+def test_operations_grow_with_pixels_and_width():
+    small, large = (full_size.count_operations(full_size.Size(0.1, side)) for side in (128, 256))
+    assert set(small) >= {"network", "network + back", "decode", "decode + back", "encode", "tiny decode"}
+    for kind, n in small.items():
+        assert 2.5 * n < large[kind] < 8.0 * n
+        if f"{kind} + back" in small:  # back to the input alone, whose cost is about that of the way there
+            assert 1.8 * n < small[f"{kind} + back"] < 2.2 * n
+    assert full_size.count_operations(full_size.Size(0.2, 128))["network"] > 1.5 * small["network"]
+    assert small["tiny decode"] < 0.2 * small["decode"]
+
+
+def test_narrow_networks_have_the_published_shape():
+    assert narrowed(UNET, 1.0) == UNET
+    assert narrowed(UNET, 0.2)["block_out_channels"] == (64, 128, 256, 256)
+    assert narrowed(VAE, 0.01)["block_out_channels"] == (32,) * 4
+
+
+def test_exponent_of_a_power():
+    values = (10, 20, 40)
+    assert cost.exponent(values, [3.0 * v**1.5 for v in values]) == pytest.approx(1.5)
+    assert cost.exponent(values, [7.0] * 3) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_tables_stand_between_the_marks():
+    page = f"before\n{cost.BEGIN}\nold\n{cost.END}\nafter\n"
+    assert cost.with_tables(page, "new") == f"before\n{cost.BEGIN}\n\nnew\n{cost.END}\nafter\n"
+    with pytest.raises(InputError, match="marks"):
+        cost.with_tables("no marks", "new")
+
+
+def test_deviation_is_relative():
+    mean, most = deviation(np.array([2.2, 4.0]), np.array([2.0, 4.0]))
+    assert (mean, most) == (pytest.approx(0.05), pytest.approx(0.1))
