@@ -244,7 +244,9 @@ def lenses_of(
     if len(typed) > 2:
         bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
     found = (typed[0], typed[-1]) if typed else own
-    further = [distortion_from_text(text, "--view-distortion") for text in arguments.view_distortion]
+    further: list[Distortion | None] = [
+        distortion_from_text(text, "--view-distortion") for text in arguments.view_distortion
+    ]
     if not further:
         if arguments.view_k and any(lens is not None and is_distorted(lens.coefficients) for lens in found):
             cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."

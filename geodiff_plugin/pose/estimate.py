@@ -146,7 +146,7 @@ def _five_points(tracks: Tracks) -> np.ndarray:
     )
     T = np.eye(4)
     T[:3] = found.Rt
-    T[:3, 3] /= max(np.linalg.norm(T[:3, 3]), 1e-12)
+    T[:3, 3] /= max(float(np.linalg.norm(T[:3, 3])), 1e-12)
     return T
 
 

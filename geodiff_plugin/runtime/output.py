@@ -150,8 +150,8 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_own: Tensor) -> Metric
     )
     output.prediction = output.prediction * factor
     output.uncertainty = None if output.uncertainty is None else output.uncertainty * factor
-    output.global_scale = output.global_scale * factor
-    output.own_scale = output.own_scale * factor
+    for name in ("global_scale", "own_scale"):
+        setattr(output, name, getattr(output, name) * factor)
     output.history = [replace(step, g_s=step.g_s * factor) for step in output.history]
     output.poses = [
         pose.changed(E=tuple(map(moved, pose.E)), E_given=tuple(map(moved, pose.E_given)))
