@@ -79,7 +79,7 @@ def _loaded(name: str, dtype: torch.dtype, device: str) -> AutoencoderTiny:
     if not folder.is_dir() and (name.count("/") != 1 or name.startswith((".", "/", "~"))):
         bad_value("decoder", f"{FULL!r}, {TINY!r}, a folder that is there, or a hub id", repr(name))
     try:
-        tiny = AutoencoderTiny.from_pretrained(name, torch_dtype=dtype, use_safetensors=True)
+        tiny = AutoencoderTiny.from_pretrained(name, dtype=dtype, use_safetensors=True)
     except (OSError, ValueError, ConnectionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         cure = (

@@ -24,7 +24,7 @@ BY_EVIDENCE = (0.25, 0.3, 0.28, 1.47, 0.22, -15.0)
 #: camera sees has none, so not being in view can never raise it.
 SIGNS = (0, 1, 1, 1, 1, -1)
 # Support and error beyond these tell nothing more; where the slope of the support changes.
-_LEAST_SUPPORT, _MOST_SUPPORT, _LEAST_ERROR, _MOST_ERROR = 0.03, 0.999, 0.01, 0.1
+_LEAST_SUPPORT, _MOST_SUPPORT, _LEAST_ERROR, _MOST_ERROR = 0.3, 0.999, 0.01, 0.1
 _BEND = 3.0
 
 

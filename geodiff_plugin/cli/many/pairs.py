@@ -65,7 +65,8 @@ def find_pairs(arguments: DepthArguments) -> list[PairRef]:
     if is_video(left):
         return _of_videos(left, right)
     if right is not None:
-        bad_value("RIGHT", "left out with a list of pairs", right, "The list names both views of each.")
+        cure = f"{left.name} is a text, so it is read as a list, which names both views of each pair."
+        bad_value("RIGHT", "left out where LEFT is a list of pairs", right, cure)
     return _of_list(left)
 
 
@@ -84,7 +85,7 @@ def _photographs(folder: Path) -> list[Path]:
 def _of_folders(left: Path, right: Path | None) -> list[PairRef]:
     if right is None or not right.is_dir():
         got = "nothing" if right is None else right
-        bad_value("RIGHT", "a folder too, with the right view of each", got, "Or name a list of pairs.")
+        bad_value("RIGHT", "a folder where LEFT is one", got, "Or let LEFT be an image, or a list of pairs.")
     lefts, rights = _photographs(left), _photographs(right)
     for name, folder, found in (("LEFT", left, lefts), ("RIGHT", right, rights)):
         if not found:
