@@ -127,12 +127,12 @@ def test_changes_are_configurations_of_the_guidance(name):
 def test_flatness_tries_every_number_at_half_and_at_twice():
     names = flatness_methods()
     assert len(names) == 1 + 2 * len(NUMBERS) == len(set(names))
-    assert "guided:outlier_width=6" in names and "guided:correction_cauchy=4" in names
+    assert "guided:outlier_width=6" in names and "guided:correction_cauchy=5" in names
     records = [
-        make_record(name, "0", 0.2 if name.endswith("correction_cauchy=4") else 0.1, 1.0) for name in names
+        make_record(name, "0", 0.2 if name.endswith("correction_cauchy=5") else 0.1, 1.0) for name in names
     ]
     rows = {row[0]: row for row in flatness_table(records).rows}
-    assert rows["`correction_cauchy`"][1:] == ("2", "0.1000", "0.2000", f"0.100 ({label_of(records[0])})")
+    assert rows["`correction_cauchy`"][1:] == ("2.5", "0.1000", "0.2000", f"0.100 ({label_of(records[0])})")
     assert rows["`gate`"][-1] == "0.000"
 
 
@@ -140,7 +140,7 @@ def test_a_variant_changes_its_leaf_and_no_other():
     preset = find_method("guided").configuration(Settings())["guidance"]
     changed = find_method("guided:correction_cauchy=4").configuration(Settings())["guidance"]
     assert changed["correction"].pop("correction_cauchy") == 4.0
-    assert preset["correction"].pop("correction_cauchy") == 2.0
+    assert preset["correction"].pop("correction_cauchy") == 2.5
     assert changed == preset
 
 
