@@ -19,12 +19,12 @@ RIGHT_WITHIN = 0.1
 #: (``python -m geodiff_plugin.evaluation.calibrate`` refits them): constant, by log-odds of the support below
 #: 0, from 0 to 3 and above 3, by photometric agreement, by the relative spread of an ensemble (set by hand:
 #: members that differ by 10 % halve the odds twice).
-BY_EVIDENCE = (0.25, 0.3, 0.28, 1.47, 0.22, -15.0)
+BY_EVIDENCE = (0.915, 0.72, 0.0, 0.607, 0.443, -15.0)
 #: Which sign each of them may have; 0 for any. Agreement can only raise confidence, and a pixel that no right
 #: camera sees has none, so not being in view can never raise it.
 SIGNS = (0, 1, 1, 1, 1, -1)
 # Support and error beyond these tell nothing more; where the slope of the support changes.
-_LEAST_SUPPORT, _MOST_SUPPORT, _LEAST_ERROR, _MOST_ERROR = 0.3, 0.999, 0.01, 0.1
+_LEAST_SUPPORT, _MOST_SUPPORT, _LEAST_ERROR, _MOST_ERROR = 0.15, 0.999, 0.01, 0.1
 _BEND = 3.0
 
 

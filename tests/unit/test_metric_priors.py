@@ -175,7 +175,7 @@ def test_without_a_length_the_metres_are_those_of_a_metric_prior():
     baseline = float(np.linalg.norm(E[:3, 3]))
     assert metric.unit == "m" and metric.scale_from == "prior" and 0 < metric.scale_spread < 0.5
     assert metric.rescaled == pytest.approx(baseline, rel=0.25)  # the pose is an estimate of 240 rows
-    assert np.median(metric.prediction[0, ..., 0] / depth_m) == pytest.approx(1.0, rel=0.1)
+    assert np.median(metric.prediction[0, ..., 0] / depth_m) == pytest.approx(1.0, rel=0.2)
     assert np.linalg.norm(metric.poses[0].E[0][:3, 3]) == pytest.approx(metric.rescaled, rel=0.05)
     assert float(metric.own_scale) == pytest.approx(1.0, rel=1e-5)
     assert any("metres are the prior's own" in sentence for sentence in metric.warnings)
