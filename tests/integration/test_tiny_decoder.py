@@ -121,10 +121,16 @@ def test_what_cannot_be_is_said(make_pipeline, textured_plane, tmp_path, monkeyp
         guided(pipe, pair, tiny_folder(tmp_path / "deep", stages=4))
     with pytest.raises(ValueError, match="a folder that is there, or a hub id"):
         guided(pipe, pair, str(tmp_path / "nothing"))
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    with pytest.raises(ValueError, match=r"cached or can be reached; got 'nobody/no-such-decoder'"):
-        guided(pipe, pair, "nobody/no-such-decoder")
+
+    def unreachable(*args, **kwargs):
+        raise OSError("We couldn't connect to 'https://huggingface.co' to load the files")
+
+    with monkeypatch.context() as offline:
+        offline.setattr(AutoencoderTiny, "from_pretrained", unreachable)
+        with pytest.raises(
+            ValueError, match=r"can be reached; got 'nobody/no-such-decoder' \(We couldn't connect"
+        ):
+            guided(pipe, pair, "nobody/no-such-decoder")
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="a folder of an AutoencoderTiny"):
         guided(pipe, pair, str(tmp_path / "empty"))
