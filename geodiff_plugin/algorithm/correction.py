@@ -180,9 +180,11 @@ def refine_depth(
     trusted = asked.trusted * _robust(broad - asked.wanted, asked.noise, error, config)
     found, weight = torch.zeros_like(asked.wanted), trusted
     decided = torch.zeros_like(found)
-    for smoothness, inertia in _levels(error, config):
-        # Two right-hand sides in one solve: the correction, and ones, which show where it is decided.
-        data = torch.cat([asked.wanted - found, torch.ones_like(found)], 1)
+    levels = _levels(error, config)
+    for k, (smoothness, inertia) in enumerate(levels):
+        data = asked.wanted - found
+        if k == len(levels) - 1:  # a second right-hand side of ones shows where the correction is decided
+            data = torch.cat([data, torch.ones_like(data)], 1)
         system = asked.system(smoothness)
         part: Tensor | None = None
         for _ in range(config.reweightings):
