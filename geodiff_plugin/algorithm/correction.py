@@ -211,8 +211,8 @@ def _levels(error: Tensor, config: CorrectionConfig) -> list[tuple[Tensor, Tenso
     broad = own.clamp_min(config.broad_smoothness)
     inertia = (config.inertia * ratio**4).clamp_max(config.most_inertia)
     levels = []
-    for k in range(1, config.passes + 1):
-        share = (k - 1) / (config.passes - 1) if config.passes > 1 else 1.0
+    for k in range(config.passes):
+        share = k / (config.passes - 1) if config.passes > 1 else 1.0
         least = config.broad_inertia ** (1.0 - share) * config.least_inertia**share
         levels.append((broad ** (1.0 - share) * own**share, inertia.clamp_min(least)))
     return levels

@@ -32,13 +32,17 @@ __all__ = [
 LEAST = 0.3
 
 
-def _two_numbers(text: str) -> tuple[float, float]:
-    """Two numbers with a comma as typed; negative ones for what is none."""
+def _two_numbers(
+    text: str, option: str, names: str, most: tuple[float, float], cure: str
+) -> tuple[float, float]:
+    """Two numbers with a comma as typed, each from 0 to its ``most``; else an error with the cure."""
     found = re.fullmatch(r"\s*([\d.]+)\s*,\s*([\d.]+)\s*", text)
     try:
         one, other = (float(number) for number in found.groups()) if found else (-1.0, -1.0)
-    except ValueError:
-        return -1.0, -1.0
+    except ValueError:  # two points in a number
+        one, other = -1.0, -1.0
+    if not (0 <= one <= most[0] and 0 <= other <= most[1]):
+        bad_value(option, f"{names} with numbers in [0, {most[0]:g}] and [0, {most[1]:g}]", repr(text), cure)
     return one, other
 
 
@@ -48,11 +52,8 @@ def drift_of(text: str) -> tuple[float, float]:
     Raises:
         ValueError: not two numbers, an angle outside [0, 5], or pixels outside [0, 20].
     """
-    degrees, px = _two_numbers(text)
-    if not (0 <= degrees <= 5 and 0 <= px <= 20):
-        cure = "0.3,1.5 turns the right camera by 0.3 degrees and moves its image by 1.5 pixels."
-        bad_value("--drift", "DEGREES,PIXELS with numbers in [0, 5] and [0, 20]", repr(text), cure)
-    return degrees, px
+    cure = "0.3,1.5 turns the right camera by 0.3 degrees and moves its image by 1.5 pixels."
+    return _two_numbers(text, "--drift", "DEGREES,PIXELS", (5, 20), cure)
 
 
 def drifted_ref(ref: SampleRef, change: tuple[float, float]) -> SampleRef:
@@ -89,11 +90,8 @@ def perturbation(text: str) -> tuple[float, float]:
     Raises:
         ValueError: not two numbers, an angle outside [0, 30], or a share outside [0, 0.9].
     """
-    degrees, share = _two_numbers(text)
-    if not (0 <= degrees <= 30 and 0 <= share <= 0.9):
-        cure = "1.5,0.1 turns by up to 1.5 degrees and shifts by up to a tenth of the baseline."
-        bad_value("--perturb", "DEGREES,SHARE with numbers in [0, 30] and [0, 0.9]", repr(text), cure)
-    return degrees, share
+    cure = "1.5,0.1 turns by up to 1.5 degrees and shifts by up to a tenth of the baseline."
+    return _two_numbers(text, "--perturb", "DEGREES,SHARE", (30, 0.9), cure)
 
 
 def perturbed_ref(ref: SampleRef, change: tuple[float, float]) -> SampleRef:
