@@ -6,7 +6,7 @@ Paper: none; its output is the decoded latent, which the decoder's grid and its 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +18,7 @@ from geodiff_plugin.guidance.config import CorrectionConfig
 from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.scale.points import weighted_quantile
 
-__all__ = ["Refined", "prior_error", "refine_depth"]
+__all__ = ["Refined", "off_edges", "prior_error", "refine_depth"]
 
 #: Longer side in pixels of the grid that ``smoothness``, ``image_edge`` and ``depth_edge`` are numbers of; on
 #: another one they are scaled, so that a correction reaches the same share of the image.
@@ -86,6 +86,33 @@ def _links(guide: Tensor, log_depth: Tensor, axis: int, config: CorrectionConfig
     step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / config.image_edge
     jump = log_depth.diff(dim=axis).abs() / config.depth_edge
     return scale**2 * torch.exp(-scale * (step + jump)).clamp_min(config.least_link)
+
+
+@torch.no_grad()
+def off_edges(
+    target: MatchTarget, depth_m: Tensor, error: Tensor, config: CorrectionConfig = DEFAULT.correction
+) -> MatchTarget:
+    """Matches with less confidence near the depth edges of a map, as far as the map knows where they are.
+
+    A window of the matching that lies across an edge takes the nearer surface's depth for both.
+
+    Args:
+        target: matches, not known points: those are measured on their own ray.
+        depth_m: ``(B, 1, H, W)`` metres, at any resolution.
+        error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it; one above ``edge_error`` has its
+            edges elsewhere than the scene.
+        config: the fit's numbers.
+    """
+    size = tuple(target.confidence.shape[-2:])
+    log_depth = F.interpolate(depth_m.float().log(), size, mode="bilinear", align_corners=False)
+    reach = max(1, round(config.edge_reach * max(size)))
+    span = _highest(log_depth, reach) + _highest(-log_depth, reach)
+    width = config.edge_step * (error / config.edge_error).clamp_min(1.0) ** 3
+    return replace(target, confidence=target.confidence / (1.0 + (span / width) ** 2))
+
+
+def _highest(values: Tensor, reach: int) -> Tensor:
+    return F.max_pool2d(F.pad(values, (reach,) * 4, mode="replicate"), 2 * reach + 1, 1)
 
 
 def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: CorrectionConfig) -> Tensor:

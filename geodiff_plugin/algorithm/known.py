@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.correction import Refined, prior_error, refine_depth
+from geodiff_plugin.algorithm.correction import Refined, off_edges, prior_error, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.terms.base import MatchTarget
 from geodiff_plugin.geometry.cameras import image_size
@@ -121,6 +121,8 @@ class Known:
     def target(self, depth_m: Tensor) -> MatchTarget | None:
         """What an estimate is brought to: matches that it believes, and points; ``None`` without either."""
         matches = self.believed(depth_m)
+        if matches is not None and self.error is not None:
+            matches = off_edges(matches, depth_m, self.error, self.config.correction)
         return matches if self.points is None else with_points(matches, self.points)
 
     def bring(self, depth_m: Tensor, left_01: Tensor) -> Refined | None:

@@ -23,17 +23,22 @@ __all__ = ["StepContext", "corrected_rounds", "guided_step"]
 def corrected_rounds(config: GuidanceConfig, count: int) -> set[int]:
     """Which rounds of a schedule correct the estimate; a round without updates either decodes nothing.
 
+    Early estimates are vague, and what the network makes of an early correction is corrected again later. So
+    corrections are spread over the second half of the active rounds, the last of them among them, and reach
+    further back only where they are more than fit there.
+
     Args:
-        config: says which are active, and how many of them correct, evenly spread: the first, which finds the
-            scale, and the last, which is the result, among them.
+        config: says which rounds are active, and how many of them correct.
         count: rounds of the whole schedule.
     """
     updates = config.updates
     active = [i for i in range(count) if updates.start <= i / count < updates.stop]
     if not config.correction.correct or not updates.optimize_latents or not active:
         return set()
-    wanted, last = min(config.correction.corrections or count, len(active)), len(active) - 1
-    return {active[round(k * last / (wanted - 1))] for k in range(wanted)} if wanted > 1 else {active[-1]}
+    wanted = min(config.correction.corrections, len(active))
+    first = min(len(active) // 2, len(active) - wanted)
+    step = (len(active) - 1 - first) / max(wanted - 1, 1)
+    return {active[len(active) - 1 - round(k * step)] for k in range(wanted)}
 
 
 @dataclass(frozen=True)
@@ -107,11 +112,15 @@ def _plan(state: Trajectory, at: StepContext) -> list[tuple[int, bool]]:
     chosen = corrected_rounds(config, at.count) if corrects else set()
     active = [i for i in at.rounds if state.is_active(i / at.count)]
     rounds: list[tuple[int, bool]] = []
+    fresh = False  # corrected, and not moved since
     for i in active or at.rounds[:1]:
         updates = state.plan.inner_steps if active and (i + 1) / at.count > state.plan.updates_from else 0
-        corrected = i in chosen and (not rounds or rounds[-1][0] > 0)
-        if corrected or updates or not corrects or (not rounds and not state.has_scale):
+        corrected = i in chosen and not fresh
+        if corrected or updates or not corrects:
             rounds.append((updates, corrected))
+            fresh = (corrected or fresh) and updates == 0
+    if not rounds and at.rounds[-1] == at.count - 1 and not state.has_scale:
+        rounds.append((0, False))  # the output needs a scale, even if no step is guided
     return rounds
 
 

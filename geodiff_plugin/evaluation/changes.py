@@ -44,7 +44,8 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("photometric only", "photometric-only"),
         ("matches only", "matches-only"),
         ("no diffusion", "no-diffusion"),
-        ("without correction at every step", "guided:correct=false"),
+        ("without correction in the loop", "guided:correct=false"),
+        ("with a correction in every step", "guided:corrections=1000"),
         ("with gradient updates", "guided:inner_steps=5"),
         ("with gradient updates at every step", "guided:updates_from=0"),
         ("without refinement of the result", "guided:refine=false"),
@@ -63,9 +64,10 @@ has known points, so their term has none); ``parts`` is what the default has bey
 _NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
 
 NUMBERS = (
-    *("gate", "min_steps", "outlier_width", "broad_smoothness", "passes", "stiffness_power"),
+    *("gate", "min_steps", "corrections", "outlier_width", "broad_smoothness", "passes", "stiffness_power"),
     *("weights.photometric", "weights.matches", "weights.anchor", "loss_resolution"),
-    *("match_noise", "correction_cauchy", "smoothness", "inertia", "image_edge", "depth_edge"),
+    *("match_noise", "correction_cauchy", "smoothness", "stiffest", "inertia", "most_inertia"),
+    *("image_edge", "depth_edge", "edge_step"),
     *("reflection_region", "reflection_spreads", "reflection_floor", "basin_cauchy", "fit_cauchy"),
 )
 """The numbers that decide the default's result, by leaf."""

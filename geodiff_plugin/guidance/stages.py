@@ -132,22 +132,22 @@ class ReflectionsConfig(Checked):
 
 @dataclass(frozen=True)
 class CorrectionConfig(Checked):
-    """The edge-aware fit of a metric map to what is known, at every step and on the result."""
+    """The edge-aware fit of a metric map to what is known, in the loop and on the result."""
 
     correct: bool = flag(
         True,
-        "at every step the decoded map is brought to its matches and points and the change is encoded, "
+        "in `corrections` of the steps the decoded map is brought to its matches and points and the change is encoded, "
         'before the updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek and '
         "Nalpantidis 2024)",
     )
-    corrections: int | None = integer(
-        None,
+    corrections: int = integer(
+        2,
         1,
         10_000,
-        "steps (or rounds of a prior with fewer steps) that are corrected, evenly spread, the first and the "
-        "last among them; a step with neither correction nor updates is the prior's own, and is not decoded",
+        "steps (or rounds of a prior with fewer steps) that are corrected, at most: spread over the second "
+        "half of the schedule, the last among them, and further back if they are more; a step with neither "
+        "correction nor updates is the prior's own, and is not decoded",
         paper="-",
-        unset="all",
     )
     correction_scale: float = number(
         1.0,
@@ -184,9 +184,9 @@ class CorrectionConfig(Checked):
         4.0, 0, 10, "power of the prior's error that smoothness falls with", paper="-"
     )
     loosest: float = number(0.03, TINY, 1e6, "and never below this, however wrong the prior is", paper="-")
-    stiffest: float = number(2000.0, TINY, 1e6, "or above this", paper="-")
+    stiffest: float = number(50.0, TINY, 1e6, "or above this", paper="-")
     inertia: float = number(
-        0.05,
+        0.02,
         TINY,
         1e6,
         "weight of the correction itself, for a prior that is wrong by 5 %: what is far from every match "
@@ -194,9 +194,9 @@ class CorrectionConfig(Checked):
         paper="-",
     )
     least_inertia: float = number(5e-4, TINY, 1e6, "and is never below this,", paper="-")
-    most_inertia: float = number(3.0, TINY, 1e6, "or above this", paper="-")
+    most_inertia: float = number(0.01, TINY, 1e6, "or above this", paper="-")
     broad_smoothness: float = number(
-        100.0,
+        50.0,
         TINY,
         1e6,
         "smoothness of the first pass of a fit, if the prior's own is not above it: it brings whole regions, "
@@ -240,6 +240,18 @@ class CorrectionConfig(Checked):
         paper="-",
     )
     depth_edge: float = number(0.1, TINY, 1e6, "the same in log depth", paper="-")
+    edge_reach: float = number(
+        0.006, TINY, 1, "matches this near to an edge of the map count for less, in image sides", paper="-"
+    )
+    edge_step: float = number(0.3, TINY, 1e6, "step in log depth beside which they count for half", paper="-")
+    edge_error: float = number(
+        0.12,
+        TINY,
+        10,
+        "error of the prior above which that step grows, with its third power: such a prior does not know "
+        "where edges are",
+        paper="-",
+    )
     least_link: float = number(1e-3, 0, 1, "share of the smoothness that remains across any edge", paper="-")
     reweightings: int = integer(3, 1, 1000, "robustly reweighted solves", paper="-")
     solver_steps: int = integer(

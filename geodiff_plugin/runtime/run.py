@@ -272,25 +272,31 @@ class GuidedRun:
 
     def _on_done(self, timestep: Tensor, latents: Tensor) -> Tensor:
         if self.callback is not None:
-            trajectory = self.trajectories[-1]
-            affine, x = trajectory.affine, trajectory.last_x
-            if x is None or self.step_index == len(self.timesteps) - 1:
-                x = self.decode_result(latents[:, self.prior.latents])
-            values = {
-                "latents": latents,
-                "metric_depth": trajectory.metric(x, affine),
-                "loss": trajectory.history[-1].loss,
-                "scale": affine.scale,
-                "shift": affine.shift,
-            }
+            values = {"latents": latents} | self._seen_by_callback(latents)
             with self._suspended():
                 answer = self.callback(self.pipe, self.step_index, timestep, values) or {}
             if "latents" in answer:
-                latents, trajectory.result = answer["latents"], None
+                latents, self.trajectories[-1].result = answer["latents"], None
         self.step_index += 1
         if self._bar is not None:
-            loss = self.trajectories[-1].history[-1].loss
-            if not self._bar.disable and loss.device.type == "cpu":  # another device would be waited for
+            history = self.trajectories[-1].history
+            loss = history[-1].loss if history else None
+            # Another device would be waited for.
+            if loss is not None and not self._bar.disable and loss.device.type == "cpu":
                 self._bar.set_postfix(loss=f"{float(loss.mean()):.4f}", refresh=False)
             self._bar.update()
         return latents
+
+    def _seen_by_callback(self, latents: Tensor) -> dict[str, Tensor | None]:
+        trajectory = self.trajectories[-1]
+        if not trajectory.has_scale:  # the steps before the first correction are the prior's own
+            return dict.fromkeys(("metric_depth", "loss", "scale", "shift"))
+        affine, x = trajectory.affine, trajectory.last_x
+        if x is None or self.step_index == len(self.timesteps) - 1:
+            x = self.decode_result(latents[:, self.prior.latents])
+        return {
+            "metric_depth": trajectory.metric(x, affine),
+            "loss": trajectory.history[-1].loss,
+            "scale": affine.scale,
+            "shift": affine.shift,
+        }

@@ -21,16 +21,25 @@ def guided(pipe, pair, steps=5, **knobs):
     )
 
 
-def corrected(count, corrections=None, **knobs):
+def corrected(count, corrections=2, **knobs):
     return sorted(corrected_rounds(DEFAULT.changed(corrections=corrections, **knobs), count))
 
 
-def test_corrections_are_spread_over_what_is_active():
-    assert corrected(4) == corrected(4, 4) == corrected(4, 9) == [0, 1, 2, 3]
-    assert corrected(9, 3) == [0, 4, 8]
-    assert corrected(9, 2) == [0, 8]
+def test_corrections_are_spread_over_the_second_half_of_what_is_active():
+    assert corrected(4) == [2, 3]
+    assert corrected(1) == corrected(1, 4) == [0]
+    assert corrected(10) == [5, 9]
+    assert corrected(9, 3) == [4, 6, 8]
     assert corrected(9, 1) == [8]
-    assert corrected(8, 2, start=0.25, stop=0.75) == [2, 5]
+    assert corrected(8, 2, start=0.25, stop=0.75) == [4, 5]
+
+
+def test_more_corrections_than_fit_the_second_half_reach_further_back():
+    assert corrected(4, 3) == [1, 2, 3]
+    assert corrected(4, 4) == corrected(4, 9) == [0, 1, 2, 3]
+    assert corrected(5, 4) == [1, 2, 3, 4]
+
+
     assert corrected(4, correct=False) == corrected(4, optimize_latents=False) == []
     assert corrected(4, start=1.0) == []
 
@@ -43,8 +52,7 @@ def test_a_step_that_is_not_corrected_is_the_priors_own(
     counted = Counted(pipe.vae, monkeypatch)
     found = guided(pipe, textured_plane, corrections=corrections)
     looked = [report.step for report in found.history]
-    # The first step is looked at in any case, for the scale.
-    assert looked == {1: [0, 4], 2: [0, 4], 3: [0, 2, 4]}[corrections]
+    assert looked == {1: [4], 2: [2, 4], 3: [2, 3, 4]}[corrections]
     # A correction decodes once and encodes twice, the last one not at all; the stock call encodes the image.
     assert (counted.decoded, counted.encoded) == (len(looked), 1 + 2 * (corrections - 1))
 

@@ -17,9 +17,9 @@ def test_calls_of_every_way():
     image = {"encode": 1}
     assert calls["plain"] == image | {"network": 3, "decode": 1}
     # Every correction decodes once and encodes twice, but for the last one, whose map is the result.
-    assert calls["guided, 2 corrections"] == {"network": 3, "decode": 2, "encode": 3}
-    assert calls["guided"] == {"network": 3, "decode": 3, "encode": 5}
-    tiny = {"tiny decode": 2, "tiny encode": 4}
+    assert calls["guided"] == {"network": 3, "decode": 2, "encode": 3}
+    assert calls["guided, every step corrected"] == {"network": 3, "decode": 3, "encode": 5}
+    tiny = {"tiny decode": 1, "tiny encode": 2}
     assert calls["guided, tiny decoder"] == image | {"network": 3, "decode": 1} | tiny
     assert calls["Marigold-DC"] == image | {"network + back": 2, "decode + back": 2, "decode": 1}
 

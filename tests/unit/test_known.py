@@ -61,6 +61,16 @@ def test_what_was_kept_on_one_grid_holds_on_the_other():
     assert (fine.confidence[..., :14] == 1).all() and (fine.confidence[..., 18:] == 0).all()
 
 
+def test_points_count_in_full_beside_an_edge():
+    edge = depth(2.0)
+    edge[..., 8:] = 6.0
+    points = matches_at(2.2, COARSE, confidence=0.0)
+    points.confidence[0, 6, 8] = 1.0
+    known = Known.of([evidence(points)], DEFAULT, "loss").judged(depth(2.1), GREY)
+    beside, away = (known.target(m).confidence[0, 0] for m in (edge, depth(2.1)))
+    assert beside[6, 8] == away[6, 8] and beside[5, 8] < 0.3 * away[5, 8]
+
+
 def test_an_estimate_is_brought_to_matches_and_points():
     points = matches_at(2.2, COARSE, confidence=0.0)
     points.confidence[0, 6, 8] = 1.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.correction import prior_error, refine_depth
+from geodiff_plugin.algorithm.correction import off_edges, prior_error, refine_depth
 from geodiff_plugin.algorithm.terms import MatchTarget
 from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.scale.space import SPACES, AffineState, MetricMap, inverse_softplus
@@ -92,10 +92,10 @@ def test_the_error_of_a_prior_is_measured_where_it_was_not_fitted():
 
 def test_a_good_prior_keeps_its_surface_where_matches_are_noisy():
     generator = torch.Generator().manual_seed(0)
-    truth = torch.full((1, 1, *SIZE), 2.0)
+    truth, grey = torch.full((1, 1, 128, 256), 2.0), torch.full((1, 3, 128, 256), 0.5)
     noisy = truth * torch.exp(0.03 * torch.randn(truth.shape, generator=generator))
     target = _target(noisy, torch.ones_like(truth))
-    strong, weak = (refine_depth(truth, target, _grey(), error).depth_m for error in (STRONG, WEAK))
+    strong, weak = (refine_depth(truth, target, grey, error).depth_m for error in (STRONG, WEAK))
     assert (strong - truth).abs().mean() < 0.2 * (weak - truth).abs().mean()
 
 
@@ -106,6 +106,20 @@ def test_matches_that_a_good_prior_contradicts_over_a_region_lose():
     target = _target(matched, torch.ones_like(truth))
     strong = refine_depth(truth, target, _grey(), STRONG).depth_m
     assert (strong / 2.0 - 1.0).abs().max() < 0.02
+
+
+def test_beside_an_edge_of_a_good_map_a_match_counts_for_less():
+    depth = torch.full((1, 1, *SIZE), 2.0)
+    depth[..., 30:] = 4.0
+    target = _target(depth, torch.ones_like(depth))
+    doubted = off_edges(target, depth, STRONG).confidence
+    assert doubted[..., 29:31].max() < 0.2
+    assert doubted[..., :29].min() == doubted[..., 31:].min() == 1.0
+    # A map that is wrong by a third does not know where edges are.
+    assert off_edges(target, depth, WEAK).confidence.min() > 0.9
+    # Nor is a slope an edge.
+    slope = torch.linspace(2.0, 4.0, SIZE[1]).expand(1, 1, *SIZE)
+    assert off_edges(target, slope, STRONG).confidence.min() > 0.95
 
 
 def test_what_no_match_is_near_follows_its_region_in_the_broad_passes():

@@ -50,8 +50,8 @@ __all__ = ["WAYS", "Found", "Size", "calls_of_all", "count_calls", "count_operat
 #: with.
 WAYS: dict[str, dict[str, Any] | None] = {
     "plain": None,
-    "guided, 2 corrections": {"corrections": 2},
     "guided": {},
+    "guided, every step corrected": {"corrections": 10_000},
     "guided, tiny decoder": {"decoder": TINY},
     "Marigold-DC": {},
 }

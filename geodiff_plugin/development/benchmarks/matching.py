@@ -28,7 +28,7 @@ from geodiff_plugin.matching.mirrored import mirrored_pose_preferred
 from geodiff_plugin.matching.sweep import CostVolume, median_shift, sweep_planes
 from geodiff_plugin.types import CameraView
 
-__all__ = ["Pair", "data_pairs", "main", "measure", "textured_pair"]
+__all__ = ["Pair", "data_pairs", "disparities_of", "main", "measure", "sgbm_call", "textured_pair"]
 
 Pair = tuple[torch.Tensor, CameraView, torch.Tensor]
 """Left image ``(3, H, W)`` in [0, 1], right view and ``K_left``."""
@@ -129,7 +129,7 @@ def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str
     return {name: _least_seconds(work, device, repeats) for name, work in stages.items()}, volume
 
 
-def _disparities(volume: CostVolume, width: int) -> int:
+def disparities_of(volume: CostVolume, width: int) -> int:
     """As many whole pixels of the image as the planes span for the median pixel, a multiple of 16."""
     _, K_right, T = volume.rights[0]
     rays = plane_rays(volume.K[None], K_right[None], T[None], volume.size)
@@ -137,14 +137,20 @@ def _disparities(volume: CostVolume, width: int) -> int:
     return 16 * math.ceil(min(near, width / 2) / 16) if math.isfinite(near) else 128
 
 
-def _sgbm_seconds(pair: Pair, disparities: int, repeats: int) -> float | None:
-    """CPU seconds of OpenCV's ``StereoSGBM`` with eight paths on the same images; ``None`` without OpenCV."""
+def sgbm_call(pair: Pair, disparities: int) -> Callable[[], object] | None:
+    """OpenCV's ``StereoSGBM`` with eight paths on the same images, as many threads as torch has.
+
+    Args:
+        pair: its images may differ in size.
+        disparities: a multiple of 16, as ``disparities_of`` gives it.
+
+    Returns:
+        What does the work when it is called; ``None`` without OpenCV.
+    """
     try:
         cv2 = importlib.import_module("cv2")
     except ImportError:
         return None
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(torch.get_num_threads())
     size = pair[0].shape[-2:]
     # It needs images of one size; what they show does not change its time.
     images = [F.interpolate(image[None], size)[0].mul(255).byte() for image in (pair[0], pair[1][0])]
@@ -152,9 +158,15 @@ def _sgbm_seconds(pair: Pair, disparities: int, repeats: int) -> float | None:
     penalties = {"P1": 8 * 3 * 25, "P2": 32 * 3 * 25}
     checks = {"disp12MaxDiff": 1, "uniquenessRatio": 10, "speckleWindowSize": 100, "speckleRange": 2}
     matcher = cv2.StereoSGBM_create(0, disparities, 5, mode=cv2.STEREO_SGBM_MODE_HH, **penalties, **checks)
-    seconds = _least_seconds(lambda: matcher.compute(left, right), "cpu", repeats)
-    cv2.setNumThreads(threads)
-    return seconds
+
+    def compute() -> object:
+        threads = cv2.getNumThreads()
+        cv2.setNumThreads(torch.get_num_threads())
+        found = matcher.compute(left, right)
+        cv2.setNumThreads(threads)
+        return found
+
+    return compute
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -175,8 +187,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table, ratios = None, []
     for name, pair in pairs:
         seconds, volume = measure(pair, options.device, options.repeats)
-        disparities = options.disparities or _disparities(volume, pair[0].shape[-1])
-        sgbm = _sgbm_seconds(pair, disparities, options.repeats)
+        disparities = options.disparities or disparities_of(volume, pair[0].shape[-1])
+        peer = sgbm_call(pair, disparities)
+        sgbm = None if peer is None else _least_seconds(peer, "cpu", options.repeats)
         if table is None:
             title = f"seconds on {options.device}, threads: {options.threads}"
             table = Table("pair", "size", "planes", *seconds, "SGBM", "evidence / SGBM", title=title)

@@ -58,7 +58,7 @@ class TermByTerm:
     """One guided call taken apart; ``(h, w)`` is the grid of the losses, ``(H, W)`` the left image's.
 
     Attributes:
-        first_m: ``(H, W)`` metres, the prior's first estimate with the search's scale.
+        first_m: ``(H, W)`` metres, the prior's own map with the scale that the search finds.
         matches_m: ``(h, w)`` metres, depth that the views say by themselves; NaN where nothing.
         believed: ``(h, w)`` in [0, 1], confidence of the matches after rejection and gate; NaN without one.
         denoised_m: ``(H, W)`` metres, the decoded result, before it is refined.
@@ -85,11 +85,12 @@ class TermByTerm:
 def _followed(
     pipe: Any, left: Image.Image, guidance: GeometryGuidance, settings: Settings
 ) -> tuple[Any, list]:
-    """Output of a guided call, and the metric depth ``(1, 1, h', w')`` after each of its steps."""
+    """Output of a guided call, and the metric depth ``(1, 1, h', w')`` after each step that has one."""
     seen: list[Tensor] = []
 
-    def keep(_pipe: Any, _step: int, _timestep: Any, values: dict[str, Tensor]) -> None:
-        seen.append(values["metric_depth"].detach().float().cpu())
+    def keep(_pipe: Any, _step: int, _timestep: Any, values: dict[str, Tensor | None]) -> None:
+        if (depth_m := values["metric_depth"]) is not None:
+            seen.append(depth_m.detach().float().cpu())
 
     arguments = call_arguments(settings)
     return pipe(left, guidance=guidance, callback_on_step_end=keep, **arguments), seen
@@ -115,7 +116,7 @@ def _resized(values: Tensor, size: tuple[int, ...]) -> Tensor:
 def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -> TermByTerm:
     """Guide one pair by the default preset and keep what it went through.
 
-    The first estimate is that of a second call, the same but for ``start``: it searches, and updates nothing.
+    The prior's own map is that of a second call, the same but for ``start``: it searches, and corrects nothing.
 
     Raises:
         ValueError: an ensemble, whose members differ in every map but the last.
