@@ -34,7 +34,7 @@ from geodiff_plugin.runtime.warm_start import WarmStart
 
 __all__ = ["GuidedRun"]
 
-StepCallback = Callable[[Any, int, Any, dict[str, Tensor]], dict[str, Tensor] | None]
+StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Tensor] | None]
 
 
 class GuidedRun:
@@ -272,7 +272,7 @@ class GuidedRun:
 
     def _on_done(self, timestep: Tensor, latents: Tensor) -> Tensor:
         if self.callback is not None:
-            values = {"latents": latents} | self._seen_by_callback(latents)
+            values = {"latents": latents, **self._seen_by_callback(latents)}
             with self._suspended():
                 answer = self.callback(self.pipe, self.step_index, timestep, values) or {}
             if "latents" in answer:

@@ -39,7 +39,6 @@ def test_more_corrections_than_fit_the_second_half_reach_further_back():
     assert corrected(4, 4) == corrected(4, 9) == [0, 1, 2, 3]
     assert corrected(5, 4) == [1, 2, 3, 4]
 
-
     assert corrected(4, correct=False) == corrected(4, optimize_latents=False) == []
     assert corrected(4, start=1.0) == []
 

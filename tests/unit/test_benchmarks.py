@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.development.benchmarks import cost, full_size
+from geodiff_plugin.development.benchmarks import calls, cost, full_size
 from geodiff_plugin.development.benchmarks.matrix import deviation
 from geodiff_plugin.development.full_sizes import UNET, VAE
 from geodiff_plugin.development.random_marigold import narrowed
 
 
 def test_calls_of_every_way():
-    calls = full_size.calls_of_all(full_size.Size(steps=3, dc_steps=2))
+    made = full_size.calls_of_all(full_size.Size(steps=3, dc_steps=2))
     image = {"encode": 1}
-    assert calls["plain"] == image | {"network": 3, "decode": 1}
+    assert made["plain"] == image | {"network": 3, "decode": 1}
     # Every correction decodes once and encodes twice, but for the last one, whose map is the result.
-    assert calls["guided"] == {"network": 3, "decode": 2, "encode": 3}
-    assert calls["guided, every step corrected"] == {"network": 3, "decode": 3, "encode": 5}
+    assert made["guided"] == {"network": 3, "decode": 2, "encode": 3}
+    assert made["guided, every step corrected"] == {"network": 3, "decode": 3, "encode": 5}
     tiny = {"tiny decode": 1, "tiny encode": 2}
-    assert calls["guided, tiny decoder"] == image | {"network": 3, "decode": 1} | tiny
-    assert calls["Marigold-DC"] == image | {"network + back": 2, "decode + back": 2, "decode": 1}
+    assert made["guided, tiny decoder"] == image | {"network": 3, "decode": 1} | tiny
+    assert made["Marigold-DC"] == image | {"network + back": 2, "decode + back": 2, "decode": 1}
 
 
 def test_operations_grow_with_pixels_and_width():
@@ -57,3 +58,11 @@ def test_tables_stand_between_the_marks():
 def test_deviation_is_relative():
     mean, most = deviation(np.array([2.2, 4.0]), np.array([2.0, 4.0]))
     assert (mean, most) == (pytest.approx(0.05), pytest.approx(0.1))
+
+
+def test_a_row_of_calls_for_every_number_of_threads(capsys):
+    threads = torch.get_num_threads()
+    calls.main(["--size", "64", "96", "--repeats", "1", "--threads", "1", "2"])
+    assert torch.get_num_threads() == threads
+    rows = [line for line in capsys.readouterr().out.splitlines() if "64" in line]
+    assert len(rows) == 2 and all("96x64" in row for row in rows)

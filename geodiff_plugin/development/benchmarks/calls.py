@@ -84,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         pairs = data_pairs(options.data, options.device)
     title = f"CPU seconds (seconds of a clock) on {options.device}"
     table = Table("pair", "size", "threads", "plain", "guided", "SGBM", "guided / SGBM", title=title)
+    before = torch.get_num_threads()
     for name, pair in pairs:
         for threads in options.threads:
             torch.set_num_threads(threads)
@@ -97,6 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ]
             ratio = f"{seconds['guided'][0] / seconds['SGBM'][0]:.1f}" if "SGBM" in seconds else "-"
             table.add_row(name, f"{pair[0].shape[-1]}x{pair[0].shape[-2]}", f"{threads}", *shown, ratio)
+    torch.set_num_threads(before)
     Console(width=max(Console().width, 120)).print(table)
 
 

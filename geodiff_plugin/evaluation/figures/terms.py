@@ -116,7 +116,8 @@ def _resized(values: Tensor, size: tuple[int, ...]) -> Tensor:
 def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -> TermByTerm:
     """Guide one pair by the default preset and keep what it went through.
 
-    The prior's own map is that of a second call, the same but for ``start``: it searches, and corrects nothing.
+    The prior's own map is that of a second call, the same but for ``start``: it searches and corrects
+    nothing.
 
     Raises:
         ValueError: an ensemble, whose members differ in every map but the last.
