@@ -137,8 +137,8 @@ class CorrectionConfig(Checked):
     correct: bool = flag(
         True,
         "in `corrections` of the steps the decoded map is brought to its matches and points and the change "
-        'is encoded, before the updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek and '
-        "Nalpantidis 2024)",
+        'is encoded, before the updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek '
+        "and Nalpantidis 2024)",
     )
     corrections: int = integer(
         2,
