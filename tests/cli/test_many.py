@@ -321,7 +321,7 @@ def test_warm_start_goes_from_frame_to_frame(geodiff, folders):
     root, command = folders
     words = [word for word in command if word not in ("--preset", "paper")]
     words[words.index("--steps") + 1] = 4
-    assert geodiff(*words, "--warm-start", "-q").code == 0
+    assert geodiff(*words, "--warm-start", "--knob", "corrections=4", "-q").code == 0
     reports = [json.loads((root / "out" / name / "report.json").read_text()) for name in "abc"]
     assert [report["pair"]["began_from"] for report in reports] == [None, "a", "b"]
     assert [len(report["history"]) for report in reports] == [4, 3, 3]

@@ -293,7 +293,7 @@ SCHEDULERS = {
 def test_every_scheduler_is_guided_and_restored(make_pipeline, textured_plane, left, name, gradient):
     reference = stock(make_pipeline(SCHEDULERS[name]()), left, num_inference_steps=3)
     pipe = enable_geometry_guidance(make_pipeline(SCHEDULERS[name]()))
-    guidance = guidance_for(textured_plane, gradient=gradient)
+    guidance = guidance_for(textured_plane, gradient=gradient, corrections=3)
     out = pipe(left, guidance=guidance, num_inference_steps=3, generator=seeded())
     assert np.isfinite(out.prediction).all() and len(out.history) == 3
     assert_same(stock(pipe, left, num_inference_steps=3), reference)

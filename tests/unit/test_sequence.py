@@ -16,7 +16,7 @@ from geodiff_plugin.runtime.warm_start import plan_warm_start
 from geodiff_plugin.synthetic import render_sequence
 from geodiff_plugin.types import MetricDepthOutput
 
-FAST = {"inner_steps": 0, "loss_resolution": 64}
+FAST = {"inner_steps": 0, "loss_resolution": 64, "corrections": 4}
 
 
 @pytest.fixture(scope="module")

@@ -46,8 +46,6 @@ from geodiff_plugin.types import StepReport
 
 __all__ = ["TermByTerm", "draw_terms", "term_by_term"]
 
-#: A fraction of the schedule that no step reaches: nothing is updated, the scale is searched all the same.
-NEVER = 1.0
 #: The largest mean absolute difference of colours that has a colour of its own.
 WORST_DIFFERENCE = 0.2
 HIDDEN_COLOUR = COLOURS[5]
@@ -58,7 +56,7 @@ class TermByTerm:
     """One guided call taken apart; ``(h, w)`` is the grid of the losses, ``(H, W)`` the left image's.
 
     Attributes:
-        first_m: ``(H, W)`` metres, the prior's own map with the scale that the search finds.
+        first_m: ``(H, W)`` metres, the prior's own estimate in the first guided step, with the search's scale.
         matches_m: ``(h, w)`` metres, depth that the views say by themselves; NaN where nothing.
         believed: ``(h, w)`` in [0, 1], confidence of the matches after rejection and gate; NaN without one.
         denoised_m: ``(H, W)`` metres, the decoded result, before it is refined.
@@ -116,8 +114,8 @@ def _resized(values: Tensor, size: tuple[int, ...]) -> Tensor:
 def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -> TermByTerm:
     """Guide one pair by the default preset and keep what it went through.
 
-    The prior's own map is that of a second call, the same but for ``start``: it searches and corrects
-    nothing.
+    The estimate of the first guided step is that of a second call, which searches in every step and moves
+    nothing: the steps before are the prior's own in either.
 
     Raises:
         ValueError: an ensemble, whose members differ in every map but the last.
@@ -127,13 +125,17 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
     pipe, left = priors.get(settings), Image.fromarray(sample.left)
     views, size = posed_views(sample, settings.views), sample.left.shape[:2]
     guidance = GeometryGuidance(*views)
-    held, estimates = _followed(pipe, left, GeometryGuidance(*views, start=NEVER), settings)
+    unmoved = GeometryGuidance(*views, correct=False, inner_steps=0)
+    held, estimates = _followed(pipe, left, unmoved, settings)
     out, steps = _followed(pipe, left, guidance, settings)
     evidence = guidance.prepare(as_image_01(sample.left, "left")[None])
     trajectory = Trajectory(guidance.config, evidence, [0], prior_space(pipe))
-    start = held.history[0]
+    first = out.history[0].step
+    start = held.history[first]
     found = AffineState(*(value.cpu() for value in (start.s_hat, start.t_hat, start.g_s)))
-    trajectory.settle_scale(trajectory.metric.relative(estimates[0], found))
+    relative = trajectory.metric.relative(estimates[first], found)
+    trajectory.settle_scale(relative)
+    first_m = trajectory.metric(relative, trajectory.affine)
     known, believed = trajectory.known.matches, trajectory.matches
     there = (known.confidence > 0) & (known.inverse_depth > 0)
     final_m = torch.from_numpy(out.prediction).permute(0, 3, 1, 2).float()
@@ -143,7 +145,7 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
         return torch.where(there, values, torch.full_like(values, torch.nan))[0, 0].numpy()
 
     return TermByTerm(
-        first_m=_resized(estimates[0], size)[0, 0].numpy(),
+        first_m=_resized(first_m, size)[0, 0].numpy(),
         matches_m=where_matched(1.0 / known.inverse_depth),
         believed=where_matched(believed.confidence),
         denoised_m=_resized(steps[-1], size)[0, 0].numpy(),
