@@ -184,7 +184,7 @@ class CorrectionConfig(Checked):
         4.0, 0, 10, "power of the prior's error that smoothness falls with", paper="-"
     )
     loosest: float = number(0.03, TINY, 1e6, "and never below this, however wrong the prior is", paper="-")
-    stiffest: float = number(50.0, TINY, 1e6, "or above this", paper="-")
+    stiffest: float = number(100.0, TINY, 1e6, "or above this", paper="-")
     inertia: float = number(
         0.02,
         TINY,
@@ -194,7 +194,7 @@ class CorrectionConfig(Checked):
         paper="-",
     )
     least_inertia: float = number(5e-4, TINY, 1e6, "and is never below this,", paper="-")
-    most_inertia: float = number(0.01, TINY, 1e6, "or above this", paper="-")
+    most_inertia: float = number(0.03, TINY, 1e6, "or above this", paper="-")
     broad_smoothness: float = number(
         50.0,
         TINY,
