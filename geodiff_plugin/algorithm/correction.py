@@ -25,8 +25,8 @@ __all__ = ["Refined", "off_edges", "prior_error", "refine_depth"]
 REFERENCE_SIDE = 512.0
 #: Error of the prior at which ``smoothness`` and ``inertia`` are as the configuration says.
 REFERENCE_ERROR = 0.05
-#: Share of the residuals by which the prior is measured, and the normal distribution's quantile of their size
-#: there: the median would not see that a fifth of the scene is on a wrong surface.
+#: Share of the right matches' residuals by which the prior is measured, and the normal distribution's
+#: quantile of their size there: the median would not see that a fifth of the scene is on a wrong surface.
 SHARE, DEVIATIONS = 0.8, 1.2816
 
 
@@ -54,12 +54,14 @@ class _Asked:
         wanted: log factor on inverse depth.
         noise: standard deviation of it, from the match alone.
         trusted: confidence over the relative variance of a match, 0 without one.
+        right: ``(B, 1)`` share of what is trusted that is expected to be right, by its confidence.
         links: across and down, of a smoothness of 1.
     """
 
     wanted: Tensor
     noise: Tensor
     trusted: Tensor
+    right: Tensor
     links: tuple[Tensor, Tensor]
 
     def system(self, smoothness: Tensor) -> FieldSystem:
@@ -76,8 +78,10 @@ def _asked(depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: Correc
     noise = ((step / known) ** 2 + config.match_noise**2).sqrt()
     trusted = target.confidence * (config.match_noise / noise) ** 2
     wanted = torch.where(trusted > 0, known.log() + log_depth, torch.zeros_like(known))
+    right = (trusted * target.confidence.clamp_max(1.0)).flatten(1).sum(1, keepdim=True)
+    right = right / trusted.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
     across, down = (_links(guide, log_depth, axis, config) for axis in (-1, -2))
-    return _Asked(wanted, noise, trusted, (across, down))
+    return _Asked(wanted, noise, trusted, right, (across, down))
 
 
 def _links(guide: Tensor, log_depth: Tensor, axis: int, config: CorrectionConfig) -> Tensor:
@@ -134,9 +138,12 @@ def _stiff(asked: _Asked, trusted: Tensor, error: Tensor, config: CorrectionConf
 
 
 def _spread(residual: Tensor, asked: _Asked) -> Tensor:
-    """``(B, 1, 1, 1)`` robust standard deviation of residuals beyond the noise of their matches."""
+    """``(B, 1, 1, 1)`` robust standard deviation of residuals beyond the noise of their matches.
+
+    Matches that are expected to be wrong are taken for those with the largest residuals, and left out.
+    """
     weight = asked.trusted.flatten(1)
-    found = weighted_quantile(residual.abs().flatten(1), weight, SHARE) / DEVIATIONS
+    found = weighted_quantile(residual.abs().flatten(1), weight, SHARE * asked.right) / DEVIATIONS
     noise = weighted_quantile(asked.noise.flatten(1), weight, 0.5)
     beyond = (found**2 - noise**2 / 4.0).clamp_min(0.0).sqrt() * (weight.sum(1) > 0)
     return beyond.view(-1, 1, 1, 1)

@@ -173,7 +173,7 @@ class CorrectionConfig(Checked):
         paper="-",
     )
     smoothness: float = number(
-        50.0,
+        40.0,
         TINY,
         1e6,
         "weight of the correction's slope against a sure match, on a grid 512 pixels long, for a prior that "
@@ -186,7 +186,7 @@ class CorrectionConfig(Checked):
     loosest: float = number(0.03, TINY, 1e6, "and never below this, however wrong the prior is", paper="-")
     stiffest: float = number(100.0, TINY, 1e6, "or above this", paper="-")
     inertia: float = number(
-        0.02,
+        0.015,
         TINY,
         1e6,
         "weight of the correction itself, for a prior that is wrong by 5 %: what is far from every match "
@@ -245,7 +245,7 @@ class CorrectionConfig(Checked):
     )
     edge_step: float = number(0.3, TINY, 1e6, "step in log depth beside which they count for half", paper="-")
     edge_error: float = number(
-        0.12,
+        0.11,
         TINY,
         10,
         "error of the prior above which that step grows, with its third power: such a prior does not know "

@@ -183,8 +183,11 @@ def _refine_once(
     return torch.minimum(torch.maximum(fitted, bounds[0]), bounds[1])
 
 
-def weighted_quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
-    """``(B,)`` of rows ``(B, P)`` with weights >= 0 of the same shape; ``share`` .5 is the median."""
+def weighted_quantile(values: Tensor, weight: Tensor, share: float | Tensor) -> Tensor:
+    """``(B,)`` of rows ``(B, P)`` with weights >= 0 of the same shape; ``share`` .5 is the median.
+
+    ``share`` may be ``(B, 1)``, one of each row.
+    """
     values, order = values.sort(dim=1)
     below = weight.gather(1, order).cumsum(1)
     at = torch.searchsorted(below, share * below[:, -1:]).clamp_max(values.shape[1] - 1)

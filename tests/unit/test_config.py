@@ -138,7 +138,7 @@ def test_what_is_no_knob_is_told_with_those_that_are(typed):
 
 
 def test_a_value_by_name():
-    assert value_of("smoothness", DEFAULT) == 50.0 and value_of("weights.matches", DEFAULT) == 1.0
+    assert value_of("smoothness", DEFAULT) == 40.0 and value_of("weights.matches", DEFAULT) == 1.0
     assert value_of("inner_steps", DEFAULT) == 0
     with pytest.raises(InputError, match="smoothnes"):
         value_of("smoothnes", DEFAULT)

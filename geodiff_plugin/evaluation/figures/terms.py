@@ -56,7 +56,7 @@ class TermByTerm:
     """One guided call taken apart; ``(h, w)`` is the grid of the losses, ``(H, W)`` the left image's.
 
     Attributes:
-        first_m: ``(H, W)`` metres, the prior's own estimate in the first guided step, with the search's scale.
+        first_m: ``(H, W)`` metres, the prior's own estimate in the first guided step, scaled by the search.
         matches_m: ``(h, w)`` metres, depth that the views say by themselves; NaN where nothing.
         believed: ``(h, w)`` in [0, 1], confidence of the matches after rejection and gate; NaN without one.
         denoised_m: ``(H, W)`` metres, the decoded result, before it is refined.
