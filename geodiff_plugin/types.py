@@ -155,10 +155,12 @@ class MetricDepthOutput(BaseOutput):
         photometric_error: [0, 1] mean absolute difference to the left image re-rendered from the right view
             that explains the pixel best, 0 where not visible; ``None`` without a right view.
         confidence: [0, 1] probability that the depth is within 10 % of the truth, shaped as ``prediction``:
-            from matches near on the same surface, photometric error and, where it is given, uncertainty;
-            ``None`` without ``refine``, or without matches and points.
+            from matches near on the same surface, photometric error, the prior's own error and, where it is
+            given, uncertainty; ``None`` without ``refine``, or without matches and points.
         support: [0, 1] how far matches and points, own or near on the same surface, decided the depth, shaped
             as ``prediction``; ``None`` where ``confidence`` is.
+        prior_error: ``(N,)`` how far the prior alone is wrong, standard deviation in log depth, as left-out
+            matches or points tell; ``None`` where none were compared.
         K: ``(N, 3, 3)`` intrinsics of the output grid, pixels.
         history: one ``StepReport`` a step and batch chunk.
         poses: one ``PoseReport`` an image with right views: the poses as given and as used.
@@ -189,6 +191,7 @@ class MetricDepthOutput(BaseOutput):
     photometric_error: np.ndarray | torch.Tensor | None = None
     confidence: np.ndarray | torch.Tensor | None = None
     support: np.ndarray | torch.Tensor | None = None
+    prior_error: torch.Tensor | None = None
     K: np.ndarray | torch.Tensor | None = None
     history: list[StepReport] = field(default_factory=list)
     poses: list[PoseReport] = field(default_factory=list)

@@ -135,6 +135,7 @@ def build_report(
         "shift": output.shift,
         "global_scale": output.global_scale,
         "own_scale": output.own_scale,
+        "prior_error": output.prior_error,
         "history": _history(output),
         "warnings": warnings,
         "unit": output.unit,

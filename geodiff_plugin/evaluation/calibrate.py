@@ -27,12 +27,13 @@ from geodiff_plugin.evaluation.baselines._sweep import sweep
 from geodiff_plugin.evaluation.baselines.base import PriorCache, Settings
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.evaluation.emulated import DENSE, STRENGTHS, EmulatedPrior, EmulatedPriors
 from geodiff_plugin.evaluation.logistic import deciles, fit_log_odds, promised
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import consistency
 from geodiff_plugin.runtime import confidence
 
-__all__ = ["Observed", "calibrate", "observe_depth", "observe_matches"]
+__all__ = ["Observed", "calibrate", "observe_depth", "observe_emulated", "observe_matches"]
 
 #: Pixels of a pair that are looked at; more say nothing new.
 PIXELS = 5000
@@ -71,10 +72,29 @@ def observe_depth(sample: StereoSample, settings: Settings, priors: PriorCache) 
         **call_arguments(settings),
     )
     spread = None if out.uncertainty is None else out.uncertainty / out.prediction
-    evidence = confidence.depth_evidence(out.support, out.photometric_error, out.visible, spread)[0]
+    known = None if out.prior_error is None else out.prior_error.view(-1, 1, 1, 1).to(out.support)
+    maps = out.support, out.photometric_error, out.visible
+    evidence = confidence.depth_evidence(*maps, spread, known)[0]
     depth_m = out.prediction[0, 0].cpu().numpy()
     right = np.abs(depth_m / np.where(sample.valid, sample.depth_m, 1.0) - 1.0) < confidence.RIGHT_WITHIN
     return _drawn(evidence.cpu().numpy(), right, sample.valid, settings.seed)
+
+
+def observe_emulated(sample: StereoSample, strengths: Sequence[str]) -> list[Observed]:
+    """As ``observe_depth``, under emulated priors of several strengths; empty for truth that is sparse.
+
+    Args:
+        sample: with truth.
+        strengths: keys of ``emulated.STRENGTHS``.
+    """
+    if sample.valid.mean() < DENSE:
+        return []
+    prior, settings = EmulatedPrior(), Settings(steps=4, resolution=384)
+    priors, found = EmulatedPriors(prior), []
+    for name in strengths:
+        prior.answer(sample, STRENGTHS[name], settings.resolution, settings.seed)
+        found.append(observe_depth(sample, settings, priors))
+    return found
 
 
 def observe_matches(sample: StereoSample, settings: Settings, priors: PriorCache) -> Observed:
@@ -100,6 +120,10 @@ def _stack(pairs: Sequence[Observed]) -> tuple[np.ndarray, np.ndarray, np.ndarra
     weights = [np.full(len(pair.right), 1.0 / len(pair.right)) for pair in pairs]
     evidence, right = ([getattr(pair, name) for pair in pairs] for name in ("evidence", "right"))
     return np.concatenate(evidence), np.concatenate(right), np.concatenate(weights)
+
+
+def _joined(parts: Sequence[Observed]) -> Observed:
+    return Observed(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("evidence", "right")))
 
 
 def calibrate(
@@ -163,6 +187,7 @@ def main(
     ensemble: Annotated[int, typer.Option(help="Members; 2 and more also fit the effect of spread.")] = 1,
     resolution: Annotated[int | None, typer.Option(help="Longer side for the prior, pixels.")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:N or mps.")] = "cpu",
+    strengths: Annotated[str, typer.Option(help="Emulated priors besides: 5%,20%; see eval strength.")] = "",
     what: Annotated[str, typer.Option(help="depth, matches or both.")] = "both",
 ) -> None:
     """Print coefficients of confidence, fitted on pairs with truth, and how they do on the other half."""
@@ -186,8 +211,13 @@ def main(
         if what not in (kind, "both"):
             continue
         each = settings if kind == "depth" else settings[:1]
-        jobs = [(ref, own) for own in each for ref in refs]
-        pairs = [observe(load(ref), own, priors) for ref, own in tqdm(jobs, desc=kind)]
+        pairs = []
+        for ref in tqdm(refs, desc=kind):  # what one pair shows under several priors stays in one half
+            sample = load(ref)
+            own = [observe(sample, one, priors) for one in each]
+            if kind == "depth" and strengths:
+                own += observe_emulated(sample, strengths.split(","))
+            pairs.append(_joined(own))
         _print(console, f"{kind}, on the half not fitted on", where, name, pairs, signs, shipped)
 
 

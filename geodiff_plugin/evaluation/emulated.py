@@ -25,13 +25,17 @@ from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.algorithm.denoising import output_from
 from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.evaluation.alignment import to_space
+from geodiff_plugin.evaluation.baselines.base import PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.noise_levels import noise_level
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
-__all__ = ["SPACES", "STRENGTHS", "EmulatedPrior", "Strength", "relative_map"]
+__all__ = ["DENSE", "SPACES", "STRENGTHS", "EmulatedPrior", "EmulatedPriors", "Strength", "relative_map"]
 
 SPACES = ("disparity", "depth", "log")
+#: Share of pixels with truth from which a sample is dense: a prior is made of its truth.
+DENSE = 0.5
 #: What a prior calls 0 and 1: the quantiles of Marigold's training; the rest of the map lies beyond them.
 ENDS = (0.02, 0.98)
 #: Standard deviation of the smooth half of the error, and spacing of the segments of the other half, as
@@ -185,3 +189,15 @@ class EmulatedPrior:
         small = F.pad(small, (0, padding[1], 0, padding[0]), mode="replicate")
         self.pipe.unet.code = find_adapter(self.pipe)(self.pipe).encode(small).float()
         return relative
+
+
+class EmulatedPriors(PriorCache):
+    """Hands an emulated prior, guided, to every method that asks for one."""
+
+    def __init__(self, prior: EmulatedPrior) -> None:
+        super().__init__()
+        self._pipe = enable_geometry_guidance(prior.pipe)
+
+    def get(self, settings: Settings) -> Any:
+        """The emulated pipeline, whatever prior the settings name."""
+        return self._pipe

@@ -23,14 +23,13 @@ from geodiff_plugin.evaluation.baselines import PriorCache, Settings, find_metho
 from geodiff_plugin.evaluation.cells import count_of_pairs
 from geodiff_plugin.evaluation.datasets import SampleRef, find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.evaluation.emulated import SPACES, STRENGTHS, EmulatedPrior
+from geodiff_plugin.evaluation.emulated import DENSE, SPACES, STRENGTHS, EmulatedPrior, EmulatedPriors
 from geodiff_plugin.evaluation.figures.strength import draw_strength, shaded
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.records import append_record, read_records
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
 from geodiff_plugin.evaluation.surfaces import DenseTruth
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 __all__ = ["METHODS", "StrengthOptions", "run_strength", "strength_tables"]
 
@@ -39,8 +38,6 @@ ORACLE = "prior-aligned"
 METHODS = (ORACLE, "prior-fit", "guided", "search-only", "guided:inner_steps=5")
 #: Strength whose surfaces the figure shows.
 SHOWN = "5%"
-#: Share of pixels with truth from which a sample is dense: a prior is made of its truth.
-DENSE = 0.5
 _VALUES = {"abs_rel": "AbsRel", "delta1": "δ1", "edges": "at edges", "surfaces": "surfaces"}
 
 
@@ -90,18 +87,6 @@ class StrengthOptions:
                 bad_value("methods", "methods that use a prior", repr(name))
 
 
-class _Emulated(PriorCache):
-    """Hands the emulated pipeline to every method that asks for a prior."""
-
-    def __init__(self, prior: EmulatedPrior) -> None:
-        super().__init__()
-        self._pipe = enable_geometry_guidance(prior.pipe)
-
-    def get(self, settings: Settings) -> Any:
-        """The emulated pipeline, whatever prior the settings name."""
-        return self._pipe
-
-
 def run_strength(options: StrengthOptions) -> Page:
     """Measure every method at every strength, and write the page.
 
@@ -114,7 +99,7 @@ def run_strength(options: StrengthOptions) -> Page:
     path = options.out / "strength.jsonl"
     found = {record["key"]: record for record in read_records(path)}
     prior = EmulatedPrior(options.space, options.follow)
-    cache, records = _Emulated(prior), []
+    cache, records = EmulatedPriors(prior), []
     for ref in tqdm(refs, disable=options.quiet, desc="pairs"):
         keys = {(s, m): _key(ref, s, m, options) for s in options.strengths for m in options.methods}
         if not all(key in found for key in keys.values()):

@@ -70,12 +70,15 @@ def assemble_output(
     ]
     visible = torch.cat([where for where, _ in seen]) if seen else None
     error = torch.cat([difference for _, difference in seen]) if seen else None
+    errors = [run.known(i).error for i in range(count)]
+    measured = [error for error in errors if error is not None]
+    prior_error = torch.cat(measured) if len(measured) == count else None  # (N, 1, 1, 1)
     confidence = None
     if support is not None:
         spread = None if uncertainty is None else uncertainty / depth_m
         nowhere = torch.zeros_like(depth_m)
         shown = nowhere if error is None else error, nowhere.bool() if visible is None else visible
-        confidence = depth_confidence(support, *shown, spread)
+        confidence = depth_confidence(support, *shown, spread, prior_error)
     judgements = [_judged(run, i, lefts_01[i], known[i][1], confidence) for i in range(count)]
     if confidence is not None:
         agreed = confidence.new_tensor([agreement_of_points(each.signs) for each in judgements])
@@ -106,6 +109,7 @@ def assemble_output(
         photometric_error=out(error),
         confidence=out(confidence),
         support=out(support),
+        prior_error=None if prior_error is None else prior_error.flatten().cpu(),
         K=K if call["output_type"] == "pt" else K.cpu().numpy(),
         history=[report for t in run.trajectories for report in t.history],
         poses=[own.pose for own in run.evidence if own.pose is not None],

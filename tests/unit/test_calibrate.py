@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from geodiff_plugin.evaluation.calibrate import Observed, calibrate, main
+from geodiff_plugin.evaluation.calibrate import Observed, calibrate, main, observe_emulated
+from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.logistic import deciles, fit_log_odds, promised
+from geodiff_plugin.runtime.confidence import SIGNS
 
 TRUE = (-0.5, 1.2, -0.7)
 
@@ -68,6 +73,16 @@ def test_the_command_prints_constants_that_can_be_pasted(capsys):
     for line in printed.splitlines():
         if line.startswith(("LOG_ODDS", "BY_EVIDENCE")):
             exec(line, names)  # as pasted
-    assert len(names["LOG_ODDS"]) == 4 and len(names["BY_EVIDENCE"]) == 6
+    assert len(names["LOG_ODDS"]) == 4 and len(names["BY_EVIDENCE"]) == 7
     assert names["BY_EVIDENCE"][-1] == -15.0  # one member has no spread: the shipped number stays
     assert "largest gap between promised and kept" in printed
+
+
+def test_emulated_priors_of_a_pair_are_observed_one_by_one():
+    sample = load(find_pairs(Path("synthetic:1@64x96"))[0])
+    strong, weak = observe_emulated(sample, ("2%", "20%"))
+    column = SIGNS.index(-1) - 1  # the prior's strength stands before the spread
+    assert strong.evidence[:, column].mean() > weak.evidence[:, column].mean()
+    assert strong.right.mean() > weak.right.mean()
+    sparse = replace(sample, valid=np.zeros_like(sample.valid))
+    assert observe_emulated(sparse, ("2%",)) == []
