@@ -1,6 +1,6 @@
 """``python -m geodiff_plugin`` is the ``geodiff`` command (for ``accelerate launch`` and ``torchrun``).
 
-Hop: argv -> ``geodiff_plugin.cli.app.main``.
+Data flow: argv -> ``geodiff_plugin.cli.app.main``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """The one voice of every user-facing error: name, expected, got, likely cure.
 
-Hop: an argument as the user gave it -> the same argument, or ``InputError`` (a ``ValueError``).
+Data flow: an argument as the user gave it -> the same argument, or ``InputError`` (a ``ValueError``).
 Paper: none.
 """
 

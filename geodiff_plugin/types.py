@@ -1,6 +1,7 @@
 """Records that travel between the layers: cameras of a pair, a view, what a step did, the output.
 
-Hop: files and user input -> ``Rig``, ``CameraView`` -> guidance -> ``StepReport``, ``MetricDepthOutput``.
+Data flow: files and user input -> ``Rig``, ``CameraView`` -> guidance
+    -> ``StepReport``, ``MetricDepthOutput``.
 Paper: S3.3 (two views with known cameras).
 """
 

@@ -1,6 +1,6 @@
 """The ways in which a visitor can say where the cameras are.
 
-Hop: fields of the page -> ``GeometryGuidance``.
+Data flow: fields of the page -> ``GeometryGuidance``.
 Paper: S3.3 (two views with known cameras).
 """
 

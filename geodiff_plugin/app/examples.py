@@ -1,6 +1,6 @@
 """Pairs to try the page with, rendered here: ``python -m geodiff_plugin.app.examples`` renews them.
 
-Hop: seeds -> ``app/pairs/<name>/`` with two images and a calibration.
+Data flow: seeds -> ``app/pairs/<name>/`` with two images and a calibration.
 Paper: none; they stand in for the photographs of S5, which may not be shipped.
 """
 

@@ -1,6 +1,6 @@
 """The files that a visitor takes home.
 
-Hop: ``Result`` -> a folder with depth, cloud and report.
+Data flow: ``Result`` -> a folder with depth, cloud and report.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """The fields that a visitor fills in.
 
-Hop: gradio components -> ``Request``.
+Data flow: gradio components -> ``Request``.
 Paper: none.
 """
 

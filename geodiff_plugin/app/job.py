@@ -1,6 +1,6 @@
 """One job of the page: what a visitor asked for, run through the public API, to everything that is shown.
 
-Hop: ``Request`` -> images, ``GeometryGuidance``, prior -> ``Result``.
+Data flow: ``Request`` -> images, ``GeometryGuidance``, prior -> ``Result``.
 Paper: Algorithm 1, run by the pipeline.
 """
 

@@ -1,6 +1,6 @@
 """``geodiff app``: serves the page, and nothing of it calls anybody.
 
-Hop: options -> a server on this machine.
+Data flow: options -> a server on this machine.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Words and style of the page.
 
-Hop: -> HTML and CSS; no script, no font and no picture comes from elsewhere.
+Data flow: -> HTML and CSS; no script, no font and no picture comes from elsewhere.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """A ruler on a depth map: the point of a pixel, the distance of two, and how sure each is.
 
-Hop: a pixel -> ``Reading`` (point in metres, spread, confidence) -> distance of two.
+Data flow: a pixel -> ``Reading`` (point in metres, spread, confidence) -> distance of two.
 Paper: Eq. 9 (unprojection).
 """
 

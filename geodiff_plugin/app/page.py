@@ -1,6 +1,6 @@
 """The page itself: what happens on a click, for one visitor at a time.
 
-Hop: a visitor's clicks -> ``Request`` -> ``run_job`` -> panels.
+Data flow: a visitor's clicks -> ``Request`` -> ``run_job`` -> panels.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """The components of the page's right side, tab by tab.
 
-Hop: -> ``Panels``, which ``results`` fills.
+Data flow: -> ``Panels``, which ``results`` fills.
 Paper: none.
 """
 

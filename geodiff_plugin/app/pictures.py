@@ -1,6 +1,6 @@
 """What the page shows of a result: coloured maps with their legends, and marks on a photograph.
 
-Hop: maps, readings -> RGB arrays of the left photograph's size, legends as HTML.
+Data flow: maps, readings -> RGB arrays of the left photograph's size, legends as HTML.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """The priors that a page offers, loaded once for all its visitors.
 
-Hop: name -> live pipeline with guidance enabled.
+Data flow: name -> live pipeline with guidance enabled.
 Paper: none.
 """
 

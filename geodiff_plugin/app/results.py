@@ -1,6 +1,6 @@
 """What the page shows of a result, panel by panel.
 
-Hop: ``Result`` -> values of gradio components.
+Data flow: ``Result`` -> values of gradio components.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """The stereo pair of ``geodiff demo``: rendered by this package, with exact depth.
 
-Hop: ``bundled/pair/`` -> images, ``Rig``, depth.
+Data flow: ``bundled/pair/`` -> images, ``Rig``, depth.
 Paper: none; it stands in for the photographs of S5, which may not be shipped.
 """
 

@@ -1,6 +1,6 @@
 """Reading the folder of the bundled prior, or of one trained like it, without progress bars.
 
-Hop: folder on disk -> ``MarigoldDepthPipeline``.
+Data flow: folder on disk -> ``MarigoldDepthPipeline``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """The ``geodiff`` command: its subcommands, with their options and help where these are few.
 
-Hop: argv -> a function of ``geodiff_plugin.cli`` -> exit code 0, 2 (bad input) or 130 (Ctrl-C).
+Data flow: argv -> a function of ``geodiff_plugin.cli`` -> exit code 0, 2 (bad input) or 130 (Ctrl-C).
 Paper: none.
 
 Torch and diffusers are imported inside the commands, so that ``--help`` and ``--version`` answer at once.

@@ -1,6 +1,6 @@
 """What ``geodiff depth`` was asked to do.
 
-Hop: options as typed -> ``DepthArguments``, which ``cli.checks`` looks at before torch is imported.
+Data flow: options as typed -> ``DepthArguments``, which ``cli.checks`` looks at before torch is imported.
 Paper: none.
 """
 

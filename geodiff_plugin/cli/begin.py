@@ -1,6 +1,6 @@
 """What a run of ``geodiff depth`` does before torch is imported: every file looked at, its folder taken.
 
-Hop: ``DepthArguments`` -> checked, ``OutFolder`` held -> the work.
+Data flow: ``DepthArguments`` -> checked, ``OutFolder`` held -> the work.
 Paper: none.
 """
 

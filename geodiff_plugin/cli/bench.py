@@ -1,6 +1,6 @@
 """``geodiff bench``: time and memory of a guided call against a plain one.
 
-Hop: a prior and the demo pair -> plain, guided ("denoised"), guided ("full") -> ratios.
+Data flow: a prior and the demo pair -> plain, guided ("denoised"), guided ("full") -> ratios.
 Paper: S5.4 (cost), as ratios and not as seconds of another machine.
 """
 

@@ -1,6 +1,6 @@
 """``geodiff bench --points N``: completion from known points, guided against a LoRA fitted at test time.
 
-Hop: a Marigold V2, the demo pair's left image, N depths of its truth -> seconds and error of each way.
+Data flow: a Marigold V2, the demo pair's left image, N depths of its truth -> seconds and error of each way.
 Paper: none; the peer is Marigold V2's own depth completion.
 """
 

@@ -1,6 +1,6 @@
 """What can be said of the options of ``geodiff depth`` before a file is opened or torch is imported.
 
-Hop: ``DepthArguments`` -> the same, or one clear error in under a second.
+Data flow: ``DepthArguments`` -> the same, or one clear error in under a second.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """``geodiff convert``: weights in their authors' format to a folder that ``--prior`` takes.
 
-Hop: .ckpt or .pth file, folder of .bin weights, or base and LoRA -> a new folder, whole or not at all.
+Data flow: .ckpt or .pth file, folder of .bin weights, or base and LoRA -> a new folder, whole or not at all.
 Paper: none.
 """
 

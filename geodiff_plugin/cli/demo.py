@@ -1,6 +1,6 @@
 """``geodiff demo``: a guided call on a rendered pair whose depth is known, offline.
 
-Hop: the demo pair -> ``geodiff depth`` on it -> files, a picture and a table of errors.
+Data flow: the demo pair -> ``geodiff depth`` on it -> files, a picture and a table of errors.
 Paper: S5.1 (AbsRel, delta1, RMSE).
 """
 

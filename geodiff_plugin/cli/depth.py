@@ -1,6 +1,6 @@
 """``geodiff depth``: two images and their cameras to a folder of metric depth.
 
-Hop: ``DepthArguments``, ``OutFolder`` held -> prior -> guided call -> files, report, one line.
+Data flow: ``DepthArguments``, ``OutFolder`` held -> prior -> guided call -> files, report, one line.
 Paper: Algorithm 1.
 """
 

@@ -1,6 +1,6 @@
 """``geodiff depth``: every option with its help.
 
-Hop: argv -> ``DepthArguments`` -> ``cli.depth``.
+Data flow: argv -> ``DepthArguments`` -> ``cli.depth``.
 Paper: none.
 """
 

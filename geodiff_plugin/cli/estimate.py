@@ -1,6 +1,6 @@
 """The guided call of ``geodiff depth``: progress bar, seconds by stage.
 
-Hop: ``Inputs`` -> a prior -> ``MetricDepthOutput`` with the seconds of every stage.
+Data flow: ``Inputs`` -> a prior -> ``MetricDepthOutput`` with the seconds of every stage.
 Paper: Algorithm 1, run by the pipeline.
 """
 

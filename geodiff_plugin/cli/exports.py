@@ -1,6 +1,6 @@
 """The cloud and its cameras for other programs: GLB and COLMAP files, and viewers that are installed.
 
-Hop: ``MetricDepthOutput``, ``Inputs`` -> files in ``--out``, or a window.
+Data flow: ``MetricDepthOutput``, ``Inputs`` -> files in ``--out``, or a window.
 Paper: none.
 """
 

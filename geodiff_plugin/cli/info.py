@@ -1,6 +1,6 @@
 """``geodiff info``: what is installed, where it can run, and which priors are at hand.
 
-Hop: the machine -> lines of text.
+Data flow: the machine -> lines of text.
 Paper: none.
 """
 

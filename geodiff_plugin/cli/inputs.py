@@ -1,6 +1,6 @@
 """Reading and checking of the files that ``geodiff depth`` is given, before any weights load.
 
-Hop: ``DepthArguments`` -> images, a ``Rig`` and the ``GeometryGuidance`` made of them.
+Data flow: ``DepthArguments`` -> images, a ``Rig`` and the ``GeometryGuidance`` made of them.
 Paper: S3.3 (two views with known cameras).
 """
 

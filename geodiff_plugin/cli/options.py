@@ -1,6 +1,6 @@
 """Options that several commands of ``geodiff`` share, and where in their help they stand.
 
-Hop: a help text -> an option of typer.
+Data flow: a help text -> an option of typer.
 Paper: none.
 """
 

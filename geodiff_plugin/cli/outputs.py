@@ -1,6 +1,6 @@
 """Writing of the files of ``geodiff depth``, all of them or none.
 
-Hop: ``MetricDepthOutput`` and report -> files in a folder that ``out_folder`` puts in its place.
+Data flow: ``MetricDepthOutput`` and report -> files in a folder that ``out_folder`` puts in its place.
 Paper: none.
 """
 

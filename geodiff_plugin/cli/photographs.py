@@ -1,6 +1,6 @@
 """``geodiff depth --estimate-pose``: photographs whose cameras nobody measured.
 
-Hop: ``DepthArguments`` -> images, K from options or EXIF -> estimated poses -> ``Inputs``.
+Data flow: ``DepthArguments`` -> images, K from options or EXIF -> estimated poses -> ``Inputs``.
 Paper: none; it takes known cameras for granted (S3.3).
 """
 

@@ -1,6 +1,6 @@
 """``report.json``: every number of a guided call as one JSON document.
 
-Hop: inputs, ``MetricDepthOutput``, options, seconds -> ``dict`` for ``report.json`` and ``--json``.
+Data flow: inputs, ``MetricDepthOutput``, options, seconds -> ``dict`` for ``report.json`` and ``--json``.
 Paper: none.
 """
 

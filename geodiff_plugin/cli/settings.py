@@ -1,6 +1,6 @@
 """What the options of ``geodiff depth`` mean to torch and to the guidance.
 
-Hop: ``DepthArguments``, checked -> ``Settings`` (device, dtype, range, knobs).
+Data flow: ``DepthArguments``, checked -> ``Settings`` (device, dtype, range, knobs).
 Paper: none.
 """
 

@@ -1,6 +1,7 @@
 """Tables and lines on standard output, drawn by ``rich``.
 
-Hop: cells -> text as wide as the terminal, or as wide as it needs where standard output is a file or a pipe.
+Data flow: cells -> text as wide as the terminal, or as wide as it needs where standard output is a file or a
+    pipe.
 Paper: none.
 """
 

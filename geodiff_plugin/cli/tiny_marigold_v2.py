@@ -1,6 +1,6 @@
 """A Marigold V2 with random weights, to try and measure the way of its points without a download.
 
-Hop: a seed -> ``MarigoldV2Pipeline`` that is tiny.
+Data flow: a seed -> ``MarigoldV2Pipeline`` that is tiny.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """``geodiff video``: results of a sequence to one moving picture.
 
-Hop: folders of ``geodiff depth``, or depth maps -> a video.
+Data flow: folders of ``geodiff depth``, or depth maps -> a video.
 Paper: none.
 """
 

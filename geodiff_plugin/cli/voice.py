@@ -1,6 +1,6 @@
 """Messages and exit codes of the command: one line for bad input, warnings as sentences.
 
-Hop: an exception or a warning of this package -> one line on stderr (and an exit code).
+Data flow: an exception or a warning of this package -> one line on stderr (and an exit code).
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Architectures of all priors at full size with random weights, to measure what they cost.
 
-Hop: key of ``PRIORS`` -> pipeline of that architecture.
+Data flow: key of ``PRIORS`` -> pipeline of that architecture.
 Paper: S5.1 (the prior of the experiments is the first).
 
 Sizes as the published weights have them; for DepthFM, PPD and GeoWizard as the authors' code sets them.

@@ -1,6 +1,6 @@
 """Rendering of the demo pair: ``python -m geodiff_plugin.development.make_pair [--out DIR]``.
 
-Hop: a seed -> two images, Middlebury calibration, depth in millimetres.
+Data flow: a seed -> two images, Middlebury calibration, depth in millimetres.
 Paper: none; it stands in for the photographs of S5, which may not be shipped.
 """
 

@@ -1,6 +1,7 @@
 """Memory of every prior at full size, counted with fake tensors.
 
-Hop: architecture -> one step under ``FakeTensorMode`` -> bytes of weights, and of what lives beside them.
+Data flow: architecture -> one step under ``FakeTensorMode``
+    -> bytes of weights, and of what lives beside them.
 Paper: none.
 
 Run ``python -m geodiff_plugin.development.memory [KEY ...]`` for the table of docs/reference/priors.md.

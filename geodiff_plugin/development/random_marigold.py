@@ -1,6 +1,6 @@
 """Marigold v1-1 with random weights, to measure what it costs without a download.
 
-Hop: a seed -> ``MarigoldDepthPipeline`` of 866 M (U-Net) and 84 M (VAE) parameters, or a narrower one.
+Data flow: a seed -> ``MarigoldDepthPipeline`` of 866 M (U-Net) and 84 M (VAE) parameters, or a narrower one.
 Paper: S5.1 (the prior of the experiments).
 """
 

@@ -1,5 +1,5 @@
 """Evaluation: data sets, metrics, methods side by side, resumable runs, tables and figures.
 
-Hop: folder of a data set -> samples -> every method's depth -> numbers -> table.
+Data flow: folder of a data set -> samples -> every method's depth -> numbers -> table.
 Paper: S5 (experiments).
 """

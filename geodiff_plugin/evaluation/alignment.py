@@ -1,6 +1,6 @@
 """Alignment of relative depth to the truth by least squares in scale and shift.
 
-Hop: prediction in its own space + truth -> depth in metres.
+Data flow: prediction in its own space + truth -> depth in metres.
 Paper: S5.1 ("aligned"); least squares as Marigold's evaluation does it.
 """
 

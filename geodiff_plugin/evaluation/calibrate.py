@@ -1,6 +1,7 @@
 """Refit the probabilities that the package promises: of a depth, and of a match.
 
-Hop: pairs with truth -> evidence and outcome by pixel -> coefficients, deciles on the half not fitted on.
+Data flow: pairs with truth -> evidence and outcome by pixel
+    -> coefficients, deciles on the half not fitted on.
 Paper: none; it gives no confidence.
 
 ``python -m geodiff_plugin.evaluation.calibrate --data DIR --data synthetic:40`` prints constants that can be

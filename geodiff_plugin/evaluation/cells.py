@@ -1,6 +1,6 @@
 """Formatting of numbers as cells of tables.
 
-Hop: records -> values by method and sample -> text.
+Data flow: records -> values by method and sample -> text.
 Paper: none.
 """
 

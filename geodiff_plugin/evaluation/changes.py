@@ -1,6 +1,6 @@
 """Ablations of a preset, one change at a time, and the flatness of its optimum.
 
-Hop: records -> ``Table``.
+Data flow: records -> ``Table``.
 Paper: S5.3, which it extends.
 """
 

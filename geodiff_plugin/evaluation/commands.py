@@ -1,6 +1,6 @@
 """Measure methods on pairs and put what came out on a page, for ``geodiff eval pairs`` and its like.
 
-Hop: ``PairsOptions`` -> records -> ``Page``.
+Data flow: ``PairsOptions`` -> records -> ``Page``.
 Paper: S5 (experiments).
 """
 

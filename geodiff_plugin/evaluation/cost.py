@@ -1,6 +1,6 @@
 """Seconds and peak memory of methods on a data set, as ratios to the plain pipeline.
 
-Hop: references + methods -> one process per method -> records -> ``Table``.
+Data flow: references + methods -> one process per method -> records -> ``Table``.
 Paper: S9 (inference time, run time comparison), as ratios and not as seconds of another machine.
 """
 

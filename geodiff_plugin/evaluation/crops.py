@@ -1,6 +1,6 @@
 """Evaluation crops by the names that papers use: Garg, Eigen, KITTI's benchmark.
 
-Hop: name, image size -> mask of the pixels that count.
+Data flow: name, image size -> mask of the pixels that count.
 Paper: none given for KITTI (S5.1); the names are those of the monocular depth literature.
 """
 

@@ -1,6 +1,6 @@
 """Tables of errors by region and material, in disparity, and of the calibration of uncertainty.
 
-Hop: records -> ``Table``.
+Data flow: records -> ``Table``.
 Paper: S5.2 (transparent and mirroring surfaces) as a number; in disparity as stereo benchmarks have it.
 """
 

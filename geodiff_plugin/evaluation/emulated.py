@@ -1,6 +1,6 @@
 """A prior of chosen strength: a module in the network's place that answers with a truth of controlled error.
 
-Hop: truth + ``Strength`` -> relative map of a prior -> its code -> what the network would have said.
+Data flow: truth + ``Strength`` -> relative map of a prior -> its code -> what the network would have said.
 Paper: none; it stands for priors that cannot be had here, from exact ones to weak ones.
 
 The pipeline, its scheduler and its autoencoder are real. The network's clean estimate is

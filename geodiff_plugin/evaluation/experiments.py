@@ -1,6 +1,6 @@
 """The paper's tables as runs: samples, methods, files.
 
-Hop: name of a table + options -> references -> records -> tables on disk.
+Data flow: name of a table + options -> references -> records -> tables on disk.
 Paper: Tables 1 to 4, S5.
 """
 

@@ -1,6 +1,6 @@
 """Depth completion as Marigold V2's authors do it: a second LoRA, fitted to the known points of each image.
 
-Hop: pipeline, image, sparse metres -> 100 Adam steps through the transformer -> metres.
+Data flow: pipeline, image, sparse metres -> 100 Adam steps through the transformer -> metres.
 Paper: none (Marigold V2, arXiv 2609.08084): the peer of ``GeometryGuidance.from_points`` on that prior.
 """
 

@@ -1,6 +1,6 @@
 """A table in Markdown, LaTeX and JSON.
 
-Hop: cells -> ``Table`` -> text.
+Data flow: cells -> ``Table`` -> text.
 Paper: Tables 1 to 4 in layout (grouped columns, rules between groups of rows).
 """
 

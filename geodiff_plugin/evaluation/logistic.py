@@ -1,6 +1,6 @@
 """Logistic regression with signs that are known beforehand, and a table of promised against kept.
 
-Hop: evidence, right or wrong, weights -> coefficients -> deciles.
+Data flow: evidence, right or wrong, weights -> coefficients -> deciles.
 Paper: none.
 """
 

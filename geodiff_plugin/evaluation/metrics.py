@@ -1,6 +1,6 @@
 """Metrics of a depth map against the truth: errors in depth and disparity, and of the uncertainty.
 
-Hop: predicted depth + truth + mask -> numbers, one image at a time.
+Data flow: predicted depth + truth + mask -> numbers, one image at a time.
 Paper: S5.1 (AbsRel, delta, RMSE; its printed RMSE lacks the root, docs/reference/paper-map.md E5).
 """
 

@@ -1,6 +1,6 @@
 """Options of a run: samples, methods, settings; and the command line that repeats it.
 
-Hop: ``PairsOptions`` -> references to samples; ``PairsOptions`` -> text of a command.
+Data flow: ``PairsOptions`` -> references to samples; ``PairsOptions`` -> text of a command.
 Paper: none.
 """
 

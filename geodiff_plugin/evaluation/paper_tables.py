@@ -1,6 +1,6 @@
 """Tables in the paper's layout, from records.
 
-Hop: ``Layout`` + records -> ``Table``.
+Data flow: ``Layout`` + records -> ``Table``.
 Paper: Tables 1 to 4.
 """
 

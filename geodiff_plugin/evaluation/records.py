@@ -1,6 +1,6 @@
 """Records of a resumable run: one JSON line per sample and method.
 
-Hop: record -> line of ``samples.jsonl`` -> records of a later run.
+Data flow: record -> line of ``samples.jsonl`` -> records of a later run.
 Paper: none.
 """
 

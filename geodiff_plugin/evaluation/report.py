@@ -1,6 +1,6 @@
 """The page of a run, written as Markdown, LaTeX and JSON.
 
-Hop: tables + command + versions -> files.
+Data flow: tables + command + versions -> files.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Resumable runs of methods over samples, in one process or several.
 
-Hop: references + methods + settings -> records in ``samples.jsonl``.
+Data flow: references + methods + settings -> records in ``samples.jsonl``.
 Paper: S5.1.
 """
 

@@ -1,6 +1,6 @@
 """Every metric of one prediction on one sample, as JSON values.
 
-Hop: ``StereoSample`` + ``Prediction`` -> record.
+Data flow: ``StereoSample`` + ``Prediction`` -> record.
 Paper: S5.1 (metrics, raw and aligned).
 """
 

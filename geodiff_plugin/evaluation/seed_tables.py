@@ -1,6 +1,6 @@
 """Spread of a method's errors over the seeds of its noise.
 
-Hop: records of ``METHOD`` and ``METHOD#SEED`` -> ``Table``.
+Data flow: records of ``METHOD`` and ``METHOD#SEED`` -> ``Table``.
 Paper: none; it reports one seed.
 """
 

@@ -1,6 +1,6 @@
 """How steady depth is from frame to frame: ``geodiff eval sequence``.
 
-Hop: rendered sequences -> every frame alone, or from the frame before -> AbsRel, flicker, seconds.
+Data flow: rendered sequences -> every frame alone, or from the frame before -> AbsRel, flicker, seconds.
 Paper: none; S5 measures single pairs.
 """
 

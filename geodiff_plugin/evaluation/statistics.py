@@ -1,6 +1,6 @@
 """Means over images with bootstrap intervals.
 
-Hop: one number per image -> mean and interval.
+Data flow: one number per image -> mean and interval.
 Paper: S5.1 reports means only; the intervals are ours.
 """
 

@@ -1,6 +1,6 @@
 """What guidance makes of priors from exact to weak: ``geodiff eval strength``.
 
-Hop: dense pairs + ``STRENGTHS`` -> emulated prior -> plain, fitted and guided -> tables.
+Data flow: dense pairs + ``STRENGTHS`` -> emulated prior -> plain, fitted and guided -> tables.
 Paper: none; S5 measures one prior.
 """
 

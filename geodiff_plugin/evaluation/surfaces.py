@@ -1,6 +1,6 @@
 """How well a map keeps what a good prior has: depth edges where they are, and smooth surfaces between them.
 
-Hop: depth in metres + dense truth -> error near truth edges, error of slope away from them.
+Data flow: depth in metres + dense truth -> error near truth edges, error of slope away from them.
 Paper: none; its tables average over all pixels.
 """
 

@@ -1,6 +1,6 @@
 """Tables of ``geodiff eval pairs``, from records.
 
-Hop: records -> ``Table``.
+Data flow: records -> ``Table``.
 Paper: none; per pair, with intervals and paired differences.
 """
 

@@ -1,6 +1,6 @@
 """Right pairs made wrong, as people get them wrong: what ``geodiff eval trust`` sees caught or not.
 
-Hop: ``StereoSample`` -> the same with another calibration, images or points.
+Data flow: ``StereoSample`` -> the same with another calibration, images or points.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """File formats: calibrations, images, depth maps, point clouds.
 
-Hop: what lies on disk -> ``Rig``, arrays; arrays -> what lies on disk, whole or not at all.
+Data flow: what lies on disk -> ``Rig``, arrays; arrays -> what lies on disk, whole or not at all.
 Paper: S5.1 (the layouts of the data sets).
 """
 

@@ -1,6 +1,6 @@
 """Atomic writing: a file appears whole or not at all.
 
-Hop: a path -> a temporary one beside it -> the path, by one rename.
+Data flow: a path -> a temporary one beside it -> the path, by one rename.
 Paper: none.
 """
 

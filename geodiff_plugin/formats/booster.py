@@ -1,6 +1,6 @@
 """Calibration files of the Booster data set (XML).
 
-Hop: ``proj_matL``, ``proj_matR``, ``baselineLR`` (mm) -> ``Rig``.
+Data flow: ``proj_matL``, ``proj_matR``, ``baselineLR`` (mm) -> ``Rig``.
 Paper: S5.1 (Booster).
 """
 

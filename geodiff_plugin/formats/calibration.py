@@ -1,6 +1,6 @@
 """Interface of a calibration format: how its text is recognised, and how it becomes a rig.
 
-Hop: the text of one or two files -> ``Rig``.
+Data flow: the text of one or two files -> ``Rig``.
 Paper: S3.3 (known cameras).
 """
 

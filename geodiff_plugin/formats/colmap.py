@@ -1,6 +1,6 @@
 """A COLMAP model in text: ``cameras.txt`` and ``images.txt``, and the names of two images in it.
 
-Hop: lines of two images and of their cameras -> ``Rig``, in the model's unit.
+Data flow: lines of two images and of their cameras -> ``Rig``, in the model's unit.
 Paper: S5.1 (Tanks and Temples).
 """
 

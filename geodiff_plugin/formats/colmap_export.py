@@ -1,6 +1,6 @@
 """Cameras and cloud as a COLMAP model in text: for Gaussian splatting, MVS and whatever else reads one.
 
-Hop: cameras with their poses, ``Cloud`` -> ``cameras.txt``, ``images.txt``, ``points3D.txt``.
+Data flow: cameras with their poses, ``Cloud`` -> ``cameras.txt``, ``images.txt``, ``points3D.txt``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Depth and disparity maps: PFM, npy, 16-bit PNG in millimetres or KITTI's 1/256.
 
-Hop: file <-> float32 map and boolean mask.
+Data flow: file <-> float32 map and boolean mask.
 Paper: S5.1 (ground truth of the data sets).
 """
 

@@ -1,6 +1,6 @@
 """Camera matrices from what a photograph says of itself, or from a field of view.
 
-Hop: EXIF of an image, or degrees -> K in pixels of the upright image.
+Data flow: EXIF of an image, or degrees -> K in pixels of the upright image.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Opening of files that the user named, with an error in one sentence.
 
-Hop: a path as given -> an existing file, or its text.
+Data flow: a path as given -> an existing file, or its text.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """``K.txt`` of FoundationStereo: the flat K, then the baseline in metres.
 
-Hop: 9 numbers and 1 -> ``Rig`` with equal K on both sides.
+Data flow: 9 numbers and 1 -> ``Rig`` with equal K on both sides.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """A coloured cloud and its cameras as binary glTF, for browsers, Blender and the viewers of phones.
 
-Hop: ``Cloud``, cameras -> GLB: points, and one pyramid of lines a camera.
+Data flow: ``Cloud``, cameras -> GLB: points, and one pyramid of lines a camera.
 Paper: none.
 
 glTF needs a header, one JSON chunk and one binary chunk, which is less to write than to import.

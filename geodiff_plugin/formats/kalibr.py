@@ -1,6 +1,6 @@
 """Kalibr's ``camchain.yaml``.
 
-Hop: ``cam0``, ``cam1`` with ``intrinsics``, ``distortion_coeffs``, ``T_cn_cnm1`` -> ``Rig``.
+Data flow: ``cam0``, ``cam1`` with ``intrinsics``, ``distortion_coeffs``, ``T_cn_cnm1`` -> ``Rig``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """KITTI ``calib_cam_to_cam`` (2015 benchmark, raw data; DrivingStereo shares it).
 
-Hop: ``P_rect_xx`` (3x4), ``S_rect_xx`` -> ``Rig``.
+Data flow: ``P_rect_xx`` (3x4), ``S_rect_xx`` -> ``Rig``.
 Paper: S5.1 (KITTI stereo).
 """
 

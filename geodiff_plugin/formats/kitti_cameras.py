@@ -1,6 +1,6 @@
 """Choice of two of KITTI's four cameras: 0, 1 are the grey pair, 2, 3 the colour pair.
 
-Hop: ``cameras``, the image folder's name, the file's own cameras -> (left, right).
+Data flow: ``cameras``, the image folder's name, the file's own cameras -> (left, right).
 Paper: S5.1 (KITTI stereo).
 """
 

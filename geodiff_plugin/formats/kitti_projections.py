@@ -1,6 +1,6 @@
 """KITTI ``P0`` .. ``P3`` files (2012 benchmark, odometry, object).
 
-Hop: ``P0: ...`` .. ``P3: ...`` (3x4 each) -> ``Rig``.
+Data flow: ``P0: ...`` .. ``P3: ...`` (3x4 each) -> ``Rig``.
 Paper: S5.1 (KITTI stereo).
 """
 

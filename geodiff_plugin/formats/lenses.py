@@ -1,6 +1,6 @@
 """Cameras as a factory measures them: intrinsics, lens and resolution, one camera at a time.
 
-Hop: ``FactoryCamera`` of both sides and their pose -> ``Rig``.
+Data flow: ``FactoryCamera`` of both sides and their pose -> ``Rig``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """KITTI's velodyne scans, brought into the left camera's frame.
 
-Hop: ``.bin`` of x, y, z, reflectance + calibration -> ``(N, 3)`` metres, x right, y down, z forward.
+Data flow: ``.bin`` of x, y, z, reflectance + calibration -> ``(N, 3)`` metres, x right, y down, z forward.
 Paper: none (points go beyond it).
 """
 

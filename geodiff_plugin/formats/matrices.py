@@ -1,6 +1,6 @@
 """K and E from text and ``.npy`` files.
 
-Hop: whitespace text or ``.npy`` -> float64 matrix, unchecked for meaning.
+Data flow: whitespace text or ``.npy`` -> float64 matrix, unchecked for meaning.
 Paper: none.
 """
 

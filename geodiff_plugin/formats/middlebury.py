@@ -1,6 +1,6 @@
 """Middlebury ``calib.txt``, version 2014; MiddEval3 and ETH3D two-view share it.
 
-Hop: ``cam0=[...]``, ``cam1=[...]``, ``doffs`` (px), ``baseline`` (mm) -> ``Rig``.
+Data flow: ``cam0=[...]``, ``cam1=[...]``, ``doffs`` (px), ``baseline`` (mm) -> ``Rig``.
 Paper: S5.1 (Middlebury); Z = baseline * f / (d + doffs).
 """
 

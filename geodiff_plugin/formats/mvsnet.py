@@ -1,6 +1,6 @@
 """A pair of MVSNet ``cam.txt`` files, one a view (DTU, BlendedMVS, Tanks and Temples as MVS code ships it).
 
-Hop: ``extrinsic`` (world-to-camera 4x4), ``intrinsic`` (3x3), twice -> ``Rig``.
+Data flow: ``extrinsic`` (world-to-camera 4x4), ``intrinsic`` (3x3), twice -> ``Rig``.
 Paper: S5.1 (Tanks and Temples).
 """
 

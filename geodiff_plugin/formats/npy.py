@@ -1,6 +1,6 @@
 """Arrays of numbers from ``.npy`` files, never unpickled.
 
-Hop: path -> array.
+Data flow: path -> array.
 Paper: none.
 """
 

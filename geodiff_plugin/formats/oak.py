@@ -1,6 +1,6 @@
 """Luxonis' calibration of an OAK-D, as ``CalibrationHandler.eepromToJsonFile`` writes it.
 
-Hop: ``cameraData`` by socket, ``stereoRectificationData`` -> ``Rig``.
+Data flow: ``cameraData`` by socket, ``stereoRectificationData`` -> ``Rig``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """OpenCV's stereo calibration as its samples write it, YAML, XML or JSON, in one file or two.
 
-Hop: ``P1 P2`` (rectified), else ``M1 D1 M2 D2 R T`` -> ``Rig``.
+Data flow: ``P1 P2`` (rectified), else ``M1 D1 M2 D2 R T`` -> ``Rig``.
 Paper: none; R, T of ``stereoCalibrate`` map left points to right ones.
 """
 

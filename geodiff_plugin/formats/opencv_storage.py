@@ -1,6 +1,6 @@
 """OpenCV's FileStorage, what calibrations use of it: matrices, numbers, short sequences; YAML, XML, JSON.
 
-Hop: text -> {key in small letters: float64 array}.
+Data flow: text -> {key in small letters: float64 array}.
 Paper: none.
 """
 

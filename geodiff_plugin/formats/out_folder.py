@@ -1,6 +1,6 @@
 """The folder of a run's results: tried before the work, held during it, filled whole or not at all.
 
-Hop: ``--out`` as typed -> ``OutFolder``, held by a lock -> files in a hidden folder -> the folder.
+Data flow: ``--out`` as typed -> ``OutFolder``, held by a lock -> files in a hidden folder -> the folder.
 Paper: none.
 
 Nothing here imports torch: what is wrong with a folder is said at once.

@@ -1,6 +1,6 @@
 """The place of an output folder: what is there already, whether another run has it, a name that is free.
 
-Hop: ``--out`` as typed -> a path that ``OutFolder`` can take, or one clear error.
+Data flow: ``--out`` as typed -> a path that ``OutFolder`` can take, or one clear error.
 Paper: none.
 
 Nothing here imports torch: what is wrong with a folder is said at once.

@@ -1,6 +1,6 @@
 """Points of a PLY file, ASCII or binary, whatever else it holds.
 
-Hop: ``.ply`` -> ``(N, 3)`` x, y, z.
+Data flow: ``.ply`` -> ``(N, 3)`` x, y, z.
 Paper: none.
 """
 

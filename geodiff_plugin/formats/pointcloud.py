@@ -1,6 +1,6 @@
 """Coloured point clouds from depth, without flying points between two surfaces.
 
-Hop: depth in metres, image, K -> binary PLY in the left camera's frame.
+Data flow: depth in metres, image, K -> binary PLY in the left camera's frame.
 Paper: Eq. 9 (unprojection).
 """
 

@@ -1,6 +1,6 @@
 """Known depths from files: a sparse depth map, or a list of points.
 
-Hop: file -> what ``GeometryGuidance(points=...)`` takes.
+Data flow: file -> what ``GeometryGuidance(points=...)`` takes.
 Paper: none (points go beyond it).
 """
 

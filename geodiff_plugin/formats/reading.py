@@ -1,6 +1,6 @@
 """Reading of calibration files whose format is recognised from their content.
 
-Hop: a path or a pair of paths -> ``CALIBRATION_FORMATS`` -> ``Rig``.
+Data flow: a path or a pair of paths -> ``CALIBRATION_FORMATS`` -> ``Rig``.
 Paper: S3.3 (known cameras).
 
 A new format is a new file and one line in the table (docs/reference/calibration.md).

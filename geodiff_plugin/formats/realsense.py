@@ -1,6 +1,6 @@
 """Intel RealSense: what ``rs-enumerate-devices -c`` prints, or rs2's structures as JSON.
 
-Hop: intrinsics of both infrared cameras and the extrinsics between them -> ``Rig``.
+Data flow: intrinsics of both infrared cameras and the extrinsics between them -> ``Rig``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Checked ``Rig`` records from the numbers of a calibration file.
 
-Hop: camera matrices, projections, world-to-camera transforms, baselines -> ``Rig``.
+Data flow: camera matrices, projections, world-to-camera transforms, baselines -> ``Rig``.
 Paper: S3.3; E as in docs/reference/calibration.md.
 """
 

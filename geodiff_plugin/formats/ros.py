@@ -1,6 +1,6 @@
 """A pair of ROS ``camera_info``: files of ``camera_calibration``, or the message as ``echo`` prints it.
 
-Hop: ``projection_matrix`` (or ``P``) of the left and the right camera -> ``Rig``.
+Data flow: ``projection_matrix`` (or ``P``) of the left and the right camera -> ``Rig``.
 Paper: none.
 """
 

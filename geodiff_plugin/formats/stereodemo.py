@@ -1,6 +1,6 @@
 """``stereodemo_calibration.json``, the calibration of the stereodemo project.
 
-Hop: ``fx fy cx0 cx1 cy baseline_meters width height`` -> ``Rig``.
+Data flow: ``fx fy cx0 cx1 cy baseline_meters width height`` -> ``Rig``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Large maps a strip of rows at a time, so that what is computed on the way is small beside them.
 
-Hop: height and width -> slices of rows.
+Data flow: height and width -> slices of rows.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """JSON and YAML as calibration files use them, and numbers out of them.
 
-Hop: text -> nested dicts and lists -> checked float64 arrays.
+Data flow: text -> nested dicts and lists -> checked float64 arrays.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Frames of a video as images in [0, 1], read by OpenCV.
 
-Hop: a video file -> ``(H, W, 3)`` floats, one frame after the other.
+Data flow: a video file -> ``(H, W, 3)`` floats, one frame after the other.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Stereolabs' factory calibration ``SN<number>.conf`` of a ZED.
 
-Hop: sections ``[LEFT_CAM_HD]``, ``[RIGHT_CAM_HD]``, ``[STEREO]`` -> ``Rig``.
+Data flow: sections ``[LEFT_CAM_HD]``, ``[RIGHT_CAM_HD]``, ``[STEREO]`` -> ``Rig``.
 Paper: none.
 """
 

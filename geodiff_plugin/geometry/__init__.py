@@ -1,6 +1,6 @@
 """Two pinhole cameras: intrinsics, rigid transforms, projection, backward warping.
 
-Hop: depth in metres on the left grid -> right-view pixels -> right image seen from the left.
+Data flow: depth in metres on the left grid -> right-view pixels -> right image seen from the left.
 Paper: S3.3, S7.2.
 """
 

@@ -1,6 +1,6 @@
 """Pinhole cameras and rigid transforms: how K follows an image, how two poses become one transform.
 
-Hop: K and camera-to-world poses as given -> K of the grid in use and ``T_right_from_left``.
+Data flow: K and camera-to-world poses as given -> K of the grid in use and ``T_right_from_left``.
 Paper: S3.3, S7.2 Eq. 25 (eq:forward-warp_supp).
 """
 

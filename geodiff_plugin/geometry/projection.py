@@ -1,6 +1,6 @@
 """From pixels with a depth to points and back, for one camera and across two.
 
-Hop: depth map in metres + K -> points -> points of the other camera -> pixels of the other image.
+Data flow: depth map in metres + K -> points -> points of the other camera -> pixels of the other image.
 Paper: S3.3 Eq. 9 (eq:forward-warp), S7.2 Eq. 25 (eq:forward-warp_supp).
 """
 

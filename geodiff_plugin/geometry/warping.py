@@ -1,6 +1,6 @@
 """The right image seen from the left camera, and which left pixels the right camera does not see.
 
-Hop: right image + left depth in metres -> image on the left grid, validity mask.
+Data flow: right image + left depth in metres -> image on the left grid, validity mask.
 Paper: S3.3, S7.2 "Backward warping", P_{y2 -> y1}(x1, y2), Eq. 25 (eq:forward-warp_supp).
 """
 

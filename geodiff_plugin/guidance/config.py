@@ -1,6 +1,6 @@
 """Every number and switch of the guidance: one frozen configuration, nested by stage.
 
-Hop: names and values as given -> ``GuidanceConfig``, checked -> the stage that a function takes.
+Data flow: names and values as given -> ``GuidanceConfig``, checked -> the stage that a function takes.
 Paper: S5.1 and Algorithm 1 name some; docs/reference/knobs.md, which is made from here, says which.
 """
 

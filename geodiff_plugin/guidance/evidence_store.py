@@ -1,6 +1,6 @@
 """Evidence of the last pairs, for many guided calls on one pair.
 
-Hop: views and points as given, configuration -> ``Evidence``, made or remembered.
+Data flow: views and points as given, configuration -> ``Evidence``, made or remembered.
 Paper: none.
 """
 

@@ -1,6 +1,7 @@
 """Fields of a configuration: a default, what a value may be, a line that explains it, the paper's value.
 
-Hop: a field's description -> its check, its row in docs/reference/knobs.md and in ``geodiff info --knobs``.
+Data flow: a field's description -> its check, its row in docs/reference/knobs.md and in ``geodiff info
+    --knobs``.
 Paper: none.
 """
 

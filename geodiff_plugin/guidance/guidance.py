@@ -1,6 +1,6 @@
 """What a user configures: right views, cameras, known points and the hyperparameters of the guidance.
 
-Hop: ``right, K, E, points``, configuration -> ``GeometryGuidance`` -> at call time ``Evidence``.
+Data flow: ``right, K, E, points``, configuration -> ``GeometryGuidance`` -> at call time ``Evidence``.
 Paper: S3.3, S4.2, S5.1; ``GeometryGuidance.paper`` is Algorithm 1 with its printed numbers.
 """
 

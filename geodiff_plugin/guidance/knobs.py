@@ -1,6 +1,7 @@
 """The leaves of the configuration as text: read from ``KNOB=VALUE``, and told in tables.
 
-Hop: ``KNOB=VALUE`` -> ``GuidanceConfig`` -> tables of docs/reference/knobs.md and ``geodiff info --knobs``.
+Data flow: ``KNOB=VALUE`` -> ``GuidanceConfig`` -> tables of docs/reference/knobs.md and ``geodiff info
+    --knobs``.
 Paper: the column of docs/reference/knobs.md.
 
     python -m geodiff_plugin.guidance.knobs docs/reference/knobs.md

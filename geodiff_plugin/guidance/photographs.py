@@ -1,6 +1,6 @@
 """Photographs without poses: cameras, poses and scale from what there is.
 
-Hop: images, K's or EXIF, one known length -> tracks -> poses up to scale -> ``EstimatedRig``.
+Data flow: images, K's or EXIF, one known length -> tracks -> poses up to scale -> ``EstimatedRig``.
 Paper: none; it takes known cameras for granted (S3.3).
 """
 

@@ -1,6 +1,7 @@
 """The poses of an image's right views as everything downstream uses them.
 
-Hop: right views as given -> ``pose.refine`` with a first depth of a coarse sweep -> right views and report.
+Data flow: right views as given -> ``pose.refine`` with a first depth of a coarse sweep
+    -> right views and report.
 Paper: none; it takes exact poses for granted (S3.3).
 """
 

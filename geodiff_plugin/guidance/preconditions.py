@@ -1,6 +1,6 @@
 """What must hold before a guidance is used: names that exist, and something for what is asked to work on.
 
-Hop: ``GuidanceConfig``, what is given -> nothing, or an ``InputError``.
+Data flow: ``GuidanceConfig``, what is given -> nothing, or an ``InputError``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Sets of hyperparameters with a name: the default, two published methods, and the search without gradients.
 
-Hop: ``GuidanceConfig()`` -> the same with some leaves set otherwise.
+Data flow: ``GuidanceConfig()`` -> the same with some leaves set otherwise.
 Paper: Algorithm 1, S5.1, S7.3, S9; Marigold-DC (Viola et al. 2024, "Marigold-DC: zero-shot monocular depth
 completion with guided diffusion") and its published code.
 """

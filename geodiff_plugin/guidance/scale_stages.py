@@ -1,6 +1,6 @@
 """The stages of the configuration that find metres: sweep, matches of it, search in it, fit to points.
 
-Hop: named values -> a stage, checked.
+Data flow: named values -> a stage, checked.
 Paper: S7.3 has a search and a range, no numbers of it; a leaf that the paper has no place for says so.
 """
 

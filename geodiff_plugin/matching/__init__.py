@@ -1,6 +1,6 @@
 """What the views alone say about depth: plane sweep, aggregation, left-right check, for any pose.
 
-Hop: images, K's, T's -> ``CostVolume`` -> ``Matches``.
+Data flow: images, K's, T's -> ``CostVolume`` -> ``Matches``.
 Paper: S7.3 (the search is a lookup in this volume); the matches go beyond it.
 """
 

@@ -1,6 +1,7 @@
 """A right view turned parallel to the left one: there, every plane is one scale and one shift.
 
-Hop: right image, K, pose + left K, grid -> ``AlignedView`` -> where each plane's rows and columns lie in it.
+Data flow: right image, K, pose + left K, grid -> ``AlignedView``
+    -> where each plane's rows and columns lie in it.
 Paper: none (Collins 1996, "A space-sweep approach to true multi-image matching").
 """
 

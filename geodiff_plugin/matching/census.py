@@ -1,6 +1,6 @@
 """Soft census: a description of a pixel's surroundings that exposure does not change, in small integers.
 
-Hop: grey image -> 16 comparisons a pixel; two of them -> matching cost.
+Data flow: grey image -> 16 comparisons a pixel; two of them -> matching cost.
 Paper: none (Zabih and Woodfill 1994, "Non-parametric local transforms for computing visual correspondence").
 """
 

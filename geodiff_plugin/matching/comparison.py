@@ -1,6 +1,6 @@
 """The left view's description against that of a right view, plane by plane.
 
-Hop: census of the left view + ``AlignedView`` -> costs and what is seen of one plane.
+Data flow: census of the left view + ``AlignedView`` -> costs and what is seen of one plane.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Matches that both views agree on: winner, left-right check, uniqueness, sub-plane position.
 
-Hop: ``CostVolume`` -> aggregated costs -> ``Matches`` (inverse depth and confidence on the left grid).
+Data flow: ``CostVolume`` -> aggregated costs -> ``Matches`` (inverse depth and confidence on the left grid).
 Paper: none; the evidence that a photometric loss does not have.
 """
 

@@ -1,6 +1,6 @@
 """What the views say about depth: inverse depths with their confidence.
 
-Hop: ``match_volume`` -> ``Matches`` of one image -> ``MatchTarget`` of a chunk of samples.
+Data flow: ``match_volume`` -> ``Matches`` of one image -> ``MatchTarget`` of a chunk of samples.
 Paper: none; the evidence that a photometric loss does not have.
 """
 

@@ -1,6 +1,6 @@
 """Are left and right swapped, or is the pose the wrong way round? The views themselves tell.
 
-Hop: images, K's, T's -> whether the inverse pose matches more of the image.
+Data flow: images, K's, T's -> whether the inverse pose matches more of the image.
 Paper: none; a check of the user's input.
 """
 

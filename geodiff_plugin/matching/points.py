@@ -1,6 +1,6 @@
 """Depths that the user has, in the form of matches: lidar, structure from motion, any sparse depth.
 
-Hop: ``(N, 3)`` points or an ``(H, W)`` map in metres, K -> ``Matches`` on any grid of the left view.
+Data flow: ``(N, 3)`` points or an ``(H, W)`` map in metres, K -> ``Matches`` on any grid of the left view.
 Paper: none; what Marigold-DC (Viola et al. 2024) completes.
 """
 

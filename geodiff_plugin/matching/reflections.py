@@ -1,6 +1,7 @@
 """Matches that lie behind what the prior says, over a region: mirrors and glass.
 
-Hop: matches + metric depth of the prior's first estimate -> share of each match's confidence that remains.
+Data flow: matches + metric depth of the prior's first estimate
+    -> share of each match's confidence that remains.
 Paper: S5.2 (transparent and mirroring surfaces are where a second view misleads and the prior knows).
 """
 

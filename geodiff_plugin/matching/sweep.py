@@ -1,6 +1,6 @@
 """How well each inverse depth explains each pixel: a plane sweep for any pose and any number of views.
 
-Hop: left view + right views (grey image, K, pose) + inverse depths -> ``CostVolume``.
+Data flow: left view + right views (grey image, K, pose) + inverse depths -> ``CostVolume``.
 Paper: S7.3, which calls its search for g_s a variant of the plane sweep volume.
 """
 

@@ -1,6 +1,6 @@
 """Pictures of depth maps: colours and a legend in metres, with Pillow alone.
 
-Hop: depth in metres, mask -> RGB picture.
+Data flow: depth in metres, mask -> RGB picture.
 Paper: Figures of S5 (coloured depth).
 """
 

@@ -1,6 +1,6 @@
 """One picture of a run: the left image, its depth, how far to believe it, how well the views agree.
 
-Hop: image, depth in metres, confidence, photometric error -> RGB picture.
+Data flow: image, depth in metres, confidence, photometric error -> RGB picture.
 Paper: none.
 """
 

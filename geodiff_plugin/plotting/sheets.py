@@ -1,6 +1,6 @@
 """Contact sheets: pictures side by side under their titles.
 
-Hop: pictures -> one RGB picture.
+Data flow: pictures -> one RGB picture.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """A moving picture of a sequence of depth maps, all in one range of colours, beside one legend in metres.
 
-Hop: depth maps in metres -> frames -> GIF, WebP or MP4.
+Data flow: depth maps in metres -> frames -> GIF, WebP or MP4.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Adapters of diffusion depth priors, one a file, and how a prior is found by name.
 
-Hop: name or folder -> ``FoundPrior`` -> pipeline -> ``DepthPrior``.
+Data flow: name or folder -> ``FoundPrior`` -> pipeline -> ``DepthPrior``.
 Paper: S4 (any diffusion-based depth model with iterative updates).
 
 A new prior is a new file and one line in ``PRIORS``.

@@ -1,6 +1,6 @@
 """Interface of a prior's adapter: decoding, space, network call; it never sees a camera.
 
-Hop: folder -> pipeline -> ``DepthPrior`` -> network, decode, space.
+Data flow: folder -> pipeline -> ``DepthPrior`` -> network, decode, space.
 Paper: S4 ("can be integrated with any DB-MDE framework following a similar schema").
 """
 

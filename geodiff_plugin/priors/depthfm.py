@@ -1,6 +1,6 @@
 """Adapter of DepthFM, from the folder that ``geodiff convert`` writes.
 
-Hop: folder -> ``DepthFMPipeline``.
+Data flow: folder -> ``DepthFMPipeline``.
 Paper: none.
 """
 

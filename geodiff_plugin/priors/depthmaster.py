@@ -1,6 +1,6 @@
 """Adapter of DepthMaster, whose folder is in diffusers' layout but for the block that its U-Net adds.
 
-Hop: folder -> ``DepthMasterPipeline``.
+Data flow: folder -> ``DepthMasterPipeline``.
 Paper: none.
 """
 

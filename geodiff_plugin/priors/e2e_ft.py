@@ -1,6 +1,6 @@
 """Marigold E2E-FT and Stable Diffusion E2E-FT: one step from zeros.
 
-Hop: folder -> ``E2EFTPipeline``.
+Data flow: folder -> ``E2EFTPipeline``.
 Paper: none (Martin Garcia et al., arXiv 2409.11355, WACV 2025).
 """
 

@@ -1,6 +1,7 @@
 """Resolution of a prior's name: the bundled one, a folder, or a hub id.
 
-Hop: ``"bundled"``, folder or hub id -> folder with the small files -> (once it is known) the weights too.
+Data flow: ``"bundled"``, folder or hub id -> folder with the small files
+    -> (once it is known) the weights too.
 Paper: none.
 """
 

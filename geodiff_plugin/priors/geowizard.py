@@ -1,6 +1,6 @@
 """GeoWizard v1 and v2.
 
-Hop: authors' folder or ours -> ``GeoWizardPipeline`` -> contract.
+Data flow: authors' folder or ours -> ``GeoWizardPipeline`` -> contract.
 Paper: S4 (any diffusion-based depth model).
 """
 

@@ -1,6 +1,6 @@
 """Run any depth model of ``transformers``: own preparation, its map, and the space of that map.
 
-Hop: hub id or folder -> ``HFDepthModel``; image ``(B, 3, H, W)`` in [0, 1] -> ``DepthMap``.
+Data flow: hub id or folder -> ``HFDepthModel``; image ``(B, 3, H, W)`` in [0, 1] -> ``DepthMap``.
 Paper: none (a prior without diffusion).
 """
 

@@ -3,7 +3,7 @@
 The library's own are not called: those on tensors need torchvision, and two models have no other; those on
 Pillow round to bytes after either axis and take the image to the CPU and back, one at a time.
 
-Hop: ``preprocessor_config.json``, image ``(B, 3, H, W)`` in [0, 1] -> ``pixel_values (B, 3, h, w)``.
+Data flow: ``preprocessor_config.json``, image ``(B, 3, H, W)`` in [0, 1] -> ``pixel_values (B, 3, h, w)``.
 Paper: none.
 """
 

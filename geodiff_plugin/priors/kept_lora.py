@@ -1,6 +1,7 @@
 """A LoRA that stays beside its base: over a base in 4 bits there is nothing that it could be merged into.
 
-Hop: ``transformer/``, ``lora/`` of a folder -> the base as it is or in NF4 -> the same with the LoRA on it.
+Data flow: ``transformer/``, ``lora/`` of a folder -> the base as it is or in NF4
+    -> the same with the LoRA on it.
 Paper: none (LoRA, arXiv 2106.09685; NF4, arXiv 2305.14314).
 
 ``peft`` puts it on, ``bitsandbytes`` holds 4-bit weights; both are extras of the package.

@@ -1,6 +1,6 @@
 """The configuration files of a folder of weights, read once.
 
-Hop: folder -> ``Layout`` -> configs by component.
+Data flow: folder -> ``Layout`` -> configs by component.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Strict loading of components: every weight has a place and every place a weight.
 
-Hop: ``Layout`` -> modules of diffusers and transformers -> pipeline.
+Data flow: ``Layout`` -> modules of diffusers and transformers -> pipeline.
 Paper: none.
 
 Classes come from diffusers, transformers or the caller, never from the folder; weights from safetensors only.

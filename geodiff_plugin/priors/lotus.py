@@ -1,6 +1,6 @@
 """Lotus: depth and disparity, generative (G) and discriminative (D).
 
-Hop: folder in diffusers' layout, and its name -> ``LotusPipeline``.
+Data flow: folder in diffusers' layout, and its name -> ``LotusPipeline``.
 Paper: none (He et al., Lotus, ICLR 2025).
 """
 

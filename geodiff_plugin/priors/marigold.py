@@ -1,6 +1,6 @@
 """Marigold v1-0, v1-1 and LCM, and every fine-tune that keeps ``MarigoldDepthPipeline``.
 
-Hop: clean latent -> VAE decoder, not clipped -> relative map.
+Data flow: clean latent -> VAE decoder, not clipped -> relative map.
 Paper: S3.1, S5.1 (built upon Marigold).
 """
 

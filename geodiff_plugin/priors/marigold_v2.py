@@ -1,6 +1,6 @@
 """Adapter of Marigold V2, from the folder that ``geodiff convert marigold-v2`` writes.
 
-Hop: folder -> ``MarigoldV2Pipeline``.
+Data flow: folder -> ``MarigoldV2Pipeline``.
 Paper: none (Marigold V2, arXiv 2609.08084).
 """
 

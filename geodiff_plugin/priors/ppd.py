@@ -1,6 +1,7 @@
 """Pixel-Perfect Depth with the semantics of Depth Anything V2, as ``geodiff convert`` writes it.
 
-Hop: ``dit/``, ``semantic_encoder/``, ``scheduler/`` -> ``PPDPipeline``, whose latents are the map itself.
+Data flow: ``dit/``, ``semantic_encoder/``, ``scheduler/`` -> ``PPDPipeline``, whose latents are the map
+    itself.
 Paper: none; Pixel-Perfect Depth (arXiv 2510.07316).
 """
 

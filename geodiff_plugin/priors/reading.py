@@ -1,6 +1,7 @@
 """Libraries that read weights, made to speak in sentences.
 
-Hop: whatever diffusers, transformers and safetensors raise over a folder -> ``ValueError`` that names it.
+Data flow: whatever diffusers, transformers and safetensors raise over a folder
+    -> ``ValueError`` that names it.
 Paper: none.
 """
 

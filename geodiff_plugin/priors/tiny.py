@@ -1,6 +1,6 @@
 """Tiny autoencoders of the latents that priors work in, for what is decoded between the steps.
 
-Hop: ``decoder`` of the configuration + prior -> ``AutoencoderTiny`` of the same latent.
+Data flow: ``decoder`` of the configuration + prior -> ``AutoencoderTiny`` of the same latent.
 Paper: none; TAESD and its relatives (O. Boer Bohan, github.com/madebyollin/taesd) are distilled from the
 autoencoders that they stand for.
 """

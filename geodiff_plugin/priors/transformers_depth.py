@@ -1,6 +1,6 @@
 """Any depth model of ``transformers``, as that saves it or as a pipeline of ours.
 
-Hop: ``config.json``, ``preprocessor_config.json``, weights -> ``TransformersDepthPipeline``.
+Data flow: ``config.json``, ``preprocessor_config.json``, weights -> ``TransformersDepthPipeline``.
 Paper: none.
 """
 

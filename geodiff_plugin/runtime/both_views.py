@@ -1,6 +1,6 @@
 """Guided depth of both views, each with the other's confident depth as known points.
 
-Hop: left, right, K, E -> guided depth of both -> sure points into the other frame -> guided again.
+Data flow: left, right, K, E -> guided depth of both -> sure points into the other frame -> guided again.
 Paper: none; it leaves a left-right term out (docs/reference/paper-map.md).
 """
 

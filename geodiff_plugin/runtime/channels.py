@@ -1,6 +1,6 @@
 """The depth channels of a latent that holds other maps as well.
 
-Hop: whole latent, channels, new part -> whole latent.
+Data flow: whole latent, channels, new part -> whole latent.
 Paper: none.
 """
 

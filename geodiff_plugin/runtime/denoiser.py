@@ -1,6 +1,6 @@
 """Hook on the denoiser that keeps its graph for the full gradient, inside the pipeline's ``no_grad``.
 
-Hop: the network's first argument -> a detached leaf of its depth channels -> the output with its graph.
+Data flow: the network's first argument -> a detached leaf of its depth channels -> the output with its graph.
 Paper: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
 """
 

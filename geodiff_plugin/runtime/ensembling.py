@@ -1,6 +1,6 @@
 """Ensembles of metric maps: median and median absolute deviation, without alignment.
 
-Hop: ``(E, 1, H, W)`` metres -> median and median absolute deviation.
+Data flow: ``(E, 1, H, W)`` metres -> median and median absolute deviation.
 Paper: S5.1 (an ensemble of 10).
 
 Marigold's own ``ensemble_depth`` renormalises to [0, 1], which would throw the metres away.

@@ -1,6 +1,7 @@
 """One guided call at a time on the same pipeline and networks; a second thread waits for the first.
 
-Hop: pipeline -> locks of it and of its networks, held for a call, given back for the length of a callback.
+Data flow: pipeline -> locks of it and of its networks, held for a call, given back for the length of a
+    callback.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """The grid that a pipeline denoises on: the image's own pixels, and what was added to fill latent cells.
 
-Hop: maps with or without padding -> maps without or with it.
+Data flow: maps with or without padding -> maps without or with it.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Half precision on a CPU: images are resized in float32, for which PyTorch has kernels there.
 
-Hop: the pipeline's image processor, in half precision on a CPU -> the same, resizing in float32.
+Data flow: the pipeline's image processor, in half precision on a CPU -> the same, resizing in float32.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Whether a run is to be trusted, why not, and what the likeliest cause is.
 
-Hop: ``Signs`` of an image's run -> ``Judgement``: one word and a few sentences.
+Data flow: ``Signs`` of an image's run -> ``Judgement``: one word and a few sentences.
 Paper: none; the paper takes its calibration for granted.
 
 What no sign shows, none of this can tell: a rectified pair with a wrong focal length, or with a baseline that

@@ -1,6 +1,6 @@
 """The machine that a result was made on: its devices, its packages, the memory that a call takes.
 
-Hop: name of a device -> ``torch.device``; a ``with`` block -> bytes.
+Data flow: name of a device -> ``torch.device``; a ``with`` block -> bytes.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """What a guided call sets on a pipeline beside its scheduler and network, and takes off again.
 
-Hop: pipeline -> weights without gradients, and the run that its methods ask for.
+Data flow: pipeline -> weights without gradients, and the run that its methods ask for.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Noise level of a live scheduler at a timestep, one function per family.
 
-Hop: scheduler, timestep -> ``NoiseLevel``.
+Data flow: scheduler, timestep -> ``NoiseLevel``.
 Paper: alpha_bar of Eq. 6 (eq:tweedie) and Algorithm 1.
 
 A new scheduler is one line in ``FAMILIES``; everything else goes through the scheduler's own ``step``.

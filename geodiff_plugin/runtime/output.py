@@ -1,6 +1,6 @@
 """Assemble everything known about a guided call on the grid of its output.
 
-Hop: stock output in metres + ``GuidedRun`` -> ``MetricDepthOutput``.
+Data flow: stock output in metres + ``GuidedRun`` -> ``MetricDepthOutput``.
 Paper: Eq. 14's re-rendered left image, as a per-pixel report.
 """
 

@@ -1,6 +1,6 @@
 """Images in, metric depth out: the guided call of a Marigold-style pipeline.
 
-Hop: left image(s) + ``GeometryGuidance`` -> stock call with guidance inside -> ``MetricDepthOutput``.
+Data flow: left image(s) + ``GeometryGuidance`` -> stock call with guidance inside -> ``MetricDepthOutput``.
 Paper: S4, Figure 3 (fig:framework).
 """
 

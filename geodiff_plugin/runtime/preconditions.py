@@ -1,6 +1,6 @@
 """Preconditions of a guided call: what a pipeline must fulfil, checked before anything is computed.
 
-Hop: pipeline, adapter, gradient -> nothing, or one clear error.
+Data flow: pipeline, adapter, gradient -> nothing, or one clear error.
 Paper: none.
 """
 

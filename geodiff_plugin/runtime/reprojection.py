@@ -1,6 +1,6 @@
 """How well the right views explain the left one at a depth, at the output's resolution.
 
-Hop: depth in metres, right views -> where any of them sees the pixel, photometric error.
+Data flow: depth in metres, right views -> where any of them sees the pixel, photometric error.
 Paper: Eq. 14's re-rendered left image, as a per-pixel report.
 """
 

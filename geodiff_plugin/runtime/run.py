@@ -1,6 +1,7 @@
 """State of one guided call: what is set up for it on the pipeline and taken down after it.
 
-Hop: pipeline + ``GeometryGuidance`` -> hooks on -> trajectories -> metric depth of every member -> hooks off.
+Data flow: pipeline + ``GeometryGuidance`` -> hooks on -> trajectories -> metric depth of every member
+    -> hooks off.
 Paper: Algorithm 1 around ``algorithm.guided_step``.
 """
 

@@ -1,6 +1,6 @@
 """What a finished run shows of its own quality, as numbers.
 
-Hop: evidence, confidence, rank correlation of a call -> one ``Signs`` an image.
+Data flow: evidence, confidence, rank correlation of a call -> one ``Signs`` an image.
 Paper: none; the paper takes its calibration for granted.
 """
 

@@ -1,6 +1,7 @@
 """A guided call that goes on from the frame before: its latent, noised again, and its scale.
 
-Hop: ``guidance.previous`` -> latents at a middle step, how many steps to leave out, depths of both ends.
+Data flow: ``guidance.previous`` -> latents at a middle step, how many steps to leave out, depths of both
+    ends.
 Paper: none; the start in the middle is SDEdit's (Meng et al. 2022), of another frame's result.
 """
 

@@ -1,6 +1,6 @@
 """Whether a prior and the views agree on what is near and what is far.
 
-Hop: relative map ``x (B, 1, h, w)``, matches or points -> rank correlation per sample.
+Data flow: relative map ``x (B, 1, h, w)``, matches or points -> rank correlation per sample.
 Paper: none; a check of the user's input, which the prior knows nothing of.
 """
 

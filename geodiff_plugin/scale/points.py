@@ -1,6 +1,7 @@
 """Metres of a relative map from matches and known points: which basin is right, and the fit within it.
 
-Hop: matches or points, relative map ``x (B, 1, h, w)`` -> depths of its nearest and farthest end, per sample.
+Data flow: matches or points, relative map ``x (B, 1, h, w)``
+    -> depths of its nearest and farthest end, per sample.
 Paper: none; the range of the points is where Marigold-DC starts (Viola et al. 2024, Eq. 2).
 """
 

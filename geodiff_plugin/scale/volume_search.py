@@ -1,6 +1,6 @@
 """Find the metres of a relative map by lookup in a plane-sweep volume.
 
-Hop: ``CostVolume``, relative map ``x (B, 1, h, w)`` -> depths of ``x = 0`` and ``x = 1``, per sample.
+Data flow: ``CostVolume``, relative map ``x (B, 1, h, w)`` -> depths of ``x = 0`` and ``x = 1``, per sample.
 Paper: S7.3 (pre-selection of g_s, "a variant of the traditional Plane Sweep Volume technique").
 
 The paper's one number, x = g_s x_rel, prefers depths at which every pixel leaves the right image;

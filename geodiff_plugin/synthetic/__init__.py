@@ -1,6 +1,6 @@
 """Procedural stereo scenes with exact depth: rooms, streets, table tops, corridors, terrain.
 
-Hop: a seed -> ``Scene`` -> ``RenderedView``, ``SyntheticPair`` or a training batch.
+Data flow: a seed -> ``Scene`` -> ``RenderedView``, ``SyntheticPair`` or a training batch.
 Paper: stands in for the rendered training sets of S5.1; mirrors and glass are the hard cases of S5.2.
 """
 

@@ -1,6 +1,6 @@
 """Collects primitives, lights and a camera while a layout draws them, then packs them into a ``Scene``.
 
-Hop: calls like ``box(centre, size, ...)`` -> tensors of a ``Scene``.
+Data flow: calls like ``box(centre, size, ...)`` -> tensors of a ``Scene``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Pinhole cameras as bundles of rays: one bundle a square tile of pixels.
 
-Hop: ``Camera`` + image size -> ``Bundles``; maps over bundles -> images.
+Data flow: ``Camera`` + image size -> ``Bundles``; maps over bundles -> images.
 Paper: S3.3 (pinhole projection).
 """
 

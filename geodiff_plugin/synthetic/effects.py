@@ -1,6 +1,6 @@
 """What a camera does to an image: white balance, contrast, vignetting, blur, noise, JPEG, grey.
 
-Hop: a clean sRGB image -> the same image as a real camera would have written it.
+Data flow: a clean sRGB image -> the same image as a real camera would have written it.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Batches of single views with depth, for training a monocular prior.
 
-Hop: seeds -> images ``(N, 3, H, W)`` and depths ``(N, 1, H, W)``.
+Data flow: seeds -> images ``(N, 3, H, W)`` and depths ``(N, 1, H, W)``.
 Paper: S5.1 (the prior's training data).
 """
 

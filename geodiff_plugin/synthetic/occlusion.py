@@ -1,6 +1,6 @@
 """Ambient occlusion from distances: how free the space above a surface is.
 
-Hop: surface points and normals + primitives -> openness in [0, 1].
+Data flow: surface points and normals + primitives -> openness in [0, 1].
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Stereo pairs with exact depth, rectified or in any relative pose.
 
-Hop: a seed -> ``SyntheticPair``.
+Data flow: a seed -> ``SyntheticPair``.
 Paper: S3.3 (two posed views); S5.2 (mirrors and glass).
 """
 

@@ -1,6 +1,6 @@
 """Photographs as textures, only on request and only for training: those that scikit-image bundles.
 
-Hop: files of the installed scikit-image -> atlas layers; a ``Scene`` -> some surfaces re-covered.
+Data flow: files of the installed scikit-image -> atlas layers; a ``Scene`` -> some surfaces re-covered.
 Paper: none.
 """
 

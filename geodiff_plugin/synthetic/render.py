@@ -1,6 +1,6 @@
 """Rendering: cameras to ray bundles, nearest hits, light, one bounce, smooth edges, exposure.
 
-Hop: ``Scene`` + ``Camera`` -> ``RenderedView``.
+Data flow: ``Scene`` + ``Camera`` -> ``RenderedView``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Frozen records of the renderer: a scene's primitives, lights and sky, its cameras, and what is rendered.
 
-Hop: a layout's draws -> ``Scene`` -> rays -> ``RenderedView``.
+Data flow: a layout's draws -> ``Scene`` -> rays -> ``RenderedView``.
 Paper: none; stands in for the rendered training data of Marigold (S5.1) and for the hard cases of S5.2.
 """
 

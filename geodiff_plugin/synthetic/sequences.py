@@ -1,6 +1,6 @@
 """A rig that moves through a scene that stays as it is: frames with exact depth and exact poses.
 
-Hop: a seed -> ``SyntheticSequence``.
+Data flow: a seed -> ``SyntheticSequence``.
 Paper: none.
 """
 

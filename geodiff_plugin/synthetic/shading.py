@@ -1,6 +1,6 @@
 """Shading of a hit: texture, light, haze, and what mirrors and glass add.
 
-Hop: nearest hits of ray bundles -> linear radiance, and what the surface reflects or lets through.
+Data flow: nearest hits of ray bundles -> linear radiance, and what the surface reflects or lets through.
 Paper: none; mirrors and glass are the hard cases of S5.2.
 """
 

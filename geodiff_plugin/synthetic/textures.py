@@ -1,6 +1,7 @@
 """Texture atlas: procedural layers baked once, sampled on the hit with a mip level that the distance sets.
 
-Hop: surface coordinates in metres + a primitive's layer and palette -> albedo, gloss and shade per pixel.
+Data flow: surface coordinates in metres + a primitive's layer and palette
+    -> albedo, gloss and shade per pixel.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Ray casting: bundles of rays, primitives culled by a cone around each bundle, then exact intersections.
 
-Hop: ray bundles + primitives -> nearest hit, or how strongly something blocks the way.
+Data flow: ray bundles + primitives -> nearest hit, or how strongly something blocks the way.
 Paper: none.
 """
 

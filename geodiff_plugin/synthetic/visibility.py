@@ -1,6 +1,6 @@
 """What a camera stands in, could see, or cannot see because something is in the way.
 
-Hop: ``Scene`` and cameras -> a smaller ``Scene``, or masks over the left image.
+Data flow: ``Scene`` and cameras -> a smaller ``Scene``, or masks over the left image.
 Paper: S3.3 (pixels that only one view sees).
 """
 

@@ -1,6 +1,6 @@
 """The primitives of a batch of scenes as tables, one row a primitive, on the device that renders.
 
-Hop: ``Scene`` records -> ``World``.
+Data flow: ``Scene`` records -> ``World``.
 Paper: none.
 """
 

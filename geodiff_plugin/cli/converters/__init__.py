@@ -1,6 +1,6 @@
 """Converters of published checkpoints, one kind a file, one table.
 
-Hop: an unpickled checkpoint -> the kind that it is -> a folder of safetensors.
+Data flow: an unpickled checkpoint -> the kind that it is -> a folder of safetensors.
 Paper: none.
 
 A new kind is a new file and one line in ``CONVERTERS``.

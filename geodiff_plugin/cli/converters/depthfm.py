@@ -1,6 +1,6 @@
 """Converter of ``depthfm-v1.ckpt``: CompVis' U-Net and empty prompt; the VAE is Stable Diffusion 1.5's.
 
-Hop: ``state_dict, ldm_hparams, noising_step, empty_text_embedding`` -> ``DepthFMPipeline`` -> folder.
+Data flow: ``state_dict, ldm_hparams, noising_step, empty_text_embedding`` -> ``DepthFMPipeline`` -> folder.
 Paper: none (DepthFM, arXiv 2403.13788).
 """
 

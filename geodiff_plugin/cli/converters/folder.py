@@ -1,6 +1,7 @@
 """Converter of folders whose weights are pickled ``.bin`` files.
 
-Hop: .bin files -> .safetensors of the names that diffusers and transformers look for; text files are copied.
+Data flow: .bin files -> .safetensors of the names that diffusers and transformers look for; text files are
+    copied.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Interface of a converter: how a checkpoint is recognised and what is written.
 
-Hop: unpickled checkpoint -> whether it is of this kind -> a folder.
+Data flow: unpickled checkpoint -> whether it is of this kind -> a folder.
 Paper: none.
 """
 

@@ -1,6 +1,7 @@
 """Marigold V2: a base of 40 GB, a checkpoint of what was trained on it, two files of a prompt -> one folder.
 
-Hop: ``transformer/``, ``vae/`` of the base; ``trainables.safetensors``; ``*_prompt_*.pt`` -> prior's folder.
+Data flow: ``transformer/``, ``vae/`` of the base; ``trainables.safetensors``; ``*_prompt_*.pt``
+    -> prior's folder.
 Paper: none (Marigold V2, arXiv 2609.08084; LoRA, arXiv 2106.09685).
 """
 

@@ -1,6 +1,6 @@
 """Converter of ``ppd.pth``: a diffusion transformer on pixels, with the encoder of Depth Anything V2 Large.
 
-Hop: ``dit.*`` and the encoder that ``--with`` names -> ``PPDPipeline`` -> folder.
+Data flow: ``dit.*`` and the encoder that ``--with`` names -> ``PPDPipeline`` -> folder.
 Paper: none; Pixel-Perfect Depth (arXiv 2510.07316).
 """
 

@@ -1,6 +1,6 @@
 """Safe reading of pickled checkpoints: tensors, numbers and text, never code.
 
-Hop: .ckpt, .pth, .pt or .bin -> what was saved in it.
+Data flow: .ckpt, .pth, .pt or .bin -> what was saved in it.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Copy a sharded network tensor by tensor, changing some: no more than one new shard is in memory.
 
-Hop: a folder of safetensors, ``name, tensor -> tensor`` -> a folder of safetensors of our own shards.
+Data flow: a folder of safetensors, ``name, tensor -> tensor`` -> a folder of safetensors of our own shards.
 Paper: none.
 """
 

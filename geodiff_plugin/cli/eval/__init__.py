@@ -1,5 +1,5 @@
 """The ``geodiff eval`` commands: options, help, and tables on the terminal.
 
-Hop: argv -> a function of ``geodiff_plugin.evaluation`` -> its page, printed.
+Data flow: argv -> a function of ``geodiff_plugin.evaluation`` -> its page, printed.
 Paper: S5 (experiments).
 """

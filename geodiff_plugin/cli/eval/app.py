@@ -1,6 +1,6 @@
 """The ``geodiff eval`` commands: options and their help.
 
-Hop: argv -> ``PairsOptions`` -> ``evaluation.commands`` -> its page, printed.
+Data flow: argv -> ``PairsOptions`` -> ``evaluation.commands`` -> its page, printed.
 Paper: S5 (experiments).
 
 Torch and diffusers are imported inside the commands, so that ``--help`` answers at once.

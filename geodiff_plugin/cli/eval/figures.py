@@ -1,6 +1,6 @@
 """``geodiff eval figure NAME``: options and their help.
 
-Hop: argv -> ``FigureOptions`` -> ``evaluation.figures``.
+Data flow: argv -> ``FigureOptions`` -> ``evaluation.figures``.
 Paper: Figures of S5.2, S5.3, S7.3, S9.
 """
 

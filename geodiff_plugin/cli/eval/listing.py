@@ -1,6 +1,6 @@
 """``geodiff eval list``: data sets, whether they are there and how to obtain them, and methods.
 
-Hop: ``DATASETS``, ``METHODS``, ``FAMILIES`` and a folder -> lines on standard output.
+Data flow: ``DATASETS``, ``METHODS``, ``FAMILIES`` and a folder -> lines on standard output.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Options that the commands of ``geodiff eval`` share, with their help.
 
-Hop: argv -> ``PairsOptions``.
+Data flow: argv -> ``PairsOptions``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """``geodiff eval poses``: options and their help.
 
-Hop: argv -> ``PosesOptions`` -> ``evaluation.poses``.
+Data flow: argv -> ``PosesOptions`` -> ``evaluation.poses``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """A page of the evaluation as rich tables on the terminal.
 
-Hop: ``Page`` -> rich tables on standard output; the Markdown file has the same cells.
+Data flow: ``Page`` -> rich tables on standard output; the Markdown file has the same cells.
 Paper: none.
 """
 

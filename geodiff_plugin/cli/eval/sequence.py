@@ -1,6 +1,6 @@
 """``geodiff eval sequence``: options and their help.
 
-Hop: argv -> ``SequenceOptions`` -> ``evaluation.sequence`` -> its page, printed.
+Data flow: argv -> ``SequenceOptions`` -> ``evaluation.sequence`` -> its page, printed.
 Paper: none.
 """
 

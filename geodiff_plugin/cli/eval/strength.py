@@ -1,6 +1,6 @@
 """``geodiff eval strength``: options and their help.
 
-Hop: argv -> ``StrengthOptions`` -> ``evaluation.strength`` -> its page, printed.
+Data flow: argv -> ``StrengthOptions`` -> ``evaluation.strength`` -> its page, printed.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """``geodiff eval table1 | table2 | table3 | ablation | parts | flatness | cost``: options and their help.
 
-Hop: argv -> ``PairsOptions`` -> ``evaluation.experiments`` or ``evaluation.cost``.
+Data flow: argv -> ``PairsOptions`` -> ``evaluation.experiments`` or ``evaluation.cost``.
 Paper: Tables 1 to 4.
 """
 

@@ -1,6 +1,6 @@
 """``geodiff eval trust``: options and their help.
 
-Hop: argv -> ``TrustOptions`` -> ``evaluation.trust``.
+Data flow: argv -> ``TrustOptions`` -> ``evaluation.trust``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Stages of a work side by side: while one item is in a stage, the next one is in the stage before it.
 
-Hop: items -> one thread a stage, a bounded number of items at a time -> finished items, in order.
+Data flow: items -> one thread a stage, a bounded number of items at a time -> finished items, in order.
 Paper: none.
 
 Nothing here imports torch.

@@ -1,6 +1,6 @@
 """Pairs that an earlier run has finished.
 
-Hop: the folder of a pair, what is asked of it -> its report, nothing, or why it cannot be gone on with.
+Data flow: the folder of a pair, what is asked of it -> its report, nothing, or why it cannot be gone on with.
 Paper: none.
 
 Nothing here imports torch.

@@ -1,6 +1,7 @@
 """One pair of many on its way: read, its evidence made, the prior guided by it, its folder written.
 
-Hop: ``PairRef`` -> ``Job`` -> four stages, each in a thread of its own -> files, and a row of the summary.
+Data flow: ``PairRef`` -> ``Job`` -> four stages, each in a thread of its own
+    -> files, and a row of the summary.
 Paper: none.
 """
 

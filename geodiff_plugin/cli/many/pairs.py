@@ -1,6 +1,7 @@
 """Which pairs a run of many is about: two folders, a list, or the video of a rig.
 
-Hop: LEFT and RIGHT as typed -> one ``PairRef`` a pair -> the arguments that ``geodiff depth`` would have had.
+Data flow: LEFT and RIGHT as typed -> one ``PairRef`` a pair
+    -> the arguments that ``geodiff depth`` would have had.
 Paper: none.
 
 Nothing here imports torch: what is wrong with a list is said at once.

@@ -1,6 +1,6 @@
 """The processes of a run of many pairs, one or as many as ``accelerate launch`` or ``torchrun`` started.
 
-Hop: all pairs -> those of this process; what each process found -> all of it, in order.
+Data flow: all pairs -> those of this process; what each process found -> all of it, in order.
 Paper: none.
 """
 

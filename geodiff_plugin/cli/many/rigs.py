@@ -1,6 +1,6 @@
 """Cameras of a rig, read once for all of its pairs.
 
-Hop: arguments of a pair -> ``Rig``, read or remembered.
+Data flow: arguments of a pair -> ``Rig``, read or remembered.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """``geodiff depth`` on many pairs: one process, one prior, four stages side by side.
 
-Hop: ``DepthArguments`` -> ``PairRef`` each -> ``Conveyor`` -> a folder a pair, a table, the exit code.
+Data flow: ``DepthArguments`` -> ``PairRef`` each -> ``Conveyor`` -> a folder a pair, a table, the exit code.
 Paper: Algorithm 1, pair after pair.
 """
 

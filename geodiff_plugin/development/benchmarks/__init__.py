@@ -1,5 +1,5 @@
 """Benchmarks: each module prints one table, run as ``python -m geodiff_plugin.development.benchmarks.NAME``.
 
-Hop: this machine -> seconds.
+Data flow: this machine -> seconds.
 Paper: none.
 """

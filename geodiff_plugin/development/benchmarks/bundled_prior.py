@@ -1,6 +1,6 @@
 """Seconds of a stock call: ``python -m geodiff_plugin.development.benchmarks.bundled_prior``.
 
-Hop: bundled prior, a rendered image -> wall-clock of the stock pipeline at its defaults.
+Data flow: bundled prior, a rendered image -> wall-clock of the stock pipeline at its defaults.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Which corrections earn their decode and encodes: error of the default with fewer, coarser or tiny ones.
 
-Hop: rendered pairs, knobs -> AbsRel with the bundled prior and with emulated ones -> table.
+Data flow: rendered pairs, knobs -> AbsRel with the bundled prior and with emulated ones -> table.
 Paper: none.
 
     python -m geodiff_plugin.development.benchmarks.corrections --pairs 3 corrections=4 corrections=2

@@ -1,6 +1,7 @@
 """How time and memory of a guided call grow, and what a million pairs would cost: docs/explanation/cost.md.
 
-Hop: the demo pair at several sizes, planes, views, steps, members -> CPU seconds, bytes -> exponents -> page.
+Data flow: the demo pair at several sizes, planes, views, steps, members -> CPU seconds, bytes
+    -> exponents -> page.
 Paper: S5.4 (cost).
 
     python -m geodiff_plugin.development.benchmarks.cost --write docs/explanation/cost.md

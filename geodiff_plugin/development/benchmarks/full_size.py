@@ -1,6 +1,7 @@
 """What guidance costs at the size of Marigold v1-1, with random weights, beside Marigold-DC's published loop.
 
-Hop: a seed -> plain, guided, guided with a tiny decoder, Marigold-DC -> seconds, memory, operations, ratios.
+Data flow: a seed -> plain, guided, guided with a tiny decoder, Marigold-DC
+    -> seconds, memory, operations, ratios.
 Paper: S5.4 (cost), as ratios and not as seconds of another machine.
 
 ``--count`` runs nothing of that size: the calls of each network are counted in narrow ones at a low

@@ -1,6 +1,6 @@
 """Seconds to import the package and to start the command.
 
-Hop: one fresh interpreter per line -> a table on standard output.
+Data flow: one fresh interpreter per line -> a table on standard output.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Peak memory of ``geodiff depth`` on large pairs: ``python -m geodiff_plugin.development.benchmarks.large``.
 
-Hop: a rendered pair of W x H -> the command in a process of its own -> resident memory by stage, error.
+Data flow: a rendered pair of W x H -> the command in a process of its own -> resident memory by stage, error.
 Paper: none.
 
 The scene is known in closed form: a tilted wall, and a panel that hangs before it, in a texture with detail

@@ -1,6 +1,6 @@
 """CPU seconds of every stage of the matching, beside OpenCV's eight-path semi-global matching.
 
-Hop: rendered or real pairs -> a table (``python -m geodiff_plugin.development.benchmarks.matching``).
+Data flow: rendered or real pairs -> a table (``python -m geodiff_plugin.development.benchmarks.matching``).
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """What the host's own switches give a guided call, and how far they move its answer.
 
-Hop: a prior, the demo pair -> the same call with each switch -> ratio of seconds, largest deviation.
+Data flow: a prior, the demo pair -> the same call with each switch -> ratio of seconds, largest deviation.
 Paper: none.
 """
 

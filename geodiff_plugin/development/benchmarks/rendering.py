@@ -1,6 +1,6 @@
 """Scenes per second of the renderer, by image size and device.
 
-Hop: nothing -> a table on standard output.
+Data flow: nothing -> a table on standard output.
 Paper: none.
 """
 

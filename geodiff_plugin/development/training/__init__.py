@@ -1,5 +1,5 @@
 """Training of the bundled prior: rendered scenes, autoencoder, denoiser, validation.
 
-Hop: seeds of scenes -> a ``MarigoldDepthPipeline`` folder.
+Data flow: seeds of scenes -> a ``MarigoldDepthPipeline`` folder.
 Paper: S3.1 (a latent diffusion prior); this one is ours.
 """

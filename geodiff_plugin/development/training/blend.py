@@ -1,6 +1,6 @@
 """Mean of two runs' weights: ``python -m geodiff_plugin.development.training.blend --help``.
 
-Hop: two prior folders of one autoencoder -> one whose U-Net lies between theirs.
+Data flow: two prior folders of one autoencoder -> one whose U-Net lies between theirs.
 Paper: none; weights of a run and of its continuation are averaged as in "Model soups" (arXiv 2203.05482).
 """
 

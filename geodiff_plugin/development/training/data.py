@@ -1,6 +1,7 @@
 """Cache of rendered scenes on disk, and the normalised disparity that is learnt.
 
-Hop: seeds -> ``synthetic.render_mono`` -> shards (uint8 images, float16 depth in metres) -> [-1, 1] targets.
+Data flow: seeds -> ``synthetic.render_mono`` -> shards (uint8 images, float16 depth in metres)
+    -> [-1, 1] targets.
 Paper: none; the target is normalised as Marigold's (2 % and 98 % quantiles), of inverse depth.
 """
 

@@ -1,6 +1,6 @@
 """Zero-shot errors of the bundled prior: ``python -m geodiff_plugin.development.training.evaluate``.
 
-Hop: real pairs (left image, truth) and held-out rendered scenes -> aligned errors -> a Markdown table.
+Data flow: real pairs (left image, truth) and held-out rendered scenes -> aligned errors -> a Markdown table.
 Paper: S5.1 (AbsRel, delta1); the plane and the constant are ours, as what any prior must beat.
 """
 

@@ -1,6 +1,6 @@
 """Latents of rendered scenes: encoded once, kept on disk, drawn in batches.
 
-Hop: shard -> flips and colour jitter -> VAE encoder -> float16 latents -> a batch of one shape.
+Data flow: shard -> flips and colour jitter -> VAE encoder -> float16 latents -> a batch of one shape.
 Paper: S3.1 (the prior works in the latent space of a VAE).
 """
 

@@ -1,6 +1,6 @@
 """Networks of the bundled prior, and the pipeline folder that they are saved as.
 
-Hop: configuration -> VAE, U-Net, scheduler, text parts -> ``MarigoldDepthPipeline`` -> folder on disk.
+Data flow: configuration -> VAE, U-Net, scheduler, text parts -> ``MarigoldDepthPipeline`` -> folder on disk.
 Paper: S3.1 (a latent diffusion prior of affine-invariant depth); sizes are ours.
 """
 

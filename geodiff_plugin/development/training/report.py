@@ -1,6 +1,6 @@
 """Reports of a training run: losses, held-out errors, a contact sheet, the prior so far.
 
-Hop: averaged weights -> pipeline folder, ``log.jsonl``, ``contact.png`` in the run's folder.
+Data flow: averaged weights -> pipeline folder, ``log.jsonl``, ``contact.png`` in the run's folder.
 Paper: none.
 """
 

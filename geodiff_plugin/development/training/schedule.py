@@ -1,6 +1,6 @@
 """Training schedule: stages, learning rate and timesteps by the spent share of the time budget.
 
-Hop: fraction in [0, 1] -> learning rate, image size, share of pure regression; batch -> loss.
+Data flow: fraction in [0, 1] -> learning rate, image size, share of pure regression; batch -> loss.
 Paper: none; v-prediction with zero terminal signal-to-noise ratio, as Marigold v1-1.
 """
 

@@ -1,6 +1,7 @@
 """State of a training run on disk, so that a killed run continues.
 
-Hop: U-Net, its moving average, AdamW moments, counters -> ``state.safetensors`` + ``state.json`` -> the same.
+Data flow: U-Net, its moving average, AdamW moments, counters -> ``state.safetensors`` + ``state.json``
+    -> the same.
 Paper: none.
 """
 

@@ -1,6 +1,7 @@
 """Train the small prior: ``python -m geodiff_plugin.development.training.train --out DIR --hours 6``.
 
-Hop: rendered scenes -> autoencoder, then U-Net -> pipeline folder ``DIR/prior``; a killed run continues.
+Data flow: rendered scenes -> autoencoder, then U-Net -> pipeline folder ``DIR/prior``; a killed run
+    continues.
 Paper: none; the recipe is Marigold's in small (README.md beside the weights).
 """
 

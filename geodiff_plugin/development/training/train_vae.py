@@ -1,6 +1,6 @@
 """Training of the autoencoder on small crops of rendered images and depth maps.
 
-Hop: shards -> crops -> ``AutoencoderKL`` with its ``scaling_factor`` set.
+Data flow: shards -> crops -> ``AutoencoderKL`` with its ``scaling_factor`` set.
 Paper: none (the paper takes Stable Diffusion's autoencoder as it is).
 """
 

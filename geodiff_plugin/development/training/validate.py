@@ -1,6 +1,6 @@
 """Validation of a prior: held-out scenes, aligned errors, a contact sheet.
 
-Hop: pipeline, images, depth -> AbsRel and delta1 after a least-squares fit -> numbers, PNG.
+Data flow: pipeline, images, depth -> AbsRel and delta1 after a least-squares fit -> numbers, PNG.
 Paper: S5.1 (AbsRel, delta1); the alignment is Marigold's.
 """
 

@@ -1,6 +1,6 @@
 """Methods side by side, one file each, one table.
 
-Hop: ``StereoSample`` -> every method's ``Prediction``.
+Data flow: ``StereoSample`` -> every method's ``Prediction``.
 Paper: S5.1 (compared methods), S5.3 (ablation).
 """
 

@@ -1,6 +1,6 @@
 """A pipeline that always gives the same answer, for methods without a network in their loop.
 
-Hop: image -> a fixed latent -> (guided) -> relative map.
+Data flow: image -> a fixed latent -> (guided) -> relative map.
 Paper: S5.3.1 (optimisation without the diffusion framework).
 """
 

@@ -1,6 +1,6 @@
 """Filling of holes in a match map from the background.
 
-Hop: shift or inverse depth with holes -> without.
+Data flow: shift or inverse depth with holes -> without.
 Paper: none; as KITTI's development kit does it for sparse results.
 """
 

@@ -1,6 +1,6 @@
 """Fingerprint of a folder's files, for the key of a result.
 
-Hop: folder -> names, sizes and times of change -> short hash.
+Data flow: folder -> names, sizes and times of change -> short hash.
 Paper: none.
 """
 

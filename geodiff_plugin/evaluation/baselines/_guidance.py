@@ -1,6 +1,6 @@
 """The guided call that several methods share; they differ in one preset.
 
-Hop: ``StereoSample`` + preset -> ``GeometryGuidance`` -> pipeline -> ``Prediction``.
+Data flow: ``StereoSample`` + preset -> ``GeometryGuidance`` -> pipeline -> ``Prediction``.
 Paper: Algorithm 1, S5.1, S5.3.
 """
 

@@ -1,6 +1,7 @@
 """The plane sweep that two methods share.
 
-Hop: ``StereoSample`` -> ``CostVolume``; inverse depth on its grid -> depth at the left image's resolution.
+Data flow: ``StereoSample`` -> ``CostVolume``; inverse depth on its grid
+    -> depth at the left image's resolution.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Interface of a method under test: what it is given and what it returns.
 
-Hop: ``StereoSample`` + ``Settings`` -> ``Prediction``.
+Data flow: ``StereoSample`` + ``Settings`` -> ``Prediction``.
 Paper: S5.1 (compared methods).
 """
 

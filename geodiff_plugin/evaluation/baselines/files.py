@@ -1,6 +1,6 @@
 """Depth or disparity maps computed elsewhere, one file a sample.
 
-Hop: ``StereoSample`` -> file of its name -> metres, or relative values to be aligned.
+Data flow: ``StereoSample`` -> file of its name -> metres, or relative values to be aligned.
 Paper: S5.1 (UniDepth, RAFT-Stereo, IGEV-Stereo and DUSt3R among the compared methods).
 """
 

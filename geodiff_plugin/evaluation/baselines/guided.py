@@ -1,6 +1,6 @@
 """The default preset.
 
-Hop: ``StereoSample`` -> guided pipeline -> metres.
+Data flow: ``StereoSample`` -> guided pipeline -> metres.
 Paper: S4; where the default departs from it, docs/reference/knobs.md says why.
 """
 

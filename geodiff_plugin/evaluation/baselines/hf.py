@@ -1,6 +1,6 @@
 """Depth models of ``transformers``: DPT, Depth Anything, ZoeDepth, GLPN, DepthPro.
 
-Hop: ``StereoSample`` -> depth model on the left image -> metres, or relative disparity to be aligned.
+Data flow: ``StereoSample`` -> depth model on the left image -> metres, or relative disparity to be aligned.
 Paper: S5.1 (ZoeDepth, DepthPro and MiDaS among the compared methods).
 """
 

@@ -1,6 +1,6 @@
 """The default preset without the photometric error: matches between the views are the only evidence.
 
-Hop: ``StereoSample`` -> pipeline guided by matches alone -> metres.
+Data flow: ``StereoSample`` -> pipeline guided by matches alone -> metres.
 Paper: none.
 """
 

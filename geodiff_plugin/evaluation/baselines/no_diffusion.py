@@ -1,6 +1,6 @@
 """The default preset without the U-Net: the same losses on a latent that starts as a ramp.
 
-Hop: ``StereoSample`` -> latent of a ramp -> the default's updates of it, scale and shift -> metres.
+Data flow: ``StereoSample`` -> latent of a ramp -> the default's updates of it, scale and shift -> metres.
 Paper: none; what is left of the default once the diffusion is taken out.
 """
 

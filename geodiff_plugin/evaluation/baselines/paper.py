@@ -1,6 +1,6 @@
 """Algorithm 1 of the paper as printed.
 
-Hop: ``StereoSample`` -> pipeline guided with the paper's numbers -> metres.
+Data flow: ``StereoSample`` -> pipeline guided with the paper's numbers -> metres.
 Paper: Algorithm 1, S5.1, S7.3.
 """
 

@@ -1,6 +1,6 @@
 """The default preset without matches: the paper's evidence with our updates.
 
-Hop: ``StereoSample`` -> pipeline guided by the photometric error alone -> metres.
+Data flow: ``StereoSample`` -> pipeline guided by the photometric error alone -> metres.
 Paper: Eq. 14 (eq:geo-loss) as the only evidence.
 """
 

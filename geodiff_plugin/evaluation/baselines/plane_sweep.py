@@ -1,6 +1,6 @@
 """Winner-takes-all depth of our plane sweep, without aggregation.
 
-Hop: ``StereoSample`` of any pose -> cost volume -> best plane -> metres.
+Data flow: ``StereoSample`` of any pose -> cost volume -> best plane -> metres.
 Paper: none; the floor under every method that uses the volume.
 """
 

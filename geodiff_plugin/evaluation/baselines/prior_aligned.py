@@ -1,6 +1,6 @@
 """The prior alone, with scale and shift from the truth: the paper's row "Marigold".
 
-Hop: ``StereoSample`` -> stock pipeline call -> relative depth, to be aligned by an oracle.
+Data flow: ``StereoSample`` -> stock pipeline call -> relative depth, to be aligned by an oracle.
 Paper: S5.1, Tables 1 to 3 (aligned methods).
 """
 

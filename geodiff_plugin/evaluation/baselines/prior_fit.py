@@ -1,6 +1,6 @@
 """One plain call, its scale and shift fitted to the matches, one edge-aware fit: no guided denoising step.
 
-Hop: ``StereoSample`` -> plain call -> robust affine fit -> ``refine_depth`` -> metres.
+Data flow: ``StereoSample`` -> plain call -> robust affine fit -> ``refine_depth`` -> metres.
 Paper: none; what the loop of guided steps has to beat.
 """
 

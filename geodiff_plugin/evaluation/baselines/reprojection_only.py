@@ -1,6 +1,6 @@
 """The paper's ablation without diffusion: gradient descent of the prior's depth on the photometric error.
 
-Hop: ``StereoSample`` -> prior's relative map -> 50 updates of its pixels, scale and shift -> metres.
+Data flow: ``StereoSample`` -> prior's relative map -> 50 updates of its pixels, scale and shift -> metres.
 Paper: S5.3.1, Figure 6 (fig:ab1).
 """
 

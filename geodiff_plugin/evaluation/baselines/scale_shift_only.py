@@ -1,6 +1,6 @@
 """The paper's ablation that learns scale and shift and leaves the latents alone.
 
-Hop: ``StereoSample`` -> pipeline guided in two numbers -> metres.
+Data flow: ``StereoSample`` -> pipeline guided in two numbers -> metres.
 Paper: S5.3, Table 4.
 """
 

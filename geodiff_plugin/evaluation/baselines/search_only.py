@@ -1,6 +1,6 @@
 """The default preset without gradient updates: the search for the scale alone.
 
-Hop: ``StereoSample`` -> pipeline, scale and shift from the search -> metres.
+Data flow: ``StereoSample`` -> pipeline, scale and shift from the search -> metres.
 Paper: S7.3 (the pre-selected g_s), extended to near and far.
 """
 

@@ -1,6 +1,6 @@
 """OpenCV's semi-global block matching with background fill.
 
-Hop: rectified ``StereoSample`` -> disparity -> filled -> metres.
+Data flow: rectified ``StereoSample`` -> disparity -> filled -> metres.
 Paper: leaves this peer out; fill as KITTI's development kit does it for sparse results.
 """
 

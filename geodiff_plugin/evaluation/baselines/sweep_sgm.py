@@ -1,6 +1,6 @@
 """Our plane sweep with semi-global aggregation, left-right check and fill: stereo for any pose, no prior.
 
-Hop: ``StereoSample`` of any pose -> cost volume -> matches -> filled -> metres.
+Data flow: ``StereoSample`` of any pose -> cost volume -> matches -> filled -> metres.
 Paper: none; shows what of the guided result the matches alone explain.
 """
 

@@ -1,6 +1,6 @@
 """A preset with some knobs changed, as a method: ``guided:gradient=full``.
 
-Hop: ``preset:knob=value+knob=value`` -> ``Method``.
+Data flow: ``preset:knob=value+knob=value`` -> ``Method``.
 Paper: S5.3, S7.3, S9 (ablations).
 """
 

@@ -1,6 +1,6 @@
 """Data sets in their official layouts, one file each, one table.
 
-Hop: folder -> references -> ``StereoSample``.
+Data flow: folder -> references -> ``StereoSample``.
 Paper: S5.1 (data sets of Tables 1 to 3).
 """
 

@@ -1,6 +1,6 @@
 """What several data sets need around the readers of ``formats``.
 
-Hop: path -> array of the left image's size; arrays and ``Rig`` -> ``StereoSample``.
+Data flow: path -> array of the left image's size; arrays and ``Rig`` -> ``StereoSample``.
 Paper: none.
 """
 

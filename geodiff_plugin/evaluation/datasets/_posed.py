@@ -1,6 +1,6 @@
 """What data sets of posed views share: camera files, lists of view pairs, the loader.
 
-Hop: scene folder, two views -> ``StereoSample``.
+Data flow: scene folder, two views -> ``StereoSample``.
 Paper: S5.1, Table 2 (the arbitrary two-view setting).
 """
 

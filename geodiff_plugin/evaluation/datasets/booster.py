@@ -1,6 +1,6 @@
 """Booster: indoor scenes full of glass and mirrors, with dense truth and material classes.
 
-Hop: folder -> references -> ``StereoSample`` at a quarter of the images' size.
+Data flow: folder -> references -> ``StereoSample`` at a quarter of the images' size.
 Paper: S5.1, Table 1 (228 pairs of the balanced split).
 """
 

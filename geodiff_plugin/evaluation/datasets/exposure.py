@@ -1,6 +1,6 @@
 """A sample whose right view was taken with another exposure or tone curve.
 
-Hop: ``StereoSample`` + gain + gamma -> ``StereoSample``.
+Data flow: ``StereoSample`` + gain + gamma -> ``StereoSample``.
 Paper: S11 (limits under changing illumination); Middlebury's im1E has such views of a few scenes only.
 """
 

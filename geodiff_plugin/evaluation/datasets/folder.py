@@ -1,6 +1,6 @@
 """Own pairs: a folder a pair, with left, right, calibration and, to be scored, depth.
 
-Hop: folder -> references -> ``StereoSample``.
+Data flow: folder -> references -> ``StereoSample``.
 Paper: none.
 """
 

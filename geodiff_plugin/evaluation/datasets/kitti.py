@@ -1,6 +1,6 @@
 """What KITTI 2012 and 2015 share: 16-bit disparity PNGs and projection matrices.
 
-Hop: reference -> ``StereoSample``.
+Data flow: reference -> ``StereoSample``.
 Paper: S5.1; protocol as in the sets' own development kits (disparity * 256, 0 = unknown).
 """
 

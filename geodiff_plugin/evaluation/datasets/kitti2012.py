@@ -1,6 +1,6 @@
 """KITTI stereo 2012: street pairs, grey or colour, with lidar truth.
 
-Hop: folder -> references -> ``StereoSample``.
+Data flow: folder -> references -> ``StereoSample``.
 Paper: S5.1 names KITTI stereo; the 2012 set is read for its denser grey pairs.
 """
 

@@ -1,6 +1,6 @@
 """KITTI stereo 2015: colour street pairs with lidar truth.
 
-Hop: folder -> references -> ``StereoSample``.
+Data flow: folder -> references -> ``StereoSample``.
 Paper: S5.1, Table 1 (200 training pairs).
 """
 

@@ -1,6 +1,6 @@
 """Middlebury 2014, MiddEval3 and ETH3D two-view: three sets in one file format.
 
-Hop: folder -> references -> ``StereoSample``.
+Data flow: folder -> references -> ``StereoSample``.
 Paper: S5.1, Table 3 (15 pairs). Depth in metres is ``f b / (d + doffs)``, with doffs in pixels and b from
 millimetres.
 """

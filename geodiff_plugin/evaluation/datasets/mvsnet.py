@@ -1,6 +1,6 @@
 """Posed views in the layout that multi-view stereo code uses for Tanks and Temples.
 
-Hop: folder -> references -> ``StereoSample``.
+Data flow: folder -> references -> ``StereoSample``.
 Paper: S5.1, Table 2 (the arbitrary two-view setting).
 """
 

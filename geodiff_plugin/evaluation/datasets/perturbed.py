@@ -1,6 +1,6 @@
 """A sample whose pose is given wrongly, or whose rig has drifted, by a known amount.
 
-Hop: ``StereoSample`` + degrees + share of the baseline, or pixels -> ``StereoSample``.
+Data flow: ``StereoSample`` + degrees + share of the baseline, or pixels -> ``StereoSample``.
 Paper: none; it takes exact poses for granted (S3.3).
 """
 

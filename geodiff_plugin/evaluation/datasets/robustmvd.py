@@ -1,6 +1,6 @@
 """Tanks and Temples as the Robust Multi-View Depth Benchmark ships it: 69 key views of four scenes.
 
-Hop: folder -> references -> ``StereoSample``.
+Data flow: folder -> references -> ``StereoSample``.
 Paper: S5.1, Table 2 (its 116 random pairs of four scenes are not published).
 """
 

@@ -1,6 +1,6 @@
 """The frozen sample that every data set yields, and the reference that loads it.
 
-Hop: files of a data set -> ``SampleRef`` -> ``StereoSample`` -> methods and metrics.
+Data flow: files of a data set -> ``SampleRef`` -> ``StereoSample`` -> methods and metrics.
 Paper: S5.1 (data sets); conventions as everywhere in the package.
 """
 

@@ -1,6 +1,6 @@
 """Our own renderer as a data set: unlimited, seeded, with exact depth, occlusion and material.
 
-Hop: seeds -> references -> ``StereoSample``.
+Data flow: seeds -> references -> ``StereoSample``.
 Paper: stands in where its data sets cannot be shown (S5.2, S5.3).
 """
 

@@ -1,6 +1,6 @@
 """The paper's figures on any data set, one function each, one table.
 
-Hop: name + options -> ``figure-<name>.png`` and ``figure-<name>.json``.
+Data flow: name + options -> ``figure-<name>.png`` and ``figure-<name>.json``.
 Paper: Figure 6 (fig:ab1), fig:qualitative, supplementary figures of S7.3 and S9.
 """
 

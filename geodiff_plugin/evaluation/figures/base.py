@@ -1,6 +1,6 @@
 """Options of a figure, and the depth maps that several figures draw.
 
-Hop: options -> samples and predictions of methods.
+Data flow: options -> samples and predictions of methods.
 Paper: none.
 """
 

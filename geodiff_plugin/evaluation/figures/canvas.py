@@ -1,6 +1,6 @@
 """Drawing tools of the figures: a sheet, maps with shared colour bars, small PNG files.
 
-Hop: arrays -> matplotlib figure -> PNG.
+Data flow: arrays -> matplotlib figure -> PNG.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Drawing of a depth map as a point cloud, seen from another place.
 
-Hop: depth in metres + colours + K -> points -> picture from a second camera.
+Data flow: depth in metres + colours + K -> points -> picture from a second camera.
 Paper: Figure 5 (fig:exp-two-view, point clouds).
 """
 

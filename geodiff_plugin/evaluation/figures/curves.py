@@ -1,6 +1,6 @@
 """Curves of error against updates per step, and against the exposure of the right view.
 
-Hop: samples + variants -> records (resumable) -> mean per variant -> figure.
+Data flow: samples + variants -> records (resumable) -> mean per variant -> figure.
 Paper: S9 (fig:error_time); S11 (limits) for the exposure.
 """
 

@@ -1,6 +1,6 @@
 """Figure of one pair: epipolar lines and residuals by the pose as given and as refined.
 
-Hop: a sample with a perturbed pose -> matches -> lines in the right image, residuals in the left one.
+Data flow: a sample with a perturbed pose -> matches -> lines in the right image, residuals in the left one.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Sweep of the global scale: L_geo and AbsRel against g_s, with re-rendered left images.
 
-Hop: sample + the prior's relative map -> losses and errors per g_s -> figure.
+Data flow: sample + the prior's relative map -> losses and errors per g_s -> figure.
 Paper: S7.3, supplementary figures (fig:lossAbs1, fig:lossAbs2, fig:warp).
 """
 

@@ -1,6 +1,6 @@
 """Depth maps, error maps and point clouds of several methods side by side.
 
-Hop: samples + methods -> predictions -> figure.
+Data flow: samples + methods -> predictions -> figure.
 Paper: Figure 6 (fig:ab1), the qualitative figures (fig:qualitative, fig:exp-two-view).
 """
 

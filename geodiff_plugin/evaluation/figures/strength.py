@@ -1,6 +1,6 @@
 """Guided error against the prior's own, and what its surfaces look like: ``geodiff eval strength --figure``.
 
-Hop: records of ``evaluation.strength`` + shaded depth of one pair -> figure.
+Data flow: records of ``evaluation.strength`` + shaded depth of one pair -> figure.
 Paper: none.
 """
 

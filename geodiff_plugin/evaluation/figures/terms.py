@@ -1,6 +1,6 @@
 """Anatomy of one guided call: prior, matches, confidence, loss terms, result.
 
-Hop: sample -> a call without updates, a guided call -> maps of both, loss terms by step -> figure.
+Data flow: sample -> a call without updates, a guided call -> maps of both, loss terms by step -> figure.
 Paper: Algorithm 1, Eq. 14 (eq:geo-loss) and Eq. 17; not a figure of its own.
 """
 

@@ -1,6 +1,7 @@
 """Base pipeline of depth priors that diffusers has no pipeline for.
 
-Hop: image -> condition, latents -> ``denoise`` once a step -> clean latent -> relative map -> output grid.
+Data flow: image -> condition, latents -> ``denoise`` once a step -> clean latent -> relative map
+    -> output grid.
 Paper: S3.1 (the prior's own sampling), around which Algorithm 1 is put.
 
 A subclass says how its network is called; preprocessing, batching, ensembling and resizing are those of

@@ -1,6 +1,6 @@
 """DepthFM: a flow from the noised image latent to the latent of log depth.
 
-Hop: image latent + noise at t = 0 -> Euler steps of the network's velocity -> t = 1 -> log depth.
+Data flow: image latent + noise at t = 0 -> Euler steps of the network's velocity -> t = 1 -> log depth.
 Paper: none (DepthFM, arXiv 2403.13788).
 
 Its time runs upwards. With ``sigma = 1 - t`` it is the schedule of ``FlowMatchEulerDiscreteScheduler``, whose

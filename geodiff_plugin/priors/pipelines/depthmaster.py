@@ -1,6 +1,6 @@
 """DepthMaster: one pass of a U-Net from the image latent to the depth latent.
 
-Hop: image -> its latent -> ``FourierUNet`` at t = 1 -> clean depth latent -> relative map.
+Data flow: image -> its latent -> ``FourierUNet`` at t = 1 -> clean depth latent -> relative map.
 Paper: none (DepthMaster, arXiv 2501.02576).
 """
 

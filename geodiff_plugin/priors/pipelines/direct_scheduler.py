@@ -1,6 +1,6 @@
 """A schedule of one step for networks whose output is the clean latent itself.
 
-Hop: ``model_output`` -> ``prev_sample``, unchanged.
+Data flow: ``model_output`` -> ``prev_sample``, unchanged.
 Paper: none (its priors all take several steps).
 """
 

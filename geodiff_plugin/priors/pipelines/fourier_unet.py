@@ -1,6 +1,6 @@
 """DepthMaster's U-Net: that of Stable Diffusion 2 with a block after the middle that works on frequencies.
 
-Hop: image latent -> clean depth latent.
+Data flow: image latent -> clean depth latent.
 Paper: none (DepthMaster, arXiv 2501.02576, the Fourier Enhancement module).
 """
 

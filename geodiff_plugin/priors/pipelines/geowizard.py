@@ -1,6 +1,7 @@
 """GeoWizard: depth and surface normals denoised side by side, each attending to the other.
 
-Hop: image -> one noise for both -> pair of latents through one U-Net -> relative depth and unit normals.
+Data flow: image -> one noise for both -> pair of latents through one U-Net
+    -> relative depth and unit normals.
 Paper: S4 (any diffusion-based depth model); the model is Fu et al., ECCV 2024.
 
 The latents are ``(B, 8, h, w)``: four channels of depth, then four of normals. The U-Net is diffusers' own

@@ -1,6 +1,6 @@
 """What a subclass of ``DepthDiffusionPipeline`` overrides: condition, network call, decoder.
 
-Hop: image -> condition; latents, time -> network output; clean latents <-> relative map.
+Data flow: image -> condition; latents, time -> network output; clean latents <-> relative map.
 Paper: S3.1 (the prior's own sampling), around which Algorithm 1 is put.
 """
 

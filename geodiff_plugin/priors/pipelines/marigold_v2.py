@@ -1,6 +1,7 @@
 """Marigold V2: one step of an image-editing transformer from the image's latent to that of depth.
 
-Hop: image -> its latent z -> velocity v -> ``z - v`` -> decode -> mean of three channels -> relative map.
+Data flow: image -> its latent z -> velocity v -> ``z - v`` -> decode -> mean of three channels
+    -> relative map.
 Paper: none (Marigold V2, arXiv 2609.08084).
 """
 

@@ -1,6 +1,6 @@
 """Prompt embeddings for U-Nets with cross-attention: encoded, or saved with the weights.
 
-Hop: prompt -> ``(1, n, C)`` text embedding.
+Data flow: prompt -> ``(1, n, C)`` text embedding.
 Paper: none (Marigold's empty prompt).
 """
 

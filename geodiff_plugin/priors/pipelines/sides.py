@@ -1,6 +1,6 @@
 """Image processors for networks whose sides must be multiples of a number and whose authors resize to that.
 
-Hop: image of any size -> ``(N, 3, H, W)`` in [-1, 1], each side brought there with a factor of its own.
+Data flow: image of any size -> ``(N, 3, H, W)`` in [-1, 1], each side brought there with a factor of its own.
 Paper: none.
 """
 

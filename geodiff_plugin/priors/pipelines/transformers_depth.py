@@ -1,6 +1,7 @@
 """A depth model of ``transformers`` as a "diffusion" of one step that knows its answer.
 
-Hop: image -> the model's map, brought to about [0, 1] -> the clean latent, which is decoded by doing nothing.
+Data flow: image -> the model's map, brought to about [0, 1]
+    -> the clean latent, which is decoded by doing nothing.
 Paper: none (an honest prior for those who have no diffusion prior).
 """
 

@@ -1,6 +1,6 @@
 """One frame through a video autoencoder, and its latents as a transformer's tokens.
 
-Hop: picture ``(B, 3, H, W)`` <-> normalised latents ``(B, 16, h, w)`` <-> tokens ``(B, hw / 4, 64)``.
+Data flow: picture ``(B, 3, H, W)`` <-> normalised latents ``(B, 16, h, w)`` <-> tokens ``(B, hw / 4, 64)``.
 Paper: none (Qwen-Image's autoencoder and patches, arXiv 2508.02324).
 
 The autoencoder works on ``(B, C, T, H, W)``; here T is 1 and stays inside this file.

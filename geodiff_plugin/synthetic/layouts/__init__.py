@@ -1,6 +1,6 @@
 """Layouts: one file a kind of place, each drawing primitives, lights and a camera.
 
-Hop: a seed and a kind -> ``Scene``.
+Data flow: a seed and a kind -> ``Scene``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Small things that lie and stand around: boxes, books, papers, cups, bottles, leaflets, cloth.
 
-Hop: a place and a size -> primitives in a ``Builder``.
+Data flow: a place and a size -> primitives in a ``Builder``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Corridors: a long narrow room with doors, lamps and things along the walls.
 
-Hop: draws -> ``Scene`` of kind "corridor".
+Data flow: draws -> ``Scene`` of kind "corridor".
 Paper: none.
 """
 

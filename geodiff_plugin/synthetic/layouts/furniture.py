@@ -1,6 +1,6 @@
 """Furniture: tables, shelves, cabinets, kitchen counters, monitors, lamps.
 
-Hop: a place and a size -> primitives in a ``Builder``.
+Data flow: a place and a size -> primitives in a ``Builder``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Flat patches on the ground, as fields and drives are: colour that changes, depth that does not.
 
-Hop: an area -> quads in a ``Builder``.
+Data flow: an area -> quads in a ``Builder``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """What indoor kinds share: floor, walls and ceiling, things on walls, lamps, ambient light.
 
-Hop: draws -> primitives, lights and fields of a ``Scene``.
+Data flow: draws -> primitives, lights and fields of a ``Scene``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Sun, sky, haze and buildings, shared by streets and terrain.
 
-Hop: draws -> lights and sky fields of a ``Scene``; buildings in a ``Builder``.
+Data flow: draws -> lights and sky fields of a ``Scene``; buildings in a ``Builder``.
 Paper: none.
 """
 

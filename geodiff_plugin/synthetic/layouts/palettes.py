@@ -1,6 +1,6 @@
 """Plausible colours and surface looks, shared by all layouts.
 
-Hop: random draws -> ``Look``.
+Data flow: random draws -> ``Look``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Vegetation and stones: pot plants, trees, tree lines, bushes, hedges, boulders.
 
-Hop: a place and a size -> primitives in a ``Builder``.
+Data flow: a place and a size -> primitives in a ``Builder``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """The sides of a street: rows of blocks, houses in gardens, or open country.
 
-Hop: a cross-section and a side -> primitives in a ``Builder``.
+Data flow: a cross-section and a side -> primitives in a ``Builder``.
 Paper: none.
 """
 

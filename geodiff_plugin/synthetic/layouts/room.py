@@ -1,6 +1,6 @@
 """Rooms: floor, walls and ceiling, furniture along the walls and in the middle, clutter, lamps and windows.
 
-Hop: draws -> ``Scene`` of kind "room".
+Data flow: draws -> ``Scene`` of kind "room".
 Paper: none.
 """
 

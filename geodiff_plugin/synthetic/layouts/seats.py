@@ -1,6 +1,6 @@
 """Seats: chairs, slatted garden chairs, benches, sofas.
 
-Hop: a place and a size -> primitives in a ``Builder``.
+Data flow: a place and a size -> primitives in a ``Builder``.
 Paper: none.
 """
 

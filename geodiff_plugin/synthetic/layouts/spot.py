@@ -1,6 +1,6 @@
 """A place to put things: local coordinates with a heading, heights upwards from the ground.
 
-Hop: local positions and sizes -> primitives in a ``Builder``.
+Data flow: local positions and sizes -> primitives in a ``Builder``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Streets in towns, suburbs and the country: road and kerbs, facades, gardens, cars, poles, trees, people.
 
-Hop: draws -> ``Scene`` of kind "street".
+Data flow: draws -> ``Scene`` of kind "street".
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Table tops: many touching and overlapping things seen from near, a wall behind.
 
-Hop: draws -> ``Scene`` of kind "tabletop".
+Data flow: draws -> ``Scene`` of kind "tabletop".
 Paper: none.
 """
 

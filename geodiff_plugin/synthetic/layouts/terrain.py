@@ -1,6 +1,6 @@
 """Open ground: hills, rocks, bushes and trees, and terraces with steps, walls, railings and benches.
 
-Hop: draws -> ``Scene`` of kind "terrain".
+Data flow: draws -> ``Scene`` of kind "terrain".
 Paper: none.
 """
 

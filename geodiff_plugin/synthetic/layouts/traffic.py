@@ -1,6 +1,6 @@
 """Cars and vans, people, poles with lamps, signs and wires.
 
-Hop: a place -> primitives in a ``Builder``.
+Data flow: a place -> primitives in a ``Builder``.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Built surfaces: bricks, planks, roofs, roads, facades, shops.
 
-Hop: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile.
+Data flow: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Noise families and simple repeats: fractal, cellular, marble, wood, stripes, checkers, cloth.
 
-Hop: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile that repeats without a seam.
+Data flow: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile that repeats without a seam.
 Paper: none.
 """
 

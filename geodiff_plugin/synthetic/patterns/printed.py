@@ -1,6 +1,6 @@
 """Printed and made things: text, posters, books, screens, keyboards, cupboard fronts, doors, windows.
 
-Hop: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile.
+Data flow: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile.
 Paper: none.
 """
 
