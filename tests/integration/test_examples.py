@@ -42,8 +42,9 @@ def pair(textured_plane, tmp_path) -> list[str]:
 
 
 def test_every_example_is_tested():
-    tested = {"depth_from_stereo", "marigold_v2", "posed_photographs", "swap_prior"}
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == tested
+    source = Path(__file__).read_text(encoding="utf-8")
+    for path in EXAMPLES.glob("*.py"):
+        assert f'load(EXAMPLES / "{path.name}").main(' in source
 
 
 def test_depth_from_stereo(prior, pair, tmp_path, monkeypatch, capsys):
@@ -86,3 +87,35 @@ def test_world_poses_compose_to_the_relative_pose():
     left, right = load(EXAMPLES / "posed_photographs.py").world_poses(E)
     np.testing.assert_allclose(np.linalg.inv(left) @ right, E, atol=1e-12)
     assert not np.allclose(left, np.eye(4))
+
+
+def test_photographs_without_pose(prior, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("poselib")
+    monkeypatch.chdir(tmp_path)
+    load(EXAMPLES / "photographs_without_pose.py").main(["--steps", "1", "--prior", str(prior)])
+    said = capsys.readouterr().out
+    assert "inliers" in said and " m\n" in said
+    assert (np.load("photographs_without_pose.npy") > 0).all()
+
+
+def test_sparse_points(prior, pair, textured_plane, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    points = np.zeros_like(textured_plane.depth_m)
+    points[::4, ::4] = textured_plane.depth_m[::4, ::4]
+    np.save("points.npy", points)
+    np.savetxt("K.txt", textured_plane.K)
+    load(EXAMPLES / "sparse_points.py").main(
+        [pair[0], "points.npy", "K.txt", "--steps", "1", "--prior", str(prior)]
+    )
+    depth_m = np.load("sparse_points.npy")
+    assert np.median(np.abs(depth_m / textured_plane.depth_m - 1)) < 0.05
+    assert "where no point was given" not in capsys.readouterr().out
+
+
+def test_rig_video(prior, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--frames", "2", "--steps", "1", "--prior", str(prior), "--out", "depth.gif"]
+    load(EXAMPLES / "rig_video.py").main(arguments)
+    assert capsys.readouterr().out.count("median") == 2
+    with Image.open("depth.gif") as video:
+        assert video.n_frames == 2

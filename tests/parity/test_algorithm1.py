@@ -47,8 +47,9 @@ def test_scale_shift_and_latents_of_every_step(make_pipeline, turned):
     K, T = (torch.from_numpy(m).float() for m in (pair.K, np.linalg.inv(pair.E)))
     expected = algorithm_1(pipe, encoded, text, z[0], STEPS, left, right, K, T, RATE, RATE_AFFINE)
     assert float(out.global_scale) == expected[-1][2]
+    # Float32's rounding, multiplied by RATE: up to 1e-6 and, on latents of up to 5.5, 3e-5 were seen.
     for (scale, shift, latents), (its_scale, its_shift, _, its_latents) in zip(steps, expected, strict=True):
-        assert scale == pytest.approx(its_scale, abs=2e-5) and shift == pytest.approx(its_shift, abs=2e-5)
+        assert scale == pytest.approx(its_scale, abs=5e-6) and shift == pytest.approx(its_shift, abs=5e-6)
         torch.testing.assert_close(latents, its_latents, atol=1e-4, rtol=0)
     # The guidance has moved something: without it this would hold of any sign.
     alone = algorithm_1(pipe, encoded, text, z[0], STEPS, left, right, K, T, 0.0, 0.0)

@@ -67,7 +67,7 @@ def test_slices_and_tiles_give_the_same_frame():
         tiled = frame_of(vae, z)
     assert (
         tiled.shape == whole.shape
-        and torch.corrcoef(torch.stack([tiled.flatten(), whole.flatten()]))[0, 1] > 0
+        and torch.corrcoef(torch.stack([tiled.flatten(), whole.flatten()]))[0, 1] > 0.8
     )
 
 
@@ -104,7 +104,7 @@ def test_points_make_every_space_metric(space, textured_plane):
     points[::4, ::4] = textured_plane.depth_m[::4, ::4]
     guidance = GeometryGuidance.from_points(points, textured_plane.K, inner_steps=1, **FAST)
     depth_m = pipe(Image.fromarray(textured_plane.left), guidance=guidance).prediction[0, ..., 0]
-    assert np.median(np.abs(depth_m / textured_plane.depth_m - 1)) < 0.03
+    assert np.median(np.abs(depth_m / textured_plane.depth_m - 1)) < 0.025
 
 
 class BlockCode(torch.nn.Module):
@@ -163,7 +163,7 @@ def test_a_corrected_latent_keeps_the_correction_and_the_detail(beyond):
     moved = pipe.encode_relative(corrected) - pipe.encode_relative(x)
     z0 = torch.randn(moved.shape, generator=torch.Generator().manual_seed(0))  # the prior's own, any
     arrived = pipe.decode_relative(z0 + moved) - pipe.decode_relative(z0)
-    torch.testing.assert_close(arrived, corrected - x, rtol=0, atol=2e-3)
+    torch.testing.assert_close(arrived, corrected - x, rtol=0, atol=1e-3)
     assert latents_of(pipe.vae, x.expand(-1, 3, -1, -1)).shape[1] == 16
 
 
@@ -180,7 +180,8 @@ def test_a_guided_call_ends_at_its_points(textured_plane):
         )
         depth_m = pipe(Image.fromarray(textured_plane.left), guidance=guidance).prediction[0, ..., 0]
         errors[correct] = np.abs(depth_m[points > 0] / points[points > 0] - 1).mean()
-    assert errors[True] < 0.5 * errors[False] and errors[True] < 0.05
+    # 0.039 and 0.091 were seen: the prior has random weights, and 16 channels do not hold its whole map.
+    assert errors[True] < 0.5 * errors[False] and errors[True] < 0.045
 
 
 def test_bfloat16_is_guided_to_the_same_depth(textured_plane):
@@ -192,4 +193,4 @@ def test_bfloat16_is_guided_to_the_same_depth(textured_plane):
         guidance = GeometryGuidance.from_points(points, textured_plane.K, inner_steps=1, **FAST)
         found.append(pipe(Image.fromarray(textured_plane.left), guidance=guidance).prediction)
     assert found[1].dtype == np.float32 and np.isfinite(found[1]).all()
-    assert np.median(np.abs(found[1] / found[0] - 1)) < 0.01
+    assert np.median(np.abs(found[1] / found[0] - 1)) < 0.003

@@ -50,8 +50,8 @@ def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
     knows(pipe, textured_plane.depth_m, factor=0.5)
     out = guided(pipe, textured_plane)
     assert out.own_scale.shape == (1, 1)
-    assert float(out.own_scale) == pytest.approx(2.0, rel=0.05)
-    assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.05)
+    assert float(out.own_scale) == pytest.approx(2.0, rel=0.015)
+    assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.01)
 
 
 def test_the_summary_names_the_factor_of_a_metric_prior_alone():
@@ -83,9 +83,10 @@ def test_the_search_starts_from_the_priors_own_metres(kind, textured_plane, monk
     knows(pipe, textured_plane.depth_m)
     out = guided(pipe, textured_plane, refine=False)
     ends = sorted(float(v) for v in started[0])
-    assert ends[0] == pytest.approx(textured_plane.depth_m.min(), rel=0.1)
-    assert ends[1] == pytest.approx(textured_plane.depth_m.max(), rel=0.1)
-    assert float(out.own_scale) == pytest.approx(1.0, abs=0.02)
+    # One end is the map's 98 % quantile, which lies up to 6.4 % within the range of this plane.
+    assert ends[0] == pytest.approx(textured_plane.depth_m.min(), rel=0.08)
+    assert ends[1] == pytest.approx(textured_plane.depth_m.max(), rel=0.08)
+    assert float(out.own_scale) == pytest.approx(1.0, abs=0.01)
 
 
 def test_where_the_views_say_nothing_the_priors_metres_stand(textured_plane):
@@ -95,7 +96,7 @@ def test_where_the_views_say_nothing_the_priors_metres_stand(textured_plane):
     grey = np.full_like(textured_plane.left, 128)
     guidance = GeometryGuidance(grey, textured_plane.K, textured_plane.E, **FAST)
     out = pipe(Image.fromarray(grey), guidance=guidance, processing_resolution=64)
-    assert float(out.own_scale) == pytest.approx(1.0, abs=0.05)
+    assert float(out.own_scale) == pytest.approx(1.0, abs=1e-3)
 
 
 def evidence_of(pair, points=None, rights=True):
@@ -121,14 +122,15 @@ def test_matches_become_a_dense_prompt(textured_plane):
     assert prompt.shape[:2] == (1, 1) and max(prompt.shape[-2:]) <= PROMPT_LONG_EDGE
     truth = torch.from_numpy(textured_plane.depth_m)[None, None]
     truth = torch.nn.functional.interpolate(truth, prompt.shape[-2:], mode="bilinear", antialias=True)
-    assert ((prompt - truth).abs() / truth).median() < 0.03
+    assert ((prompt - truth).abs() / truth).median() < 0.015
 
 
 def test_points_alone_become_a_prompt_and_nothing_becomes_none(textured_plane):
     points = torch.zeros(textured_plane.depth_m.shape)
     points[::8, ::8] = torch.from_numpy(textured_plane.depth_m)[::8, ::8]
     prompt = prompt_of([evidence_of(textured_plane, points, rights=False)])
-    assert prompt.isfinite().all() and 0.9 < prompt.median() / np.median(textured_plane.depth_m) < 1.1
+    middle = float(np.median(textured_plane.depth_m))
+    assert prompt.isfinite().all() and float(prompt.median()) == pytest.approx(middle, rel=0.01)
     bare = evidence_of(textured_plane, points, rights=False)
     assert prompt_of([bare, type(bare)(bare.left_01, bare.K_left, (), None, None, None)]) is None
 
@@ -139,8 +141,8 @@ def test_prompt_depth_anything_is_given_what_is_known(textured_plane):
     out = guided(pipe, textured_plane)
     assert told[0] is not None and told[0].isfinite().all()
     middle = float(np.median(textured_plane.depth_m))
-    assert float(told[0].median()) == pytest.approx(middle, rel=0.1)
-    assert float(out.own_scale) == pytest.approx(1.0, abs=0.05)  # its map is in metres with a prompt
+    assert float(told[0].median()) == pytest.approx(middle, rel=0.01)
+    assert float(out.own_scale) == pytest.approx(1.0, abs=0.01)  # its map is in metres with a prompt
     pipe(Image.fromarray(textured_plane.left), processing_resolution=64)
     assert told[-1] is None  # without guidance it is a relative prior
 
