@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageOps
 
-from geodiff_plugin._checks import bad_value, check_calibrated_size
+from geodiff_plugin._camera_checks import check_calibrated_size
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import read_calibration, rig_from_parameters
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig

@@ -13,15 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import (
-    bad_value,
+from geodiff_plugin._camera_checks import (
     check_baseline,
     check_calibrated_size,
     check_intrinsics,
     check_intrinsics_fit,
-    check_number,
     check_pose,
 )
+from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.begin import PARAMETERS, calibration_way
 from geodiff_plugin.cli.checks import check_positive

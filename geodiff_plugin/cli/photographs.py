@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value, check_intrinsics
+from geodiff_plugin._camera_checks import check_intrinsics
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_positive
 from geodiff_plugin.cli.inputs import Inputs, lenses_of, pinhole

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value, check_intrinsics
+from geodiff_plugin._camera_checks import check_intrinsics
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.atomic import atomic_path
 from geodiff_plugin.formats.strips import row_strips
 

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import bad_value, check_intrinsics, check_number
+from geodiff_plugin._camera_checks import check_intrinsics
+from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.geometry import nearest_rotation
 from geodiff_plugin.types import Rig
 

@@ -14,15 +14,8 @@ from typing import Any, Self
 import numpy as np
 from torch import Tensor
 
-from geodiff_plugin._checks import (
-    bad_type,
-    bad_value,
-    check_calibrated_size,
-    check_intrinsics_fit,
-    check_number,
-    check_size,
-    warn_of_other_size,
-)
+from geodiff_plugin._camera_checks import check_calibrated_size, check_intrinsics_fit, warn_of_other_size
+from geodiff_plugin._checks import bad_type, bad_value, check_number, check_size
 from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs
 from geodiff_plugin.formats import as_image_01, read_calibration
 from geodiff_plugin.geometry.cameras import image_size

@@ -13,16 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geodiff_plugin._checks import (
-    bad_type,
-    bad_value,
+from geodiff_plugin._camera_checks import (
     check_baseline,
     check_intrinsics,
     check_intrinsics_fit,
-    check_map_in_metres,
     check_pose,
     warn_of_other_size,
 )
+from geodiff_plugin._checks import bad_type, bad_value, check_map_in_metres
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.types import CameraView, Rig
 

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_type, bad_value, check_intrinsics, check_intrinsics_fit, check_number
+from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit
+from geodiff_plugin._checks import bad_type, bad_value, check_number
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.guidance.posing import coarse_depth

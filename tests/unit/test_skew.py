@@ -16,7 +16,7 @@ import torch
 
 import geodiff_plugin
 from geodiff_plugin import GeometryGuidance, geometry
-from geodiff_plugin._checks import check_intrinsics, check_intrinsics_fit, warn_of_other_size
+from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit, warn_of_other_size
 from geodiff_plugin.algorithm.evidence import EvidenceInputs, as_fine_as, prepare_evidence, resize_long_edge
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.figures.clouds import render_cloud
@@ -41,8 +41,8 @@ DEPTH = 1.5 + np.random.default_rng(0).uniform(size=SIZE)
 HAS_GRADIO = importlib.util.find_spec("gradio") is not None
 #: Functions that hand a camera matrix on or read no coordinate of it, beside those with a test below.
 HAND_ON = {
-    "_checks.check_intrinsics_fit",  # the principal point alone
-    "_checks.warn_of_other_size",
+    "_camera_checks.check_intrinsics_fit",  # the principal point alone
+    "_camera_checks.warn_of_other_size",
     "evaluation.datasets.booster._quarter_intrinsics",  # by resize_intrinsics
     "formats.rigs.make_rig",
     "guidance.inputs.read_inputs",
@@ -250,7 +250,7 @@ def test_a_guidance_keeps_it():
 
 
 def test_no_function_that_takes_a_camera_matrix_is_left_out():
-    tested = {"_checks.check_intrinsics"} | {
+    tested = {"_camera_checks.check_intrinsics"} | {
         f"{f.__module__.removeprefix('geodiff_plugin.')}.{f.__name__}"
         for f in (
             *(geometry.unproject, geometry.project, geometry.plane_rays, geometry.warp_right_to_left),
