@@ -1,0 +1,144 @@
+"""Checks of camera matrices and poses, and of images against them.
+
+Data flow: ``K``, ``E`` and sizes as the user gave them -> float64 matrices, a warning, or ``InputError``.
+Paper: none; S3.3 takes known cameras for granted.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_type, bad_value
+
+__all__ = [
+    "check_baseline",
+    "check_calibrated_size",
+    "check_intrinsics",
+    "check_intrinsics_fit",
+    "check_pose",
+    "warn_of_other_size",
+]
+
+#: A baseline longer than this is taken for millimetres that were meant as metres (with a warning).
+LONG_BASELINE_M = 20.0
+#: A principal point in the outer fifth of an image is rather that of an image of another size.
+NEAR_BORDER = 0.2
+SCALED_K = "with s = new size / old size take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy"
+
+
+def _as_matrix(value: Any, name: str, shape: tuple[int, int], cure: str) -> np.ndarray:
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().double().numpy()  # numpy has no bfloat16
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        bad_type(name, f"a {shape[0]}x{shape[1]} matrix of numbers", value, cure)
+    if matrix.shape != shape:
+        bad_value(name, f"a {shape[0]}x{shape[1]} matrix", f"shape {matrix.shape}", cure)
+    if not np.isfinite(matrix).all():
+        bad_value(name, "finite", "NaN or infinity in it", "Check the calibration file.")
+    return matrix
+
+
+def check_intrinsics(K: Any, name: str = "K") -> np.ndarray:
+    """A ``(3, 3)`` float64 camera matrix in pixels.
+
+    Raises:
+        TypeError, ValueError: not 3x3, not finite, zero or negative focal length, last row not (0, 0, 1).
+    """
+    cure = "K is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the image it comes with."
+    K = _as_matrix(K, name, (3, 3), cure)
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        got = f"{K[0, 0]:g} and {K[1, 1]:g}"
+        bad_value(f"{name}[0, 0] and {name}[1, 1] (fx, fy)", "positive focal lengths in pixels", got, cure)
+    if not np.allclose(K[2], (0, 0, 1), atol=1e-6) or abs(K[1, 0]) > 1e-6:
+        bad_value(name, "upper triangular with last row (0, 0, 1)", K.tolist(), cure)
+    return K
+
+
+def check_intrinsics_fit(
+    K: np.ndarray, width: int, height: int, name: str = "K", image: str = "the image"
+) -> None:
+    """Refuse a camera matrix whose principal point lies outside the image that it comes with."""
+    cx, cy = K[0, 2], K[1, 2]
+    if not (0 <= cx <= width and 0 <= cy <= height):
+        bad_value(
+            name,
+            f"for {image} of {width}x{height} pixels",
+            f"principal point ({cx:.1f}, {cy:.1f}) outside of it",
+            f"It probably belongs to another resolution: {SCALED_K}. "
+            "If it is a crop, say so with cropped=True.",
+        )
+
+
+def check_calibrated_size(
+    size: tuple[int, int], calibrated: tuple[int, int] | None, name: str, source: object, cure: str
+) -> None:
+    """Refuse an image whose ``(width, height)`` is not what its calibration says, if that says any."""
+    if calibrated is not None and tuple(calibrated) != size:
+        expected = "of {}x{} pixels, as {} says".format(*calibrated, source)
+        bad_value(name, expected, "{}x{}".format(*size), cure)
+
+
+def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
+    """Warn of a principal point near the border, where that of an image of twice the size lies."""
+    shares = (K[0, 2] / width, K[1, 2] / height)
+    if min(shares) < NEAR_BORDER or max(shares) > 1.0 - NEAR_BORDER:
+        warnings.warn(
+            f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) near the border of {image} of "
+            f"{width}x{height} pixels. If it is for another resolution, {SCALED_K}.",
+            stacklevel=3,
+        )
+
+
+def check_pose(E: Any, name: str = "E") -> np.ndarray:
+    """A ``(4, 4)`` float64 rigid transform; a rotation off by at most 1e-2 is projected to the nearest one.
+
+    A 3x4 gets the row 0 0 0 1.
+
+    Raises:
+        TypeError, ValueError: neither 4x4 nor 3x4, not finite, last row not (0, 0, 0, 1), no rotation,
+            mirrored.
+    """
+    cure = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t], [0, 1]], t in metres."
+    if np.shape(E) == (3, 4):
+        E = np.vstack([_as_matrix(E, name, (3, 4), cure), (0.0, 0.0, 0.0, 1.0)])
+    E = _as_matrix(E, name, (4, 4), cure)
+    if not np.allclose(E[3], (0, 0, 0, 1), atol=1e-6):
+        bad_value(
+            name, "rigid with last row (0, 0, 0, 1)", f"last row {E[3].tolist()}", cure + " Is it transposed?"
+        )
+    R = E[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        bad_value(
+            name,
+            "rigid: its upper left 3x3 a rotation (orthogonal within 1e-2, determinant +1)",
+            f"determinant {np.linalg.det(R):.4f}, |R R^T - I| up to {np.abs(R @ R.T - np.eye(3)).max():.4f}",
+            cure,
+        )
+    U, _, Vt = np.linalg.svd(R)
+    E = E.copy()
+    E[:3, :3] = U @ Vt
+    return E
+
+
+def check_baseline(E: np.ndarray, name: str = "E") -> None:
+    """Refuse a relative pose without translation; warn of one that looks like millimetres."""
+    baseline = float(np.linalg.norm(E[:3, 3]))
+    if baseline < 1e-6:
+        bad_value(
+            name,
+            "a pose whose camera centre differs from the left one's (a baseline)",
+            f"a translation of {baseline:.1g} m",
+            "Without a baseline two views do not tell the scale; "
+            "give the distance between the cameras in metres.",
+        )
+    if baseline > LONG_BASELINE_M:
+        warnings.warn(
+            f"{name} has a baseline of {baseline:.4g} m. "
+            "If that is millimetres, divide the translation by 1000.",
+            stacklevel=3,
+        )
