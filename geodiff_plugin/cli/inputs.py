@@ -24,17 +24,14 @@ from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.begin import PARAMETERS, calibration_way
 from geodiff_plugin.cli.checks import check_positive
+from geodiff_plugin.cli.lenses import Lenses, lenses_of, pinhole
 from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
-from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
-from geodiff_plugin.formats.rigs import intrinsics, is_distorted
+from geodiff_plugin.formats.rigs import intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.types import Distortion, Rig
+from geodiff_plugin.types import Rig
 
-__all__ = ["Inputs", "lenses_of", "pinhole", "read_inputs", "read_rig"]
-
-Lenses = tuple[Distortion | None, ...]
-"""One entry a photograph, or one a further view; ``None`` for a pinhole camera."""
+__all__ = ["Inputs", "read_inputs", "read_rig"]
 
 MOST_PIXELS = 1e6
 
@@ -221,36 +218,3 @@ def read_inputs(
     right = None if right is None else pinhole(right, rig.K_right, lenses[1])
     guidance = _make_guidance(arguments, settings, right, rig, lenses[2:])
     return Inputs(left, rig, guidance, any(lens is not None for lens in lenses))
-
-
-def pinhole(image: np.ndarray, K: np.ndarray, lens: Distortion | None) -> np.ndarray:
-    """The image as a pinhole camera would have taken it: the very one where the lens has no distortion."""
-    return image if lens is None else undistorted(image, K, lens)
-
-
-def lenses_of(
-    arguments: DepthArguments, own: tuple[Distortion | None, Distortion | None] = (None, None)
-) -> Lenses:
-    """Distortion of the lens of every photograph, the left one first; ``None`` where a lens has none.
-
-    As typed, else the calibration's own; of a further view as typed, else the left one's, as its K is.
-
-    Raises:
-        ValueError: more than two lenses, malformed coefficients, or a further view with a K of its own and a
-            lens that is not told.
-    """
-    typed = [distortion_from_text(text) for text in arguments.distortion]
-    if len(typed) > 2:
-        bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
-    found = (typed[0], typed[-1]) if typed else own
-    further: list[Distortion | None] = [
-        distortion_from_text(text, "--view-distortion") for text in arguments.view_distortion
-    ]
-    if not further:
-        if arguments.view_k and any(lens is not None and is_distorted(lens.coefficients) for lens in found):
-            cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
-            bad_value("--view-distortion", "given for each --view", "none", cure)
-        further = [found[0]] * len(arguments.view)
-    return tuple(
-        lens if lens is not None and is_distorted(lens.coefficients) else None for lens in (*found, *further)
-    )

@@ -16,7 +16,8 @@ from geodiff_plugin._camera_checks import check_intrinsics
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_positive
-from geodiff_plugin.cli.inputs import Inputs, lenses_of, pinhole
+from geodiff_plugin.cli.inputs import Inputs
+from geodiff_plugin.cli.lenses import lenses_of, pinhole
 from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.cli.voice import say
 from geodiff_plugin.formats import read_image, read_matrix, read_points

@@ -6,7 +6,6 @@ Paper: none; S5 measures one prior.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,25 +19,23 @@ from tqdm import tqdm
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.cells import count_of_pairs
 from geodiff_plugin.evaluation.datasets import SampleRef, find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.emulated import DENSE, SPACES, STRENGTHS, EmulatedPrior, EmulatedPriors
 from geodiff_plugin.evaluation.figures.strength import draw_strength, shaded
-from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.records import append_record, read_records
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
+from geodiff_plugin.evaluation.strength_tables import strength_tables
 from geodiff_plugin.evaluation.surfaces import DenseTruth
 
-__all__ = ["METHODS", "StrengthOptions", "run_strength", "strength_tables"]
+__all__ = ["METHODS", "StrengthOptions", "run_strength"]
 
 #: The plain call whose scale and shift the truth decides.
 ORACLE = "prior-aligned"
 METHODS = (ORACLE, "prior-fit", "guided", "search-only", "guided:inner_steps=5")
 #: Strength whose surfaces the figure shows.
 SHOWN = "5%"
-_VALUES = {"abs_rel": "AbsRel", "delta1": "δ1", "edges": "at edges", "surfaces": "surfaces"}
 
 
 @dataclass(frozen=True)
@@ -200,51 +197,3 @@ def _depth(
         generator=torch.Generator().manual_seed(settings.seed),
     )
     return align(out.prediction[0, ..., 0], sample.depth_m, sample.valid, prior.space)
-
-
-def strength_tables(records: Sequence[dict[str, Any]]) -> tuple[Table, ...]:
-    """One table a group of pairs (all, rendered rectified, rendered posed, real), strengths by methods.
-
-    Args:
-        records: of ``run_strength``.
-    """
-    groups = {
-        "All pairs": lambda r: True,
-        "Rendered, rectified": lambda r: r["rendered"] and r["rectified"],
-        "Rendered, any pose": lambda r: r["rendered"] and not r["rectified"],
-        "Real": lambda r: not r["rendered"],
-    }
-    tables = []
-    for title, belongs in groups.items():
-        own = [record for record in records if belongs(record)]
-        if own:
-            tables.append(_table(title, own))
-    return tuple(tables)
-
-
-def _table(title: str, records: Sequence[dict[str, Any]]) -> Table:
-    strengths = list(dict.fromkeys(record["strength"] for record in records))
-    methods = list(dict.fromkeys(record["method"] for record in records))
-    rows, rules = [], []
-    for strength in strengths:
-        rules.append(len(rows))
-        for method in methods:
-            own = [r for r in records if r["strength"] == strength and r["method"] == method]
-            if not own:
-                continue
-            means = {name: _mean([r[name] for r in own]) for name in _VALUES}
-            worst = max(r["abs_rel"] for r in own)
-            shown = [f"{means[n]:.2f}" if n == "surfaces" else f"{means[n]:.4f}" for n in _VALUES]
-            rows.append((strength, find_method(method).title, *shown, f"{worst:.3f}"))
-    pairs = count_of_pairs(len({record["pair"] for record in records}))
-    note = (
-        f"{pairs}. AbsRel and δ1 in metres, without alignment but for the prior with oracle; AbsRel within "
-        f"3 px of the truth's edges; error of the slope of log depth away from them, per mille a pixel."
-    )
-    header = ("prior's error", "method", *_VALUES.values(), "worst AbsRel")
-    return Table(title, header, tuple(rows), note, rules=tuple(rules[1:]))
-
-
-def _mean(values: Sequence[float]) -> float:
-    known = [value for value in values if not math.isnan(value)]
-    return sum(known) / len(known) if known else float("nan")

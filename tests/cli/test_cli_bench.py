@@ -13,7 +13,7 @@ from diffusers import AutoencoderKL, UNet2DConditionModel
 
 from geodiff_plugin.bundled.demo_pair import DemoPair
 from geodiff_plugin.cli.bench import BUNDLED, Cost, measure, run_bench
-from geodiff_plugin.development.benchmarks import full_size
+from geodiff_plugin.development.benchmarks import full_size, operations
 from geodiff_plugin.development.full_sizes import UNET, VAE
 from geodiff_plugin.runtime.machine import PeakMemory
 from geodiff_plugin.types import Rig
@@ -90,4 +90,4 @@ def test_full_size_bench(capsys):
     narrow = ["--width", "0.05", "--resolution", "64", "--steps", "2", "--dc-steps", "2", "--repeats", "0"]
     full_size.main(["--device", "cpu", *narrow])
     printed = capsys.readouterr().out
-    assert all(way in printed for way in full_size.WAYS)
+    assert all(way in printed for way in operations.WAYS)

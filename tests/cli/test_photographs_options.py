@@ -9,7 +9,7 @@ import pytest
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_arguments
-from geodiff_plugin.cli.inputs import lenses_of
+from geodiff_plugin.cli.lenses import lenses_of
 from geodiff_plugin.cli.photographs import known_length
 from geodiff_plugin.formats.distortion import distortion_from_text
 

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.development.benchmarks import calls, cost, full_size
+from geodiff_plugin.development.benchmarks import calls, cost, operations
 from geodiff_plugin.development.benchmarks.matrix import deviation
 from geodiff_plugin.development.full_sizes import UNET, VAE
 from geodiff_plugin.development.random_marigold import narrowed
 
 
 def test_calls_of_every_way():
-    made = full_size.calls_of_all(full_size.Size(steps=3, dc_steps=2))
+    made = operations.calls_of_all(operations.Size(steps=3, dc_steps=2))
     image = {"encode": 1}
     assert made["plain"] == image | {"network": 3, "decode": 1}
     # Every correction decodes once and encodes twice, but for the last one, whose map is the result.
@@ -26,13 +26,13 @@ def test_calls_of_every_way():
 
 
 def test_operations_grow_with_pixels_and_width():
-    small, large = (full_size.count_operations(full_size.Size(0.1, side)) for side in (128, 256))
+    small, large = (operations.count_operations(operations.Size(0.1, side)) for side in (128, 256))
     assert set(small) >= {"network", "network + back", "decode", "decode + back", "encode", "tiny decode"}
     for kind, n in small.items():
         assert 2.5 * n < large[kind] < 8.0 * n
         if f"{kind} + back" in small:  # back to the input alone, whose cost is about that of the way there
             assert 1.8 * n < small[f"{kind} + back"] < 2.2 * n
-    assert full_size.count_operations(full_size.Size(0.2, 128))["network"] > 1.5 * small["network"]
+    assert operations.count_operations(operations.Size(0.2, 128))["network"] > 1.5 * small["network"]
     assert small["tiny decode"] < 0.2 * small["decode"]
 
 

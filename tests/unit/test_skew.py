@@ -51,7 +51,7 @@ HAND_ON = {
     "matching.build.pilot_volume",
     "runtime.both_views.guide_both_views",
     "runtime.reprojection.reprojection",  # to warp_right_to_left
-    "cli.inputs.pinhole",  # to OpenCV
+    "cli.lenses.pinhole",  # to OpenCV
     "app.measure.read_pixel",
     "formats.distortion.undistorted",
     "formats.pointcloud.make_cloud",

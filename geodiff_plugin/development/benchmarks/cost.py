@@ -28,7 +28,7 @@ from diffusers.utils import logging as diffusers_logging
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
-from geodiff_plugin.development.benchmarks import full_size
+from geodiff_plugin.development.benchmarks.operations import Size, calls_of_all, count_operations
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.machine import PeakMemory
@@ -135,7 +135,7 @@ def _axis_table(axis: Axis, found: Sequence[tuple[float, int]]) -> list[str]:
     return [*lines, ""]
 
 
-def tables(measured: dict[str, list[tuple[float, int]]], size: full_size.Size) -> str:
+def tables(measured: dict[str, list[tuple[float, int]]], size: Size) -> str:
     """The page's tables as Markdown.
 
     Args:
@@ -149,19 +149,19 @@ def tables(measured: dict[str, list[tuple[float, int]]], size: full_size.Size) -
     return "\n".join([*lines, *_extrapolated(size)])
 
 
-def _extrapolated(size: full_size.Size) -> list[str]:
+def _extrapolated(size: Size) -> list[str]:
     """What a million pairs cost by counted operations: no GPU was there to measure it."""
-    operations = full_size.count_operations(size)
+    operations = count_operations(size)
     sides = [size.resolution // 2, size.resolution, 2 * size.resolution]
     lines = [f"### Counted: Marigold v1-1's configuration, {size.resolution} px, {size.steps} steps", ""]
     lines += [f"| TFLOP of one call at px | {' | '.join(map(str, sides))} | exponent |"]
     lines += ["| --- |" + " ---: |" * (len(sides) + 1)]
-    each = [full_size.count_operations(full_size.Size(size.width, side)) for side in sides]
+    each = [count_operations(Size(size.width, side)) for side in sides]
     for kind in ("network", "decode", "encode"):
         flops = [one[kind] for one in each]
         told = " | ".join(f"{n / 1e12:.2f}" for n in flops)
         lines.append(f"| {kind} | {told} | {exponent(sides, flops):.2f} |")
-    calls = full_size.calls_of_all(size)
+    calls = calls_of_all(size)
     lines += [
         "",
         "| way | TFLOP a pair | x plain | " + " | ".join(_head(s, g) for s in SUSTAINED for g in GPUS) + " |",
@@ -213,7 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
                 found = fresh_process.submit(measure, **axis.call(value)).result()
             measured.setdefault(axis.name, []).append(found)
-    made = tables(measured, full_size.Size())
+    made = tables(measured, Size())
     print(made)
     if typed.write is not None:
         typed.write.write_text(with_tables(typed.write.read_text(encoding="utf-8"), made), encoding="utf-8")

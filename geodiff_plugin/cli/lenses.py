@@ -1,0 +1,59 @@
+"""Lens distortion as ``geodiff depth`` is given it, and images without it.
+
+Data flow: ``--distortion``, ``--view-distortion``, the calibration -> one ``Distortion`` a photograph
+    -> undistorted images.
+Paper: none; it takes pinhole cameras for granted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
+from geodiff_plugin.formats.rigs import is_distorted
+from geodiff_plugin.types import Distortion
+
+__all__ = ["Lenses", "lenses_of", "pinhole"]
+
+Lenses = tuple[Distortion | None, ...]
+"""One entry a photograph, or one a further view; ``None`` for a pinhole camera."""
+
+
+def pinhole(image: np.ndarray, K: np.ndarray, lens: Distortion | None) -> np.ndarray:
+    """The image as a pinhole camera would have taken it; the same array where the lens has no distortion."""
+    return image if lens is None else undistorted(image, K, lens)
+
+
+def lenses_of(
+    arguments: DepthArguments, own: tuple[Distortion | None, Distortion | None] = (None, None)
+) -> Lenses:
+    """Distortion of every photograph's lens, the left one first; ``None`` for a lens without distortion.
+
+    Options take precedence over the calibration. A further view without ``--view-distortion`` has the left
+    one's lens, as it has its K.
+
+    Args:
+        arguments: the options.
+        own: of the left and the right lens, as the calibration says.
+
+    Raises:
+        ValueError: more than two lenses, malformed coefficients, or a further view with a K of its own and a
+            lens that is not told.
+    """
+    typed = [distortion_from_text(text) for text in arguments.distortion]
+    if len(typed) > 2:
+        bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
+    found = (typed[0], typed[-1]) if typed else own
+    further: list[Distortion | None] = [
+        distortion_from_text(text, "--view-distortion") for text in arguments.view_distortion
+    ]
+    if not further:
+        if arguments.view_k and any(lens is not None and is_distorted(lens.coefficients) for lens in found):
+            cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
+            bad_value("--view-distortion", "given for each --view", "none", cure)
+        further = [found[0]] * len(arguments.view)
+    return tuple(
+        lens if lens is not None and is_distorted(lens.coefficients) else None for lens in (*found, *further)
+    )
