@@ -24,8 +24,9 @@ from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior
+from geodiff_plugin.runtime.guided_call import native_images
 from geodiff_plugin.runtime.machine import pick_device
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance, native_images
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.synthetic.sequences import SyntheticSequence, render_sequence
 
 __all__ = ["WAYS", "SequenceOptions", "Way", "flicker", "run_sequence", "sequence_table"]

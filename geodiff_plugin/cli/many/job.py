@@ -30,7 +30,7 @@ from geodiff_plugin.cli.voice import in_options
 from geodiff_plugin.formats.out_folder import OutFolder
 from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
-from geodiff_plugin.runtime.pipeline import native_images
+from geodiff_plugin.runtime.guided_call import native_images
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["Job", "Stages", "ThreadWarnings"]
