@@ -101,8 +101,8 @@ class GeoDiffDepth:
         lefts, rights = (list(batch.cpu().numpy()) for batch in (left, right))
         make = GeometryGuidance.paper if preset == "paper" else GeometryGuidance
         guidance = make(rights, (rig.K_left, rig.K_right), rig.E)
-        asked = guidance.denoising_steps(steps or None, pipe.default_denoising_steps)
-        bar = comfy.utils.ProgressBar(asked * len(lefts) * ensemble)
+        count = guidance.denoising_steps(steps or None, pipe.default_denoising_steps)
+        bar = comfy.utils.ProgressBar(count * len(lefts) * ensemble)
 
         def show(*_):
             comfy.model_management.throw_exception_if_processing_interrupted()

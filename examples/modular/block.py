@@ -85,24 +85,24 @@ class GuidedDepthBlock(ModularPipelineBlocks):
 
     def __call__(self, components: Any, state: Any) -> tuple[Any, Any]:
         """Run the guided call; modular pipelines do so without gradients, guidance asks for its own."""
-        asked = self.get_block_state(state)
-        knobs = {**(asked.knobs or {}), "points": asked.points}
-        if asked.calibration is not None:
-            guidance = GeometryGuidance.from_calibration(asked.right, asked.calibration, **knobs)
+        block_state = self.get_block_state(state)
+        knobs = {**(block_state.knobs or {}), "points": block_state.points}
+        if block_state.calibration is not None:
+            guidance = GeometryGuidance.from_calibration(block_state.right, block_state.calibration, **knobs)
         else:
-            guidance = GeometryGuidance(asked.right, asked.K, asked.E, **knobs)
+            guidance = GeometryGuidance(block_state.right, block_state.K, block_state.E, **knobs)
         out = enable_geometry_guidance(components.prior)(
-            asked.image,
+            block_state.image,
             guidance=guidance,
-            generator=asked.generator,
-            num_inference_steps=asked.num_inference_steps,
-            processing_resolution=asked.processing_resolution,
+            generator=block_state.generator,
+            num_inference_steps=block_state.num_inference_steps,
+            processing_resolution=block_state.processing_resolution,
         )
-        asked.depth_m = out.prediction[0, ..., 0]
-        asked.confidence = None if out.confidence is None else out.confidence[0, ..., 0]
-        asked.guided_output = out
-        setattr(asked, self.picture_as, _picture(asked.depth_m))
-        self.set_block_state(state, asked)
+        block_state.depth_m = out.prediction[0, ..., 0]
+        block_state.confidence = None if out.confidence is None else out.confidence[0, ..., 0]
+        block_state.guided_output = out
+        setattr(block_state, self.picture_as, _picture(block_state.depth_m))
+        self.set_block_state(state, block_state)
         return components, state
 
 

@@ -115,8 +115,8 @@ def _cameras() -> dict[str, Any]:
     found["baseline_m"] = _optional("baseline_m", "as the calibration file says")
 
     def show(chosen: str) -> tuple[Any, Any]:
-        asked = CAMERA_WAYS[chosen].fields
-        return gr.update(visible="calibration" in asked), gr.update(visible="fx" in asked)
+        fields = CAMERA_WAYS[chosen].fields
+        return gr.update(visible="calibration" in fields), gr.update(visible="fx" in fields)
 
     way.change(show, way, [files, lens], queue=False, api_visibility="private")
     return found

@@ -134,15 +134,15 @@ def _wire_run(
             found[panels.scene], found[panels.points] = scene(shown, least)
         return found
 
-    asked = (panels.beside, panels.under, panels.least_confidence)
+    controls = (panels.beside, panels.under, panels.least_confidence)
     outputs = [
         component
         for component in vars(panels).values()
-        if component not in (*asked, panels.tabs, panels.clear)
+        if component not in (*controls, panels.tabs, panels.clear)
     ]
     form.run.click(come, outputs=panels.status, **QUICK).then(
         estimate,
-        [*fields, state, *asked, tab],
+        [*fields, state, *controls, tab],
         [*outputs, state, clicks],
         concurrency_limit=1,
         concurrency_id="job",

@@ -36,8 +36,8 @@ def _map(path: Path) -> np.ndarray:
 def _photograph(folder: Path) -> Image.Image:
     """The left image of a result, where it lay when the result was made."""
     report = check_file(folder / "report.json", "--photographs", "the report of a folder of geodiff depth")
-    told = json.loads(report.read_text(encoding="utf-8"))
-    arguments, frame = told["arguments"], told.get("pair", {}).get("frame")
+    result = json.loads(report.read_text(encoding="utf-8"))
+    arguments, frame = result["arguments"], result.get("pair", {}).get("frame")
     left = Path(arguments["left"])
     if frame is not None:
         with VideoReader(left, f"the left video of {folder}") as video:

@@ -125,12 +125,12 @@ def complete_by_lora(
     try:
         with _adapter(pipe.transformer, options) as parameters:
             with torch.no_grad():
-                told = pipe.prepare_condition(padded, 1, 1, None)
+                condition = pipe.prepare_condition(padded, 1, 1, None)
             pipe.set_timesteps(1, device)
 
             def relative() -> Tensor:
-                z = told["image_latent"]
-                z0 = z.float() - pipe.denoise(z, pipe.scheduler.timesteps[0], told).float()
+                z = condition["image_latent"]
+                z0 = z.float() - pipe.denoise(z, pipe.scheduler.timesteps[0], condition).float()
                 x = 2.0 * pipe.decode_prediction(z0) - 1.0
                 return F.interpolate(x, size, mode="bilinear", align_corners=False)[0, 0]
 

@@ -192,17 +192,17 @@ def _measure(
         with torch.no_grad():
             guidance.prepare(native_images(left.image_01, device))  # the same for every way, so not timed
         generator = torch.Generator("cpu").manual_seed(options.seed)
-        told = {"num_inference_steps": steps, "generator": generator, "output_latent": True}
+        options = {"num_inference_steps": steps, "generator": generator, "output_latent": True}
         started = clock()
-        before = pipe(left.image_01, guidance=guidance, **told)  # its result is numpy: nothing is pending
+        before = pipe(left.image_01, guidance=guidance, **options)  # its result is numpy: nothing is pending
         seconds += clock() - started
         depth_m, truth = before.prediction[0, ..., 0], left.depth_m[0].numpy()
         valid = left.valid[0].numpy()
         scores.append(evaluate_depth(depth_m, truth, valid)["abs_rel"])
         errors.append(np.log(depth_m / np.where(valid, truth, np.nan)))
     moved, breath = flicker(errors, sequence)
-    told = {"abs_rel": float(np.mean(scores)), "worst": float(np.max(scores))}
-    return told | {"flicker": moved, "breath": breath, "seconds": seconds / len(sequence.lefts)}
+    numbers = {"abs_rel": float(np.mean(scores)), "worst": float(np.max(scores))}
+    return numbers | {"flicker": moved, "breath": breath, "seconds": seconds / len(sequence.lefts)}
 
 
 def sequence_table(records: Sequence[dict[str, Any]]) -> Table:

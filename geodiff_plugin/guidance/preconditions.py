@@ -54,7 +54,7 @@ def check_fed(config: GuidanceConfig, updates: UpdatePlan, *, views: bool, point
         for name in weighted
         if any(absent and getattr(TERMS[name], need) for need, absent in lacking.items())
     ]
-    asked = updates.inner_steps or config.updates.inner_steps is None
-    if asked and len(idle) == len(weighted):
+    makes_updates = updates.inner_steps or config.updates.inner_steps is None
+    if makes_updates and len(idle) == len(weighted):
         cure = "photometric and matches need a right view, points needs points; inner_steps=0 needs none."
         bad_value("weights", "above 0 for a term that can work on what is given", dict(config.weights), cure)

@@ -121,9 +121,9 @@ def _nearest_inverse_depth(pilot: CostVolume, config: SweepConfig, matching: Mat
     """The inverse depth that a coarse sweep says nothing is nearer than."""
     matches = match_volume(pilot, matching)
     sure, limit = matches.confidence > config.pilot_sure, pilot.inverse_depth[-1]
-    believed = torch.where(sure, matches.inverse_depth, torch.nan)
+    inverse_depth = torch.where(sure, matches.inverse_depth, torch.nan)
     least = _at_shift(pilot.rights, pilot.K, pilot.size, config.least_shift)
-    nearest = (config.headroom * torch.nanquantile(believed, config.pilot_quantile)).clamp(least, limit)
+    nearest = (config.headroom * torch.nanquantile(inverse_depth, config.pilot_quantile)).clamp(least, limit)
     # With little to go by, the search must see everything.
     return torch.where(sure.float().mean() < config.pilot_least_sure, limit, nearest)
 

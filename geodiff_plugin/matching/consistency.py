@@ -36,7 +36,7 @@ RIGHT_WITHIN_PLANES = 3.0
 LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
 #: Which sign each of them may have; 0 for any.
 SIGNS = (0, 1, -1, -1)
-# The right view is asked in every such row.
+# The right view is matched in every such row only.
 _EVERY_ROW = 2
 # A sum over the paths and its plane in one integer, so that one minimum finds both.
 _PLANES = 1 << 12
@@ -67,7 +67,7 @@ def _winner(total: torch.Tensor) -> _Winner:
     return _Winner(index, position, around, best)
 
 
-def _right_opinion(volume: CostVolume, view: AlignedView, config: MatchingConfig, room: Room) -> torch.Tensor:
+def _right_winners(volume: CostVolume, view: AlignedView, config: MatchingConfig, room: Room) -> torch.Tensor:
     """The position between planes that a right view takes for the best, ``(ceil(h / 2), w)`` of its canvas.
 
     Its costs are those of the same sweep, looked up along its own pixels, and aggregated along its own edges:
@@ -90,8 +90,8 @@ def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor
 
     Args:
         view: the right view.
-        other: what it says, ``_right_opinion``.
-        position: ``(H, W)`` what the left view says, between planes.
+        other: its own winners, ``_right_winners``.
+        position: ``(H, W)`` winners of the left view, between planes.
     """
     device = position.device
     scale, shift = view.scale.to(device, torch.float32), view.shift.to(device, torch.float32)
@@ -109,7 +109,7 @@ def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor
     column, row = found
     if view.valid is not None:
         inside = inside & view.valid[row, column]
-    # Between two rows that were asked, their mean: at an edge it agrees with neither.
+    # Between two matched rows, their mean: at an edge it agrees with neither.
     before, after = row // _EVERY_ROW, ((row + _EVERY_ROW - 1) // _EVERY_ROW).clamp_max(len(other) - 1)
     difference = (0.5 * (other[before, column] + other[after, column]) - position).abs()
     return torch.where(inside, difference, torch.full_like(difference, torch.inf))
@@ -130,8 +130,8 @@ def _contrast(volume: CostVolume, index: torch.Tensor, reach: int) -> torch.Tens
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """Per pixel ``(H, W)``: the winner, and what each right view, one after the other, says to it.
+class _Candidates:
+    """Per pixel ``(H, W)``: the winning plane, and how far each right view disagrees with it.
 
     Attributes:
         position: between planes.
@@ -148,8 +148,8 @@ class _Asked:
     differences: Iterator[torch.Tensor]
 
 
-def _ask(volume: CostVolume, views: Sequence[AlignedView], config: MatchingConfig) -> _Asked:
-    """Aggregate, take the winner, and ask right views whether they agree."""
+def _find_candidates(volume: CostVolume, views: Sequence[AlignedView], config: MatchingConfig) -> _Candidates:
+    """Aggregate, take the winner, and compare it with the matches of right views."""
     room = Room()
     total = aggregate(volume.levels, volume.left_01[0], config, room=room)
     winner = _winner(total)
@@ -157,27 +157,29 @@ def _ask(volume: CostVolume, views: Sequence[AlignedView], config: MatchingConfi
     unit = 1.0 / (PATHS * COST_LEVELS)
     margin, cost = (second - winner.best) * unit, winner.best * unit
     differences = (
-        _disagreement(view, _right_opinion(volume, view, config, room), winner.position) for view in views
+        _disagreement(view, _right_winners(volume, view, config, room), winner.position) for view in views
     )
     contrast = _contrast(volume, winner.index, config.contrast_reach)
-    return _Asked(winner.position, margin, cost, contrast, differences)
+    return _Candidates(winner.position, margin, cost, contrast, differences)
 
 
-def _evidence(asked: _Asked, difference: torch.Tensor, config: MatchingConfig) -> tuple[torch.Tensor, ...]:
+def _evidence(
+    found: _Candidates, difference: torch.Tensor, config: MatchingConfig
+) -> tuple[torch.Tensor, ...]:
     """1, log of the margin (0.03 + second best cost - best cost), best cost, left-right difference."""
-    margin = asked.margin.clamp(0.0, 0.5)
+    margin = found.margin.clamp(0.0, 0.5)
     ones = torch.ones_like(margin)
     differs = difference.clamp_max(config.agreement_planes)
-    return ones, (margin + 0.03).log(), asked.cost.clamp(0.0, 0.8), differs
+    return ones, (margin + 0.03).log(), found.cost.clamp(0.0, 0.8), differs
 
 
-def _confidence(asked: _Asked, difference: torch.Tensor, config: MatchingConfig) -> torch.Tensor:
+def _confidence(found: _Candidates, difference: torch.Tensor, config: MatchingConfig) -> torch.Tensor:
     """Probability ``(H, W)`` that the winner is right, given the left-right difference in planes."""
     odds = torch.zeros_like(difference)
-    for weight, x in zip(LOG_ODDS, _evidence(asked, difference, config), strict=True):
+    for weight, x in zip(LOG_ODDS, _evidence(found, difference, config), strict=True):
         odds = odds + weight * x
     probability = torch.sigmoid(odds)
-    probability = probability * (asked.contrast / config.least_contrast).clamp_max(1.0)
+    probability = probability * (found.contrast / config.least_contrast).clamp_max(1.0)
     return torch.where(difference <= config.agreement_planes, probability, torch.zeros_like(probability))
 
 
@@ -199,16 +201,16 @@ class CheckedMatches:
 @torch.no_grad()
 def checked_matches(volume: CostVolume, config: MatchingConfig = DEFAULT.matching) -> CheckedMatches:
     """Matches of a cost volume and their evidence, by its first right view."""
-    asked = _ask(volume, volume.aligned[:1], config)
-    (difference,) = asked.differences
-    checked = (difference <= config.agreement_planes) & (asked.contrast >= config.least_contrast)
-    inverse_depth = volume.inverse_depth[0] + asked.position * volume.plane_step
-    return CheckedMatches(inverse_depth, torch.stack(_evidence(asked, difference, config)), checked)
+    found = _find_candidates(volume, volume.aligned[:1], config)
+    (difference,) = found.differences
+    checked = (difference <= config.agreement_planes) & (found.contrast >= config.least_contrast)
+    inverse_depth = volume.inverse_depth[0] + found.position * volume.plane_step
+    return CheckedMatches(inverse_depth, torch.stack(_evidence(found, difference, config)), checked)
 
 
 @torch.no_grad()
 def match_volume(volume: CostVolume, config: MatchingConfig = DEFAULT.matching) -> Matches:
-    """Matches of a cost volume: aggregate, take the winner, and ask every right view whether it agrees.
+    """Matches of a cost volume: aggregate, take the winner, and check it against every right view.
 
     Args:
         volume: of any number of right views.
@@ -218,9 +220,9 @@ def match_volume(volume: CostVolume, config: MatchingConfig = DEFAULT.matching) 
         ``Matches``; zero confidence where no right view agrees, else about the probability that the match is
         within ``RIGHT_WITHIN_PLANES`` of the truth (that of the right view most sure of it).
     """
-    asked = _ask(volume, volume.aligned, config)
-    confidence = torch.zeros_like(asked.cost)
-    for difference in asked.differences:
-        confidence = torch.maximum(confidence, _confidence(asked, difference, config))
-    inverse_depth = volume.inverse_depth[0] + asked.position * volume.plane_step
+    found = _find_candidates(volume, volume.aligned, config)
+    confidence = torch.zeros_like(found.cost)
+    for difference in found.differences:
+        confidence = torch.maximum(confidence, _confidence(found, difference, config))
+    inverse_depth = volume.inverse_depth[0] + found.position * volume.plane_step
     return Matches(inverse_depth[None], confidence[None], volume.plane_step, volume.K, volume.size)

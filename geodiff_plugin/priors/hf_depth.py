@@ -196,12 +196,12 @@ class HFDepthModel:
         """
         height, width = image_01.shape[-2:]
         size = self.grid(height, width) if size is None else size
-        told = {}
+        extra = {}
         if prompt_m is not None:
             if not self.takes_prompt:
                 bad_value("prompt_depth", "left out with this model", "given", f"Only {PROMPTED} takes one.")
-            told["prompt_depth"] = _with_a_span(prompt_m).to(image_01.device, self.model.dtype)
-        output = self.model(pixel_values=self.preparation(image_01.float()).to(self.model.dtype), **told)
+            extra["prompt_depth"] = _with_a_span(prompt_m).to(image_01.device, self.model.dtype)
+        output = self.model(pixel_values=self.preparation(image_01.float()).to(self.model.dtype), **extra)
         values = output.predicted_depth.float()[:, None]  # (B, 1, h', w')
         fov = getattr(output, "field_of_view", None)
         if fov is not None:  # canonical inverse depth -> inverse metres: times width over focal length

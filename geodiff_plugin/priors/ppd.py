@@ -29,10 +29,10 @@ class PPDPrior(OwnPipelinePrior):
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """A transformer that is told semantic tokens, beside an encoder that makes them."""
-        told = layout.config("dit").get("semantic_size")
+        """A transformer on semantic tokens, beside the encoder that computes them."""
+        semantic_size = layout.config("dit").get("semantic_size")
         encoder = layout.config("semantic_encoder")
-        return told is not None and encoder.get("model_type") == "dinov2"
+        return semantic_size is not None and encoder.get("model_type") == "dinov2"
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> PPDPipeline:

@@ -36,8 +36,8 @@ def guide_both_views(
 ) -> tuple[MetricDepthOutput, MetricDepthOutput]:
     """Metric depth of the left and of the right view, consistent with each other.
 
-    Four guided calls: each view by itself, then each with what the other is sure of, and it is not, as known
-    points: a surface that one view sees from the front and the other at a slant is told across.
+    Four guided calls: each view by itself, then each with known points where the other view is confident and
+    it is not: a surface that is oblique in one view may be frontal, and therefore certain, in the other.
 
     Args:
         pipe: with guidance enabled.
@@ -63,10 +63,12 @@ def guide_both_views(
     # Rendered points need the images' own pixels: confidence and depth come at the input's resolution.
     options = {**call, "match_input_resolution": True, "output_type": "pt", "return_dict": True}
     first = [pipe(own, guidance=_guidance(other, r, knobs), **options) for own, other, r in views]
-    told = [_believed_points(out, r, min_confidence) for out, (_, _, r) in zip(first, views, strict=True)]
+    confident = [
+        _confident_points(out, r, min_confidence) for out, (_, _, r) in zip(first, views, strict=True)
+    ]
     options["output_type"] = call.get("output_type", "np")
     second = []
-    for (own, other, r), points, alone in zip(views, reversed(told), first, strict=True):
+    for (own, other, r), points, alone in zip(views, reversed(confident), first, strict=True):
         news = _news(points, r, alone, min_confidence)
         guidance = _guidance(other, r, knobs, news if len(news) else None)
         second.append(pipe(own, guidance=guidance, **options))
@@ -95,8 +97,8 @@ def _confidence(output: MetricDepthOutput) -> Tensor:
     return torch.as_tensor(output.confidence)
 
 
-def _believed_points(output: MetricDepthOutput, rig: Rig, min_confidence: float) -> Tensor:
-    """Points ``(N, 3)`` of a view's depth in the other view's frame, metres; only those that are sure."""
+def _confident_points(output: MetricDepthOutput, rig: Rig, min_confidence: float) -> Tensor:
+    """Points ``(N, 3)`` of a view's depth in the other view's frame, metres; only the confident ones."""
     confidence, depth_m = _confidence(output), torch.as_tensor(output.prediction).float()
     K = torch.as_tensor(rig.K_left, dtype=torch.float32, device=depth_m.device)[None]
     T = torch.as_tensor(rig.T_right_from_left, dtype=torch.float32, device=K.device)[None]
@@ -107,7 +109,7 @@ def _believed_points(output: MetricDepthOutput, rig: Rig, min_confidence: float)
 def _news(points: Tensor, rig: Rig, alone: MetricDepthOutput, min_confidence: float) -> Tensor:
     """Those of the other view's points that fall on pixels of which this view is not sure by itself.
 
-    A point that its own surface hides from here falls on one that this view knows, and so is not told.
+    A point that its own surface hides from here falls on one that this view knows, and is left out.
     """
     K = torch.as_tensor(rig.K_left, dtype=torch.float32, device=points.device)[None]
     uv, z = (x[0, 0] for x in project(points[None, None], K))

@@ -14,7 +14,7 @@ __all__ = ["plan_steps"]
 
 
 def plan_steps(
-    guidance: GeometryGuidance, prior: DepthPrior, asked: int | None, pipeline_default: int | None
+    guidance: GeometryGuidance, prior: DepthPrior, requested: int | None, pipeline_default: int | None
 ) -> tuple[int, int]:
     """Denoising steps of a guided call, and how often each makes its updates.
 
@@ -24,16 +24,16 @@ def plan_steps(
     Args:
         guidance: says how many steps it wants.
         prior: says how many make sense.
-        asked: ``num_inference_steps`` of the call.
-        pipeline_default: when none was asked for.
+        requested: ``num_inference_steps`` of the call.
+        pipeline_default: used if none is requested.
 
     Raises:
-        ValueError: more steps were asked for than the prior has.
+        ValueError: more steps are requested than the prior has.
     """
-    wanted = guidance.denoising_steps(asked, pipeline_default)
+    wanted = guidance.denoising_steps(requested, pipeline_default)
     if prior.max_steps is None or wanted <= prior.max_steps:
         return wanted, 1
-    if asked is not None:
+    if requested is not None:
         cure = "Leave it out: the prior was trained for so few."
-        bad_value("num_inference_steps", f"at most {prior.max_steps} with this prior", asked, cure)
+        bad_value("num_inference_steps", f"at most {prior.max_steps} with this prior", requested, cure)
     return prior.max_steps, -(-wanted // prior.max_steps)

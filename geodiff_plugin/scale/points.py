@@ -38,11 +38,11 @@ def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
 
 def sure_matches(matches: Matches, config: FitConfig = DEFAULT.fit) -> Matches | None:
     """The matches that are more likely right than wrong, as if they were points; ``None`` for too few."""
-    believed = (matches.confidence > config.sure_confidence) & (matches.inverse_depth > matches.plane_step)
-    if int(believed.sum()) < config.min_sure:
+    sure = (matches.confidence > config.sure_confidence) & (matches.inverse_depth > matches.plane_step)
+    if int(sure.sum()) < config.min_sure:
         return None
-    unit = UNIT * matches.inverse_depth[believed].median()
-    return replace(matches, confidence=believed.float(), plane_step=unit)
+    unit = UNIT * matches.inverse_depth[sure].median()
+    return replace(matches, confidence=sure.float(), plane_step=unit)
 
 
 @torch.no_grad()

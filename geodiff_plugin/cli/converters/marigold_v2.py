@@ -136,10 +136,10 @@ def _trainables_file(checkpoint: Path) -> Path:
     return file
 
 
-def _space(file: Path, asked: str | None) -> str:
-    """As asked, or as the checkpoint's folder is called."""
-    if asked is not None:
-        return check_choice(asked, "--space", SPACES)
+def _space(file: Path, requested: str | None) -> str:
+    """As requested, or as the checkpoint's folder is called."""
+    if requested is not None:
+        return check_choice(requested, "--space", SPACES)
     name = file.resolve().parent.name
     space = SPACE_OF_CHECKPOINT.get(name.split("-")[0].lower())
     if space is None:
@@ -148,10 +148,10 @@ def _space(file: Path, asked: str | None) -> str:
     return space
 
 
-def _prompt_folder(file: Path, asked: str | None) -> Path:
-    """As asked, or where the authors' download has it: beside ``depth/``."""
-    if asked is not None:
-        return Path(asked)
+def _prompt_folder(file: Path, requested: str | None) -> Path:
+    """As requested, or where the authors' download has it: beside ``depth/``."""
+    if requested is not None:
+        return Path(requested)
     for parent in file.resolve().parents:
         if (parent / PROMPT_FOLDER).is_dir():
             return parent / PROMPT_FOLDER
@@ -173,7 +173,7 @@ def convert_marigold_v2(
         lora: of ``LORAS``: merged into the base, or kept beside a copy of it.
 
     Raises:
-        ValueError: files that are missing or do not fit each other; a space that cannot be told.
+        ValueError: files that are missing or do not fit each other; a space that cannot be determined.
     """
     check_choice(lora, "--lora", LORAS)
     file = _trainables_file(checkpoint)

@@ -35,14 +35,18 @@ def finished_report(arguments: DepthArguments) -> dict[str, Any] | None:
     report = _report(arguments.out)
     if report is None:
         return None
-    asked, made = arguments.as_json(), report["arguments"]
+    wanted, made = arguments.as_json(), report["arguments"]
     others = sorted(
-        name for name in asked if name not in NOT_OF_THE_RESULT and asked[name] != made.get(name, asked[name])
+        name
+        for name in wanted
+        if name not in NOT_OF_THE_RESULT and wanted[name] != made.get(name, wanted[name])
     )
     if others:
-        told = ", ".join(f"{name} {made[name]!r} and not {asked[name]!r}" for name in others)
+        differences = ", ".join(f"{name} {made[name]!r} and not {wanted[name]!r}" for name in others)
         cure = "Name another --out, or add --overwrite."
-        bad_value("--out", "a folder of results of the same options", f"{arguments.out} with {told}", cure)
+        bad_value(
+            "--out", "a folder of results of the same options", f"{arguments.out} with {differences}", cure
+        )
     return report
 
 

@@ -122,11 +122,11 @@ def _run(
 
 def _once() -> Callable[[str], None]:
     """Says a warning the first time that any pair gives rise to it; ``report.json`` has those of each."""
-    told: set[str] = set()
+    seen: set[str] = set()
 
     def tell(sentence: str) -> None:
-        if sentence not in told:
-            told.add(sentence)
+        if sentence not in seen:
+            seen.add(sentence)
             say(f"warning: {sentence}")
 
     return tell
@@ -134,11 +134,11 @@ def _once() -> Callable[[str], None]:
 
 def _failed(job: Job, error: Exception) -> Row:
     """Say why a pair failed; what is no fault of the input keeps its traceback."""
-    told = in_options(str(error)) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    reason = in_options(str(error)) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     if not isinstance(error, InputError):
         say("".join(traceback.format_exception(error)).rstrip())
-    say(f"geodiff: {job.ref.name}: {told}")
-    return _row(job.ref.name, "failed", None, told)
+    say(f"geodiff: {job.ref.name}: {reason}")
+    return _row(job.ref.name, "failed", None, reason)
 
 
 def _row(name: str, result: str, report: dict[str, Any] | None, said: str | None = None) -> Row:
@@ -180,9 +180,9 @@ def _print(rows: Sequence[Row], out: Path) -> None:
         show(table)
     counts = {kind: sum(row["result"] == kind for row in rows) for kind in ("done", "there", "failed")}
     doubtful = sum(row["trusted"] is False for row in rows)
-    told = [f"{len(rows)} pairs: {counts['done']} done, {counts['there']} there already"]
-    told.append(f"{counts['failed']} failed, {doubtful} not to be trusted -> {out}/")
-    show(Text(", ".join(told)))
+    totals = [f"{len(rows)} pairs: {counts['done']} done, {counts['there']} there already"]
+    totals.append(f"{counts['failed']} failed, {doubtful} not to be trusted -> {out}/")
+    show(Text(", ".join(totals)))
     for row in shown:
         if row["result"] == "failed":
             show(Text(f"{row['pair']}: {row['said']}"))

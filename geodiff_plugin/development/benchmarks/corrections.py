@@ -82,8 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for knobs in typed.knobs:
             errors, seconds = zip(*found[prior, knobs], strict=True)
             change = [e - b for e, b in zip(errors, base, strict=True)]
-            told = (sum(errors), sum(change), max(change) * len(base), sum(seconds))
-            mean, moved, worst, taken = (value / len(base) for value in told)
+            sums = (sum(errors), sum(change), max(change) * len(base), sum(seconds))
+            mean, moved, worst, taken = (value / len(base) for value in sums)
             print(f"{prior:<10}{knobs:<36}{mean:>8.4f}{moved:>+9.4f}{worst:>+9.4f}{taken:>8.2f}")
 
 

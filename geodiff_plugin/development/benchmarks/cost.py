@@ -128,10 +128,10 @@ def _axis_table(axis: Axis, found: Sequence[tuple[float, int]]) -> list[str]:
     seconds, peaks = ([one[i] for one in found] for i in (0, 1))
     lines = [f"| {axis.name} | " + " | ".join(map(str, axis.values)) + " | exponent |"]
     lines.append("| --- |" + " ---: |" * (len(axis.values) + 1))
-    told = " | ".join(f"{s:.2f}" for s in seconds)
-    lines.append(f"| CPU seconds | {told} | {exponent(axis.values, seconds):.2f} |")
-    told = " | ".join(f"{b / 1e6:.0f}" for b in peaks)
-    lines.append(f"| peak MB | {told} | {exponent(axis.values, peaks):.2f} |")
+    cells = " | ".join(f"{s:.2f}" for s in seconds)
+    lines.append(f"| CPU seconds | {cells} | {exponent(axis.values, seconds):.2f} |")
+    cells = " | ".join(f"{b / 1e6:.0f}" for b in peaks)
+    lines.append(f"| peak MB | {cells} | {exponent(axis.values, peaks):.2f} |")
     return [*lines, ""]
 
 
@@ -159,8 +159,8 @@ def _extrapolated(size: Size) -> list[str]:
     each = [count_operations(Size(size.width, side)) for side in sides]
     for kind in ("network", "decode", "encode"):
         flops = [one[kind] for one in each]
-        told = " | ".join(f"{n / 1e12:.2f}" for n in flops)
-        lines.append(f"| {kind} | {told} | {exponent(sides, flops):.2f} |")
+        cells = " | ".join(f"{n / 1e12:.2f}" for n in flops)
+        lines.append(f"| {kind} | {cells} | {exponent(sides, flops):.2f} |")
     calls = calls_of_all(size)
     lines += [
         "",
@@ -177,8 +177,8 @@ def _extrapolated(size: Size) -> list[str]:
         )
     pixels = size.resolution * round(0.75 * size.resolution)
     written = PAIRS * pixels * BYTES_A_PIXEL / 1e12
-    told = f"{PAIRS:,} pairs of {pixels / 1e6:.2f} megapixels"
-    lines += ["", f"Depth and confidence of {told} in float32: {written:.1f} TB."]
+    amount = f"{PAIRS:,} pairs of {pixels / 1e6:.2f} megapixels"
+    lines += ["", f"Depth and confidence of {amount} in float32: {written:.1f} TB."]
     return [*lines, ""]
 
 

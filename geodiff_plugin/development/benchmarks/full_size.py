@@ -97,8 +97,8 @@ def _print_counted(size: Size) -> None:
     for way, calls in calls_of_all(size).items():
         total = sum(n * operations[kind] for kind, n in calls.items())
         plain = plain or total
-        told = ", ".join(f"{n} {kind}" for kind, n in sorted(calls.items()))
-        print(f"{way:<24}{total / 1e12:>10.2f}{total / plain:>9.2f}  {told}", flush=True)
+        counts = ", ".join(f"{n} {kind}" for kind, n in sorted(calls.items()))
+        print(f"{way:<24}{total / 1e12:>10.2f}{total / plain:>9.2f}  {counts}", flush=True)
     print("Evidence, the correction's solves and the refinement are no products of matrices: not counted.")
 
 

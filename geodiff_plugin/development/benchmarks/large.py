@@ -169,8 +169,8 @@ def main(argv: list[str] | None = None) -> None:
             peak, pixels = max(stage["peak_mb"] for stage in stages.values()), size[0] * size[1]
             own = (peak - stages["start"]["peak_mb"]) * 1e6 / pixels
             print(f"{size[0]}x{size[1]}, {pixels / 1e6:.0f} megapixels, AbsRel {answers[-1]['abs_rel']:.4f}")
-            for stage, told in stages.items():
-                print(f"  {stage:12} {told['seconds']:8.1f} s {told['peak_mb']:9.0f} MB")
+            for stage, used in stages.items():
+                print(f"  {stage:12} {used['seconds']:8.1f} s {used['peak_mb']:9.0f} MB")
             print(f"  {'peak':12} {'':10} {peak:9.0f} MB, {own:.0f} bytes a pixel over the start", flush=True)
     if options.json:
         print(json.dumps(answers))

@@ -154,8 +154,10 @@ class PriorCache:
                 module = pipe.components[name]
                 config = getattr(module, "config", None)
                 # Names that start with an underscore say where it was loaded from and by which version.
-                told = {k: v for k, v in config.items() if k[0] != "_"} if isinstance(config, Mapping) else {}
-                digest.update(json.dumps([name, told], default=str, sort_keys=True).encode())
+                values = (
+                    {k: v for k, v in config.items() if k[0] != "_"} if isinstance(config, Mapping) else {}
+                )
+                digest.update(json.dumps([name, values], default=str, sort_keys=True).encode())
                 if isinstance(module, torch.nn.Module):
                     for tensor_name, tensor in module.state_dict().items():
                         sample = tensor.detach().flatten()[:4].double().cpu().numpy()

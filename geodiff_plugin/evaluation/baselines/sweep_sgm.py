@@ -23,11 +23,11 @@ def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Predic
     volume = sweep(sample, settings.device, settings.views)
     matches = find_matches(volume.left_01, volume.rights, volume.K, volume=volume)
     # A match at infinity is none: the sky would spread over every hole beside it.
-    believed = (matches.confidence[0] > 0) & (matches.inverse_depth[0] > 0.5 * volume.plane_step)
-    with_holes = torch.where(believed, matches.inverse_depth[0], torch.nan).cpu().numpy()
+    matched = (matches.confidence[0] > 0) & (matches.inverse_depth[0] > 0.5 * volume.plane_step)
+    with_holes = torch.where(matched, matches.inverse_depth[0], torch.nan).cpu().numpy()
     filled = torch.from_numpy(fill_background(with_holes))
     depth_m = native_depth(filled, volume, sample.left.shape[:2], "bilinear")
-    notes = {"density": float(believed.float().mean())}
+    notes = {"density": float(matched.float().mean())}
     return Prediction(depth_m=depth_m, space="disparity", notes=notes)
 
 

@@ -41,18 +41,18 @@ def find_synthetic(root: Path) -> list[SampleRef]:
             (one in seven has), ``synthetic-posed:`` for the first N that have a general pose. Any other path
             holds none. Even seeds give rectified pairs, odd ones a general pose.
     """
-    asked = _ROOT.fullmatch(str(root))
-    if asked is None:
+    matched = _ROOT.fullmatch(str(root))
+    if matched is None:
         return []
-    seeds = count(int(asked[3] or 0))
-    if asked[1] == "-posed":
+    seeds = count(int(matched[3] or 0))
+    if matched[1] == "-posed":
         seeds = filter(lambda seed: seed % 2 == 1, seeds)
-    elif asked[1]:
+    elif matched[1]:
         seeds = filter(is_reflective, seeds)
-    size = (int(asked[5]), int(asked[4])) if asked[4] else SIZE
+    size = (int(matched[5]), int(matched[4])) if matched[4] else SIZE
     return [
         SampleRef("synthetic", f"seed{seed:04d}", {"seed": seed, "posed": seed % 2 == 1, "size": size})
-        for seed in islice(seeds, int(asked[2]))
+        for seed in islice(seeds, int(matched[2]))
     ]
 
 

@@ -189,10 +189,10 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
         done = []
         for i in self.progress_bar(range(0, len(latents), batch_size), leave=True, desc="Depth predictions"):
             z = latents[i : i + batch_size]
-            told = {name: value[i : i + batch_size] for name, value in condition.items()}
+            part = {name: value[i : i + batch_size] for name, value in condition.items()}
             self.set_timesteps(steps, latents.device)
             for t in self.progress_bar(self.scheduler.timesteps, leave=False, desc="Denoising steps"):
-                output = self.denoise(z, t, told)
+                output = self.denoise(z, t, part)
                 z = self.scheduler.step(output, t, z, generator=generator).prev_sample
             done.append(z)
         return torch.cat(done)

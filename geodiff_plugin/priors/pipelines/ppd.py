@@ -1,4 +1,4 @@
-"""Pixel-Perfect Depth: a flow in pixel space, without a VAE, told the tokens of Depth Anything V2's encoder.
+"""Pixel-Perfect Depth: a flow in pixel space, without a VAE and the tokens of Depth Anything V2's encoder.
 
 Data flow: image at the area of 1024 x 768 -> tokens, noise -> Euler steps of the velocity -> log(depth + 1).
 Paper: none; Pixel-Perfect Depth (arXiv 2510.07316).
@@ -150,8 +150,8 @@ class PPDPipeline(DepthDiffusionPipeline):
     ) -> Condition:
         """The image in [-0.5, 0.5] and its semantic tokens, one per member."""
         tokens = [semantic_tokens(self.semantic_encoder, part / 2 + 0.5) for part in image.split(batch_size)]
-        told = {"image": image / 2, "semantics": torch.cat(tokens)}
-        return {name: value.repeat_interleave(ensemble_size, dim=0) for name, value in told.items()}
+        condition = {"image": image / 2, "semantics": torch.cat(tokens)}
+        return {name: value.repeat_interleave(ensemble_size, dim=0) for name, value in condition.items()}
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
         """Gaussian noise of one channel, ``(N * E, 1, H, W)``."""
