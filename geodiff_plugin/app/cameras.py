@@ -1,4 +1,4 @@
-"""The ways in which a visitor can say where the cameras are.
+"""Ways to give the cameras on the page: a calibration file, numbers, or photographs alone.
 
 Data flow: fields of the page -> ``GeometryGuidance``.
 Paper: S3.3 (two views with known cameras).

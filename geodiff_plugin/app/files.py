@@ -1,4 +1,4 @@
-"""The files that a visitor takes home.
+"""Files that the page offers for download.
 
 Data flow: ``Result`` -> a folder with depth, cloud and report.
 Paper: none.

@@ -1,4 +1,4 @@
-"""The fields that a visitor fills in.
+"""Input fields of the page.
 
 Data flow: gradio components -> ``Request``.
 Paper: none.

@@ -1,4 +1,4 @@
-"""One job of the page: what a visitor asked for, run through the public API, to everything that is shown.
+"""One job of the page: a visitor's request, run through the public API, to everything that is shown.
 
 Data flow: ``Request`` -> images, ``GeometryGuidance``, prior -> ``Result``.
 Paper: Algorithm 1, run by the pipeline.

@@ -1,4 +1,4 @@
-"""``geodiff app``: serves the page, and nothing of it calls anybody.
+"""``geodiff app``: serves the page, without any request to another host.
 
 Data flow: options -> a server on this machine.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Words and style of the page.
+"""Texts and style sheet of the page.
 
 Data flow: -> HTML and CSS; no script, no font and no picture comes from elsewhere.
 Paper: none.

@@ -1,4 +1,4 @@
-"""The page itself: what happens on a click, for one visitor at a time.
+"""The page: layout, and what happens on every click.
 
 Data flow: a visitor's clicks -> ``Request`` -> ``run_job`` -> panels.
 Paper: none.

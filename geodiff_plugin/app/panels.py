@@ -1,4 +1,4 @@
-"""The components of the page's right side, tab by tab.
+"""Components of the page's result side, tab by tab.
 
 Data flow: -> ``Panels``, which ``results`` fills.
 Paper: none.

@@ -1,4 +1,4 @@
-"""What the page shows of a result: coloured maps with their legends, and marks on a photograph.
+"""Pictures of a result for the page: coloured maps with legends, and marks on a photograph.
 
 Data flow: maps, readings -> RGB arrays of the left photograph's size, legends as HTML.
 Paper: none.

@@ -1,4 +1,4 @@
-"""What the page shows of a result, panel by panel.
+"""Contents of the result panels of the page.
 
 Data flow: ``Result`` -> values of gradio components.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Reading the folder of the bundled prior, or of one trained like it, without progress bars.
+"""Loads the folder of the bundled prior, or of one trained like it, without progress bars.
 
 Data flow: folder on disk -> ``MarigoldDepthPipeline``.
 Paper: none.

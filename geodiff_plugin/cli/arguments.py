@@ -1,4 +1,4 @@
-"""What ``geodiff depth`` was asked to do.
+"""``DepthArguments``: the options of ``geodiff depth`` as a record.
 
 Data flow: options as typed -> ``DepthArguments``, which ``cli.checks`` looks at before torch is imported.
 Paper: none.

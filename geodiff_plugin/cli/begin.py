@@ -1,4 +1,4 @@
-"""What a run of ``geodiff depth`` does before torch is imported: every file looked at, its folder taken.
+"""Start of ``geodiff depth``, before torch is imported: input files are checked, the output folder is taken.
 
 Data flow: ``DepthArguments`` -> checked, ``OutFolder`` held -> the work.
 Paper: none.

@@ -1,4 +1,4 @@
-"""What can be said of the options of ``geodiff depth`` before a file is opened or torch is imported.
+"""Checks of the options of ``geodiff depth`` that need neither files nor torch.
 
 Data flow: ``DepthArguments`` -> the same, or one clear error in under a second.
 Paper: none.

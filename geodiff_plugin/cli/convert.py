@@ -1,4 +1,4 @@
-"""``geodiff convert``: weights in their authors' format to a folder that ``--prior`` takes.
+"""``geodiff convert``: weights in their authors' format to a folder for ``--prior``.
 
 Data flow: .ckpt or .pth file, folder of .bin weights, or base and LoRA -> a new folder, whole or not at all.
 Paper: none.

@@ -1,4 +1,4 @@
-"""The cloud and its cameras for other programs: GLB and COLMAP files, and viewers that are installed.
+"""Exports of ``geodiff depth``: GLB and COLMAP files, and viewers (rerun, viser).
 
 Data flow: ``MetricDepthOutput``, ``Inputs`` -> files in ``--out``, or a window.
 Paper: none.

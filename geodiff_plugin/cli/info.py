@@ -1,4 +1,4 @@
-"""``geodiff info``: what is installed, where it can run, and which priors are at hand.
+"""``geodiff info``: installed packages, devices and available priors.
 
 Data flow: the machine -> lines of text.
 Paper: none.

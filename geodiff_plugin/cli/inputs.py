@@ -1,4 +1,4 @@
-"""Reading and checking of the files that ``geodiff depth`` is given, before any weights load.
+"""Reads and checks the input files of ``geodiff depth``, before any weights load.
 
 Data flow: ``DepthArguments`` -> images, a ``Rig`` and the ``GeometryGuidance`` made of them.
 Paper: S3.3 (two views with known cameras).

@@ -1,4 +1,4 @@
-"""Lens distortion as ``geodiff depth`` is given it, and images without it.
+"""Lens distortion in ``geodiff depth``: the options, and undistorted images.
 
 Data flow: ``--distortion``, ``--view-distortion``, the calibration -> one ``Distortion`` a photograph
     -> undistorted images.

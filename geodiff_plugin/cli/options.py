@@ -1,4 +1,4 @@
-"""Options that several commands of ``geodiff`` share, and where in their help they stand.
+"""Options that several commands of ``geodiff`` share, and their help panels.
 
 Data flow: a help text -> an option of typer.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Writing of the files of ``geodiff depth``, all of them or none.
+"""Writes the files of ``geodiff depth``, all of them or none.
 
 Data flow: ``MetricDepthOutput`` and report -> files in a folder that ``out_folder`` puts in its place.
 Paper: none.

@@ -1,4 +1,4 @@
-"""``geodiff depth --estimate-pose``: photographs whose cameras nobody measured.
+"""``geodiff depth --estimate-pose``: photographs without known cameras.
 
 Data flow: ``DepthArguments`` -> images, K from options or EXIF -> estimated poses -> ``Inputs``.
 Paper: none; it takes known cameras for granted (S3.3).

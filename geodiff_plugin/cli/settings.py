@@ -1,4 +1,4 @@
-"""What the options of ``geodiff depth`` mean to torch and to the guidance.
+"""Options of ``geodiff depth`` as torch and the guidance need them: device, dtype, configuration.
 
 Data flow: ``DepthArguments``, checked -> ``Settings`` (device, dtype, range, knobs).
 Paper: none.

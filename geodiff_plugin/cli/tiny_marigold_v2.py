@@ -1,4 +1,4 @@
-"""A Marigold V2 with random weights, to try and measure the way of its points without a download.
+"""A tiny Marigold V2 with random weights, for examples and benchmarks without a download.
 
 Data flow: a seed -> ``MarigoldV2Pipeline`` that is tiny.
 Paper: none.

@@ -1,4 +1,4 @@
-"""``geodiff video``: results of a sequence to one moving picture.
+"""``geodiff video``: the results of a sequence as one video.
 
 Data flow: folders of ``geodiff depth``, or depth maps -> a video.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Refit the probabilities that the package promises: of a depth, and of a match.
+"""Refits the confidence of depths and of matches.
 
 Data flow: pairs with truth -> evidence and outcome by pixel
     -> coefficients, deciles on the half not fitted on.

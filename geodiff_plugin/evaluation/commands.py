@@ -1,4 +1,4 @@
-"""Measure methods on pairs and put what came out on a page, for ``geodiff eval pairs`` and its like.
+"""Runs methods on pairs and writes the page, for ``geodiff eval pairs`` and similar commands.
 
 Data flow: ``PairsOptions`` -> records -> ``Page``.
 Paper: S5 (experiments).

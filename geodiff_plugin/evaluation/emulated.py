@@ -1,4 +1,4 @@
-"""A prior of chosen strength: a module in the network's place that answers with a truth of controlled error.
+"""Emulated prior of chosen strength: a network that answers with the truth plus a controlled error.
 
 Data flow: truth + ``Strength`` -> relative map of a prior -> its code -> what the network would have said.
 Paper: none; it stands for priors that cannot be had here, from exact ones to weak ones.

@@ -1,4 +1,4 @@
-"""Logistic regression with signs that are known beforehand, and a table of promised against kept.
+"""Logistic regression with coefficients of known sign, and its calibration table.
 
 Data flow: evidence, right or wrong, weights -> coefficients -> deciles.
 Paper: none.

@@ -1,4 +1,4 @@
-"""How steady depth is from frame to frame: ``geodiff eval sequence``.
+"""Temporal stability of depth: ``geodiff eval sequence``.
 
 Data flow: rendered sequences -> every frame alone, or from the frame before -> AbsRel, flicker, seconds.
 Paper: none; S5 measures single pairs.

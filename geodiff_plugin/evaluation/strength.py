@@ -1,4 +1,4 @@
-"""What guidance makes of priors from exact to weak: ``geodiff eval strength``.
+"""Guidance of priors from exact to weak: ``geodiff eval strength``.
 
 Data flow: dense pairs + ``STRENGTHS`` -> emulated prior -> plain, fitted and guided -> tables.
 Paper: none; S5 measures one prior.

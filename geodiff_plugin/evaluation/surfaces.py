@@ -1,4 +1,4 @@
-"""How well a map keeps what a good prior has: depth edges where they are, and smooth surfaces between them.
+"""How well a map keeps the qualities of a good prior: sharp depth edges and smooth surfaces.
 
 Data flow: depth in metres + dense truth -> error near truth edges, error of slope away from them.
 Paper: none; its tables average over all pixels.

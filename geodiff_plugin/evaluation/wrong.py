@@ -1,4 +1,4 @@
-"""Right pairs made wrong, as people get them wrong: what ``geodiff eval trust`` sees caught or not.
+"""Typical calibration mistakes applied to correct pairs, for ``geodiff eval trust``.
 
 Data flow: ``StereoSample`` -> the same with another calibration, images or points.
 Paper: none.

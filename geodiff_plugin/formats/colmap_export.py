@@ -1,4 +1,4 @@
-"""Cameras and cloud as a COLMAP model in text: for Gaussian splatting, MVS and whatever else reads one.
+"""Writes cameras and cloud as a COLMAP text model, for Gaussian splatting and MVS.
 
 Data flow: cameras with their poses, ``Cloud`` -> ``cameras.txt``, ``images.txt``, ``points3D.txt``.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Lens distortion taken out of photographs, by OpenCV's model or that of fisheye lenses.
+"""Undistorts photographs, with OpenCV's model or its fisheye model.
 
 Data flow: image, K, coefficients -> the image that a pinhole camera of the same K would have taken.
 Paper: none; every formula of the package is of a pinhole camera.

@@ -1,4 +1,4 @@
-"""Camera matrices from what a photograph says of itself, or from a field of view.
+"""Camera matrices from EXIF data, or from a field of view.
 
 Data flow: EXIF of an image, or degrees -> K in pixels of the upright image.
 Paper: none.

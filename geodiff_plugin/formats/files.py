@@ -1,4 +1,4 @@
-"""Opening of files that the user named, with an error in one sentence.
+"""Opens files that the user named, with one-sentence errors.
 
 Data flow: a path as given -> an existing file, or its text.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Cameras as a factory measures them: intrinsics, lens and resolution, one camera at a time.
+"""Factory calibrations: intrinsics, distortion and resolution of each camera.
 
 Data flow: ``FactoryCamera`` of both sides and their pose -> ``Rig``.
 Paper: none.

@@ -1,4 +1,4 @@
-"""KITTI's velodyne scans, brought into the left camera's frame.
+"""KITTI's velodyne scans, transformed to the left camera's frame.
 
 Data flow: ``.bin`` of x, y, z, reflectance + calibration -> ``(N, 3)`` metres, x right, y down, z forward.
 Paper: none (points go beyond it).

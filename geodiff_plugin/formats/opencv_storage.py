@@ -1,4 +1,4 @@
-"""OpenCV's FileStorage, what calibrations use of it: matrices, numbers, short sequences; YAML, XML, JSON.
+"""OpenCV's FileStorage (YAML, XML, JSON), as far as calibrations use it.
 
 Data flow: text -> {key in small letters: float64 array}.
 Paper: none.

@@ -1,4 +1,4 @@
-"""The folder of a run's results: tried before the work, held during it, filled whole or not at all.
+"""The output folder of a run: checked before the work, locked during it, filled whole or not at all.
 
 Data flow: ``--out`` as typed -> ``OutFolder``, held by a lock -> files in a hidden folder -> the folder.
 Paper: none.

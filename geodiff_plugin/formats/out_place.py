@@ -1,4 +1,4 @@
-"""The place of an output folder: what is there already, whether another run has it, a name that is free.
+"""Choice of an output folder: whether it exists, is in use by another run, and the next free name.
 
 Data flow: ``--out`` as typed -> a path that ``OutFolder`` can take, or one clear error.
 Paper: none.

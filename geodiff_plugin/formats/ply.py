@@ -1,4 +1,4 @@
-"""Points of a PLY file, ASCII or binary, whatever else it holds.
+"""Reads the points of a PLY file, ASCII or binary, whatever else it holds.
 
 Data flow: ``.ply`` -> ``(N, 3)`` x, y, z.
 Paper: none.

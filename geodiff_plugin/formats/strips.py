@@ -1,4 +1,4 @@
-"""Large maps a strip of rows at a time, so that what is computed on the way is small beside them.
+"""Iterates over large maps in strips of rows, so that temporary arrays stay small.
 
 Data flow: height and width -> slices of rows.
 Paper: none.

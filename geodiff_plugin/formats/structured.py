@@ -1,4 +1,4 @@
-"""JSON and YAML as calibration files use them, and numbers out of them.
+"""Numbers from the JSON and YAML of calibration files.
 
 Data flow: text -> nested dicts and lists -> checked float64 arrays.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Evidence of the last pairs, for many guided calls on one pair.
+"""Cache of cost volumes and matches, for several guided calls on one pair.
 
 Data flow: views and points as given, configuration -> ``Evidence``, made or remembered.
 Paper: none.

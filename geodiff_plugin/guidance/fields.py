@@ -1,4 +1,4 @@
-"""Fields of a configuration: a default, what a value may be, a line that explains it, the paper's value.
+"""Fields of a configuration: default, valid range, help text, value in the paper.
 
 Data flow: a field's description -> its check, its row in docs/reference/knobs.md and in ``geodiff info
     --knobs``.

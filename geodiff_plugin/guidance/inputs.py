@@ -1,4 +1,4 @@
-"""What a user gives beside the left image, checked: right views with their cameras, known points.
+"""Checks and sorts the input beside the left image: right views with cameras, known points.
 
 Data flow: ``right, K, E, points`` in any of their forms -> one ``ImageInputs`` per left image.
 Paper: S3.3 (two views with known cameras); more views and points go beyond it.

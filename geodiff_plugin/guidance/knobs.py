@@ -1,4 +1,4 @@
-"""The leaves of the configuration as text: read from ``KNOB=VALUE``, and told in tables.
+"""Hyperparameters as text: parsed from ``KNOB=VALUE``, and listed in tables.
 
 Data flow: ``KNOB=VALUE`` -> ``GuidanceConfig`` -> tables of docs/reference/knobs.md and ``geodiff info
     --knobs``.

@@ -1,4 +1,4 @@
-"""Photographs without poses: cameras, poses and scale from what there is.
+"""Cameras, poses and scale of photographs that come without poses.
 
 Data flow: images, K's or EXIF, one known length -> tracks -> poses up to scale -> ``EstimatedRig``.
 Paper: none; it takes known cameras for granted (S3.3).

@@ -1,4 +1,4 @@
-"""The poses of an image's right views as everything downstream uses them.
+"""Checks and refines the poses of an image's right views, once per call.
 
 Data flow: right views as given -> ``pose.refine`` with a first depth of a coarse sweep
     -> right views and report.

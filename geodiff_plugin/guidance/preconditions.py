@@ -1,4 +1,4 @@
-"""What must hold before a guidance is used: names that exist, and something for what is asked to work on.
+"""Checks of a configuration before it is used: names exist, and active terms have input.
 
 Data flow: ``GuidanceConfig``, what is given -> nothing, or an ``InputError``.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Sets of hyperparameters with a name: the default, two published methods, and the search without gradients.
+"""Presets: the default, two published methods, and variants without the loop or without gradients.
 
 Data flow: ``GuidanceConfig()`` -> the same with some leaves set otherwise.
 Paper: Algorithm 1, S5.1, S7.3, S9; Marigold-DC (Viola et al. 2024, "Marigold-DC: zero-shot monocular depth

@@ -1,4 +1,4 @@
-"""A right view turned parallel to the left one: there, every plane is one scale and one shift.
+"""Right views rotated parallel to the left one, so that every plane is one scale and one shift.
 
 Data flow: right image, K, pose + left K, grid -> ``AlignedView``
     -> where each plane's rows and columns lie in it.

@@ -1,4 +1,4 @@
-"""Two or more views as the user gave them -> a volume that spans the scene, and its matches.
+"""From two or more views to a cost volume that spans the scene, and its matches.
 
 Data flow: images, K's, T's -> grid, span of inverse depth -> ``CostVolume`` -> ``Matches``.
 Paper: S7.3 ("a predefined depth range"); here the views find the range by themselves.

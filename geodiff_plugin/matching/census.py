@@ -1,4 +1,4 @@
-"""Soft census: a description of a pixel's surroundings that exposure does not change, in small integers.
+"""Soft census transform: an exposure-invariant descriptor in small integers.
 
 Data flow: grey image -> 16 comparisons a pixel; two of them -> matching cost.
 Paper: none (Zabih and Woodfill 1994, "Non-parametric local transforms for computing visual correspondence").

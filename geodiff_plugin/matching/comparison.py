@@ -1,4 +1,4 @@
-"""The left view's description against that of a right view, plane by plane.
+"""Cost of the left descriptors against those of a right view, plane by plane.
 
 Data flow: census of the left view + ``AlignedView`` -> costs and what is seen of one plane.
 Paper: none.

@@ -1,4 +1,4 @@
-"""What the views say about depth: inverse depths with their confidence.
+"""``Matches``: inverse depth and confidence per pixel.
 
 Data flow: ``match_volume`` -> ``Matches`` of one image -> ``MatchTarget`` of a chunk of samples.
 Paper: none; the evidence that a photometric loss does not have.

@@ -1,4 +1,4 @@
-"""Are left and right swapped, or is the pose the wrong way round? The views themselves tell.
+"""Detects swapped images and inverted poses from the matches.
 
 Data flow: images, K's, T's -> whether the inverse pose matches more of the image.
 Paper: none; a check of the user's input.

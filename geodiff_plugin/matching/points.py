@@ -1,4 +1,4 @@
-"""Depths that the user has, in the form of matches: lidar, structure from motion, any sparse depth.
+"""Known depths in the form of matches: lidar, structure from motion, any sparse depth.
 
 Data flow: ``(N, 3)`` points or an ``(H, W)`` map in metres, K -> ``Matches`` on any grid of the left view.
 Paper: none; what Marigold-DC (Viola et al. 2024) completes.

@@ -1,4 +1,4 @@
-"""Matches that lie behind what the prior says, over a region: mirrors and glass.
+"""Rejects matches that lie behind the prior's depth over a region: mirrors and glass.
 
 Data flow: matches + metric depth of the prior's first estimate
     -> share of each match's confidence that remains.

@@ -1,4 +1,4 @@
-"""How well each inverse depth explains each pixel: a plane sweep for any pose and any number of views.
+"""Plane sweep: cost of each inverse depth at each pixel, for any pose and any number of views.
 
 Data flow: left view + right views (grey image, K, pose) + inverse depths -> ``CostVolume``.
 Paper: S7.3, which calls its search for g_s a variant of the plane sweep volume.

@@ -1,4 +1,4 @@
-"""One picture of a run: the left image, its depth, how far to believe it, how well the views agree.
+"""Overview of a run in one picture: left image, depth, confidence, photometric error.
 
 Data flow: image, depth in metres, confidence, photometric error -> RGB picture.
 Paper: none.

@@ -1,4 +1,4 @@
-"""A moving picture of a sequence of depth maps, all in one range of colours, beside one legend in metres.
+"""Video of a sequence of depth maps, in one range of colours with a legend in metres.
 
 Data flow: depth maps in metres -> frames -> GIF, WebP or MP4.
 Paper: none.

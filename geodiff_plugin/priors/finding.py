@@ -1,4 +1,4 @@
-"""Resolution of a prior's name: the bundled one, a folder, or a hub id.
+"""Resolves the name of a prior: the bundled one, a folder, or a hub id.
 
 Data flow: ``"bundled"``, folder or hub id -> folder with the small files
     -> (once it is known) the weights too.

@@ -1,4 +1,4 @@
-"""Run any depth model of ``transformers``: own preparation, its map, and the space of that map.
+"""Runs any depth model of ``transformers``: preprocessing, its map, and the space of that map.
 
 Data flow: hub id or folder -> ``HFDepthModel``; image ``(B, 3, H, W)`` in [0, 1] -> ``DepthMap``.
 Paper: none (a prior without diffusion).

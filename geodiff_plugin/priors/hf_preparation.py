@@ -1,4 +1,4 @@
-"""What a ``transformers`` image processor does before a depth model, on tensors and without torchvision.
+"""Preprocessing of ``transformers`` depth models, on tensors and without torchvision.
 
 The library's own are not called: those on tensors need torchvision, and two models have no other; those on
 Pillow round to bytes after either axis and take the image to the CPU and back, one at a time.

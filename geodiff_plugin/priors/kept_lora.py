@@ -1,4 +1,4 @@
-"""A LoRA that stays beside its base: over a base in 4 bits there is nothing that it could be merged into.
+"""A LoRA kept apart from its base, since a base in 4 bits cannot be merged with it.
 
 Data flow: ``transformer/``, ``lora/`` of a folder -> the base as it is or in NF4
     -> the same with the LoRA on it.

@@ -1,4 +1,4 @@
-"""The configuration files of a folder of weights, read once.
+"""Configuration files of a folder of weights, read once.
 
 Data flow: folder -> ``Layout`` -> configs by component.
 Paper: none.

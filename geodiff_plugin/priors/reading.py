@@ -1,4 +1,4 @@
-"""Libraries that read weights, made to speak in sentences.
+"""Turns errors of the libraries that read weights into one-sentence errors.
 
 Data flow: whatever diffusers, transformers and safetensors raise over a folder
     -> ``ValueError`` that names it.

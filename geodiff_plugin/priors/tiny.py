@@ -1,4 +1,4 @@
-"""Tiny autoencoders of the latents that priors work in, for what is decoded between the steps.
+"""Tiny autoencoders for the decoding and encoding between the denoising steps.
 
 Data flow: ``decoder`` of the configuration + prior -> ``AutoencoderTiny`` of the same latent.
 Paper: none; TAESD and its relatives (O. Boer Bohan, github.com/madebyollin/taesd) are distilled from the

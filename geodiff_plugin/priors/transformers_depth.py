@@ -1,4 +1,4 @@
-"""Any depth model of ``transformers``, as that saves it or as a pipeline of ours.
+"""Adapter of depth models of ``transformers``, from their own folder or ours.
 
 Data flow: ``config.json``, ``preprocessor_config.json``, weights -> ``TransformersDepthPipeline``.
 Paper: none.

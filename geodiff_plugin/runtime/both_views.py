@@ -1,4 +1,4 @@
-"""Guided depth of both views, each with the other's confident depth as known points.
+"""``guide_both_views``: depth of both views, each with the other's confident depth as known points.
 
 Data flow: left, right, K, E -> guided depth of both -> sure points into the other frame -> guided again.
 Paper: none; it leaves a left-right term out (docs/reference/paper-map.md).

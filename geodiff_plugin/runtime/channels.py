@@ -1,4 +1,4 @@
-"""The depth channels of a latent that holds other maps as well.
+"""Depth channels of a latent that holds other maps as well.
 
 Data flow: whole latent, channels, new part -> whole latent.
 Paper: none.

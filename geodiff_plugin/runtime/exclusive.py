@@ -1,4 +1,4 @@
-"""One guided call at a time on the same pipeline and networks; a second thread waits for the first.
+"""Locks: one guided call at a time on the same pipeline and networks.
 
 Data flow: pipeline -> locks of it and of its networks, held for a call, given back for the length of a
     callback.

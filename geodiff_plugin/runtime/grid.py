@@ -1,4 +1,4 @@
-"""The grid that a pipeline denoises on: the image's own pixels, and what was added to fill latent cells.
+"""``ProcessingGrid``: the grid that a pipeline denoises on, with and without its padding.
 
 Data flow: maps with or without padding -> maps without or with it.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Half precision on a CPU: images are resized in float32, for which PyTorch has kernels there.
+"""Half precision on a CPU: images are resized in float32, because PyTorch lacks kernels for half.
 
 Data flow: the pipeline's image processor, in half precision on a CPU -> the same, resizing in float32.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Whether a run is to be trusted, why not, and what the likeliest cause is.
+"""Whether a result can be trusted, and if not, the likeliest cause.
 
 Data flow: ``Signs`` of an image's run -> ``Judgement``: one word and a few sentences.
 Paper: none; the paper takes its calibration for granted.

@@ -1,4 +1,4 @@
-"""The machine that a result was made on: its devices, its packages, the memory that a call takes.
+"""Devices, package versions and peak memory of the machine.
 
 Data flow: name of a device -> ``torch.device``; a ``with`` block -> bytes.
 Paper: none.

@@ -1,4 +1,4 @@
-"""What a guided call sets on a pipeline beside its scheduler and network, and takes off again.
+"""Flags of a guided call on the pipeline: frozen weights, and the running ``GuidedRun``.
 
 Data flow: pipeline -> weights without gradients, and the run that its methods ask for.
 Paper: none.

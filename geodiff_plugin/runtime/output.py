@@ -1,4 +1,4 @@
-"""Assemble everything known about a guided call on the grid of its output.
+"""Assembles ``MetricDepthOutput`` on the grid of the output.
 
 Data flow: stock output in metres + ``GuidedRun`` -> ``MetricDepthOutput``.
 Paper: Eq. 14's re-rendered left image, as a per-pixel report.

@@ -1,4 +1,4 @@
-"""Preconditions of a guided call: what a pipeline must fulfil, checked before anything is computed.
+"""Checks of a pipeline before a guided call.
 
 Data flow: pipeline, adapter, gradient -> nothing, or one clear error.
 Paper: none.

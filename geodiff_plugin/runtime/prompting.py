@@ -1,4 +1,4 @@
-"""What is known of an image as a dense map, for priors that take depths to start from.
+"""Matches and points as a dense depth map, for priors that take a depth prompt.
 
 Data flow: one ``Evidence`` per image -> ``(N, 1, h, w)`` metres.
 Paper: none (Prompt Depth Anything, arXiv 2412.14015, takes a phone's lidar of 256 x 192).

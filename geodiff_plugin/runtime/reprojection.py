@@ -1,4 +1,4 @@
-"""How well the right views explain the left one at a depth, at the output's resolution.
+"""Photometric error and visibility of a depth map in the right views, at the output's resolution.
 
 Data flow: depth in metres, right views -> where any of them sees the pixel, photometric error.
 Paper: Eq. 14's re-rendered left image, as a per-pixel report.

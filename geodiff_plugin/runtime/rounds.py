@@ -1,4 +1,4 @@
-"""How many denoising steps a guided call takes, and how many rounds of updates in each.
+"""Number of denoising steps of a guided call, and of rounds in each.
 
 Data flow: steps that guidance wants, that the call asks for and that the prior has -> steps and rounds.
 Paper: none; its prior takes as many steps as it is asked for.

@@ -1,4 +1,4 @@
-"""A guided call's own scheduler: ``set_timesteps`` starts a trajectory, ``step`` is guided.
+"""The scheduler of a guided call: ``set_timesteps`` starts a trajectory, ``step`` is guided.
 
 Data flow: ``model_output, t, z_t`` -> guided ``z_{t-1}``, through the scheduler's own ``step``, called once.
 Paper: the DDIM line of Algorithm 1.

@@ -1,4 +1,4 @@
-"""What a finished run shows of its own quality, as numbers.
+"""Quality indicators of a finished run, as numbers.
 
 Data flow: evidence, confidence, rank correlation of a call -> one ``Signs`` an image.
 Paper: none; the paper takes its calibration for granted.

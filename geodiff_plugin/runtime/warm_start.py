@@ -1,4 +1,4 @@
-"""A guided call that goes on from the frame before: its latent, noised again, and its scale.
+"""Warm start: a guided call from the latent, noised again, and the scale of the previous frame.
 
 Data flow: ``guidance.previous`` -> latents at a middle step, how many steps to leave out, depths of both
     ends.

@@ -1,4 +1,4 @@
-"""Whether a prior and the views agree on what is near and what is far.
+"""Rank correlation between the prior's map and the matches.
 
 Data flow: relative map ``x (B, 1, h, w)``, matches or points -> rank correlation per sample.
 Paper: none; a check of the user's input, which the prior knows nothing of.

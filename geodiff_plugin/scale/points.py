@@ -1,4 +1,4 @@
-"""Metres of a relative map from matches and known points: which basin is right, and the fit within it.
+"""Scale from matches and known points: which minimum is right, and the fit within it.
 
 Data flow: matches or points, relative map ``x (B, 1, h, w)``
     -> depths of its nearest and farthest end, per sample.

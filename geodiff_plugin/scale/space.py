@@ -1,4 +1,4 @@
-"""Turn a relative map into metres: an affine map with positive scale and shift, times a global scale.
+"""From a relative map to metres: an affine map with positive scale and shift, times a global scale.
 
 Data flow: ``x (B, 1, H, W)`` unclipped relative map, ``s_hat, t_hat, g_s (B,)`` -> ``depth_m (B, 1, H, W)``.
 Paper: S4.1, Eq. 10 and 13 (eq:metric), Eq. 16 (no label); ``square`` is Marigold-DC's (its Eq. 2).

@@ -1,4 +1,4 @@
-"""Find the metres of a relative map by lookup in a plane-sweep volume.
+"""Search for the scale of a relative map, by lookup in a plane-sweep volume.
 
 Data flow: ``CostVolume``, relative map ``x (B, 1, h, w)`` -> depths of ``x = 0`` and ``x = 1``, per sample.
 Paper: S7.3 (pre-selection of g_s, "a variant of the traditional Plane Sweep Volume technique").

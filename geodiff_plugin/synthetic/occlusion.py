@@ -1,4 +1,4 @@
-"""Ambient occlusion from distances: how free the space above a surface is.
+"""Ambient occlusion from distances to the nearest surfaces.
 
 Data flow: surface points and normals + primitives -> openness in [0, 1].
 Paper: none.

@@ -1,4 +1,4 @@
-"""A rig that moves through a scene that stays as it is: frames with exact depth and exact poses.
+"""Stereo sequences: a rig moves through a static scene, with exact depth and poses.
 
 Data flow: a seed -> ``SyntheticSequence``.
 Paper: none.

@@ -1,4 +1,4 @@
-"""What a camera stands in, could see, or cannot see because something is in the way.
+"""Visibility: objects that a camera stands in, could see, or that are occluded.
 
 Data flow: ``Scene`` and cameras -> a smaller ``Scene``, or masks over the left image.
 Paper: S3.3 (pixels that only one view sees).

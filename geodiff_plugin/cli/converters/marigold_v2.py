@@ -1,4 +1,4 @@
-"""Marigold V2: a base of 40 GB, a checkpoint of what was trained on it, two files of a prompt -> one folder.
+"""Converter of Marigold V2: base model, trained checkpoint and prompt files to one folder.
 
 Data flow: ``transformer/``, ``vae/`` of the base; ``trainables.safetensors``; ``*_prompt_*.pt``
     -> prior's folder.

@@ -1,4 +1,4 @@
-"""Copy a sharded network tensor by tensor, changing some: no more than one new shard is in memory.
+"""Copies a sharded network tensor by tensor, changing some, with at most one new shard in memory.
 
 Data flow: a folder of safetensors, ``name, tensor -> tensor`` -> a folder of safetensors of our own shards.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Stages of a work side by side: while one item is in a stage, the next one is in the stage before it.
+"""A pipeline of threads: each stage works on one item while the next item is in the stage before.
 
 Data flow: items -> one thread a stage, a bounded number of items at a time -> finished items, in order.
 Paper: none.

@@ -1,4 +1,4 @@
-"""One pair of many on its way: read, its evidence made, the prior guided by it, its folder written.
+"""One pair of many, through its stages: read, match, guide, write.
 
 Data flow: ``PairRef`` -> ``Job`` -> four stages, each in a thread of its own
     -> files, and a row of the summary.

@@ -1,4 +1,4 @@
-"""Which pairs a run of many is about: two folders, a list, or the video of a rig.
+"""Which pairs a run consists of: from two folders, a list, or the video of a rig.
 
 Data flow: LEFT and RIGHT as typed -> one ``PairRef`` a pair
     -> the arguments that ``geodiff depth`` would have had.

@@ -1,4 +1,4 @@
-"""The processes of a run of many pairs, one or as many as ``accelerate launch`` or ``torchrun`` started.
+"""Processes that share the pairs, when started by ``accelerate launch`` or ``torchrun``.
 
 Data flow: all pairs -> those of this process; what each process found -> all of it, in order.
 Paper: none.

@@ -1,4 +1,4 @@
-"""Which corrections earn their decode and encodes: error of the default with fewer, coarser or tiny ones.
+"""Which corrections are worth their cost: error of the default with fewer, coarser or tiny-decoder ones.
 
 Data flow: rendered pairs, knobs -> AbsRel with the bundled prior and with emulated ones -> table.
 Paper: none.

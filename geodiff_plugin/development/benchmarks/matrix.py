@@ -1,4 +1,4 @@
-"""What the host's own switches give a guided call, and how far they move its answer.
+"""Speed and deviation of a guided call under the host's switches (compile, bfloat16, slicing, offload).
 
 Data flow: a prior, the demo pair -> the same call with each switch -> ratio of seconds, largest deviation.
 Paper: none.

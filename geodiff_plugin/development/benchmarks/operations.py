@@ -1,4 +1,4 @@
-"""Ways to call a Marigold that are compared, and how much each one computes.
+"""Ways of calling a Marigold, and the operations that each computes.
 
 Data flow: a way and a size -> calls of each network; networks without data -> operations of each call.
 Paper: S5.4 (cost).

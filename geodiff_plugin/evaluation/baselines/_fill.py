@@ -1,4 +1,4 @@
-"""Filling of holes in a match map from the background.
+"""Fills holes in a match map from the background.
 
 Data flow: shift or inverse depth with holes -> without.
 Paper: none; as KITTI's development kit does it for sparse results.

@@ -1,4 +1,4 @@
-"""Depth or disparity maps computed elsewhere, one file a sample.
+"""Depth or disparity maps computed elsewhere, one file per sample.
 
 Data flow: ``StereoSample`` -> file of its name -> metres, or relative values to be aligned.
 Paper: S5.1 (UniDepth, RAFT-Stereo, IGEV-Stereo and DUSt3R among the compared methods).

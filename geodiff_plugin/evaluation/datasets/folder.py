@@ -1,4 +1,4 @@
-"""Own pairs: a folder a pair, with left, right, calibration and, to be scored, depth.
+"""The user's pairs: one folder each, with left, right, calibration and, for scores, depth.
 
 Data flow: folder -> references -> ``StereoSample``.
 Paper: none.

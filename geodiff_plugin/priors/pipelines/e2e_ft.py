@@ -1,4 +1,4 @@
-"""Marigold and Stable Diffusion fine-tuned end to end to answer in one step from zeros.
+"""Marigold and Stable Diffusion fine-tuned end to end: one step from zeros.
 
 Data flow: image latent, zeros -> v at t = 999 -> clean latent -> relative map.
 Paper: none (Martin Garcia et al., arXiv 2409.11355, WACV 2025).

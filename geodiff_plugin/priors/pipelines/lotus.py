@@ -1,4 +1,4 @@
-"""Lotus G and D: one step of an x0-predicting SD-2 U-Net that is told its task.
+"""Lotus G and D: one step of an x0-predicting SD-2 U-Net with a task embedding.
 
 Data flow: image -> posterior sample of its latent (G: and noise) -> U-Net at t = 999 -> ẑ0 -> relative map.
 Paper: none (He et al., Lotus, ICLR 2025, arXiv 2409.18124; EnVision-Research/Lotus, pipeline.py, infer.py).

@@ -1,4 +1,4 @@
-"""Pixel-Perfect Depth: a flow in pixel space, without a VAE and the tokens of Depth Anything V2's encoder.
+"""Pixel-Perfect Depth: a flow in pixel space, conditioned on tokens of Depth Anything V2's encoder.
 
 Data flow: image at the area of 1024 x 768 -> tokens, noise -> Euler steps of the velocity -> log(depth + 1).
 Paper: none; Pixel-Perfect Depth (arXiv 2510.07316).

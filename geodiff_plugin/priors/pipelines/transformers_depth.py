@@ -1,4 +1,4 @@
-"""A depth model of ``transformers`` as a "diffusion" of one step that knows its answer.
+"""A feed-forward depth model of ``transformers`` as a pipeline of one denoising step.
 
 Data flow: image -> the model's map, brought to about [0, 1]
     -> the clean latent, which is decoded by doing nothing.
