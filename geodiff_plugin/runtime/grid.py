@@ -26,6 +26,11 @@ class ProcessingGrid:
     content: tuple[int, int]
     padding: tuple[int, int]
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(H, W)`` with padding."""
+        return self.content[0] + self.padding[0], self.content[1] + self.padding[1]
+
     def cropped(self, x: Tensor) -> Tensor:
         """``(B, C, H, W)`` without its padding."""
         height, width = self.content

@@ -65,7 +65,8 @@ class GuidedCall(_Stock):
             *args: as the stock call takes them.
             guidance: the second view; ``None`` is the stock call, bit for bit.
             callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
-                ``latents`` in what it returns replace the pipeline's.
+                ``latents`` in what it returns replace the pipeline's. The others are ``None`` in the steps
+                before the first correction, which are the prior's own.
             strict: a depth that is not to be trusted (``output.judgements``) is an error.
             **kwargs: as the stock call takes them.
 

@@ -1,248 +1,23 @@
-"""Images in, metric depth out: the guided call of a Marigold-style pipeline.
+"""Switching guidance on and off for a pipeline object.
 
-Data flow: left image(s) + ``GeometryGuidance`` -> stock call with guidance inside -> ``MetricDepthOutput``.
+Data flow: a live pipeline -> the same object, of a class whose call takes ``guidance`` -> the stock class.
 Paper: S4, Figure 3 (fig:framework).
 """
 
 from __future__ import annotations
 
 import functools
-import inspect
-import warnings
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
 
-import torch
 from diffusers import DiffusionPipeline, MarigoldDepthPipeline
-from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
-from torch import Tensor
-from tqdm.auto import tqdm
 
-from geodiff_plugin._checks import bad_type, bad_value, refuse
-from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
-from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
-from geodiff_plugin.priors.tiny import tiny_autoencoder
-from geodiff_plugin.runtime.ensembling import ensemble_metric
-from geodiff_plugin.runtime.exclusive import Exclusive, exclusive_call
-from geodiff_plugin.runtime.grid import ProcessingGrid
-from geodiff_plugin.runtime.output import assemble_output
-from geodiff_plugin.runtime.preconditions import check_guidable
-from geodiff_plugin.runtime.prompting import prompt_of
-from geodiff_plugin.runtime.rounds import plan_steps
-from geodiff_plugin.runtime.run import GuidedRun
-from geodiff_plugin.runtime.warm_start import plan_warm_start
+from geodiff_plugin.runtime.guided_call import GuidedCall, stock_class
 
-__all__ = [
-    "GuidedMarigoldDepthPipeline",
-    "disable_geometry_guidance",
-    "enable_geometry_guidance",
-    "native_images",
-]
+__all__ = ["GuidedMarigoldDepthPipeline", "disable_geometry_guidance", "enable_geometry_guidance"]
 
 
-if TYPE_CHECKING:  # mixed in before a class that has all of a stock pipeline
-    from diffusers import MarigoldDepthPipeline as _Stock
-else:
-    _Stock = object
-
-
-class _GuidedCall(_Stock):
-    """What a pipeline class gains: a ``__call__`` that takes ``guidance``, metric ensembling while guided.
-
-    Mixed in before the stock class, whose call does all the rest: preprocessing, latents, loop, resizing.
-    """
-
-    _guided_run: GuidedRun | None = None
-
-    @torch.no_grad()
-    def __call__(
-        self,
-        image: Any,
-        *args: Any,
-        guidance: GeometryGuidance | None = None,
-        callback_on_step_end: Callable[..., dict[str, Tensor] | None] | None = None,
-        strict: bool = False,
-        **kwargs: Any,
-    ) -> Any:
-        """The stock call; with ``guidance`` its depth is in metres.
-
-        Args:
-            image: left image(s), as the stock call takes them.
-            *args: as the stock call takes them.
-            guidance: the second view; ``None`` is the stock call, bit for bit.
-            callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
-                ``latents`` in what it returns replace the pipeline's. The others are ``None`` in the steps
-                before the first correction, which are the prior's own.
-            strict: a depth that is not to be trusted (``output.judgements``) is an error.
-            **kwargs: as the stock call takes them.
-
-        Returns:
-            ``MetricDepthOutput``, or with ``return_dict=False`` the stock tuple (prediction, uncertainty,
-            latent).
-
-        Raises:
-            TypeError: ``guidance`` is no ``GeometryGuidance``; a scheduler that cannot be guided.
-            ValueError: inputs that do not fit each other; offloading that forbids guidance.
-            RuntimeError: called inside ``torch.inference_mode()``, or by a hook of a guided call's own
-                networks. From ``callback_on_step_end`` the pipeline may be called, guided or not: there it
-                is as the user left it. A call in another thread waits.
-        """
-        if guidance is None and callback_on_step_end is not None:
-            bad_value("callback_on_step_end", "given together with guidance", "guidance=None")
-        with exclusive_call(self, guidance is not None) as held:
-            if self._guided_run is not None:
-                raise RuntimeError(
-                    "This pipeline is in the middle of a guided call; call it again from "
-                    "callback_on_step_end, or afterwards, but not from a hook of its networks."
-                )
-            if guidance is None:
-                return super().__call__(image, *args, **kwargs)
-            stock_call = super().__call__
-            extra = (guidance, callback_on_step_end, strict)
-            return self._call_guided(stock_call, held, *extra, image, *args, **kwargs)
-
-    def _call_guided(
-        self,
-        stock_call: Callable[..., Any],
-        held: Exclusive,
-        guidance: GeometryGuidance,
-        callback: Callable[..., dict[str, Tensor] | None] | None,
-        strict: bool,
-        image: Any,
-        *args: Any,
-        **kwargs: Any,
-    ) -> Any:
-        if not isinstance(guidance, GeometryGuidance):
-            bad_type("guidance", "a GeometryGuidance", guidance, "GeometryGuidance(right, K, E)")
-        if torch.is_inference_mode_enabled():
-            raise RuntimeError(
-                "A guided call needs gradients, which torch.inference_mode() forbids; "
-                "use torch.no_grad() or nothing."
-            )
-        call, prior = _bind(stock_call, image, *args, **kwargs), find_adapter(self)(self)
-        call["num_inference_steps"], rounds = plan_steps(
-            guidance, prior, call["num_inference_steps"], self.default_denoising_steps
-        )
-        call["resample_method_output"] = call["resample_method_output"] or "bilinear"
-        check_guidable(self, prior, guidance)
-        tiny = tiny_autoencoder(self, prior, guidance.config.decoder)
-        if prior.deterministic and call["ensemble_size"] > 1:
-            call |= {"ensemble_size": 1, "output_uncertainty": False}
-            warnings.warn(
-                "This prior gives the same map every time: of the ensemble one member runs.",
-                stacklevel=4,
-            )
-        wants_dict, wants_latent = call["return_dict"], call["output_latent"]
-        processor, device = self.image_processor, self._execution_device
-        lefts_01 = native_images(image, device)  # (N, 3, H, W)
-        resolution = call["processing_resolution"]
-        resolution = self.default_processing_resolution if resolution is None else resolution
-        padded, padding, _ = processor.preprocess(image, resolution, call["resample_method_input"], device)
-        content = (padded.shape[-2] - padding[0], padded.shape[-1] - padding[1])
-        grid = ProcessingGrid(content, padding)
-        with torch.autocast(device.type, enabled=False):
-            evidence = guidance.prepare(lefts_01)
-            if prior.takes_prompt and call.get("prompt_depth") is None:
-                call["prompt_depth"] = prompt_of(evidence)
-        warm = plan_warm_start(self, prior, guidance, call, tuple(padded.shape[-2:]))
-        if warm is not None and warm.latents is not None:
-            # They hold what was to be drawn; beside latents Marigold takes no image with its channels last.
-            call |= {"image": lefts_01, "latents": warm.latents, "generator": None}
-        run = GuidedRun(
-            self,
-            prior,
-            guidance,
-            evidence,
-            call["ensemble_size"],
-            call["batch_size"],
-            grid,
-            rounds,
-            callback,
-            wants_latent,
-            tiny,
-            held,
-            warm,
-        )
-        with run:
-            stock = stock_call(**{**call, "return_dict": True, "output_latent": True})
-        run.check_finite()
-        with torch.autocast(device.type, enabled=False):
-            output = assemble_output(stock, run, guidance, lefts_01, call)
-        for judgement in output.judgements if strict else ():
-            if not judgement.trusted:
-                refuse(judgement.sentence)
-        output.latent = stock.latent if wants_latent else None
-        return output if wants_dict else (output.prediction, output.uncertainty, output.latent)
-
-    def progress_bar(self, iterable: Any = None, total: int | None = None, **kwargs: Any) -> Any:
-        """Stock bars, one within another; while guided, one bar of the run's own stands for all."""
-        if self._guided_run is None:
-            return super().progress_bar(iterable, total, **kwargs)
-        return tqdm(iterable, total=total, disable=True)
-
-    def decode_prediction(self, pred_latent: Tensor) -> Tensor:
-        """Stock decode; while guided, metres instead of the clipped relative map."""
-        if self._guided_run is None:
-            return super().decode_prediction(pred_latent)
-        return self._guided_run.metric_prediction(pred_latent)
-
-    def ensemble_depth(self, depth: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
-        """Stock ensembling; while guided, the median of members that are in metres already."""
-        if self._guided_run is None:
-            return super().ensemble_depth(depth, *args, **kwargs)
-        self._guided_run.members.append(depth)
-        return ensemble_metric(depth, kwargs.get("reduction", "median"))
-
-    def put_together(self, maps: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
-        """A prior's own ending of ensembles; while guided, ``ensemble_depth`` for every image."""
-        if self._guided_run is None:
-            return super().put_together(maps, *args, **kwargs)
-        return DepthDiffusionPipeline.put_together(self, maps, *args, **kwargs)
-
-    def save_pretrained(self, *args: Any, **kwargs: Any) -> None:
-        """Save the stock pipeline: the folder loads where this package is not installed."""
-        guided = type(self)
-        self.__class__ = _stock_class(guided)
-        try:
-            self.save_pretrained(*args, **kwargs)
-        finally:
-            self.__class__ = guided
-
-
-class GuidedMarigoldDepthPipeline(_GuidedCall, MarigoldDepthPipeline):
+class GuidedMarigoldDepthPipeline(GuidedCall, MarigoldDepthPipeline):
     """``MarigoldDepthPipeline`` whose call takes ``guidance``; ``from_pretrained`` as always."""
-
-
-def native_images(image: Any, device: torch.device) -> Tensor:
-    """Left image(s) in any form that the stock call takes, as they go to ``GeometryGuidance.prepare``.
-
-    Args:
-        image: PIL, numpy or torch, or a list.
-        device: where the call runs.
-
-    Returns:
-        ``(N, 3, H, W)`` float32 in [0, 1], native size.
-    """
-    as_given = MarigoldImageProcessor(vae_scale_factor=1, do_normalize=False)
-    return as_given.preprocess(image, 0, device=device, dtype=torch.float32)[0].contiguous()
-
-
-def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
-    """All arguments of the stock call by name, defaults and what a prior adds included."""
-    signature = inspect.signature(stock_call)
-    bound = signature.bind(*args, **kwargs)
-    bound.apply_defaults()
-    call = dict(bound.arguments)
-    for name, parameter in signature.parameters.items():
-        if parameter.kind is parameter.VAR_KEYWORD:
-            call |= call.pop(name)
-    return call
-
-
-def _stock_class(guided: type) -> type:
-    """The class that guidance was mixed into."""
-    return next(c for c in guided.__mro__ if not issubclass(c, _GuidedCall))
 
 
 @functools.cache
@@ -250,7 +25,7 @@ def _guided_class(stock: type) -> type:
     if stock is MarigoldDepthPipeline:
         return GuidedMarigoldDepthPipeline
     return type(
-        f"Guided{stock.__name__}", (_GuidedCall, stock), {"__doc__": GuidedMarigoldDepthPipeline.__doc__}
+        f"Guided{stock.__name__}", (GuidedCall, stock), {"__doc__": GuidedMarigoldDepthPipeline.__doc__}
     )
 
 
@@ -267,13 +42,13 @@ def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
         TypeError: no adapter understands it.
     """
     find_adapter(pipe)
-    if not isinstance(pipe, _GuidedCall):
+    if not isinstance(pipe, GuidedCall):
         pipe.__class__ = _guided_class(pipe.__class__)
     return pipe
 
 
 def disable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
     """Undo ``enable_geometry_guidance``; on a pipeline that is not enabled it does nothing."""
-    if isinstance(pipe, _GuidedCall):
-        pipe.__class__ = _stock_class(type(pipe))
+    if isinstance(pipe, GuidedCall):
+        pipe.__class__ = stock_class(type(pipe))
     return pipe

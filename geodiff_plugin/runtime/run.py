@@ -1,4 +1,4 @@
-"""State of one guided call: what is set up for it on the pipeline and taken down after it.
+"""State of one guided call: its hooks on the pipeline, one ``Trajectory`` per batch chunk, the callbacks.
 
 Data flow: pipeline + ``GeometryGuidance`` -> hooks on -> trajectories -> metric depth of every member
     -> hooks off.
@@ -23,6 +23,7 @@ from geodiff_plugin.algorithm.step import StepContext, guided_step
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.channels import put_channels
+from geodiff_plugin.runtime.codec import MapCodec
 from geodiff_plugin.runtime.denoiser import DenoiserTap
 from geodiff_plugin.runtime.exclusive import Exclusive
 from geodiff_plugin.runtime.grid import ProcessingGrid
@@ -36,6 +37,8 @@ from geodiff_plugin.runtime.warm_start import WarmStart
 __all__ = ["GuidedRun"]
 
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Tensor] | None]
+#: What the scheduler's step is given: network output, noisy latent, and what to add to its result.
+StepResult = tuple[Tensor, Tensor, Tensor | None]
 
 
 class GuidedRun:
@@ -48,17 +51,17 @@ class GuidedRun:
         evidence: one entry per image.
         ensemble_size: members per image.
         batch_size: samples per chunk, as the pipeline slices them.
-        grid: that the pipeline works on.
-        rounds: times that every denoising step makes its updates, see ``rounds.plan_steps``.
+        grid: the processing grid of the pipeline.
+        rounds: how often each denoising step is corrected and updated, see ``rounds.plan_steps``.
         callback: ``callback_on_step_end`` or ``None``.
-        wants_latents: whether the caller is given the final latents.
-        tiny: what decodes and encodes in the loop; ``None`` for the pipeline's own autoencoder.
-        held: what the call holds against other threads, given back while the callback runs.
-        warm: where the call goes on from another frame, or ``None``.
+        wants_latents: whether the call returns the final latents.
+        tiny: autoencoder that is used in the loop; ``None`` for the pipeline's.
+        held: lock against calls in other threads, released while the callback runs.
+        warm: the start from the previous frame, or ``None``.
 
     Attributes:
-        trajectories: one a chunk.
-        relative: the decoded maps of the final latents, one a chunk, without padding.
+        trajectories: one per chunk.
+        relative: decoded maps of the final latents, one per chunk, without padding.
         members: of every image with an ensemble, ``(E, 1, H, W)`` metres without padding.
     """
 
@@ -85,7 +88,7 @@ class GuidedRun:
         self.rounds, self.callback, self._held = rounds, callback, held
         self.warm, self._skipped = warm, 0 if warm is None else warm.skipped
         self._reads_latents = wants_latents or callback is not None
-        self._tiny = tiny
+        self._codec = MapCodec(pipe, prior, grid, tiny)
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
         self.members: list[Tensor] = []
@@ -120,7 +123,7 @@ class GuidedRun:
 
     @contextmanager
     def _suspended(self) -> Iterator[None]:
-        """The pipeline as the user left it, for the length of a callback: stock, guided or saved there."""
+        """Remove the hooks while a callback runs, so that it may call or save the pipeline."""
         self._stack.close()
         try:
             with self._held.given_back():
@@ -130,39 +133,12 @@ class GuidedRun:
 
     @property
     def rounds_of_step(self) -> range:
-        """Numbers of the current step's rounds in the schedule; steps that a warm start leaves out count."""
+        """Numbers of the current step's rounds in the schedule; steps skipped by a warm start count."""
         first = (self._skipped + self.step_index) * self.rounds
         return range(first, first + self.rounds)
 
-    @contextmanager
-    def _in_the_loop(self) -> Iterator[None]:
-        """The tiny autoencoder, if there is one, in the place of the pipeline's own."""
-        if self._tiny is None:
-            yield
-            return
-        own = self.pipe.vae
-        object.__setattr__(self.pipe, "vae", self._tiny)  # past the rewriting of the pipeline's config
-        try:
-            yield
-        finally:
-            object.__setattr__(self.pipe, "vae", own)
-
-    def decode(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map without padding, ``(B, 1, H, W)`` float32, with its graph; in the loop."""
-        with self._in_the_loop():
-            return self.decode_result(z0)
-
-    def decode_result(self, z0: Tensor) -> Tensor:
-        """The same by the pipeline's own autoencoder."""
-        return self.grid.cropped(self.grid.filled(self.prior.decode(z0)))
-
-    def encode(self, x: Tensor) -> Tensor:
-        """Clean latent of a relative map without padding, which is made as the image's was; in the loop."""
-        with self._in_the_loop():
-            return self.prior.encode(self.grid.padded(x))
-
     def metric_prediction(self, latents: Tensor) -> Tensor:
-        """Metric depth of the next chunk of final latents; takes the place of the clipping decode.
+        """Metric depth of the next chunk of final latents, instead of the clipping decode.
 
         Args:
             latents: ``(B, C, h, w)``, chunks in the order in which they were denoised.
@@ -172,7 +148,7 @@ class GuidedRun:
         """
         trajectory = self.trajectories[self._decoded_chunks]
         self._decoded_chunks += 1
-        # What was encoded last, before the autoencoder's loss and the noise that SD-2's schedulers leave.
+        # The map that was encoded last: decoding would add the autoencoder's loss and the scheduler's noise.
         x = trajectory.result
         if x is None:
             x = self.grid.filled(self.prior.decode(latents[:, self.prior.latents]))
@@ -183,22 +159,27 @@ class GuidedRun:
         return trajectory.metric(x, trajectory.affine)
 
     def known(self, image: int, member: int | None = None) -> Known:
-        """What is known of one image on the grid of the sweep.
+        """Matches and points of one image on the grid of the sweep, weighted by what the loop found of them.
 
         Args:
             image: its index in the call.
-            member: as the judgement of this one says; ``None`` for that of all members, on average.
+            member: index of the ensemble member whose weights are used; ``None`` for the mean of all.
         """
-        own = [t.known.of_sample(i) for t in self.trajectories for i, o in enumerate(t.owners) if o == image]
-        chosen = own if member is None else own[member : member + 1]
+        members = [
+            t.known.of_sample(i)
+            for t in self.trajectories
+            for i, owner in enumerate(t.owners)
+            if owner == image
+        ]
+        chosen = members if member is None else members[member : member + 1]
         means = []
-        for judged in zip(*chosen, strict=True):  # what is kept of each match, and the prior's error
-            given = [one for one in judged if one is not None]
-            means.append(torch.stack(given).mean(0, keepdim=True) if given else None)
+        for values in zip(*chosen, strict=True):  # what is kept of each match, and the prior's error
+            present = [value for value in values if value is not None]
+            means.append(torch.stack(present).mean(0, keepdim=True) if present else None)
         return Known.of([self.evidence[image]], self.config, "sweep", *means)
 
     def check_finite(self) -> None:
-        """Ask, once and after the loop, whether everything that was computed is finite.
+        """Check, once and after the loop, that everything computed in it is finite.
 
         Raises:
             ValueError: naming the step, the tensor and the cure.
@@ -216,11 +197,11 @@ class GuidedRun:
         )
         self.step_index, self.timesteps = 0, timesteps.tolist()
         if self._bar is None:
-            told = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
+            options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
             chunks = -(-len(self.owners) // self.batch_size)
-            self._bar = tqdm(total=chunks * len(self.timesteps), **told)
+            self._bar = tqdm(total=chunks * len(self.timesteps), **options)
 
-    def _on_step(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _on_step(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepResult:
         level = noise_level(self.pipe.scheduler, timestep)
         trajectory, depth = self.trajectories[-1], self.prior.latents
         wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
@@ -234,32 +215,24 @@ class GuidedRun:
         def z0_of(z: Tensor) -> Tensor:
             return z if tap is None else z0_from(tap.output_at(z)[:, depth].to(wide), z, level)
 
-        encode = self.encode if tap is None else None
+        codec = self._codec
+        encode = codec.encode if tap is None else None
         timestep_now = self.timesteps[self.step_index]
         last = self.step_index == len(self.timesteps) - 1
-        decode_result = self.decode_result if last and not self._reads_latents else None
+        decode_result = codec.decode_result if last and not self._reads_latents else None
         rounds, count = self.rounds_of_step, (self._skipped + len(self.timesteps)) * self.rounds
         at = StepContext(
-            self.step_index, timestep_now, rounds, count, eps, z0_of, self.decode, encode, decode_result
+            self.step_index, timestep_now, rounds, count, eps, z0_of, codec.decode, encode, decode_result
         )
         with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
             move = guided_step(trajectory, leaf, at)
-        updates = self.config.updates
-        result: tuple[Tensor, Tensor, Tensor | None]
-        if self._tiny is not None and decode_result is None:
+        if codec.has_tiny and decode_result is None:
             trajectory.result = None  # its map is a tiny decoder's
         active = any(trajectory.is_active(i / count) for i in rounds)
-        if move is None or not updates.optimize_latents or not active:
-            result = output, z_t, None  # bit for bit the pipeline's own step
-        elif tap is not None and self.prior.max_steps == 1:
-            # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
-            moved = (leaf + move).detach()
-            result = tap.output_at(moved).detach(), put_channels(z_t, depth, moved.to(z_t.dtype)), None
-        elif tap is not None and updates.step_from == "updated":
-            moved = (leaf + move).detach().to(z_t.dtype)
-            result = output, put_channels(z_t, depth, moved), None
+        if move is None or not self.config.updates.optimize_latents or not active:
+            result: StepResult = output, z_t, None  # bit for bit the pipeline's own step
         elif tap is not None:
-            result = output, z_t, put_channels(torch.zeros_like(z_t, dtype=wide), depth, move)
+            result = self._moved_noisy(tap, output, z_t, leaf, move)
         else:
             moved_output, moved_z_t = output_from(leaf + move, eps, level)
             result = (
@@ -270,6 +243,21 @@ class GuidedRun:
         if tap is not None:
             tap.release()
         return result
+
+    def _moved_noisy(
+        self, tap: DenoiserTap, output: Tensor, z_t: Tensor, leaf: Tensor, move: Tensor
+    ) -> StepResult:
+        """What the scheduler steps from where z_t was moved: the full gradient."""
+        depth = self.prior.latents
+        if self.prior.max_steps == 1:
+            # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
+            moved = (leaf + move).detach()
+            return tap.output_at(moved).detach(), put_channels(z_t, depth, moved.to(z_t.dtype)), None
+        if self.config.updates.step_from == "updated":
+            moved = (leaf + move).detach().to(z_t.dtype)
+            return output, put_channels(z_t, depth, moved), None
+        wide = torch.promote_types(z_t.dtype, torch.float32)
+        return output, z_t, put_channels(torch.zeros_like(z_t, dtype=wide), depth, move)
 
     def _on_done(self, timestep: Tensor, latents: Tensor) -> Tensor:
         if self.callback is not None:
@@ -294,7 +282,7 @@ class GuidedRun:
             return dict.fromkeys(("metric_depth", "loss", "scale", "shift"))
         affine, x = trajectory.affine, trajectory.last_x
         if x is None or self.step_index == len(self.timesteps) - 1:
-            x = self.decode_result(latents[:, self.prior.latents])
+            x = self._codec.decode_result(latents[:, self.prior.latents])
         return {
             "metric_depth": trajectory.metric(x, affine),
             "loss": trajectory.history[-1].loss,

@@ -1,6 +1,6 @@
 """Seconds of a guided call beside the plain call and OpenCV's eight-path semi-global matching.
 
-Hop: rendered or real pairs -> a table (``python -m geodiff_plugin.development.benchmarks.calls``).
+Data flow: rendered or real pairs -> a table (``python -m geodiff_plugin.development.benchmarks.calls``).
 Paper: none.
 """
 
