@@ -6,7 +6,6 @@ Paper: S5.4 (cost), as ratios and not as seconds of another machine.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -20,7 +19,7 @@ from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.cli.terminal import new_console, new_table
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior
-from geodiff_plugin.runtime.machine import PeakMemory, pick_device
+from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 __all__ = ["BUNDLED", "Cost", "Workload", "measure", "run_bench"]
@@ -63,14 +62,6 @@ def _load_bundled(device: torch.device) -> Any:
 BUNDLED = Workload("bundled prior, default guidance", _load_bundled)
 
 
-def _timed(call: Callable[[], Any], device: torch.device) -> float:
-    started = time.perf_counter()
-    call()
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter() - started
-
-
 def measure(gradient: str | None, workload: Workload, device_name: str) -> Cost:
     """Cost of one call on the demo pair, to be run in a process of its own.
 
@@ -96,9 +87,9 @@ def measure(gradient: str | None, workload: Workload, device_name: str) -> Cost:
         pipe(pair.left, generator=torch.Generator("cpu").manual_seed(0), **options)
 
     with PeakMemory(device) as memory:
-        seconds = _timed(call, device)
+        seconds = timed(call, device)
     if workload.repeats:
-        seconds = min(_timed(call, device) for _ in range(workload.repeats))
+        seconds = min(timed(call, device) for _ in range(workload.repeats))
     return Cost(seconds, memory.peak_bytes)
 
 

@@ -1,6 +1,6 @@
-"""Devices, package versions and peak memory of the machine.
+"""Devices, package versions, time and peak memory on this machine.
 
-Data flow: name of a device -> ``torch.device``; a ``with`` block -> bytes.
+Data flow: name of a device -> ``torch.device``; a call -> seconds; a ``with`` block -> bytes.
 Paper: none.
 """
 
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import platform
 import threading
+import time
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 
 import psutil  # comes with accelerate
@@ -15,7 +17,7 @@ import torch
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["PeakMemory", "pick_device", "versions"]
+__all__ = ["PeakMemory", "pick_device", "timed", "versions"]
 
 PACKAGES = ("geodiff-plugin", "torch", "diffusers", "transformers", "accelerate", "kornia", "numpy", "pillow")
 SAMPLING_INTERVAL_S = 0.05
@@ -57,6 +59,15 @@ def pick_device(name: str) -> torch.device:
             "--device", f"one of the {torch.cuda.device_count()} CUDA devices of this machine", repr(name)
         )
     return device
+
+
+def timed(call: Callable[[], object], device: torch.device) -> float:
+    """Seconds of a call; on CUDA until its last kernel has finished."""
+    started = time.perf_counter()
+    call()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter() - started
 
 
 class PeakMemory:

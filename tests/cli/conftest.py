@@ -54,6 +54,14 @@ def write_pair(folder: Path, pair) -> PairFiles:
 
 
 @pytest.fixture
+def prior(make_pipeline, tmp_path_factory) -> Path:
+    """Folder of a tiny random Marigold."""
+    folder = tmp_path_factory.mktemp("prior")
+    make_pipeline().save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture
 def pair_files(tmp_path, textured_plane, monkeypatch) -> PairFiles:
     """The pair in a fresh folder, which is also the working directory."""
     monkeypatch.chdir(tmp_path)

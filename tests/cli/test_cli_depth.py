@@ -32,13 +32,6 @@ QUICK = ["--steps", 1, "--preset", "paper"]
 
 
 @pytest.fixture
-def prior(make_pipeline, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("prior")
-    make_pipeline().save_pretrained(folder)
-    return folder
-
-
-@pytest.fixture
 def command(pair_files, prior):
     return [*pair_files.command, "--prior", prior, "--device", "cpu"]
 

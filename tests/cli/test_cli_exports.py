@@ -14,13 +14,6 @@ from geodiff_plugin.formats import read_calibration
 
 
 @pytest.fixture
-def prior(make_pipeline, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("prior")
-    make_pipeline().save_pretrained(folder)
-    return folder
-
-
-@pytest.fixture
 def quick(pair_files, prior):
     return [*pair_files.command, "--prior", prior, "--device", "cpu", "--steps", 1, "--preset", "paper"]
 

@@ -29,13 +29,6 @@ from geodiff_plugin.formats.video import VideoReader, both_halves, count_frames
 QUICK = ["--steps", 1, "--preset", "paper", "--device", "cpu"]
 
 
-@pytest.fixture
-def prior(make_pipeline, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("prior")
-    make_pipeline().save_pretrained(folder)
-    return folder
-
-
 def write_folders(root: Path, pair, names) -> None:
     for side in ("left", "right"):
         (root / side).mkdir()

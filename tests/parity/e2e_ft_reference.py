@@ -14,14 +14,12 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-import types
 from enum import Enum
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import numpy as np
 
-from tests.parity import tiny_configs
+from tests.parity import stub_modules, tiny_configs
 from tests.parity.geowizard_reference import TEXT, VAE, write_tokenizer
 
 UNET = tiny_configs.UNET | {"in_channels": 8}
@@ -54,15 +52,7 @@ def _stand_in() -> None:
             "resize": None,  # nothing is resized here
         },
     }
-    for name, content in contents.items():
-        module = types.ModuleType(name)
-        module.__spec__ = ModuleSpec(name, None)
-        module.__dict__.update(content)
-        module.__path__ = []
-        sys.modules[name] = module
-        parent, _, child = name.rpartition(".")
-        if parent:
-            setattr(sys.modules[parent], child, module)
+    stub_modules.install(contents)
 
 
 def main() -> None:

@@ -15,14 +15,12 @@ import argparse
 import json
 import sys
 import tempfile
-import types
 from enum import Enum
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import numpy as np
 
-from tests.parity import tiny_configs
+from tests.parity import stub_modules, tiny_configs
 
 UNET = tiny_configs.UNET | {"in_channels": 8, "class_embed_type": "projection"}
 VAE = tiny_configs.VAE
@@ -80,15 +78,7 @@ def _stand_ins() -> None:
         "xformers": {},
         "xformers.ops": {"memory_efficient_attention": attention},
     }
-    for name, content in contents.items():
-        module = types.ModuleType(name)
-        module.__spec__ = ModuleSpec(name, None)  # diffusers looks for it
-        module.__dict__.update(content)
-        module.__path__ = []
-        sys.modules[name] = module
-        parent, _, child = name.rpartition(".")
-        if parent:
-            setattr(sys.modules[parent], child, module)
+    stub_modules.install(contents)
 
 
 def run_case(case: str, coupled: bool) -> dict[str, np.ndarray]:

@@ -14,14 +14,12 @@ import argparse
 import json
 import sys
 import tempfile
-import types
 from enum import Enum
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import numpy as np
 
-from tests.parity import tiny_configs
+from tests.parity import stub_modules, tiny_configs
 
 UNET = tiny_configs.UNET | {"class_embed_type": "projection", "projection_class_embeddings_input_dim": 4}
 VAE = tiny_configs.VAE
@@ -99,15 +97,7 @@ def _stand_ins() -> None:
         "tensorboard": {},
         "matplotlib": {},
     }
-    for name, content in contents.items():
-        module = types.ModuleType(name)
-        module.__spec__ = ModuleSpec(name, None)  # diffusers looks for it
-        module.__dict__.update(content)
-        module.__path__ = []
-        sys.modules[name] = module
-        parent, _, child = name.rpartition(".")
-        if parent:
-            setattr(sys.modules[parent], child, module)
+    stub_modules.install(contents)
 
 
 def run_case(case: str) -> dict[str, np.ndarray]:

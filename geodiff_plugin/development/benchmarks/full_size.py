@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -31,7 +30,7 @@ from geodiff_plugin.development.benchmarks.operations import (
     tiny_folder,
 )
 from geodiff_plugin.development.random_marigold import random_marigold
-from geodiff_plugin.runtime.machine import PeakMemory, pick_device
+from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 __all__ = ["Found", "main", "measure"]
@@ -60,18 +59,10 @@ def measure(way: str, size: Size, device_name: str, folder: str) -> Found:
     pipe.set_progress_bar_config(disable=True)
     call = call_of(way, enable_geometry_guidance(pipe), size, folder)
     with PeakMemory(device) as memory:
-        seconds = _timed(call, device)
+        seconds = timed(call, device)
     if size.repeats:
-        seconds = min(_timed(call, device) for _ in range(size.repeats))
+        seconds = min(timed(call, device) for _ in range(size.repeats))
     return Found(seconds, memory.peak_bytes, _waits(call) if device.type == "cuda" else None)
-
-
-def _timed(call: Callable[[], Any], device: torch.device) -> float:
-    started = time.perf_counter()
-    call()
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter() - started
 
 
 def _waits(call: Callable[[], Any]) -> int:
