@@ -1,19 +1,53 @@
-"""Metric depth from a diffusion prior and a second view (GeoDiff, arXiv 2510.18291), as a diffusers plugin.
+"""Metric depth from a diffusion prior and a second view, without training, as a plugin for diffusers.
 
-Reading order, which is the path of one image: ``types``, ``geometry``, ``guidance.config``, ``matching``,
-``scale``, ``algorithm``, ``guidance``, ``priors``, ``runtime``.
-
->>> pipe = load_bundled_prior()
->>> enable_geometry_guidance(pipe)
+>>> pipe = enable_geometry_guidance(load_prior("bundled"))
 >>> out = pipe(left, guidance=GeometryGuidance(right, K, E))
+>>> depth_m = out.prediction  # (1, H, W, 1), metres
+
+The method follows GeoDiff (arXiv 2510.18291). Read the code along the path of one image: ``types``,
+``geometry``, ``guidance.config``, ``matching``, ``scale``, ``algorithm``, ``guidance``, ``priors``,
+``runtime``.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what type checkers and editors see; at run time names are imported on first use
+    from geodiff_plugin._checks import InputError
+    from geodiff_plugin.bundled import load_bundled_prior
+    from geodiff_plugin.formats.reading import read_calibration
+    from geodiff_plugin.guidance.config import GuidanceConfig
+    from geodiff_plugin.guidance.guidance import GeometryGuidance
+    from geodiff_plugin.priors import PRIORS, load_prior
+    from geodiff_plugin.runtime.both_views import guide_both_views
+    from geodiff_plugin.runtime.pipeline import (
+        GuidedMarigoldDepthPipeline,
+        disable_geometry_guidance,
+        enable_geometry_guidance,
+    )
+    from geodiff_plugin.synthetic import render_pair
+    from geodiff_plugin.types import MetricDepthOutput, Rig
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "PRIORS",
+    "GeometryGuidance",
+    "GuidanceConfig",
+    "GuidedMarigoldDepthPipeline",
+    "InputError",
+    "MetricDepthOutput",
+    "Rig",
+    "disable_geometry_guidance",
+    "enable_geometry_guidance",
+    "guide_both_views",
+    "load_bundled_prior",
+    "load_prior",
+    "read_calibration",
+    "render_pair",
+]
 
 #: Public name -> module, imported on first use so that ``import geodiff_plugin`` stays quick.
 _MODULE_OF = {
@@ -29,11 +63,9 @@ _MODULE_OF = {
     "guide_both_views": "geodiff_plugin.runtime.both_views",
     "load_bundled_prior": "geodiff_plugin.bundled",
     "load_prior": "geodiff_plugin.priors",
-    "read_calibration": "geodiff_plugin.formats",
+    "read_calibration": "geodiff_plugin.formats.reading",
     "render_pair": "geodiff_plugin.synthetic",
 }
-
-__all__ = sorted(_MODULE_OF)  # noqa: PLE0605
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Records that travel between the layers: cameras of a pair, a view, what a step did, the output.
+"""Records shared by all layers: ``Rig``, ``CameraView``, reports, and ``MetricDepthOutput``.
 
 Data flow: files and user input -> ``Rig``, ``CameraView`` -> guidance
     -> ``StepReport``, ``MetricDepthOutput``.
@@ -19,7 +19,7 @@ __all__ = ["CameraView", "Distortion", "MetricDepthOutput", "PoseReport", "Rig",
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
-    """What a lens does to the image of a pinhole camera.
+    """Lens distortion of one camera.
 
     Attributes:
         model: ``"opencv"`` (k1, k2, p1, p2, k3 and so on) or ``"fisheye"`` (k1 to k4).
@@ -32,16 +32,16 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Rig:
-    """Calibration of two pinhole cameras, before any image is seen.
+    """Calibration of a left and a right pinhole camera.
 
     Attributes:
         K_left: ``(3, 3)`` float64, pixels of the left image.
         K_right: ``(3, 3)`` float64, pixels of the right image.
         E: ``(4, 4)`` float64, metres; pose of the right camera in the left camera's frame.
-        size_left: ``(width, height)`` that ``K_left`` is for, or ``None`` where the file does not say.
+        size_left: ``(width, height)`` of the images that ``K_left`` is for; ``None`` if unknown.
         size_right: likewise for ``K_right``.
-        source: what it was read from, for messages and reports.
-        distortion: of the left and the right lens, ``None`` for a pinhole camera.
+        source: file or option it comes from, for messages and reports.
+        distortion: of the left and the right lens; ``None`` for none.
 
     Convention:
         A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
@@ -57,25 +57,27 @@ class Rig:
 
     @property
     def T_right_from_left(self) -> np.ndarray:
-        """``(4, 4)`` float64, takes points from the left camera's frame to the right one's."""
+        """``(4, 4)`` float64, maps points from the left camera's frame to the right one's."""
         return np.linalg.inv(self.E)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseReport:
-    """How the poses of one left image's right views fit the images, and what was made of them.
+    """Poses of one image's right views: as given, as used, and how well they fit the matches.
 
-    Pixels are those of the right images at the left one's pixels per radian, the left one at most 832 wide.
+    Residuals are in pixels of the right images, resized to the left one's pixels per radian; the left one is
+    at most 832 wide.
 
     Attributes:
-        status: ``"given"`` (not looked at), ``"fits"``, ``"refined"``, ``"kept"`` (no better pose is near),
-            ``"mistaken"`` (a mistake explains the misfit; the pose is used as given) or ``"not checked"``.
+        status: ``"given"`` (not checked, by configuration), ``"fits"``, ``"refined"``, ``"kept"`` (no better
+            pose nearby), ``"mistaken"`` (a known mistake explains the misfit; the pose is used as given) or
+            ``"not checked"``.
         E_given: ``(4, 4)`` each, metres, pose of every right camera in the left camera's frame, as given.
         E: the same as used.
-        residual_px_given: median distance of the matches from their epipolar lines, one a right view.
+        residual_px_given: median distance of the matches from their epipolar lines, one per right view.
         residual_px: the same with the poses, and images, as used.
-        matches: how many of them, one a right view.
-        straightened_px: root mean square of the right images' displacement, 0 for none.
+        matches: number of matches, one per right view.
+        straightened_px: root mean square displacement applied to the right images; 0 for none.
         warnings: sentences for the user.
     """
 
@@ -99,7 +101,7 @@ class CameraView(NamedTuple):
     Attributes:
         image_01: ``(C, H, W)`` float32 in [0, 1], C = 3, or 1 for grey.
         K: ``(3, 3)`` float32, pixels of this image.
-        T_right_from_left: ``(4, 4)`` float32, metres; takes points of the left camera's frame to this one's.
+        T_right_from_left: ``(4, 4)`` float32, metres; maps points of the left camera's frame to this one's.
     """
 
     image_01: torch.Tensor
@@ -109,7 +111,7 @@ class CameraView(NamedTuple):
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one guided denoising step did, one entry per sample of the batch.
+    """Report of one guided denoising step, with one entry per sample of the batch.
 
     Attributes:
         step: index of the step in the schedule, from 0.
@@ -134,50 +136,49 @@ class StepReport:
 
 @dataclass
 class MetricDepthOutput(BaseOutput):
-    """Metric depth and all that is known about it.
+    """Metric depth with confidence, diagnostics and warnings.
 
     ``N`` images, ``E`` ensemble members, ``H W`` the resolution of the input image (or of the
     processing grid with ``match_input_resolution=False``).
 
     Attributes:
         prediction: metres; ``(N, H, W, 1)`` numpy or ``(N, 1, H, W)`` torch, as ``output_type`` says.
-        uncertainty: metres (median absolute deviation of the members from ``prediction``, each refined as it
-            was), shaped as ``prediction``; ``None`` unless ``output_uncertainty=True`` asked for it, of two
-            members or more.
+        uncertainty: metres, median absolute deviation of the ensemble members from ``prediction``, each
+            refined like it; shaped as ``prediction``. ``None`` without ``output_uncertainty=True``, or with
+            fewer than two members.
         latent: ``(N * E, 4, h, w)`` final latents, with ``output_latent=True``.
         relative: median unclipped relative depth, about [0, 1], shaped as ``prediction``.
         scale: ``(N, E)`` softplus of the learnt scale.
         shift: ``(N, E)`` softplus of the learnt shift.
         global_scale: ``(N, E)`` metres, the pre-selected g_s of Eq. 16.
-        own_scale: ``(N, E)`` what the metres of a prior that is metric by itself had to be multiplied with,
-            median over the pixels; ``None`` for a relative prior.
+        own_scale: ``(N, E)`` for a metric prior, the factor from its metres to the result, median over the
+            pixels; ``None`` for a relative prior.
         visible: boolean, in front of a right camera and inside its image, shaped as ``prediction``; ``None``
             without a right view.
-        photometric_error: [0, 1] mean absolute difference to the left image re-rendered from the right view
-            that explains the pixel best, 0 where not visible; ``None`` without a right view.
-        confidence: [0, 1] probability that the depth is within 10 % of the truth, shaped as ``prediction``:
-            from matches near on the same surface, photometric error, the prior's own error and, where it is
-            given, uncertainty; ``None`` without ``refine``, or without matches and points.
-        support: [0, 1] how far matches and points, own or near on the same surface, decided the depth, shaped
-            as ``prediction``; ``None`` where ``confidence`` is.
-        prior_error: ``(N,)`` how far the prior alone is wrong, standard deviation in log depth, as left-out
-            matches or points tell; ``None`` where none were compared.
+        photometric_error: [0, 1] mean absolute difference between the left image and the right view, warped,
+            that matches the pixel best; 0 where not visible; ``None`` without a right view.
+        confidence: [0, 1] probability that the depth is within 10 % of the truth, shaped as ``prediction``;
+            from support, photometric error, ``prior_error`` and, if there is an ensemble, uncertainty.
+            ``None`` without ``refine``, or without matches and points.
+        support: [0, 1] how much matches and points, at the pixel or nearby on the same surface, determine the
+            depth; shaped as ``prediction``. ``None`` where ``confidence`` is.
+        prior_error: ``(N,)`` error of the prior alone, standard deviation in log depth, estimated from
+            left-out matches or points; ``None`` where none were compared.
         K: ``(N, 3, 3)`` intrinsics of the output grid, pixels.
-        history: one ``StepReport`` a step and batch chunk.
-        poses: one ``PoseReport`` an image with right views: the poses as given and as used.
-        extras: further maps of the prior by name (GeoWizard's ``"normals"``), shaped as ``prediction`` with
-            their own channels.
-        judgements: for every image whether its depth is to be trusted, and why not
-            (``runtime.judgement.Judgement``).
-        unit: ``"m"``, or ``None`` where poses were estimated and no length is known: what is said to be in
-            metres is then in baselines of the first two cameras.
-        scale_from: where the unit of estimated poses comes from: ``"baseline"``, ``"known length"``,
-            ``"points"``, ``"prior"`` or ``"none"``; ``None`` for given poses.
-        scale_spread: relative spread of that scale, as matches or the prior's map show it; ``None`` where
-            they cannot.
-        rescaled: what the lengths of ``GeometryGuidance`` are to be multiplied with to be metres, where the
-            prior alone knew the unit.
-        warnings: what the user should know about this result, as sentences; those of the judgements too.
+        history: one ``StepReport`` per guided step and batch chunk.
+        poses: one ``PoseReport`` per image with right views.
+        extras: further maps of the prior by name (GeoWizard's ``"normals"``), shaped as ``prediction`` except
+            for the channels.
+        judgements: one ``runtime.judgement.Judgement`` per image: whether the depth can be trusted, and why
+            not.
+        unit: ``"m"``, or ``None`` if poses were estimated and no length is known; lengths are then in units
+            of the first baseline instead of metres.
+        scale_from: source of the scale of estimated poses: ``"baseline"``, ``"known length"``, ``"points"``,
+            ``"prior"`` or ``"none"``; ``None`` for given poses.
+        scale_spread: relative spread of that scale over matches or the prior's map; ``None`` if unknown.
+        rescaled: factor from the lengths of ``GeometryGuidance`` to metres, if only the prior knows the unit;
+            else 1.
+        warnings: sentences for the user about this result, including those of the judgements.
     """
 
     prediction: np.ndarray | torch.Tensor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import shutil
 import subprocess
@@ -11,6 +12,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+
+import geodiff_plugin
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("torch", "diffusers", "transformers", "scipy")
@@ -29,6 +32,15 @@ def test_start_is_light(code: str) -> None:
     code += f"\nimport sys\nassert not set({HEAVY!r}) & set(sys.modules), set({HEAVY!r}) & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_type_checkers_see_the_public_names() -> None:
+    """What is imported on first use is imported for type checkers too, from the same module."""
+    tree = ast.parse((ROOT / "geodiff_plugin" / "__init__.py").read_text(encoding="utf-8"))
+    (seen,) = (node for node in tree.body if isinstance(node, ast.If))
+    imported = {alias.name: node.module for node in seen.body for alias in node.names}
+    assert imported == geodiff_plugin._MODULE_OF
+    assert sorted(geodiff_plugin.__all__) == sorted(imported)
 
 
 def test_constraints_pin_what_types_are_checked_with() -> None:
