@@ -18,7 +18,7 @@ import torch
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
 from geodiff_plugin.app.priors import Priors
-from geodiff_plugin.cli.voice import collected_warnings
+from geodiff_plugin.cli.messages import collected_warnings
 from geodiff_plugin.formats import read_image
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.guidance.presets import DEFAULT, PAPER

@@ -15,13 +15,13 @@ import typer
 
 from geodiff_plugin.cli.depth_options import add_depth
 from geodiff_plugin.cli.eval.app import eval_app
+from geodiff_plugin.cli.messages import CommandGroup
 from geodiff_plugin.cli.options import OUT, OUTPUT, RUN, Device, Overwrite, option, out_folder
-from geodiff_plugin.cli.voice import DoorGroup
 
 __all__ = ["app", "main"]
 
 app = typer.Typer(
-    cls=DoorGroup,
+    cls=CommandGroup,
     help="Two photographs and their cameras to depth in metres, by any Marigold-style diffusion prior.",
     no_args_is_help=True,
     add_completion=False,
@@ -63,10 +63,10 @@ def demo(
 ) -> None:
     """Run on a rendered pair that ships with the package, offline, and print how good it is."""
     from geodiff_plugin.cli.arguments import demo_arguments
-    from geodiff_plugin.cli.begin import begun
+    from geodiff_plugin.cli.start import start_run
 
     arguments = demo_arguments(out_folder(out, "geodiff-demo", overwrite), overwrite, quiet)
-    with begun(arguments) as held:
+    with start_run(arguments) as held:
         from geodiff_plugin.cli.demo import run_demo
 
         run_demo(arguments, held)

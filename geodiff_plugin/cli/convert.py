@@ -34,7 +34,7 @@ def run_convert(
             or ``marigold-v2``, base, checkpoint and the folder to appear.
         part: file, folder or hub id of what the checkpoint lacks (DepthFM's VAE), ``None`` for the usual one.
         space: of Marigold V2, where the checkpoint's folder does not tell.
-        lora: of Marigold V2, of ``kept_lora.LORAS``.
+        lora: of Marigold V2, of ``unmerged_lora.LORAS``.
 
     Raises:
         ValueError: another number of paths; a target that exists or has no parent; a source that is no

@@ -15,9 +15,9 @@ import torch
 from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.depth import estimate_and_write
+from geodiff_plugin.cli.messages import say
 from geodiff_plugin.cli.report import single_map, summary_line
 from geodiff_plugin.cli.terminal import new_table, show
-from geodiff_plugin.cli.voice import say
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import atomic_path
@@ -43,7 +43,7 @@ def run_demo(arguments: DepthArguments, out: OutFolder) -> None:
     """Write what ``geodiff depth`` writes and ``comparison.png``, and print how far it is from the truth.
 
     Args:
-        arguments: of ``demo_arguments``, checked by ``begin.begun``.
+        arguments: of ``demo_arguments``, checked by ``start.start_run``.
         out: the folder that it gave, held.
     """
     run = estimate_and_write(arguments, out)

@@ -15,11 +15,11 @@ from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments
 from geodiff_plugin.cli.estimate import StopWatch, guided_call, load_guided_prior
 from geodiff_plugin.cli.exports import Scene, check_exports, make_scene, show_scene, write_exports
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
+from geodiff_plugin.cli.messages import collected_warnings, in_options, say
 from geodiff_plugin.cli.outputs import write_maps, write_report, write_undistorted
 from geodiff_plugin.cli.photographs import read_photographs
 from geodiff_plugin.cli.report import build_report, summary_line
 from geodiff_plugin.cli.settings import Settings, read_settings
-from geodiff_plugin.cli.voice import collected_warnings, in_options, say
 from geodiff_plugin.formats.out_folder import EXIT_ELSEWHERE, OutFolder
 from geodiff_plugin.types import MetricDepthOutput
 
@@ -51,7 +51,7 @@ def estimate_and_write(arguments: DepthArguments, out: OutFolder) -> DepthRun:
     """Everything of ``geodiff depth`` but its answer on stdout.
 
     Args:
-        arguments: checked by ``begin.begun``.
+        arguments: checked by ``start.start_run``.
         out: the folder that it gave, held.
 
     Raises:
@@ -127,7 +127,7 @@ def run_depth(arguments: DepthArguments, out: OutFolder) -> None:
     """Run the command and answer on stdout: the summary, or the report with ``--json``.
 
     Args:
-        arguments: checked by ``begin.begun``.
+        arguments: checked by ``start.start_run``.
         out: the folder that it gave, held.
     """
     run = estimate_and_write(arguments, out)

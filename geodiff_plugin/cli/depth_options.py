@@ -196,8 +196,8 @@ def _depth(
     """Estimate the metric depth of LEFT with RIGHT as its guide; of one pair, or of many."""
     typed = locals()
     from geodiff_plugin.cli.arguments import DepthArguments
-    from geodiff_plugin.cli.begin import begun, begun_many
     from geodiff_plugin.cli.many.pairs import is_many
+    from geodiff_plugin.cli.start import start_many, start_run
 
     many = is_many(left)
     typed["out"] = Path("geodiff-out") if many and out is None else out_folder(out, "geodiff-out", overwrite)
@@ -205,12 +205,12 @@ def _depth(
     repeated = ("calib", *views, "option", "knob", "points_calib", "export", "distortion")
     arguments = DepthArguments(**typed | {name: tuple(typed[name] or ()) for name in repeated})
     if many:
-        refs = begun_many(arguments)
+        refs = start_many(arguments)
         from geodiff_plugin.cli.many.run import run_many
 
         run_many(arguments, refs)
         return
-    with begun(arguments) as held:
+    with start_run(arguments) as held:
         from geodiff_plugin.cli.depth import run_depth
 
         run_depth(arguments, held)

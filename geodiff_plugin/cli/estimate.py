@@ -20,8 +20,8 @@ from transformers.utils import logging as transformers_logging
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.inputs import Inputs
+from geodiff_plugin.cli.messages import say
 from geodiff_plugin.cli.settings import Settings
-from geodiff_plugin.cli.voice import say
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance

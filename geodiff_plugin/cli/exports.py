@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.cli.inputs import Inputs
+from geodiff_plugin.cli.messages import say
 from geodiff_plugin.cli.report import rescaled_pose, single_map
-from geodiff_plugin.cli.voice import say
 from geodiff_plugin.formats import Cloud, flying_points, make_cloud, write_colmap, write_glb
 from geodiff_plugin.types import MetricDepthOutput
 

@@ -22,10 +22,10 @@ from geodiff_plugin._camera_checks import (
 )
 from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.cli.arguments import DepthArguments
-from geodiff_plugin.cli.begin import PARAMETERS, calibration_way
 from geodiff_plugin.cli.checks import check_positive
 from geodiff_plugin.cli.lenses import Lenses, lenses_of, pinhole
 from geodiff_plugin.cli.settings import Settings
+from geodiff_plugin.cli.start import PARAMETERS, calibration_way
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.formats.rigs import intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance

@@ -18,8 +18,8 @@ from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_positive
 from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.lenses import lenses_of, pinhole
+from geodiff_plugin.cli.messages import say
 from geodiff_plugin.cli.settings import Settings
-from geodiff_plugin.cli.voice import say
 from geodiff_plugin.formats import read_image, read_matrix, read_points
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.rigs import intrinsics

@@ -31,8 +31,8 @@ except ImportError:  # transformers 4
 
 from geodiff_plugin.development.full_sizes import FULL_SIZES
 from geodiff_plugin.priors import PRIORS
-from geodiff_plugin.priors.kept_lora import SKIPPED
 from geodiff_plugin.priors.pipelines.marigold_v2 import MarigoldV2Pipeline
+from geodiff_plugin.priors.unmerged_lora import SKIPPED
 
 __all__ = ["Memory", "count_memory", "four_bit_bytes", "main"]
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 import torch
 
 from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.kept_lora import LORA_FOLDER, load_with_lora
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.loading import build_pipeline
 from geodiff_plugin.priors.pipelines.marigold_v2 import MarigoldV2Pipeline
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
+from geodiff_plugin.priors.unmerged_lora import LORA_FOLDER, load_with_lora
 
 __all__ = ["MarigoldV2Prior"]
 

@@ -26,9 +26,9 @@ from geodiff_plugin.runtime.channels import put_channels
 from geodiff_plugin.runtime.codec import MapCodec
 from geodiff_plugin.runtime.denoiser import DenoiserTap
 from geodiff_plugin.runtime.exclusive import Exclusive
+from geodiff_plugin.runtime.flags import FrozenWeights, Running
 from geodiff_plugin.runtime.grid import ProcessingGrid
-from geodiff_plugin.runtime.half import ImagesInFloat32
-from geodiff_plugin.runtime.marks import FrozenWeights, Running
+from geodiff_plugin.runtime.half_precision import ImagesInFloat32
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.preconditions import needs_network
 from geodiff_plugin.runtime.scheduler import GuidedScheduler

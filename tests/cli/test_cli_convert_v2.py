@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from geodiff_plugin.cli.converters import shards
 from geodiff_plugin.cli.converters.marigold_v2 import Trainables, read_prompt
-from geodiff_plugin.priors import find_prior, kept_lora, load_prior
+from geodiff_plugin.priors import find_prior, load_prior, unmerged_lora
 from geodiff_plugin.priors.pipelines.marigold_v2 import MarigoldV2Pipeline
 from tests.parity import marigold_v2_reference as reference
 
@@ -106,7 +106,7 @@ def test_a_lora_apart_is_put_on_by_peft(convert, assets):
     kept = load_file(assets / "out" / "lora" / "lora.safetensors")
     assert "transformer_blocks.0.attn.to_q.lora_A.weight" in kept
     pipe = load_prior(assets / "out")
-    assert kept_lora.has_lora(pipe.transformer)
+    assert unmerged_lora.has_lora(pipe.transformer)
     again = MarigoldV2Pipeline.from_pretrained(assets / "out")
     pipe.set_progress_bar_config(disable=True)
     again.set_progress_bar_config(disable=True)
@@ -126,7 +126,7 @@ def test_a_base_without_its_lora_is_no_prior(convert, assets):
 
 def test_without_peft_the_sentence_says_what_to_install(convert, assets, monkeypatch):
     convert("--lora", "apart")
-    monkeypatch.setattr(kept_lora, "find_spec", lambda name: None)
+    monkeypatch.setattr(unmerged_lora, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"geodiff-plugin\[peft\]"):
         load_prior(assets / "out")
 
@@ -147,16 +147,16 @@ def test_four_bits_are_asked_for_as_the_authors_hold_them(convert, assets, monke
         asked.update(extra)
         return load_component(layout, name, cls, dtype)
 
-    load_component = kept_lora.load_component
+    load_component = unmerged_lora.load_component
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(kept_lora, "find_spec", lambda name: name)
-    monkeypatch.setattr(kept_lora, "BitsAndBytesConfig", dict)
-    monkeypatch.setattr(kept_lora, "load_component", load)
+    monkeypatch.setattr(unmerged_lora, "find_spec", lambda name: name)
+    monkeypatch.setattr(unmerged_lora, "BitsAndBytesConfig", dict)
+    monkeypatch.setattr(unmerged_lora, "load_component", load)
     pipe = load_prior(assets / "out", dtype=torch.bfloat16)
     config = asked["quantization_config"]
     assert config["bnb_4bit_quant_type"] == "nf4" and config["bnb_4bit_compute_dtype"] == torch.bfloat16
     assert config["llm_int8_skip_modules"] == ["transformer_blocks.0.img_mod"]
-    assert kept_lora.has_lora(pipe.transformer)
+    assert unmerged_lora.has_lora(pipe.transformer)
 
 
 @pytest.mark.parametrize(

@@ -16,17 +16,17 @@ from typing import Any
 import torch
 
 from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments
-from geodiff_plugin.cli.begin import check_files
 from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.cli.depth import write_result
 from geodiff_plugin.cli.estimate import StopWatch, guided_call
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
 from geodiff_plugin.cli.many.pairs import PairRef, arguments_of
 from geodiff_plugin.cli.many.rigs import RigStore
+from geodiff_plugin.cli.messages import in_options
 from geodiff_plugin.cli.photographs import read_photographs
 from geodiff_plugin.cli.report import build_report
 from geodiff_plugin.cli.settings import Settings
-from geodiff_plugin.cli.voice import in_options
+from geodiff_plugin.cli.start import check_files
 from geodiff_plugin.formats.out_folder import OutFolder
 from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.guidance.evidence_store import EvidenceStore

@@ -28,9 +28,9 @@ from geodiff_plugin.cli.many.finished import finished_report
 from geodiff_plugin.cli.many.job import Job, Stages, ThreadWarnings
 from geodiff_plugin.cli.many.pairs import PairRef
 from geodiff_plugin.cli.many.processes import Processes, join_processes
+from geodiff_plugin.cli.messages import collected_warnings, in_options, say
 from geodiff_plugin.cli.settings import Settings, read_settings
 from geodiff_plugin.cli.terminal import new_table, show
-from geodiff_plugin.cli.voice import collected_warnings, in_options, say
 from geodiff_plugin.formats.atomic import atomic_path
 
 __all__ = ["EXIT_SOME_FAILED", "run_many"]
@@ -50,7 +50,7 @@ def run_many(arguments: DepthArguments, refs: Sequence[PairRef]) -> None:
     """Run the command on all pairs, answer on stdout, and leave with a code if one of them failed.
 
     Args:
-        arguments: checked by ``begin.begun_many``.
+        arguments: checked by ``start.start_many``.
         refs: the pairs, in order.
     """
     settings = read_settings(arguments)

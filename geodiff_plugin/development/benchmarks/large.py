@@ -122,13 +122,13 @@ def measure_depth(folder: Path) -> dict[str, dict[str, float]]:
         the process with its libraries.
     """
     from geodiff_plugin.cli.arguments import DepthArguments
-    from geodiff_plugin.cli.begin import begun
     from geodiff_plugin.cli.depth import estimate_and_write
+    from geodiff_plugin.cli.start import start_run
 
     names = {name: folder / f"{name}.png" for name in ("left", "right")}
     out, samples = folder / "out", [(time.perf_counter(), psutil.Process().memory_info().rss)]
     arguments = DepthArguments(**names, calib=(folder / "calib.txt",), out=out, device="cpu", quiet=True)
-    with _sampled(samples), begun(arguments) as held:
+    with _sampled(samples), start_run(arguments) as held:
         stages = estimate_and_write(arguments, held).report["seconds"]
     # The stages follow each other and the last one ends where sampling ends.
     found, end = {}, samples[-1][0]

@@ -15,13 +15,13 @@ from diffusers import AutoencoderKLQwenImage, FlowMatchEulerDiscreteScheduler, Q
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.priors.kept_lora import LORA_FOLDER, LORAS, has_lora, load_with_lora
 from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.priors.pipelines.hooks import Condition, Generators
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
 from geodiff_plugin.priors.pipelines.sides import SidesOf
 from geodiff_plugin.priors.pipelines.video_latents import frame_of, latents_of, pack, unpack
+from geodiff_plugin.priors.unmerged_lora import LORA_FOLDER, LORAS, has_lora, load_with_lora
 
 __all__ = ["SPACE_OF_CHECKPOINT", "MarigoldV2Pipeline"]
 

@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 
 from geodiff_plugin._checks import InputError
 
-__all__ = ["EXIT_BAD_INPUT", "EXIT_INTERRUPTED", "DoorGroup", "collected_warnings", "in_options", "say"]
+__all__ = ["EXIT_BAD_INPUT", "EXIT_INTERRUPTED", "CommandGroup", "collected_warnings", "in_options", "say"]
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -26,13 +26,13 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def say(line: str) -> None:
-    """Print one line on stderr, where it does not mix with what a command answers."""
+    """Print one line on stderr, apart from the results on stdout."""
     tqdm.write(line, file=sys.stderr)  # above a progress bar, if there is one
     sys.stderr.flush()
 
 
 class Sentences(Protocol):
-    """A list of sentences, as far as collecting them goes."""
+    """What ``collected_warnings`` needs of a list of sentences."""
 
     def append(self, sentence: str, /) -> None:
         """Add one."""
@@ -40,7 +40,7 @@ class Sentences(Protocol):
     def __contains__(self, sentence: object, /) -> bool: ...
 
 
-#: What a keyword in Python is called on the command line.
+#: Keyword in Python -> option of the command line.
 OPTIONS = {
     "widen depth_range": "widen the range of --near and --far",
     "cropped=True": "--cropped",
@@ -50,13 +50,13 @@ OPTIONS = {
 
 
 def in_options(sentence: str) -> str:
-    """A sentence of the package in the words of the command line."""
+    """A message with Python keywords replaced by options of the command line."""
     for keyword, option in OPTIONS.items():
         sentence = sentence.replace(keyword, option)
     return sentence
 
 
-class DoorGroup(TyperGroup):
+class CommandGroup(TyperGroup):
     """The group of all subcommands: bad input is one line and exit code 2, Ctrl-C is exit code 130."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -77,9 +77,9 @@ def _warn(sentence: str) -> None:
 
 @contextmanager
 def collected_warnings(into: Sentences, tell: Callable[[str], None] = _warn) -> Iterator[None]:
-    """Take this package's warnings as sentences: each is told once and appended to ``into``.
+    """Collect this package's warnings as sentences: each is printed once and appended to ``into``.
 
-    What other packages warn about is shown as ever, and the warning filters are restored at the end.
+    Warnings of other packages are shown as usual, and the warning filters are restored at the end.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("always", category=UserWarning, module=r"geodiff_plugin")

@@ -1,4 +1,4 @@
-"""The command's one voice: what counts as bad input, warnings, and folders that appear whole."""
+"""Messages of the command: what counts as bad input, warnings, and folders that appear whole."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from PIL import Image
 
 from geodiff_plugin import _checks
 from geodiff_plugin._checks import InputError, bad_type, bad_value
+from geodiff_plugin.cli.messages import collected_warnings, in_options
 from geodiff_plugin.cli.report import depth_summary, summary_line
-from geodiff_plugin.cli.voice import collected_warnings, in_options
 from geodiff_plugin.formats import read_image
 
 

@@ -22,7 +22,7 @@ from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.out_folder import OutFolder
 from geodiff_plugin.formats.out_place import check_out
 
-__all__ = ["CALIBRATION_WAYS", "PARAMETERS", "begun", "begun_many", "calibration_way", "check_files"]
+__all__ = ["CALIBRATION_WAYS", "PARAMETERS", "calibration_way", "check_files", "start_many", "start_run"]
 
 CALIBRATION_WAYS = "--calib FILE, or --fx --fy --cx --cy --baseline, or --K FILE --E FILE"
 CAMERA_WAYS = "--calib FILE, or --fx --fy --cx --cy, or --K FILE"
@@ -121,8 +121,8 @@ def check_files(arguments: DepthArguments, videos: bool = False) -> None:
     _check_other_files(arguments)
 
 
-def begun_many(arguments: DepthArguments) -> list[PairRef]:
-    """The pairs of a run of many, and everything that can be said of their options at once.
+def start_many(arguments: DepthArguments) -> list[PairRef]:
+    """Find the pairs of a run over many, and make all checks that need neither images nor torch.
 
     Raises:
         OSError, TypeError, ValueError: naming the option or the file.
@@ -152,8 +152,8 @@ def begun_many(arguments: DepthArguments) -> list[PairRef]:
 
 
 @contextmanager
-def begun(arguments: DepthArguments) -> Iterator[OutFolder]:
-    """Check what can be checked at once, and hold the folder of the results meanwhile.
+def start_run(arguments: DepthArguments) -> Iterator[OutFolder]:
+    """Check the options and files of a run over one pair, and hold its output folder during the block.
 
     Raises:
         OSError, TypeError, ValueError: naming the option or the file.
