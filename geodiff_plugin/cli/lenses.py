@@ -40,7 +40,7 @@ def lenses_of(
 
     Raises:
         ValueError: more than two lenses, malformed coefficients, or a further view with a K of its own and a
-            lens that is not told.
+            lens that is not given.
     """
     typed = [distortion_from_text(text) for text in arguments.distortion]
     if len(typed) > 2:

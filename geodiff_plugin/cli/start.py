@@ -84,7 +84,7 @@ def _check_photographs(arguments: DepthArguments) -> None:
 
 
 def _is_colmap_model(path: Path) -> bool:
-    """The one kind of calibration that is a folder; what it lacks is told when it is read."""
+    """The one kind of calibration that is a folder; missing files are reported when it is read."""
     return any((path / name).exists() for name in ("cameras.txt", "images.txt", "images.bin"))
 
 

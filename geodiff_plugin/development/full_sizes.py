@@ -61,7 +61,7 @@ UNET: dict[str, Any] = {
     "attention_head_dim": (5, 10, 20, 20),
     "use_linear_projection": True,
 }
-#: That of Stable Diffusion 1, as GeoWizard v1 has it: told an image embedding and ten numbers.
+#: That of Stable Diffusion 1, as GeoWizard v1 has it: with an image embedding and ten numbers as conditions.
 GEOWIZARD_UNET = UNET | {
     "cross_attention_dim": 768,
     "attention_head_dim": 8,

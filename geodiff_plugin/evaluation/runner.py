@@ -41,7 +41,7 @@ _BROKEN = (OSError, ValueError)
 def processes(settings: Settings) -> PartialState:
     """The processes of this run, one or as many as ``torchrun`` or ``accelerate launch`` started.
 
-    On the CPU accelerate must be told so, or it takes several processes for several runs of one.
+    On the CPU accelerate needs ``cpu=True``, or it takes several processes for several runs of one.
     """
     return PartialState(cpu=torch.device(settings.device).type == "cpu")
 

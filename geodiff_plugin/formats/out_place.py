@@ -16,7 +16,7 @@ from geodiff_plugin._checks import bad_value
 
 try:
     import fcntl
-except ImportError:  # where there is no flock, two runs with one folder are not told apart
+except ImportError:  # where there is no flock, two runs with one folder are not detected
     CAN_LOCK = False
 else:
     CAN_LOCK = True

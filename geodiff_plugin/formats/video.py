@@ -16,7 +16,7 @@ from geodiff_plugin.formats.files import check_file
 
 __all__ = ["VIDEOS", "VideoReader", "both_halves", "count_frames", "is_video"]
 
-#: Endings by which a video is told from an image.
+#: Suffixes of videos.
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 

@@ -24,7 +24,7 @@ from geodiff_plugin.plotting.sheets import grid
 
 __all__ = ["overview", "share_figure"]
 
-#: Dark is 0; the middle and the end are told apart by every kind of eye.
+#: Dark is 0; the middle and the end differ for the colour-blind too.
 SHARE_COLOURS = np.array([(30, 30, 60), (60, 110, 160), (120, 190, 160), (250, 240, 150)], dtype=np.float64)
 CELL_WIDTH = 480
 #: Maps are thinned to no less than so many times the width of a cell.

@@ -166,6 +166,6 @@ def load_prior(
         **kwargs: for ``find_prior`` (``variant``, ``revision``, ``token``, ``local_files_only``, ...).
 
     Raises:
-        ValueError: it does not exist, is refused or unknown; its weights do not fit; its space is not told.
+        ValueError: it does not exist, is refused or unknown; its weights do not fit; its space is unknown.
     """
     return find_prior(name, **kwargs).load(device, dtype, space)

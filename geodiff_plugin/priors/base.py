@@ -31,7 +31,7 @@ class DepthPrior(Protocol):
         deterministic: the same image gives the same map, so that an ensemble has one member.
         latents: channels of the scheduler's latents that are depth; no gradient step touches the others.
         network_input: channels of the network's first argument that are the depth latent z_t; ``None``
-            where the network is not told z_t, so that only its answer can be guided.
+            if z_t is no input of the network, so that only its output can be guided.
         takes_prompt: whether the call takes ``prompt_depth``, depths that the network starts from.
         licence: of the weights by hub id, for those that are known.
     """
@@ -50,14 +50,14 @@ class DepthPrior(Protocol):
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """Whether a folder is of this kind, told by its component configs, never by ``_class_name``."""
+        """Whether a folder is of this kind, by its component configs, never by ``_class_name``."""
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
         """The pipeline of a folder that it recognises; ``space`` is what the user said, or ``None``.
 
         Raises:
-            ValueError: weights missing or left over; a space that cannot be told.
+            ValueError: weights missing or left over; an unknown space.
         """
 
     def __init__(self, pipe: Any) -> None: ...

@@ -35,7 +35,7 @@ class E2EFTPrior(MarigoldPrior):
 
         That is what the authors' training script saves. Marigold v1-0 is leading, v1-1 rescales its betas,
         the LCM says how many steps it was distilled from. A folder that keeps Marigold's own scheduler
-        cannot be told by its configs: there "e2e-ft" in the name decides, or ``e2e-ft:`` before it.
+        cannot be recognised by its configs: there "e2e-ft" in the name decides, or ``e2e-ft:`` before it.
         """
         if not MarigoldPrior.recognises(layout):
             return False

@@ -22,7 +22,7 @@ BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
 
 #: Priors that people ask for and that cannot be run: pattern of the last part of the name -> reason.
 REFUSED = {
-    r"apdepth": "its U-Net is told the depth of a Depth Anything V2 Giant, whose weights were never released",
+    r"apdepth": "its U-Net takes the depth of a Depth Anything V2 Giant, whose weights were never released",
     r"lotus-?2": "it is a LoRA on FLUX.1-dev, which is gated and needs some 40 GB; Lotus v1 and v2 work",
     r"marigold.*-hr\b.*": "no code that runs it was published; marigold-depth-v1-1 takes any resolution",
     r"geowizard-e2e-ft": "it needs GeoWizard's networks with another start; take marigold-e2e-ft-depth, "

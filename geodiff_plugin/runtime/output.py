@@ -31,7 +31,7 @@ from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["assemble_output"]
 
-#: A visible share below this is told to the user: scale then rests on little.
+#: A visible share below this is reported to the user: the scale then rests on few pixels.
 LITTLE_OVERLAP = 0.3
 #: Metres; what a metric prior may say of its nearest pixel is 0.
 LEAST_M = 1e-6

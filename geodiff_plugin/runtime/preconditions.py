@@ -43,13 +43,13 @@ def needs_network(guidance: GeometryGuidance) -> bool:
 
 
 def check_network_input(prior: DepthPrior) -> None:
-    """Refuse the full gradient where the network is not told z_t.
+    """Refuse the full gradient if z_t is no input of the network.
 
     Raises:
         ValueError: it is not, so that there is no gradient through it.
     """
     if prior.network_input is None:
-        cure = "Its network is not told z_t, so only the clean latent can be moved."
+        cure = "z_t is no input of its network, so only the clean latent can be moved."
         bad_value("gradient", "'denoised' with this prior", "'full'", cure)
 
 

@@ -30,7 +30,7 @@ class GuidedScheduler:
     pipeline past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config. It may be left
     and entered again in the middle of a call, as callbacks are: then the trajectory goes on where it was.
 
-    Its ``step`` is told the timesteps on the CPU, where diffusers keeps the tables that they index: compared
+    Its ``step`` gets the timesteps on the CPU, where diffusers keeps the tables that they index: compared
     and looked up on another device, each would be waited for several times a step.
 
     A scheduler of which the user replaced one of the two methods on the instance is used itself, since such a

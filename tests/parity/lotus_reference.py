@@ -101,7 +101,7 @@ def _stand_ins() -> None:
 
 
 def run_case(case: str) -> dict[str, np.ndarray]:
-    """One call as in ``infer.py``: what the network is told and answers, unclipped decode, final output."""
+    """One call as in ``infer.py``: inputs and outputs of the network, unclipped decode, final output."""
     import torch
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
     from diffusers.models.autoencoders import vae as vae_module

@@ -1,4 +1,4 @@
-"""What each view is told of the other: the sure points of the one where the other is not sure."""
+"""What each view gets from the other: its confident points, where the view itself is not confident."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DepthMaster: its U-Net and what its folder is told by."""
+"""DepthMaster: its U-Net, and how its folder is recognised."""
 
 from __future__ import annotations
 

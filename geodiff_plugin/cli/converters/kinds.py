@@ -19,7 +19,7 @@ class Converter:
     """One kind.
 
     Attributes:
-        recognises: whether an unpickled checkpoint is of this kind, told by its keys.
+        recognises: whether an unpickled checkpoint is of this kind, by its keys.
         write: checkpoint, an empty folder to fill, and what the user gave with ``--with`` (a file, folder or
             hub id of a part that the checkpoint lacks) or ``None``; a ``ValueError`` says what is wrong.
     """

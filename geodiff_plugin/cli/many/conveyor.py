@@ -29,7 +29,7 @@ class Conveyor(Generic[Item]):
 
     Args:
         stages: functions of an item, in order; what they find they keep in the item.
-        failed: told the item and what a stage raised.
+        failed: called with the item and the exception of a stage.
         most: items that may be on the way at a time, >= 1.
     """
 

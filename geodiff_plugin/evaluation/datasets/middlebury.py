@@ -28,7 +28,7 @@ def find_scenes(root: Path) -> list[SampleRef]:
 
     A scene is a folder with ``im0.png`` and ``calib.txt``. Its truth is ``disp0.pfm`` (2014),
     ``disp0GT.pfm`` beside the images (MiddEval3), or ``disp0GT.pfm`` in ``two_view_training_gt/<scene>``
-    (ETH3D). Which of the three a scene belongs to is told by the folder's name (``eth3d``, ``two_view``) and
+    (ETH3D). Which of the three it belongs to follows from the folder's name (``eth3d``, ``two_view``) and
     else by the truth's name.
     """
     refs = []

@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 DPI = 90
-#: Colours of lines, in order (Okabe and Ito's, told apart by the colour-blind).
+#: Colours of lines, in order (Okabe and Ito's, distinguishable for the colour-blind).
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 #: The largest error that has a colour of its own.
 WORST_SHOWN = 0.5

@@ -108,7 +108,7 @@ class DepthFMPipeline(DepthDiffusionPipeline):
         self.scheduler.set_timesteps(sigmas=sigmas, device=device)
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The network's velocity with its sign turned; the network is told t in [0, 1), not in [0, 1000)."""
+        """The network's velocity with its sign turned; its t is in [0, 1), not in [0, 1000)."""
         time = 1.0 - timestep / self.scheduler.config.num_train_timesteps
         velocity = self.unet(
             torch.cat([latents, condition["image_latent"]], dim=1),

@@ -22,7 +22,7 @@ class DirectScheduler(SchedulerMixin, ConfigMixin):
     """One step whose result is the network's output; saves and loads as any scheduler of diffusers.
 
     Args:
-        timestep: what the network is told, 999 for Lotus, 1 for DepthMaster.
+        timestep: the timestep input of the network, 999 for Lotus, 1 for DepthMaster.
         prediction_type: always ``"sample"``; kept in the config, where others look for it.
     """
 

@@ -33,7 +33,7 @@ class E2EFTPipeline(MarigoldDepthPipeline):
         shift_invariant: as Marigold's.
         default_denoising_steps: 1.
         default_processing_resolution: longer side, pixels.
-        initial_latents: ``"zeros"``; saved, so that the folder can be told from Marigold's.
+        initial_latents: ``"zeros"``; saved, so that the folder can be distinguished from Marigold's.
     """
 
     max_steps = 1

@@ -5,7 +5,7 @@ Data flow: image -> one noise for both -> pair of latents through one U-Net
 Paper: S4 (any diffusion-based depth model); the model is Fu et al., ECCV 2024.
 
 The latents are ``(B, 8, h, w)``: four channels of depth, then four of normals. The U-Net is diffusers' own
-and sees them as ``2B`` samples, all depth before all normals, told apart by a class embedding.
+and sees them as ``2B`` samples, all depth before all normals, distinguished by a class embedding.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from geodiff_plugin.priors.pipelines.prompts import text_embedding
 __all__ = ["DOMAINS", "GeoWizardPipeline", "PairAttention"]
 
 DOMAINS = ("indoor", "outdoor", "object")
-#: Width of the class embedding -> what else the U-Net is told: v1 sees the image, v2 reads the domain.
+#: Width of the class embedding -> further condition of the U-Net: the image in v1, the domain as text in v2.
 IMAGE_EMBEDDING, TEXT_PROMPT = 10, 4
 #: Added to the length of a decoded normal before dividing by it.
 EPS_LENGTH = 1e-5
@@ -45,7 +45,7 @@ class PairAttention(AttnProcessor2_0):
 
 
 class GeoWizardPipeline(DepthDiffusionPipeline):
-    """GeoWizard v1 (told the image through CLIP) and v2 (told the domain as text).
+    """GeoWizard v1 (conditioned on the image through CLIP) and v2 (on the domain as text).
 
     Args:
         unet: 8 channels in, 4 out, class embedding of 10 (v1) or 4 (v2) numbers.

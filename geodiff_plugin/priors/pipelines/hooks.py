@@ -95,7 +95,7 @@ class PriorHooks:
         *args: Any,
         **options: Any,
     ) -> Condition:
-        """Everything that the network is told beside latents and time.
+        """Every input of the network beside latents and time.
 
         Args:
             image: ``(N, 3, H, W)`` in [-1, 1], padded, of the pipeline's dtype.

@@ -49,7 +49,7 @@ class LotusImageProcessor(MarigoldImageProcessor):
 
 
 class LotusPipeline(DepthDiffusionPipeline):
-    """Lotus-G (8 input channels: image and noise) or Lotus-D (4: image alone), told by the U-Net.
+    """Lotus-G (8 input channels: image and noise) or Lotus-D (4: image alone), as the U-Net says.
 
     Not deterministic even as D: the image latent is drawn from the VAE's posterior.
 

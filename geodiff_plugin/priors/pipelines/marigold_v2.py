@@ -27,7 +27,7 @@ __all__ = ["SPACE_OF_CHECKPOINT", "MarigoldV2Pipeline"]
 
 #: First word of a checkpoint's name -> what its map is affine in.
 SPACE_OF_CHECKPOINT = {"log": "log", "uniform": "depth", "disparity": "disparity"}
-#: What the network is told, of 1000. The authors write 499 / 1000 in bfloat16, where 499 is 500.
+#: Timestep input of the network, of 1000. The authors write 499 / 1000 in bfloat16, where 499 is 500.
 TIMESTEP = 500.0
 #: One token is a square of this side.
 SIDE = 16
@@ -129,7 +129,7 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         return condition["image_latent"]
 
     def set_timesteps(self, num_inference_steps: int, device: torch.device) -> None:
-        """A step of the whole length, ``z - v``, whatever time the network is told."""
+        """A step of the whole length, ``z - v``, whatever the timestep input of the network."""
         self.scheduler.set_timesteps(sigmas=[1.0], timesteps=[TIMESTEP], device=device)
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
