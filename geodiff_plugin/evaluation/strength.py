@@ -6,7 +6,6 @@ Paper: none; S5 measures one prior.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

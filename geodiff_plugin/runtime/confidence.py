@@ -1,6 +1,7 @@
 """Confidence: the probability that a pixel's depth is within 10 % of the truth.
 
-Data flow: support by matches, photometric error, error of the prior, spread of an ensemble -> confidence in [0, 1].
+Data flow: support by matches, photometric error, error of the prior, spread of an ensemble
+    -> confidence in [0, 1].
 Paper: none; it names wrong depth where views say nothing as a limit (Limitations).
 """
 
