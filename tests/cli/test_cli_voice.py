@@ -77,6 +77,16 @@ def test_warnings_are_sentences(monkeypatch, geodiff, pair_files):
     assert "alpha" in lines[0] and "EXIF" in lines[1]
 
 
+def test_a_focal_length_that_the_exif_of_a_photograph_contradicts(monkeypatch, geodiff, pair_files):
+    monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", stop)
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 65  # 120 px for 64x48
+    Image.open(pair_files.left).save(pair_files.left, exif=exif)
+    warned, interrupted = geodiff(*pair_files.command).err.splitlines()
+    assert warned.startswith("warning: K has a focal length of 60 px for LEFT, 0.50 times the 120 px")
+    assert interrupted == "geodiff: interrupted"
+
+
 def test_other_packages_warn_as_ever():
     with pytest.warns(UserWarning, match="of another package"), collected_warnings([]):
         warnings.warn("of another package", stacklevel=1)
