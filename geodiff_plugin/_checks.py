@@ -160,17 +160,17 @@ def check_calibrated_size(
 def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
     """Warn of a principal point such as an image of another size has, and of a mistyped focal length."""
     shares = (K[0, 2] / width, K[1, 2] / height)
-    where = f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f})"
     if min(shares) < NEAR_BORDER or max(shares) > 1.0 - NEAR_BORDER:
         warnings.warn(
-            f"{where} near the border of {image} of {width}x{height} pixels. If it is for another "
-            f"resolution, {SCALED_K}.",
+            f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) near the border of {image} of "
+            f"{width}x{height} pixels. If it is for another resolution, {SCALED_K}.",
             stacklevel=3,
         )
     elif _off_alike(*shares):
         warnings.warn(
-            f"{where} where that of an image {sum(shares):.2g} times the size of {image} would be. If it is "
-            f"for another resolution, {SCALED_K}.",
+            f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) where that of "
+            f"an image {sum(shares):.2g} times the size of {image} would be. If it is for another resolution, "
+            f"{SCALED_K}.",
             stacklevel=3,
         )
     if max(K[0, 0] / K[1, 1], K[1, 1] / K[0, 0]) > STRETCHED:

@@ -84,6 +84,7 @@ def test_warnings_are_sentences(monkeypatch, geodiff, pair_files):
 def test_a_focal_length_that_the_exif_of_a_photograph_contradicts(monkeypatch, geodiff, pair_files):
     monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", stop)
     exif = Image.Exif()
+    exif[0x0112] = 1
     exif.get_ifd(0x8769)[0xA405] = 65  # 120 px for 64x48
     Image.open(pair_files.left).save(pair_files.left, exif=exif)
     warned, interrupted = geodiff(*pair_files.command).err.splitlines()

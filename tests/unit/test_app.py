@@ -279,7 +279,5 @@ def test_a_port_that_another_program_has_is_a_sentence(monkeypatch):
         raise OSError("Cannot find empty port in range: 8000-8000.")
 
     monkeypatch.setattr(launch, "launch_page", taken)
-    with pytest.raises(
-        ValueError, match=r"--host and --port must be free to listen on; got 127.0.0.1 and 8000"
-    ):
+    with pytest.raises(ValueError, match=r"--port must be free to listen on; got 127.0.0.1 and 8000"):
         launch.run_app(("bundled",), "cpu", "127.0.0.1", 8000, False)

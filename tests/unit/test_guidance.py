@@ -95,7 +95,7 @@ def test_a_principal_point_near_the_border_is_told():
     ("fx", "fy", "cx", "cy", "said"),
     [
         (120, 120, 47.5, 35.5, "an image 1.5 times the size"),
-        (40, 40, 15.5, 11.5, "an image 0.49 times the size"),
+        (40, 40, 15.5, 11.5, "an image 0.48 times the size"),
         (60, 600, 31.5, 23.5, "mistyped"),
         (60, 60, 38, 17, None),  # of a rig with converging axes
         (60, 40, 31.5, 23.5, None),  # of an image that was stretched
