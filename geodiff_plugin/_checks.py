@@ -168,8 +168,8 @@ def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image:
         )
     elif _off_alike(*shares):
         warnings.warn(
-            f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) where that of "
-            f"an image {sum(shares):.2g} times the size of {image} would be. If it is for another resolution, "
+            f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) where that of an image "
+            f"{sum(shares):.2g} times the size of {image} would be. If it is for another resolution, "
             f"{SCALED_K}.",
             stacklevel=3,
         )

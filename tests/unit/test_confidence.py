@@ -49,7 +49,8 @@ def test_falls_with_the_spread_of_an_ensemble():
 def test_a_good_prior_is_believed_where_nothing_supports_it():
     support, error = _maps(0.0, 0.5, 1.0), _maps(0.05, 0.05, 0.05)
     good, poor = (
-        depth_confidence(support, error, SEEN, None, torch.full((1, 1, 1, 1), e)).flatten() for e in (0.02, 0.4)
+        depth_confidence(support, error, SEEN, None, torch.full((1, 1, 1, 1), e)).flatten()
+        for e in (0.02, 0.4)
     )
     assert good[0] > poor[0] and good[1] > poor[1] and good[2] == poor[2]
     unknown = depth_confidence(support, error, SEEN, None).flatten()
