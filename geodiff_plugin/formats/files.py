@@ -12,7 +12,14 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from geodiff_plugin._checks import FolderError, ForbiddenFileError, MissingFileError, bad_type, bad_value
+from geodiff_plugin._checks import (
+    LONGEST_GOT,
+    FolderError,
+    ForbiddenFileError,
+    MissingFileError,
+    bad_type,
+    bad_value,
+)
 
 __all__ = ["check_file", "read_text", "refuse_decimal_commas"]
 
@@ -44,20 +51,21 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
     found = Path(path)
+    shown = str(found) if len(str(found)) <= LONGEST_GOT else f"{str(found)[:LONGEST_GOT]}..."
     if os.path.isdir(found):
-        raise FolderError(f"{name} must be {what}; got the folder {found}. Name the file inside it.")
+        raise FolderError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
     if not os.path.exists(found):  # Path.exists() raises on a name that is too long
         raise MissingFileError(
-            f"{name} must be {what}; got {found}, which does not exist. Check the spelling."
+            f"{name} must be {what}; got {shown}, which does not exist. Check the spelling."
         )
     if not found.is_file():
-        bad_value(name, what, f"{found}, which is a pipe or a device", "Save what it gives as a file first.")
+        bad_value(name, what, f"{shown}, which is a pipe or a device", "Save what it gives as a file first.")
     if not os.access(found, os.R_OK):
         raise ForbiddenFileError(
-            f"{name} must be {what} that you may read; got {found}. Check its permissions."
+            f"{name} must be {what} that you may read; got {shown}. Check its permissions."
         )
     if found.stat().st_size == 0:
-        bad_value(name, what, f"{found}, which is empty", "Was its download or copy cut off? Fetch it again.")
+        bad_value(name, what, f"{shown}, which is empty", "Was its download or copy cut off? Fetch it again.")
     return found
 
 

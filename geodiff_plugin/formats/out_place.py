@@ -73,6 +73,8 @@ def check_out(path: Path, name: str = "--out") -> Path:
         target = _absolute(path, name) if not path.exists() else path.resolve()
         if target.exists() and not target.is_dir():
             bad_value(name, "a folder", f"the file {path}", "Name a folder.")
+        if not target.name:
+            bad_value(name, "a folder below the root", str(path), "Name a folder.")
         os.stat(target.with_name(f".{target.name}{PARTIAL}"))  # the longest name that will be needed
     except FileNotFoundError:
         pass

@@ -245,6 +245,7 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "out-file": _with("--out", "left.png"),
     "out-below-file": _with("--out", "left.png/out"),
     "out-full": _with("--out", "."),
+    "out-root": _with("--out", "/"),
     "out-long": _with("--out", "x" * 300),
     "out-dangling": _out(lambda f: (f / "link").symlink_to("nothing"), "link"),
 }

@@ -86,8 +86,8 @@ def test_images(tmp_path, kind, size):
     @given(data=damaged(IMAGES[kind]))
     def check(data):
         path.write_bytes(data)
-        survives(lambda: read_image(path))
-        survives(lambda: warn_of_other_lens(path, K, "left"))
+        if survives(lambda: read_image(path)):
+            survives(lambda: warn_of_other_lens(path, K, "left"))
 
     check()
 

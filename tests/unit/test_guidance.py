@@ -109,6 +109,11 @@ def test_intrinsics_of_another_size_or_mistyped(fx, fy, cx, cy, said):
     assert [said in str(warning.message) for warning in caught] == ([] if said is None else [True])
 
 
+def test_an_array_is_no_choice():
+    with pytest.raises(ValueError, match="pose must be one of"):
+        GeometryGuidance(RIGHT, K, E, pose=np.zeros(3))
+
+
 def test_a_focal_length_that_the_exif_contradicts():
     picture = Image.fromarray(RIGHT)
     picture.getexif().get_ifd(0x8769)[0xA405] = 32  # 59 px for 64x48
