@@ -26,6 +26,11 @@ __all__ = [
 LONG_BASELINE_M = 20.0
 #: A principal point in the outer fifth of an image is rather that of an image of another size.
 NEAR_BORDER = 0.2
+#: A principal point this far off the middle, in shares of the image, by nearly the same share both ways, is
+#: rather that of an image of another size: no rig of ours has one, and a crop that moves both alike is rare.
+OFF_MIDDLE, NEARLY_ALIKE = 0.12, 0.08
+#: Pixels are about square; a stretched image has them up to 16:9, and a mistyped digit beyond.
+STRETCHED = 2.0
 SCALED_K = "with s = new size / old size take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy"
 
 
@@ -84,7 +89,7 @@ def check_calibrated_size(
 
 
 def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
-    """Warn of a principal point near the border, where that of an image of twice the size lies."""
+    """Warn of a principal point such as an image of another size has, and of a mistyped focal length."""
     shares = (K[0, 2] / width, K[1, 2] / height)
     if min(shares) < NEAR_BORDER or max(shares) > 1.0 - NEAR_BORDER:
         warnings.warn(
@@ -92,6 +97,25 @@ def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image:
             f"{width}x{height} pixels. If it is for another resolution, {SCALED_K}.",
             stacklevel=3,
         )
+    elif _off_alike(*shares):
+        warnings.warn(
+            f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) where that of an image "
+            f"{sum(shares):.2g} times the size of {image} would be. If it is for another resolution, "
+            f"{SCALED_K}.",
+            stacklevel=3,
+        )
+    if max(K[0, 0] / K[1, 1], K[1, 1] / K[0, 0]) > STRETCHED:
+        warnings.warn(
+            f"{name} has fx {K[0, 0]:.5g} and fy {K[1, 1]:.5g}; pixels are about square, so one of them may "
+            "be mistyped.",
+            stacklevel=3,
+        )
+
+
+def _off_alike(x: float, y: float) -> bool:
+    """Whether a principal point, in shares of the image, lies off its middle along the diagonal."""
+    least = min(abs(x - 0.5), abs(y - 0.5))
+    return least > OFF_MIDDLE and abs(x - y) < NEARLY_ALIKE
 
 
 def check_pose(E: Any, name: str = "E") -> np.ndarray:

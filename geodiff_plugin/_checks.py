@@ -122,7 +122,8 @@ def check_size(value: Any, name: str) -> tuple[int, int] | None:
 
 def check_choice(value: Any, name: str, choices: Any) -> Any:
     """One of ``choices``, returned as it came."""
-    if not any(value == known for known in choices):  # what came may have no hash
+    # What came may have no hash, and an array is equal to a word element by element.
+    if not any(isinstance(value, type(known)) and value == known for known in choices):
         bad_value(name, f"one of {sorted(map(str, choices))}", repr(value))
     return value
 

@@ -10,7 +10,7 @@ import importlib.util
 import os
 from typing import Any
 
-from geodiff_plugin._checks import check_number, refuse
+from geodiff_plugin._checks import bad_value, check_number, refuse
 
 __all__ = ["launch_page", "run_app"]
 
@@ -91,12 +91,18 @@ def run_app(priors: tuple[str, ...], device: str, host: str, port: int | None, b
     _check_gradio()
     from starlette.middleware import Middleware
 
-    launch_page(
-        priors,
-        device,
-        server_name=host,
-        server_port=port,
-        inbrowser=browser,
-        share=False,
-        app_kwargs={"middleware": [Middleware(_OwnOnly)]},
-    )
+    try:
+        launch_page(
+            priors,
+            device,
+            server_name=host,
+            server_port=port,
+            inbrowser=browser,
+            share=False,
+            app_kwargs={"middleware": [Middleware(_OwnOnly)]},
+        )
+    except OSError as error:
+        if "empty port" not in str(error):
+            raise
+        got = f"{host} and {port or 'no free port'}, taken by another program or not of this machine"
+        bad_value("--host and --port", "free to listen on", got, "Name another port, or leave out --port.")

@@ -8,6 +8,8 @@ Torch and diffusers are imported inside the commands, so that ``--help`` and ``-
 
 from __future__ import annotations
 
+import io
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -196,4 +198,7 @@ def main(argv: list[str] | None = None) -> None:
     Args:
         argv: arguments without the program's name; ``None`` for those of the process.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a name that the terminal's encoding lacks is no error
+            stream.reconfigure(errors="backslashreplace")
     app(args=argv, prog_name="geodiff")

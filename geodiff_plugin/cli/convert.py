@@ -47,11 +47,14 @@ def run_convert(
     if not layered and (space or lora):
         bad_value("--space and --lora", f"for {MARIGOLD_V2} alone", f"given for {paths[0]}")
     source, target = paths[-2:]
-    if target.exists():
+    if os.path.lexists(target):
         bad_value("DST", "a folder that does not exist yet", target, "Name another, or remove it first.")
-    if not target.parent.is_dir():
+    if not os.path.isdir(target.parent):
         bad_value("DST", "in an existing folder", target, f"Make the folder {target.parent} first.")
-    unfinished = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    try:
+        unfinished = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    except OSError as error:
+        bad_value("DST", "a folder that can be made", f"{target} ({error.strerror})", "Name another.")
     try:
         if layered:
             convert_marigold_v2(paths[1], source, unfinished, part, space, lora or "merged")
@@ -67,7 +70,7 @@ def run_convert(
 
 def _fill(source: Path, folder: Path, part: str | None) -> str:
     """Convert into an empty folder; what kind it was."""
-    if source.is_dir():
+    if os.path.isdir(source):
         convert_folder(source, folder)
         return "folder"
     checkpoint = read_checkpoint(source)

@@ -6,11 +6,11 @@ Paper: Algorithm 1, run by the pipeline.
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -52,7 +52,7 @@ def loading_bars(prior: str, quiet: bool = False) -> Iterator[None]:
         prior: as typed.
         quiet: switch them off for a download too.
     """
-    on_disk = prior == "bundled" or Path(prior).is_dir() or Path(prior.partition(":")[2]).is_dir()
+    on_disk = prior == "bundled" or os.path.isdir(prior) or os.path.isdir(prior.partition(":")[2])
     libraries = (diffusers_logging, transformers_logging) if on_disk or quiet else ()
     shown = [library for library in libraries if library.is_progress_bar_enabled()]
     for library in shown:

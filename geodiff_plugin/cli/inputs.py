@@ -27,6 +27,7 @@ from geodiff_plugin.cli.lenses import Lenses, lenses_of, pinhole
 from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.cli.start import PARAMETERS, calibration_way
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
+from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.formats.rigs import intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
@@ -189,6 +190,13 @@ def _make_guidance(
     return GeometryGuidance.from_views(views, points=points, cropped=cropped, config=config)
 
 
+def _compare_with_exif(arguments: DepthArguments, rig: Rig) -> None:
+    """Warn of a K that the photographs' own EXIF contradicts."""
+    warn_of_other_lens(arguments.left, rig.K_left, "LEFT")
+    if arguments.right is not None:
+        warn_of_other_lens(arguments.right, rig.K_right, "RIGHT")
+
+
 def read_inputs(
     arguments: DepthArguments,
     settings: Settings,
@@ -213,6 +221,8 @@ def read_inputs(
         left = _read_view(arguments.left, "LEFT")
         right = None if arguments.right is None else _read_view(arguments.right, "RIGHT")
     rig = rig_of(arguments, settings.cameras, _size(left), None if right is None else _size(right))
+    if views is None:
+        _compare_with_exif(arguments, rig)
     lenses = lenses_of(arguments, rig.distortion)
     left = pinhole(left, rig.K_left, lenses[0])
     right = None if right is None else pinhole(right, rig.K_right, lenses[1])

@@ -7,6 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -85,7 +86,7 @@ def _check_photographs(arguments: DepthArguments) -> None:
 
 def _is_colmap_model(path: Path) -> bool:
     """The one kind of calibration that is a folder; missing files are reported when it is read."""
-    return any((path / name).exists() for name in ("cameras.txt", "images.txt", "images.bin"))
+    return any(os.path.exists(path / name) for name in ("cameras.txt", "images.txt", "images.bin"))
 
 
 def _check_other_files(arguments: DepthArguments) -> None:

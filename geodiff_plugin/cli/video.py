@@ -7,6 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +23,14 @@ __all__ = ["run_video"]
 
 def _map(path: Path) -> np.ndarray:
     file = check_file(
-        path / "depth.npy" if path.is_dir() else path, "FRAME", "a folder of geodiff depth or a .npy"
+        path / "depth.npy" if os.path.isdir(path) else path, "FRAME", "a folder of geodiff depth or a .npy"
     )
     try:
         depth_m = np.load(file, allow_pickle=False)
     except (ValueError, EOFError) as error:
         bad_value("FRAME", "a depth map that numpy.save wrote", f"{file} ({error})")
-    if not isinstance(depth_m, np.ndarray) or depth_m.ndim != 2 or depth_m.dtype.kind != "f":
+    known = isinstance(depth_m, np.ndarray) and depth_m.ndim == 2 and depth_m.dtype.kind == "f"
+    if not (known and depth_m.size):
         bad_value("FRAME", "a depth map (H, W) of floats in metres", f"{file}")
     return depth_m
 
@@ -36,9 +38,12 @@ def _map(path: Path) -> np.ndarray:
 def _photograph(folder: Path) -> Image.Image:
     """The left image of a result, where it lay when the result was made."""
     report = check_file(folder / "report.json", "--photographs", "the report of a folder of geodiff depth")
-    result = json.loads(report.read_text(encoding="utf-8"))
-    arguments, frame = result["arguments"], result.get("pair", {}).get("frame")
-    left = Path(arguments["left"])
+    try:
+        result = json.loads(report.read_text(encoding="utf-8"))
+        arguments, frame = result["arguments"], result.get("pair", {}).get("frame")
+        left = Path(arguments["left"])
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        bad_value("--photographs", "the report of a folder of geodiff depth", f"{report}, which is damaged")
     if frame is not None:
         with VideoReader(left, f"the left video of {folder}") as video:
             image = video.read(frame)

@@ -14,6 +14,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
-from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, Case, cases_of
+from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, Case, case_kinds, cases_of
 from geodiff_plugin.formats.out_folder import OutFolder
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.judgement import judge
@@ -128,17 +129,21 @@ def _records(options: TrustOptions) -> Iterator[dict[str, Any]]:
     done = {record["key"]: record for record in read_records(path)}
     for group, refs in _refs(options).items():
         for i, ref in enumerate(tqdm(refs, desc=group, disable=options.quiet, file=sys.stderr)):
-            other = load(refs[(i + 1) % len(refs)])
-            sample = load(ref)
-            for case in cases_of(sample, other, options.kinds):
-                settings = asdict(options.settings) | {"width": options.width if group == "rendered" else 0}
-                key = json.dumps([ref.label, case.kind, settings], sort_keys=True)
-                if key not in done:
-                    found = _measure(case, priors.get(options.settings), options.settings)
-                    head = {"key": key, "group": group, "sample": ref.label, "kind": case.kind}
-                    done[key] = head | found
-                    append_record(path, done[key])
-                yield _judged(done[key]) | {"rectified": sample.rectified}
+            settings = asdict(options.settings) | {"width": options.width if group == "rendered" else 0}
+            keys = {
+                kind: json.dumps([ref.label, kind, settings], sort_keys=True)
+                for kind in case_kinds(options.kinds)
+            }
+            if not done.keys() >= set(keys.values()):
+                sample = load(ref)
+                head = {"group": group, "sample": ref.label, "rectified": sample.rectified}
+                for case in cases_of(sample, partial(load, refs[(i + 1) % len(refs)]), options.kinds):
+                    key = keys[case.kind]
+                    if key not in done:
+                        found = _measure(case, priors.get(options.settings), options.settings)
+                        done[key] = {"key": key, "kind": case.kind} | head | found
+                        append_record(path, done[key])
+            yield from (_judged(done[key]) for key in keys.values())
 
 
 def _beyond_views(record: dict[str, Any]) -> bool:

@@ -6,16 +6,17 @@ Paper: none.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 
-__all__ = ["WRONG", "Case", "cases_of"]
+__all__ = ["WRONG", "Case", "case_kinds", "cases_of"]
 
-Change = Callable[[StereoSample, StereoSample], StereoSample]
+Other = Callable[[], StereoSample]
+Change = Callable[[StereoSample, Other], StereoSample]
 #: Known points of the cases about points: so many of the truth.
 POINTS = 200
 
@@ -38,7 +39,7 @@ class Case:
 
 
 def _scaled_baseline(factor: float) -> Change:
-    def change(sample: StereoSample, other: StereoSample) -> StereoSample:
+    def change(sample: StereoSample, other: Other) -> StereoSample:
         E = sample.E.copy()
         E[:3, 3] *= factor
         return replace(sample, E=E)
@@ -49,7 +50,7 @@ def _scaled_baseline(factor: float) -> Change:
 def _scaled_K(factor: float) -> Change:
     """Focal lengths of another size, and the principal point in the middle, where it says nothing."""
 
-    def change(sample: StereoSample, other: StereoSample) -> StereoSample:
+    def change(sample: StereoSample, other: Other) -> StereoSample:
         def scaled(K: np.ndarray) -> np.ndarray:
             return K * np.array([[factor, factor, 1.0], [factor, factor, 1.0], [1.0, 1.0, 1.0]])
 
@@ -58,21 +59,21 @@ def _scaled_K(factor: float) -> Change:
     return change
 
 
-def _swapped(sample: StereoSample, other: StereoSample) -> StereoSample:
+def _swapped(sample: StereoSample, other: Other) -> StereoSample:
     return replace(sample, left=sample.right, right=sample.left)
 
 
-def _inverse(sample: StereoSample, other: StereoSample) -> StereoSample:
+def _inverse(sample: StereoSample, other: Other) -> StereoSample:
     return replace(sample, E=np.linalg.inv(sample.E))
 
 
-def _axis(sample: StereoSample, other: StereoSample) -> StereoSample:
+def _axis(sample: StereoSample, other: Other) -> StereoSample:
     E = sample.E.copy()
     E[:3, 3] = E[[1, 0, 2], 3]
     return replace(sample, E=E)
 
 
-def _tilted(sample: StereoSample, other: StereoSample) -> StereoSample:
+def _tilted(sample: StereoSample, other: Other) -> StereoSample:
     """As if not rectified: the right camera nods by two degrees."""
     c, s = np.cos(np.radians(2.0)), np.sin(np.radians(2.0))
     nod = np.eye(4)
@@ -80,19 +81,20 @@ def _tilted(sample: StereoSample, other: StereoSample) -> StereoSample:
     return replace(sample, E=sample.E @ nod)
 
 
-def _mirrored(sample: StereoSample, other: StereoSample) -> StereoSample:
+def _mirrored(sample: StereoSample, other: Other) -> StereoSample:
     return replace(sample, right=np.ascontiguousarray(sample.right[:, ::-1]))
 
 
-def _unrelated(sample: StereoSample, other: StereoSample) -> StereoSample:
-    return replace(sample, right=other.right, K_right=other.K_right)
+def _unrelated(sample: StereoSample, other: Other) -> StereoSample:
+    given = other()
+    return replace(sample, right=given.right, K_right=given.K_right)
 
 
-def _one_picture(sample: StereoSample, other: StereoSample) -> StereoSample:
+def _one_picture(sample: StereoSample, other: Other) -> StereoSample:
     return replace(sample, right=sample.left.copy(), K_right=sample.K_left)
 
 
-def _shifted(sample: StereoSample, other: StereoSample) -> StereoSample:
+def _shifted(sample: StereoSample, other: Other) -> StereoSample:
     """The right picture is the left one, moved: every disparity is the same."""
     shift = max(2, sample.left.shape[1] // 20)
     return replace(sample, right=np.roll(sample.left, -shift, axis=1), K_right=sample.K_left)
@@ -127,21 +129,28 @@ def _points(sample: StereoSample, seed: int = 0) -> np.ndarray:
     return rays * z[:, None]
 
 
-def cases_of(sample: StereoSample, other: StereoSample, kinds: tuple[str, ...]) -> list[Case]:
+def case_kinds(kinds: tuple[str, ...]) -> tuple[str, ...]:
+    """Kinds of ``cases_of``, in its order."""
+    pointed = any(kind in WRONG_POINTS for kind in kinds)
+    return ("right", *(("right, points",) if pointed else ()), *kinds)
+
+
+def cases_of(
+    sample: StereoSample, other: Callable[[], StereoSample], kinds: tuple[str, ...]
+) -> Iterator[Case]:
     """The sample as it is, and made wrong in every way that is asked for.
 
     Args:
         sample: right.
-        other: another one, whose right image is "unrelated".
+        other: gives another one, whose right image is "unrelated".
         kinds: keys of ``WRONG`` and ``WRONG_POINTS``.
     """
-    found = [Case("right", sample)]
-    if any(kind in WRONG_POINTS for kind in kinds):
-        found.append(Case("right, points", sample, _points(sample)))
-    for kind in kinds:
-        if kind in WRONG_POINTS:
-            found.append(Case(kind, sample, WRONG_POINTS[kind] * _points(sample)))
+    for kind in case_kinds(kinds):
+        if kind == "right":
+            yield Case(kind, sample)
+        elif kind == "right, points":
+            yield Case(kind, sample, _points(sample))
+        elif kind in WRONG_POINTS:
+            yield Case(kind, sample, WRONG_POINTS[kind] * _points(sample))
         else:
-            truth = kind != "swapped"
-            found.append(Case(kind, WRONG[kind][1](sample, other), truth=truth))
-    return found
+            yield Case(kind, WRONG[kind][1](sample, other), truth=kind != "swapped")

@@ -36,9 +36,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         IsADirectoryError: ``path`` is a folder.
     """
     target = Path(path)
-    if target.is_dir():
+    if os.path.isdir(target):
         raise FolderError(f"The output must be a file; got the folder {target}. Name a file inside of it.")
-    if not target.parent.is_dir():
+    if not os.path.isdir(target.parent):
         raise MissingFileError(
             f"The output must be in an existing folder; got {target}. Make the folder {target.parent} first."
         )

@@ -8,22 +8,26 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin._checks import InputError, bad_value, check_number
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.rigs import intrinsics
 
-__all__ = ["intrinsics_from_exif", "intrinsics_from_fov"]
+__all__ = ["intrinsics_from_exif", "intrinsics_from_fov", "warn_of_other_lens"]
 
 _ORIENTATION, _IFD, _FOCAL, _FOCAL_35, _ZOOM = 0x0112, 0x8769, 0x920A, 0xA405, 0xA404
 _WIDTH, _HEIGHT, _X_RESOLUTION, _Y_RESOLUTION, _UNIT = 0xA002, 0xA003, 0xA20E, 0xA20F, 0xA210
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 #: Diagonal of a 35 mm frame, which equivalent focal lengths are compared by.
 _DIAGONAL_35_MM = math.hypot(36.0, 24.0)
+#: A focal length further off its EXIF than this factor is of an image of another size: EXIF is known to a few
+#: per cent, and rectification or a lens that was straightened changes it by less.
+_OTHER_LENS = 1.4
 #: Sides may be rounded by this share before an image counts as cropped.
 _SAME_SHAPE = 0.01
 CURES = "Give K (--fx --fy --cx --cy or --K), a field of view (--fov), or photographs with their EXIF."
@@ -63,6 +67,30 @@ def intrinsics_from_exif(
         return _of(source, name, turned=False)
     with Image.open(check_file(source, name, "an image file")) as image:
         return _of(image, name, turned=image.getexif().get(_ORIENTATION) in (5, 6, 7, 8))
+
+
+def warn_of_other_lens(source: str | os.PathLike[str] | Image.Image, K: np.ndarray, name: str) -> None:
+    """Warn of a focal length that contradicts the image's own EXIF, which two rectified views cannot tell.
+
+    Nothing is said of an image without a focal length, or one that was cropped or zoomed digitally.
+
+    Args:
+        source: a file, or an image that still carries its EXIF.
+        K: ``(3, 3)`` pixels of that image.
+        name: the image, for the message.
+    """
+    try:
+        found, notes = intrinsics_from_exif(source, name)
+    except InputError:
+        return
+    factor = K[0, 0] / found[0, 0]
+    if len(notes) > 1 or max(factor, 1 / factor) < _OTHER_LENS:
+        return
+    warnings.warn(
+        f"K has a focal length of {K[0, 0]:.0f} px for {name}, {factor:.2f} times the {found[0, 0]:.0f} px "
+        "of its EXIF: is K for an image of another size? If it is, all metres are off by that factor.",
+        stacklevel=3,
+    )
 
 
 def _number(entries: Any, tag: int) -> float:

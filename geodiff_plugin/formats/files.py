@@ -6,12 +6,25 @@ Paper: none.
 
 from __future__ import annotations
 
+import codecs
 import os
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
-from geodiff_plugin._checks import FolderError, ForbiddenFileError, MissingFileError, bad_type, bad_value
+from geodiff_plugin._checks import (
+    LONGEST_GOT,
+    FolderError,
+    ForbiddenFileError,
+    MissingFileError,
+    bad_type,
+    bad_value,
+)
 
-__all__ = ["check_file", "read_text"]
+__all__ = ["check_file", "read_text", "refuse_decimal_commas"]
+
+#: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
+DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
 
 #: No calibration file is near this size; a larger one is something else.
 LARGEST_TEXT_BYTES = 16_000_000
@@ -33,23 +46,26 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
         FileNotFoundError: nothing there.
         IsADirectoryError: a folder.
         PermissionError: not readable.
-        ValueError: empty.
+        ValueError: empty, or a pipe or a device.
     """
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
     found = Path(path)
-    if found.is_dir():
-        raise FolderError(f"{name} must be {what}; got the folder {found}. Name the file inside it.")
-    if not found.exists():
+    shown = str(found) if len(str(found)) <= LONGEST_GOT else f"{str(found)[:LONGEST_GOT]}..."
+    if os.path.isdir(found):
+        raise FolderError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
+    if not os.path.exists(found):  # Path.exists() raises on a name that is too long
         raise MissingFileError(
-            f"{name} must be {what}; got {found}, which does not exist. Check the spelling."
+            f"{name} must be {what}; got {shown}, which does not exist. Check the spelling."
         )
+    if not found.is_file():
+        bad_value(name, what, f"{shown}, which is a pipe or a device", "Save what it gives as a file first.")
     if not os.access(found, os.R_OK):
         raise ForbiddenFileError(
-            f"{name} must be {what} that you may read; got {found}. Check its permissions."
+            f"{name} must be {what} that you may read; got {shown}. Check its permissions."
         )
     if found.stat().st_size == 0:
-        bad_value(name, what, f"{found}, which is empty", "Was its download or copy cut off? Fetch it again.")
+        bad_value(name, what, f"{shown}, which is empty", "Was its download or copy cut off? Fetch it again.")
     return found
 
 
@@ -65,9 +81,28 @@ def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file"
     if size > LARGEST_TEXT_BYTES:
         bad_value(name, what, f"{found} of {size} bytes", cure)
     raw = found.read_bytes()
-    if b"\0" in raw:
+    wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # as Windows' shell and Notepad write
+    if b"\0" in raw and not wide:
         bad_value(name, what, f"{found}, which holds binary data", cure)
-    text = raw.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+    text = raw.decode("utf-16" if wide else "utf-8-sig", errors="replace")
+    if "\0" in text:
+        bad_value(name, what, f"{found}, which holds binary data", cure)
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
     if not text.strip():
         bad_value(name, what, f"{found}, which holds only blanks", "Fetch it again.")
     return text
+
+
+def refuse_decimal_commas(lines: Iterable[str], path: str | os.PathLike[str], name: str) -> None:
+    """Refuse ``1,5 2,5 3,0`` and ``1,5;2,5;3,0``, which would be read as six numbers.
+
+    ``1,2`` alone in a line may be two columns.
+
+    Raises:
+        ValueError: a line of several numbers, one of them with a decimal comma.
+    """
+    for line in lines:
+        found = DECIMAL_COMMA.search(line)
+        if found and found.group() != line:
+            cure = "Write points for commas, as 1.5 for 1,5."
+            bad_value(name, "numbers with a decimal point", f"{path} with {found.group()}", cure)

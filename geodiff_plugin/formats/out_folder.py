@@ -174,9 +174,10 @@ class OutFolder:
             except OSError as error:
                 shutil.rmtree(self._staging, ignore_errors=True)
                 reason = f"{self.path} could not be written ({reason_of(error)})"
-            for base in (Path.cwd(), Path(tempfile.gettempdir()), Path.home()):
-                with suppress(OSError):
-                    result = self._fill_in(base, fill)
+            for base_of in (Path.cwd, tempfile.gettempdir, Path.home):
+                # On a full disk no folder for temporary files is found; a working folder may be gone.
+                with suppress(OSError, RuntimeError):
+                    result = self._fill_in(Path(base_of()), fill)
                     self.elsewhere = f"{reason}; the result is in {self.path}."
                     return result
             if not sys.stderr.isatty():

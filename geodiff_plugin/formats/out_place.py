@@ -48,6 +48,14 @@ def reason_of(error: OSError) -> str:
     return error.strerror or str(error)
 
 
+def _absolute(path: Path, name: str) -> Path:
+    try:
+        return path.absolute()
+    except FileNotFoundError:
+        cure = "Change to one that is there."
+        bad_value(name, "below a working folder that exists", f"{path}, and that folder was removed", cure)
+
+
 def check_out(path: Path, name: str = "--out") -> Path:
     """The place that an output folder has or will have, links followed.
 
@@ -62,9 +70,11 @@ def check_out(path: Path, name: str = "--out") -> Path:
         if path.is_symlink() and not path.exists():
             cure = "Make that folder, or remove the link."
             bad_value(name, "a folder", f"{path}, a link to {os.readlink(path)}, which does not exist", cure)
-        target = path.absolute() if not path.exists() else path.resolve()
+        target = _absolute(path, name) if not path.exists() else path.resolve()
         if target.exists() and not target.is_dir():
             bad_value(name, "a folder", f"the file {path}", "Name a folder.")
+        if not target.name:
+            bad_value(name, "a folder below the root", str(path), "Name a folder.")
         os.stat(target.with_name(f".{target.name}{PARTIAL}"))  # the longest name that will be needed
     except FileNotFoundError:
         pass
@@ -85,7 +95,7 @@ def free_folder(default: Path) -> Path:
     for number in range(1, MOST_NUMBERED):
         path = default if number == 1 else default.with_name(f"{default.name}-{number}")
         taken = os.path.lexists(path) and (not path.is_dir() or holds_files(path))
-        if not taken and not held_by_another(hidden_path(path.absolute(), LOCK)):
+        if not taken and not held_by_another(hidden_path(_absolute(path, "--out"), LOCK)):
             return path
     bad_value("--out", "given, as a new folder", f"{MOST_NUMBERED} folders {default}-N that hold files")
 

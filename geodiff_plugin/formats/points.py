@@ -16,7 +16,7 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value, check_map_in_metres, check_number
 from geodiff_plugin.formats.depth import read_depth_png, read_pfm
-from geodiff_plugin.formats.files import check_file, read_text
+from geodiff_plugin.formats.files import check_file, read_text, refuse_decimal_commas
 from geodiff_plugin.formats.lidar import read_velodyne
 from geodiff_plugin.formats.npy import read_npy
 from geodiff_plugin.formats.ply import read_ply_points
@@ -33,26 +33,51 @@ KITTI_UNITS, MILLIMETRES = 256.0, 1000.0
 KITTI_FOLDERS = re.compile(r"(^|[\\/])(proj_depth|groundtruth|groundtruth_depth|velodyne_raw)([\\/]|$)")
 #: Columns of points: x y z, with an intensity, or with a colour.
 COLUMNS = (3, 4, 6)
+#: What known depths come in as well, and is not read.
+PICTURES, CLOUDS = (
+    (".jpg", ".jpeg", ".tif", ".tiff", ".exr"),
+    (".pcd", ".las", ".laz", ".obj", ".off", ".e57"),
+)
 MOST_POINTS = 50_000_000
 NEAREST, FARTHEST_SCALE = 1e-9, 1e9
 
 
 def _rows(path: Path, name: str) -> np.ndarray:
-    """Numbers of a text, one row a line: blanks, tabs, commas or semicolons between, lines of words left out.
+    """Numbers of a text, one row a line: blanks, tabs, commas or semicolons between.
 
-    A first line of words is a heading; ``#`` and ``//`` start a remark, anywhere in a line.
+    A first line of words is a heading, and tells which columns are x, y and z if it has one word a column;
+    ``#`` and ``//`` start a remark, anywhere in a line.
     """
-    lines = [re.split(r"#|//", line)[0].strip(" \t,;") for line in read_text(path, name, KINDS).splitlines()]
+    text = read_text(path, name, KINDS).replace('"', "")
+    lines = [re.split(r"#|//", line)[0].strip(" \t,;") for line in text.splitlines()]
+    refuse_decimal_commas(lines, path, name)
     rows = [re.split(r"[\s,;]+", line) for line in lines if line]
-    headed = bool(rows) and not _is_number(rows[0][0])
+    heading = rows.pop(0) if rows and not _is_number(rows[0][0]) else []
+    columns = _columns(heading, len(rows[0]), path, name) if rows else None
     try:
-        values = [[float(word) for word in row] for row in rows[headed:]]
+        values = [[float(word) for word in (row if columns is None else _of(row, columns))] for row in rows]
     except ValueError:
         bad_value(name, "rows of numbers, below one heading at most", f"{path} with words among them")
-    if not values or len({len(row) for row in values}) > 1:
-        lengths = sorted({len(row) for row in values})
+    if not values or len({len(row) for row in rows}) > 1:
+        lengths = sorted({len(row) for row in rows})
         bad_value(name, "points in metres, one a line", f"{path} with rows of {lengths or 'no'} numbers")
     return np.array(values)
+
+
+def _of(row: list[str], columns: list[int]) -> list[str]:
+    return [row[column] for column in columns if column < len(row)]
+
+
+def _columns(heading: list[str], count: int, path: Path, name: str) -> list[int] | None:
+    """Where a heading has x, y and z; ``None`` for a title, whose words are not as many as the columns."""
+    if len(heading) != count:
+        return None
+    words = [re.sub(r"([_ ]?m|[_ ]?[\[(]m[\])])$", "", word.lower()) for word in heading]
+    if any(words.count(axis) != 1 for axis in "xyz"):
+        cure = "Write the points as x, y and z of the left camera, or the depths as a map of the left image."
+        got = f"{path} with {', '.join(heading)}"
+        bad_value(name, "points with columns x, y and z, in metres", got, cure)
+    return [words.index(axis) for axis in "xyz"]
 
 
 def _is_number(word: str) -> bool:
@@ -89,8 +114,9 @@ def read_points(
         path: a map of the left image, 0 or not finite where nothing is known: 16-bit PNG of millimetres (of
             1/256 m in folders that KITTI's depth benchmark names so), PFM or two-dimensional ``.npy`` of
             metres. Or points, metres, in the left camera's frame (x right, y down, z forward): ``N x 3``, ``N
-            x 4`` or ``N x 6`` as ``.npy`` or text (blanks or commas, a heading is left out), of which the
-            first three columns count; ``.ply``; KITTI's velodyne ``.bin`` with its calibration.
+            x 4`` or ``N x 6`` as ``.npy`` or text (blanks or commas), of which those columns count that a
+            heading names x, y and z, else the first three; ``.ply``; KITTI's velodyne ``.bin`` with its
+            calibration.
         name: the argument that it came in, for messages.
         scale: units of the file in a metre, > 0, for any kind: 1000 for millimetres, 256 for KITTI's PNG.
         calibration: of a ``.bin``: KITTI's object ``calib/N.txt``, or ``calib_velo_to_cam.txt`` with
@@ -111,8 +137,10 @@ def read_points(
         bad_value(f"{name}-calib", "given with a velodyne .bin only", f"{found}")
     if kind == ".png":
         return read_depth_png(found, _png_scale(found, scale), name)[0]
-    if kind in (".jpg", ".jpeg", ".tif", ".tiff", ".exr"):
+    if kind in PICTURES:
         bad_value(name, KINDS, f"{found}", "Save it as .npy or PFM in metres.")
+    if kind in CLOUDS:
+        bad_value(name, KINDS, f"{found}", "Save the cloud as .ply.")
     if kind == ".pfm":
         values = read_pfm(found, name)
     elif kind == ".ply":

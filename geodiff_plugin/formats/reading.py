@@ -65,7 +65,7 @@ def _paths(path: PathLike | Sequence[PathLike]) -> tuple[Path, ...]:
         bad_type("calibration", "a path, or a pair of paths (left, right)", path)
     if len(paths) not in (1, 2):
         bad_value("calibration", "one file, or a pair (left, right)", f"{len(paths)} files")
-    if len(paths) == 1 and Path(paths[0]).is_dir():
+    if len(paths) == 1 and os.path.isdir(paths[0]):
         return _model_files(Path(paths[0]))
     return tuple(Path(p) for p in paths)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from geodiff_plugin._camera_checks import (
@@ -22,6 +23,7 @@ from geodiff_plugin._camera_checks import (
 )
 from geodiff_plugin._checks import bad_type, bad_value, check_map_in_metres
 from geodiff_plugin.formats import as_image_01
+from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.types import CameraView, Rig
 
 __all__ = ["ImageInputs", "read_inputs", "split_views"]
@@ -112,6 +114,9 @@ def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int, cropp
         fit = (K_right, image.shape[-1], image.shape[-2], name, "the right image")
         check_intrinsics_fit(*fit)
         warn_of_other_size(*fit)
+    for image, K_right, name in zip(views, K_rights, names, strict=True):
+        if isinstance(image, Image.Image):
+            warn_of_other_lens(image, K_right, name)
     rigs = tuple(Rig(K_left, K_right, pose) for K_right, pose in zip(K_rights, poses, strict=True))
     own_points = _entry(points, "points", i, count)
     return ImageInputs(
@@ -239,4 +244,6 @@ def split_views(
     height, width = as_image_01(images[0], "the left view's image").shape[-2:]
     K_left = check_intrinsics(Ks[0], "K[left]")
     check_intrinsics_fit(K_left, width, height, "K[left]", "the left view's image")
+    if isinstance(images[0], Image.Image):
+        warn_of_other_lens(images[0], K_left, "the left view's image")
     return (width, height), images[1:], Ks, Es

@@ -89,6 +89,8 @@ def write_depth_video(path: str | os.PathLike[str], frames: Sequence[Image.Image
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         bad_value("the video", f"a file that ends in {', '.join(SUFFIXES)}", path.name)
+    if not os.path.isdir(path.parent):
+        bad_value("the video", "in an existing folder", path, f"Make the folder {path.parent} first.")
     if not frames:
         bad_value("frames", "at least one picture", "none")
     check_number(fps, "fps", 0.1, 120)
@@ -96,4 +98,12 @@ def write_depth_video(path: str | os.PathLike[str], frames: Sequence[Image.Image
         _write_mp4(path, frames, fps)
         return
     more: dict[str, Any] = {"quality": 85} if path.suffix.lower() == ".webp" else {}
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, **more)
+    try:
+        frames[0].save(
+            path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, **more
+        )
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputFileError(
+            f"the video must be a file that can be written; got {path} ({reason})."
+        ) from error

@@ -7,6 +7,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def fetch_small_files(name: str, hub: dict[str, Any]) -> Path:
     """
     if name == "bundled":
         return BUNDLED_FOLDER
-    if Path(name).is_dir():
+    if os.path.isdir(name):
         return Path(name)
     if name.count("/") > 1 or name.startswith((".", "/", "~")):
         bad_value("prior", "'bundled', a folder that is there, or a hub id", repr(name), "Check the path.")

@@ -7,8 +7,8 @@ autoencoders that they stand for.
 
 from __future__ import annotations
 
+import os
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -75,8 +75,7 @@ def tiny_autoencoder(pipe: Any, prior: DepthPrior, decoder: str) -> AutoencoderT
 
 @lru_cache(maxsize=1)
 def _loaded(name: str, dtype: torch.dtype, device: str) -> AutoencoderTiny:
-    folder = Path(name)
-    if not folder.is_dir() and (name.count("/") != 1 or name.startswith((".", "/", "~"))):
+    if not os.path.isdir(name) and (name.count("/") != 1 or name.startswith((".", "/", "~"))):
         bad_value("decoder", f"{FULL!r}, {TINY!r}, a folder that is there, or a hub id", repr(name))
     try:
         tiny = AutoencoderTiny.from_pretrained(name, dtype=dtype, use_safetensors=True)

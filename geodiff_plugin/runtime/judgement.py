@@ -27,8 +27,11 @@ WEAK_CONFIDENCE, WEAK_MATCHED, WEAK_ORDER = 0.5, 0.4, 0.45
 LEAST_SPREAD = 0.15
 #: Points and matches that differ by these factors are said to; and cost trust.
 POINTS_SAID, POINTS_WRONG = math.log(1.08), math.log(1.2)
-#: A rig's baseline in metres lies between these, and a lens's horizontal field of view, in degrees.
-BASELINES_M, VIEWS_DEG = (1e-3, 20.0), (8.0, 140.0)
+#: A rig's baseline in metres lies between these, and a lens's horizontal field of view, in degrees: that of
+#: 135 mm and that of 10 mm in 35 mm equivalent.
+BASELINES_M, VIEWS_DEG = (1e-3, 20.0), (15.0, 120.0)
+#: From this factor on it is said that a metric prior's own metres are others.
+OWN_METRES = math.log(1.9)
 #: Matches that lie further beside their epipolar lines, with the best pose that was found near the given
 #: one, are weak, are said, and cost trust; pixels of the grid of the matches.
 EPIPOLAR_WEAK, EPIPOLAR_PX, EPIPOLAR_WRONG = 1.0, 2.0, 4.0
@@ -174,6 +177,11 @@ def _odd(signs: Signs, trusted: bool) -> list[str]:
         found.append(
             f"K gives the left image a field of view of {signs.view_deg:.0f} degrees: is it for an image of "
             "another size?"
+        )
+    if signs.own_ratio > 0 and abs(math.log(signs.own_ratio)) > OWN_METRES:
+        found.append(
+            f"The depth is {signs.own_ratio:.2g} times the prior's own metres: is the baseline in metres, "
+            "and K for an image of this size? Or is the scene of a kind that the prior does not know?"
         )
     points = _of_points(signs)
     if points is not None and abs(math.log(signs.points_ratio)) <= POINTS_WRONG:

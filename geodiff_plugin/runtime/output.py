@@ -6,6 +6,7 @@ Paper: Eq. 14's re-rendered left image, as a per-pixel report.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -79,7 +80,11 @@ def assemble_output(
         nowhere = torch.zeros_like(depth_m)
         shown = nowhere if error is None else error, nowhere.bool() if visible is None else visible
         confidence = depth_confidence(support, *shown, spread, prior_error)
-    judgements = [_judged(run, i, lefts_01[i], known[i][1], confidence) for i in range(count)]
+    over_own = _over_own(run, depth_m)
+    own_ratios = [math.nan] * count
+    if over_own is not None and guidance.unit is not None:
+        own_ratios = over_own.reshape(count, -1).median(1).values.tolist()
+    judgements = [_judged(run, i, lefts_01[i], known[i][1], confidence, own_ratios[i]) for i in range(count)]
     if confidence is not None:
         agreed = confidence.new_tensor([agreement_of_points(each.signs) for each in judgements])
         confidence = confidence * agreed.view(-1, 1, 1, 1)
@@ -87,7 +92,6 @@ def assemble_output(
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
     if call["match_input_resolution"]:
         relative = F.interpolate(relative, size, mode="bilinear", align_corners=False)
-    over_own = _over_own(run, depth_m)
     affine = [t.affine for t in run.trajectories]
 
     def members(name: str) -> Tensor:
@@ -172,6 +176,7 @@ def _judged(
     left_01: Tensor,
     K_left: Tensor,
     confidence: Tensor | None,
+    own_ratio: float,
 ) -> Judgement:
     """What the signs of one image's run say of it."""
     own = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
@@ -185,6 +190,7 @@ def _judged(
         confidence=None if confidence is None else confidence[image],
         on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in own),
         range_given=run.config.depth_range is not None,
+        own_ratio=own_ratio,
     )
     return judge(signs)
 

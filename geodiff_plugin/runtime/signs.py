@@ -47,6 +47,7 @@ class Signs:
         at_end: share of the sure matches that lie on the first or the last plane of a given range, [0, 1].
         baseline_m: distance of the first right camera; 0 without one.
         view_deg: horizontal field of view that K gives the left image.
+        own_ratio: of the depth over a metric prior's own, median.
         epipolar_px: how far matches lie beside their epipolar lines, pixels, with the poses as used; of the
             worst right view.
         mistakes: sentences on mistakes of a given pose that would explain its misfit (``pose.mistakes``).
@@ -66,6 +67,7 @@ class Signs:
     at_end: float = 0.0
     baseline_m: float = 0.0
     view_deg: float = math.nan
+    own_ratio: float = math.nan
     epipolar_px: float = math.nan
     mistakes: tuple[str, ...] = ()
     flat: bool = False
@@ -143,6 +145,7 @@ def read_signs(
     confidence: Tensor | None,
     on_edge: bool,
     range_given: bool = False,
+    own_ratio: float = math.nan,
 ) -> Signs:
     """The signs of one image.
 
@@ -155,6 +158,7 @@ def read_signs(
         confidence: ``(1, H, W)``, or ``None``.
         on_edge: whether the search for the scale ended on the edge of its range.
         range_given: whether that range was given by the user.
+        own_ratio: of the depth over a metric prior's own, NaN for a relative prior.
     """
     matches, points = evidence.sweep_matches, evidence.sweep_points
     planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
@@ -170,6 +174,7 @@ def read_signs(
         points=0 if known is None else int((known.confidence > 0).sum()),
         baseline_m=float(rights[0][2][:3, 3].norm()) if rights else 0.0,
         view_deg=2.0 * math.degrees(math.atan(0.5 * left_01.shape[-1] / float(K_left[0, 0]))),
+        own_ratio=own_ratio,
         same=_is_same(left_01, rights),
         inverse_fits=INVERSE in evidence.warnings,
         on_edge=on_edge,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -165,6 +166,8 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "K-shape": _matrices(K=np.eye(4)),
     "K-focal": _matrices(K=_changed(GOOD_K, (0, 0), 0)),
     "K-nan": _matrices(K=_changed(GOOD_K, (1, 1), np.nan)),
+    "K-decimal-commas": _matrices(K_right="60,5 0 31,5\n0 60,5 23,5\n0 0 1\n"),
+    "K-without-numbers": _matrices(K_right="# fx 0 cx\n"),
     "K-last-row": _matrices(K=_changed(GOOD_K, (2, 0), 1)),
     "K-of-another-size": _matrices(K=4 * np.diag([60, 60, 0.25]) + 128 * np.eye(3, k=2)),
     "K-right-words": _matrices(K_right="fx fy cx cy"),
@@ -178,6 +181,9 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     # calibration files
     "calib-missing": _bare("--calib", "nothing.txt"),
     "calib-folder": _bare("--calib", "."),
+    "calib-name-too-long": _bare("--calib", "x" * 300),
+    "calib-pipe": lambda f: os.mkfifo(f / "pipe") or _bare("--calib", "pipe")(f),
+    "calib-device": _bare("--calib", os.devnull),
     "calib-empty": _calib(b""),
     "calib-blank": _calib(" \n\n"),
     "calib-binary": _calib(b"\x00\x01\x02"),
@@ -200,6 +206,7 @@ KINDS: dict[str, Callable[[Path], Words]] = {
         "height=96\n"
     ),
     # images
+    "left-name-too-long": _all("x" * 300 + ".png", "right.png", "--calib", "calib.txt"),
     "left-missing": _all("nothing.png", "right.png", "--calib", "calib.txt"),
     "right-missing": _all("left.png", "nothing.png", "--calib", "calib.txt"),
     "left-folder": _all(".", "right.png", "--calib", "calib.txt"),
@@ -213,6 +220,13 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "view-without-pose": _with("--view", "calib.txt"),
     "pose-without-view": _with("--view-E", "calib.txt"),
     # points
+    "points-name-too-long": _with("--points", "x" * 300),
+    "points-decimal-commas": _points("1,5;2,5;3,0\n"),
+    "points-decimal-commas-and-blanks": _points("1,5 2,5 3,0\n"),
+    "points-of-pixels": _points("u,v,depth\n10,20,3\n"),
+    "points-with-words": _points("1 2 3\n1 2 car\n"),
+    "points-with-too-few-cells": _points("id,x,y,z\n0,1,2,3\n1,2\n"),
+    "points-pcd": _points("VERSION 0.7\nFIELDS x y z\nDATA ascii\n1 2 3\n", "points.pcd"),
     "points-missing": _with("--points", "nothing.npy"),
     "points-empty": _points(b""),
     "points-words": _points("lidar\n"),
@@ -231,6 +245,7 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "out-file": _with("--out", "left.png"),
     "out-below-file": _with("--out", "left.png/out"),
     "out-full": _with("--out", "."),
+    "out-root": _with("--out", "/"),
     "out-long": _with("--out", "x" * 300),
     "out-dangling": _out(lambda f: (f / "link").symlink_to("nothing"), "link"),
 }

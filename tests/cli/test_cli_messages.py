@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import os
 import re
+import sys
 import warnings
 from pathlib import Path
 
@@ -12,6 +15,7 @@ from PIL import Image
 
 from geodiff_plugin import _checks
 from geodiff_plugin._checks import InputError, bad_type, bad_value
+from geodiff_plugin.cli.app import main
 from geodiff_plugin.cli.messages import collected_warnings, in_options
 from geodiff_plugin.cli.report import depth_summary, summary_line
 from geodiff_plugin.formats import read_image
@@ -75,6 +79,56 @@ def test_warnings_are_sentences(monkeypatch, geodiff, pair_files):
         True
     ] * 3
     assert "alpha" in lines[0] and "EXIF" in lines[1]
+
+
+def test_a_focal_length_that_the_exif_of_a_photograph_contradicts(monkeypatch, geodiff, pair_files):
+    monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", stop)
+    exif = Image.Exif()
+    exif[0x0112] = 1
+    exif.get_ifd(0x8769)[0xA405] = 65  # 120 px for 64x48
+    Image.open(pair_files.left).save(pair_files.left, exif=exif)
+    warned, interrupted = geodiff(*pair_files.command).err.splitlines()
+    assert warned.startswith("warning: K has a focal length of 60 px for LEFT, 0.50 times the 120 px")
+    assert interrupted == "geodiff: interrupted"
+
+
+def test_names_beyond_the_terminals_encoding(monkeypatch, tmp_path):
+    """As on Windows, or into a file there: the answer says them in escapes, after the work as before."""
+    np.save(tmp_path / "depth.npy", np.ones((40, 48), np.float32))
+    narrow = {name: io.TextIOWrapper(io.BytesIO(), encoding="ascii") for name in ("stdout", "stderr")}
+    for name, stream in narrow.items():
+        monkeypatch.setattr(sys, name, stream)
+    for out in ("größe.webp", os.fsdecode(b"gr\xf6.webp")):
+        with pytest.raises(SystemExit) as leaving:
+            main(["video", str(tmp_path / "depth.npy"), "--out", str(tmp_path / out)])
+        assert not leaving.value.code and (tmp_path / out).exists()
+    with pytest.raises(SystemExit) as leaving:
+        main(["video", "größe.npy"])
+    assert leaving.value.code == 2
+    for stream, words in ((narrow["stdout"], rb"gr\xf6\xdfe.webp"), (narrow["stderr"], rb"gr\xf6\xdfe.npy")):
+        stream.flush()
+        assert words in stream.buffer.getvalue()
+
+
+def test_a_video_of_what_is_none_is_a_sentence(geodiff, tmp_path):
+    """No pixels, no folder for it, a name that is too long, a damaged report."""
+    np.save(tmp_path / "depth.npy", np.ones((40, 48), np.float32))
+    np.save(tmp_path / "empty.npy", np.ones((0, 5), np.float32))
+    (tmp_path / "report.json").write_text('{"a"')
+    depth = tmp_path / "depth.npy"
+    for words, said in (
+        ([tmp_path / "empty.npy"], "FRAME must be a depth map"),
+        ([depth, "--out", tmp_path / "no" / "v.webp"], "in an existing folder"),
+        ([depth, "--out", tmp_path / f"{'x' * 300}.webp"], "that can be written"),
+        ([tmp_path, "--photographs", "--out", tmp_path / "v.webp"], "report.json, which is damaged"),
+    ):
+        answer = geodiff("video", *words)
+        assert answer.code == 2 and answer.err.startswith("geodiff: ") and said in answer.err, answer
+
+
+def test_convert_to_a_name_that_is_too_long(geodiff, tmp_path):
+    answer = geodiff("convert", "nothing.ckpt", tmp_path / ("x" * 300))
+    assert answer.code == 2 and "DST must be a folder that can be made" in answer.err
 
 
 def test_other_packages_warn_as_ever():

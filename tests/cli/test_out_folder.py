@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.arguments import OUTPUT_FILES
 from geodiff_plugin.formats import out_folder
 from geodiff_plugin.formats.out_folder import OutFolder
@@ -235,6 +236,43 @@ def test_a_result_that_fits_nowhere(tmp_path, monkeypatch, capsys):
         held.write(full)
     assert "Trying again" in capsys.readouterr().err
     assert names(tmp_path / "out") == ["depth.npy", "report.json"]
+
+
+def test_a_result_is_kept_where_nothing_knows_a_folder(tmp_path, monkeypatch):
+    """Of a full disk there is no folder for temporary files, of a container's user none at home."""
+    tries = []
+
+    def unknown(error):
+        def raises(*_args):
+            raise error
+
+        return raises
+
+    def full(folder):
+        tries.append(folder)
+        if len(tries) < 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return fill(folder)
+
+    monkeypatch.setattr(out_folder.Path, "cwd", unknown(FileNotFoundError("the working folder is gone")))
+    monkeypatch.setattr(out_folder.tempfile, "gettempdir", unknown(FileNotFoundError("none usable")))
+    monkeypatch.setattr(out_folder.Path, "home", unknown(RuntimeError("no home")))
+    monkeypatch.setattr(out_folder, "RETRY_S", 0.0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    with OutFolder(tmp_path / "out") as held:
+        held.write(full)
+    assert len(tries) == 3 and names(tmp_path / "out") == ["depth.npy", "report.json"]
+
+
+def test_a_working_folder_that_was_removed_is_a_sentence(tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with pytest.raises(InputError, match="below a working folder that exists"), OutFolder(Path("out")):
+        pass
+    with pytest.raises(InputError, match="below a working folder that exists"):
+        free_folder(Path("geodiff-out"))
 
 
 def test_a_run_that_names_no_folder_takes_the_next_free_one(tmp_path, monkeypatch):

@@ -18,7 +18,17 @@ from PIL import Image
 
 from geodiff_plugin._checks import InputError
 
-__all__ = ["CALIBRATIONS", "EXAMPLES", "MANY", "damaged", "image_bytes", "junk", "point_files", "survives"]
+__all__ = [
+    "CALIBRATIONS",
+    "EXAMPLES",
+    "MANY",
+    "damaged",
+    "file_names",
+    "image_bytes",
+    "junk",
+    "point_files",
+    "survives",
+]
 
 COMMON: dict[str, Any] = {
     "deadline": None,
@@ -104,6 +114,12 @@ def image_bytes() -> dict[str, bytes]:
             buffer = io.BytesIO()
             Image.fromarray(pixels).save(buffer, format=kind)
             found[kind.lower()] = buffer.getvalue()
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769).update({0xA405: 28, 0x920A: 4.2, 0xA002: 48, 0xA003: 40, 0xA20E: 9000.0})
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="JPEG", exif=exif)
+    found["exif.jpeg"] = buffer.getvalue()
     buffer = io.BytesIO()
     Image.fromarray(pixels[..., 0].astype(np.uint16) * 200).save(buffer, format="PNG")
     return found | {"grey16.png": buffer.getvalue()}
@@ -126,6 +142,14 @@ def point_files() -> dict[str, bytes]:
         ".png": image_bytes()["grey16.png"],
         ".bin": np.random.default_rng(0).uniform(1, 9, (8, 4)).astype("<f4").tobytes(),
     }
+
+
+def file_names() -> st.SearchStrategy[str]:
+    """Names as a file system may have them, and longer ones."""
+    text = st.text(st.characters(blacklist_characters="\0"), min_size=1, max_size=300)
+    return st.one_of(
+        text, st.sampled_from(["x" * 300, "a/" * 2500, "~", "-", "..", "/dev/null", "/dev/zero"])
+    )
 
 
 def _numbers() -> st.SearchStrategy[Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from geodiff_plugin import GeometryGuidance
+from geodiff_plugin.cli.many.pairs import is_many
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
+from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.formats.out_place import check_out
 from geodiff_plugin.guidance.config import GuidanceConfig
 from tests.fuzz.strategies import (
@@ -17,6 +21,7 @@ from tests.fuzz.strategies import (
     EXAMPLES,
     MANY,
     damaged,
+    file_names,
     image_bytes,
     junk,
     point_files,
@@ -81,7 +86,8 @@ def test_images(tmp_path, kind, size):
     @given(data=damaged(IMAGES[kind]))
     def check(data):
         path.write_bytes(data)
-        survives(lambda: read_image(path))
+        if survives(lambda: read_image(path)):
+            survives(lambda: warn_of_other_lens(path, K, "left"))
 
     check()
 
@@ -127,6 +133,19 @@ def test_what_stands_for_an_image(size):
         survives(lambda: as_image_01(value, "right"))
         if isinstance(value, np.ndarray) and value.dtype.kind in "fui":
             survives(lambda: as_image_01(torch.from_numpy(value.astype("f4")).to(dtype), "right"))
+
+    check()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_names_of_files(tmp_path, monkeypatch, size):
+    monkeypatch.chdir(tmp_path)
+    readers = [read_image, read_calibration, read_points, read_matrix, lambda name: is_many(Path(name))]
+
+    @size
+    @given(name=file_names(), reader=st.sampled_from(readers))
+    def check(name, reader):
+        survives(lambda: reader(name))
 
     check()
 

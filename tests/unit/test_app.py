@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import enable_geometry_guidance
-from geodiff_plugin.app import cameras
+from geodiff_plugin.app import cameras, launch
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
 from geodiff_plugin.app.examples import EXAMPLES
 from geodiff_plugin.app.files import write_files
@@ -272,3 +272,12 @@ def test_without_gradio_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "gradio" else found(n, *a))
     with pytest.raises(ValueError, match=r"pip install 'geodiff-plugin\[app\]'"):
         launch_page()
+
+
+def test_a_port_that_another_program_has_is_a_sentence(monkeypatch):
+    def taken(*_args, **_options):
+        raise OSError("Cannot find empty port in range: 8000-8000.")
+
+    monkeypatch.setattr(launch, "launch_page", taken)
+    with pytest.raises(ValueError, match=r"--port must be free to listen on; got 127.0.0.1 and 8000"):
+        launch.run_app(("bundled",), "cpu", "127.0.0.1", 8000, False)

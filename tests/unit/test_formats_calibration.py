@@ -467,6 +467,21 @@ def test_read_matrix_text_and_npy(tmp_path):
         np.testing.assert_array_equal(matrix, expected)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1 0 0 0.12 0 1 0 0 0 0 1 0",
+        "1;0;0;0.12\n0;1;0;0\n0;0;1;0\n",
+        "[[1, 0, 0, 0.12],\n [0, 1, 0, 0],\n [0, 0, 1, 0]]  # of the rig\n",
+        "[[1.0, 0.0, 0.0, 0.12], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0, 0, 0, 1]]",
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_read_matrix_as_people_have_it(tmp_path, text, encoding):
+    (tmp_path / "E.txt").write_text(text, encoding=encoding)
+    np.testing.assert_allclose(read_matrix(tmp_path / "E.txt"), np.eye(4) + 0.12 * np.eye(4, k=3))
+
+
 def test_read_matrix_errors(tmp_path):
     with pytest.raises(FileNotFoundError, match="E must be .* does not exist"):
         read_matrix(tmp_path / "nope", "E")

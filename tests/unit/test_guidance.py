@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -87,6 +89,40 @@ def test_a_principal_point_near_the_border_is_told():
     twice[:2] = 2 * K[:2] + np.array([[0, 0, 0.5], [0, 0, 0.5]])
     with pytest.warns(UserWarning, match="another resolution"):
         GeometryGuidance(RIGHT, twice, E)
+
+
+@pytest.mark.parametrize(
+    ("fx", "fy", "cx", "cy", "said"),
+    [
+        (120, 120, 47.5, 35.5, "an image 1.5 times the size"),
+        (40, 40, 15.5, 11.5, "an image 0.48 times the size"),
+        (60, 600, 31.5, 23.5, "mistyped"),
+        (60, 60, 38, 17, None),  # of a rig with converging axes
+        (60, 40, 31.5, 23.5, None),  # of an image that was stretched
+    ],
+)
+def test_intrinsics_of_another_size_or_mistyped(fx, fy, cx, cy, said):
+    odd = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        GeometryGuidance(RIGHT, odd, E)
+    assert [said in str(warning.message) for warning in caught] == ([] if said is None else [True])
+
+
+def test_an_array_is_no_choice():
+    with pytest.raises(ValueError, match="pose must be one of"):
+        GeometryGuidance(RIGHT, K, E, pose=np.zeros(3))
+
+
+def test_a_focal_length_that_the_exif_contradicts():
+    picture = Image.fromarray(RIGHT)
+    picture.getexif().get_ifd(0x8769)[0xA405] = 32  # 59 px for 64x48
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        GeometryGuidance(picture, K, E)
+    wrong = K * np.array([[1.5, 1.5, 1], [1.5, 1.5, 1], [1, 1, 1]])
+    with pytest.warns(UserWarning, match=r"right, 1.5. times the 59 px of its EXIF"):
+        GeometryGuidance(picture, wrong, E)
 
 
 @pytest.mark.filterwarnings("ignore:K.*near the border")

@@ -25,6 +25,7 @@ GOOD = Signs(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.1
 def test_a_good_run_is_trusted_in_silence():
     judgement = judge(GOOD)
     assert judgement.trusted and not judgement.reasons and not judgement.remarks and judgement.sentence == ""
+    assert judge(replace(GOOD, own_ratio=1.4, view_deg=21.0)).remarks == ()
     assert judge(Signs()).trusted  # nothing is known, as of a search without matches
 
 
@@ -61,7 +62,10 @@ def test_reasons(signs, words):
     [
         ({"baseline_m": 120.0}, "millimetres"),
         ({"baseline_m": 0.00012}, "0.12 mm"),
-        ({"view_deg": 5.0}, "5 degrees"),
+        ({"view_deg": 12.0}, "12 degrees"),
+        ({"view_deg": 125.0}, "125 degrees"),
+        ({"own_ratio": 2.1}, "2.1 times the prior's own metres"),
+        ({"own_ratio": 0.4}, "0.4 times"),
         ({"points_ratio": 1.15, "points": 99}, "1.15 times as far"),
         ({"points": 1}, "Only 1 known depth lie"),
         ({"epipolar_px": 2.4}, "2.4 px beside"),

@@ -51,6 +51,7 @@ def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
     out = guided(pipe, textured_plane)
     assert out.own_scale.shape == (1, 1)
     assert float(out.own_scale) == pytest.approx(2.0, rel=0.015)
+    assert any("2 times the prior's own metres" in sentence for sentence in out.warnings)
     assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.01)
 
 

@@ -60,12 +60,21 @@ def test_a_cube_is_no_map(tmp_path):
         "x,y,z\n0.1, -0.2, 2.0\n0.4, 0.3, 5.5\n",
         "X Y Z intensity\n0.1 -0.2 2.0 .5\n0.4 0.3 5.5 .1\n",
         "# a remark\n0.1;-0.2;2.0\n\n0.4;0.3;5.5 # the last\n",
+        "id,z,y,x\n0,2.0,-0.2,0.1\n1,5.5,0.3,0.4\n",
+        "label;x [m];y [m];z [m]\n".replace(" ", "") + "car;0.1;-0.2;2\ntree;0.4;0.3;5.5\n",
+        '"X_m","Y_m","Z_m"\n"0.1","-0.2","2.0"\n"0.4","0.3","5.5"\n',
+        "two points\n0.1 -0.2 2.0\n0.4 0.3 5.5\n",
         "//X Y Z R G B\r\n0.1\t-0.2\t2.0\t255\t0\t0\r\n0.4\t0.3\t5.5\t0\t0\t9\r\n",
     ],
 )
 def test_text_as_people_have_it(tmp_path, text):
     (tmp_path / "points.csv").write_text(text)
     np.testing.assert_allclose(read_points(tmp_path / "points.csv"), POINTS)
+
+
+def test_text_of_windows_shell(tmp_path):
+    (tmp_path / "points.txt").write_text("0.1 -0.2 2.0\n0.4 0.3 5.5\n", encoding="utf-16")
+    np.testing.assert_allclose(read_points(tmp_path / "points.txt"), POINTS)
 
 
 @pytest.mark.parametrize("columns", [4, 6])

@@ -8,6 +8,7 @@ Paper: none (Marigold V2, arXiv 2609.08084; LoRA, arXiv 2106.09685).
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -129,8 +130,8 @@ def read_prompt(folder: Path) -> Tensor:
 
 
 def _trainables_file(checkpoint: Path) -> Path:
-    file = checkpoint / TRAINABLES if checkpoint.is_dir() else checkpoint
-    if not file.is_file() or file.suffix != ".safetensors":
+    file = checkpoint / TRAINABLES if os.path.isdir(checkpoint) else checkpoint
+    if not os.path.isfile(file) or file.suffix != ".safetensors":
         expected = f"a folder of huawei-bayerlab/marigold-v2-0 with {TRAINABLES}, such as depth/Log-stage2"
         bad_value("CHECKPOINT", expected, checkpoint, "Check the path.")
     return file
@@ -180,7 +181,7 @@ def convert_marigold_v2(
     space, prompt = _space(file, space), read_prompt(_prompt_folder(file, prompts))
     parts = {}
     for component, name in FOLDERS.items():
-        if not (base / name / "config.json").is_file():
+        if not os.path.isfile(base / name / "config.json"):
             bad_value("BASE", f"a folder of Qwen/Qwen-Image-Edit-2509 with {name}/", base, "Check the path.")
         files, trained = weight_files(base / name, "BASE"), Trainables.of(file, component)
         trained.check({key: shape for key, (_, shape, _) in shapes_of(files).items()})

@@ -7,6 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 import importlib
+import os
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
@@ -46,7 +47,7 @@ def read_checkpoint(path: str | Path) -> Mapping[str, Any]:
             that holds no mapping.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         bad_value("SRC", "a checkpoint file or a folder in diffusers' layout", path, "Check the path.")
     content = _unpickle(path)
     if not isinstance(content, Mapping):

@@ -51,7 +51,7 @@ class PairRef:
 
 def is_many(left: Path) -> bool:
     """Whether LEFT names many pairs: a folder, a list, or a video."""
-    return left.is_dir() or left.suffix.lower() in LISTS or is_video(left)
+    return os.path.isdir(left) or left.suffix.lower() in LISTS or is_video(left)
 
 
 def find_pairs(arguments: DepthArguments) -> list[PairRef]:
@@ -61,7 +61,7 @@ def find_pairs(arguments: DepthArguments) -> list[PairRef]:
         OSError, ValueError: a folder or list without pairs, views that have no partner, a line that is none.
     """
     left, right = arguments.left, arguments.right
-    if left.is_dir():
+    if os.path.isdir(left):
         return _of_folders(left, right)
     if is_video(left):
         return _of_videos(left, right)
@@ -84,7 +84,7 @@ def _photographs(folder: Path) -> list[Path]:
 
 
 def _of_folders(left: Path, right: Path | None) -> list[PairRef]:
-    if right is None or not right.is_dir():
+    if right is None or not os.path.isdir(right):
         got = "nothing" if right is None else right
         bad_value("RIGHT", "a folder where LEFT is one", got, "Or let LEFT be an image, or a list of pairs.")
     lefts, rights = _photographs(left), _photographs(right)

@@ -6,6 +6,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 from geodiff_plugin.cli.arguments import DepthArguments
@@ -34,7 +35,7 @@ class RigStore:
     ) -> Rig:
         """As ``read_rig``; KITTI's asks names for the camera's number, and COLMAP has one for every image."""
         views: tuple[Any, ...] = (arguments.left, arguments.right)
-        if not any(path.is_dir() or path.name in COLMAP_FILES for path in arguments.calib):
+        if not any(os.path.isdir(path) or path.name in COLMAP_FILES for path in arguments.calib):
             views = tuple(
                 path.parent if path is not None and NUMBERED not in path.name else path for path in views
             )

@@ -7,6 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 
 __all__ = ["folder_fingerprint"]
@@ -14,7 +15,7 @@ __all__ = ["folder_fingerprint"]
 
 def folder_fingerprint(folder: Path) -> str:
     """16 hexadecimal digits that change with any file of the folder; empty where there is no such folder."""
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         return ""
     digest = hashlib.sha256()
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):

@@ -6,6 +6,7 @@ Paper: S5.1 (UniDepth, RAFT-Stereo, IGEV-Stereo and DUSt3R among the compared me
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,7 @@ def files_method(text: str) -> Method:
     if not (colon and kind in KINDS):
         kind, named = "depth", text
     folder = Path(named)
-    if not named or not folder.is_dir():
+    if not named or not os.path.isdir(folder):
         cure = f"KIND is one of {', '.join(KINDS)}."
         bad_value("methods", "files:DIR or files:KIND:DIR with an existing folder", repr(text), cure)
 

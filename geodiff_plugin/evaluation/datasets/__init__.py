@@ -6,6 +6,7 @@ Paper: S5.1 (data sets of Tables 1 to 3).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -78,7 +79,7 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
         dataset = DATASETS[name]
         given = {key: options[key] for key in dataset.options if options.get(key) is not None}
         refs += dataset.find(root, **given)
-    if not refs and not root.is_dir():
+    if not refs and not os.path.isdir(root):
         bad_value("root", "an existing folder or synthetic:N", str(root))
     return refs
 

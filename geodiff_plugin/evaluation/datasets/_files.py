@@ -6,6 +6,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ def check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...]) -> N
 
 def folders(root: Path, depth: int) -> list[Path]:
     """``root`` and the folders below it down to ``depth`` levels, sorted."""
-    found = [root] if root.is_dir() else []
+    found = [root] if os.path.isdir(root) else []
     level = found
     for _ in range(depth):
         level = [child for parent in level for child in sorted(parent.iterdir()) if child.is_dir()]
