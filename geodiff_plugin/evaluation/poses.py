@@ -45,6 +45,7 @@ class PosesOptions:
         out: folder of records and tables; resumed.
         results: Markdown page to write beside; ``None`` for none.
         quiet: no bar.
+        rendered_size: width and height of the rendered pairs, pixels; ``None`` for the data set's own.
     """
 
     data: Path | None
@@ -56,6 +57,7 @@ class PosesOptions:
     out: Path
     results: Path | None
     quiet: bool
+    rendered_size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -217,7 +219,9 @@ def run_poses(options: PosesOptions) -> Page:
     real = [] if options.data is None else find_pairs(options.data)[: options.limit]
     if options.data is not None and not real:
         bad_value("--data", "a folder with pairs", str(options.data), "See: geodiff eval list.")
-    rendered = find_pairs(f"synthetic-posed:{options.rendered}") if options.rendered else []
+    size = "" if options.rendered_size is None else "{}x{}".format(*options.rendered_size)
+    asked = f"synthetic-posed:{options.rendered}" + (f"@{size}" if size else "")
+    rendered = find_pairs(asked) if options.rendered else []
     if not real and not rendered:
         bad_value("--data", "given, or --rendered above 0", "neither")
     rectified = [ref for ref in real if load(ref).rectified] if any(options.drift) else []
@@ -226,6 +230,7 @@ def run_poses(options: PosesOptions) -> Page:
         for part, refs in ((_real, real), (_rendered, rendered), (_drifted, rectified)):
             tables += part(bench, refs) if refs else []
     words = ["geodiff eval poses", f"--rendered {options.rendered}"]
+    words += [f"--rendered-size {size}"] if size else []
     words += [] if options.data is None else [f"--data {options.data.name}"]
     words += [] if options.limit is None else [f"--limit {options.limit}"]
     words += ["--perturb {:g},{:g}".format(*options.perturb), "--drift {:g},{:g}".format(*options.drift)]

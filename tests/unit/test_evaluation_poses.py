@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from geodiff_plugin.cli.eval.app import eval_app
 from geodiff_plugin.cli.eval.options import pairs_options
 from geodiff_plugin.evaluation import poses
 from geodiff_plugin.evaluation.baselines import Settings, find_method, with_poses
@@ -107,9 +109,11 @@ def record(ref, method: str, error: float | None, warned: bool) -> dict:
 def test_the_page_of_poses(tmp_path, monkeypatch) -> None:
     """Two rendered pairs: estimated, one has no pose and the other is off by half without a word."""
     errors = {"given": 0.1, "refine": 0.06}
+    sizes = []
 
     def run(refs, methods, settings, out, progress):
         found = []
+        sizes.extend({ref.files["size"] for ref in refs} - set(sizes))
         for i, ref in enumerate(refs):
             for method in methods:
                 pose = method.partition("=")[2]
@@ -132,5 +136,15 @@ def test_the_page_of_poses(tmp_path, monkeypatch) -> None:
     assert "| mean of 2 pairs | 0.050 | 0.100 | 0.060 | - |" in text
     assert "| without a result | 0 | 0 | 0 | 1 |" in text
     assert "| off by more than 0.25 in silence | 0 | 0 | 0 | 1 |" in text
+    sized = replace(options, rendered_size=(256, 192), out=tmp_path / "small")
+    run_poses(sized)
+    assert "geodiff eval poses --rendered 2 --rendered-size 256x192 --perturb" in page.read_text()
+    assert sizes == [(384, 512), (192, 256)]
     with pytest.raises(ValueError, match="--data"):
         run_poses(replace(options, rendered=0))
+
+
+@pytest.mark.parametrize("text", ["256", "256x", "0x0", "256x32", "-256x192"])
+def test_a_bad_size_of_rendered_pairs_is_an_error(text: str) -> None:
+    with pytest.raises(ValueError, match="--rendered-size"):
+        CliRunner().invoke(eval_app, ["poses", "--rendered-size", text], catch_exceptions=False)

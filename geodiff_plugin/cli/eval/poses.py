@@ -6,11 +6,13 @@ Paper: none.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.eval import options as o
 
 __all__ = ["add_poses"]
@@ -19,12 +21,36 @@ _SETTINGS = ("space", "seed", "steps", "resolution", "dtype")
 _SHARED = ("limit", "prior", *_SETTINGS, "device", "out", "results", "quiet")
 
 
+#: Smaller images have too few matches to say anything about poses.
+_SMALLEST_PX = 64
+
+
+def _width_and_height(text: str) -> tuple[int, int]:
+    """``WIDTHxHEIGHT`` as typed.
+
+    Raises:
+        ValueError: not two whole numbers of at least 64.
+    """
+    found = re.fullmatch(r"\s*(\d{1,5})\s*x\s*(\d{1,5})\s*", text)
+    width, height = (int(number) for number in found.groups()) if found else (0, 0)
+    if min(width, height) < _SMALLEST_PX:
+        expected = f"WIDTHxHEIGHT in pixels, each at least {_SMALLEST_PX}"
+        bad_value("--rendered-size", expected, repr(text), "256x192 has a quarter of the usual pixels.")
+    return width, height
+
+
 @o.takes(*_SHARED, prior="bundled", out=Path("geodiff-poses"))
 def _poses(
     data: Annotated[
         Path | None, typer.Option("--data", help="Folder of real pairs; none by default.")
     ] = None,
     rendered: Annotated[int, typer.Option(help="Rendered pairs in a general pose.", min=0)] = 60,
+    rendered_size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WIDTHxHEIGHT", help="Size of rendered pairs; smaller is faster. [default: 512x384]"
+        ),
+    ] = None,
     perturb: Annotated[
         str, typer.Option(metavar="DEGREES,SHARE", help="Rendered: largest turn, and shift / baseline.")
     ] = "1.5,0.1",
@@ -45,7 +71,9 @@ def _poses(
     settings = Settings(shared["prior"], **chosen, device=str(pick_device(shared["device"])))
     limit, out, results, quiet = (shared[name] for name in ("limit", "out", "results", "quiet"))
     changes = perturbation(perturb), drift_of(drift)
-    page = run_poses(PosesOptions(data, rendered, *changes, limit, settings, out, results, quiet))
+    size = None if rendered_size is None else _width_and_height(rendered_size)
+    options = PosesOptions(data, rendered, *changes, limit, settings, out, results, quiet, size)
+    page = run_poses(options)
     if not quiet:
         print_page(page)
 
