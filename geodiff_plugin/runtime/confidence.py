@@ -21,7 +21,7 @@ RIGHT_WITHIN = 0.1
 #: 0, from 0 to 3 and above 3, by photometric agreement, by the prior's strength where nothing supports a
 #: depth, by the relative spread of an ensemble (set by hand: members that differ by 10 % halve the odds
 #: twice).
-BY_EVIDENCE = (0.915, 0.72, 0.0, 0.607, 0.443, 0.0, -15.0)
+BY_EVIDENCE = (0.548, 0.805, 0.527, 0.31, 0.223, 0.564, -15.0)
 #: Which sign each of them may have; 0 for any. Agreement can only raise confidence, and a pixel that no right
 #: camera sees has none, so not being in view can never raise it.
 SIGNS = (0, 1, 1, 1, 1, 1, -1)
