@@ -51,7 +51,8 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
     found = Path(path)
-    shown = str(found) if len(str(found)) <= LONGEST_GOT else f"{str(found)[:LONGEST_GOT]}..."
+    shown = " ".join(str(found).split())  # a name may hold line ends
+    shown = shown if len(shown) <= LONGEST_GOT else f"{shown[:LONGEST_GOT]}..."
     if os.path.isdir(found):
         raise FolderError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
     if not os.path.exists(found):  # Path.exists() raises on a name that is too long
