@@ -47,41 +47,43 @@ class Refined:
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What the matches ask of a map on their grid, ``(B, 1, h, w)`` each, and the links of that grid.
+class _Observations:
+    """Matches against a map on their grid, ``(B, 1, h, w)`` each, and the links of that grid.
 
     Attributes:
-        wanted: log factor on inverse depth.
+        residual: log of the factor on the map's inverse depth that a match asks for.
         noise: standard deviation of it, from the match alone.
-        trusted: confidence over the relative variance of a match, 0 without one.
-        right: ``(B, 1)`` share of what is trusted that is expected to be right, by its confidence.
+        weight: confidence over the relative variance of a match, 0 without one.
+        right_share: ``(B, 1)`` share of that weight which is expected to be right, by confidence.
         links: across and down, of a smoothness of 1.
     """
 
-    wanted: Tensor
+    residual: Tensor
     noise: Tensor
-    trusted: Tensor
-    right: Tensor
+    weight: Tensor
+    right_share: Tensor
     links: tuple[Tensor, Tensor]
 
     def system(self, smoothness: Tensor) -> FieldSystem:
         """With the smoothness ``(B, 1, 1, 1)`` of every sample."""
         across, down = self.links
-        return FieldSystem(self.trusted, self.trusted, smoothness * across, smoothness * down)
+        return FieldSystem(self.weight, self.weight, smoothness * across, smoothness * down)
 
 
-def _asked(depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: CorrectionConfig) -> _Asked:
+def _observations(
+    depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: CorrectionConfig
+) -> _Observations:
     size = tuple(target.inverse_depth.shape[-2:])
     guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
     log_depth = F.interpolate(depth_m.float().log(), size, mode="bilinear", align_corners=False)
     known, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
     noise = ((step / known) ** 2 + config.match_noise**2).sqrt()
-    trusted = target.confidence * (config.match_noise / noise) ** 2
-    wanted = torch.where(trusted > 0, known.log() + log_depth, torch.zeros_like(known))
-    right = (trusted * target.confidence.clamp_max(1.0)).flatten(1).sum(1, keepdim=True)
-    right = right / trusted.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
+    weight = target.confidence * (config.match_noise / noise) ** 2
+    residual = torch.where(weight > 0, known.log() + log_depth, torch.zeros_like(known))
+    right = (weight * target.confidence.clamp_max(1.0)).flatten(1).sum(1, keepdim=True)
+    right_share = right / weight.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
     across, down = (_links(guide, log_depth, axis, config) for axis in (-1, -2))
-    return _Asked(wanted, noise, trusted, right, (across, down))
+    return _Observations(residual, noise, weight, right_share, (across, down))
 
 
 def _links(guide: Tensor, log_depth: Tensor, axis: int, config: CorrectionConfig) -> Tensor:
@@ -124,27 +126,27 @@ def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: CorrectionCo
     return 1.0 / (1.0 + residual**2 / (config.outlier_width**2 * (noise**2 + error**2)))
 
 
-def _stiff(asked: _Asked, trusted: Tensor, error: Tensor, config: CorrectionConfig) -> Tensor:
+def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: CorrectionConfig) -> Tensor:
     """The field ``(B, 1, h, w)`` that only says what matches say over wide regions."""
     stiff = torch.full_like(error, config.stiff_smoothness)
-    system, weight = asked.system(stiff), trusted
+    system, weight = observed.system(stiff), trusted
     field: Tensor | None = None
     for _ in range(config.reweightings + 1):
-        own = reweighted(system, weight, asked.wanted, config.stiff_inertia * stiff)
+        own = reweighted(system, weight, observed.residual, config.stiff_inertia * stiff)
         field = solve_field(own, config.solver_steps, field)
-        weight = trusted * _robust(field - asked.wanted, asked.noise, error, config)
+        weight = trusted * _robust(field - observed.residual, observed.noise, error, config)
     assert field is not None  # it was solved for once at least
     return field
 
 
-def _spread(residual: Tensor, asked: _Asked) -> Tensor:
+def _spread(residual: Tensor, observed: _Observations) -> Tensor:
     """``(B, 1, 1, 1)`` robust standard deviation of residuals beyond the noise of their matches.
 
     Matches that are expected to be wrong are taken for those with the largest residuals, and left out.
     """
-    weight = asked.trusted.flatten(1)
-    found = weighted_quantile(residual.abs().flatten(1), weight, SHARE * asked.right) / DEVIATIONS
-    noise = weighted_quantile(asked.noise.flatten(1), weight, 0.5)
+    weight = observed.weight.flatten(1)
+    found = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.right_share) / DEVIATIONS
+    noise = weighted_quantile(observed.noise.flatten(1), weight, 0.5)
     beyond = (found**2 - noise**2 / 4.0).clamp_min(0.0).sqrt() * (weight.sum(1) > 0)
     return beyond.view(-1, 1, 1, 1)
 
@@ -155,7 +157,7 @@ def prior_error(
 ) -> Tensor:
     """How far a prior is wrong, in log depth, as far as its matches can tell.
 
-    Matches are left out in blocks, and foretold from those of the other blocks by the prior's map under a
+    Matches are left out in blocks, and predicted from those of the other blocks by the prior's map under a
     stiff correction: what the map itself is worth between matches, not how well it can be bent to them.
 
     Args:
@@ -165,18 +167,18 @@ def prior_error(
         config: the fit's numbers.
 
     Returns:
-        ``(B, 1, 1, 1)``, the robust standard deviation of what is foretold wrongly, beyond the noise of
+        ``(B, 1, 1, 1)``, the robust standard deviation of what is predicted wrongly, beyond the noise of
         matches; within ``least_error`` and ``most_error``, the latter for a sample without matches.
     """
-    asked = _asked(depth_m, target, left_01, config)
-    height, width = asked.wanted.shape[-2:]
+    observed = _observations(depth_m, target, left_01, config)
+    height, width = observed.residual.shape[-2:]
     side = max(1, round(config.block * max(height, width)))
     rows, columns = (torch.arange(n, device=depth_m.device) // side for n in (height, width))
-    black = ((rows[:, None] + columns[None]) % 2).to(asked.wanted.dtype)
-    first = _bounded(_spread(asked.wanted, asked), config)
-    told = [_stiff(asked, asked.trusted * colour, first, config) for colour in (black, 1.0 - black)]
-    error = _spread(torch.where(black > 0, told[1], told[0]) - asked.wanted, asked)
-    matched = asked.trusted.flatten(1).amax(1).view(-1, 1, 1, 1) > 0
+    black = ((rows[:, None] + columns[None]) % 2).to(observed.residual.dtype)
+    first = _bounded(_spread(observed.residual, observed), config)
+    predicted = [_stiff(observed, observed.weight * colour, first, config) for colour in (black, 1.0 - black)]
+    error = _spread(torch.where(black > 0, predicted[1], predicted[0]) - observed.residual, observed)
+    matched = observed.weight.flatten(1).amax(1).view(-1, 1, 1, 1) > 0
     return torch.where(matched, _bounded(error, config), torch.full_like(error, config.most_error))
 
 
@@ -209,22 +211,22 @@ def refine_depth(
         ``g`` falls at edges of the image and of the given depth. Passes go from a broad ``a`` to the one of
         the prior's error: what no match is near keeps what the broad passes say of its region.
     """
-    asked = _asked(depth_m, target, left_01, config)
-    broad = _stiff(asked, asked.trusted, error, config)
-    trusted = asked.trusted * _robust(broad - asked.wanted, asked.noise, error, config)
-    found, weight = torch.zeros_like(asked.wanted), trusted
+    observed = _observations(depth_m, target, left_01, config)
+    broad = _stiff(observed, observed.weight, error, config)
+    trusted = observed.weight * _robust(broad - observed.residual, observed.noise, error, config)
+    found, weight = torch.zeros_like(observed.residual), trusted
     decided = torch.zeros_like(found)
     levels = _levels(error, config)
     for k, (smoothness, inertia) in enumerate(levels):
-        data = asked.wanted - found
+        data = observed.residual - found
         if k == len(levels) - 1:  # a second right-hand side of ones shows where the correction is decided
             data = torch.cat([data, torch.ones_like(data)], 1)
-        system = asked.system(smoothness)
+        system = observed.system(smoothness)
         part: Tensor | None = None
         for _ in range(config.reweightings):
             part = solve_field(reweighted(system, weight, data, inertia), config.solver_steps, part)
             residual = part[:, :1] - data[:, :1]
-            weight = trusted / (1.0 + (residual / (config.correction_cauchy * asked.noise)) ** 2)
+            weight = trusted / (1.0 + (residual / (config.correction_cauchy * observed.noise)) ** 2)
         assert part is not None  # reweightings >= 1
         found, decided = found + part[:, :1], part[:, 1:]
     size = tuple(depth_m.shape[-2:])
