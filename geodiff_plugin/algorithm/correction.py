@@ -1,6 +1,7 @@
 """Bring a metric map to its matches by an edge-aware fit, as stiff as the prior is good.
 
-Hop: metric depth, ``MatchTarget``, left image, error of the prior -> smooth log correction -> metric depth.
+Data flow: metric depth, ``MatchTarget``, left image, error of the prior -> smooth log correction -> metric
+depth.
 Paper: none; its output is the decoded latent, which the decoder's grid and its blur limit.
 """
 

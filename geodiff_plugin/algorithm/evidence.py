@@ -1,6 +1,7 @@
 """Prepare one left image and its further views for guidance: common grid, cost volume, matches, points.
 
-Hop: images, K's, T's, points as the user gave them -> ``Evidence`` (once a call) -> ``Views`` of a chunk.
+Data flow: images, K's, T's, points as the user gave them -> ``Evidence`` (once a call) -> ``Views`` of a
+chunk.
 Paper: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
 """
 

@@ -1,6 +1,6 @@
 """Gradients through networks of half precision: a power of two per sample in, the same power out.
 
-Hop: gradient of the loss in a decoded map, float32 -> gradient in the latent, float32.
+Data flow: gradient of the loss in a decoded map, float32 -> gradient in the latent, float32.
 Paper: the gradients of Algorithm 1 and Eq. 15 (eq:final_score).
 
 The loss is a mean, so a gradient in one pixel may be below float16's least number (a mean over a whole image)

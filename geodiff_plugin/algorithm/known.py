@@ -1,6 +1,7 @@
 """What is known beside the prior: matches and points, and how far an estimate lets them be believed.
 
-Hop: metric depth of an estimate -> the matches that it believes, and points -> that depth brought to them.
+Data flow: metric depth of an estimate -> the matches that it believes, and points -> that depth brought to
+them.
 Paper: none; its only evidence is the photometric error of Eq. 14 (eq:geo-loss).
 
 One object answers for both grids: that of the losses, at every step, and that of the sweep, for the output.

@@ -1,6 +1,6 @@
 """From a relative map to one loss per sample.
 
-Hop: ``x (B, 1, h, w)`` -> metric depth on the loss grid -> warp -> terms -> ``loss (B,)``.
+Data flow: ``x (B, 1, h, w)`` -> metric depth on the loss grid -> warp -> terms -> ``loss (B,)``.
 Paper: Eq. 14 (eq:geo-loss) with Eq. 16 and 17.
 """
 

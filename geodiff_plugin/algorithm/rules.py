@@ -1,6 +1,6 @@
 """Gradient rules: how far one gradient moves a tensor.
 
-Hop: gradient and its state -> a step to be added.
+Data flow: gradient and its state -> a step to be added.
 Paper: Algorithm 1 (plain step); S5.1 (learning rate 1e-2, no optimiser); ``adam-norm`` is Marigold-DC's.
 """
 

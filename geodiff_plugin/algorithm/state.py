@@ -1,6 +1,6 @@
 """The state that Algorithm 1 carries along: scale, shift, g_s, what is known, optimisers, history.
 
-Hop: relative map of a step -> metric state, and the map that the views would have.
+Data flow: relative map of a step -> metric state, and the map that the views would have.
 Paper: Algorithm 1, S7.3.
 """
 

@@ -1,6 +1,6 @@
 """Algorithm 1's body on one screen: what happens to one estimate of the clean latent.
 
-Hop: ``z_t, eps, z0_hat`` of one denoising step -> what to add to the guided latent.
+Data flow: ``z_t, eps, z0_hat`` of one denoising step -> what to add to the guided latent.
 Paper: Algorithm 1, with Eq. 16 and 17.
 """
 

@@ -1,6 +1,6 @@
 """What inexact poses cost, what refining them gains, what estimated ones are worth: ``geodiff eval poses``.
 
-Hop: real and rendered pairs, poses given, perturbed, withheld, rigs drifted -> records -> one page.
+Data flow: real and rendered pairs, poses given, perturbed, withheld, rigs drifted -> records -> one page.
 Paper: none; it takes exact poses for granted (S3.3).
 """
 

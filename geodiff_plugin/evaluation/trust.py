@@ -1,6 +1,6 @@
 """How often a wrong calibration is caught, and how often a right one is doubted: ``geodiff eval trust``.
 
-Hop: pairs, right and made wrong -> guided calls -> signs -> judgements -> one table.
+Data flow: pairs, right and made wrong -> guided calls -> signs -> judgements -> one table.
 Paper: none.
 
 The folder keeps the signs of every call, so that other thresholds need no new calls.

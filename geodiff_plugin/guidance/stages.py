@@ -1,6 +1,6 @@
 """The stages of the configuration that a guided step goes through: terms, reflections, correction, updates.
 
-Hop: named values -> a stage, checked.
+Data flow: named values -> a stage, checked.
 Paper: Algorithm 1, S5.1, S9 name some numbers; a leaf that the paper has no number or no place for says so.
 """
 

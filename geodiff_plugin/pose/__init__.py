@@ -1,5 +1,5 @@
 """Where the cameras stand: given poses checked and refined, missing ones estimated.
 
-Hop: images, K and poses as given (or none) -> matches of points -> poses that fit them.
+Data flow: images, K and poses as given (or none) -> matches of points -> poses that fit them.
 Paper: none; it takes exact poses for granted (S3.3).
 """

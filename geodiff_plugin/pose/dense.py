@@ -1,6 +1,6 @@
 """Matches all over the image: optical flow between the left view and the right one warped by a first depth.
 
-Hop: left image, right image, first depth, pose -> one checked match a cell of the left image.
+Data flow: left image, right image, first depth, pose -> one checked match a cell of the left image.
 Paper: none; Kroeger et al. 2016 (DIS flow).
 """
 

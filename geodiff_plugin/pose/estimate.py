@@ -1,6 +1,7 @@
 """The pose of a second photograph from matches alone, up to the length of its baseline.
 
-Hop: tracks + K's -> rotation and direction of the baseline, or a sentence on why there is none to be had.
+Data flow: tracks + K's -> rotation and direction of the baseline, or a sentence on why there is none to be
+had.
 Paper: none. Robust five-point estimation by PoseLib (Larsson).
 """
 

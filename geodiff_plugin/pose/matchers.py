@@ -1,6 +1,6 @@
 """Matches of distinct points by name: SIFT, or a learned matcher whose weights the user has.
 
-Hop: name -> matcher: grey views -> tracks.
+Data flow: name -> matcher: grey views -> tracks.
 Paper: none; Lindenberger et al. 2023 (LightGlue), Sarlin et al. 2020 (SuperGlue), by transformers.
 """
 

@@ -1,6 +1,6 @@
 """The usual mistakes of a given pose, recognised by which of them would make it fit.
 
-Hop: matches + cameras as given -> the name of a mistake, or nothing.
+Data flow: matches + cameras as given -> the name of a mistake, or nothing.
 Paper: none. A mistake is named, never repaired: what the user meant only the user knows.
 
 What epipolar lines do not show is not told here: the unit of a translation, and for a rectified pair K.

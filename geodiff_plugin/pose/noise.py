@@ -1,6 +1,6 @@
 """How many independent observations a set of matches is worth.
 
-Hop: matches + poses that fit them -> share of the matches that count, in (0, 1].
+Data flow: matches + poses that fit them -> share of the matches that count, in (0, 1].
 Paper: none.
 
 Residuals of neighbours are alike where a pose cannot explain them (a rolling shutter, lens distortion, K),

@@ -1,6 +1,6 @@
 """Poses as given -> poses that fit the images, or the same ones bit for bit where they fit already.
 
-Hop: images, K's, T's -> matches -> residual; above 0.45 px refined poses and straightened images.
+Data flow: images, K's, T's -> matches -> residual; above 0.45 px refined poses and straightened images.
 Paper: none; it takes exact poses for granted (S3.3).
 """
 

@@ -1,6 +1,6 @@
 """What unit an estimated baseline is in: the one thing that photographs do not show.
 
-Hop: tracks, poses up to scale, one known length -> factor to metres and how sure it is.
+Data flow: tracks, poses up to scale, one known length -> factor to metres and how sure it is.
 Paper: none.
 """
 

@@ -1,6 +1,6 @@
 """Small robust least squares over the poses of right cameras, under a prior that holds the given ones.
 
-Hop: tracks + poses as given -> poses that fit the tracks.
+Data flow: tracks + poses as given -> poses that fit the tracks.
 Paper: none. Minimises, over 6 degrees of freedom a right view and one inverse depth a track,
     trust * sum log(1 + (residual / scale)^2)
     + mean |moved|^2 / sd^2 + |turned|^2 / 3 deg^2 + |shifted|^2 / (.3 |t|)^2 + (change of log |t|)^2 / .05^2.

@@ -1,6 +1,6 @@
 """Matches of distinct points: SIFT as RootSIFT, mutual nearest neighbours, ratio test.
 
-Hop: grey left image, grey right images -> pixels of points in both.
+Data flow: grey left image, grey right images -> pixels of points in both.
 Paper: none; Arandjelovic and Zisserman 2012 for the root, Lowe 2004 for the ratio.
 """
 

@@ -1,6 +1,6 @@
 """What a pose cannot explain, taken out of the right image: a smooth displacement across the epipolar lines.
 
-Hop: refined pose, matches, right image -> the right image whose matches lie on their lines.
+Data flow: refined pose, matches, right image -> the right image whose matches lie on their lines.
 Paper: none. Rolling shutter, lens distortion and errors of K leave such residuals.
 
 Only after the pose: a residual that depends on depth is a pose's, and bending the image for it ruins it.

@@ -1,6 +1,6 @@
 """Points of the left image with their places in the right ones, and how poses explain them.
 
-Hop: left pixels, right pixels, K's, poses -> inverse depths -> residuals in pixels.
+Data flow: left pixels, right pixels, K's, poses -> inverse depths -> residuals in pixels.
 Paper: S7.2 Eq. 25 (eq:forward-warp_supp), with inverse depth in place of depth.
 """
 

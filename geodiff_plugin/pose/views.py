@@ -1,6 +1,7 @@
 """The matches of a left image with its right ones, on a grid of their own.
 
-Hop: images, K's, T's as given -> grey images of at most 832 px -> sparse tracks; dense ones by a first depth.
+Data flow: images, K's, T's as given -> grey images of at most 832 px -> sparse tracks; dense ones by a
+first depth.
 Paper: none.
 """
 

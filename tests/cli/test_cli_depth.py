@@ -88,7 +88,7 @@ def test_knobs_reach_the_guidance(geodiff, command, pair_files):
 def test_info_lists_the_knobs(geodiff):
     answer = geodiff("info", "--knobs")
     assert (
-        answer.code == 0 and "  smoothness = 50" in answer.out and "  weights = photometric 1" in answer.out
+        answer.code == 0 and "  smoothness = 40" in answer.out and "  weights = photometric 1" in answer.out
     )
 
 

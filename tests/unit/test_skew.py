@@ -52,6 +52,7 @@ HAND_ON = {
     "runtime.both_views.guide_both_views",
     "runtime.reprojection.reprojection",  # to warp_right_to_left
     "cli.lenses.pinhole",  # to OpenCV
+    "formats.exif.warn_of_other_lens",  # the focal length alone
     "app.measure.read_pixel",
     "formats.distortion.undistorted",
     "formats.pointcloud.make_cloud",

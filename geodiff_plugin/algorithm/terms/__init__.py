@@ -1,6 +1,6 @@
 """Guidance terms, one a file: functions from an ``Estimate`` to one number per sample.
 
-Hop: ``Estimate`` -> ``{name: (B,)}``.
+Data flow: ``Estimate`` -> ``{name: (B,)}``.
 Paper: Eq. 14 (eq:geo-loss), Eq. 17; the terms beyond the paper say so.
 
 A new term is a new file and one line in ``TERMS``. ``options`` are the keywords that it takes: leaves of

@@ -1,6 +1,6 @@
 """Keep the guided latent near what the network said at this step.
 
-Hop: ``Estimate`` -> ``(B,)``.
+Data flow: ``Estimate`` -> ``(B,)``.
 Paper: none; the proximal form of one diffusion posterior step (S3.2 takes a single gradient step instead).
 """
 

@@ -1,6 +1,6 @@
 """What a guidance term sees: one estimate and everything it can be compared with.
 
-Hop: objective -> ``Estimate`` -> one number per sample.
+Data flow: objective -> ``Estimate`` -> one number per sample.
 Paper: S4.2, Eq. 14 (eq:geo-loss) and Eq. 17 (no label).
 """
 

@@ -1,6 +1,6 @@
 """Take the difference in exposure and colour between two cameras out of a photometric comparison.
 
-Hop: right image seen from the left, left image, visible mask -> right image in the left one's exposure.
+Data flow: right image seen from the left, left image, visible mask -> right image in the left one's exposure.
 Paper: none; it names illumination as a limit (Limitations), and its loss takes both images as they are.
 """
 

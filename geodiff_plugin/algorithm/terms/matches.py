@@ -1,6 +1,6 @@
 """Distance of the estimate from the matches that the two views give by themselves.
 
-Hop: ``Estimate`` -> ``(B,)``.
+Data flow: ``Estimate`` -> ``(B,)``.
 Paper: none (it guides by Eq. 14 alone); what it buys is in docs/reference/results.md.
 """
 

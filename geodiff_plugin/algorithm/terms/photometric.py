@@ -1,6 +1,6 @@
 """Photometric error between the left image and the right ones seen through the estimate.
 
-Hop: ``Estimate`` -> ``(B,)`` in [0, 1].
+Data flow: ``Estimate`` -> ``(B,)`` in [0, 1].
 Paper: S4.2, Eq. 14 (eq:geo-loss).
 """
 

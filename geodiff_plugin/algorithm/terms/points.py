@@ -1,6 +1,6 @@
 """Distance of the estimate from depths that the user knows: lidar, structure from motion, a tape measure.
 
-Hop: ``Estimate`` -> ``(B,)``.
+Data flow: ``Estimate`` -> ``(B,)``.
 Paper: none; ``l1l2`` is the loss of Marigold-DC (Viola et al. 2024, Eq. 4).
 """
 

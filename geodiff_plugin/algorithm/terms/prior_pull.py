@@ -1,6 +1,6 @@
 """Keep scale and shift near where they should be.
 
-Hop: ``Estimate`` -> ``(B,)``.
+Data flow: ``Estimate`` -> ``(B,)``.
 Paper: S4.2 (Regularization), Eq. 17 (no label).
 """
 
