@@ -192,9 +192,9 @@ def _measure(
         with torch.no_grad():
             guidance.prepare(native_images(left.image_01, device))  # the same for every way, so not timed
         generator = torch.Generator("cpu").manual_seed(options.seed)
-        options = {"num_inference_steps": steps, "generator": generator, "output_latent": True}
+        call = {"num_inference_steps": steps, "generator": generator, "output_latent": True}
         started = clock()
-        before = pipe(left.image_01, guidance=guidance, **options)  # its result is numpy: nothing is pending
+        before = pipe(left.image_01, guidance=guidance, **call)  # its result is numpy: nothing is pending
         seconds += clock() - started
         depth_m, truth = before.prediction[0, ..., 0], left.depth_m[0].numpy()
         valid = left.valid[0].numpy()

@@ -101,7 +101,8 @@ def _cameras():
 
 def test_convention_tuple_is_left_and_right_and_poses_are_camera_to_world():
     cameras, poses = _cameras()
-    (rig,) = GeometryGuidance(np.zeros((*(2 * side for side in SIZE), 3), np.float32), cameras, poses).rigs
+    right = np.zeros((*(2 * side for side in SIZE), 3), np.float32)
+    (rig,) = GeometryGuidance(right, cameras, poses, cropped=True).rigs
     assert rig.K_right[0, 2] - rig.K_left[0, 2] == pytest.approx(3.0)
     assert rig.E[0, 3] == pytest.approx(B, abs=1e-6) and rig.T_right_from_left[0, 3] == pytest.approx(
         -B, abs=1e-6

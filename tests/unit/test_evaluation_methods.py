@@ -34,7 +34,7 @@ SHAPE = (32, 48)
 
 def make_sample(rectified=True) -> StereoSample:
     image = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
-    K = np.array([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
+    K = np.array([[30.0, 0, 23.5], [0, 30.0, 15.5], [0, 0, 1]])
     K_right = K.copy()
     K_right[0, 2] += 2  # doffs
     E = np.eye(4)
