@@ -182,7 +182,7 @@ def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[st
     shown = show_values(lower[2], parts.residual, title, "RdBu_r", -most, most)
     value_bar(figure, shown, lower[2], "planes of the sweep", "both")
     shown = show_values(lower[3], parts.believed, "matches, how far believed", "viridis", 0.0, 1.0)
-    value_bar(figure, shown, lower[3], "confidence after rejection and gate")
+    value_bar(figure, shown, lower[3], "after rejection and gate")
     shown = show_values(lower[4], parts.confidence, "confidence of refined", "viridis", 0.0, 1.0)
     value_bar(figure, shown, lower[4], "probability of an error < 10 %")
     shown = show_error(lower[5], parts.final_m, sample.depth_m, sample.valid, "error of refined")
@@ -191,9 +191,9 @@ def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[st
 
 def _curves(figure: Any, history: Sequence[StepReport], values: dict[str, list[float]]) -> None:
     """One small plot a term, each with its own unit, from 0."""
-    figure.suptitle("terms of the loss, before the updates of each step", fontsize=9)
+    figure.suptitle("terms of the loss in every guided step", fontsize=9)
     repeated = len({report.step for report in history}) < len(history)
-    count = range(1, len(history) + 1)
+    count = [i + 1 if repeated else report.step + 1 for i, report in enumerate(history)]
     for index, (axes, (name, own)) in enumerate(
         zip(figure.subplots(1, len(values), squeeze=False)[0], values.items(), strict=True)
     ):
