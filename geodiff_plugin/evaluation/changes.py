@@ -47,7 +47,7 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("without correction in the loop", "guided:correct=false"),
         ("with a correction in every step", "guided:corrections=1000"),
         ("with gradient updates", "guided:inner_steps=5"),
-        ("with gradient updates at every step", "guided:updates_from=0"),
+        ("with gradient updates at every step", "guided:inner_steps=5+updates_from=0"),
         ("without refinement of the result", "guided:refine=false"),
         ("without rejection of reflections", "guided:reject_reflections=false"),
         ("without a gate on matches", "guided:gate=1000000"),
