@@ -25,6 +25,7 @@ __all__ = [
     "check_number",
     "check_range",
     "check_size",
+    "quoted",
     "refuse",
 ]
 
@@ -56,10 +57,14 @@ class ForbiddenFileError(InputFileError, PermissionError):
     """The same for what may not be read."""
 
 
+def quoted(got: object) -> str:
+    """What was given, on one line of a message and not too long for it."""
+    text = " ".join(str(got).split())  # arrays are printed over several lines; file names may hold line ends
+    return text if len(text) <= LONGEST_GOT else f"{text[:LONGEST_GOT]}..."
+
+
 def _sentence(name: str, expected: str, got: object, cure: str) -> str:
-    got = " ".join(str(got).split())  # arrays are printed over several lines
-    got = got if len(got) <= LONGEST_GOT else f"{got[:LONGEST_GOT]}..."
-    return f"{name} must be {expected}; got {got}." + (f" {cure}" if cure else "")
+    return f"{name} must be {expected}; got {quoted(got)}." + (f" {cure}" if cure else "")
 
 
 def bad_value(name: str, expected: str, got: object, cure: str = "") -> NoReturn:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.solver import FieldSystem, reweighted, solve_field
 from geodiff_plugin.algorithm.terms.base import MatchTarget
+from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.guidance.config import CorrectionConfig
 from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.scale.points import weighted_quantile
@@ -74,9 +75,9 @@ class _Observations:
 def _observations(
     depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: CorrectionConfig
 ) -> _Observations:
-    size = tuple(target.inverse_depth.shape[-2:])
+    size = image_size(target.inverse_depth)
     guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
-    log_depth = F.interpolate(depth_m.float().log(), size, mode="bilinear", align_corners=False)
+    log_depth = _log_depth(depth_m, size)
     known, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
     noise = ((step / known) ** 2 + config.match_noise**2).sqrt()
     weight = target.confidence * (config.match_noise / noise) ** 2
@@ -85,6 +86,10 @@ def _observations(
     right_share = right / weight.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
     across, down = (_links(guide, log_depth, axis, config) for axis in (-1, -2))
     return _Observations(residual, noise, weight, right_share, (across, down))
+
+
+def _log_depth(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
+    return F.interpolate(depth_m.float().log(), size, mode="bilinear", align_corners=False)
 
 
 def _links(guide: Tensor, log_depth: Tensor, axis: int, config: CorrectionConfig) -> Tensor:
@@ -110,8 +115,8 @@ def off_edges(
             edges elsewhere than the scene.
         config: the fit's numbers.
     """
-    size = tuple(target.confidence.shape[-2:])
-    log_depth = F.interpolate(depth_m.float().log(), size, mode="bilinear", align_corners=False)
+    size = image_size(target.confidence)
+    log_depth = _log_depth(depth_m, size)
     reach = max(1, round(config.edge_reach * max(size)))
     span = _highest(log_depth, reach) + _highest(-log_depth, reach)
     width = config.edge_step * (error / config.edge_error).clamp_min(1.0) ** 3

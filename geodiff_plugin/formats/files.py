@@ -13,12 +13,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from geodiff_plugin._checks import (
-    LONGEST_GOT,
     FolderError,
     ForbiddenFileError,
     MissingFileError,
     bad_type,
     bad_value,
+    quoted,
 )
 
 __all__ = ["check_file", "read_text", "refuse_decimal_commas"]
@@ -51,8 +51,7 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
     found = Path(path)
-    shown = " ".join(str(found).split())  # a name may hold line ends
-    shown = shown if len(shown) <= LONGEST_GOT else f"{shown[:LONGEST_GOT]}..."
+    shown = quoted(found)
     if os.path.isdir(found):
         raise FolderError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
     if not os.path.exists(found):  # Path.exists() raises on a name that is too long
@@ -83,8 +82,6 @@ def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file"
         bad_value(name, what, f"{found} of {size} bytes", cure)
     raw = found.read_bytes()
     wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # as Windows' shell and Notepad write
-    if b"\0" in raw and not wide:
-        bad_value(name, what, f"{found}, which holds binary data", cure)
     text = raw.decode("utf-16" if wide else "utf-8-sig", errors="replace")
     if "\0" in text:
         bad_value(name, what, f"{found}, which holds binary data", cure)

@@ -18,6 +18,7 @@ from diffusers.pipelines.marigold import MarigoldDepthOutput
 from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from torch import Tensor
 
+from geodiff_plugin.algorithm.known import Known
 from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.mistakes import INVERSE
@@ -56,7 +57,8 @@ def assemble_output(
     """
     count, size = lefts_01.shape[0], image_size(lefts_01)
     depth_m = _as_maps(stock.prediction).to(lefts_01.device)  # (N, 1, H, W) or the processing grid
-    depth_m, support = _refined(run, depth_m, lefts_01)
+    known_of = [run.known(i) for i in range(count)]
+    depth_m, support = _refined(run, known_of, depth_m, lefts_01)
     uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
     if uncertainty is not None and support is not None:
         uncertainty = _uncertainty(run, depth_m, lefts_01, call)
@@ -71,8 +73,7 @@ def assemble_output(
     ]
     visible = torch.cat([where for where, _ in seen]) if seen else None
     error = torch.cat([difference for _, difference in seen]) if seen else None
-    errors = [run.known(i).error for i in range(count)]
-    measured = [error for error in errors if error is not None]
+    measured = [own.error for own in known_of if own.error is not None]
     prior_error = torch.cat(measured) if len(measured) == count else None  # (N, 1, 1, 1)
     confidence = None
     if support is not None:
@@ -202,12 +203,14 @@ def _as_maps(values: Any) -> Tensor:
     return torch.from_numpy(values).permute(0, 3, 1, 2).float()
 
 
-def _refined(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> tuple[Tensor, Tensor | None]:
+def _refined(
+    run: GuidedRun, known_of: Sequence[Known], depth_m: Tensor, lefts_01: Tensor
+) -> tuple[Tensor, Tensor | None]:
     """The depth of every image brought to what is known, and how far that decided it."""
     if not run.config.correction.refine:
         return depth_m, None
-    pairs = enumerate(zip(depth_m.split(1), lefts_01.split(1), strict=True))
-    refined = [one for i, (depth, left) in pairs if (one := run.known(i).bring(depth, left)) is not None]
+    images = zip(known_of, depth_m.split(1), lefts_01.split(1), strict=True)
+    refined = [one for own, depth, left in images if (one := own.bring(depth, left)) is not None]
     if len(refined) < len(depth_m):
         return depth_m, None
     return torch.cat([r.depth_m for r in refined]), torch.cat([r.support for r in refined])

@@ -7,8 +7,8 @@ Paper: none.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -19,6 +19,7 @@ from geodiff_plugin.development.benchmarks.matching import (
     Pair,
     data_pairs,
     disparities_of,
+    least_seconds,
     sgbm_call,
     textured_pair,
 )
@@ -31,7 +32,7 @@ from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 __all__ = ["calls_of", "main"]
 
 
-def calls_of(pair: Pair, pipe: object, knobs: str = "") -> dict[str, Callable[[], object]]:
+def calls_of(pair: Pair, pipe: Any, knobs: str = "") -> dict[str, Callable[[], object]]:
     """The calls that are compared, by name; each does all of its work every time that it is called.
 
     Args:
@@ -50,20 +51,6 @@ def calls_of(pair: Pair, pipe: object, knobs: str = "") -> dict[str, Callable[[]
     calls = {"plain": lambda: pipe(left[None], **arguments), "guided": guided}
     sgbm = sgbm_call(pair, disparities_of(build_cost_volume(left, [pair[1]], K), left.shape[-1]))
     return calls if sgbm is None else calls | {"SGBM": sgbm}
-
-
-def _seconds(work: Callable[[], object], device: str, repeats: int) -> tuple[float, float]:
-    """Least CPU and least wall-clock seconds of several calls, after one to warm up."""
-    taken = []
-    for turn in range(repeats + 1):
-        cpu, wall = time.process_time(), time.perf_counter()
-        work()
-        if device.startswith("cuda"):
-            torch.cuda.synchronize()
-        if turn:
-            taken.append((time.process_time() - cpu, time.perf_counter() - wall))
-    cpus, walls = zip(*taken, strict=True)
-    return min(cpus), min(walls)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -89,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for threads in options.threads:
             torch.set_num_threads(threads)
             seconds = {
-                key: _seconds(work, options.device, options.repeats)
+                key: least_seconds(work, options.device, options.repeats)
                 for key, work in calls_of(pair, pipe, options.knobs).items()
             }
             shown = [

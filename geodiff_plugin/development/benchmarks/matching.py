@@ -28,7 +28,16 @@ from geodiff_plugin.matching.mirrored import mirrored_pose_preferred
 from geodiff_plugin.matching.sweep import CostVolume, median_shift, sweep_planes
 from geodiff_plugin.types import CameraView
 
-__all__ = ["Pair", "data_pairs", "disparities_of", "main", "measure", "sgbm_call", "textured_pair"]
+__all__ = [
+    "Pair",
+    "data_pairs",
+    "disparities_of",
+    "least_seconds",
+    "main",
+    "measure",
+    "sgbm_call",
+    "textured_pair",
+]
 
 Pair = tuple[torch.Tensor, CameraView, torch.Tensor]
 """Left image ``(3, H, W)`` in [0, 1], right view and ``K_left``."""
@@ -81,19 +90,18 @@ def data_pairs(root: str, device: str = "cpu") -> Iterator[tuple[str, Pair]]:
         )
 
 
-def _least_seconds(work: Callable[[], object], device: str, repeats: int) -> float:
-    """CPU seconds of a piece of work, or seconds on a GPU: the least of several, after one to warm up."""
-    on_gpu = device.startswith("cuda")
-    clock = time.perf_counter if on_gpu else time.process_time
-    seconds = math.inf
+def least_seconds(work: Callable[[], object], device: str, repeats: int) -> tuple[float, float]:
+    """Least CPU seconds and least seconds of a clock of several runs, after one to warm up."""
+    cpu = clock = math.inf
     for turn in range(repeats + 1):
-        start = clock()
+        cpu_start, start = time.process_time(), time.perf_counter()
         work()
-        if on_gpu:
+        if device.startswith("cuda"):
             torch.cuda.synchronize()
         if turn:
-            seconds = min(seconds, clock() - start)
-    return seconds
+            cpu = min(cpu, time.process_time() - cpu_start)
+            clock = min(clock, time.perf_counter() - start)
+    return cpu, clock
 
 
 def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str, float], CostVolume]:
@@ -126,7 +134,8 @@ def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str
         "swapped?": lambda: mirrored_pose_preferred(left, [right], K, matches),
         "evidence": evidence,
     }
-    return {name: _least_seconds(work, device, repeats) for name, work in stages.items()}, volume
+    kind = 1 if device.startswith("cuda") else 0  # a GPU's work takes no CPU seconds
+    return {name: least_seconds(work, device, repeats)[kind] for name, work in stages.items()}, volume
 
 
 def disparities_of(volume: CostVolume, width: int) -> int:
@@ -189,7 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seconds, volume = measure(pair, options.device, options.repeats)
         disparities = options.disparities or disparities_of(volume, pair[0].shape[-1])
         peer = sgbm_call(pair, disparities)
-        sgbm = None if peer is None else _least_seconds(peer, "cpu", options.repeats)
+        sgbm = None if peer is None else least_seconds(peer, "cpu", options.repeats)[0]
         if table is None:
             title = f"seconds on {options.device}, threads: {options.threads}"
             table = Table("pair", "size", "planes", *seconds, "SGBM", "evidence / SGBM", title=title)
