@@ -23,9 +23,9 @@ __all__ = ["StepContext", "corrected_rounds", "guided_step"]
 def corrected_rounds(config: GuidanceConfig, count: int) -> set[int]:
     """Which rounds of a schedule correct the estimate; a round without updates either decodes nothing.
 
-    Early estimates are vague, and what the network makes of an early correction is corrected again later. So
-    corrections are spread over the second half of the active rounds, the last of them among them, and reach
-    further back only where they are more than fit there.
+    Early estimates are vague, and later corrections replace what earlier ones did. So the last active round
+    is corrected, and the others are spread over the second half of the active rounds, or over more of them if
+    they do not fit there.
 
     Args:
         config: says which rounds are active, and how many of them correct.

@@ -144,9 +144,9 @@ class CorrectionConfig(Checked):
         2,
         1,
         10_000,
-        "steps (or rounds of a prior with fewer steps) that are corrected, at most: spread over the second "
-        "half of the schedule, the last among them, and further back if they are more; a step with neither "
-        "correction nor updates is the prior's own, and is not decoded",
+        "the most steps (or rounds of a prior with fewer steps) that are corrected: the last, and the others "
+        "spread over the second half of the schedule, or over more of it if they do not fit there; a step "
+        "with neither correction nor updates is left to the prior, and is not decoded",
         paper="-",
     )
     correction_scale: float = number(
@@ -241,9 +241,15 @@ class CorrectionConfig(Checked):
     )
     depth_edge: float = number(0.1, TINY, 1e6, "the same in log depth", paper="-")
     edge_reach: float = number(
-        0.006, TINY, 1, "matches this near to an edge of the map count for less, in image sides", paper="-"
+        0.006,
+        TINY,
+        1,
+        "matches this close to a depth edge of the map have less weight; a share of the longer side",
+        paper="-",
     )
-    edge_step: float = number(0.3, TINY, 1e6, "step in log depth beside which they count for half", paper="-")
+    edge_step: float = number(
+        0.3, TINY, 1e6, "step in log depth beside which that weight is halved", paper="-"
+    )
     edge_error: float = number(
         0.11,
         TINY,
