@@ -21,7 +21,7 @@ from geodiff_plugin.pose.tracks import Tracks, merge_tracks, residuals_px
 from geodiff_plugin.pose.views import FirstDepth, dense_tracks, grey_views, sparse_tracks
 from geodiff_plugin.types import CameraView, PoseReport
 
-__all__ = ["FITS_PX", "WARNS_PX", "RefinedViews", "polished", "refine_views", "untouched"]
+__all__ = ["FITS_PX", "WARNS_PX", "RefinedViews", "polished", "refine_views", "settle_poses", "untouched"]
 
 #: A pose whose matches lie nearer than this to their epipolar lines, in the median, is left as it is.
 FITS_PX = 0.45
@@ -29,12 +29,16 @@ FITS_PX = 0.45
 WARNS_PX = 1.0
 #: Fewer matches than this say nothing about a pose.
 FEWEST = 40
-# What a refined pose may move the points by, along their lines as well: this share of the residual that it
-# explains, for every time that this is as large as what it leaves. Where a pose explains nearly all, it was
-# the pose that was wrong; where it leaves much, the cameras have other faults, which a free pose would hide.
-_MOVED_BY, _MOVED_SHARE, _FLOOR_PX = 0.15, (0.4, 4.0), 0.05
-# Robust scale of the last fit, pixels of the right view.
-_SCALE_PX = 0.7
+# What a refined pose may move the points by, along their lines as well: a share of the residual that it
+# explains, which grows with the square of how many times that is what it leaves. Where a pose explains nearly
+# all, it was the pose that was wrong; where it leaves much, the cameras have other faults, which a free pose
+# would hide.
+_MOVED_BY, _MOVED_SHARE, _FLOOR_PX = 0.05, (0.4, 10.0), 0.05
+# Robust scale of a fit whose noise is not known yet, pixels of the right view; then so many times what the
+# fit leaves, and what residuals that are independent count: half, for they are not quite.
+_SCALE_PX, _SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 0.7, 2.0, 0.1, 0.5
+# What hardly holds a pose: the length of its baseline stays, all else is free.
+_FREE_PX = 1e3
 # A refinement must gain this share of the residual, and may turn and shift a camera so far.
 _LEAST_GAIN, _MOST_TURN_DEG, _MOST_SHIFT = 0.1, 8.0, 0.8
 
@@ -96,7 +100,7 @@ def refine_views(
         return RefinedViews(tuple(rights), found.changed(warnings=units))
     depth_m = _on_grid(first_depth(_applied(rights, near)), views.left.shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
-    Ts = _settled(tracks, given, near)
+    Ts = settle_poses(tracks, given, near)
     before, after = _medians(tracks, given), _medians(tracks, Ts)
     warnings = _warnings(before, after) + units
     found = found.changed(
@@ -138,7 +142,12 @@ def polished(
     """
     views, Ts = grey_views(left_01, rights, K_left), _poses(rights)
     tracks = merge_tracks([sparse, dense_tracks(views, _on_grid(first_depth(rights), views.left.shape), Ts)])
-    free = Prior(np.full(len(Ts), 1e3), longer_share=0.02 if len(Ts) == 1 else 0.2)
+    free = Prior(
+        np.full(len(Ts), _FREE_PX),
+        turned_rad=np.radians(3.0),
+        shifted_share=0.3,
+        longer_share=0.02 if len(Ts) == 1 else 0.2,
+    )
     solved = solve_poses(tracks, Ts, free, scale_px=_SCALE_PX)
     length = np.linalg.norm(Ts[0, :3, 3]) / np.linalg.norm(solved[0, :3, 3])
     solved[:, :3, 3] *= length
@@ -168,15 +177,33 @@ def _nearby(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.ndarray
     return Ts
 
 
-def _settled(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Poses that fit all matches, held as firmly as the given ones turn out to deserve."""
-    left = np.maximum(_medians(tracks, near), _FLOOR_PX)
+def settle_poses(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Poses that fit all matches, held as firmly as the given ones turn out to deserve.
+
+    Args:
+        tracks: all matches of V right views.
+        given: ``(V, 4, 4)``, ``T_right_from_left`` as given.
+        near: likewise, poses that fit roughly.
+
+    Returns:
+        ``(V, 4, 4)``: free where they explain nearly all of the residual, near the given ones where the
+        cameras have faults that no pose explains.
+    """
+    free = Prior(np.full(len(given), _FREE_PX), longer_share=0.02)
+    fitted = solve_poses(tracks, given, free, start=near, scale_px=_SCALE_PX)
+    left = np.maximum(_medians(tracks, fitted), _FLOOR_PX)
     explained = np.sqrt(np.clip(_medians(tracks, given) ** 2 - left**2, 0.0, None))
-    share = np.clip(_MOVED_BY * explained / left, *_MOVED_SHARE)
+    share = np.clip(_MOVED_BY * (explained / left) ** 2, *_MOVED_SHARE)
     moved = np.maximum(np.nan_to_num(share * explained), _FLOOR_PX)
-    shares = [independent_share(tracks.view(v), T) for v, T in enumerate(near) if tracks.seen[v].any()]
-    trust = float(np.mean(shares))
-    return solve_poses(tracks, given, Prior(moved), start=near, scale_px=_SCALE_PX, trust=trust)
+    shares = [independent_share(tracks.view(v), T) for v, T in enumerate(fitted) if tracks.seen[v].any()]
+    return solve_poses(
+        tracks,
+        given,
+        Prior(moved),
+        start=fitted,
+        scale_px=max(_SCALE_BY * float(np.nanmean(left)), _LEAST_SCALE_PX),
+        trust=_COUNTS * float(np.mean(shares)),
+    )
 
 
 def _on_grid(depth_m: Tensor, size: tuple[int, int]) -> Tensor:

@@ -3,7 +3,8 @@
 Data flow: tracks + poses as given -> poses that fit the tracks.
 Paper: none. Minimises, over 6 degrees of freedom a right view and one inverse depth a track,
     trust * sum log(1 + (residual / scale)^2)
-    + mean |moved|^2 / sd^2 + |turned|^2 / 3 deg^2 + |shifted|^2 / (.3 |t|)^2 + (change of log |t|)^2 / .05^2.
+    + mean |moved|^2 / sd^2 + |turned|^2 / 1.5 deg^2 + |shifted|^2 / (.1 |t|)^2
+    + (change of log |t|)^2 / .05^2.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ class Prior:
     """
 
     moved_px: np.ndarray
-    turned_rad: float = np.radians(3.0)
-    shifted_share: float = 0.3
+    turned_rad: float = np.radians(1.5)
+    shifted_share: float = 0.1
     longer_share: float = 0.05
 
 

@@ -13,6 +13,7 @@ from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.posing import coarse_depth, pose_views
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.noise import independent_share
+from geodiff_plugin.pose.refine import settle_poses
 from geodiff_plugin.pose.solve import Prior, solve_poses
 from geodiff_plugin.pose.straighten import fit_displacement, straightened
 from geodiff_plugin.pose.tracks import Tracks, merge_tracks, residuals_px, solve_inverse_depth
@@ -99,6 +100,34 @@ def test_what_the_views_cannot_tell_stays_as_given() -> None:
     assert np.linalg.norm(np.linalg.inv(solved[0])[:3, 3]) == pytest.approx(
         np.linalg.norm(longer[:3, 3]), rel=0.01
     )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_shift_that_makes_up_for_a_turn_comes_back(seed: int) -> None:
+    """A tracker's error: matches lie near their lines and still far from where they should be along them."""
+    tracks, Ts, depth_m = make_tracks([TRUE], seed=seed)
+    wrong = TRUE @ pose((0.1, 0.5, 0.0), (-np.radians(0.5) * 4.0 * 0.8, np.radians(0.1) * 4.0 * 0.8, 0))
+    wrong[:3, 3] *= np.linalg.norm(TRUE[:3, 3]) / np.linalg.norm(wrong[:3, 3])
+    given = np.linalg.inv(wrong)[None]
+    assert np.median(residuals_px(tracks, given)) < 1.0
+    solved = settle_poses(tracks, given, given)
+    errors = [np.median(np.abs(solve_inverse_depth(tracks, T) * depth_m - 1)) for T in (given, solved)]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_cameras_with_faults_of_their_own_do_not_move_a_pose() -> None:
+    """What a lens or a shutter does looks like a turn in part; a free pose takes it, and spoils all depths."""
+    clean, Ts, depth_m = make_tracks([TRUE], outliers=0.0)
+    x, y = (clean.right_px / np.array([511.0, 383.0]) - 0.5).transpose(2, 0, 1)
+    bent = clean.right_px + np.stack([0 * x, 8.0 * x * y + np.sin(9.0 * y)], axis=-1)
+    tracks = Tracks(clean.left_px, bent, clean.seen, clean.K_left, clean.K_rights)
+    free = solve_poses(tracks, Ts, Prior(np.array([1e3])))
+    errors = [
+        np.median(np.abs(solve_inverse_depth(tracks, T) * depth_m - 1))
+        for T in (free, settle_poses(tracks, Ts, Ts))
+    ]
+    assert errors[1] < 0.01
+    assert errors[0] > 0.1
 
 
 def test_several_views_are_solved_together() -> None:
