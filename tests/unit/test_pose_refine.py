@@ -116,7 +116,7 @@ def test_a_shift_that_makes_up_for_a_turn_comes_back(seed: int) -> None:
 
 
 def test_cameras_with_faults_of_their_own_do_not_move_a_pose() -> None:
-    """What a lens or a shutter does looks like a turn in part; a free pose takes it, and spoils all depths."""
+    """What a lens or a shutter does looks like a turn in part; a free pose takes it and spoils depth."""
     clean, Ts, depth_m = make_tracks([TRUE], outliers=0.0)
     x, y = (clean.right_px / np.array([511.0, 383.0]) - 0.5).transpose(2, 0, 1)
     bent = clean.right_px + np.stack([0 * x, 8.0 * x * y + np.sin(9.0 * y)], axis=-1)
