@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geodiff_plugin.geometry.cameras import is_rectified
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.noise import independent_share
 from geodiff_plugin.pose.solve import Prior, solve_poses
@@ -32,8 +33,10 @@ FEWEST = 40
 # What a refined pose may move the points by, along their lines as well: a share of the residual that it
 # explains, which grows with the square of how many times that is what it leaves. Where a pose explains nearly
 # all, it was the pose that was wrong; where it leaves much, the cameras have other faults, which a free pose
-# would hide.
+# would hide. The cameras of a rectified pair are bolted together: they turn by tenths of a degree, hardly
+# shift, and a pan that fits the rows better is more often a fault of the lenses; the least share is theirs.
 _MOVED_BY, _MOVED_SHARE, _FLOOR_PX = 0.05, (0.4, 10.0), 0.05
+_RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = np.radians(0.3), 0.01
 # Robust scale of a fit whose noise is not known yet, pixels of the right view; then so many times what the
 # fit leaves, and what residuals that are independent count: half, for they are not quite.
 _SCALE_PX, _SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 0.7, 2.0, 0.1, 0.5
@@ -187,19 +190,20 @@ def settle_poses(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> np.ndar
 
     Returns:
         ``(V, 4, 4)``: free where they explain nearly all of the residual, near the given ones where the
-        cameras have faults that no pose explains.
+        cameras have faults that no pose explains, and where they are those of a rectified rig.
     """
     free = Prior(np.full(len(given), _FREE_PX), longer_share=0.02)
     fitted = solve_poses(tracks, given, free, start=near, scale_px=_SCALE_PX)
     left = np.maximum(_medians(tracks, fitted), _FLOOR_PX)
     explained = np.sqrt(np.clip(_medians(tracks, given) ** 2 - left**2, 0.0, None))
-    share = np.clip(_MOVED_BY * (explained / left) ** 2, *_MOVED_SHARE)
+    rig = bool(is_rectified(*(torch.as_tensor(m) for m in (tracks.K_left, tracks.K_rights, given))).all())
+    share = np.clip(0.0 if rig else _MOVED_BY * (explained / left) ** 2, *_MOVED_SHARE)
     moved = np.maximum(np.nan_to_num(share * explained), _FLOOR_PX)
     shares = [independent_share(tracks.view(v), T) for v, T in enumerate(fitted) if tracks.seen[v].any()]
     return solve_poses(
         tracks,
         given,
-        Prior(moved),
+        Prior(moved, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE) if rig else Prior(moved),
         start=fitted,
         scale_px=max(_SCALE_BY * float(np.nanmean(left)), _LEAST_SCALE_PX),
         trust=_COUNTS * float(np.mean(shares)),
