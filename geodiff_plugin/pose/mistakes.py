@@ -52,15 +52,18 @@ _FACTORS = {
 }
 #: Within so many pixels of its line, and in front of both cameras, a match speaks for a pose.
 NEAR_PX = 4.0
+# Within so many it speaks for a mistake rather than for an inexact pose: where the cameras are near each
+# other, many a wrong K leaves all matches within some pixels of their lines.
+_FINE_PX = 1.5
 _CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def _share(tracks: Tracks, T: np.ndarray) -> float:
+def _share(tracks: Tracks, T: np.ndarray, near_px: float = NEAR_PX) -> float:
     """How many of the matches speak for a pose, [0, 1]."""
     inverse_depth = solve_inverse_depth(tracks, T[None])
     ahead = (inverse_depth > 0) & ((tracks.rays @ T[2, :3] + inverse_depth * T[2, 3]) > 0)
-    return float((ahead & (residuals_px(tracks, T[None])[0] < NEAR_PX)).mean())
+    return float((ahead & (residuals_px(tracks, T[None])[0] < near_px)).mean())
 
 
 def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
@@ -105,10 +108,10 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
         near: ``(4, 4)``, the pose near it that fits best: where only that fits, the pose is inexact.
     """
     given = _share(tracks, T)
-    found = [(_share(own, pose), sentence) for sentence, own, pose in _candidates(tracks, T)]
-    best, sentence = max(found, key=lambda entry: entry[0])
-    least = max(_AT_LEAST, _CLEARLY * given, _NEARLY * _share(tracks, near))
-    return sentence if best > least else None
+    sentence, own, pose = max(_candidates(tracks, T), key=lambda entry: _share(*entry[1:]))
+    coarse = _share(own, pose) > max(_AT_LEAST, _CLEARLY * given, _NEARLY * _share(tracks, near))
+    fine = _share(own, pose, _FINE_PX) > _NEARLY * _share(tracks, near, _FINE_PX)
+    return sentence if coarse and fine else None
 
 
 def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:

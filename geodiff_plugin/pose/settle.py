@@ -1,0 +1,123 @@
+"""How firmly poses as given hold against matches that want others.
+
+Data flow: tracks, poses as given, poses nearby -> poses that are used, and those that fit best.
+Paper: none; it takes exact poses for granted (S3.3).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from geodiff_plugin.geometry.cameras import is_rectified
+from geodiff_plugin.pose.noise import independent_share
+from geodiff_plugin.pose.solve import Prior, solve_poses
+from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
+
+__all__ = [
+    "FEWEST",
+    "FREE_PX",
+    "SCALE_PX",
+    "is_rig",
+    "median_residuals",
+    "nearby_poses",
+    "settle_poses",
+    "undecided",
+]
+
+#: Fewer matches than this say nothing about a pose.
+FEWEST = 40
+# What a refined pose may move the points by, along their lines as well: a share of the residual that it
+# explains, which grows with the square of how many times that is what it leaves. Where a pose explains nearly
+# all, it was the pose that was wrong; where it leaves much, the cameras have other faults, which a free pose
+# would hide. The cameras of a rectified pair are bolted together: they turn by tenths of a degree, hardly
+# shift, and a pan that fits the rows better is more often a fault of the lenses; the least share is theirs.
+_MOVED_BY, _MOVED_SHARE, _FLOOR_PX = 0.05, (0.4, 10.0), 0.05
+_RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = np.radians(0.3), 0.01
+# Robust scale of a fit whose noise is not known yet, pixels of the right view; then so many times what the
+# fit leaves, and what residuals that are independent count: half, for they are not quite.
+SCALE_PX, _SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 0.7, 2.0, 0.1, 0.5
+# What hardly holds a pose: the length of its baseline stays, all else is free.
+FREE_PX = 1e3
+# Poses that explain the matches as well and lead to depths that differ by this much, in log, are told of.
+_MOST_SPREAD = 0.2
+
+
+def median_residuals(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
+    """Median distance from the epipolar lines, ``(V,)`` pixels, NaN for a view with too few matches."""
+    own = [tracks.view(v) for v in range(len(Ts))]
+    return np.array(
+        [
+            np.median(residuals_px(one, T[None])) if len(one) >= FEWEST else np.nan
+            for one, T in zip(own, Ts, strict=True)
+        ]
+    )
+
+
+def is_rig(tracks: Tracks, given: np.ndarray) -> bool:
+    """Whether all poses as given ``(V, 4, 4)`` are those of a rectified rig."""
+    cameras = (torch.as_tensor(m) for m in (tracks.K_left, tracks.K_rights, given))
+    return bool(is_rectified(*cameras).all())
+
+
+def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Poses that fit the sparse matches, found from far away first: then no match is an outlier yet.
+
+    Args:
+        sparse: matches of V right views, outliers among them.
+        given: ``(V, 4, 4)``, ``T_right_from_left`` as given.
+        before: ``(V,)`` pixels, ``median_residuals`` of those.
+
+    Returns:
+        ``(V, 4, 4)``.
+    """
+    before = np.nan_to_num(before, nan=1.0)
+    prior, Ts = Prior(1.5 * before + _FLOOR_PX), given
+    for scale in (max(float(before.max()), 1.0), 1.0):
+        Ts = solve_poses(sparse, given, prior, start=Ts, scale_px=scale)
+    return Ts
+
+
+def settle_poses(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses that fit all matches, held as firmly as the given ones turn out to deserve.
+
+    Args:
+        tracks: all matches of V right views.
+        given: ``(V, 4, 4)``, ``T_right_from_left`` as given.
+        near: likewise, poses that fit roughly.
+
+    Returns:
+        ``(V, 4, 4)``: free where they explain nearly all of the residual, near the given ones where the
+        cameras have faults that no pose explains, and where they are those of a rectified rig. And
+        ``(V, 4, 4)``: those that fit best, but for the lengths of the baselines.
+    """
+    free = Prior(np.full(len(given), FREE_PX), longer_share=0.02)
+    fitted = solve_poses(tracks, given, free, start=near, scale_px=SCALE_PX)
+    left = np.maximum(median_residuals(tracks, fitted), _FLOOR_PX)
+    explained = np.sqrt(np.clip(median_residuals(tracks, given) ** 2 - left**2, 0.0, None))
+    rig = is_rig(tracks, given)
+    share = np.clip(0.0 if rig else _MOVED_BY * (explained / left) ** 2, *_MOVED_SHARE)
+    moved = np.maximum(np.nan_to_num(share * explained), _FLOOR_PX)
+    shares = [independent_share(tracks.view(v), T) for v, T in enumerate(fitted) if tracks.seen[v].any()]
+    settled = solve_poses(
+        tracks,
+        given,
+        Prior(moved, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE) if rig else Prior(moved),
+        start=fitted,
+        scale_px=max(_SCALE_BY * float(np.nanmean(left)), _LEAST_SCALE_PX),
+        trust=_COUNTS * float(np.mean(shares)),
+    )
+    return settled, fitted
+
+
+def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ...]:
+    """A sentence where the matches leave the pose, and with it the depth, open."""
+    used, other = (solve_inverse_depth(tracks, poses) for poses in (Ts, free))
+    ahead = (used > 0) & (other > 0)
+    spread = float(np.median(np.abs(np.log(used[ahead] / other[ahead])))) if ahead.any() else 0.0
+    if spread < _MOST_SPREAD:
+        return ()
+    return (
+        f"The matches do not settle the pose: another one fits them as well, and its depths differ by "
+        f"{100 * np.expm1(spread):.0f} % in the median. Give a more exact pose, or views from further apart.",
+    )
