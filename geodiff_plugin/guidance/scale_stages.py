@@ -176,7 +176,9 @@ class FitConfig(Checked):
     min_sure: int = integer(50, 1, 1 << 32, "sure matches that make a basin or a quantile", paper="-")
     fit_iterations: int = integer(12, 0, 1000, "reweighted Gauss-Newton steps on near and far", paper="-")
     fit_samples: int = integer(20_000, 16, 1 << 32, "matches that the fit looks at", paper="-")
-    fit_noise: float = number(0.5, 0, 1e3, "standard deviation of a match in the fit, planes", paper="-")
+    fit_noise: float = number(
+        0.5, 0, 1e3, "standard deviation of a match of confidence .96 in the fit, planes", paper="-"
+    )
     fit_floor: float = number(
         4e-3, TINY, 1, "and at least this, in log depth, for what a map leaves over", paper="-"
     )

@@ -29,6 +29,10 @@ __all__ = [
     "weighted_quantile",
 ]
 
+# What a match leaves to doubt, ``1 - confidence``, tells its variance as well: on pairs with truth the error
+# of matches, in planes, grows with its root. At the first ``fit_noise`` holds; it falls to a share of it.
+_REFERENCE_DOUBT, _LEAST_DOUBT = 0.04, 0.16
+
 
 def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
     """Metres, ``()`` each, of the nearest and the farthest known point."""
@@ -122,8 +126,10 @@ def refine_to_matches(
     at = at[:: max(1, len(at) // config.fit_samples)]
     inverse = matches.inverse_depth.flatten()[at].clamp_min(1e-9)
     # A match at infinity constrains nothing, and a wrong one would push far without end.
-    trusted = matches.confidence.flatten()[at] * (inverse > matches.plane_step)
-    noise = (config.fit_noise * matches.plane_step / inverse) ** 2
+    confidence = matches.confidence.flatten()[at]
+    trusted = confidence * (inverse > matches.plane_step)
+    doubt = ((1.0 - confidence) / _REFERENCE_DOUBT).clamp_min(_LEAST_DOUBT)
+    noise = doubt * (config.fit_noise * matches.plane_step / inverse) ** 2
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
     form = SPACES[space]
     start = _ends(form, near_m, far_m)
