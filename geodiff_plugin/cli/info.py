@@ -11,6 +11,8 @@ from pathlib import Path
 import torch
 from huggingface_hub import CacheNotFound, scan_cache_dir
 
+from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.cli.checks import SPACES
 from geodiff_plugin.cli.estimate import loading_bars
 from geodiff_plugin.cli.terminal import print_lines
 from geodiff_plugin.priors import BUNDLED_FOLDER, PRIORS, FoundPrior, find_adapter, find_prior
@@ -90,8 +92,13 @@ def run_info(prior: str | None, space: str | None = None) -> None:
         space: what it is affine in, where its folder does not tell.
 
     Raises:
-        ValueError: that prior does not exist, is not cached, is refused or of no known kind.
+        ValueError: that prior does not exist, is not cached, is refused or of no known kind; no such space, or
+            a space without a prior.
     """
+    if space is not None:
+        check_choice(space, "--space", SPACES)
+        if prior is None:
+            bad_value("--space", "given with --prior, the prior that it describes", repr(space))
     described = []
     if prior is not None:
         with loading_bars(prior):

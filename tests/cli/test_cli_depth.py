@@ -240,6 +240,8 @@ def test_info(geodiff, prior, monkeypatch, tmp_path):
         assert word in answer.out
     missing = geodiff("info", "--prior", tmp_path / "nothing")
     assert missing.code == 2 and len(missing.err.splitlines()) == 1
+    assert "--space must be one of" in geodiff("info", "--prior", prior, "--space", "banana").err
+    assert "--space must be given with --prior" in geodiff("info", "--space", "depth").err
 
 
 def test_demo(geodiff, prior, pair_files, monkeypatch):
