@@ -92,8 +92,8 @@ def run_info(prior: str | None, space: str | None = None) -> None:
         space: what it is affine in, where its folder does not tell.
 
     Raises:
-        ValueError: that prior does not exist, is not cached, is refused or of no known kind; no such space, or
-            a space without a prior.
+        ValueError: that prior does not exist, is not cached, is refused or of no known kind; no such space,
+            or a space without a prior.
     """
     if space is not None:
         check_choice(space, "--space", SPACES)
