@@ -40,7 +40,7 @@ SCALE_PX, _SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 0.7, 2.0, 0.1, 0.5
 # What hardly holds a pose: the length of its baseline stays, all else is free.
 FREE_PX = 1e3
 # Poses that explain the matches as well and lead to depths that differ by this much, in log, are told of.
-_MOST_SPREAD = 0.2
+_MOST_SPREAD = 0.13
 
 
 def median_residuals(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
