@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.solver import FieldSystem, reweighted, solve_field
+from geodiff_plugin.algorithm.solver import solve_robust
 from geodiff_plugin.algorithm.terms.base import MatchTarget
 from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.guidance.config import CorrectionConfig
@@ -66,11 +66,6 @@ class _Observations:
     right_share: Tensor
     links: tuple[Tensor, Tensor]
 
-    def system(self, smoothness: Tensor) -> FieldSystem:
-        """With the smoothness ``(B, 1, 1, 1)`` of every sample."""
-        across, down = self.links
-        return FieldSystem(self.weight, self.weight, smoothness * across, smoothness * down)
-
 
 def _observations(
     depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: CorrectionConfig
@@ -98,6 +93,11 @@ def _links(guide: Tensor, log_depth: Tensor, axis: int, config: CorrectionConfig
     step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / config.image_edge
     jump = log_depth.diff(dim=axis).abs() / config.depth_edge
     return scale**2 * torch.exp(-scale * (step + jump)).clamp_min(config.least_link)
+
+
+def _times(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Tensor]:
+    """Links of the smoothness ``(B, 1, 1, 1)`` of every sample."""
+    return smoothness * links[0], smoothness * links[1]
 
 
 @torch.no_grad()
@@ -135,14 +135,20 @@ def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: CorrectionCo
 def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: CorrectionConfig) -> Tensor:
     """The field ``(B, 1, h, w)`` that only says what matches say over wide regions."""
     stiff = torch.full_like(error, config.stiff_smoothness)
-    system, weight = observed.system(stiff), trusted
-    field: Tensor | None = None
-    for _ in range(config.reweightings + 1):
-        own = reweighted(system, weight, observed.residual, config.stiff_inertia * stiff)
-        field = solve_field(own, config.solver_steps, field)
-        weight = trusted * _robust(field - observed.residual, observed.noise, error, config)
-    assert field is not None  # it was solved for once at least
-    return field
+
+    def robust(left_over: Tensor) -> Tensor:
+        return trusted * _robust(left_over, observed.noise, error, config)
+
+    rounds, inertia = config.reweightings + 1, config.stiff_inertia * stiff
+    return solve_robust(
+        _times(observed.links, stiff),
+        observed.residual,
+        inertia,
+        trusted,
+        robust,
+        rounds,
+        config.solver_steps,
+    )[0]
 
 
 def _spread(residual: Tensor, observed: _Observations) -> Tensor:
@@ -220,20 +226,21 @@ def refine_depth(
     observed = _observations(depth_m, target, left_01, config)
     broad = _stiff(observed, observed.weight, error, config)
     trusted = observed.weight * _robust(broad - observed.residual, observed.noise, error, config)
-    found, weight = torch.zeros_like(observed.residual), trusted
+
+    def robust(left_over: Tensor) -> Tensor:
+        return trusted / (1.0 + (left_over / (config.correction_cauchy * observed.noise)) ** 2)
+
+    found, weights = torch.zeros_like(observed.residual), trusted
     decided = torch.zeros_like(found)
     levels = _levels(error, config)
     for k, (smoothness, inertia) in enumerate(levels):
         data = observed.residual - found
         if k == len(levels) - 1:  # a second right-hand side of ones shows where the correction is decided
             data = torch.cat([data, torch.ones_like(data)], 1)
-        system = observed.system(smoothness)
-        part: Tensor | None = None
-        for _ in range(config.reweightings):
-            part = solve_field(reweighted(system, weight, data, inertia), config.solver_steps, part)
-            residual = part[:, :1] - data[:, :1]
-            weight = trusted / (1.0 + (residual / (config.correction_cauchy * observed.noise)) ** 2)
-        assert part is not None  # reweightings >= 1
+        links = _times(observed.links, smoothness)
+        part, weights = solve_robust(
+            links, data, inertia, weights, robust, config.reweightings, config.solver_steps
+        )
         found, decided = found + part[:, :1], part[:, 1:]
     size = tuple(depth_m.shape[-2:])
     change, support = (

@@ -7,13 +7,14 @@ Bornemann and Deuflhard 1996).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["FieldSystem", "reweighted", "solve_field"]
+__all__ = ["FieldSystem", "solve_field", "solve_robust"]
 
 #: The shorter side, in pixels, of the coarsest grid, and its conjugate-gradient steps: near enough to exact.
 COARSEST_SIDE, COARSEST_STEPS = 24, 80
@@ -112,6 +113,32 @@ def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:
     return x
 
 
-def reweighted(system: FieldSystem, weight: Tensor, data: Tensor, screen: Tensor) -> FieldSystem:
-    """The same links with other weights on the data, ``(B, 1, H, W)``, and a pull towards 0 of ``screen``."""
-    return replace(system, weight=weight + screen, pull=weight * data)
+def solve_robust(
+    links: tuple[Tensor, Tensor],
+    data: Tensor,
+    inertia: Tensor,
+    weights: Tensor,
+    robust: Callable[[Tensor], Tensor],
+    rounds: int,
+    steps: int,
+) -> tuple[Tensor, Tensor]:
+    """The field of iteratively reweighted least squares.
+
+    Args:
+        links: across and down, as in ``FieldSystem``.
+        data: ``(B, C, H, W)`` what each pixel asks for.
+        inertia: ``(B, 1, 1, 1)``, a pull of every pixel towards 0.
+        weights: ``(B, 1, H, W)`` >= 0 of the data in the first round.
+        robust: the weights of the next round, from what the field of the first channel leaves of its data.
+        rounds: >= 1.
+        steps: as for ``solve_field``.
+
+    Returns:
+        ``(B, C, H, W)``, and the weights of another round.
+    """
+    field: Tensor | None = None
+    for _ in range(rounds):
+        field = solve_field(FieldSystem(weights + inertia, weights * data, *links), steps, field)
+        weights = robust(field[:, :1] - data[:, :1])
+    assert field is not None  # rounds >= 1
+    return field, weights

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.solver import FieldSystem, reweighted, solve_field
+from geodiff_plugin.algorithm.solver import FieldSystem, solve_field, solve_robust
 
 
 def _system(height: int, width: int, link: float, seed: int = 0) -> FieldSystem:
@@ -42,8 +42,21 @@ def test_a_coarser_system_has_the_same_total():
     torch.testing.assert_close(coarse.pull.sum(), system.pull.sum())
 
 
-def test_other_weights_keep_the_links():
-    system = _system(8, 8, 1.0)
-    other = reweighted(system, torch.ones(1, 1, 8, 8), torch.full((1, 1, 8, 8), 3.0), torch.tensor(0.5))
-    assert other.across is system.across and float(other.weight.mean()) == 1.5
-    torch.testing.assert_close(solve_field(other, 30), torch.full((1, 1, 8, 8), 2.0), atol=1e-4, rtol=0)
+def test_an_outlier_is_weighted_down_round_by_round():
+    """Two thirds ask for 2, one for 20; a constant field ends where most of them are."""
+    data = torch.full((1, 2, 9, 9), 2.0)
+    data[..., ::3] = 20.0
+    links = torch.full((1, 1, 9, 8), 1e4), torch.full((1, 1, 8, 9), 1e4)
+    ones, free = torch.ones(1, 1, 9, 9), torch.zeros(1, 1, 1, 1)
+    plain, _ = solve_robust(links, data, free, ones, lambda left_over: ones, 1, 60)
+    robust, weights = solve_robust(links, data, free, ones, lambda off: 1.0 / (1.0 + off**2), 8, 60)
+    torch.testing.assert_close(plain, torch.full_like(data, 8.0), atol=1e-2, rtol=0)
+    torch.testing.assert_close(robust, torch.full_like(data, 2.0), atol=0.1, rtol=0)
+    assert float(weights[..., ::3].max()) < 0.01 < 0.9 < float(weights[..., 1::3].min())
+
+
+def test_inertia_pulls_to_nothing():
+    links = torch.ones(1, 1, 8, 7), torch.ones(1, 1, 7, 8)
+    ones, half = torch.ones(1, 1, 8, 8), torch.full((1, 1, 1, 1), 0.5)
+    field, _ = solve_robust(links, 3.0 * ones, half, ones, lambda left_over: ones, 1, 30)
+    torch.testing.assert_close(field, 2.0 * ones, atol=1e-4, rtol=0)
