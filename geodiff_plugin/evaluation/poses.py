@@ -89,6 +89,13 @@ def _silent(column: Column) -> int:
     )
 
 
+def _mean(values: Sequence[float | None]) -> str:
+    """The mean of those that have a result, with their number where some have none."""
+    found = [value for value in values if value is not None]
+    mean = cell(mean_with_interval(found).value) if found else "-"
+    return mean if len(found) in (0, len(values)) else f"{mean} of {len(found)}"
+
+
 def poses_table(title: str, columns: Sequence[Column], note: str) -> Table:
     """AbsRel of the same pairs with their poses given in several ways, and what was said.
 
@@ -99,8 +106,8 @@ def poses_table(title: str, columns: Sequence[Column], note: str) -> Table:
         note: below the heading.
 
     Returns:
-        A row a pair, then the means of all, of rectified and of posed pairs, then how many have no result
-        and how many are off by more than ``BY_A_FACTOR`` without a warning.
+        A row a pair, then the means of all, of rectified and of posed pairs (of those with a result), then
+        how many have none, and how many are off by more than ``BY_A_FACTOR`` without a warning.
     """
     first = columns[0].records
     rows = [
@@ -116,8 +123,7 @@ def poses_table(title: str, columns: Sequence[Column], note: str) -> Table:
     for kind, belongs in groups.items():
         own = [i for i, record in enumerate(first) if belongs(record)]
         values = [[headline(column.records[i]) for i in own] for column in columns]
-        means = [None if None in each else mean_with_interval(each).value for each in values]
-        rows.append((f"mean of {count_of_pairs(len(own), kind)}", *(cell(mean) for mean in means)))
+        rows.append((f"mean of {count_of_pairs(len(own), kind)}", *(_mean(each) for each in values)))
     missing = [sum(headline(record) is None for record in column.records) for column in columns]
     rows.append(("without a result", *(str(count) for count in missing)))
     off = f"off by more than {BY_A_FACTOR:g} in silence"

@@ -133,7 +133,7 @@ def test_the_page_of_poses(tmp_path, monkeypatch) -> None:
     assert text == (tmp_path / "out" / "poses.md").read_text()
     assert "geodiff eval poses --rendered 2 --perturb 1.5,0.1 --drift 0.3,1.5" in text
     assert "| pair | true, given | perturbed, given | perturbed, refined | estimated |" in text
-    assert "| mean of 2 pairs | 0.050 | 0.100 | 0.060 | - |" in text
+    assert "| mean of 2 pairs | 0.050 | 0.100 | 0.060 | 0.500 of 1 |" in text
     assert "| without a result | 0 | 0 | 0 | 1 |" in text
     assert "| off by more than 0.25 in silence | 0 | 0 | 0 | 1 |" in text
     sized = replace(options, rendered_size=(256, 192), out=tmp_path / "small")
