@@ -34,13 +34,19 @@ class WithinCores:
     """Context manager: torch has at most ``available_cores()`` threads inside, afterwards what it had.
 
     A lower number holds as it is, and so does one that is set inside. Once left, it may be entered again.
+
+    Args:
+        among: parts of a program that work at the same time and share the cores, >= 1.
     """
 
     _found: int | None = None
     _capped = 0
 
+    def __init__(self, among: int = 1) -> None:
+        self._among = among
+
     def __enter__(self) -> None:
-        threads, cores = torch.get_num_threads(), available_cores()
+        threads, cores = torch.get_num_threads(), max(1, available_cores() // self._among)
         if threads > cores:
             self._found, self._capped = threads, cores
             torch.set_num_threads(cores)

@@ -74,7 +74,7 @@ def test_many_pairs_one_after_the_other_and_overlapped(capsys):
     assert torch.get_num_threads() == threads
     rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.split()[:1] == ["1"]]
     assert len(rows) == 1
-    one, both = (float(rows[0][i]) for i in (1, 3))
+    one, both = (float(rows[0][i]) for i in (1, 5))
     assert float(rows[0][-1]) == pytest.approx(both / one, abs=0.05)
 
 
@@ -83,7 +83,7 @@ def test_many_pairs_say_what_broke(tmp_path):
     work = many.ManyPairs(typed)
     (tmp_path / "left" / "000000.png").write_bytes(b"")
     with pytest.raises(InputError):
-        work.seconds(1)
+        work.seconds(1, False)
 
 
 def test_large_scene_is_nearer_at_the_bottom_and_behind_its_panel():

@@ -33,8 +33,12 @@ from geodiff_plugin.synthetic import render_pair
 
 __all__ = ["WAYS", "ManyPairs", "main"]
 
-#: Name -> pairs that may be on the way at a time.
-WAYS = {"one after the other": 1, "overlapped": MOST_ON_THE_WAY}
+#: Name -> pairs that may be on the way at a time, and whether matching and guiding share the cores.
+WAYS = {
+    "one after the other": (1, False),
+    "overlapped, all threads each": (MOST_ON_THE_WAY, False),
+    "overlapped": (MOST_ON_THE_WAY, True),
+}
 KIND, BASELINE_M = "street", 0.54
 
 
@@ -80,14 +84,18 @@ class ManyPairs:
         self._arguments, self._settings = arguments, read_settings(arguments)
         self._pipe = load_guided_prior(arguments, self._settings)
 
-    def seconds(self, most: int) -> tuple[float, float]:
-        """Seconds of a clock and of all cores for all pairs, with ``most`` of them on the way at a time.
+    def seconds(self, most: int, shared: bool) -> tuple[float, float]:
+        """Seconds of a clock and of all cores for all pairs.
+
+        Args:
+            most: pairs that may be on the way at a time.
+            shared: matching and guiding share the cores, as in the command.
 
         Raises:
             Exception: what a stage raised.
         """
         jobs = [Job.of(ref, self._arguments) for ref in find_pairs(self._arguments)]
-        stages, broken = Stages(self._pipe, self._settings, ThreadWarnings(), False), []
+        stages, broken = Stages(self._pipe, self._settings, ThreadWarnings(), False, shared), []
         steps = [stages.read, stages.evidence, stages.guide, stages.write]
         conveyor = Conveyor(steps, lambda job, error: broken.append(error), most)
         clock, cores = time.perf_counter(), time.process_time()
@@ -110,18 +118,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="rows for each")
     parser.add_argument("--repeats", type=int, default=3, help="the ways in turn; the median counts")
     options = parser.parse_args(arguments)
-    table = new_table(("threads", *WAYS, "ratio"))
+    table = new_table(("threads", *WAYS, "ratio"), "seconds of a clock (of all cores) a pair")
     before = torch.get_num_threads()
     with tempfile.TemporaryDirectory() as folder:
         typed = write_pairs(Path(folder), options.pairs, tuple(options.size))
         many = ManyPairs(replace(typed, device=options.device, prior=options.prior))
-        many.seconds(1)  # warms up
+        many.seconds(1, False)  # warms up
         for threads in options.threads:
             torch.set_num_threads(threads)
             taken = {way: [] for way in WAYS}
             for _ in range(options.repeats):
-                for way, most in WAYS.items():
-                    taken[way].append([value / options.pairs for value in many.seconds(most)])
+                for way, how in WAYS.items():
+                    taken[way].append([value / options.pairs for value in many.seconds(*how)])
             clock, cores = ({way: median(t[i] for t in taken[way]) for way in WAYS} for i in (0, 1))
             ratio = clock["overlapped"] / clock["one after the other"]
             shown = [f"{clock[way]:.2f} ({cores[way]:.2f})" for way in WAYS]
