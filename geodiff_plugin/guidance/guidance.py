@@ -16,6 +16,7 @@ from torch import Tensor
 
 from geodiff_plugin._camera_checks import check_calibrated_size, check_intrinsics_fit, warn_of_other_size
 from geodiff_plugin._checks import bad_type, bad_value, check_number, check_size
+from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs
 from geodiff_plugin.formats import as_image_01, read_calibration
 from geodiff_plugin.geometry.cameras import image_size
@@ -356,9 +357,9 @@ class GeometryGuidance:
                 check_intrinsics_fit(*fit)
                 warn_of_other_size(*fit)
             views, K_left, points = one.on(lefts_01.device)
-            evidence.append(
-                make(EvidenceInputs(lefts_01[i], views, K_left, points, self.config, self._needs_matches))
-            )
+            given = EvidenceInputs(lefts_01[i], views, K_left, points, self.config, self._needs_matches)
+            with WithinCores():  # here too, for who asks outside of a guided call
+                evidence.append(make(given))
         return evidence
 
     @property

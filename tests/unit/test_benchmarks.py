@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.development.benchmarks import calls, cost, operations
+from geodiff_plugin.development.benchmarks import calls, cost, large, many, operations
 from geodiff_plugin.development.benchmarks.matrix import deviation
 from geodiff_plugin.development.full_sizes import UNET, VAE
 from geodiff_plugin.development.random_marigold import narrowed
@@ -66,3 +66,30 @@ def test_a_row_of_calls_for_every_number_of_threads(capsys):
     assert torch.get_num_threads() == threads
     rows = [line for line in capsys.readouterr().out.splitlines() if "64" in line]
     assert len(rows) == 2 and all("96x64" in row for row in rows)
+
+
+def test_many_pairs_one_after_the_other_and_overlapped(capsys):
+    threads = torch.get_num_threads()
+    many.main(["--pairs", "2", "--size", "64", "96", "--repeats", "1", "--threads", "1"])
+    assert torch.get_num_threads() == threads
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.split()[:1] == ["1"]]
+    assert len(rows) == 1
+    one, both = (float(rows[0][i]) for i in (1, 5))
+    rounded = 0.005 * (1 + both / one) / (one - 0.005) + 0.005  # of both to hundredths, and of their ratio
+    assert float(rows[0][-1]) == pytest.approx(both / one, abs=rounded)
+
+
+def test_many_pairs_say_what_broke(tmp_path):
+    typed = many.write_pairs(tmp_path, 1, (64, 96))
+    work = many.ManyPairs(typed)
+    (tmp_path / "left" / "000000.png").write_bytes(b"")
+    with pytest.raises(InputError):
+        work.seconds(1, False)
+
+
+def test_large_scene_is_nearer_at_the_bottom_and_behind_its_panel():
+    """As most pictures are; the other way round near and far look exchanged."""
+    depth_m, panel = large.depth_strip((80, 60), range(60))
+    wall = np.where(panel, np.nan, depth_m)
+    assert np.nanmean(wall[-10:]) < np.nanmean(wall[:10])
+    assert panel.any() and (depth_m[panel] == large.PANEL_M).all() and np.nanmin(wall) > large.PANEL_M

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments
 from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.cli.depth import write_result
@@ -107,10 +108,19 @@ class Stages:
         settings: what was understood of the options.
         warned: where the warnings of a thread go.
         warm_start: go on from the pair before, where it has the same size.
+        side_by_side: matching and guiding, which compute, run at the same time: they share the cores.
     """
 
-    def __init__(self, pipe: Any, settings: Settings, warned: ThreadWarnings, warm_start: bool) -> None:
+    def __init__(
+        self,
+        pipe: Any,
+        settings: Settings,
+        warned: ThreadWarnings,
+        warm_start: bool,
+        side_by_side: bool = True,
+    ) -> None:
         self._pipe, self._settings, self._warned, self._warm_start = pipe, settings, warned, warm_start
+        self._among = 2 if side_by_side else 1
         self._rigs, self._videos, self._held = RigStore(), dict[Path, VideoReader](), ExitStack()
         self._before: tuple[str, tuple[int, ...], MetricDepthOutput] | None = None
 
@@ -145,7 +155,11 @@ class Stages:
         self._warned.use(job.warnings)
         assert job.inputs is not None
         device = self._pipe._execution_device
-        with job.watch.stage("evidence"), torch.no_grad(), torch.autocast(device.type, enabled=False):
+        with ExitStack() as held:
+            held.enter_context(job.watch.stage("evidence"))
+            held.enter_context(WithinCores(self._among))
+            held.enter_context(torch.no_grad())
+            held.enter_context(torch.autocast(device.type, enabled=False))
             job.inputs.guidance.evidence_store = EvidenceStore(1, copies=False)
             job.inputs.guidance.prepare(native_images(job.inputs.left, device))
 
@@ -157,7 +171,7 @@ class Stages:
         self._before = None  # whatever happens now: a sequence with a hole begins anew
         if before is not None and before[1] == size:
             job.began_from, guidance.previous = before[0], before[2]
-        with job.watch.stage("guided call"):
+        with job.watch.stage("guided call"), WithinCores(self._among):
             further = {"output_latent": self._warm_start}
             quiet = replace(job.arguments, quiet=True)
             job.output = guided_call(self._pipe, job.inputs, quiet, self._settings, **further)

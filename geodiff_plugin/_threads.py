@@ -1,0 +1,57 @@
+"""Threads of torch on the CPU: never more than cores that this process may use.
+
+Data flow: affinity, CPU quota -> number of cores; a ``with`` block -> torch's number of threads inside it.
+Paper: none.
+
+Beyond the cores every parallel operation waits for threads that are not running: with twice as many threads
+as cores a guided call takes twice as long. torch counts the cores of the affinity mask, but not the CPU quota
+of a container, and takes any number from ``OMP_NUM_THREADS`` and ``torch.set_num_threads``.
+
+The number belongs to the thread that calls: others that run already keep theirs. A thread that is started
+inside the block begins with the number inside. OpenCV is left alone: its number belongs to the whole process,
+is by default that of the cores by the same count, and more are not slower there.
+"""
+
+from __future__ import annotations
+
+import os
+
+import cv2
+import torch
+
+__all__ = ["WithinCores", "available_cores"]
+
+
+def available_cores() -> int:
+    """Cores that this process may use, >= 1: what is there, within its affinity and its cgroup's quota."""
+    cores = cv2.getNumberOfCPUs()  # reads the quota of cgroups v1 and v2, but only once
+    if hasattr(os, "sched_getaffinity"):  # Linux
+        cores = min(cores, len(os.sched_getaffinity(0)))
+    return max(1, cores)
+
+
+class WithinCores:
+    """Context manager: torch has at most ``available_cores()`` threads inside, afterwards what it had.
+
+    A lower number holds as it is, and so does one that is set inside. Once left, it may be entered again.
+
+    Args:
+        among: parts of a program that work at the same time and share the cores, >= 1.
+    """
+
+    _found: int | None = None
+    _capped = 0
+
+    def __init__(self, among: int = 1) -> None:
+        self._among = among
+
+    def __enter__(self) -> None:
+        threads, cores = torch.get_num_threads(), max(1, available_cores() // self._among)
+        if threads > cores:
+            self._found, self._capped = threads, cores
+            torch.set_num_threads(cores)
+
+    def __exit__(self, *exc: object) -> None:
+        found, self._found = self._found, None
+        if found is not None and torch.get_num_threads() == self._capped:
+            torch.set_num_threads(found)
