@@ -10,7 +10,7 @@ pasted into ``runtime/confidence.py`` and ``matching/consistency.py``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -129,7 +129,7 @@ def _joined(parts: Sequence[Observed]) -> Observed:
 
 def calibrate(
     pairs: Sequence[Observed], signs: Sequence[int]
-) -> tuple[np.ndarray, list[np.ndarray], tuple[np.ndarray, ...]]:
+) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
     """Fit on all pairs, and on each half of them to see what it promises for the other.
 
     Args:
@@ -137,17 +137,11 @@ def calibrate(
         signs: as for ``fit_log_odds``.
 
     Returns:
-        Coefficients of all pairs; of each half; and of every pixel the probability by the coefficients of the
-        half that it is not in, its outcome and its weight.
+        Coefficients of all pairs; of each half; and of every pair the probabilities of its pixels by the
+        coefficients of the half that it is not in.
     """
-    pairs = [pair for pair in pairs if len(pair.right)]
-    halves = pairs[::2], pairs[1::2]
-    fitted = [fit_log_odds(*_stack(half), signs) for half in halves]
-    columns: list[tuple[np.ndarray, ...]] = []
-    for half, coefficients in zip(reversed(halves), fitted, strict=True):
-        evidence, right, weights = _stack(half)
-        columns.append((promised(evidence, coefficients), right, weights))
-    judged = tuple(np.concatenate(column) for column in zip(*columns, strict=True))
+    fitted = [fit_log_odds(*_stack(half), signs) for half in (pairs[::2], pairs[1::2])]
+    judged = [promised(pair.evidence, fitted[1 - i % 2]) for i, pair in enumerate(pairs)]
     return fit_log_odds(*_stack(pairs), signs), fitted, judged
 
 
@@ -155,30 +149,44 @@ def _constants(name: str, coefficients: Iterable[float]) -> str:
     return f"{name} = ({', '.join(f'{value:.3g}' for value in coefficients)})"
 
 
+def _print_deciles(
+    console: Console, title: str, pairs: Sequence[Observed], judged: Sequence[np.ndarray]
+) -> None:
+    """What was promised of some pairs and what was kept."""
+    _, right, weights = _stack(pairs)
+    table = Table("promised", "kept", "share")
+    worst = 0.0
+    for decile in deciles(np.concatenate(judged), right, weights):
+        table.add_row(*(f"{value:.3f}" for value in (decile.promised, decile.kept, decile.share)))
+        worst = max(worst, abs(decile.promised - decile.kept))
+    console.print(title, highlight=False, soft_wrap=True)
+    console.print(table)
+    console.print(f"largest gap between promised and kept: {worst:.3f}", highlight=False)
+
+
 def _print(
     console: Console,
-    title: str,
+    kind: str,
     where: str,
     name: str,
-    pairs: Sequence[Observed],
+    observed: Mapping[str, Sequence[Observed]],
     signs: Sequence[int],
     shipped: Sequence[float],
 ) -> None:
-    """Constants to paste, those of the halves, and the deciles."""
+    """Constants to paste, those of the halves, and the deciles of all data and of each of several."""
+    pairs = [pair for own in observed.values() for pair in own]
     coefficients, halves, judged = calibrate(pairs, signs)
     # What was the same everywhere (the spread, of a single member) tells nothing: the shipped number stays.
     varies = np.ptp(np.concatenate([pair.evidence for pair in pairs]), axis=0) > 0
     coefficients = np.where(varies | (np.arange(len(shipped)) == 0), coefficients, shipped)
-    console.print(title)
-    table = Table("promised", "kept", "share")
-    worst = 0.0
-    for decile in deciles(*judged):
-        table.add_row(*(f"{value:.3f}" for value in (decile.promised, decile.kept, decile.share)))
-        worst = max(worst, abs(decile.promised - decile.kept))
-    console.print(table)
-    console.print(f"largest gap between promised and kept: {worst:.3f}", highlight=False)
-    for half, own in zip(("even", "odd"), halves, strict=True):
-        console.print(f"# the {half} half alone: {_constants(name, own)}", highlight=False)
+    _print_deciles(console, f"{kind}, on the half not fitted on", pairs, judged)
+    first = 0
+    for root, own in observed.items() if len(observed) > 1 else ():
+        console.print()
+        _print_deciles(console, f"of these, {root}", own, judged[first : first + len(own)])
+        first += len(own)
+    for half, fitted in zip(("even", "odd"), halves, strict=True):
+        console.print(f"# the {half} half alone: {_constants(name, fitted)}", highlight=False)
     console.print(f"# {where}\n{_constants(name, coefficients)}\n", highlight=False, soft_wrap=True)
 
 
@@ -192,7 +200,7 @@ def main(
     what: Annotated[str, typer.Option(help="depth, matches or both.")] = "both",
 ) -> None:
     """Print coefficients of confidence, fitted on pairs with truth, and how they do on the other half."""
-    refs = [ref for root in data for ref in find_pairs(root)]
+    refs = [(root, ref) for root in data for ref in find_pairs(root)]
     console, priors = Console(width=100), PriorCache()
     kinds: dict[str, tuple[Callable[..., Observed], tuple[Any, ...]]] = {
         "matches": (
@@ -212,14 +220,16 @@ def main(
         if what not in (kind, "both"):
             continue
         each = settings if kind == "depth" else settings[:1]
-        pairs = []
-        for ref in tqdm(refs, desc=kind):  # what one pair shows under several priors stays in one half
+        observed: dict[str, list[Observed]] = {}
+        for root, ref in tqdm(refs, desc=kind):  # what one pair shows under several priors stays in one half
             sample = load(ref)
             own = [observe(sample, one, priors) for one in each]
             if kind == "depth" and strengths:
                 own += observe_emulated(sample, strengths.split(","))
-            pairs.append(_joined(own))
-        _print(console, f"{kind}, on the half not fitted on", where, name, pairs, signs, shipped)
+            pair = _joined(own)
+            if len(pair.right):
+                observed.setdefault(root, []).append(pair)
+        _print(console, kind, where, name, observed, signs, shipped)
 
 
 if __name__ == "__main__":

@@ -17,19 +17,20 @@ __all__ = ["BY_EVIDENCE", "RIGHT_WITHIN", "SIGNS", "depth_confidence", "depth_ev
 #: What confidence is the probability of: a relative error below this.
 RIGHT_WITHIN = 0.1
 #: Log-odds, by logistic regression on pairs with truth, every pair weighing the same
-#: (``python -m geodiff_plugin.evaluation.calibrate`` refits them): constant, by log-odds of the support below
-#: 0, from 0 to 3 and above 3, by photometric agreement, by the prior's strength where nothing supports a
-#: depth, by the relative spread of an ensemble (set by hand: members that differ by 10 % halve the odds
-#: twice).
-BY_EVIDENCE = (0.548, 0.805, 0.527, 0.31, 0.223, 0.564, -15.0)
+#: (``python -m geodiff_plugin.evaluation.calibrate`` refits them): constant, by certainty, by the prior's
+#: strength, by photometric agreement, by the relative spread of an ensemble (set by hand: members that differ
+#: by 10 % halve the odds twice).
+BY_EVIDENCE = (-0.524, 0.835, 1.26, 0.135, -15.0)
 #: Which sign each of them may have; 0 for any. Agreement can only raise confidence, and a pixel that no right
 #: camera sees has none, so not being in view can never raise it.
-SIGNS = (0, 1, 1, 1, 1, 1, -1)
-# Support and error beyond these tell nothing more; where the slope of the support changes.
-_LEAST_SUPPORT, _MOST_SUPPORT, _LEAST_ERROR, _MOST_ERROR = 0.15, 0.999, 0.01, 0.1
-# Errors of the prior in log depth: of one that is of no use, and of the best that matches can tell.
-_USELESS, _BEST = 0.5, 0.01
-_BEND = 3.0
+SIGNS = (0, 1, 1, 1, -1)
+# Photometric errors beyond these tell nothing more, nor do errors of the prior as a whole.
+_LEAST_ERROR, _MOST_ERROR, _STRONG, _WEAK = 0.01, 0.1, 0.03, 0.15
+# Nor does the error of the prior that is left to a depth, beyond these: where it is largest many depths are
+# right all the same, and log-odds that fell on would promise too little.
+_LEAST_LEFT, _MOST_LEFT = 0.0005, 0.05
+# Errors of the prior in log depth: of the best that matches can tell, of one that is of no use.
+_BEST, _USELESS = 0.01, 0.5
 
 
 def depth_evidence(
@@ -45,22 +46,22 @@ def depth_evidence(
         prior_error: likewise.
 
     Returns:
-        ``(B, 7, H, W)``: 1, log-odds of the support in three pieces, agreement, the prior's strength, spread.
-        Agreement is how far the log of the photometric error lies below that of .1: from 0 (error .1 and
-        more, or not seen) to 2.3 (error .01 and less). Strength is how far the log of the prior's error lies
-        below that of .5, up to 3.9, times the share of the depth that nothing supports.
+        ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. Certainty is how far the log of the
+        prior's error, times the share of the depth that nothing supports, lies below that of .05: from 0
+        (.05 and more) to 4.6 (.0005 and less). It is one number because support says how much of a depth is
+        the prior's, and the prior's error what that is worth. Strength is how far the log of the prior's
+        error itself lies below that of .15, up to 1.6: a good prior doubts the matches that support a depth,
+        a poor one follows wrong ones. Agreement is how far the log of the photometric error lies below that
+        of .1: from 0 (error .1 and more, or not seen) to 2.3 (error .01 and less).
     """
     agreement = -(error.clamp(_LEAST_ERROR, _MOST_ERROR) / _MOST_ERROR).log()
     known = support.new_tensor(_USELESS) if prior_error is None else prior_error
-    strength = -(known.clamp(_BEST, _USELESS) / _USELESS).log()
-    supported = torch.logit(support.clamp(_LEAST_SUPPORT, _MOST_SUPPORT))
+    left = (1.0 - support) * known.clamp(_BEST, _USELESS)
     evidence = [
         torch.ones_like(support),
-        supported.clamp_max(0.0),
-        supported.clamp(0.0, _BEND),
-        (supported - _BEND).clamp_min(0.0),
+        -(left.clamp(_LEAST_LEFT, _MOST_LEFT) / _MOST_LEFT).log(),
+        -(known.clamp(_STRONG, _WEAK) / _WEAK).log().expand_as(support),
         torch.where(visible, agreement, torch.zeros_like(agreement)),
-        (1.0 - support) * strength,
         torch.zeros_like(support) if spread is None else spread,
     ]
     return torch.cat(evidence, dim=1)
@@ -84,7 +85,7 @@ def depth_confidence(
     """
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
-    for rows in row_strips(*support.shape[-2:]):  # evidence is seven times as large as what it says
+    for rows in row_strips(*support.shape[-2:]):  # evidence is five times as large as what it says
         own, at, seen = (part[:, :, rows] for part in (support, error, visible))
         evidence = depth_evidence(own, at, seen, None if spread is None else spread[:, :, rows], prior_error)
         confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))

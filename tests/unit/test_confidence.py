@@ -16,7 +16,7 @@ SEEN = torch.ones(1, 1, 1, 3, dtype=torch.bool)
 
 
 def test_rises_with_support():
-    found = depth_confidence(_maps(0.0, 0.9, 1.0), _maps(0.05, 0.05, 0.05), SEEN, None).flatten()
+    found = depth_confidence(_maps(0.0, 0.95, 1.0), _maps(0.05, 0.05, 0.05), SEEN, None).flatten()
     assert 0.0 < found[0] < found[1] < found[2] < 1.0
 
 
@@ -46,12 +46,21 @@ def test_falls_with_the_spread_of_an_ensemble():
     assert found[0] > found[1] > found[2]
 
 
-def test_a_good_prior_is_believed_where_nothing_supports_it():
+def test_a_good_prior_is_believed_most_where_nothing_supports_it():
     support, error = _maps(0.0, 0.5, 1.0), _maps(0.05, 0.05, 0.05)
     good, poor = (
         depth_confidence(support, error, SEEN, None, torch.full((1, 1, 1, 1), own)).flatten()
         for own in (0.02, 0.4)
     )
-    assert good[0] > poor[0] and good[1] > poor[1] and good[2] == poor[2]
+    assert bool((good > poor).all()) and good[0] - poor[0] > good[2] - poor[2]
     unknown = depth_confidence(support, error, SEEN, None).flatten()
     assert bool((unknown <= poor).all())
+
+
+def test_a_weak_prior_needs_more_support_than_a_good_one():
+    """What is left of its error decides, so nine tenths of support are little where the rest is useless."""
+    good, poor = (
+        depth_confidence(_maps(0.9), _maps(0.05), SEEN[..., :1], None, torch.full((1, 1, 1, 1), own)).item()
+        for own in (0.05, 0.5)
+    )
+    assert good > 0.85 and poor < 0.6
