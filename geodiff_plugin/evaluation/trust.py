@@ -203,7 +203,7 @@ def run_trust(options: TrustOptions) -> Page:
             bad_value("--kinds", f"some of {known}", repr(kind))
     with OutFolder(options.out, resume=True):
         records = list(_records(options))
-        words = ["geodiff eval trust", f"--rendered {options.rendered}@{options.width}"]
+        words = ["geodiff eval trust", f"--rendered {options.rendered} --width {options.width}"]
         words += [] if options.data is None else [f"--data {options.data.name}"]
         words += [] if options.limit is None else [f"--limit {options.limit}"]
         groups = dict.fromkeys(record["group"] for record in records)
