@@ -113,6 +113,8 @@ def _of_order(signs: Signs) -> str | None:
 
 
 def _of_matches(signs: Signs) -> str | None:
+    if math.isnan(signs.matched):  # known points alone: nothing that a second view could be wrong about
+        return None
     few = signs.matched < LEAST_MATCHED
     weak = [
         signs.matched < WEAK_MATCHED,
@@ -122,14 +124,14 @@ def _of_matches(signs: Signs) -> str | None:
     ]
     if not (few or signs.confidence < LEAST_CONFIDENCE or sum(weak) > 1):
         return None
-    said = [] if math.isnan(signs.matched) else [f"{100 * signs.matched:.0f} % of the left image is matched"]
+    said = [f"{100 * signs.matched:.0f} % of the left image is matched"]
     said += [] if math.isnan(signs.confidence) else [f"mean confidence is {signs.confidence:.2f}"]
     cause = (
         "Likely causes: E along the wrong axis or with a wrong rotation, images that are not rectified or "
         "whose lens is not corrected, K of another size, a mirrored image, or views of different scenes or "
         "moments."
     )
-    return f"Only {' and '.join(said)}. {cause}" if said else None
+    return f"Only {' and '.join(said)}. {cause}"
 
 
 def _of_lines(signs: Signs) -> str | None:

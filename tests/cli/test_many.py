@@ -185,7 +185,7 @@ def test_two_folders_give_what_single_runs_give(geodiff, folders):
     single[single.index("out")] = "single"
     assert geodiff(*single, "-q").code == 0
     many, one = (np.load(root / name / "depth.npy") for name in ("out/b", "single"))
-    np.testing.assert_array_equal(many, one)
+    np.testing.assert_allclose(many, one, rtol=1e-5)  # sums of other threads end on other digits
     assert [row["pair"] for row in rows_of(root / "out")] == ["a", "b", "c"]
     assert {path.name for path in (root / "out" / "b").iterdir()} == {
         path.name for path in (root / "single").iterdir()
