@@ -52,8 +52,8 @@ _FACTORS = {
 }
 #: Within so many pixels of its line, and in front of both cameras, a match speaks for a pose.
 NEAR_PX = 4.0
-# Within so many it speaks for a mistake rather than for an inexact pose: where the cameras are near each
-# other, many a wrong K leaves all matches within some pixels of their lines.
+# A mistake must also explain the matches within so many, about as well as the pose nearby: where the cameras
+# are close together, a wrong K too leaves all matches within a few pixels of their lines.
 _FINE_PX = 1.5
 _CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -108,10 +108,12 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
         near: ``(4, 4)``, the pose near it that fits best: where only that fits, the pose is inexact.
     """
     given = _share(tracks, T)
-    sentence, own, pose = max(_candidates(tracks, T), key=lambda entry: _share(*entry[1:]))
-    coarse = _share(own, pose) > max(_AT_LEAST, _CLEARLY * given, _NEARLY * _share(tracks, near))
+    found = [(_share(own, pose), sentence, own, pose) for sentence, own, pose in _candidates(tracks, T)]
+    best, sentence, own, pose = max(found, key=lambda entry: entry[0])
+    if not best > max(_AT_LEAST, _CLEARLY * given, _NEARLY * _share(tracks, near)):
+        return None
     fine = _share(own, pose, _FINE_PX) > _NEARLY * _share(tracks, near, _FINE_PX)
-    return sentence if coarse and fine else None
+    return sentence if fine else None
 
 
 def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:

@@ -27,19 +27,21 @@ __all__ = [
 
 #: Fewer matches than this say nothing about a pose.
 FEWEST = 40
-# What a refined pose may move the points by, along their lines as well: a share of the residual that it
-# explains, which grows with the square of how many times that is what it leaves. Where a pose explains nearly
-# all, it was the pose that was wrong; where it leaves much, the cameras have other faults, which a free pose
-# would hide. The cameras of a rectified pair are bolted together: they turn by tenths of a degree, hardly
-# shift, and a pan that fits the rows better is more often a fault of the lenses; the least share is theirs.
+# How far a refined pose may move the points, along their lines as well: the residual that it explains, times
+# the first number, times the square of explained over left residual; that factor stays within the bounds.
+# Where a pose explains nearly all of the residual, the given one was wrong; where it leaves much, the cameras
+# have other faults, which a free pose would hide. A rectified pair gets the lower bound and a narrow prior:
+# its cameras are bolted together, turn by tenths of a degree and hardly shift, and a pan that fits the rows
+# better is more often a fault of the lenses.
 _MOVED_BY, _MOVED_SHARE, _FLOOR_PX = 0.05, (0.4, 10.0), 0.05
 _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = np.radians(0.3), 0.01
-# Robust scale of a fit whose noise is not known yet, pixels of the right view; then so many times what the
-# fit leaves, and what residuals that are independent count: half, for they are not quite.
+# Robust scale of the first fit, whose noise is not known yet, pixels of the right view. That of the last fit
+# is so many times the residual that the first one leaves, but not below a tenth of a pixel; and its residuals
+# count half, because blocks of the image do not show all that neighbours have in common.
 SCALE_PX, _SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 0.7, 2.0, 0.1, 0.5
-# What hardly holds a pose: the length of its baseline stays, all else is free.
+# A prior as wide as this leaves a pose free, but for the length of its baseline.
 FREE_PX = 1e3
-# Poses that explain the matches as well and lead to depths that differ by this much, in log, are told of.
+# The user is warned if the pose that fits best changes log depth by more than this, in the median.
 _MOST_SPREAD = 0.13
 
 
@@ -118,6 +120,6 @@ def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ..
     if spread < _MOST_SPREAD:
         return ()
     return (
-        f"The matches do not settle the pose: another one fits them as well, and its depths differ by "
+        "The matches do not settle the pose: another one fits them as well, and its depths differ by "
         f"{100 * np.expm1(spread):.0f} % in the median. Give a more exact pose, or views from further apart.",
     )

@@ -46,13 +46,11 @@ def depth_evidence(
         prior_error: likewise.
 
     Returns:
-        ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. Certainty is how far the log of the
-        prior's error, times the share of the depth that nothing supports, lies below that of .05: from 0
-        (.05 and more) to 4.6 (.0005 and less). It is one number because support says how much of a depth is
-        the prior's, and the prior's error what that is worth. Strength is how far the log of the prior's
-        error itself lies below that of .15, up to 1.6: a good prior doubts the matches that support a depth,
-        a poor one follows wrong ones. Agreement is how far the log of the photometric error lies below that
-        of .1: from 0 (error .1 and more, or not seen) to 2.3 (error .01 and less).
+        ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. Certainty is the log of .05 over what is
+        left of the prior's error, ``(1 - support) * prior_error``: from 0 (.05 and more) to 4.6 (.0005 and
+        less). Strength is the log of .15 over the prior's error, from 0 to 1.6: with a good prior wrong
+        matches lose their weight, a poor one follows them. Agreement is how far the log of the photometric
+        error lies below that of .1: from 0 (error .1 and more, or not seen) to 2.3 (error .01 and less).
     """
     agreement = -(error.clamp(_LEAST_ERROR, _MOST_ERROR) / _MOST_ERROR).log()
     known = support.new_tensor(_USELESS) if prior_error is None else prior_error

@@ -155,11 +155,12 @@ class Stages:
         self._warned.use(job.warnings)
         assert job.inputs is not None
         device = self._pipe._execution_device
-        with ExitStack() as held:
-            held.enter_context(job.watch.stage("evidence"))
-            held.enter_context(WithinCores(self._among))
-            held.enter_context(torch.no_grad())
-            held.enter_context(torch.autocast(device.type, enabled=False))
+        with (
+            job.watch.stage("evidence"),
+            WithinCores(self._among),
+            torch.no_grad(),
+            torch.autocast(device.type, enabled=False),
+        ):
             job.inputs.guidance.evidence_store = EvidenceStore(1, copies=False)
             job.inputs.guidance.prepare(native_images(job.inputs.left, device))
 

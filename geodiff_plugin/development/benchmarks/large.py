@@ -6,8 +6,8 @@ Paper: none.
 
 The scene is known in closed form: a wall that leans back, and a panel that hangs before it, in a texture
 with detail at every size, so that a picture of any number of pixels costs one look-up a pixel. The wall is
-nearer at the bottom, as most scenes are: of one that overhangs, the prior exchanges near and far, which is
-how a pair with exchanged images looks, and the judgement does not trust it however well the views match.
+nearer at the bottom, as most scenes are. With an overhanging wall the prior confuses near and far, as if the
+two images were exchanged, and the run is not trusted however well the views match.
 """
 
 from __future__ import annotations
