@@ -51,6 +51,7 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("without refinement of the result", "guided:refine=false"),
         ("without rejection of reflections", "guided:reject_reflections=false"),
         ("without a gate on matches", "guided:gate=1000000"),
+        ("without cleaning of photographs", "guided:clean_photographs=false"),
         ("without exposure", "guided:exposure=false"),
         ("without z-test", "guided:z_test=false"),
     ),

@@ -105,8 +105,13 @@ class GuidanceConfig(Checked):
     pose: str = choice(
         "refine",
         ("refine", "given"),
-        "poses that leave matches more than 0.45 px off their epipolar lines are refined, all views "
-        "together, and the right image is straightened ([poses](../how-to/poses.md))",
+        "poses that leave matches more than 0.3 px off their epipolar lines (0.45 px if they are rectified) "
+        "are refined, all views together, and the right image is straightened ([poses](../how-to/poses.md))",
+    )
+    clean_photographs: bool = flag(
+        True,
+        "blocks of JPEG compression and strong sensor noise are removed before photographs are compared; the "
+        "prior sees the image as it is",
     )
     decoder: str = text(
         "full",

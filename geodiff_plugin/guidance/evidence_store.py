@@ -15,14 +15,19 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs, prepare_evidence
 from geodiff_plugin.guidance.posing import pose_views
+from geodiff_plugin.matching import clean
 
 __all__ = ["EvidenceStore", "make_evidence"]
 
 
 def make_evidence(given: EvidenceInputs) -> Evidence:
-    """Poses as the knob ``pose`` says, then ``prepare_evidence``."""
+    """Photographs cleaned, poses as the knob ``pose`` says, then ``prepare_evidence``."""
     if not given.views:
         return prepare_evidence(given)
+    if given.config.clean_photographs:
+        grid = given.config.sweep.sweep_pixels
+        views = [view._replace(image_01=clean(view.image_01, grid)) for view in given.views]
+        given = replace(given, left_01=clean(given.left_01, grid), views=views)
     posed = pose_views(given.left_01, given.views, given.K_left, given.config)
     return prepare_evidence(replace(given, views=posed.rights), posed.report)
 
@@ -31,7 +36,7 @@ def _settings(given: EvidenceInputs) -> tuple[Any, ...]:
     """What of a configuration evidence depends on."""
     config, swept = given.config, given.config.search.search == "volume"
     return (
-        *(config.pose, config.loss_resolution, config.depth_range),
+        *(config.pose, config.clean_photographs, config.loss_resolution, config.depth_range),
         *(config.sweep, config.matching, config.fit),
         *(swept, given.needs_matches),
     )

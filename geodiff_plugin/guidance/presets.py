@@ -32,6 +32,7 @@ PAPER = DEFAULT.changed(
     search="one-number",
     loss_resolution=768,
     pose="given",
+    clean_photographs=False,
     correct=False,
     reject_reflections=False,
     refine=False,

@@ -6,6 +6,7 @@ Paper: S7.3 (the search is a lookup in this volume); the matches go beyond it.
 
 from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.build import build_cost_volume, find_matches
+from geodiff_plugin.matching.cleaning import clean
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches, MatchTarget, gate_matches
 from geodiff_plugin.matching.mirrored import PoseCheck, mirrored_pose_preferred
@@ -20,6 +21,7 @@ __all__ = [
     "PoseCheck",
     "aggregate",
     "build_cost_volume",
+    "clean",
     "find_matches",
     "gate_matches",
     "match_volume",

@@ -1,0 +1,183 @@
+"""Removal of JPEG blocks and sensor noise from photographs before they are compared.
+
+Data flow: photograph -> how coarsely it was compressed, how noisy it is -> photograph to match with.
+Paper: none. The filter is hard thresholding of a shifted 8 x 8 DCT (Coifman and Donoho 1995,
+"Translation-invariant de-noising"), the steps of the quantisation those of ITU-T T.81, table K.1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+
+from geodiff_plugin.matching.census import grey
+
+__all__ = ["Flaws", "clean", "find_flaws"]
+
+_SIDE = 8
+_LUMA_STEPS = (
+    *(16, 11, 10, 16, 24, 40, 51, 61),
+    *(12, 12, 14, 19, 26, 58, 60, 55),
+    *(14, 13, 16, 24, 40, 57, 69, 56),
+    *(14, 17, 22, 29, 51, 87, 80, 62),
+    *(18, 22, 37, 56, 68, 109, 103, 77),
+    *(24, 35, 55, 64, 81, 104, 113, 92),
+    *(49, 64, 78, 87, 103, 121, 120, 101),
+    *(72, 92, 95, 98, 112, 100, 103, 99),
+)
+# Coefficients that even a strongly compressed picture keeps, and how many of them must tell the same step.
+_KEPT = ((0, 1), (1, 0), (2, 0), (1, 1), (0, 2), (0, 3), (1, 2), (2, 1), (3, 0))
+_LEAST_VOTES, _ALIKE = 5, 0.3
+_MOST_STEP, _MOST_BLOCKS, _LEAST_VALUES, _LEAST_FIT = 100, 2048, 32, 0.5
+# A step of more grey levels than this between two pixels is the scene's, not the edge of a block.
+_MOST_BLOCK_EDGE = 8.0
+# Noise is read from the finest coefficients of the flattest tenth of the blocks, which contain less of it
+# than the others: the factor is that of normally distributed noise. Up to the first number of grey levels
+# it does not disturb the comparison, and fine texture may be taken for it; from the second on all is removed.
+_FLATTEST, _NOISE_OF_FLATTEST, _NOISE_RANGE = 0.1, 1.0 / 0.77, (1.7, 2.8)
+# Coefficients below so many steps, or so many standard deviations of the noise, are not the scene's. On
+# rendered pairs wrong matches are as few from half to twice these.
+_STEPS, _DEVIATIONS = 1.2, 3.6
+# 16 of the 64 positions of the blocks, every row and column twice.
+_SHIFTS = tuple((i, (3 * i + k) % _SIDE) for i in range(_SIDE) for k in (0, _SIDE // 2))
+# A picture with so many times the pixels of the grid that it is compared on is averaged by shrinking.
+_SHRUNK = 4.0
+
+
+@dataclass(frozen=True)
+class Flaws:
+    """What a camera and a file format did to a photograph.
+
+    Attributes:
+        jpeg_scale: its steps of quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at 80; 0
+            where no trace of compression was found.
+        noise: standard deviation of the sensor noise, grey levels of 255.
+    """
+
+    jpeg_scale: float
+    noise: float
+
+
+def _basis(like: torch.Tensor) -> torch.Tensor:
+    """Orthonormal DCT-II, ``(frequency, pixel)``."""
+    n = torch.arange(_SIDE, device=like.device, dtype=like.dtype)
+    waves = torch.cos(math.pi * (2 * n[None] + 1) * n[:, None] / (2 * _SIDE)) * math.sqrt(2 / _SIDE)
+    waves[0] /= math.sqrt(2)
+    return waves
+
+
+def _to_blocks(levels: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
+    """Coefficients ``(h, w, 8, 8)`` of the whole blocks of ``(H, W)``."""
+    rows, columns = (side // _SIDE for side in levels.shape)
+    whole = levels[: rows * _SIDE, : columns * _SIDE]
+    return basis @ whole.reshape(rows, _SIDE, columns, _SIDE).transpose(1, 2) @ basis.T
+
+
+def _from_blocks(coefficients: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
+    rows, columns = coefficients.shape[:2]
+    return (basis.T @ coefficients @ basis).transpose(1, 2).reshape(rows * _SIDE, columns * _SIDE)
+
+
+def _table(like: torch.Tensor) -> torch.Tensor:
+    return torch.tensor(_LUMA_STEPS, device=like.device, dtype=like.dtype).view(_SIDE, _SIDE)
+
+
+def _first_edge(levels: torch.Tensor, axis: int) -> int:
+    """Where the blocks begin, 0 to 7: a crop begins within one."""
+    steps = levels.diff(dim=axis).abs().clamp_max(_MOST_BLOCK_EDGE).mean(1 - axis)
+    whole = steps[: steps.shape[0] // _SIDE * _SIDE].view(-1, _SIDE).mean(0)
+    return (int(whole.argmax()) + 1) % _SIDE
+
+
+def _jpeg_scale(levels: torch.Tensor, basis: torch.Tensor) -> float:
+    """``Flaws.jpeg_scale``: the largest steps that the coefficients of a picture are whole multiples of."""
+    rows, columns = zip(*_KEPT, strict=True)
+    top, left = _first_edge(levels, 0), _first_edge(levels, 1)
+    blocks = _to_blocks(levels[top:, left:], basis).reshape(-1, _SIDE, _SIDE)
+    value = blocks[:: math.ceil(len(blocks) / _MOST_BLOCKS), rows, columns].abs()[..., None]
+    step = torch.arange(2, _MOST_STEP, device=levels.device, dtype=levels.dtype)
+    counts = value > 0.6 * step  # 0 is a multiple of everything
+    number = counts.sum(0)
+    fit = (torch.cos(2 * math.pi * value / step) * counts).sum(0) / number.clamp_min(1)
+    largest = (step * ((fit > _LEAST_FIT) & (number >= _LEAST_VALUES))).amax(-1)
+    scales = [scale for scale in (largest / _table(levels)[rows, columns]).tolist() if scale > 0]
+    if len(scales) < _LEAST_VOTES:
+        return 0.0
+    middle = sorted(scales)[(len(scales) - 1) // 2]
+    agree = sum(abs(scale / middle - 1.0) < _ALIKE for scale in scales)
+    return middle if agree >= _LEAST_VOTES else 0.0
+
+
+def _noise(levels: torch.Tensor, basis: torch.Tensor) -> float:
+    fine = _to_blocks(levels, basis)[..., _SIDE // 2 :, _SIDE // 2 :]
+    energy = fine.square().mean((-1, -2)).flatten()
+    flattest = energy.kthvalue(1 + int(_FLATTEST * (len(energy) - 1))).values
+    return math.sqrt(float(flattest)) * _NOISE_OF_FLATTEST
+
+
+def _levels(image_01: torch.Tensor) -> torch.Tensor:
+    return grey(image_01)[0] * 255.0
+
+
+def find_flaws(image_01: torch.Tensor) -> Flaws:
+    """How coarsely a photograph was compressed, and how noisy it is.
+
+    Compression shows as long as the picture was not resampled since: turned, shrunk, straightened.
+
+    Args:
+        image_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1], at least 32 pixels a side.
+
+    Returns:
+        ``Flaws``.
+    """
+    levels = _levels(image_01)
+    basis = _basis(levels)
+    return Flaws(_jpeg_scale(levels, basis), _noise(levels, basis))
+
+
+def _threshold(flaws: Flaws, like: torch.Tensor) -> torch.Tensor | None:
+    """Size ``(8, 8)`` below which a coefficient counts for nothing; ``None`` if none does."""
+    low, high = _NOISE_RANGE
+    noise = flaws.noise * min(max((flaws.noise - low) / (high - low), 0.0), 1.0)
+    if not flaws.jpeg_scale and not noise:
+        return None
+    threshold = torch.hypot(_STEPS * flaws.jpeg_scale * _table(like), like.new_tensor(_DEVIATIONS * noise))
+    threshold[0, 0] = 0.0  # the mean of a block is always its own
+    return threshold
+
+
+@torch.no_grad()
+def clean(image_01: torch.Tensor, grid_pixels: int) -> torch.Tensor:
+    """A photograph without the blocks of its compression and without sensor noise.
+
+    Blocks stand at the same columns of both images, so that faint texture matches at shifts of 8 pixels;
+    noise hides it.
+
+    Args:
+        image_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1], at least 32 pixels a side.
+        grid_pixels: pixels of the grid that it is to be compared on; shrinking alone cleans a picture of
+            more than four times as many.
+
+    Returns:
+        The same shape, its colours as they were; the tensor that was given if there is nothing to remove.
+    """
+    if image_01.shape[-2] * image_01.shape[-1] > _SHRUNK * grid_pixels:
+        return image_01
+    flaws = find_flaws(image_01)
+    levels = _levels(image_01)
+    threshold = _threshold(flaws, levels)
+    if threshold is None:
+        return image_01
+    basis = _basis(levels)
+    height, width = levels.shape
+    sides = _SIDE, _SIDE + (-width) % _SIDE, _SIDE, _SIDE + (-height) % _SIDE
+    wide = F.pad(levels[None, None], sides, mode="reflect")[0, 0]
+    total = torch.zeros_like(levels)
+    for row, column in _SHIFTS:
+        blocks = _to_blocks(wide[row:, column:], basis)
+        kept = _from_blocks(blocks * (blocks.abs() >= threshold), basis)
+        total += kept[_SIDE - row :, _SIDE - column :][:height, :width]
+    return (image_01 + (total / len(_SHIFTS) - levels) / 255.0).clamp(0.0, 1.0)

@@ -1,0 +1,125 @@
+"""Removal of JPEG blocks and sensor noise from photographs before they are compared."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from geodiff_plugin import GuidanceConfig
+from geodiff_plugin.algorithm.evidence import EvidenceInputs
+from geodiff_plugin.guidance.evidence_store import make_evidence
+from geodiff_plugin.matching import clean, find_matches
+from geodiff_plugin.matching.census import grey
+from geodiff_plugin.matching.cleaning import find_flaws
+from geodiff_plugin.synthetic import SyntheticPair, render_pair
+from geodiff_plugin.types import CameraView
+
+GRID = 210_000
+
+
+@pytest.fixture(scope="module")
+def pair() -> SyntheticPair:
+    return render_pair(3, "terrain", size=(240, 320))
+
+
+def compressed(image_01: torch.Tensor, quality: int) -> torch.Tensor:
+    levels = (image_01 * 255).round().byte().permute(1, 2, 0).numpy()
+    with io.BytesIO() as buffer:
+        Image.fromarray(levels).save(buffer, "JPEG", quality=quality)
+        return torch.from_numpy(np.array(Image.open(buffer))).permute(2, 0, 1).float() / 255
+
+
+def noisy(image_01: torch.Tensor, levels: float) -> torch.Tensor:
+    noise = torch.randn(image_01.shape[1:], generator=torch.Generator().manual_seed(0))
+    return (image_01 + noise * levels / 255).clamp(0, 1)
+
+
+def distance(one: torch.Tensor, other: torch.Tensor) -> float:
+    return float((one - other).square().mean())
+
+
+@pytest.mark.parametrize("quality", [30, 50, 65, 80, 90])
+def test_the_steps_of_a_compression_are_found(pair: SyntheticPair, quality: int) -> None:
+    expected = (5000 / quality if quality < 50 else 200 - 2 * quality) / 100
+    found = find_flaws(compressed(pair.left.image_01, quality)).jpeg_scale
+    assert found == pytest.approx(expected, rel=0.25)
+
+
+def test_they_are_found_in_a_crop(pair: SyntheticPair) -> None:
+    found = find_flaws(compressed(pair.left.image_01, 50)[:, 3:, 5:]).jpeg_scale
+    assert found == pytest.approx(1.0, rel=0.25)
+
+
+@pytest.mark.parametrize("levels", [4.0, 8.0])
+def test_the_noise_is_found(pair: SyntheticPair, levels: float) -> None:
+    assert find_flaws(noisy(pair.left.image_01, levels)).noise == pytest.approx(levels, rel=0.25)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_without_its_noise_a_photograph_is_closer_to_the_scene(pair: SyntheticPair, channels: int) -> None:
+    scene = pair.left.image_01[:channels]
+    before = noisy(scene, 6.0)
+    after = clean(before, GRID)
+    assert after.shape == before.shape
+    assert distance(after, scene) < 0.5 * distance(before, scene)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_blocks_vanish(pair: SyntheticPair, channels: int) -> None:
+    def block_edges(image_01: torch.Tensor) -> float:
+        steps = grey(image_01)[0].diff(dim=1).abs().mean(0)
+        return float(steps[7::8].mean() / steps[3::8].mean())
+
+    image = compressed(pair.left.image_01, 40)[:channels]
+    assert block_edges(image) > 1.2
+    assert block_edges(clean(image, GRID)) < 1.1
+
+
+def test_a_good_photograph_stays_as_it_is(pair: SyntheticPair) -> None:
+    for image in (pair.left.image_01, noisy(pair.left.image_01, 1.0), torch.full((3, 64, 48), 0.5)):
+        assert clean(image, GRID) is image
+
+
+def test_a_resampled_picture_has_no_blocks(pair: SyntheticPair) -> None:
+    turned = torch.rot90(compressed(pair.left.image_01, 50), 1, (1, 2))
+    small = torch.nn.functional.interpolate(turned[None], scale_factor=0.8, mode="bilinear", antialias=True)[
+        0
+    ]
+    assert find_flaws(turned).jpeg_scale == pytest.approx(1.0, rel=0.25)  # a quarter turn moves no pixel
+    assert find_flaws(small).jpeg_scale == 0
+
+
+def test_a_picture_that_is_shrunk_anyway_stays_as_it_is(pair: SyntheticPair) -> None:
+    image = compressed(pair.left.image_01, 40)
+    pixels = image.shape[1] * image.shape[2]
+    assert clean(image, pixels // 4 - 1) is image
+    assert clean(image, pixels // 4) is not image
+
+
+@pytest.mark.parametrize("flawed", [lambda x: compressed(x, 40), lambda x: noisy(x, 8.0)])
+def test_fewer_matches_are_wrong(pair: SyntheticPair, flawed) -> None:
+    T, left, right = torch.linalg.inv(pair.E).float(), flawed(pair.left.image_01), flawed(pair.right.image_01)
+
+    def wrong(images: tuple[torch.Tensor, torch.Tensor]) -> float:
+        view = CameraView(images[1], pair.K_right.float(), T)
+        matches = find_matches(images[0], [view], pair.K_left.float())
+        truth, seen = 1.0 / pair.left.depth_m, torch.isfinite(pair.left.depth_m) & ~pair.occluded
+        planes = (matches.inverse_depth - truth).abs() / matches.plane_step
+        off = (planes > 1.5) * matches.confidence
+        return float(off[seen].sum() / matches.confidence[seen].sum())
+
+    assert wrong((clean(left, GRID), clean(right, GRID))) < 0.9 * wrong((left, right))
+
+
+@pytest.mark.parametrize("switched_on", [True, False])
+def test_evidence_is_of_cleaned_photographs(pair: SyntheticPair, switched_on: bool) -> None:
+    left, right = (compressed(view.image_01, 40) for view in (pair.left, pair.right))
+    views = [CameraView(right, pair.K_right.float(), torch.linalg.inv(pair.E).float())]
+    config = GuidanceConfig(pose="given", clean_photographs=switched_on)
+    made = make_evidence(EvidenceInputs(left, views, pair.K_left.float(), None, config, False))
+    assert torch.equal(made.left_01, clean(left, GRID) if switched_on else left)
+    assert torch.equal(made.native[0].image_01, clean(right, GRID) if switched_on else right)
