@@ -61,6 +61,7 @@ class Evidence:
 
     Attributes:
         left_01: ``(3, H, W)`` in [0, 1].
+        native_left: the same at its native size.
         K_left: ``(3, 3)`` pixels of ``left_01``.
         views: the further views, at as many pixels per radian; none where only points are known.
         volume: plane-sweep costs, or ``None`` where the configuration does not search it.
@@ -75,6 +76,7 @@ class Evidence:
     """
 
     left_01: Tensor
+    native_left: Tensor
     K_left: Tensor
     views: tuple[CameraView, ...]
     volume: CostVolume | None
@@ -151,6 +153,7 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
     _read_back_once(volume, [one for one in (matches, known, sure) if one is not None])
     return Evidence(
         left,
+        left_01,
         K_loss,
         tuple(CameraView(*as_fine_as(v.image_01, v.K, K_loss), v.T_right_from_left) for v in views),
         volume,

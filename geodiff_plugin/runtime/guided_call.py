@@ -157,7 +157,7 @@ class GuidedCall(_Stock):
             stock = stock_call(**{**call, "return_dict": True, "output_latent": True})
         run.check_finite()
         with torch.autocast(device.type, enabled=False):
-            output = assemble_output(stock, run, guidance, lefts_01, call)
+            output = assemble_output(stock, run, guidance, call)
         for judgement in output.judgements if strict else ():
             if not judgement.trusted:
                 refuse(judgement.sentence)

@@ -43,7 +43,6 @@ def assemble_output(
     stock: MarigoldDepthOutput,
     run: GuidedRun,
     guidance: GeometryGuidance,
-    lefts_01: Tensor,
     call: Mapping[str, Any],
 ) -> MetricDepthOutput:
     """Everything of ``MetricDepthOutput`` but ``latent``.
@@ -52,9 +51,9 @@ def assemble_output(
         stock: output of the stock call, already in metres.
         run: the finished run.
         guidance: what was configured.
-        lefts_01: ``(N, 3, H, W)`` left images at native size.
         call: arguments of the stock call by name.
     """
+    lefts_01 = _as_compared(run)
     count, size = lefts_01.shape[0], image_size(lefts_01)
     depth_m = _as_maps(stock.prediction).to(lefts_01.device)  # (N, 1, H, W) or the processing grid
     known_of = [run.known(i) for i in range(count)]
@@ -194,6 +193,12 @@ def _judged(
         own_ratio=own_ratio,
     )
     return judge(signs)
+
+
+def _as_compared(run: GuidedRun) -> Tensor:
+    """The left images at native size, ``(N, 3, H, W)``, cleaned as the right ones are."""
+    lefts = [own.native_left for own in run.evidence]
+    return lefts[0][None] if len(lefts) == 1 else torch.stack(lefts)  # one large picture is not copied
 
 
 def _as_maps(values: Any) -> Tensor:

@@ -20,7 +20,9 @@ def matches_at(depth_m: float, size: tuple[int, int], confidence: float = 1.0) -
 
 def evidence(points: Matches | None = None, sweep_points: Matches | None = None) -> Evidence:
     coarse, fine = matches_at(2.0, COARSE), matches_at(2.0, FINE)
-    return Evidence(torch.rand(3, *COARSE), K, (), None, coarse, fine, points, sweep_points)
+    return Evidence(
+        torch.rand(3, *COARSE), torch.rand(3, *COARSE), K, (), None, coarse, fine, points, sweep_points
+    )
 
 
 GREY = torch.full((1, 3, *COARSE), 0.5)
