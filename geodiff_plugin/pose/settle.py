@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin.geometry.cameras import is_rectified
-from geodiff_plugin.pose.noise import independent_share
+from geodiff_plugin.pose.noise import common_residual_px, independent_share
 from geodiff_plugin.pose.solve import Prior, solve_poses
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
@@ -28,13 +28,14 @@ __all__ = [
 #: Fewer matches than this say nothing about a pose.
 FEWEST = 40
 # How far a refined pose may move the points, along their lines as well: the residual that it explains, times
-# the first number, times the square of explained over left residual; that factor stays within the bounds.
-# Where a pose explains nearly all of the residual, the given one was wrong; where it leaves much, the cameras
-# have other faults, which a free pose would hide. A rectified pair gets the lower bound and a narrow prior:
-# its cameras are bolted together, turn by tenths of a degree and hardly shift, and a pan that fits the rows
-# better is more often a fault of the lenses.
-_MOVED_BY, _MOVED_SHARE, _FLOOR_PX = 0.05, (0.4, 10.0), 0.05
-_RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = np.radians(0.3), 0.01
+# a share. The share is 1 where that residual is so many times the cameras' other faults (a rolling shutter,
+# lenses, K), which are what the residuals of neighbours have in common. It grows with the fourth power:
+# below, a free pose would hide those faults; above, the given pose was wrong.
+_FAULTS, _MOVED_SHARE = 5.6, (0.2, 40.0)
+_FLOOR_PX, _LEAST_FAULT_PX = 0.05, 0.03
+# A rectified pair has a share and a narrow prior of its own: its cameras are bolted together, turn by tenths
+# of a degree and hardly shift, and a pan that fits the rows better is more often a fault of the lenses.
+_RIG_MOVED_SHARE, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = 0.4, np.radians(0.3), 0.01
 # Robust scale of the first fit, whose noise is not known yet, pixels of the right view. That of the last fit
 # is so many times the residual that the first one leaves, but not below a tenth of a pixel; and its residuals
 # count half, because blocks of the image do not show all that neighbours have in common.
@@ -98,9 +99,13 @@ def settle_poses(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> tuple[n
     left = np.maximum(median_residuals(tracks, fitted), _FLOOR_PX)
     explained = np.sqrt(np.clip(median_residuals(tracks, given) ** 2 - left**2, 0.0, None))
     rig = is_rig(tracks, given)
-    share = np.clip(0.0 if rig else _MOVED_BY * (explained / left) ** 2, *_MOVED_SHARE)
+    views = [tracks.view(v) for v in range(len(given))]
+    pairs = list(zip(views, fitted, strict=True))
+    faults = np.array([common_residual_px(one, T) if len(one) else np.nan for one, T in pairs])
+    times = explained / (_FAULTS * np.maximum(faults, _LEAST_FAULT_PX))
+    share = np.full_like(times, _RIG_MOVED_SHARE) if rig else np.clip(times**4, *_MOVED_SHARE)
     moved = np.maximum(np.nan_to_num(share * explained), _FLOOR_PX)
-    shares = [independent_share(tracks.view(v), T) for v, T in enumerate(fitted) if tracks.seen[v].any()]
+    shares = [independent_share(one, T) for one, T in pairs if len(one)]
     settled = solve_poses(
         tracks,
         given,
