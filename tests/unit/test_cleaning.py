@@ -96,8 +96,8 @@ def test_a_resampled_picture_has_no_blocks(pair: SyntheticPair) -> None:
 def test_a_picture_that_is_shrunk_anyway_stays_as_it_is(pair: SyntheticPair) -> None:
     image = compressed(pair.left.image_01, 40)
     pixels = image.shape[1] * image.shape[2]
-    assert clean(image, pixels // 4 - 1) is image
-    assert clean(image, pixels // 4) is not image
+    assert clean(image, pixels // 6 - 1) is image
+    assert clean(image, pixels // 6) is not image
 
 
 @pytest.mark.parametrize("flawed", [lambda x: compressed(x, 40), lambda x: noisy(x, 8.0)])
