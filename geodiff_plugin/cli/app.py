@@ -24,7 +24,7 @@ __all__ = ["app", "main"]
 
 app = typer.Typer(
     cls=CommandGroup,
-    help="Two photographs and their cameras to depth in metres, by any Marigold-style diffusion prior.",
+    help="Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -48,7 +48,7 @@ def _root(
         typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
     ] = False,
 ) -> None:
-    """Two photographs and their cameras to depth in metres, by any Marigold-style diffusion prior."""
+    """Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."""
 
 
 add_depth(app)
@@ -100,7 +100,11 @@ def info(
 def bench(
     points: Annotated[
         int | None,
-        option("Complete this many known depths instead, guided and by a fitted LoRA.", RUN, "--points"),
+        option(
+            "Complete depth from this many known points instead, guided and by a fitted LoRA.",
+            RUN,
+            "--points",
+        ),
     ] = None,
     prior: Annotated[
         str | None, option("With --points: a Marigold V2; by default a tiny random one.", RUN, "--prior")
@@ -155,7 +159,7 @@ def page(
     port: Annotated[int | None, typer.Option("--port", help="Port; by default the first free one.")] = None,
     browser: Annotated[bool, typer.Option("--browser", help="Open the page in a browser.")] = False,
 ) -> None:
-    """Serve a page on which one drops two photographs and measures (extra: app)."""
+    """Serve a web page: drop two photographs and measure in their depth (needs the extra app)."""
     from geodiff_plugin.app.launch import run_app
 
     run_app(tuple(prior or ("bundled",)), device, host, port, browser)
@@ -174,19 +178,23 @@ def convert(
     part: Annotated[
         str | None,
         typer.Option(
-            "--with", help="The part that SRC lacks (docs/reference/priors.md): a file, a folder or a hub id."
+            "--with",
+            help="The part that is not in SRC (docs/reference/priors.md): a file, a folder or a hub id.",
         ),
     ] = None,
     space: Annotated[
         str | None,
-        typer.Option("--space", help="marigold-v2: what it is affine in, if CHECKPOINT's folder is renamed."),
+        typer.Option(
+            "--space",
+            help="marigold-v2: space of its map, if the name of CHECKPOINT's folder does not say it.",
+        ),
     ] = None,
     lora: Annotated[
         str | None,
         typer.Option("--lora", help="marigold-v2: merged (default), apart (peft), or 4bit (CUDA)."),
     ] = None,
 ) -> None:
-    """Convert weights that come pickled or in parts; only this command reads pickles, and runs nothing."""
+    """Convert pickled or split weights to a folder for --prior; no code in a pickle is run."""
     from geodiff_plugin.cli.convert import run_convert
 
     run_convert(paths, part, space, lora)

@@ -22,16 +22,16 @@ def _depth(
         Path,
         typer.Argument(
             metavar="LEFT",
-            help="Left image; it gets the depth. EXIF turns are applied. Or a folder of them, a video, or a "
-            "list (LEFT,RIGHT[,CALIB] a line).",
+            help="Left image, whose depth is estimated; its EXIF rotation is applied. Or a folder of images, "
+            "a video, or a list with LEFT,RIGHT[,CALIB] per line.",
         ),
     ],
     right: Annotated[
         Path | None,
         typer.Argument(
             metavar="RIGHT",
-            help="Right image, of any size; not needed with --points. Or a folder, or a video; a video "
-            "without it has both views side by side.",
+            help="Right image, of any size; not needed with --points. Or a folder, or a video; without it, a "
+            "video LEFT has both views side by side.",
         ),
     ] = None,
     calib: Annotated[
@@ -43,7 +43,7 @@ def _depth(
         ),
     ] = None,
     cameras: Annotated[
-        str | None, _option("Left and right camera of a file of many, as 2,3.", CAMERAS, "--cameras")
+        str | None, _option("Which two cameras of a file that has more, as 2,3.", CAMERAS, "--cameras")
     ] = None,
     fx: Annotated[float | None, _option("Focal length, pixels.", CAMERAS, "--fx")] = None,
     fy: Annotated[float | None, _option("Focal length, pixels.", CAMERAS, "--fy")] = None,
@@ -52,7 +52,7 @@ def _depth(
     baseline: Annotated[
         float | None,
         _option(
-            "Distance of the cameras, metres, right one to the right; also scales --calib.",
+            "Distance of the cameras, metres, right one to the right; replaces that of --calib.",
             CAMERAS,
             "--baseline",
         ),
@@ -78,12 +78,14 @@ def _depth(
     ] = False,
     fov: Annotated[
         float | None,
-        _option("Horizontal field of view, degrees, where EXIF tells no focal length.", CAMERAS, "--fov"),
+        _option("Horizontal field of view, degrees, if EXIF has no focal length.", CAMERAS, "--fov"),
     ] = None,
     known_length: Annotated[
         str | None,
         _option(
-            "Distance of two pixels of LEFT, X1,Y1,X2,Y2,METRES, for --baseline.", CAMERAS, "--known-length"
+            "Distance between two points of LEFT, X1,Y1,X2,Y2,METRES; instead of --baseline.",
+            CAMERAS,
+            "--known-length",
         ),
     ] = None,
     matcher: Annotated[
@@ -127,11 +129,14 @@ def _depth(
         int | None, _option("Denoising steps; by default the prior's own, at least 4.", RUN, "--steps")
     ] = None,
     ensemble: Annotated[
-        int, _option("Members; from 2 on their spread is written as uncertainty.", RUN, "--ensemble")
+        int,
+        _option(
+            "Number of members; with 2 or more, their spread is written as uncertainty.", RUN, "--ensemble"
+        ),
     ] = 1,
     resolution: Annotated[
         int | None,
-        _option("Longer side for the prior, pixels; 0: as the image.", RUN, "--resolution"),
+        _option("Longer side at which the prior works, pixels; 0: the image's own.", RUN, "--resolution"),
     ] = None,
     points: Annotated[
         Path | None,
@@ -143,11 +148,15 @@ def _depth(
     ] = None,
     points_scale: Annotated[
         float | None,
-        _option("Units of that file in a metre: 1000 for mm, 256 for KITTI's PNG.", RUN, "--points-scale"),
+        _option(
+            "How many units of that file are a metre: 1000 for mm, 256 for KITTI's PNG.",
+            RUN,
+            "--points-scale",
+        ),
     ] = None,
     points_calib: Annotated[
         list[Path] | None,
-        _option("KITTI's lidar calibration, for a .bin; twice for one of two files.", RUN, "--points-calib"),
+        _option("KITTI's lidar calibration, for a .bin; twice if it is in two files.", RUN, "--points-calib"),
     ] = None,
     cropped: Annotated[
         bool, _option("The principal point may lie outside: the images are crops.", CAMERAS, "--cropped")
@@ -175,10 +184,15 @@ def _depth(
     ] = None,
     overwrite: Overwrite = False,
     warm_start: Annotated[
-        bool, _option("Many pairs: go on from the frame before, in fewer steps.", RUN, "--warm-start")
+        bool,
+        _option(
+            "Many pairs: start each from the result of the previous frame, in fewer steps.",
+            RUN,
+            "--warm-start",
+        ),
     ] = False,
     strict: Annotated[
-        bool, _option("A result that is not to be trusted is an error.", OUTPUT, "--strict")
+        bool, _option("End with an error if the result is not to be trusted.", OUTPUT, "--strict")
     ] = False,
     export: Annotated[
         list[str] | None,
@@ -187,7 +201,7 @@ def _depth(
     show: Annotated[
         str | None,
         _option(
-            "Open the cloud and cameras in rerun or viser, or auto for what is installed.", OUTPUT, "--show"
+            "Open the cloud and cameras in rerun, viser, or auto (whichever is installed).", OUTPUT, "--show"
         ),
     ] = None,
     quiet: Annotated[bool, _option("No progress bar, no summary.", OUTPUT, "--quiet", "-q")] = False,

@@ -76,8 +76,8 @@ class GuidanceConfig(Checked):
         4,
         1,
         1000,
-        "denoising steps when the call names none and the pipeline's own default is lower; a prior of one "
-        "step makes their updates in it",
+        "denoising steps when the call names none and the pipeline's own default is lower; a one-step prior "
+        "does the rounds of all of them in its one step",
         paper="{} (not given)",
     )
     respace: bool = flag(True, "a leading DDIM schedule runs as trailing while guided")
@@ -85,8 +85,8 @@ class GuidanceConfig(Checked):
         0.25,
         0.0,
         0.99,
-        "share of the schedule that a call with `previous`, the output of the frame before, leaves out; 0 "
-        "takes over the scale alone ([sequences](../how-to/sequences.md))",
+        "share of the schedule that a call with `previous`, the output of the previous frame, skips; with 0 "
+        "it takes over the scale alone ([sequences](../how-to/sequences.md))",
         paper="-",
     )
     loss_resolution: int = integer(
@@ -100,7 +100,11 @@ class GuidanceConfig(Checked):
         unset="from the nearest plane to a shift of 0.3 px",
     )
     gate: float = number(
-        10.0, 1.0, 1e6, "matches further than this factor from the estimate are not believed", paper="-"
+        10.0,
+        1.0,
+        1e6,
+        "matches that differ from the estimate by more than this factor are ignored",
+        paper="-",
     )
     pose: str = choice(
         "refine",

@@ -15,7 +15,7 @@ __all__ = ["FitConfig", "MatchingConfig", "SearchConfig", "SweepConfig"]
 
 @dataclass(frozen=True)
 class SweepConfig(Checked):
-    """The plane sweep that search and matches stand on."""
+    """The plane sweep that search and matches are based on."""
 
     planes: int = integer(160, 24, 4096, "the most planes", paper="-")
     plane_step_px: float = number(
@@ -86,14 +86,14 @@ class MatchingConfig(Checked):
         0.1, TINY, 1e6, "difference in brightness that halves the cost of such a step", paper="-"
     )
     agreement_planes: float = number(
-        1.5, 0, 1e6, "planes by which what the two views say may differ", paper="-"
+        1.5, 0, 1e6, "planes by which the matches of the two views may differ", paper="-"
     )
     contrast_reach: int = integer(
         15,
         0,
         1000,
-        "half the window over which a match's plane must be better than the mean plane, px: aggregation "
-        "carries matches over blank walls for ever",
+        "half the window over which a match's plane must be better than the mean plane, px; without this, "
+        "aggregation would carry matches across blank walls without limit",
         paper="-",
     )
     least_contrast: float = number(

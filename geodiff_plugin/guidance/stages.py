@@ -97,15 +97,15 @@ class ReflectionsConfig(Checked):
 
     reject_reflections: bool = flag(
         True,
-        "matches that lie behind what the prior's first estimate says, over a region and by more than the "
-        "image's own matches scatter around it, lose their say: mirrors and glass",
+        "matches that lie behind the prior's first estimate, over a region and by more than the image's "
+        "matches scatter around it, lose their weight: they are reflections in mirrors and glass",
     )
     reflection_region: float = number(
         0.08,
         0,
         1,
-        "half the side of the window over which matches must agree, in image sides: a prior that misses a "
-        "small gap between things must not close it",
+        "half the side of the window over which matches must agree, in image sides; with a smaller "
+        "one, gaps that the prior misses would be taken for reflections",
         paper="-",
     )
     reflection_spreads: float = number(
@@ -113,17 +113,17 @@ class ReflectionsConfig(Checked):
     )
     reflection_floor: float = number(0.2, TINY, 1e3, "and at least this far, in log depth", paper="-")
     reflection_least_spread: float = number(
-        0.05, 0, 1e3, "no spread is taken for less, in log depth", paper="-"
+        0.05, 0, 1e3, "least spread that is assumed, in log depth", paper="-"
     )
     reflection_gone: float = number(
         1.6,
         1.0 + TINY,
         1e6,
-        "from the threshold to this multiple of it, belief falls from all to nothing",
+        "from the threshold to this multiple of it, a match's weight falls to nothing",
         paper="-",
     )
     reflection_limit: float = number(
-        1.5, TINY, 1e3, "further than this in log depth, a match tells nothing more", paper="-"
+        1.5, TINY, 1e3, "larger differences in log depth count as this one", paper="-"
     )
     reflection_sure: float = number(
         0.3, 0, 1, "confidence above which a match counts in the spread", paper="-"
@@ -136,7 +136,7 @@ class CorrectionConfig(Checked):
 
     correct: bool = flag(
         True,
-        "in `corrections` of the steps the decoded map is brought to its matches and points and the change "
+        "in `corrections` of the steps the decoded map is fitted to its matches and points and the change "
         'is encoded, before the updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek '
         "and Nalpantidis 2024)",
     )
@@ -154,10 +154,10 @@ class CorrectionConfig(Checked):
         0.05,
         1,
         "side of the grid that corrections in the loop are solved on, as a share of that of the losses; "
-        "their factor is upsampled, and the result is refined at full resolution whatever it is",
+        "the result is refined at full resolution in any case",
         paper="-",
     )
-    refine: bool = flag(True, "the result is brought to its matches and points once more, at full resolution")
+    refine: bool = flag(True, "the result is fitted to its matches and points once more, at full resolution")
     match_noise: float = number(
         0.02,
         TINY,
@@ -199,8 +199,8 @@ class CorrectionConfig(Checked):
         50.0,
         TINY,
         1e6,
-        "smoothness of the first pass of a fit, if the prior's own is not above it: it brings whole regions, "
-        "with what no match is near",
+        "smoothness of the first pass of a fit, if the prior's own is not above it: it corrects whole "
+        "regions, with the pixels far from every match",
         paper="-",
     )
     broad_inertia: float = number(1e-4, TINY, 1e6, "least inertia of that pass", paper="-")
@@ -219,10 +219,12 @@ class CorrectionConfig(Checked):
         400.0,
         TINY,
         1e6,
-        "smoothness that a region's matches are judged and the prior is measured under",
+        "smoothness of the fit that measures the prior and finds outliers among a region's matches",
         paper="-",
     )
-    stiff_inertia: float = number(1.3e-3, TINY, 1e6, "its inertia, as a share of it", paper="-")
+    stiff_inertia: float = number(
+        1.3e-3, TINY, 1e6, "inertia of that fit, as a share of this smoothness", paper="-"
+    )
     block: float = number(
         0.08,
         TINY,
@@ -230,8 +232,10 @@ class CorrectionConfig(Checked):
         "side of the blocks of matches left out to measure the prior, in image sides",
         paper="-",
     )
-    least_error: float = number(0.01, TINY, 1, "no prior is taken for better, in log depth", paper="-")
-    most_error: float = number(0.5, TINY, 10, "or for worse", paper="-")
+    least_error: float = number(
+        0.01, TINY, 1, "least error that is assumed of a prior, in log depth", paper="-"
+    )
+    most_error: float = number(0.5, TINY, 10, "and the largest", paper="-")
     image_edge: float = number(
         0.1,
         TINY,
@@ -284,15 +288,15 @@ class UpdatesConfig(Checked):
         None,
         0,
         10_000,
-        "updates in each denoising step that makes some; 0 leaves the search and the correction",
+        "updates in each denoising step that makes any; with 0 only the search and the correction remain",
         unset="0 after a correction, else 40",
     )
     updates_from: float | None = number(
         None,
         0,
         1,
-        "steps that end by this fraction of the schedule make no updates: what matches can say is there by "
-        "then, and the photographs refine it",
+        "steps that end by this fraction of the schedule make no updates: they leave the estimate to the "
+        "matches, and later steps refine it by the photographs",
         unset="0.75 of `stop` after a correction, else 0",
     )
     optimize_latents: bool = flag(True, "`False` is Table 4's ablation: scale and shift only (S5.3)")
