@@ -126,7 +126,7 @@ def _levels(image_01: torch.Tensor) -> torch.Tensor:
 def find_flaws(image_01: torch.Tensor) -> Flaws:
     """How coarsely a photograph was compressed, and how noisy it is.
 
-    Compression shows as long as the picture was not resampled since: turned, shrunk, straightened.
+    Compression shows as long as the picture was not resampled since: shrunk, undistorted or rectified.
 
     Args:
         image_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1], at least 32 pixels a side.

@@ -190,7 +190,7 @@ def _odd(signs: Signs, trusted: bool) -> list[str]:
     if points is not None and abs(math.log(signs.points_ratio)) <= POINTS_WRONG:
         found.append(points)
     if 0 < signs.points < LEAST_POINTS and not math.isnan(signs.matched):
-        found.append(f"Only {signs.points} known depth{'s' * (signs.points > 1)} lie in the image.")
+        found.append(f"Known depths that lie in the image: {signs.points}, too few to rely on.")
     lines = _of_lines(signs)
     if lines is not None and not signs.epipolar_px > EPIPOLAR_WRONG:
         found.append(lines)

@@ -67,7 +67,7 @@ def test_reasons(signs, words):
         ({"own_ratio": 2.1}, "2.1 times the prior's own metres"),
         ({"own_ratio": 0.4}, "0.4 times"),
         ({"points_ratio": 1.15, "points": 99}, "1.15 times as far"),
-        ({"points": 1}, "Only 1 known depth lie"),
+        ({"points": 1}, "Known depths that lie in the image: 1"),
         ({"epipolar_px": 2.4}, "2.4 px beside"),
         ({"on_edge": True, "at_end": 0.2}, "ended on the edge"),
     ],
