@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -133,7 +135,7 @@ def test_points_alone_become_a_prompt_and_nothing_becomes_none(textured_plane):
     middle = float(np.median(textured_plane.depth_m))
     assert prompt.isfinite().all() and float(prompt.median()) == pytest.approx(middle, rel=0.01)
     bare = evidence_of(textured_plane, points, rights=False)
-    assert prompt_of([bare, type(bare)(bare.left_01, bare.K_left, (), None, None, None)]) is None
+    assert prompt_of([bare, replace(bare, points=None, sweep_points=None)]) is None
 
 
 def test_prompt_depth_anything_is_given_what_is_known(textured_plane):
