@@ -115,8 +115,7 @@ def _jpeg_scale(levels: torch.Tensor, basis: torch.Tensor) -> float:
 def _noise(levels: torch.Tensor, basis: torch.Tensor) -> float:
     fine = _to_blocks(levels, basis)[..., _SIDE // 2 :, _SIDE // 2 :]
     energy = fine.square().mean((-1, -2)).flatten()
-    flattest = energy.kthvalue(1 + int(_FLATTEST * (len(energy) - 1))).values
-    return math.sqrt(float(flattest)) * _NOISE_OF_FLATTEST
+    return math.sqrt(float(torch.quantile(energy, _FLATTEST))) * _NOISE_OF_FLATTEST
 
 
 def _levels(image_01: torch.Tensor) -> torch.Tensor:
