@@ -118,8 +118,8 @@ def _noise(levels: torch.Tensor, basis: torch.Tensor) -> float:
     return math.sqrt(float(torch.quantile(energy, _FLATTEST))) * _NOISE_OF_FLATTEST
 
 
-def _levels(image_01: torch.Tensor) -> torch.Tensor:
-    return grey(image_01)[0] * 255.0
+def _flaws(levels: torch.Tensor, basis: torch.Tensor) -> Flaws:
+    return Flaws(_jpeg_scale(levels, basis), _noise(levels, basis))
 
 
 def find_flaws(image_01: torch.Tensor) -> Flaws:
@@ -133,9 +133,8 @@ def find_flaws(image_01: torch.Tensor) -> Flaws:
     Returns:
         ``Flaws``.
     """
-    levels = _levels(image_01)
-    basis = _basis(levels)
-    return Flaws(_jpeg_scale(levels, basis), _noise(levels, basis))
+    levels = grey(image_01)[0] * 255.0
+    return _flaws(levels, _basis(levels))
 
 
 def _threshold(flaws: Flaws, like: torch.Tensor) -> torch.Tensor | None:
@@ -166,12 +165,11 @@ def clean(image_01: torch.Tensor, grid_pixels: int) -> torch.Tensor:
     """
     if image_01.shape[-2] * image_01.shape[-1] > _SHRUNK * grid_pixels:
         return image_01
-    flaws = find_flaws(image_01)
-    levels = _levels(image_01)
-    threshold = _threshold(flaws, levels)
+    levels = grey(image_01)[0] * 255.0
+    basis = _basis(levels)
+    threshold = _threshold(_flaws(levels, basis), levels)
     if threshold is None:
         return image_01
-    basis = _basis(levels)
     height, width = levels.shape
     sides = _SIDE, _SIDE + (-width) % _SIDE, _SIDE, _SIDE + (-height) % _SIDE
     wide = F.pad(levels[None, None], sides, mode="reflect")[0, 0]

@@ -10,11 +10,13 @@ independent residuals varies by ``1 / n`` of what one does.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
 
-__all__ = ["across_lines", "common_residual_px", "independent_share"]
+__all__ = ["ResidualParts", "across_lines", "split_residuals"]
 
 #: Blocks a row of the left image.
 BLOCKS = 10
@@ -34,8 +36,29 @@ def across_lines(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return ((at.px - tracks.right_px[0]) * normals).sum(1), normals
 
 
-def _in_blocks(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals ``(N,)`` without outliers; their number and mean ``(M,)`` in the blocks that have enough."""
+@dataclass(frozen=True)
+class ResidualParts:
+    """What the residuals of a right view consist of.
+
+    Attributes:
+        independent_share: how much of a match counts, in (0, 1]; 1 where residuals of neighbours have
+            nothing in common.
+        common_px: standard deviation, pixels, of what the residuals of neighbours have in common: that of
+            the means of blocks beyond what noise of single matches leaves in them; of all residuals if the
+            matches lie in too few blocks to tell.
+    """
+
+    independent_share: float
+    common_px: float
+
+
+def split_residuals(tracks: Tracks, T: np.ndarray) -> ResidualParts:
+    """Tell noise of single matches from what neighbours have in common.
+
+    Args:
+        tracks: of one right view, at least one.
+        T: ``(4, 4)``, ``T_right_from_left``, that fits them.
+    """
     off, _ = across_lines(tracks, T)
     scale = max(1.4826 * float(np.median(np.abs(off))), 1e-3)
     kept = np.abs(off) < 3.0 * scale
@@ -44,37 +67,11 @@ def _in_blocks(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     _, block, count = np.unique(row * 1000 + column, return_inverse=True, return_counts=True)
     mean = np.bincount(block, off[kept]) / count
     enough = count >= _FEWEST_IN_BLOCK
-    return off[kept], count[enough], mean[enough]
-
-
-def independent_share(tracks: Tracks, T: np.ndarray) -> float:
-    """How much of a match counts, 1 where residuals of neighbours have nothing in common.
-
-    Args:
-        tracks: of one right view.
-        T: ``(4, 4)``, ``T_right_from_left``, that fits them.
-    """
-    off, count, mean = _in_blocks(tracks, T)
-    if not len(count):
-        return 1.0
-    return float(1.0 / max((count * mean**2).mean() / (off**2).mean(), 1.0))
-
-
-def common_residual_px(tracks: Tracks, T: np.ndarray) -> float:
-    """Standard deviation, in pixels, of what the residuals of neighbours have in common.
-
-    Args:
-        tracks: of one right view.
-        T: ``(4, 4)``, ``T_right_from_left``, that fits them.
-
-    Returns:
-        That of the means of blocks beyond what noise of single matches leaves in them; of all residuals if
-        the matches lie in too few blocks to tell.
-    """
-    off, count, mean = _in_blocks(tracks, T)
-    total = float((off**2).mean())
-    if len(count) < _FEWEST_BLOCKS:
-        return total**0.5
-    common = (mean**2).mean()
-    noise = max(total - common, 0.0)
-    return float(max(common - noise * (1.0 / count).mean(), 0.0) ** 0.5)
+    count, mean = count[enough], mean[enough]
+    total = float((off[kept] ** 2).mean())
+    inflated = (count * mean**2).mean() / total if len(count) else 1.0
+    common = total
+    if len(count) >= _FEWEST_BLOCKS:
+        between = (mean**2).mean()
+        common = between - max(total - between, 0.0) * (1.0 / count).mean()
+    return ResidualParts(float(1.0 / max(inflated, 1.0)), float(max(common, 0.0) ** 0.5))

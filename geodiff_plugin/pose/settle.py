@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin.geometry.cameras import is_rectified
-from geodiff_plugin.pose.noise import common_residual_px, independent_share
+from geodiff_plugin.pose.noise import split_residuals
 from geodiff_plugin.pose.solve import Prior, solve_poses
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
@@ -100,12 +100,12 @@ def settle_poses(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> tuple[n
     explained = np.sqrt(np.clip(median_residuals(tracks, given) ** 2 - left**2, 0.0, None))
     rig = is_rig(tracks, given)
     views = [tracks.view(v) for v in range(len(given))]
-    pairs = list(zip(views, fitted, strict=True))
-    faults = np.array([common_residual_px(one, T) if len(one) else np.nan for one, T in pairs])
+    parts = [split_residuals(one, T) if len(one) else None for one, T in zip(views, fitted, strict=True)]
+    faults = np.array([np.nan if part is None else part.common_px for part in parts])
     times = explained / (_FAULTS * np.maximum(faults, _LEAST_FAULT_PX))
     share = np.full_like(times, _RIG_MOVED_SHARE) if rig else np.clip(times**4, *_MOVED_SHARE)
     moved = np.maximum(np.nan_to_num(share * explained), _FLOOR_PX)
-    shares = [independent_share(one, T) for one, T in pairs if len(one)]
+    shares = [part.independent_share for part in parts if part is not None]
     settled = solve_poses(
         tracks,
         given,

@@ -133,7 +133,7 @@ def solve_poses(
         prior: how far they are believed.
         start: where to begin; ``None`` for ``given``.
         scale_px: residual from which on an observation counts for less, pixels of the right view.
-        trust: what the residuals count against the prior, (0, 1]; see ``noise.independent_share``.
+        trust: what the residuals count against the prior, (0, 1]; see ``noise.ResidualParts``.
 
     Returns:
         ``(V, 4, 4)``.

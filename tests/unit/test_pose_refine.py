@@ -12,7 +12,7 @@ from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.posing import coarse_depth, pose_views
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
-from geodiff_plugin.pose.noise import common_residual_px, independent_share
+from geodiff_plugin.pose.noise import split_residuals
 from geodiff_plugin.pose.settle import settle_poses, undecided
 from geodiff_plugin.pose.solve import Prior, solve_poses
 from geodiff_plugin.pose.straighten import fit_displacement, straightened
@@ -267,16 +267,16 @@ def test_straightening_moves_pixels_where_matches_go() -> None:
 
 def test_residuals_alike_in_neighbours_count_for_less() -> None:
     tracks, Ts, _ = make_tracks([TRUE], outliers=0.0)
-    assert independent_share(tracks, Ts[0]) > 0.5
-    assert independent_share(bent(tracks, 2.0), Ts[0]) < 0.2
+    assert split_residuals(tracks, Ts[0]).independent_share > 0.5
+    assert split_residuals(bent(tracks, 2.0), Ts[0]).independent_share < 0.2
 
 
 def test_what_neighbours_have_in_common_is_told_from_noise() -> None:
     tracks, Ts, _ = make_tracks([TRUE], noise_px=0.4, outliers=0.0)
-    assert common_residual_px(tracks, Ts[0]) < 0.1
-    assert common_residual_px(bent(tracks, 2.0), Ts[0]) > 0.4
+    assert split_residuals(tracks, Ts[0]).common_px < 0.1
+    assert split_residuals(bent(tracks, 2.0), Ts[0]).common_px > 0.4
     # Too few blocks to tell: all of it may be common.
-    assert common_residual_px(tracks.kept(slice(12)), Ts[0]) > 0.2
+    assert split_residuals(tracks.kept(slice(12)), Ts[0]).common_px > 0.2
 
 
 def test_merged_tracks_keep_their_views() -> None:
