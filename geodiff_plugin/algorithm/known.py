@@ -1,7 +1,6 @@
-"""What is known beside the prior: matches and points, and how far an estimate lets them be believed.
+"""What is known beside the prior: matches and points, and which of them an estimate contradicts.
 
-Data flow: metric depth of an estimate -> the matches that it believes, and points -> that depth brought to
-them.
+Data flow: metric depth of an estimate -> the matches near it, and points -> that depth refined by them.
 Paper: none; its only evidence is the photometric error of Eq. 14 (eq:geo-loss).
 
 One object answers for both grids: that of the losses, at every step, and that of the sweep, for the output.
@@ -107,7 +106,7 @@ class Known:
             None if self.error is None else self.error[index],
         )
 
-    def believed(self, depth_m: Tensor) -> MatchTarget | None:
+    def usable_matches(self, depth_m: Tensor) -> MatchTarget | None:
         """The matches within the gate around an estimate, less those that look like reflections.
 
         Args:
@@ -120,14 +119,14 @@ class Known:
         return replace(self.matches, confidence=_resized(self.kept, size) * gated)
 
     def target(self, depth_m: Tensor) -> MatchTarget | None:
-        """What an estimate is brought to: matches that it believes, and points; ``None`` without either."""
-        matches = self.believed(depth_m)
+        """What an estimate is refined by: usable matches, and points; ``None`` without either."""
+        matches = self.usable_matches(depth_m)
         if matches is not None and self.error is not None:
             matches = off_edges(matches, depth_m, self.error, self.config.correction)
         return matches if self.points is None else with_points(matches, self.points)
 
-    def bring(self, depth_m: Tensor, left_01: Tensor) -> Refined | None:
-        """An estimate brought to what is known, edge-aware; ``None`` where nothing is.
+    def refine(self, depth_m: Tensor, left_01: Tensor) -> Refined | None:
+        """An estimate fitted to what is known, edge-aware; ``None`` where nothing is.
 
         Args:
             depth_m: ``(B, 1, H, W)`` metres, at any resolution.

@@ -135,7 +135,7 @@ class Trajectory:
             (self._search_one_number if search == "one-number" else self._span_points)(x)
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         self.known = self.known.judged(self._on_known(depth_m), self.objective.views.left_01)
-        self.matches = replace(self._on_losses, kept=self.known.kept).believed(depth_m)
+        self.matches = replace(self._on_losses, kept=self.known.kept).usable_matches(depth_m)
 
     def _on_known(self, depth_m: Tensor) -> Tensor:
         """A metric map on the grid of the corrections."""
@@ -247,7 +247,7 @@ class Trajectory:
 
     @torch.no_grad()
     def corrected(self, x: Tensor) -> Tensor:
-        """A relative map brought to what is known, as far as the gate believes it.
+        """A relative map fitted to what is known, as far as the gate lets it in.
 
         Args:
             x: ``(B, 1, h, w)`` float32 relative map, for which ``settle_scale`` was called.
@@ -256,11 +256,11 @@ class Trajectory:
             ``(B, 1, h, w)``; ``x`` where no match or point is near.
         """
         depth_m = self._on_known(self.objective.metric_depth(x, self.affine))
-        brought = self.known.bring(depth_m, self.objective.views.left_01)
-        if brought is None:
+        refined = self.known.refine(depth_m, self.objective.views.left_01)
+        if refined is None:
             return x
         # A factor, not a difference of maps: interpolated over an edge the latter is an error on either side.
-        field = F.interpolate(brought.field, x.shape[-2:], mode="bilinear", antialias=True)
+        field = F.interpolate(refined.field, x.shape[-2:], mode="bilinear", antialias=True)
         return self.metric.relative(self.metric(x, self.affine) * torch.exp(-field), self.affine)
 
     def loss(self, x: Tensor, affine: AffineState, z0: Tensor, anchor: Tensor) -> Loss:

@@ -29,6 +29,7 @@ from geodiff_plugin.cli.start import PARAMETERS, calibration_way
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.formats.rigs import intrinsics
+from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
 
@@ -158,7 +159,7 @@ def read_rig(
 
 
 def _read_further_views(
-    arguments: DepthArguments, K_left: np.ndarray, lenses: Lenses
+    arguments: DepthArguments, K_left: np.ndarray, lenses: Lenses, config: GuidanceConfig
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Image without lens distortion, K and pose of every ``--view``, checked under its own name."""
     images, poses, matrices = arguments.view, arguments.view_e, arguments.view_k
@@ -172,7 +173,7 @@ def _read_further_views(
             check_intrinsics_fit(K, *_size(image), f"K of {option}", "its image")
         E = check_pose(read_matrix(poses[i], "--view-E"), f"--view-E {poses[i]}")
         check_baseline(E, f"--view-E {poses[i]}")
-        views.append((pinhole(image, K, lenses[i]), K, E))
+        views.append((pinhole(image, K, lenses[i], config), K, E))
     return views
 
 
@@ -185,7 +186,7 @@ def _make_guidance(
         points = read_points(arguments.points, "--points", scale=scale, calibration=calibration)
     if right is None:
         return GeometryGuidance(None, rig.K_left, points=points, cropped=cropped, config=config)
-    further = _read_further_views(arguments, rig.K_left, lenses)
+    further = _read_further_views(arguments, rig.K_left, lenses, config)
     views = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E), *further]
     return GeometryGuidance.from_views(views, points=points, cropped=cropped, config=config)
 
@@ -224,7 +225,8 @@ def read_inputs(
     if views is None:
         _compare_with_exif(arguments, rig)
     lenses = lenses_of(arguments, rig.distortion)
-    left = pinhole(left, rig.K_left, lenses[0])
-    right = None if right is None else pinhole(right, rig.K_right, lenses[1])
+    left = pinhole(left, rig.K_left, lenses[0], settings.config)
+    if right is not None:
+        right = pinhole(right, rig.K_right, lenses[1], settings.config)
     guidance = _make_guidance(arguments, settings, right, rig, lenses[2:])
     return Inputs(left, rig, guidance, any(lens is not None for lens in lenses))

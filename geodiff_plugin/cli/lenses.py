@@ -1,18 +1,21 @@
 """Lens distortion in ``geodiff depth``: the options, and undistorted images.
 
 Data flow: ``--distortion``, ``--view-distortion``, the calibration -> one ``Distortion`` a photograph
-    -> undistorted images.
+    -> cleaned and undistorted images.
 Paper: none; it takes pinhole cameras for granted.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 from geodiff_plugin.formats.rigs import is_distorted
+from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.matching import clean
 from geodiff_plugin.types import Distortion
 
 __all__ = ["Lenses", "lenses_of", "pinhole"]
@@ -21,9 +24,27 @@ Lenses = tuple[Distortion | None, ...]
 """One entry a photograph, or one a further view; ``None`` for a pinhole camera."""
 
 
-def pinhole(image: np.ndarray, K: np.ndarray, lens: Distortion | None) -> np.ndarray:
-    """The image as a pinhole camera would have taken it; the same array where the lens has no distortion."""
-    return image if lens is None else undistorted(image, K, lens)
+def pinhole(
+    image_01: np.ndarray, K: np.ndarray, lens: Distortion | None, config: GuidanceConfig
+) -> np.ndarray:
+    """The image as a pinhole camera would have taken it.
+
+    Args:
+        image_01: ``(H, W, 3)`` float32 in [0, 1].
+        K: ``(3, 3)`` pixels.
+        lens: what it was taken through; ``None`` for a lens without distortion.
+        config: says whether photographs are cleaned. That comes first: once an image is resampled, the
+            blocks of its compression are no longer found.
+
+    Returns:
+        The same shape; the array that was given where the lens has no distortion.
+    """
+    if lens is None:
+        return image_01
+    if config.clean_photographs:
+        cleaned = clean(torch.from_numpy(image_01).permute(2, 0, 1), config.sweep.sweep_pixels)
+        image_01 = cleaned.permute(1, 2, 0).contiguous().numpy()
+    return undistorted(image_01, K, lens)
 
 
 def lenses_of(

@@ -86,7 +86,7 @@ def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
         for note in notes:
             warnings.warn(note, stacklevel=2)
         Ks.append(_intrinsics(arguments, path, i, (image.shape[1], image.shape[0])))
-        images.append(pinhole(image, Ks[-1], lenses[i]))
+        images.append(pinhole(image, Ks[-1], lenses[i], settings.config))
     points = None if arguments.points is None else read_points(arguments.points, "--points")
     guidance = GeometryGuidance.from_photographs(
         images,

@@ -78,8 +78,8 @@ def _residual(record: dict[str, Any], name: str) -> str:
     return " / ".join(f"{px:.2f}" for px in values) or "-"
 
 
-def _silent(column: Column) -> int:
-    """Pairs of a column that are wrong by a factor without a word."""
+def _unwarned(column: Column) -> int:
+    """Pairs of a column that are off by more than ``BY_A_FACTOR`` without a warning."""
     return sum(
         1
         for record in column.records
@@ -126,8 +126,8 @@ def poses_table(title: str, columns: Sequence[Column], note: str) -> Table:
         rows.append((f"mean of {count_of_pairs(len(own), kind)}", *(_mean(each) for each in values)))
     missing = [sum(headline(record) is None for record in column.records) for column in columns]
     rows.append(("without a result", *(str(count) for count in missing)))
-    off = f"off by more than {BY_A_FACTOR:g} in silence"
-    rows.append((off, *(str(_silent(column)) for column in columns)))
+    off = f"off by more than {BY_A_FACTOR:g}, no warning"
+    rows.append((off, *(str(_unwarned(column)) for column in columns)))
     return Table(title, ("pair", *(column.heading for column in columns)), tuple(rows), note)
 
 

@@ -1,4 +1,4 @@
-"""How often a wrong calibration is caught, and how often a right one is doubted: ``geodiff eval trust``.
+"""How often a wrong calibration is detected, and a right one is not trusted: ``geodiff eval trust``.
 
 Data flow: pairs, right and made wrong -> guided calls -> signs -> judgements -> one table.
 Paper: none.
@@ -172,14 +172,14 @@ def _table(group: str, records: Sequence[dict[str, Any]], kinds: Sequence[str]) 
         ):
             count[0] += 0 if right else sum(map(some, told))
             count[1] += 0 if right else sum(map(some, off))
-        doubted = sum(r["status"] != "trusted" for r in own)
+        distrusted = sum(r["status"] != "trusted" for r in own)
         median = np.median([r["off"] for r in own if r["off"] is not None] or [math.nan])
         warned = sum(r["status"] != "trusted" or bool(r["said"]) for r in own)
         rows.append(
             [
                 names.get(kind, kind),
                 "-" if math.isnan(median) else f"{median:.2f}",
-                _share(doubted, len(own)),
+                _share(distrusted, len(own)),
                 _share(warned, len(own)),
                 _share(len(told), len(off)),
             ]
@@ -187,7 +187,7 @@ def _table(group: str, records: Sequence[dict[str, Any]], kinds: Sequence[str]) 
     rows += [[name, "", "", "", _share(*count)] for name, count in counted.items()]
     head = ["given as", "median error", "not trusted", "anything said", f"said, of those > {OFF:.0%} off"]
     count = len({record["sample"] for record in records})
-    title = f"Wrong calibrations caught, right ones doubted: {count_of_pairs(count, f'{group} ')}"
+    title = f"Wrong calibrations detected, right ones not trusted: {count_of_pairs(count, f'{group} ')}"
     return Table(title, tuple(head), tuple(map(tuple, rows)), NOTE)
 
 

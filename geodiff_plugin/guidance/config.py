@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from geodiff_plugin._checks import bad_type, bad_value, check_number
+from geodiff_plugin.guidance.correction_stages import CorrectionConfig, ReflectionsConfig
 from geodiff_plugin.guidance.fields import (
     Checked,
     by_name,
@@ -24,8 +25,8 @@ from geodiff_plugin.guidance.fields import (
     pair,
     text,
 )
+from geodiff_plugin.guidance.loss_stages import TermsConfig, UpdatesConfig
 from geodiff_plugin.guidance.scale_stages import FitConfig, MatchingConfig, SearchConfig, SweepConfig
-from geodiff_plugin.guidance.stages import CorrectionConfig, ReflectionsConfig, TermsConfig, UpdatesConfig
 
 __all__ = ["DEFAULT_WEIGHTS", "GuidanceConfig", "UpdatePlan"]
 __all__ += ["CorrectionConfig", "FitConfig", "MatchingConfig", "ReflectionsConfig", "SearchConfig"]

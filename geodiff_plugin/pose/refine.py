@@ -91,7 +91,8 @@ def refine_views(
         return untouched(rights, "not checked")
     before, poses = median_residuals(sparse, given), _as_E(given)
     found = PoseReport("fits", poses, poses, _numbers(before), _numbers(before), _numbers(counts))
-    fits_px = FITS_PX if is_rig(sparse, given) else POSED_FITS_PX
+    rig = is_rig(sparse, given)
+    fits_px = FITS_PX if rig else POSED_FITS_PX
     misfit = bool((before > fits_px).any())
     near = nearby_poses(sparse, given, before) if misfit else given
     units = _units(sparse, given)
@@ -102,8 +103,9 @@ def refine_views(
         return RefinedViews(tuple(rights), found.changed(warnings=units))
     depth_m = _on_grid(first_depth(_applied(rights, near)), views.left.shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
-    Ts, free = settle_poses(tracks, given, near)
-    before, after = median_residuals(tracks, given), median_residuals(tracks, Ts)
+    before = median_residuals(tracks, given)
+    Ts, free = settle_poses(tracks, given, near, before, rig)
+    after = median_residuals(tracks, Ts)
     warnings = _warnings(before, after) + undecided(tracks, Ts, free) + units
     found = found.changed(
         residual_px_given=_numbers(before),

@@ -81,13 +81,17 @@ def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.nd
     return Ts
 
 
-def settle_poses(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def settle_poses(
+    tracks: Tracks, given: np.ndarray, near: np.ndarray, before: np.ndarray, rig: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Poses that fit all matches, held as firmly as the given ones turn out to deserve.
 
     Args:
         tracks: all matches of V right views.
         given: ``(V, 4, 4)``, ``T_right_from_left`` as given.
         near: likewise, poses that fit roughly.
+        before: ``(V,)`` pixels, ``median_residuals`` of the poses as given.
+        rig: whether these are those of a rectified rig, see ``is_rig``.
 
     Returns:
         ``(V, 4, 4)``: free where they explain nearly all of the residual, near the given ones where the
@@ -97,8 +101,7 @@ def settle_poses(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> tuple[n
     free = Prior(np.full(len(given), FREE_PX), longer_share=0.02)
     fitted = solve_poses(tracks, given, free, start=near, scale_px=SCALE_PX)
     left = np.maximum(median_residuals(tracks, fitted), _FLOOR_PX)
-    explained = np.sqrt(np.clip(median_residuals(tracks, given) ** 2 - left**2, 0.0, None))
-    rig = is_rig(tracks, given)
+    explained = np.sqrt(np.clip(before**2 - left**2, 0.0, None))
     views = [tracks.view(v) for v in range(len(given))]
     parts = [split_residuals(one, T) if len(one) else None for one, T in zip(views, fitted, strict=True)]
     faults = np.array([np.nan if part is None else part.common_px for part in parts])

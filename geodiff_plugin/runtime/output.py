@@ -211,11 +211,11 @@ def _as_maps(values: Any) -> Tensor:
 def _refined(
     run: GuidedRun, known_of: Sequence[Known], depth_m: Tensor, lefts_01: Tensor
 ) -> tuple[Tensor, Tensor | None]:
-    """The depth of every image brought to what is known, and how far that decided it."""
+    """The depth of every image fitted to what is known, and how far that decided it."""
     if not run.config.correction.refine:
         return depth_m, None
     images = zip(known_of, depth_m.split(1), lefts_01.split(1), strict=True)
-    refined = [one for own, depth, left in images if (one := own.bring(depth, left)) is not None]
+    refined = [one for own, depth, left in images if (one := own.refine(depth, left)) is not None]
     if len(refined) < len(depth_m):
         return depth_m, None
     return torch.cat([r.depth_m for r in refined]), torch.cat([r.support for r in refined])
@@ -234,8 +234,8 @@ def _uncertainty(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: Mappin
         if image_size(members) != size:  # as the stock call brings the ensemble to its output
             members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
         left = lefts_01[i : i + 1]
-        brought = [run.known(i, m).bring(member, left) for m, member in enumerate(members.split(1))]
-        refined = torch.cat([one.depth_m for one in brought if one is not None])
+        fits = [run.known(i, m).refine(member, left) for m, member in enumerate(members.split(1))]
+        refined = torch.cat([fit.depth_m for fit in fits if fit is not None])
         spreads.append(spread_around(depth_m[i : i + 1], refined, reduction))
     return torch.cat(spreads)
 

@@ -11,6 +11,8 @@ from PIL import Image
 
 from geodiff_plugin import GuidanceConfig
 from geodiff_plugin.algorithm.evidence import EvidenceInputs
+from geodiff_plugin.cli.lenses import pinhole
+from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 from geodiff_plugin.guidance.evidence_store import make_evidence
 from geodiff_plugin.matching import clean, find_matches
 from geodiff_plugin.matching.census import grey
@@ -123,3 +125,19 @@ def test_evidence_is_of_cleaned_photographs(pair: SyntheticPair, switched_on: bo
     made = make_evidence(EvidenceInputs(left, views, pair.K_left.float(), None, config, False))
     assert torch.equal(made.left_01, clean(left, GRID) if switched_on else left)
     assert torch.equal(made.native[0].image_01, clean(right, GRID) if switched_on else right)
+
+
+def test_a_photograph_is_cleaned_before_it_is_undistorted(pair: SyntheticPair) -> None:
+    """Afterwards its blocks stand nowhere near a multiple of 8 pixels, and are not found."""
+    blocky, lens = compressed(pair.left.image_01, 30), distortion_from_text("-0.2,0.05,0,0")
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+
+    def straight(image_01: torch.Tensor) -> np.ndarray:
+        return undistorted(image_01.permute(1, 2, 0).contiguous().numpy(), K, lens)
+
+    given = blocky.permute(1, 2, 0).contiguous().numpy()
+    assert find_flaws(torch.from_numpy(straight(blocky)).permute(2, 0, 1)).jpeg_scale == 0
+    np.testing.assert_array_equal(pinhole(given, K, lens, GuidanceConfig()), straight(clean(blocky, GRID)))
+    off = GuidanceConfig(clean_photographs=False)
+    np.testing.assert_array_equal(pinhole(given, K, lens, off), straight(blocky))
+    assert pinhole(given, K, None, GuidanceConfig()) is given

@@ -108,7 +108,7 @@ def test_terms(draw):
     terms = numbers["terms"]
     assert set(terms) == {"photometric", "matches", "prior_pull", "anchor", "weighted sum"}
     assert all(len(values) == 2 for values in terms.values())  # two of the three steps are guided
-    assert 0 < numbers["believed"] <= 1 and 0 < numbers["matched"] <= 1
+    assert 0 < numbers["match_weight"] <= 1 and 0 < numbers["matched"] <= 1
     with pytest.raises(ValueError, match="ensemble must be 1"):
         draw("terms", "--ensemble", 2)
 
@@ -145,9 +145,9 @@ def test_terms_shows_the_guided_method_and_what_it_started_from(plane_sample, ti
         **call_arguments(tiny_settings),
     )
     own = used[0]
-    let_in = np.nan_to_num(parts.believed) > 0
+    let_in = np.nan_to_num(parts.match_weight) > 0
     assert let_in.mean() > 0.3
-    np.testing.assert_allclose(parts.believed[let_in], own[0, 0].numpy()[let_in], atol=1e-3)
+    np.testing.assert_allclose(parts.match_weight[let_in], own[0, 0].numpy()[let_in], atol=1e-3)
 
 
 def test_terms_of_a_plane(plane_sample, tiny_settings):

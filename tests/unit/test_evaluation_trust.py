@@ -48,14 +48,14 @@ def test_every_kind_changes_what_it_says(samples):
 
 
 def test_counts_and_resumption(tmp_path, monkeypatch, capsys):
-    """Caught are all but the rectified pair's K; one right pair is doubted."""
+    """All but the rectified pair's K are detected; one right pair is not trusted."""
     asked = []
 
     def measure(case, pipe, settings):
         asked.append(case.kind)
         missed = case.kind == "K-2" and case.sample.rectified
-        doubted = case.kind == "right" and not case.sample.rectified
-        bad = doubted or (case.kind != "right" and not missed)
+        distrusted = case.kind == "right" and not case.sample.rectified
+        bad = distrusted or (case.kind != "right" and not missed)
         signs = asdict(Signs(confidence=0.1 if bad else 0.9, matched=0.8, order=0.8))
         signs = {name: None if value != value else value for name, value in signs.items()}
         off = 0.01 if case.kind == "right" else 0.5

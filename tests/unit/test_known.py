@@ -38,28 +38,28 @@ def test_each_grid_has_its_own_matches(grid, size):
     assert known.matches.confidence.shape == (2, 1, *size) and known.points is None
 
 
-def test_matches_outside_of_the_gate_are_not_believed():
+def test_matches_outside_of_the_gate_are_not_usable():
     known = Known.of([evidence()], DEFAULT.changed(gate=1.5), "loss").judged(depth(2.0), GREY)
-    assert (known.believed(depth(2.5)).confidence == 1).all()
-    assert (known.believed(depth(3.1)).confidence == 0).all()
+    assert (known.usable_matches(depth(2.5)).confidence == 1).all()
+    assert (known.usable_matches(depth(3.1)).confidence == 0).all()
     # Whatever grid the estimate is on.
-    assert known.believed(depth(2.5, FINE)).confidence.shape == (1, 1, *COARSE)
+    assert known.usable_matches(depth(2.5, FINE)).confidence.shape == (1, 1, *COARSE)
 
 
 def test_reflections_are_rejected_once_by_the_first_estimate():
     known = Known.of([evidence()], DEFAULT, "loss")
-    assert known.believed(depth(2.0)) is None  # nothing is believed before the prior has spoken
+    assert known.usable_matches(depth(2.0)) is None  # no match is usable before the prior has spoken
     first = known.judged(depth(0.8), GREY)  # all lie far behind it
-    assert (first.believed(depth(0.8)).confidence < 0.1).all()
+    assert (first.usable_matches(depth(0.8)).confidence < 0.1).all()
     assert first.judged(depth(2.0), GREY) is first
     off = Known.of([evidence()], DEFAULT.changed(reject_reflections=False), "loss")
-    assert (off.judged(depth(0.8), GREY).believed(depth(0.8)).confidence == 1).all()
+    assert (off.judged(depth(0.8), GREY).usable_matches(depth(0.8)).confidence == 1).all()
 
 
 def test_what_was_kept_on_one_grid_holds_on_the_other():
     kept = torch.zeros(1, 1, *COARSE)
     kept[..., :8] = 1.0
-    fine = Known.of([evidence()], DEFAULT, "sweep", kept).believed(depth(2.0))
+    fine = Known.of([evidence()], DEFAULT, "sweep", kept).usable_matches(depth(2.0))
     assert (fine.confidence[..., :14] == 1).all() and (fine.confidence[..., 18:] == 0).all()
 
 
@@ -73,13 +73,13 @@ def test_points_count_in_full_beside_an_edge():
     assert beside[6, 8] == away[6, 8] and beside[5, 8] < 0.3 * away[5, 8]
 
 
-def test_an_estimate_is_brought_to_matches_and_points():
+def test_an_estimate_is_refined_to_matches_and_points():
     points = matches_at(2.2, COARSE, confidence=0.0)
     points.confidence[0, 6, 8] = 1.0
     known = Known.of([evidence(points)], DEFAULT, "loss").judged(depth(2.1), GREY)
     target = known.target(depth(2.1))
     assert float(target.inverse_depth[0, 0, 6, 8]) == pytest.approx(1 / 2.2)
-    brought = known.bring(depth(2.1), GREY)
-    assert float(brought.depth_m.median()) == pytest.approx(2.0, rel=0.1) and (brought.support > 0.8).all()
+    refined = known.refine(depth(2.1), GREY)
+    assert float(refined.depth_m.median()) == pytest.approx(2.0, rel=0.1) and (refined.support > 0.8).all()
     nothing = Known(DEFAULT, None, None)
-    assert nothing.judged(depth(2.0), GREY) is nothing and nothing.bring(depth(2.0), GREY) is None
+    assert nothing.judged(depth(2.0), GREY) is nothing and nothing.refine(depth(2.0), GREY) is None

@@ -60,7 +60,7 @@ def _poses(
     ] = "0.3,1.5",
     **shared: Any,
 ) -> None:
-    """What inexact poses cost, what refining them gains, and what estimated ones are worth."""
+    """Accuracy with poses as given, perturbed, refined and estimated, and of rigs that have drifted."""
     from geodiff_plugin.cli.eval.printing import print_page
     from geodiff_plugin.evaluation.baselines import Settings
     from geodiff_plugin.evaluation.datasets.perturbed import drift_of, perturbation

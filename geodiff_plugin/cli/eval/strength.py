@@ -38,14 +38,14 @@ def strength(
     steps: Annotated[int, typer.Option(min=1, help="Denoising steps.")] = 4,
     resolution: Annotated[int, typer.Option(min=64, help="Longer side for the prior, px.")] = 384,
     seed: Annotated[int, typer.Option(help="Of the noise, and of the prior's error.")] = 0,
-    limit: Annotated[int | None, typer.Option(min=1, help="Pairs of each --data at most.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="At most this many pairs of each --data.")] = None,
     figure: Annotated[
         Path | None,
         typer.Option(help="PNG: error against the prior's error, and lit surfaces."),
     ] = None,
     **shared: Any,
 ) -> None:
-    """Emulated priors from exact to weak: plain with oracle, fitted once, and guided."""
+    """Accuracy with emulated priors from exact to weak: aligned to the truth, fitted once, and guided."""
     from geodiff_plugin.cli.eval.printing import print_page
     from geodiff_plugin.evaluation.emulated import STRENGTHS
     from geodiff_plugin.evaluation.strength import METHODS, StrengthOptions, run_strength

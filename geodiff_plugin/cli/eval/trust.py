@@ -40,7 +40,7 @@ def _trust(
     ] = None,
     **shared: Any,
 ) -> None:
-    """How many wrong calibrations are caught, and how many right ones are doubted."""
+    """How many wrong calibrations are detected, and how many right ones are not trusted."""
     from geodiff_plugin.cli.eval.printing import print_page
     from geodiff_plugin.evaluation.baselines import Settings
     from geodiff_plugin.evaluation.trust import TEN, TrustOptions, run_trust

@@ -58,7 +58,7 @@ class TermByTerm:
     Attributes:
         first_m: ``(H, W)`` metres, the prior's own estimate in the first guided step, scaled by the search.
         matches_m: ``(h, w)`` metres, depth that the views say by themselves; NaN where nothing.
-        believed: ``(h, w)`` in [0, 1], confidence of the matches after rejection and gate; NaN without one.
+        match_weight: ``(h, w)`` in [0, 1], confidence of the matches after rejection and gate; NaN if none.
         denoised_m: ``(H, W)`` metres, the decoded result, before it is refined.
         final_m: ``(H, W)`` metres.
         residual: ``(h, w)`` planes of the sweep, ``final_m`` against the matches; above 0 is nearer.
@@ -70,7 +70,7 @@ class TermByTerm:
 
     first_m: np.ndarray
     matches_m: np.ndarray
-    believed: np.ndarray
+    match_weight: np.ndarray
     denoised_m: np.ndarray
     final_m: np.ndarray
     residual: np.ndarray
@@ -136,7 +136,7 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
     relative = trajectory.metric.relative(estimates[first], found)
     trajectory.settle_scale(relative)
     first_m = trajectory.metric(relative, trajectory.affine)
-    known, believed = trajectory.known.matches, trajectory.matches
+    known, usable = trajectory.known.matches, trajectory.matches
     there = (known.confidence > 0) & (known.inverse_depth > 0)
     final_m = torch.from_numpy(out.prediction).permute(0, 3, 1, 2).float()
     inverse_m = 1.0 / _resized(final_m, known.inverse_depth.shape[-2:])
@@ -147,7 +147,7 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
     return TermByTerm(
         first_m=_resized(first_m, size)[0, 0].numpy(),
         matches_m=where_matched(1.0 / known.inverse_depth),
-        believed=where_matched(believed.confidence),
+        match_weight=where_matched(usable.confidence),
         denoised_m=_resized(steps[-1], size)[0, 0].numpy(),
         final_m=out.prediction[0, ..., 0],
         residual=where_matched((inverse_m - known.inverse_depth) / known.plane_step.view(-1, 1, 1, 1)),
@@ -181,7 +181,7 @@ def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[st
     title, most = "refined against matches\n(red: nearer)", DEFAULT.terms.matches_cauchy
     shown = show_values(lower[2], parts.residual, title, "RdBu_r", -most, most)
     value_bar(figure, shown, lower[2], "planes of the sweep", "both")
-    shown = show_values(lower[3], parts.believed, "matches, how far believed", "viridis", 0.0, 1.0)
+    shown = show_values(lower[3], parts.match_weight, "weight of the matches", "viridis", 0.0, 1.0)
     value_bar(figure, shown, lower[3], "after rejection and gate")
     shown = show_values(lower[4], parts.confidence, "confidence of refined", "viridis", 0.0, 1.0)
     value_bar(figure, shown, lower[4], "probability of an error < 10 %")
@@ -229,8 +229,8 @@ def draw_terms(options: FigureOptions) -> Drawing:
     upper, lower = figure.subfigures(2, 1, height_ratios=heights)
     _maps(upper, sample, parts, abs_rel)
     _curves(lower, parts.history, values)
-    matched = np.isfinite(parts.believed)
+    matched = np.isfinite(parts.match_weight)
     numbers = {"sample": sample.label, "abs_rel": abs_rel, "matched": float(matched.mean())}
-    numbers["believed"] = float(parts.believed[matched].mean()) if matched.any() else 0.0
+    numbers["match_weight"] = float(parts.match_weight[matched].mean()) if matched.any() else 0.0
     numbers |= {"hidden": float(parts.hidden.mean()), "terms": values}
     return Drawing(figure, numbers)
