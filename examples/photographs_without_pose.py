@@ -1,8 +1,8 @@
 """Two photographs of one scene, without a pose: it is estimated from their matches.
 
-Needs the extra ``pose``: ``pip install -e ".[pose]"``. Photographs alone do not show the scale, so give the
-distance between the two cameras. K comes from the field of view, or else from the EXIF data of the
-photographs. Without arguments the script runs offline, on a rendered pair:
+Needs the extra ``pose``: ``pip install -c constraints.txt -e ".[pose]"``. Photographs alone do not show the
+scale, so give the distance between the two cameras. K comes from the field of view, or else from the EXIF
+data of the photographs. Without arguments the script runs offline, on a rendered pair:
 
     python examples/photographs_without_pose.py
     python examples/photographs_without_pose.py left.jpg right.jpg --baseline 0.12 --fov 69

@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> None:
 
     near, far = depth_range(np.concatenate(maps))  # one scale of colours, so that maps can be compared
     pictures = [left, *(colour_depth(depth_m, near=near, far=far) for depth_m in maps)]
-    grid(pictures, [f"{near:.2f} m to {far:.2f} m", *titles]).save(options.out)
+    grid(pictures, [f"left image; colours: {near:.2f} m to {far:.2f} m", *titles]).save(options.out)
     print(f"{options.out}")
 
 

@@ -38,7 +38,7 @@ def _as_matrix(value: Any, name: str, shape: tuple[int, int], cure: str) -> np.n
     if hasattr(value, "detach"):
         value = value.detach().cpu().double().numpy()  # numpy has no bfloat16
     try:
-        matrix = np.asarray(value, dtype=np.float64)
+        matrix = np.array(value, dtype=np.float64)  # a copy: the caller may go on to change theirs
     except (TypeError, ValueError, OverflowError):
         bad_type(name, f"a {shape[0]}x{shape[1]} matrix of numbers", value, cure)
     if matrix.shape != shape:

@@ -129,7 +129,7 @@ def check_choice(value: Any, name: str, choices: Any) -> Any:
     """One of ``choices``, returned as it came."""
     # What came may have no hash, and an array is equal to a word element by element.
     if not any(isinstance(value, type(known)) and value == known for known in choices):
-        bad_value(name, f"one of {sorted(map(str, choices))}", repr(value))
+        bad_value(name, "one of " + ", ".join(sorted(map(str, choices))), repr(value))
     return value
 
 

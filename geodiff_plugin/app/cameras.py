@@ -164,6 +164,5 @@ CAMERA_WAYS: dict[str, CameraWay] = {
         _from_file,
     ),
     "numbers": CameraWay("Focal length and baseline", (*NUMBERS, "third_pose"), _from_numbers),
+    "photographs": CameraWay("Estimate from the photographs", NUMBERS, _from_photographs),
 }
-if hasattr(GeometryGuidance, "from_photographs"):
-    CAMERA_WAYS["photographs"] = CameraWay("Estimate from the photographs", NUMBERS, _from_photographs)

@@ -61,7 +61,7 @@ def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **
         What ``launch`` returns.
 
     Raises:
-        ValueError: gradio is missing, or no such device.
+        OSError, ValueError: gradio is missing, no such device, or the first prior cannot be loaded.
     """
     _check_gradio()
     os.environ.update(QUIET)  # gradio looks at it when it is imported
@@ -70,7 +70,9 @@ def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **
     from geodiff_plugin.app.priors import Priors
     from geodiff_plugin.runtime.machine import pick_device
 
-    page = build_page(Priors(priors, pick_device(device)))
+    offered = Priors(priors, pick_device(device))
+    offered.get(priors[0])  # a name that cannot be loaded is told here, not to the first visitor
+    page = build_page(offered)
     return page.queue(default_concurrency_limit=8).launch(
         theme=THEME, css=CSS, state_session_capacity=SESSIONS_KEPT, footer_links=[], **options
     )

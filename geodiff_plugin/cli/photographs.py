@@ -75,7 +75,10 @@ def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
     for option, given in (("--calib", arguments.calib), ("--E", arguments.e), ("--view-E", arguments.view_e)):
         if given:
             bad_value(
-                option, "left out with --estimate-pose", "given", "Poses are given or estimated, not both."
+                option,
+                "left out with --estimate-pose",
+                "both",
+                "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy.",
             )
     if arguments.baseline is not None:
         check_positive(arguments.baseline, "--baseline", "metres")

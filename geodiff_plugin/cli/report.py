@@ -178,6 +178,11 @@ def _quality(judgement: dict[str, Any]) -> str:
     return ("" if judgement["trusted"] else "DO NOT TRUST THIS, ") + (", ".join(said) or "not judged")
 
 
+def _length(value: float, unit: str) -> str:
+    """Two decimals, or two digits of what is too small for them."""
+    return f"{value:.2f} {unit}" if value >= 0.1 else f"{value:.2g} {unit}"
+
+
 def summary_line(report: dict[str, Any], where: str) -> str:
     """One line for people: near, far, median, how far to trust them, how far off a metric prior was."""
     depth, seconds = report["depth"], sum(report["seconds"].values())
@@ -186,7 +191,7 @@ def summary_line(report: dict[str, Any], where: str) -> str:
     own = report.get("own_scale")
     said = "" if own is None else f"; prior's own metres x {own[0][0]:.2f}"
     unit = report.get("unit", "m") or "baselines (no unit)"
+    near, far, median = (_length(depth[name], unit) for name in ("min_m", "max_m", "median_m"))
     return (
-        f"{depth['min_m']:.2f} {unit} to {depth['max_m']:.2f} {unit}, median {depth['median_m']:.2f} {unit}; "
-        f"{_quality(report['judgement'])}{said}; {seconds:.1f} s -> {where}"
+        f"{near} to {far}, median {median}; {_quality(report['judgement'])}{said}; {seconds:.1f} s -> {where}"
     )

@@ -35,6 +35,8 @@ TURNS = {
     7: "mirrored and turned by 90 degrees",
     8: "turned by 90 degrees counter-clockwise",
 }
+#: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
+DARK_16_BITS = 8192
 ALPHA_DROPPED = "{name} has an alpha channel; it is dropped."
 DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError)
 
@@ -89,7 +91,7 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
 
     Returns:
         ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it: alpha dropped, or turned
-        as the EXIF orientation says. K must belong to the turned image.
+        as the EXIF orientation says (K must belong to the turned image), or 16 bits of which few are used.
 
     Raises:
         FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
@@ -118,6 +120,11 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
         )
     _check_sides(upright.height, upright.width, name)
     notes = [ALPHA_DROPPED.format(name=name)] if alpha else []
+    if upright.mode.startswith("I") and (most := upright.getextrema()[1]) < DARK_16_BITS:
+        notes.append(
+            f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
+            "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
+        )
     if turn is not None:
         notes.append(
             f"{name} was {turn} to {upright.width}x{upright.height}, as its EXIF orientation says; "

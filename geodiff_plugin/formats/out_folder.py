@@ -97,7 +97,7 @@ class OutFolder:
                 self._staging = hidden_path(self._target, PARTIAL)
                 self._clear_leftovers()
             except OSError as error:
-                cure = "Name another with --out, or make room and see to its permissions."
+                cure = "Name another with --out, or free disk space and check its permissions."
                 bad_value(
                     self._option, "a folder that can be written to", f"{self.path} ({reason_of(error)})", cure
                 )

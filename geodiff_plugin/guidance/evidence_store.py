@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs, prepare_evidence
-from geodiff_plugin.guidance.posing import pose_views
-from geodiff_plugin.matching import clean
+from geodiff_plugin.guidance.posing import cleaned_views, pose_views
 
 __all__ = ["EvidenceStore", "make_evidence"]
 
@@ -24,12 +23,9 @@ def make_evidence(given: EvidenceInputs) -> Evidence:
     """Photographs cleaned, poses as the knob ``pose`` says, then ``prepare_evidence``."""
     if not given.views:
         return prepare_evidence(given)
-    if given.config.clean_photographs:
-        grid = given.config.sweep.sweep_pixels
-        views = [view._replace(image_01=clean(view.image_01, grid)) for view in given.views]
-        given = replace(given, left_01=clean(given.left_01, grid), views=views)
-    posed = pose_views(given.left_01, given.views, given.K_left, given.config)
-    return prepare_evidence(replace(given, views=posed.rights), posed.report)
+    left_01, views = cleaned_views(given.left_01, given.views, given.config)
+    posed = pose_views(left_01, views, given.K_left, given.config)
+    return prepare_evidence(replace(given, left_01=left_01, views=posed.rights), posed.report)
 
 
 def _settings(given: EvidenceInputs) -> tuple[Any, ...]:

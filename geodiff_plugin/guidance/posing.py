@@ -1,7 +1,7 @@
-"""Checks and refines the poses of an image's right views, once per call.
+"""Cleans an image and its right views, and checks and refines their poses, once per call.
 
-Data flow: right views as given -> ``pose.refine`` with a first depth of a coarse sweep
-    -> right views and report.
+Data flow: photographs as given -> photographs to match with; right views as given -> ``pose.refine`` with a
+    first depth of a coarse sweep -> right views and report.
 Paper: none; it takes exact poses for granted (S3.3).
 """
 
@@ -14,16 +14,33 @@ from torch import Tensor
 
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.matching import clean
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.pose.refine import RefinedViews, refine_views, untouched
 from geodiff_plugin.types import CameraView
 
-__all__ = ["coarse_depth", "pose_views"]
+__all__ = ["cleaned_views", "coarse_depth", "pose_views"]
 
 #: Windows that spread sure matches into holes, pixels of the coarse sweep; a wider one counts a hundredth.
 _WINDOWS = (3, 7, 15, 31, 63)
 _FARTHEST = 1e-3
+
+
+def cleaned_views(
+    left_01: Tensor, rights: Sequence[CameraView], config: GuidanceConfig
+) -> tuple[Tensor, list[CameraView]]:
+    """The left image and the right views as the knob ``clean_photographs`` says, to be compared.
+
+    Args:
+        left_01: ``(3, H, W)`` float32 in [0, 1], native size.
+        rights: as the user gave them.
+        config: whether they are cleaned, and the grid of the sweep.
+    """
+    if not config.clean_photographs:
+        return left_01, list(rights)
+    grid = config.sweep.sweep_pixels
+    return clean(left_01, grid), [view._replace(image_01=clean(view.image_01, grid)) for view in rights]
 
 
 def pose_views(

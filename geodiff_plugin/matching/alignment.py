@@ -105,7 +105,7 @@ def align_view(
     centre = R.T @ T[:3, 3]
     ratio = 1.0 + w * centre[2]  # depth in the turned view over depth in the left view
     scale = torch.where(ratio > _LEAST_RATIO, 1.0 / ratio.clamp_min(_LEAST_RATIO), torch.zeros_like(ratio))
-    moved = w[:, None] * centre[:2] * K[[0, 1], [0, 1]] - K[:2, 2]
+    moved = w[:, None] * (K[:2, :2] @ centre[:2]) - K[:2, 2]
     shift = scale[:, None] * moved + K[:2, 2]
     to_right = K_r @ R @ torch.linalg.inv(K)  # of a left pixel's point at infinity
     offset = _translation(to_right, size)

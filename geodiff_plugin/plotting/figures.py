@@ -166,7 +166,7 @@ def _legend(height: int, near: float, far: float, unknown: bool, unit: str | Non
     picture = Image.new("RGB", (gap + bar + 5 * size, height), WHITE)
     draw = ImageDraw.Draw(picture)
     top, bottom = 2 * size, height - size - (2 * size if unknown else 0)
-    draw.text((gap, size // 3), f"depth, {unit or 'no unit'}", font=font, fill=BLACK)
+    draw.text((gap, size // 3), "no unit" if unit is None else f"depth, {unit}", font=font, fill=BLACK)
     shares = np.linspace(1.0, 0.0, bottom - top)
     shades = _shade(near * (far / near) ** shares, near, far)
     picture.paste(Image.fromarray(np.repeat(shades[:, None], bar, axis=1)), (gap, top))

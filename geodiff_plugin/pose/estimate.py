@@ -196,7 +196,7 @@ def _check_matches(count: int, name: str, mirrored: int) -> None:
     cure = "Are they of the same place, sharp and well lit? Half of what one shows should be in the other."
     if mirrored >= max(2 * count, FEWEST_INLIERS):
         cure = f"With the right one mirrored there are {mirrored}: is one of them a mirror image (a selfie)?"
-    bad_value(name, f"photographs with at least {FEWEST_INLIERS} matches", f"{count}", cure)
+    bad_value(name, f"two that share at least {FEWEST_INLIERS} matches", f"{count}", cure)
 
 
 def _check_parallax(tracks: Tracks, near: np.ndarray, parallax: float, name: str) -> None:
@@ -228,7 +228,6 @@ def _rotation_residuals(tracks: Tracks) -> np.ndarray:
 
 def _homography_share(tracks: Tracks, near: np.ndarray) -> float:
     """Share of the inliers that one homography explains."""
-    cv2.setRNGSeed(0)
     one, other = (px[near].astype(np.float32) for px in (tracks.left_px, tracks.right_px[0]))
     _, mask = cv2.findHomography(one, other, cv2.RANSAC, INLIER_PX)
     return 0.0 if mask is None else float(mask.mean())

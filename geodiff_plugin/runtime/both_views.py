@@ -17,7 +17,7 @@ from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import NEAREST_M, project, transform, unproject
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.posing import pose_views
+from geodiff_plugin.guidance.posing import cleaned_views, pose_views
 from geodiff_plugin.types import MetricDepthOutput, Rig
 
 __all__ = ["guide_both_views"]
@@ -53,10 +53,13 @@ def guide_both_views(
         Output of the left view and output of the right one, each at its own image's size.
 
     Raises:
-        ValueError: a preset without confidence (``refine=False``, or no matches).
+        ValueError: a preset without confidence (``refine=False``, or no matches); ``points`` or ``previous``
+            among the knobs.
     """
     check_number(min_confidence, "min_confidence", 0.0, 1.0)
     knobs = knobs or {}
+    for name in sorted({"points", "previous"} & set(knobs)):
+        bad_value(f"knobs[{name!r}]", "left out", "given", "It belongs to one view, and here are two.")
     rig, knobs = _refined_rig(GeometryGuidance(right, K, E, **knobs), left), {**knobs, "pose": "given"}
     back = Rig(rig.K_right, rig.K_left, np.linalg.inv(rig.E))
     views = ((left, right, rig), (right, left, back))
@@ -81,7 +84,8 @@ def _refined_rig(guidance: GeometryGuidance, left: Any) -> Rig:
     The right image stays as it is: it gets depth too.
     """
     rights, K_left, _ = guidance.inputs[0].on(torch.device("cpu"))
-    found = pose_views(as_image_01(left, "left"), rights, K_left, guidance.config)
+    left_01, rights = cleaned_views(as_image_01(left, "left"), rights, guidance.config)
+    found = pose_views(left_01, rights, K_left, guidance.config)
     return replace(guidance.rigs[0], E=found.report.E[0])
 
 

@@ -153,8 +153,11 @@ class GuidedCall(_Stock):
             held=held,
             warm=warm,
         )
-        with run:
-            stock = stock_call(**{**call, "return_dict": True, "output_latent": True})
+        try:
+            with run:
+                stock = stock_call(**{**call, "return_dict": True, "output_latent": True})
+        finally:
+            run.release()
         run.check_finite()
         with torch.autocast(device.type, enabled=False):
             output = assemble_output(stock, run, guidance, call)

@@ -25,7 +25,7 @@ class ImagesInFloat32:
     def __enter__(self) -> ImagesInFloat32:
         if not self._on_cpu:
             return self
-        own = self._processor.preprocess
+        own, self._hidden = self._processor.preprocess, vars(self._processor).get("preprocess")
 
         def preprocess(
             image: Any,
@@ -41,5 +41,9 @@ class ImagesInFloat32:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if self._on_cpu:
+        if not self._on_cpu:
+            return
+        if self._hidden is None:
             del self._processor.preprocess
+        else:  # one that the user put there
+            self._processor.preprocess = self._hidden

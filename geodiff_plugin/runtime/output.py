@@ -246,13 +246,12 @@ def _warnings(run: GuidedRun, visible: Tensor | None, judgements: Sequence[Judge
         which = "" if len(judgements) == 1 else f"Image {i + 1}: "
         spoken = [judgement.sentence] if judgement.reasons else []
         found += [which + sentence for sentence in (*spoken, *judgement.remarks)]
-    share = 1.0 if visible is None else visible.float().mean().item()
-    if share < LITTLE_OVERLAP:
-        found.append(
-            f"Only {share:.0%} of the left image is seen by a right camera at this depth; "
-            "scale rests on little."
-        )
-    # Mistakes of a pose are reasons of the judgement already.
-    named = {INVERSE, *(sentence for judgement in judgements for sentence in judgement.signs.mistakes)}
-    found.extend(sentence for e in run.evidence for sentence in e.warnings if sentence not in named)
+        share = 1.0 if visible is None else visible[i].float().mean().item()
+        if share < LITTLE_OVERLAP:
+            found.append(
+                f"{which}Only {share:.0%} of the left image is seen by a right camera at this depth; "
+                "scale rests on little."
+            )
+        named = {INVERSE, *judgement.signs.mistakes}  # of a pose: reasons of the judgement already
+        found += [which + sentence for sentence in run.evidence[i].warnings if sentence not in named]
     return found

@@ -99,13 +99,14 @@ class GuidedRun:
         self._tap = None
         if self.full and prior.network_input is not None:
             self._tap = DenoiserTap(*prior.network(), prior.network_input)
+        self._scheduler = GuidedScheduler(
+            pipe, self._on_trajectory, self._on_step, self._on_done, self.config.respace, self._skipped
+        )
         self._hooks: list[AbstractContextManager[object]] = [
             FrozenWeights(pipe),
             ImagesInFloat32(pipe.image_processor, pipe._execution_device),
             *([self._tap] if self._tap else []),
-            GuidedScheduler(
-                pipe, self._on_trajectory, self._on_step, self._on_done, self.config.respace, self._skipped
-            ),
+            self._scheduler,
             Running(pipe, self),
         ]
 
@@ -120,6 +121,15 @@ class GuidedRun:
         self._stack.close()
         if self._bar is not None:
             self._bar.close()
+
+    def release(self) -> None:
+        """Undo what ties the run and its hooks together, so that its memory is free once nobody needs it.
+
+        Python's collector of cycles comes late, and knows nothing of a device's memory.
+        """
+        self._scheduler.release()
+        del self._scheduler
+        self._hooks.clear()
 
     @contextmanager
     def _suspended(self) -> Iterator[None]:

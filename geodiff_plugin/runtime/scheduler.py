@@ -74,6 +74,10 @@ class GuidedScheduler:
         _set_attributes(self._scheduler, self._outside)
         object.__setattr__(self._pipe, "scheduler", self._theirs)
 
+    def release(self) -> None:
+        """Let go of the call, after its end: the wrapped methods and this object hold each other."""
+        self._inside = {}
+
     def _wrapped(self) -> dict[str, Callable[..., Any]]:
         """The two methods as instance attributes, which hide those of the class."""
         scheduler = self._scheduler

@@ -60,7 +60,8 @@ def plan_warm_start(
         size: ``(H, W)`` of the padded processing grid.
 
     Raises:
-        ValueError: an output of another number of images or members, or of another size.
+        ValueError: an output of another number of images or members, or of another size; ``latents`` of
+            another shape than the output's.
     """
     previous = guidance.previous
     if previous is None:
@@ -84,6 +85,8 @@ def plan_warm_start(
     noise = call["latents"]
     if noise is None:
         noise = randn_tensor(z0.shape, generator=call["generator"], device=device, dtype=z0.dtype)
+    elif noise.shape != z0.shape:
+        bad_value("latents", f"of shape {tuple(z0.shape)}, as those of previous", f"{tuple(noise.shape)}")
     scheduler = copy.deepcopy(pipe.scheduler)
     scheduler.set_timesteps(steps)
     trailing = trailing_timesteps(scheduler, steps) if guidance.config.respace else None

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import warnings
+import weakref
 
 import numpy as np
 import pytest
@@ -24,6 +27,7 @@ from geodiff_plugin import (
     enable_geometry_guidance,
 )
 from geodiff_plugin.algorithm.rules import RULES
+from geodiff_plugin.runtime.run import GuidedRun
 from tests.conftest import SCHEDULER, plane_pair
 
 FAST = {"inner_steps": 2, "min_steps": 1, "loss_resolution": 64}
@@ -470,3 +474,50 @@ def test_with_an_oracle_prior_the_scale_is_found(make_oracle, textured_plane, ne
     ratio = out.prediction[0, ..., 0] / truth
     assert abs(np.median(ratio) - 1.0) < 0.02
     assert np.mean(np.abs(ratio - 1.0)) < 0.03
+
+
+@pytest.mark.parametrize("gradient", ["denoised", "full"])
+def test_a_call_leaves_nothing_alive(make_pipeline, textured_plane, left, monkeypatch, gradient):
+    """Without the collector of cycles, which knows nothing of a device's memory."""
+    runs, own = [], GuidedRun.__init__
+
+    def remembered(run, *args, **kwargs):
+        runs.append(weakref.ref(run))
+        own(run, *args, **kwargs)
+
+    monkeypatch.setattr(GuidedRun, "__init__", remembered)
+    pipe = enable_geometry_guidance(make_pipeline())
+    gc.collect()
+    gc.disable()
+    try:
+        pipe(left, guidance=guidance_for(textured_plane, gradient=gradient), generator=seeded())
+        assert [run() for run in runs] == [None]
+    finally:
+        gc.enable()
+
+
+def test_a_preprocessing_of_the_users_own_stays(make_pipeline, textured_plane, left):
+    pipe = enable_geometry_guidance(make_pipeline())
+    own = pipe.image_processor.preprocess
+    asked = []
+
+    def preprocess(*args, **kwargs):
+        asked.append(1)
+        return own(*args, **kwargs)
+
+    pipe.image_processor.preprocess = preprocess
+    pipe(left, guidance=guidance_for(textured_plane), generator=seeded())
+    assert pipe.image_processor.preprocess is preprocess and asked
+
+
+def test_in_a_batch_the_image_with_little_overlap_is_named(make_pipeline, textured_plane, left):
+    pipe = enable_geometry_guidance(make_pipeline())
+    away = textured_plane.E.copy()
+    away[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # it looks to the right
+    rights, poses = [textured_plane.right] * 3, [textured_plane.E, away, textured_plane.E]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        guidance = GeometryGuidance(rights, [textured_plane.K] * 3, poses, pose="given", **FAST)
+        out = pipe([left] * 3, guidance=guidance, generator=seeded())
+    said = [sentence for sentence in out.warnings if "of the left image is seen" in sentence]
+    assert said and all(sentence.startswith("Image 2: Only ") for sentence in said)

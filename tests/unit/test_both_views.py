@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin import guide_both_views
+from geodiff_plugin import InputError, guide_both_views
 from geodiff_plugin.types import MetricDepthOutput
 from tests.conftest import render_plane
 
@@ -110,3 +110,9 @@ def test_points_outside_of_the_other_image_are_left_out(pipe, monkeypatch):
     assert (uv >= 0).all() and (uv < np.array([64, 48])).all() and (points[:, 2] > 0).all()
     # The right view reaches beyond the left one, so some of its points were left out.
     assert len(points) < np.prod(SIZES["right"]) - 10 * 20
+
+
+@pytest.mark.parametrize("name", ["points", "previous"])
+def test_what_belongs_to_one_view_is_refused(pipe, name):
+    with pytest.raises(InputError, match=name):
+        guide(pipe, knobs={name: None})

@@ -360,3 +360,13 @@ def test_from_calibration_picks_the_cameras(tmp_path):
         guidance = GeometryGuidance.from_calibration(RIGHT, tmp_path / "calib.txt", cameras)
         assert guidance.rigs[0].E[0, 3] == pytest.approx(baseline)
         np.testing.assert_allclose(guidance.rigs[0].K_left, K)
+
+
+def test_cameras_are_copied():
+    K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+    E = np.eye(4)
+    E[0, 3] = 0.1
+    guidance = GeometryGuidance(np.zeros((48, 64, 3)), K, E)
+    K[0] *= 2.0
+    E[0, 3] = 1.0
+    assert guidance.rigs[0].K_left[0, 0] == 60.0 and guidance.rigs[0].E[0, 3] == 0.1

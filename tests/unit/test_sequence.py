@@ -74,7 +74,7 @@ def pipe(make_pipeline):
     return enable_geometry_guidance(make_pipeline())
 
 
-def call(pipe, pair, steps=4, previous=None, size=1, **knobs):
+def call(pipe, pair, steps=4, previous=None, size=1, latents=None, **knobs):
     guidance = GeometryGuidance(pair.right, pair.K, pair.E, previous=previous, **FAST, **knobs)
     return pipe(
         pair.left,
@@ -83,6 +83,7 @@ def call(pipe, pair, steps=4, previous=None, size=1, **knobs):
         ensemble_size=size,
         generator=torch.Generator().manual_seed(0),
         output_latent=True,
+        latents=latents,
     )
 
 
@@ -150,3 +151,6 @@ def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane):
     small.shift, small.global_scale = first.shift, first.global_scale
     with pytest.raises(InputError, match="a sequence of its own"):
         call(pipe, textured_plane, previous=small)
+    for latents in (first.latent[..., :-1], first.latent[:, :1]):  # the latter would be spread silently
+        with pytest.raises(InputError, match="latents must be of shape"):
+            call(pipe, textured_plane, previous=first, latents=latents)

@@ -23,6 +23,7 @@ from geodiff_plugin.evaluation.figures.clouds import render_cloud
 from geodiff_plugin.formats.pointcloud import write_ply
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.matching import build_cost_volume, find_matches, points_to_matches
+from geodiff_plugin.matching.alignment import align_view
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.mirrored import mirrored_pose_preferred
 from geodiff_plugin.matching.sweep import sweep_planes
@@ -59,7 +60,6 @@ HAND_ON = {
     "guidance.photographs.estimate_rig",
     "guidance.posing.coarse_depth",
     "guidance.posing.pose_views",
-    "matching.alignment.align_view",
     "pose.refine.polished",
     "pose.refine.refine_views",
     "pose.tracks.project_tracks",
@@ -197,6 +197,18 @@ def test_the_sweep_and_all_that_is_made_of_it():
     )
 
 
+def test_a_plane_seen_from_above_moves_along_the_skewed_rows():
+    above = torch.eye(4, dtype=torch.float64)
+    above[:3, 3] = torch.tensor([-0.1, 0.15, 0.0])
+    camera, w = tensor(K)[0], torch.tensor([0.2, 0.5])
+    view = align_view((torch.rand(1, *SIZE), camera, above), camera, SIZE, w)
+    for k, inverse_depth in enumerate(w.tolist()):
+        points = points_of(np.full(SIZE, 1 / inverse_depth), K) + above[:3, 3, None, None].numpy()
+        expected = uv_of(points, K)
+        np.testing.assert_allclose(view.positions(SIZE[1], 0)[k], expected[0, 0], atol=1e-3)
+        np.testing.assert_allclose(view.positions(SIZE[0], 1)[k], expected[1, :, 0], atol=1e-3)
+
+
 def test_points_fall_where_the_camera_sees_them():
     camera = torch.from_numpy(K).float()
     points = torch.from_numpy(points_of(np.full(SIZE, 2.0), K)[:, 5:40:7, 3:60:9].reshape(3, -1).T).float()
@@ -257,7 +269,7 @@ def test_no_function_that_takes_a_camera_matrix_is_left_out():
             *(geometry.unproject, geometry.project, geometry.plane_rays, geometry.warp_right_to_left),
             *(geometry.hidden_in_right, geometry.resize_intrinsics, geometry.pad_intrinsics),
             *(geometry.is_rectified, resize_long_edge, as_fine_as, build_cost_volume, sweep_planes),
-            *(points_to_matches, write_ply, render_cloud, render_pair, hidden_from_right),
+            *(align_view, points_to_matches, write_ply, render_cloud, render_pair, hidden_from_right),
             *(disparity_to_depth, depth_to_disparity),
         )
     }

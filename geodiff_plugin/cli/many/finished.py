@@ -42,12 +42,20 @@ def finished_report(arguments: DepthArguments) -> dict[str, Any] | None:
         if name not in NOT_OF_THE_RESULT and wanted[name] != made.get(name, wanted[name])
     )
     if others:
-        differences = ", ".join(f"{name} {made[name]!r} and not {wanted[name]!r}" for name in others)
+        earlier, now = (", ".join(_as_option(name, of[name]) for name in others) for of in (made, wanted))
         cure = "Name another --out, or add --overwrite."
-        bad_value(
-            "--out", "a folder of results of the same options", f"{arguments.out} with {differences}", cure
-        )
+        got = f"{arguments.out}, made {earlier} and now asked for {now}"
+        bad_value("--out", "a folder of results of the same options", got, cure)
     return report
+
+
+def _as_option(name: str, value: Any) -> str:
+    """An option as it stands on the command line."""
+    option = f"--{name.replace('_', '-')}"
+    if value in (None, False, []):
+        return f"without {option}"
+    shown = " ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return f"with {option}" if value is True else f"with {option} {shown}"
 
 
 def _report(folder: Path) -> dict[str, Any] | None:

@@ -52,6 +52,9 @@ def run_many(arguments: DepthArguments, refs: Sequence[PairRef]) -> None:
     Args:
         arguments: checked by ``start.start_many``.
         refs: the pairs, in order.
+
+    Raises:
+        ValueError: ``--out`` has results of other options; then nothing is computed, and nothing written.
     """
     settings = read_settings(arguments)
     check_exports(arguments.export, None)
@@ -76,11 +79,7 @@ def _work(
     jobs = []
     for number, ref in processes.share(list(enumerate(refs))):
         job = Job.of(ref, arguments)
-        try:
-            report = None if arguments.overwrite else finished_report(job.arguments)
-        except InputError as error:
-            yield number, _failed(job, error)
-            continue
+        report = None if arguments.overwrite else finished_report(job.arguments)
         if report is not None:
             yield number, _row(ref.name, "there", report)
         else:
