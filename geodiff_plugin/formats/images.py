@@ -120,7 +120,7 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
         )
     _check_sides(upright.height, upright.width, name)
     notes = [ALPHA_DROPPED.format(name=name)] if alpha else []
-    if upright.mode.startswith("I") and (most := upright.getextrema()[1]) < DARK_16_BITS:
+    if upright.mode.startswith("I") and (most := int(np.asarray(upright).max())) < DARK_16_BITS:
         notes.append(
             f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
             "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."

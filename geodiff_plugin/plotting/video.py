@@ -17,12 +17,12 @@ from PIL import Image
 
 from geodiff_plugin._checks import InputFileError, bad_value, check_number
 from geodiff_plugin.plotting.figures import depth_figure, depth_range
-from geodiff_plugin.plotting.sheets import grid
 
 __all__ = ["SUFFIXES", "depth_frames", "write_depth_video"]
 
 SUFFIXES = (".mp4", ".webp", ".gif")
-CELL_WIDTH = 480
+#: Of a frame with its photograph, pixels.
+MOST_WIDTH = 960
 
 
 def depth_frames(
@@ -52,10 +52,22 @@ def depth_frames(
     figures = [depth_figure(depth_m, near=near, far=far) for depth_m in depths_m]
     if photographs is None:
         return figures
+    shape = shapes[0]
     return [
-        grid([photograph, figure], cell_width=CELL_WIDTH)
-        for photograph, figure in zip(photographs, figures, strict=True)
+        _beside(photograph, figure, shape) for photograph, figure in zip(photographs, figures, strict=True)
     ]
+
+
+def _beside(photograph: Image.Image, figure: Image.Image, shape: tuple[int, ...]) -> Image.Image:
+    """A photograph as large as the map in a figure, on its left."""
+    width = round(shape[1] * figure.height / shape[0])
+    joined = Image.new("RGB", (width + figure.width, figure.height))
+    joined.paste(photograph.convert("RGB").resize((width, figure.height)), (0, 0))
+    joined.paste(figure, (width, 0))
+    factor = min(1.0, MOST_WIDTH / joined.width)
+    return joined.resize(
+        (round(joined.width * factor), round(joined.height * factor)), Image.Resampling.LANCZOS
+    )
 
 
 def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:

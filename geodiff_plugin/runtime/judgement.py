@@ -169,7 +169,7 @@ def _odd(signs: Signs, trusted: bool) -> list[str]:
     if 0 < signs.baseline_m < BASELINES_M[0]:
         found.append(
             f"The baseline is {1000 * signs.baseline_m:.3g} mm: was it divided by 1000 once too often? "
-            "E is in metres."
+            "Baselines and poses are in metres."
         )
     if signs.baseline_m > BASELINES_M[1]:
         found.append(

@@ -243,15 +243,16 @@ def _uncertainty(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: Mappin
 def _warnings(run: GuidedRun, visible: Tensor | None, judgements: Sequence[Judgement]) -> list[str]:
     found = []
     for i, judgement in enumerate(judgements):
-        which = "" if len(judgements) == 1 else f"Image {i + 1}: "
         spoken = [judgement.sentence] if judgement.reasons else []
-        found += [which + sentence for sentence in (*spoken, *judgement.remarks)]
+        spoken += judgement.remarks
         share = 1.0 if visible is None else visible[i].float().mean().item()
         if share < LITTLE_OVERLAP:
-            found.append(
-                f"{which}Only {share:.0%} of the left image is seen by a right camera at this depth; "
+            spoken.append(
+                f"Only {share:.0%} of the left image is seen by a right camera at this depth; "
                 "scale rests on little."
             )
         named = {INVERSE, *judgement.signs.mistakes}  # of a pose: reasons of the judgement already
-        found += [which + sentence for sentence in run.evidence[i].warnings if sentence not in named]
+        spoken += [sentence for sentence in run.evidence[i].warnings if sentence not in named]
+        which = "" if len(judgements) == 1 else f"Image {i + 1}: "
+        found += [which + sentence for sentence in spoken]
     return found

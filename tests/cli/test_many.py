@@ -21,7 +21,7 @@ from PIL import Image
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.many.conveyor import Conveyor
-from geodiff_plugin.cli.many.finished import finished_report
+from geodiff_plugin.cli.many.finished import _as_option, finished_report
 from geodiff_plugin.cli.many.pairs import find_pairs
 from geodiff_plugin.cli.many.processes import Processes
 from geodiff_plugin.formats.video import VideoReader, both_halves, count_frames
@@ -238,9 +238,25 @@ def test_finished_pairs_are_skipped_and_overwrite_does_them_anew(geodiff, folder
 def test_results_of_other_options_are_not_taken_for_these(geodiff, folders):
     root, command = folders
     assert geodiff(*command, "-q").code == 0
+    before = {path: path.read_bytes() for path in (root / "out").rglob("*") if path.is_file()}
+    (root / "out" / "b" / "report.json").unlink()  # so that there is something to do
+    del before[root / "out" / "b" / "report.json"]
     answer = geodiff(*command, "--seed", 1)
-    assert answer.code == 4 and "3 failed" in answer.out
-    assert "seed 0 and not 1" in answer.err and "--overwrite" in answer.err
+    assert answer.code == 2 and answer.err.count("--out must be") == 1
+    assert "made with --seed 0 and now asked for with --seed 1" in answer.err and "--overwrite" in answer.err
+    assert before == {path: path.read_bytes() for path in (root / "out").rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("steps", None, "without --steps"),
+        ("warm_start", True, "with --warm-start"),
+        ("seed", 0, "with --seed 0"),
+    ],
+)
+def test_options_are_told_as_they_are_typed(name, value, said):
+    assert _as_option(name, value) == said
 
 
 def test_a_result_is_whole_or_not_there(geodiff, folders):

@@ -281,3 +281,11 @@ def test_a_port_that_another_program_has_is_a_sentence(monkeypatch):
     monkeypatch.setattr(launch, "launch_page", taken)
     with pytest.raises(ValueError, match=r"--port must be free to listen on; got 127.0.0.1 and 8000"):
         launch.run_app(("bundled",), "cpu", "127.0.0.1", 8000, False)
+
+
+def test_a_prior_that_cannot_be_loaded_is_told_before_the_page_is_served(monkeypatch, tmp_path):
+    from geodiff_plugin.app import page
+
+    monkeypatch.setattr(page, "build_page", lambda _: pytest.fail("the page was built"))
+    with pytest.raises((OSError, ValueError), match="nosuch"):
+        launch_page((str(tmp_path / "nosuch"),), "cpu")

@@ -146,7 +146,7 @@ def test_depth_sent_behind_the_camera_is_clipped_not_dropped():
 
 
 def test_alignment_names_an_unknown_space():
-    with pytest.raises(ValueError, match="space must be one of .'depth', 'disparity'"):
+    with pytest.raises(ValueError, match="space must be one of depth, disparity"):
         align(row(1.0), row(1.0), np.ones((1, 1), bool), "inverse")
 
 

@@ -135,7 +135,7 @@ def test_the_page_of_poses(tmp_path, monkeypatch) -> None:
     assert "| pair | true, given | perturbed, given | perturbed, refined | estimated |" in text
     assert "| mean of 2 pairs | 0.050 | 0.100 | 0.060 | 0.500 of 1 |" in text
     assert "| without a result | 0 | 0 | 0 | 1 |" in text
-    assert "| off by more than 0.25 in silence | 0 | 0 | 0 | 1 |" in text
+    assert "| off by more than 0.25, no warning | 0 | 0 | 0 | 1 |" in text
     sized = replace(options, rendered_size=(256, 192), out=tmp_path / "small")
     run_poses(sized)
     assert "geodiff eval poses --rendered 2 --rendered-size 256x192 --perturb" in page.read_text()

@@ -71,6 +71,13 @@ def test_16_bit_grey(tmp_path):
     np.testing.assert_allclose(image, np.repeat(ramp()[..., :1] / 255.0, 3, axis=-1), atol=1e-6)
 
 
+def test_12_bits_in_16_are_told(tmp_path):
+    grey = ramp()[..., 0].astype(np.uint16) * 16
+    _, notes = read_image(saved(tmp_path, Image.fromarray(grey)))
+    assert len(notes) == 1
+    assert f"its values reach {grey.max()} of 65535" in notes[0] and "multiply them by 16" in notes[0]
+
+
 @pytest.mark.parametrize("mode", ["L", "1", "P", "CMYK"])
 def test_other_modes_become_rgb(tmp_path, mode):
     name = "x.tif" if mode == "CMYK" else "x.png"

@@ -52,7 +52,7 @@ def finished_report(arguments: DepthArguments) -> dict[str, Any] | None:
 def _as_option(name: str, value: Any) -> str:
     """An option as it stands on the command line."""
     option = f"--{name.replace('_', '-')}"
-    if value in (None, False, []):
+    if value is None or value is False or value == []:
         return f"without {option}"
     shown = " ".join(map(str, value)) if isinstance(value, list) else str(value)
     return f"with {option}" if value is True else f"with {option} {shown}"

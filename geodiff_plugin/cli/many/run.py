@@ -59,6 +59,8 @@ def run_many(arguments: DepthArguments, refs: Sequence[PairRef]) -> None:
     settings = read_settings(arguments)
     check_exports(arguments.export, None)
     processes = join_processes(settings.device)
+    if refs[0].frame is not None and refs[0].right is None and processes.index == 0 and not arguments.quiet:
+        say(f"{refs[0].left} is read as both views side by side; with a video for each view, name both.")
     settings = replace(settings, device=processes.device(settings.device))
     rows = [row for _, row in sorted(_work(arguments, settings, refs, processes))]
     rows = processes.gather(rows)

@@ -116,7 +116,7 @@ def _curves(axes: Any, sweep: Sweep) -> None:
             label = f"{what}: g_s = {sweep.g_s[index]:.3g} m"
             axis.axvline(sweep.g_s[index], color=of, linestyle=line, linewidth=1.2, label=label)
         axis.set_ylabel(name, fontsize=9)
-        axis.set_xlim(sweep.g_s[0], sweep.g_s[-1])
+        axis.set_xlim(0.95 * sweep.g_s[0], 1.05 * sweep.g_s[-1])  # an optimum at an end is seen too
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
     plain_log_axis(axes[0].xaxis, float(sweep.g_s[0]), float(sweep.g_s[-1]))
