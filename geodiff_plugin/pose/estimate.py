@@ -71,6 +71,11 @@ def _camera(K: np.ndarray) -> dict[str, Any]:
     return {"model": "PINHOLE", "width": width, "height": height, "params": params}
 
 
+def _unskewed(px: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Pixels ``(N, 2)`` of the same rays in a camera without skew: PoseLib's models have none."""
+    return np.stack([px[:, 0] - K[0, 1] * (px[:, 1] - K[1, 2]) / K[1, 1], px[:, 1]], axis=1)
+
+
 def _right_rays(tracks: Tracks) -> np.ndarray:
     pixels = np.c_[tracks.right_px[0], np.ones(len(tracks))]
     return np.linalg.solve(tracks.K_rights[0], pixels.T).T
@@ -138,8 +143,8 @@ def estimate_pose(
 def _five_points(tracks: Tracks) -> np.ndarray:
     """``T_right_from_left`` that explains the most tracks, its baseline of length 1."""
     found, _ = _poselib().estimate_relative_pose(
-        tracks.left_px,
-        tracks.right_px[0],
+        _unskewed(tracks.left_px, tracks.K_left),
+        _unskewed(tracks.right_px[0], tracks.K_rights[0]),
         _camera(tracks.K_left),
         _camera(tracks.K_rights[0]),
         {"max_epipolar_error": INLIER_PX / 2, "seed": 0, "min_iterations": 1000},

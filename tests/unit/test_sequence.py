@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -130,6 +131,24 @@ def test_its_scale_is_that_of_the_frame_before(pipe, textured_plane):
     second = call(pipe, textured_plane, previous=first)
     ratio = second.prediction / first.prediction
     assert abs(np.log(np.median(ratio))) < 0.05
+
+
+def test_metres_of_a_prior_become_baselines_again(pipe, textured_plane):
+    """Poses without a unit, a frame before whose lengths were multiplied to a metric prior's."""
+    first = call(pipe, textured_plane)
+    told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": None}
+    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
+    from geodiff_plugin.priors import find_adapter
+
+    prior = find_adapter(pipe)(pipe)
+    plain = plan_warm_start(pipe, prior, guidance, told, (48, 64))
+    first.rescaled, first.global_scale = 4.0, 4.0 * first.global_scale
+    in_metres = plan_warm_start(pipe, prior, guidance, told, (48, 64))
+    guidance.estimated = SimpleNamespace(scale=SimpleNamespace(unit=None))
+    in_baselines = plan_warm_start(pipe, prior, guidance, told, (48, 64))
+    torch.testing.assert_close(in_metres.near_m, 4.0 * plain.near_m)
+    torch.testing.assert_close(in_baselines.near_m, plain.near_m)
+    torch.testing.assert_close(in_baselines.far_m, plain.far_m)
 
 
 def test_another_scheduler_takes_over_the_scale_alone(make_pipeline, textured_plane):
