@@ -41,7 +41,7 @@ EXIT_SOME_FAILED = 4
 MOST_ON_THE_WAY = 4
 #: A table of more pairs than this has only those that want to be looked at.
 MOST_ROWS = 20
-COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "trusted", "confidence", "seconds", "said")
+COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "trusted", "confidence", "seconds", "message")
 
 Row = dict[str, Any]
 
@@ -98,7 +98,7 @@ def _run(
     stages = Stages(pipe, settings, warned, arguments.warm_start)
 
     def failed(job: Job, error: Exception) -> None:
-        job.error = _failed(job, error)["said"]
+        job.error = _failed(job, error)["message"]
 
     numbers = {job.ref.name: number for number, job in jobs}
     conveyor = Conveyor([stages.read, stages.evidence, stages.guide, stages.write], failed, MOST_ON_THE_WAY)
@@ -142,10 +142,10 @@ def _failed(job: Job, error: Exception) -> Row:
     return _row(job.ref.name, "failed", None, reason)
 
 
-def _row(name: str, result: str, report: dict[str, Any] | None, said: str | None = None) -> Row:
+def _row(name: str, result: str, report: dict[str, Any] | None, message: str | None = None) -> Row:
     """What the summary says of one pair."""
     if report is None:
-        return dict.fromkeys(COLUMNS) | {"pair": name, "result": result, "said": said}
+        return dict.fromkeys(COLUMNS) | {"pair": name, "result": result, "message": message}
     depth, judgement = report["depth"], report["judgement"]
     return {
         "pair": name,
@@ -156,7 +156,7 @@ def _row(name: str, result: str, report: dict[str, Any] | None, said: str | None
         "trusted": judgement["trusted"],
         "confidence": judgement["signs"]["confidence"],
         "seconds": round(sum(report["seconds"].values()), 3),
-        "said": said or " ".join(report["warnings"]) or None,
+        "message": message or " ".join(report["warnings"]) or None,
     }
 
 
@@ -181,9 +181,10 @@ def _print(rows: Sequence[Row], out: Path) -> None:
         show(table)
     counts = {kind: sum(row["result"] == kind for row in rows) for kind in ("done", "there", "failed")}
     doubtful = sum(row["trusted"] is False for row in rows)
-    totals = [f"{len(rows)} pairs: {counts['done']} done, {counts['there']} there already"]
+    number = "1 pair" if len(rows) == 1 else f"{len(rows)} pairs"
+    totals = [f"{number}: {counts['done']} done, {counts['there']} there already"]
     totals.append(f"{counts['failed']} failed, {doubtful} not to be trusted -> {out}/")
     show(Text(", ".join(totals)))
     for row in shown:
         if row["result"] == "failed":
-            show(Text(f"{row['pair']}: {row['said']}"))
+            show(Text(f"{row['pair']}: {row['message']}"))
