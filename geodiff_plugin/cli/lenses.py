@@ -15,7 +15,7 @@ from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 from geodiff_plugin.formats.rigs import is_distorted
 from geodiff_plugin.guidance.config import GuidanceConfig
-from geodiff_plugin.matching import clean
+from geodiff_plugin.guidance.posing import cleaned
 from geodiff_plugin.types import Distortion
 
 __all__ = ["Lenses", "lenses_of", "pinhole"]
@@ -41,10 +41,8 @@ def pinhole(
     """
     if lens is None:
         return image_01
-    if config.clean_photographs:
-        cleaned = clean(torch.from_numpy(image_01).permute(2, 0, 1), config.sweep.sweep_pixels)
-        image_01 = cleaned.permute(1, 2, 0).contiguous().numpy()
-    return undistorted(image_01, K, lens)
+    ready = cleaned(torch.from_numpy(image_01).permute(2, 0, 1), config)
+    return undistorted(ready.permute(1, 2, 0).contiguous().numpy(), K, lens)
 
 
 def lenses_of(

@@ -116,7 +116,7 @@ class GuidanceConfig(Checked):
     clean_photographs: bool = flag(
         True,
         "blocks of JPEG compression and strong sensor noise are removed before photographs are compared; the "
-        "prior sees the image as it is, unless `--distortion` undistorts it, which comes after the cleaning",
+        "prior sees the image as it is, except with `--distortion`, which undistorts cleaned photographs",
     )
     decoder: str = text(
         "full",

@@ -18,9 +18,8 @@ from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit
 from geodiff_plugin._checks import bad_type, bad_value, check_number
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
-from geodiff_plugin.guidance.posing import coarse_depth
+from geodiff_plugin.guidance.posing import cleaned, coarse_depth
 from geodiff_plugin.guidance.presets import DEFAULT
-from geodiff_plugin.matching import clean
 from geodiff_plugin.pose.estimate import EstimatedPose, estimate_pose
 from geodiff_plugin.pose.matchers import Matcher, find_matcher
 from geodiff_plugin.pose.refine import polished
@@ -162,7 +161,7 @@ def estimate_rig(
     if baseline_m is not None:
         check_number(baseline_m, "baseline_m", 1e-6, 1e6)
     K_left = torch.as_tensor(Ks[0], dtype=torch.float32)
-    images = [clean(image, DEFAULT.sweep.sweep_pixels) for image in images]
+    images = [cleaned(image, DEFAULT) for image in images]
 
     def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
         return [

@@ -20,27 +20,31 @@ from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.pose.refine import RefinedViews, refine_views, untouched
 from geodiff_plugin.types import CameraView
 
-__all__ = ["cleaned_views", "coarse_depth", "pose_views"]
+__all__ = ["cleaned", "cleaned_views", "coarse_depth", "pose_views"]
 
 #: Windows that spread sure matches into holes, pixels of the coarse sweep; a wider one counts a hundredth.
 _WINDOWS = (3, 7, 15, 31, 63)
 _FARTHEST = 1e-3
 
 
+def cleaned(image_01: Tensor, config: GuidanceConfig) -> Tensor:
+    """A photograph ``(3, H, W)`` in [0, 1] of native size, as the knob ``clean_photographs`` says."""
+    return clean(image_01, config.sweep.sweep_pixels) if config.clean_photographs else image_01
+
+
 def cleaned_views(
     left_01: Tensor, rights: Sequence[CameraView], config: GuidanceConfig
 ) -> tuple[Tensor, list[CameraView]]:
-    """The left image and the right views as the knob ``clean_photographs`` says, to be compared.
+    """The left image and the right views, ``cleaned``, to be compared.
 
     Args:
         left_01: ``(3, H, W)`` float32 in [0, 1], native size.
         rights: as the user gave them.
         config: whether they are cleaned, and the grid of the sweep.
     """
-    if not config.clean_photographs:
-        return left_01, list(rights)
-    grid = config.sweep.sweep_pixels
-    return clean(left_01, grid), [view._replace(image_01=clean(view.image_01, grid)) for view in rights]
+    return cleaned(left_01, config), [
+        view._replace(image_01=cleaned(view.image_01, config)) for view in rights
+    ]
 
 
 def pose_views(

@@ -201,7 +201,7 @@ def _check_matches(count: int, name: str, mirrored: int) -> None:
     cure = "Are they of the same place, sharp and well lit? Half of what one shows should be in the other."
     if mirrored >= max(2 * count, FEWEST_INLIERS):
         cure = f"With the right one mirrored there are {mirrored}: is one of them a mirror image (a selfie)?"
-    bad_value(name, f"two that share at least {FEWEST_INLIERS} matches", f"{count}", cure)
+    bad_value(name, f"alike enough for at least {FEWEST_INLIERS} matches", f"{count}", cure)
 
 
 def _check_parallax(tracks: Tracks, near: np.ndarray, parallax: float, name: str) -> None:

@@ -55,9 +55,7 @@ def _point_at(
     near = near[away[near] < _NEAR_PX]
     if len(near) < 3:
         cure = "Choose ends on something with texture that both photographs show."
-        bad_value(
-            name, "near matched points", f"({px[0]:.0f}, {px[1]:.0f}) and {len(near)} matches there", cure
-        )
+        bad_value(name, "near matched points", f"({px[0]:.0f}, {px[1]:.0f}) with {len(near)} nearby", cure)
     w = inverse_depth[near]
     middle = float(np.median(w))
     spread = 1.4826 * float(np.median(np.abs(w / middle - 1)))

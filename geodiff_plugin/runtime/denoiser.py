@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from geodiff_plugin.runtime.channels import put_channels
+from geodiff_plugin.runtime.hiding import hide_method
 
 __all__ = ["DenoiserTap"]
 
@@ -42,8 +43,6 @@ class DenoiserTap:
 
     def __enter__(self) -> DenoiserTap:
         own = getattr(self._owner, self._method)
-        self._hidden = self._owner.__dict__.get(self._method)  # of another hook, put back at the end
-
         thread = threading.get_ident()
 
         @functools.wraps(own)
@@ -52,14 +51,11 @@ class DenoiserTap:
                 return own(model_input, *args, **kwargs)
             return self.run(own, model_input, *args, **kwargs)
 
-        setattr(self._owner, self._method, tapped)
+        self._restore = hide_method(self._owner, self._method, tapped)
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if self._hidden is None:
-            delattr(self._owner, self._method)
-        else:
-            setattr(self._owner, self._method, self._hidden)
+        self._restore()
         self.release()
 
     @property

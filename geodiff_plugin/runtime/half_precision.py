@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from geodiff_plugin.runtime.hiding import hide_method
+
 __all__ = ["ImagesInFloat32"]
 
 
@@ -25,7 +27,7 @@ class ImagesInFloat32:
     def __enter__(self) -> ImagesInFloat32:
         if not self._on_cpu:
             return self
-        own, self._hidden = self._processor.preprocess, vars(self._processor).get("preprocess")
+        own = self._processor.preprocess
 
         def preprocess(
             image: Any,
@@ -37,13 +39,9 @@ class ImagesInFloat32:
             images, *rest = own(image, processing_resolution, resample_method_input, device, torch.float32)
             return images.to(dtype), *rest
 
-        self._processor.preprocess = preprocess
+        self._restore = hide_method(self._processor, "preprocess", preprocess)
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if not self._on_cpu:
-            return
-        if self._hidden is None:
-            del self._processor.preprocess
-        else:  # one that the user put there
-            self._processor.preprocess = self._hidden
+        if self._on_cpu:
+            self._restore()

@@ -71,9 +71,9 @@ def plan_warm_start(
     wanted = call["ensemble_size"] * len(guidance.inputs)
     if samples != wanted:
         bad_value("previous", f"the output of {wanted} images or members", f"one of {samples}")
-    # Its lengths may be in a prior's metres, and those of this call in baselines.
-    unit = 1.0 if guidance.unit else previous.rescaled
-    near, far = (end.to(device) / unit for end in _ends(previous, prior.space))
+    # Its lengths may have become a metric prior's metres, where those of this call are in baselines.
+    metres = 1.0 if guidance.unit else previous.rescaled
+    near, far = (end.to(device) / metres for end in _ends(previous, prior.space))
     steps = call["num_inference_steps"]
     skipped = min(steps - 1, round(steps * guidance.config.warm_start))
     if skipped < 1 or not isinstance(pipe.scheduler, DDIMScheduler):

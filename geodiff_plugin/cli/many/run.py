@@ -98,7 +98,7 @@ def _run(
     stages = Stages(pipe, settings, warned, arguments.warm_start)
 
     def failed(job: Job, error: Exception) -> None:
-        job.error = _failed(job, error)["message"]
+        job.error = _say_failed(job, error)
 
     numbers = {job.ref.name: number for number, job in jobs}
     conveyor = Conveyor([stages.read, stages.evidence, stages.guide, stages.write], failed, MOST_ON_THE_WAY)
@@ -133,13 +133,13 @@ def _once() -> Callable[[str], None]:
     return tell
 
 
-def _failed(job: Job, error: Exception) -> Row:
-    """Say why a pair failed; what is no fault of the input keeps its traceback."""
+def _say_failed(job: Job, error: Exception) -> str:
+    """Say why a pair failed, and return that; what is no fault of the input keeps its traceback."""
     reason = in_options(str(error)) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     if not isinstance(error, InputError):
         say("".join(traceback.format_exception(error)).rstrip())
     say(f"geodiff: {job.ref.name}: {reason}")
-    return _row(job.ref.name, "failed", None, reason)
+    return reason
 
 
 def _row(name: str, result: str, report: dict[str, Any] | None, message: str | None = None) -> Row:
