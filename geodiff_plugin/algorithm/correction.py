@@ -210,7 +210,7 @@ def refine_depth(
 
     Args:
         depth_m: ``(B, 1, H, W)`` metres, at any resolution.
-        target: matches or known points of the same images, on any grid; the gate was applied by the caller.
+        target: matches or known points of the same images, on any grid.
         left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
         error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it: a good prior is bent over wide
             regions only, and its matches are doubted where it contradicts them.

@@ -1,6 +1,6 @@
-"""What is known beside the prior: matches and points, and which of them an estimate contradicts.
+"""What is known beside the prior: matches and points, and which of them are believed.
 
-Data flow: metric depth of an estimate -> the matches near it, and points -> that depth refined by them.
+Data flow: matches less reflections, and points + metric depth of an estimate -> that depth refined.
 Paper: none; its only evidence is the photometric error of Eq. 14 (eq:geo-loss).
 
 One object answers for both grids: that of the losses, at every step, and that of the sweep, for the output.
@@ -21,7 +21,7 @@ from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.terms.base import MatchTarget
 from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.guidance.config import GuidanceConfig
-from geodiff_plugin.matching import Matches, gate_matches, reject_reflections, with_points
+from geodiff_plugin.matching import Matches, reject_reflections, with_points
 
 __all__ = ["Known", "stacked"]
 
@@ -31,7 +31,7 @@ class Known:
     """Matches and points of some samples on one grid.
 
     Attributes:
-        config: the gate, the rejection of reflections and the fit.
+        config: the rejection of reflections and the fit.
         matches: what the views say by themselves, or ``None``.
         points: what the user knows, or ``None``.
         kept: ``(B, 1, h, w)`` in [0, 1] on any grid, the share of each match's confidence that remains once
@@ -106,21 +106,17 @@ class Known:
             None if self.error is None else self.error[index],
         )
 
-    def usable_matches(self, depth_m: Tensor) -> MatchTarget | None:
-        """The matches within the gate around an estimate, less those that look like reflections.
-
-        Args:
-            depth_m: ``(B, 1, H, W)`` metres, at any resolution.
-        """
+    @property
+    def usable_matches(self) -> MatchTarget | None:
+        """The matches less those that look like reflections; ``None`` before the prior's first estimate."""
         if self.matches is None or self.kept is None:
             return None
-        size = image_size(self.matches.confidence)
-        gated = gate_matches(self.matches, _resized(depth_m, size), self.config.gate)
-        return replace(self.matches, confidence=_resized(self.kept, size) * gated)
+        kept = _resized(self.kept, image_size(self.matches.confidence))
+        return replace(self.matches, confidence=kept * self.matches.confidence)
 
     def target(self, depth_m: Tensor) -> MatchTarget | None:
         """What an estimate is refined by: usable matches, and points; ``None`` without either."""
-        matches = self.usable_matches(depth_m)
+        matches = self.usable_matches
         if matches is not None and self.error is not None:
             matches = off_edges(matches, depth_m, self.error, self.config.correction)
         return matches if self.points is None else with_points(matches, self.points)

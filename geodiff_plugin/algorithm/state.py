@@ -135,7 +135,7 @@ class Trajectory:
             (self._search_one_number if search == "one-number" else self._span_points)(x)
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         self.known = self.known.judged(self._on_known(depth_m), self.objective.views.left_01)
-        self.matches = replace(self._on_losses, kept=self.known.kept).usable_matches(depth_m)
+        self.matches = replace(self._on_losses, kept=self.known.kept).usable_matches
 
     def _on_known(self, depth_m: Tensor) -> Tensor:
         """A metric map on the grid of the corrections."""
@@ -247,7 +247,7 @@ class Trajectory:
 
     @torch.no_grad()
     def corrected(self, x: Tensor) -> Tensor:
-        """A relative map fitted to what is known, as far as the gate lets it in.
+        """A relative map fitted to what is known.
 
         Args:
             x: ``(B, 1, h, w)`` float32 relative map, for which ``settle_scale`` was called.

@@ -50,7 +50,6 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("with gradient updates at every step", "guided:inner_steps=5+updates_from=0"),
         ("without refinement of the result", "guided:refine=false"),
         ("without rejection of reflections", "guided:reject_reflections=false"),
-        ("without a gate on matches", "guided:gate=1000000"),
         ("without cleaning of photographs", "guided:clean_photographs=false"),
         ("without exposure", "guided:exposure=false"),
         ("without z-test", "guided:z_test=false"),
@@ -65,7 +64,7 @@ has known points, so their term has none); ``parts`` is what the default has bey
 _NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
 
 NUMBERS = (
-    *("gate", "min_steps", "corrections", "outlier_width", "broad_smoothness", "passes", "stiffness_power"),
+    *("min_steps", "corrections", "outlier_width", "broad_smoothness", "passes", "stiffness_power"),
     *("weights.photometric", "weights.matches", "weights.anchor", "loss_resolution"),
     *("match_noise", "correction_cauchy", "smoothness", "stiffest", "inertia", "most_inertia"),
     *("image_edge", "depth_edge", "edge_step"),

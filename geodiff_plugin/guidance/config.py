@@ -100,13 +100,6 @@ class GuidanceConfig(Checked):
         paper="-",
         unset="from the nearest plane to a shift of 0.3 px",
     )
-    gate: float = number(
-        10.0,
-        1.0,
-        1e6,
-        "matches that differ from the estimate by more than this factor are ignored",
-        paper="-",
-    )
     pose: str = choice(
         "refine",
         ("refine", "given"),

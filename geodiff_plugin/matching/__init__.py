@@ -8,7 +8,7 @@ from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.build import build_cost_volume, find_matches
 from geodiff_plugin.matching.cleaning import clean
 from geodiff_plugin.matching.consistency import match_volume
-from geodiff_plugin.matching.matches import Matches, MatchTarget, gate_matches
+from geodiff_plugin.matching.matches import Matches, MatchTarget
 from geodiff_plugin.matching.mirrored import PoseCheck, mirrored_pose_preferred
 from geodiff_plugin.matching.points import points_to_matches, with_points
 from geodiff_plugin.matching.reflections import reject_reflections
@@ -23,7 +23,6 @@ __all__ = [
     "build_cost_volume",
     "clean",
     "find_matches",
-    "gate_matches",
     "match_volume",
     "mirrored_pose_preferred",
     "points_to_matches",

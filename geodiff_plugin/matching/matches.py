@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-__all__ = ["MatchTarget", "Matches", "gate_matches"]
+__all__ = ["MatchTarget", "Matches"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class MatchTarget:
 
     Attributes:
         inverse_depth: ``(B, 1, H, W)`` 1/m, ``(1, H, W)`` of one image; to be read where ``confidence > 0``.
-        confidence: of the same shape, in [0, 1]; 0 where nothing is known or the gate closed.
+        confidence: of the same shape, in [0, 1]; 0 where nothing is known.
         plane_step: ``(B,)`` 1/m, ``()`` of one image, the unit of the residual: between two planes of the
             sweep, or ``matching.points.UNIT`` of the points' median inverse depth.
     """
@@ -54,18 +54,3 @@ class Matches(MatchTarget):
         if confidence not in self._above:
             self._above[confidence] = (self.confidence.flatten() > confidence).nonzero()[:, 0]
         return self._above[confidence]
-
-
-def gate_matches(matches: MatchTarget, depth_m: torch.Tensor, factor: float) -> torch.Tensor:
-    """Confidence of the matches that a depth map does not contradict.
-
-    Args:
-        matches: of one image, or of a chunk of samples.
-        depth_m: ``(B, 1, H, W)`` metres, > 0, on the matches' grid.
-        factor: > 1; a match further than this factor from ``depth_m`` is dropped.
-
-    Returns:
-        ``(B, 1, H, W)`` in [0, 1].
-    """
-    ratio = matches.inverse_depth * depth_m
-    return matches.confidence * ((ratio < factor) & (ratio > 1.0 / factor))

@@ -19,7 +19,7 @@ def plan_steps(
     """Denoising steps of a guided call, and how often each makes its updates.
 
     A prior that can only take fewer steps than guidance wants makes the updates of all of them in those
-    that it has, each round with its own search and gate on matches, as a step would have.
+    that it has, each round with its own search, as a step would have.
 
     Args:
         guidance: says how many steps it wants.

@@ -63,7 +63,7 @@ def test_what_is_open_is_settled_when_asked_and_never_saved():
 
 def test_a_configuration_does_not_change():
     with pytest.raises(dataclasses.FrozenInstanceError):
-        DEFAULT.gate = 2.0
+        DEFAULT.loss_resolution = 2
     with pytest.raises(dataclasses.FrozenInstanceError):
         DEFAULT.correction.smoothness = 2.0
     with pytest.raises(TypeError, match="does not change"):
@@ -79,7 +79,7 @@ def test_a_configuration_does_not_change():
         ({"smoothness": float("nan")}, ValueError, "smoothness.*nan"),
         ({"smoothness": float("inf")}, ValueError, "smoothness"),
         ({"smoothness": True}, TypeError, "smoothness must be a number"),
-        ({"gate": None}, TypeError, "gate"),
+        ({"inertia": None}, TypeError, "inertia"),
         ({"inner_steps": 2.0}, TypeError, "inner_steps must be an integer"),
         ({"g_s_range": None}, TypeError, "g_s_range"),
         ({"g_s_range": "18"}, TypeError, "g_s_range"),
@@ -101,8 +101,8 @@ def test_what_a_leaf_cannot_be_is_refused(leaves, error, message):
 
 
 def test_values_take_one_form():
-    config = DEFAULT.changed(g_s_range=[1, 2], gate=3, weights={"matches": 1})
-    assert config.search.g_s_range == (1.0, 2.0) and isinstance(config.gate, float)
+    config = DEFAULT.changed(g_s_range=[1, 2], inertia=1, weights={"matches": 1})
+    assert config.search.g_s_range == (1.0, 2.0) and isinstance(config.correction.inertia, float)
     assert DEFAULT.changed(depth_range=None).depth_range is None
 
 
@@ -131,7 +131,7 @@ def test_knobs_as_typed():
     assert config.terms.options == {"far_pull.power": 2}
 
 
-@pytest.mark.parametrize("typed", ["speed=9", "smoothness", "weights=1", "gate.x=1", "updates.stop=1", "=1"])
+@pytest.mark.parametrize("typed", ["speed=9", "smoothness", "weights=1", "pose.x=1", "updates.stop=1", "=1"])
 def test_what_is_no_knob_is_told_with_those_that_are(typed):
     with pytest.raises(InputError, match="--knob must be KNOB=VALUE.*inner_steps.*weights.NAME"):
         config_from_text([typed], DEFAULT, "--knob")

@@ -133,7 +133,7 @@ def test_flatness_tries_every_number_at_half_and_at_twice():
     ]
     rows = {row[0]: row for row in flatness_table(records).rows}
     assert rows["`correction_cauchy`"][1:] == ("2.5", "0.1000", "0.2000", f"0.100 ({label_of(records[0])})")
-    assert rows["`gate`"][-1] == "0.000"
+    assert rows["`inertia`"][-1] == "0.000"
 
 
 def test_a_variant_changes_its_leaf_and_no_other():
@@ -277,7 +277,7 @@ def test_parts_and_flatness_take_any_data(free_methods, scene, tmp_path):
     for title, _ in CHANGES["parts"]:
         assert re.search(f"{re.escape(title)} +1 ", answer.stdout)
     answer = invoke("flatness", "--data", scene, "-o", tmp_path / "flat")
-    assert re.search("`gate` +10 ", answer.stdout) and (tmp_path / "flat" / "flatness.md").is_file()
+    assert re.search("`inertia` +0.015 ", answer.stdout) and (tmp_path / "flat" / "flatness.md").is_file()
 
 
 def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, tmp_path, monkeypatch):

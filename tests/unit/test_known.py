@@ -38,28 +38,22 @@ def test_each_grid_has_its_own_matches(grid, size):
     assert known.matches.confidence.shape == (2, 1, *size) and known.points is None
 
 
-def test_matches_outside_of_the_gate_are_not_usable():
-    known = Known.of([evidence()], DEFAULT.changed(gate=1.5), "loss").judged(depth(2.0), GREY)
-    assert (known.usable_matches(depth(2.5)).confidence == 1).all()
-    assert (known.usable_matches(depth(3.1)).confidence == 0).all()
-    # Whatever grid the estimate is on.
-    assert known.usable_matches(depth(2.5, FINE)).confidence.shape == (1, 1, *COARSE)
-
-
 def test_reflections_are_rejected_once_by_the_first_estimate():
     known = Known.of([evidence()], DEFAULT, "loss")
-    assert known.usable_matches(depth(2.0)) is None  # no match is usable before the prior has spoken
+    assert known.usable_matches is None  # no match is usable before the prior has spoken
     first = known.judged(depth(0.8), GREY)  # all lie far behind it
-    assert (first.usable_matches(depth(0.8)).confidence < 0.1).all()
+    assert (first.usable_matches.confidence < 0.1).all()
     assert first.judged(depth(2.0), GREY) is first
+    # A lamp post before the sky is no reflection, however much nearer than the estimate it is.
+    assert (known.judged(depth(1000.0), GREY).usable_matches.confidence == 1).all()
     off = Known.of([evidence()], DEFAULT.changed(reject_reflections=False), "loss")
-    assert (off.judged(depth(0.8), GREY).usable_matches(depth(0.8)).confidence == 1).all()
+    assert (off.judged(depth(0.8), GREY).usable_matches.confidence == 1).all()
 
 
 def test_what_was_kept_on_one_grid_holds_on_the_other():
     kept = torch.zeros(1, 1, *COARSE)
     kept[..., :8] = 1.0
-    fine = Known.of([evidence()], DEFAULT, "sweep", kept).usable_matches(depth(2.0))
+    fine = Known.of([evidence()], DEFAULT, "sweep", kept).usable_matches
     assert (fine.confidence[..., :14] == 1).all() and (fine.confidence[..., 18:] == 0).all()
 
 

@@ -304,17 +304,6 @@ def forward_view(left, depth, K, T):
     return image.view(3, *SIZE)
 
 
-def test_gate_drops_what_the_depth_contradicts(rectified):
-    _, _, _, depth, _, _, matches = rectified
-    depths = torch.stack([depth, depth * 3.0])  # (2, 1, H, W)
-    gated = m.gate_matches(matches, depths, 1.5)
-    assert gated.shape == (2, 1, *SIZE)
-    ratio = matches.inverse_depth * depth
-    close = (ratio < 1.4) & (ratio > 1 / 1.4)
-    assert torch.equal(gated[0][close], matches.confidence[close])
-    assert (gated[1][close] == 0).all()
-
-
 def as_levels(cost):
     return (cost * COST_LEVELS).round().to(torch.uint8)
 

@@ -58,7 +58,7 @@ class TermByTerm:
     Attributes:
         first_m: ``(H, W)`` metres, the prior's own estimate in the first guided step, scaled by the search.
         matches_m: ``(h, w)`` metres, depth that the views say by themselves; NaN where nothing.
-        match_weight: ``(h, w)`` in [0, 1], confidence of the matches after rejection and gate; NaN if none.
+        match_weight: ``(h, w)`` in [0, 1], confidence of the matches less reflections; NaN if none.
         denoised_m: ``(H, W)`` metres, the decoded result, before it is refined.
         final_m: ``(H, W)`` metres.
         residual: ``(h, w)`` planes of the sweep, ``final_m`` against the matches; above 0 is nearer.
@@ -182,7 +182,7 @@ def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[st
     shown = show_values(lower[2], parts.residual, title, "RdBu_r", -most, most)
     value_bar(figure, shown, lower[2], "planes of the sweep", "both")
     shown = show_values(lower[3], parts.match_weight, "weight of the matches", "viridis", 0.0, 1.0)
-    value_bar(figure, shown, lower[3], "after rejection and gate")
+    value_bar(figure, shown, lower[3], "without reflections")
     shown = show_values(lower[4], parts.confidence, "confidence of refined", "viridis", 0.0, 1.0)
     value_bar(figure, shown, lower[4], "probability of an error < 10 %")
     shown = show_error(lower[5], parts.final_m, sample.depth_m, sample.valid, "error of refined")
