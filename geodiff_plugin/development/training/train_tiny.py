@@ -18,7 +18,7 @@ from diffusers import AutoencoderKL, AutoencoderTiny
 from tqdm import tqdm
 
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.bundled.loading import no_bars
 from geodiff_plugin.development.training.data import normalise_disparity, read_shard, shards
 from geodiff_plugin.development.training.schedule import learning_rate
 
@@ -105,11 +105,11 @@ def distillation_loss(
     Returns:
         Scalar.
     """
-    scale = vae.config.scaling_factor
+    scale, shift = vae.config.scaling_factor, vae.config.get("shift_factor") or 0.0
     with torch.no_grad():
-        codes = scale * vae.encode(maps).latent_dist.mode()
+        codes = scale * (vae.encode(maps).latent_dist.mode() - shift)
         latents = perturbed(codes, generator)
-        target = vae.decode(latents / scale).sample.mean(dim=1, keepdim=True)
+        target = vae.decode(latents / scale + shift).sample.mean(dim=1, keepdim=True)
     found = tiny.encode(maps).latents
     return (
         _map_error(tiny.decode(latents).sample, target)
@@ -188,7 +188,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m geodiff_plugin.development.training.train_tiny", description=__doc__
     )
-    parser.add_argument("--prior", type=Path, required=True, help="pipeline folder whose autoencoder teaches")
+    parser.add_argument("--prior", required=True, help="pipeline folder or hub id whose autoencoder teaches")
     parser.add_argument("--cache", type=Path, required=True, help="rendered scenes, see training.data")
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument("--minutes", type=float, default=20.0)
@@ -199,8 +199,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(argv)
     check_number(options.minutes, "minutes", 0.001, 1e5)
+    with no_bars():
+        vae = AutoencoderKL.from_pretrained(
+            options.prior, subfolder="vae", dtype=torch.float32, use_safetensors=True
+        )
     tiny = train_tiny(
-        open_pipeline(options.prior, options.device).vae.eval().requires_grad_(False),
+        vae.to(options.device).eval().requires_grad_(False),
         options.cache,
         60.0 * options.minutes,
         width=options.width,
