@@ -67,8 +67,7 @@ def _read_view(path: Path, name: str) -> np.ndarray:
     return image
 
 
-def _rig_from_options(arguments: DepthArguments, size: tuple[int, int]) -> Rig:
-    alone = arguments.right is None
+def _rig_from_options(arguments: DepthArguments, size: tuple[int, int], alone: bool) -> Rig:
     names = PARAMETERS[:-1] if alone else PARAMETERS
     values = {name: getattr(arguments, name) for name in names}
     missing = [f"--{name}" for name, value in values.items() if value is None]
@@ -96,8 +95,7 @@ def _rig_from_options(arguments: DepthArguments, size: tuple[int, int]) -> Rig:
     return rig_from_parameters(*values.values())
 
 
-def _rig_from_matrices(arguments: DepthArguments) -> Rig:
-    alone = arguments.right is None
+def _rig_from_matrices(arguments: DepthArguments, alone: bool) -> Rig:
     for option, path in (("--K", arguments.k), ("--E", arguments.e)):
         if path is None and not (alone and option == "--E"):
             bad_value(option, "given as well", "nothing", "--K and --E go together; --K-right is optional.")
@@ -140,8 +138,11 @@ def read_rig(
             distorted=True,
         )
     else:
+        alone = right_size is None  # not by RIGHT: a frame of two images side by side has none
         rig = (
-            _rig_from_options(arguments, left_size) if way == "parameters" else _rig_from_matrices(arguments)
+            _rig_from_options(arguments, left_size, alone)
+            if way == "parameters"
+            else _rig_from_matrices(arguments, alone)
         )
     views = (
         ("left", rig.K_left, rig.size_left, left_size, arguments.left),

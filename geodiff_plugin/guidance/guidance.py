@@ -94,6 +94,7 @@ class GeometryGuidance:
         check_names(self._config)
         self._inputs = read_inputs(right, K, E, points, cropped=cropped)
         self.evidence_store: EvidenceStore | None = None
+        self.points_measured = True  # False where they are depth of another view, as in guide_both_views
         self.previous = previous
         self._cropped, self._left_size = cropped, check_size(left_size, "left_size")
         check_fed(

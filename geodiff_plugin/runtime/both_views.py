@@ -74,6 +74,7 @@ def guide_both_views(
     for (own, other, r), points, alone in zip(views, reversed(confident), first, strict=True):
         news = _news(points, r, alone, min_confidence)
         guidance = _guidance(other, r, knobs, news if len(news) else None)
+        guidance.points_measured = False
         second.append(pipe(own, guidance=guidance, **options))
     return second[0], second[1]
 

@@ -31,6 +31,8 @@ POINTS_SAID, POINTS_WRONG = math.log(1.08), math.log(1.2)
 #: A rig's baseline in metres lies between these, and a lens's horizontal field of view, in degrees: that of
 #: 135 mm and that of 10 mm in 35 mm equivalent.
 BASELINES_M, VIEWS_DEG = (1e-3, 20.0), (15.0, 120.0)
+#: No lens that keeps lines straight sees as much, degrees.
+TOO_WIDE_DEG = 150.0
 #: From this factor on it is said that a metric prior's own metres are others.
 OWN_METRES = math.log(1.9)
 #: Matches that lie further beside their epipolar lines, with the best pose that was found near the given
@@ -152,6 +154,11 @@ def _bad(signs: Signs) -> list[str]:
             "All matches have one depth: the right image looks like a shifted copy of the left one. (Of a "
             "flat wall seen head-on it may be true.)"
         )
+    if signs.view_deg > TOO_WIDE_DEG:
+        found.append(
+            f"K gives the left image {signs.view_deg:.0f} degrees of view, which no lens without distortion "
+            "has: K must be in pixels of this image, not in shares of its width and height."
+        )
     points = _of_points(signs)
     if points is not None and abs(math.log(signs.points_ratio)) > POINTS_WRONG:
         found.append(points)
@@ -176,7 +183,7 @@ def _odd(signs: Signs, trusted: bool) -> list[str]:
             f"The baseline is {signs.baseline_m:.4g} m. If that is millimetres, divide the translation by "
             "1000."
         )
-    if not VIEWS_DEG[0] <= signs.view_deg <= VIEWS_DEG[1] and not math.isnan(signs.view_deg):
+    if signs.view_deg < VIEWS_DEG[0] or VIEWS_DEG[1] < signs.view_deg <= TOO_WIDE_DEG:
         found.append(
             f"K gives the left image a field of view of {signs.view_deg:.0f} degrees: is it for an image of "
             "another size?"

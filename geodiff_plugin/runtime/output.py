@@ -72,8 +72,8 @@ def assemble_output(
     ]
     visible = torch.cat([where for where, _ in seen]) if seen else None
     error = torch.cat([difference for _, difference in seen]) if seen else None
-    measured = [own.error for own in known_of if own.error is not None]
-    prior_error = torch.cat(measured) if len(measured) == count else None  # (N, 1, 1, 1)
+    errors = [own.error for own in known_of if own.error is not None]
+    prior_error = torch.cat(errors) if len(errors) == count else None  # (N, 1, 1, 1)
     confidence = None
     if support is not None:
         spread = None if uncertainty is None else uncertainty / depth_m
@@ -84,7 +84,10 @@ def assemble_output(
     own_ratios = [math.nan] * count
     if over_own is not None and guidance.unit is not None:
         own_ratios = over_own.reshape(count, -1).median(1).values.tolist()
-    judgements = [_judged(run, i, lefts_01[i], known[i][1], confidence, own_ratios[i]) for i in range(count)]
+    measured = guidance.points_measured
+    judgements = [
+        _judged(run, i, lefts_01[i], known[i][1], confidence, own_ratios[i], measured) for i in range(count)
+    ]
     if confidence is not None:
         agreed = confidence.new_tensor([agreement_of_points(each.signs) for each in judgements])
         confidence = confidence * agreed.view(-1, 1, 1, 1)
@@ -177,6 +180,7 @@ def _judged(
     K_left: Tensor,
     confidence: Tensor | None,
     own_ratio: float,
+    points_measured: bool,
 ) -> Judgement:
     """What the signs of one image's run say of it."""
     own = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
@@ -191,6 +195,7 @@ def _judged(
         on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in own),
         range_given=run.config.depth_range is not None,
         own_ratio=own_ratio,
+        points_measured=points_measured,
     )
     return judge(signs)
 

@@ -22,7 +22,7 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.many.conveyor import Conveyor
 from geodiff_plugin.cli.many.finished import _as_option, finished_report
-from geodiff_plugin.cli.many.pairs import find_pairs
+from geodiff_plugin.cli.many.pairs import assumption, find_pairs
 from geodiff_plugin.cli.many.processes import Processes
 from geodiff_plugin.formats.video import VideoReader, both_halves, count_frames
 
@@ -140,6 +140,16 @@ def test_folders_go_by_name_else_by_order(tmp_path, textured_plane):
         path.rename(path.with_stem(f"{path.stem}_R"))
     refs = find_pairs(DepthArguments(left, right))
     assert [(ref.left.name, ref.right.name) for ref in refs] == [("a.png", "a_R.png"), ("b.png", "b_R.png")]
+
+
+def test_folders_that_share_no_name_are_said_to_go_by_order(tmp_path, textured_plane):
+    write_folders(tmp_path, textured_plane, ["10", "20", "30"])
+    arguments = DepthArguments(tmp_path / "left", tmp_path / "right")
+    assert assumption(find_pairs(arguments), arguments) is None
+    for path in arguments.right.iterdir():
+        path.rename(path.with_stem(f"{int(path.stem) + 3}"))
+    said = assumption(find_pairs(arguments), arguments)
+    assert "10.png with 13.png, and so on to 30.png with 33.png" in said
 
 
 @pytest.mark.parametrize("missing", ["left", "right"])
@@ -383,9 +393,17 @@ def test_halves_of_a_frame():
         both_halves(np.zeros((2, 3, 3), np.float32))
 
 
+@pytest.mark.parametrize("cameras", ["--calib", "--fx"])
 @pytest.mark.parametrize("beside", [False, True])
-def test_the_video_of_a_rig(geodiff, folders, views, beside):
+def test_the_video_of_a_rig(geodiff, folders, textured_plane, views, beside, cameras):
     root, command = folders
+    if cameras == "--fx":
+        K, at = textured_plane.K, command.index("--calib")
+        numbers = dict(
+            zip(("--fx", "--fy", "--cx", "--cy"), (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), strict=True)
+        )
+        typed = [word for name, value in numbers.items() for word in (name, float(value))]
+        command = [*command[:at], *typed, "--baseline", 0.1, *command[at + 2 :]]
     if beside:
         write_video(root / "rig.avi", [np.concatenate(both, 1) for both in zip(*views, strict=True)])
         words = ["depth", "rig.avi", *command[3:]]

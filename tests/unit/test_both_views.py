@@ -67,6 +67,7 @@ def test_four_calls_with_the_other_view_and_its_camera(pipe):
         np.testing.assert_allclose(rig.E, E if name == "left" else np.linalg.inv(E), atol=1e-3)
         assert options["num_inference_steps"] == 2 and options["match_input_resolution"]
     assert [options["output_type"] for _, _, options in pipe.calls] == ["pt", "pt", "np", "np"]
+    assert [guidance.points_measured for _, guidance, _ in pipe.calls] == [True, True, False, False]
 
 
 def test_only_what_is_sure_there_and_not_here_is_told_at_its_true_place(pipe):

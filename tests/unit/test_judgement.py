@@ -49,6 +49,7 @@ def test_a_good_run_is_trusted_in_silence():
         ({"epipolar_px": 1.5, "confidence": 0.45}, "Likely causes"),
         ({"mistakes": ("E seems to be in the axes of OpenGL.",)}, "OpenGL"),
         ({"points": 1, "matched": math.nan, "confidence": math.nan}, "One known depth does not fix"),
+        ({"view_deg": 179.0}, "179 degrees of view"),
     ],
 )
 def test_reasons(signs, words):
@@ -117,6 +118,20 @@ def test_confidence_falls_with_disagreement():
     factors = [agreement_of_points(replace(GOOD, points_ratio=r)) for r in (1.0, 1.05, 1.12, 1.2, 3.0, 1 / 3)]
     assert factors[:2] == [1.0, 1.0] and factors[3:] == pytest.approx([0.25] * 3)
     assert 0.25 < factors[2] < 1.0 and agreement_of_points(GOOD) == 1.0
+
+
+def test_points_of_another_views_depth_tell_nothing_of_the_calibration(textured_plane):
+    v, u = np.mgrid[4:44:4, 4:60:4]
+    z = 3.0 * textured_plane.depth_m[v, u]
+    K = np.asarray(textured_plane.K)
+    points = np.stack([(u - K[0, 2]) * z / K[0, 0], (v - K[1, 2]) * z / K[1, 1], z], -1).reshape(-1, 3)
+    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, points=points)
+    left = torch.from_numpy(textured_plane.left).permute(2, 0, 1)[None].float() / 255
+    (evidence,) = guidance.prepare(left)
+    given = (evidence, left[0], evidence.native, torch.as_tensor(K).float())
+    known = {"order": 1.0, "confidence": None, "on_edge": False}
+    assert read_signs(*given, **known).points_ratio == pytest.approx(3.0, rel=0.1)
+    assert math.isnan(read_signs(*given, **known, points_measured=False).points_ratio)
 
 
 def test_rank_correlation(textured_plane):

@@ -23,7 +23,7 @@ from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.video import VIDEOS, count_frames, is_video
 
-__all__ = ["LISTS", "PairRef", "arguments_of", "find_pairs", "is_many"]
+__all__ = ["LISTS", "PairRef", "arguments_of", "assumption", "find_pairs", "is_many"]
 
 LISTS = (".csv", ".tsv", ".txt")
 #: First words of a list's heading, which is no pair.
@@ -69,6 +69,22 @@ def find_pairs(arguments: DepthArguments) -> list[PairRef]:
         cure = f"{left.name} is a text, so it is read as a list, which names both views of each pair."
         bad_value("RIGHT", "left out where LEFT is a list of pairs", right, cure)
     return _of_list(left)
+
+
+def assumption(refs: Sequence[PairRef], arguments: DepthArguments) -> str | None:
+    """What was assumed about which views belong together, for the user to check; ``None`` for nothing."""
+    first, last = refs[0], refs[-1]
+    if first.frame is not None and first.right is None:
+        return f"{first.left} is read as both views side by side; with a video for each view, name both."
+    if first.right is None or last.right is None or not os.path.isdir(arguments.left):
+        return None
+    if first.left.stem == first.right.stem:
+        return None
+    return (
+        f"The two folders share no name, so their images are paired in order: {first.left.name} with "
+        f"{first.right.name}, and so on to {last.left.name} with {last.right.name}. Should one be missing, "
+        "write a list of pairs."
+    )
 
 
 def arguments_of(ref: PairRef, arguments: DepthArguments) -> DepthArguments:

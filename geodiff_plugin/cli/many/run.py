@@ -26,7 +26,7 @@ from geodiff_plugin.cli.exports import check_exports
 from geodiff_plugin.cli.many.conveyor import Conveyor
 from geodiff_plugin.cli.many.finished import finished_report
 from geodiff_plugin.cli.many.job import Job, Stages, ThreadWarnings
-from geodiff_plugin.cli.many.pairs import PairRef
+from geodiff_plugin.cli.many.pairs import PairRef, assumption
 from geodiff_plugin.cli.many.processes import Processes, join_processes
 from geodiff_plugin.cli.messages import collected_warnings, in_options, say
 from geodiff_plugin.cli.settings import Settings, read_settings
@@ -59,8 +59,9 @@ def run_many(arguments: DepthArguments, refs: Sequence[PairRef]) -> None:
     settings = read_settings(arguments)
     check_exports(arguments.export, None)
     processes = join_processes(settings.device)
-    if refs[0].frame is not None and refs[0].right is None and processes.index == 0 and not arguments.quiet:
-        say(f"{refs[0].left} is read as both views side by side; with a video for each view, name both.")
+    assumed = assumption(refs, arguments)
+    if assumed and processes.index == 0 and not arguments.quiet:
+        say(assumed)
     settings = replace(settings, device=processes.device(settings.device))
     rows = [row for _, row in sorted(_work(arguments, settings, refs, processes))]
     rows = processes.gather(rows)
