@@ -182,7 +182,7 @@ def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[st
     shown = show_values(lower[2], parts.residual, title, "RdBu_r", -most, most)
     value_bar(figure, shown, lower[2], "planes of the sweep", "both")
     shown = show_values(lower[3], parts.match_weight, "weight of the matches", "viridis", 0.0, 1.0)
-    value_bar(figure, shown, lower[3], "without reflections")
+    value_bar(figure, shown, lower[3], "confidence, 0 for reflections")
     shown = show_values(lower[4], parts.confidence, "confidence of refined", "viridis", 0.0, 1.0)
     value_bar(figure, shown, lower[4], "probability of an error < 10 %")
     shown = show_error(lower[5], parts.final_m, sample.depth_m, sample.valid, "error of refined")
