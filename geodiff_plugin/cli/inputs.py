@@ -225,7 +225,7 @@ def read_inputs(
     rig = rig_of(arguments, settings.cameras, _size(left), None if right is None else _size(right))
     if views is None:
         _compare_with_exif(arguments, rig)
-    lenses = lenses_of(arguments, rig.distortion)
+    lenses = lenses_of(arguments, rig)
     left = pinhole(left, rig.K_left, lenses[0], settings.config)
     if right is not None:
         right = pinhole(right, rig.K_right, lenses[1], settings.config)

@@ -16,7 +16,7 @@ from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 from geodiff_plugin.formats.rigs import is_distorted
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.posing import cleaned
-from geodiff_plugin.types import Distortion
+from geodiff_plugin.types import Distortion, Rig
 
 __all__ = ["Lenses", "lenses_of", "pinhole"]
 
@@ -45,9 +45,7 @@ def pinhole(
     return undistorted(ready.permute(1, 2, 0).contiguous().numpy(), K, lens)
 
 
-def lenses_of(
-    arguments: DepthArguments, own: tuple[Distortion | None, Distortion | None] = (None, None)
-) -> Lenses:
+def lenses_of(arguments: DepthArguments, rig: Rig | None = None) -> Lenses:
     """Distortion of every photograph's lens, the left one first; ``None`` for a lens without distortion.
 
     Options take precedence over the calibration. A further view without ``--view-distortion`` has the left
@@ -55,24 +53,30 @@ def lenses_of(
 
     Args:
         arguments: the options.
-        own: of the left and the right lens, as the calibration says.
+        rig: the calibration, with the lenses that it knows; ``None`` where there is none.
 
     Raises:
-        ValueError: more than two lenses, malformed coefficients, or a further view with a K of its own and a
-            lens that is not given.
+        ValueError: more than two lenses, malformed coefficients, lenses for rectified images, or a further
+            view with a K of its own and a lens that is not given.
     """
     typed = [distortion_from_text(text) for text in arguments.distortion]
     if len(typed) > 2:
         bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
+    if rig is not None and rig.rectified and any(is_distorted(lens) for lens in typed):
+        bad_value(
+            "--distortion",
+            f"left out where the calibration is of rectified images ({rig.source})",
+            " and ".join(arguments.distortion),
+            "Drop it and give the rectified images, or give K and E of the raw cameras (--K, --E).",
+        )
+    own = (None, None) if rig is None else rig.distortion
     found = (typed[0], typed[-1]) if typed else own
     further: list[Distortion | None] = [
         distortion_from_text(text, "--view-distortion") for text in arguments.view_distortion
     ]
     if not further:
-        if arguments.view_k and any(lens is not None and is_distorted(lens.coefficients) for lens in found):
+        if arguments.view_k and any(is_distorted(lens) for lens in found):
             cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
             bad_value("--view-distortion", "given for each --view", "none", cure)
         further = [found[0]] * len(arguments.view)
-    return tuple(
-        lens if lens is not None and is_distorted(lens.coefficients) else None for lens in (*found, *further)
-    )
+    return tuple(lens if is_distorted(lens) else None for lens in (*found, *further))

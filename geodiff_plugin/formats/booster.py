@@ -37,7 +37,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
         bad_value(f"{path}", f"a Booster calibration with {', '.join(KEYS)}", f"no {', '.join(missing)}")
     K_left, K_right = (entries[key.lower()][:, :3] for key in KEYS[:2])
     baseline_m = positive(entries["baselinelr"].ravel()[0], f"baselineLR in {path}") / 1000.0
-    return make_rig(K_left, K_right, pose_to_the_right(baseline_m), path)
+    return make_rig(K_left, K_right, pose_to_the_right(baseline_m), path, rectified=True)
 
 
 BOOSTER = CalibrationFormat("Booster xml (proj_matL, proj_matR, baselineLR)", matches, read)

@@ -14,27 +14,28 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.lenses import FactoryCamera, rig_of_cameras
+from geodiff_plugin.formats.lenses import FactoryCamera, lens_of, rig_of_cameras
 from geodiff_plugin.formats.rigs import intrinsics, pose_from_world_to_camera
 from geodiff_plugin.formats.structured import array_of
 from geodiff_plugin.types import Rig
 
 __all__ = ["COLMAP", "matches", "read"]
 
-#: How many numbers of a model stand before its lens: f cx cy, or fx fy cx cy.
-FOCALS = {
-    "SIMPLE_PINHOLE": 1,
-    "PINHOLE": 2,
-    "SIMPLE_RADIAL": 1,
-    "RADIAL": 1,
-    "OPENCV": 2,
-    "OPENCV_FISHEYE": 2,
-    "FULL_OPENCV": 2,
-    "SIMPLE_RADIAL_FISHEYE": 1,
-    "RADIAL_FISHEYE": 1,
-    "THIN_PRISM_FISHEYE": 2,
+#: Of a model: how many focal lengths stand before cx cy, OpenCV's name of its lens, how many of its
+#: coefficients stand behind. Where OpenCV has more, those that are not there are zero.
+MODELS = {
+    "SIMPLE_PINHOLE": (1, "opencv", 0),
+    "PINHOLE": (2, "opencv", 0),
+    "SIMPLE_RADIAL": (1, "opencv", 1),
+    "RADIAL": (1, "opencv", 2),
+    "OPENCV": (2, "opencv", 4),
+    "FULL_OPENCV": (2, "opencv", 8),
+    "SIMPLE_RADIAL_FISHEYE": (1, "fisheye", 1),
+    "RADIAL_FISHEYE": (1, "fisheye", 2),
+    "OPENCV_FISHEYE": (2, "fisheye", 4),
 }
-FISHEYES = {name for name in FOCALS if "FISHEYE" in name}
+#: COLMAP's models that OpenCV does not have.
+FOREIGN = ("FOV", "THIN_PRISM_FISHEYE")
 CAMERA = re.compile(r"^(\d+) ([A-Z_]+) (\d+) (\d+) (.+)$", re.MULTILINE)
 IMAGE = re.compile(r"^(\d+)((?: [-+.\deE]+){7}) (\d+) (\S.*)$", re.MULTILINE)
 CAMERAS_MARK, IMAGES_MARK = "# Camera list with", "# Image list with"
@@ -46,27 +47,23 @@ def matches(text: str, path: Path) -> bool:
     if CAMERAS_MARK in text or IMAGES_MARK in text:
         return True
     found = CAMERA.search(text)
-    return (found is not None and found.group(2) in FOCALS) or IMAGE.search(text) is not None
+    return (found is not None and found.group(2) in (*MODELS, *FOREIGN)) or IMAGE.search(text) is not None
 
 
 def _cameras(file: CalibrationFile) -> dict[str, FactoryCamera]:
     cameras = {}
     for number, model, width, height, words in CAMERA.findall(file.text):
         where = f"camera {number} in {file.path}"
-        if model not in FOCALS:
-            bad_value(f"the model of {where}", f"one of {', '.join(FOCALS)}", model, UNDISTORT)
-        if model in FISHEYES:
-            bad_value(f"the model of {where}", "a pinhole", model, UNDISTORT)
-        numbers = array_of(words.split(), (-1,), f"parameters of {where}")
-        count = FOCALS[model]
-        if numbers.size < count + 2:
-            bad_value(f"parameters of {where}", f"at least {count + 2} numbers", numbers.size, "Cut off?")
+        if model not in MODELS:
+            bad_value(f"the model of {where}", f"one of {', '.join(MODELS)}", model, UNDISTORT)
+        count, kind, behind = MODELS[model]
+        numbers = array_of(words.split(), (count + 2 + behind,), f"parameters of {where}")
         fx, fy = numbers[0], numbers[count - 1]
         # COLMAP puts the centre of the first pixel at (0.5, 0.5).
         cx, cy = numbers[count : count + 2] - 0.5
-        cameras[number] = FactoryCamera(
-            intrinsics(fx, fy, cx, cy), numbers[count + 2 :], (int(width), int(height))
-        )
+        coefficients = np.pad(numbers[count + 2 :], (0, max(4 - behind, 0)))
+        lens = lens_of(coefficients, f"the lens of {where}", kind)
+        cameras[number] = FactoryCamera(intrinsics(fx, fy, cx, cy), (int(width), int(height)), lens)
     return cameras
 
 
@@ -100,7 +97,8 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     Lengths keep the model's unit, which is no metre: one measured distance gives it (``baseline_m``).
 
     Raises:
-        ValueError: no such images, no names, a lens, or two files of one kind.
+        ValueError: no such images, no names, a model that OpenCV does not have, or two files of one
+            kind.
     """
     by_kind = {bool(CAMERA.search(file.text)) and IMAGES_MARK not in file.text: file for file in files}
     if len(by_kind) != 2:

@@ -10,12 +10,10 @@ import cv2
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.lenses import COUNTS
 from geodiff_plugin.types import Distortion
 
 __all__ = ["distortion_from_text", "undistorted"]
-
-#: How many coefficients OpenCV's functions take.
-COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
 
 
 def distortion_from_text(text: str, name: str = "--distortion") -> Distortion:

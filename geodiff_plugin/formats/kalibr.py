@@ -14,14 +14,17 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.lenses import FactoryCamera, rig_of_cameras
+from geodiff_plugin.formats.lenses import FactoryCamera, lens_of, rig_of_cameras
 from geodiff_plugin.formats.rigs import check_rigid, intrinsics, pose_from_world_to_camera
 from geodiff_plugin.formats.structured import array_of, entry, parse_yaml
-from geodiff_plugin.types import Rig
+from geodiff_plugin.types import Distortion, Rig
 
 __all__ = ["KALIBR", "matches", "read"]
 
-MARK = re.compile(r"^cam\d+:\s*$", re.MULTILINE)
+MARK = re.compile(r"^cam\d+:\s*(?:#.*)?$", re.MULTILINE)
+#: OpenCV's name of a distortion model.
+LENSES = {"radtan": "opencv", "equidistant": "fisheye"}
+CURE = "Calibrate with pinhole-radtan or pinhole-equi, or undistort the images to a pinhole first."
 
 
 def matches(text: str, path: Path) -> bool:
@@ -29,18 +32,26 @@ def matches(text: str, path: Path) -> bool:
     return MARK.search(text) is not None
 
 
+def _lens(camera: dict[str, Any], where: str) -> Distortion | None:
+    name = f"distortion_coeffs of {where}"
+    coefficients = array_of(entry(camera, "distortion_coeffs", where), (-1,), name)
+    model = entry(camera, "distortion_model", where)
+    if model == "none":
+        return None
+    if model not in LENSES:
+        bad_value(f"distortion_model of {where}", f"one of {', '.join(LENSES)}, none", repr(model), CURE)
+    return lens_of(array_of(coefficients, (4,), name), name, LENSES[model])
+
+
 def _camera(chain: dict[str, Any], name: str, path: Path) -> FactoryCamera:
     where = f"{name} in {path}"
     camera = entry(chain, name, f"{path}")
     model = entry(camera, "camera_model", where)
     if model != "pinhole":
-        bad_value(
-            f"camera_model of {where}", "pinhole", repr(model), "Undistort the images to a pinhole first."
-        )
+        bad_value(f"camera_model of {where}", "pinhole", repr(model), CURE)
     numbers = array_of(entry(camera, "intrinsics", where), (4,), f"intrinsics of {where}")
-    lens = array_of(entry(camera, "distortion_coeffs", where), (-1,), f"distortion_coeffs of {where}")
     width, height = array_of(entry(camera, "resolution", where), (2,), f"resolution of {where}")
-    return FactoryCamera(intrinsics(*numbers), lens, (int(width), int(height)))
+    return FactoryCamera(intrinsics(*numbers), (int(width), int(height)), _lens(camera, where))
 
 
 def _from_first(chain: dict[str, Any], number: int, path: Path) -> np.ndarray:
@@ -55,17 +66,30 @@ def _from_first(chain: dict[str, Any], number: int, path: Path) -> np.ndarray:
     return T
 
 
+def _numbers(chain: dict[str, Any], choice: CameraChoice, path: Path) -> tuple[int, int]:
+    """Numbers of the left and the right camera, as they were chosen, or 0 and 1."""
+    if choice.cameras is None:
+        return 0, 1
+    there = [number for number in range(len(chain)) if f"cam{number}" in chain]
+    left, right = choice.cameras
+    if left == right or not {left, right} <= set(there):
+        have = ", ".join(map(str, there))
+        bad_value("cameras", f"two different cameras of {path} ({have})", f"{left},{right}")
+    return left, right
+
+
 def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     """The rig of two cameras of a chain: ``choice.cameras``, or cam0 (left) and cam1 (right).
 
     ``T_cn_cnm1`` takes points of the camera before to this one, in metres.
 
     Raises:
-        ValueError: an entry is missing or malformed, another camera model than pinhole, lens distortion.
+        ValueError: an entry is missing or malformed, no such camera, another model of a camera or a lens
+            than pinhole, radtan, equidistant.
     """
     path = files[0].path
     chain = parse_yaml(files[0].text, path)
-    left, right = choice.cameras or (0, 1)
+    left, right = _numbers(chain, choice, path)
     first, second = (_camera(chain, f"cam{number}", path) for number in (left, right))
     E = pose_from_world_to_camera(*(_from_first(chain, number, path) for number in (left, right)))
     return rig_of_cameras(first, second, E, str(path))

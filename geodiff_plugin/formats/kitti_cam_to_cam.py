@@ -62,7 +62,9 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     P_left, P_right = (kitti_row(text, f"P_rect_{n}", 12, path).reshape(3, 4) for n in names)
     sizes = [_size(text, f"S_rect_{n}", path) for n in names]
     E = pose_from_projections(P_left, P_right, path)
-    return make_rig(P_left[:, :3], P_right[:, :3], E, path, size=sizes[0], size_right=sizes[1])
+    return make_rig(
+        P_left[:, :3], P_right[:, :3], E, path, size=sizes[0], size_right=sizes[1], rectified=True
+    )
 
 
 def _size(text: str, key: str, path: Path) -> tuple[int, int] | None:

@@ -35,7 +35,9 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     path, text = files[0].path, files[0].text
     cameras = choose_cameras({int(number) for number in ROW.findall(text)}, choice, path)
     P_left, P_right = (kitti_row(text, f"P{camera}", 12, path).reshape(3, 4) for camera in cameras)
-    return make_rig(P_left[:, :3], P_right[:, :3], pose_from_projections(P_left, P_right, path), path)
+    return make_rig(
+        P_left[:, :3], P_right[:, :3], pose_from_projections(P_left, P_right, path), path, rectified=True
+    )
 
 
 KITTI_PROJECTIONS = CalibrationFormat(

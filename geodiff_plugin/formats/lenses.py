@@ -1,4 +1,4 @@
-"""Factory calibrations: intrinsics, distortion and resolution of each camera.
+"""Cameras as calibrations describe them: intrinsics, lens and resolution of each.
 
 Data flow: ``FactoryCamera`` of both sides and their pose -> ``Rig``.
 Paper: none.
@@ -11,10 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.rigs import check_no_distortion, make_rig
-from geodiff_plugin.types import Rig
+from geodiff_plugin.formats.rigs import is_distorted, make_rig
+from geodiff_plugin.types import Distortion, Rig
 
-__all__ = ["FactoryCamera", "rig_of_cameras", "scaled_to"]
+__all__ = ["COUNTS", "FactoryCamera", "lens_of", "rig_of_cameras", "scaled_to"]
+
+#: How many coefficients OpenCV's functions take.
+COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
+ORDERS = {
+    "opencv": "k1, k2, p1, p2, k3, ... of OpenCV's model",
+    "fisheye": "k1 to k4 of OpenCV's fisheye model",
+}
 
 #: Images of one sensor differ in their ratio of sides by rounding only; beyond this one of them was cropped.
 RATIO_TOLERANCE = 0.01
@@ -26,13 +33,37 @@ class FactoryCamera:
 
     Attributes:
         K: ``(3, 3)`` pixels.
-        distortion: coefficients of the lens in the order of the file; zeros where it was taken out.
         size: ``(width, height)`` that ``K`` is for, or ``None``.
+        lens: its distortion; ``None`` for none.
     """
 
     K: np.ndarray
-    distortion: np.ndarray
     size: tuple[int, int] | None = None
+    lens: Distortion | None = None
+
+
+def lens_of(coefficients: np.ndarray, name: str, model: str = "opencv") -> Distortion | None:
+    """The lens of a file's coefficients in OpenCV's order; ``None`` where they move no pixel.
+
+    Args:
+        coefficients: as many as OpenCV has.
+        name: for the message.
+        model: ``"opencv"`` or ``"fisheye"``.
+
+    Raises:
+        ValueError: another count, or NaN or infinity among them.
+    """
+    numbers = np.asarray(coefficients, np.float64).ravel()
+    lens = Distortion(model, numbers)
+    finite = bool(np.isfinite(numbers).all())
+    if finite and not is_distorted(lens):
+        return None
+    if not finite or numbers.size not in COUNTS[model]:
+        *fewer, most = map(str, COUNTS[model])
+        counts = f"{', '.join(fewer)} or {most}" if fewer else most
+        got = f"{numbers.size}: {np.array2string(numbers, precision=4, separator=', ')}"
+        bad_value(name, f"{counts} finite coefficients ({ORDERS[model]})", got, "Check the calibration file.")
+    return lens
 
 
 def scaled_to(camera: FactoryCamera, size: tuple[int, int] | None, name: str) -> FactoryCamera:
@@ -60,18 +91,29 @@ def scaled_to(camera: FactoryCamera, size: tuple[int, int] | None, name: str) ->
     return replace(camera, K=S @ camera.K, size=size)
 
 
-def rig_of_cameras(left: FactoryCamera, right: FactoryCamera, E: np.ndarray, source: str) -> Rig:
-    """The rig of two cameras whose images are those of a pinhole.
+def rig_of_cameras(
+    left: FactoryCamera, right: FactoryCamera, E: np.ndarray, source: str, *, rectified: bool = False
+) -> Rig:
+    """The rig of two cameras and their lenses.
 
     Args:
         left: the left camera.
         right: the right camera.
         E: ``(4, 4)`` metres, pose of the right camera in the left camera's frame.
         source: the file, for messages.
+        rectified: whether their images are rectified.
 
     Raises:
-        ValueError: lens distortion that is not zero, or a matrix that is none.
+        ValueError: a matrix that is none.
     """
-    for side, camera in (("left", left), ("right", right)):
-        check_no_distortion(camera.distortion, f"Lens distortion of the {side} camera in {source}")
-    return make_rig(left.K, right.K, E, source, size=left.size, size_right=right.size)
+    lenses = (left.lens, right.lens)
+    return make_rig(
+        left.K,
+        right.K,
+        E,
+        source,
+        size=left.size,
+        size_right=right.size,
+        distortion=lenses,
+        rectified=rectified,
+    )

@@ -80,7 +80,9 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
             "Is the file cut off?",
         )
     baseline_m = positive(entries["baseline"], f"baseline in {path}") / 1000.0
-    return make_rig(K_left, K_right, pose_to_the_right(baseline_m), path, size=_size(entries, path))
+    return make_rig(
+        K_left, K_right, pose_to_the_right(baseline_m), path, size=_size(entries, path), rectified=True
+    )
 
 
 def _number(value: str, name: str) -> float:

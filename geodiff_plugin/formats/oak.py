@@ -6,6 +6,7 @@ Paper: none.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,18 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.lenses import FactoryCamera, rig_of_cameras, scaled_to
+from geodiff_plugin.formats.lenses import FactoryCamera, lens_of, rig_of_cameras, scaled_to
 from geodiff_plugin.formats.rigs import check_rigid, pose_to_the_right
 from geodiff_plugin.formats.structured import array_of, entry, parse_json
-from geodiff_plugin.types import Rig
+from geodiff_plugin.types import Distortion, Rig
 
 __all__ = ["OAK", "matches", "read"]
 
 #: CAM_B and CAM_C, where every OAK-D has its left and its right camera.
 LEFT, RIGHT = 1, 2
 METRES_PER_CENTIMETRE = 0.01
+#: dai::CameraModel by its number; the others are none of OpenCV's.
+LENSES = {0: "opencv", 1: "fisheye"}
 
 
 def matches(text: str, path: Path) -> bool:
@@ -44,9 +47,21 @@ def _camera(cameras: dict[int, dict[str, Any]], socket: int, path: Path) -> Fact
         bad_value("cameras", f"sockets of {path} ({', '.join(map(str, sorted(cameras)))})", socket)
     camera = cameras[socket]
     K = array_of(entry(camera, "intrinsicMatrix", where), (3, 3), f"intrinsicMatrix of {where}")
-    lens = array_of(entry(camera, "distortionCoeff", where), (-1,), f"distortionCoeff of {where}")
     width, height = (int(array_of(entry(camera, key, where), (1,), key)[0]) for key in ("width", "height"))
-    return FactoryCamera(K, lens, (width, height))
+    return FactoryCamera(K, (width, height))
+
+
+def _lens(cameras: dict[int, dict[str, Any]], socket: int, path: Path) -> Distortion | None:
+    where = f"the camera of socket {socket} in {path}"
+    name = f"distortionCoeff of {where}"
+    numbers = array_of(entry(cameras[socket], "distortionCoeff", where), (-1,), name)
+    kind = cameras[socket].get("cameraType", 0)
+    if kind not in LENSES:
+        cure = "OpenCV does not have this model: undistort or rectify both images first."
+        bad_value(f"cameraType of {where}", "0 (perspective) or 1 (fisheye)", repr(kind), cure)
+    # A fisheye has four, in a list that may be filled up with zeros.
+    numbers = numbers if LENSES[kind] == "opencv" or numbers[4:].any() else numbers[:4]
+    return lens_of(numbers, name, LENSES[kind])
 
 
 def _to_root(cameras: dict[int, dict[str, Any]], socket: int, path: Path) -> dict[int, np.ndarray]:
@@ -80,10 +95,10 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
 
     Where the file holds the rectifying rotations, both images are those of a pinhole with the right camera's
     intrinsics, a baseline apart; that is what ``StereoDepth`` makes. Without them, or for other sockets, the
-    cameras stand as they are, for images without lens distortion. Lengths are centimetres.
+    cameras stand as they are, with their lenses. Lengths are centimetres.
 
     Raises:
-        ValueError: an entry is missing or malformed, no such socket, lens distortion without rectification.
+        ValueError: an entry is missing or malformed, no such socket, a lens that OpenCV has no model of.
     """
     path = files[0].path
     data = parse_json(files[0].text, path)
@@ -97,8 +112,12 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     )
     E = _pose(cameras, left, right, path)
     if (left, right) == pair and stereo.get("rectifiedRotationLeft"):
-        first = second = FactoryCamera(second.K, np.zeros(0), second.size)
         E = pose_to_the_right(float(np.linalg.norm(E[:3, 3])))
+        return rig_of_cameras(second, second, E, str(path), rectified=True)
+    first, second = (
+        replace(camera, lens=_lens(cameras, socket, path))
+        for camera, socket in ((first, left), (second, right))
+    )
     return rig_of_cameras(first, second, E, str(path))
 
 

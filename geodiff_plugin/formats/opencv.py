@@ -6,13 +6,13 @@ Paper: none; R, T of ``stereoCalibrate`` map left points to right ones.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
+from geodiff_plugin.formats.lenses import lens_of
 from geodiff_plugin.formats.opencv_storage import is_storage, parse_storage
 from geodiff_plugin.formats.rigs import check_rigid, make_rig, pose_from_projections
 from geodiff_plugin.types import Distortion, Rig
@@ -34,9 +34,12 @@ def _first(entries: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray
     return next((entries[name] for name in names if name in entries), None)
 
 
-def _lens(entries: dict[str, np.ndarray], names: tuple[str, ...]) -> Distortion | None:
+def _lens(
+    entries: dict[str, np.ndarray], names: tuple[str, ...], side: str, source: str
+) -> Distortion | None:
     coefficients = _first(entries, names)
-    return None if coefficients is None else Distortion("opencv", coefficients.ravel())
+    name = f"Lens distortion of the {side} camera in {source}"
+    return None if coefficients is None else lens_of(coefficients, name)
 
 
 def _merged(files: tuple[CalibrationFile, ...]) -> dict[str, np.ndarray]:
@@ -105,13 +108,13 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     taken as metres: OpenCV keeps the unit of the chessboard's squares, and the file does not say it.
 
     Raises:
-        ValueError: neither set is there, or a matrix is malformed.
+        ValueError: neither set is there, a matrix is malformed, or D has a count that OpenCV has not.
     """
     entries, source = _merged(files), " and ".join(str(file.path) for file in files)
     if {"p1", "p2"} <= entries.keys():
-        return make_rig(*_rectified(entries, source), source, size=_size(entries))
-    rig = make_rig(*_as_taken(entries, source), source, size=_size(entries))
-    return replace(rig, distortion=(_lens(entries, LEFT_D), _lens(entries, RIGHT_D)))
+        return make_rig(*_rectified(entries, source), source, size=_size(entries), rectified=True)
+    lenses = (_lens(entries, LEFT_D, "left", source), _lens(entries, RIGHT_D, "right", source))
+    return make_rig(*_as_taken(entries, source), source, size=_size(entries), distortion=lenses)
 
 
 OPENCV = CalibrationFormat(

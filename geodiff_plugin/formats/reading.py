@@ -179,9 +179,9 @@ def read_calibration(
         None if image_size is None else (int(image_size[0]), int(image_size[1])),
     )
     rig = CALIBRATION_FORMATS[name].read(files, choice)
-    for side, lens in enumerate(rig.distortion):
-        if lens is not None and not distorted:
-            check_no_distortion(lens.coefficients, f"Lens distortion D{side + 1} in {rig.source}")
+    if not distorted:
+        for side, lens in zip(("left", "right"), rig.distortion, strict=True):
+            check_no_distortion(lens, f"Lens distortion of the {side} camera in {rig.source}")
     return _in_metres(rig, baseline_m, name)
 
 

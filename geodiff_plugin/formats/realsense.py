@@ -15,10 +15,10 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.lenses import FactoryCamera, rig_of_cameras
-from geodiff_plugin.formats.rigs import check_rigid, intrinsics, positive
+from geodiff_plugin.formats.lenses import FactoryCamera, lens_of, rig_of_cameras
+from geodiff_plugin.formats.rigs import check_rigid, intrinsics, is_distorted, positive
 from geodiff_plugin.formats.structured import array_of, entry, parse_json
-from geodiff_plugin.types import Rig
+from geodiff_plugin.types import Distortion, Rig
 
 __all__ = ["REALSENSE", "matches", "read"]
 
@@ -31,11 +31,39 @@ EXTRINSIC = re.compile(
 )
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 LINES = {"Fx": "fx", "Fy": "fy", "PPX": "ppx", "PPY": "ppy", "Width": "width", "Height": "height"}
+LINES |= {"Distortion": "model"}
+#: rs2_distortion by its number.
+MODELS = (
+    "none",
+    "modified brown conrady",
+    "inverse brown conrady",
+    "ftheta",
+    "brown conrady",
+    "kannala brandt4",
+)
 
 
 def matches(text: str, path: Path) -> bool:
     """Whether it is JSON with ``"ppx"`` in it, or has a line ``Intrinsic of "..."``."""
     return (text.lstrip().startswith(("{", "[")) and '"ppx"' in text) or PRINTED.search(text) is not None
+
+
+def _lens(values: dict[str, Any], where: str) -> Distortion | None:
+    coefficients = array_of(values.get("coeffs", ()), (-1,), f"coeffs of {where}")
+    said = values.get("model", "none")
+    known = isinstance(said, int) and 0 <= said < len(MODELS)
+    text = re.sub(r"[\s_]+", " ", str(MODELS[said] if known else said).lower()).strip()
+    model = text.removeprefix("distortion.").removeprefix("rs2 distortion ")
+    if model == "kannala brandt4":
+        return lens_of(coefficients[:4], f"coeffs of {where}", "fisheye")
+    if model != "brown conrady" and is_distorted(Distortion("opencv", coefficients)):
+        bad_value(
+            f"the distortion model of {where}",
+            "brown conrady or kannala brandt4, unless its coefficients are zero",
+            repr(model),
+            "OpenCV does not have this model: undistort or rectify both images first.",
+        )
+    return lens_of(coefficients, f"coeffs of {where}")
 
 
 def _camera(values: dict[str, Any], where: str) -> FactoryCamera:
@@ -44,8 +72,7 @@ def _camera(values: dict[str, Any], where: str) -> FactoryCamera:
     width, height = (
         int(positive(entry(values, key, where), f"{key} of {where}")) for key in ("width", "height")
     )
-    lens = array_of(values.get("coeffs", ()), (-1,), f"coeffs of {where}")
-    return FactoryCamera(intrinsics(fx, fy, cx, cy), lens, (width, height))
+    return FactoryCamera(intrinsics(fx, fy, cx, cy), (width, height), _lens(values, where))
 
 
 def _of_size(cameras: list[FactoryCamera], choice: CameraChoice, path: Path) -> FactoryCamera:
@@ -127,17 +154,19 @@ def _json(file: CalibrationFile, choice: CameraChoice) -> tuple[FactoryCamera, F
 
 
 def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
-    """The rig of the infrared pair, whose images the camera rectifies itself.
+    """The rig of the infrared pair, whose images the camera rectifies itself, or of the T265's fisheyes.
 
     The printed text holds every resolution: ``choice.image_size`` chooses. JSON holds ``rs2_intrinsics`` of
     the left camera, then of the right one, and ``rs2_extrinsics`` between them, under any names.
 
     Raises:
-        ValueError: an entry is missing or malformed, no such resolution, lens distortion.
+        ValueError: an entry is missing or malformed, no such resolution, a lens that OpenCV has no model of.
     """
     printed = PRINTED.search(files[0].text) is not None
     left, right, T_right_from_left = (_printed if printed else _json)(files[0], choice)
-    return rig_of_cameras(left, right, np.linalg.inv(T_right_from_left), str(files[0].path))
+    rectified = left.lens is None and right.lens is None
+    E = np.linalg.inv(T_right_from_left)
+    return rig_of_cameras(left, right, E, str(files[0].path), rectified=rectified)
 
 
 REALSENSE = CalibrationFormat(

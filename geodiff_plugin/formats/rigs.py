@@ -16,7 +16,7 @@ import torch
 from geodiff_plugin._camera_checks import check_intrinsics
 from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.geometry import nearest_rotation
-from geodiff_plugin.types import Rig
+from geodiff_plugin.types import Distortion, Rig
 
 __all__ = [
     "check_no_distortion",
@@ -102,25 +102,28 @@ def check_rigid(T: np.ndarray, name: str) -> np.ndarray:
     return T
 
 
-def is_distorted(coefficients: np.ndarray | None) -> bool:
-    """Whether a coefficient moves any pixel."""
-    return coefficients is not None and np.abs(coefficients).max(initial=0.0) > DISTORTION_TOLERANCE
+def is_distorted(lens: Distortion | None) -> bool:
+    """Whether a lens moves any pixel; a fisheye does with coefficients of zero as well."""
+    if lens is None:
+        return False
+    return lens.model == "fisheye" or np.abs(lens.coefficients).max(initial=0.0) > DISTORTION_TOLERANCE
 
 
-def check_no_distortion(coefficients: np.ndarray | None, name: str) -> None:
+def check_no_distortion(lens: Distortion | None, name: str) -> None:
     """Refuse lens distortion: every formula here is of a pinhole camera.
 
     Raises:
-        ValueError: a coefficient that is not zero.
+        ValueError: a lens that moves pixels.
     """
-    if coefficients is None or not is_distorted(coefficients):
+    if lens is None or not is_distorted(lens):
         return
+    numbers = np.array2string(lens.coefficients, precision=4, separator=", ")
     bad_value(
         name,
         "zero (images of a pinhole camera)",
-        np.array2string(np.ravel(coefficients), precision=4, separator=", "),
+        f"fisheye {numbers}" if lens.model == "fisheye" else numbers,
         "Undistort or rectify both images first (OpenCV: stereoRectify, initUndistortRectifyMap, remap) "
-        "and give the calibration of the result (P1, P2).",
+        "and give the calibration of the result (P1, P2), or use geodiff depth, which undistorts them.",
     )
 
 
@@ -161,6 +164,8 @@ def make_rig(
     *,
     size: tuple[int, int] | None = None,
     size_right: tuple[int, int] | None = None,
+    distortion: tuple[Distortion | None, Distortion | None] = (None, None),
+    rectified: bool = False,
 ) -> Rig:
     """A ``Rig`` whose numbers are finite and whose matrices have the right form.
 
@@ -171,6 +176,8 @@ def make_rig(
         source: the file.
         size: ``(width, height)`` of the left image, and of the right one unless ``size_right`` is given.
         size_right: ``(width, height)`` of the right image.
+        distortion: of both lenses.
+        rectified: whether the file says that its images are rectified.
 
     Raises:
         ValueError: a matrix that is none, naming the file.
@@ -184,6 +191,8 @@ def make_rig(
         size_left=size,
         size_right=size if size_right is None else size_right,
         source=str(source),
+        distortion=distortion,
+        rectified=rectified,
     )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
 from geodiff_plugin.formats.kalibr import MARK as KALIBR_MARK
 from geodiff_plugin.formats.rigs import make_rig, pose_from_projections
@@ -41,7 +41,13 @@ def _projection(file: CalibrationFile) -> tuple[np.ndarray, tuple[int, int] | No
         bad_value(f"{file.path}", "a camera_info with projection_matrix (or P)", "none", "Is it cut off?")
     size = (_first(info, ("image_width", "width")), _first(info, ("image_height", "height")))
     known = all(isinstance(side, int) and side > 0 for side in size)
-    return array_of(matrix, (3, 4), f"projection_matrix in {file.path}"), size if known else None
+    P = array_of(matrix, (3, 4), f"projection_matrix in {file.path}")
+    if not P.any():
+        refuse(
+            f"{file.path} is of a camera that is not calibrated: its projection_matrix (P) is all zeros. "
+            "Calibrate the pair (camera_calibration with two topics)."
+        )
+    return P, size if known else None
 
 
 def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
@@ -51,7 +57,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     right camera is ``-fx * baseline``, in metres.
 
     Raises:
-        ValueError: no projection, or none of the two knows the other camera.
+        ValueError: no projection, a camera that is not calibrated, or none of the two knows the other camera.
     """
     (P_left, size), (P_right, size_right) = (_projection(file) for file in files)
     source = " and ".join(str(file.path) for file in files)
@@ -63,7 +69,9 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
             "the same in both",
             "These are of single cameras; calibrate the pair (camera_calibration with two topics).",
         )
-    return make_rig(P_left[:, :3], P_right[:, :3], E, source, size=size, size_right=size_right)
+    return make_rig(
+        P_left[:, :3], P_right[:, :3], E, source, size=size, size_right=size_right, rectified=True
+    )
 
 
 ROS = CalibrationFormat("a pair of ROS camera_info (projection_matrix)", matches, read, file_counts=(2,))

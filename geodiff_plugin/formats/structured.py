@@ -7,6 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from geodiff_plugin._checks import bad_value
 __all__ = ["array_of", "entry", "parse_json", "parse_yaml"]
 
 CUT_OFF = "Is the file cut off?"
+#: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
+OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")
 
 
 def parse_json(text: str, path: Path) -> Any:
@@ -43,7 +46,7 @@ def parse_yaml(text: str, path: Path) -> dict[str, Any]:
         ValueError: not YAML, or no mapping.
     """
     try:
-        content = next(yaml.safe_load_all(text), None)
+        content = next(yaml.safe_load_all(OPENCV_HEAD.sub("", text)), None)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f" in line {mark.line + 1}"

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.lenses import FactoryCamera, rig_of_cameras
+from geodiff_plugin.formats.lenses import FactoryCamera, lens_of, rig_of_cameras
 from geodiff_plugin.formats.rigs import intrinsics, positive
 from geodiff_plugin.types import Rig
 
@@ -33,6 +33,7 @@ SIZES = {
     "SVGA": (960, 600),
     "VGA": (672, 376),
 }
+#: In OpenCV's order, which is that of its models with 5 and with 8 coefficients.
 LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
@@ -81,9 +82,11 @@ def _camera(sections: configparser.ConfigParser, side: str, name: str, path: Pat
         positive(_number(sections, section, key, path), f"{key} of [{section}]") for key in ("fx", "fy")
     )
     cx, cy = (_number(sections, section, key, path) for key in ("cx", "cy"))
-    lens = section if any(sections.has_option(section, key) for key in LENS) else f"{side}_DISTO"
-    distortion = [_number(sections, lens, key, path) for key in LENS if sections.has_option(lens, key)]
-    return FactoryCamera(intrinsics(fx, fy, cx, cy), np.array(distortion), SIZES[name])
+    of_lens = section if any(sections.has_option(section, key) for key in LENS) else f"{side}_DISTO"
+    there = {key: _number(sections, of_lens, key, path) for key in LENS if sections.has_option(of_lens, key)}
+    keys = LENS if there.keys() & set(LENS[5:]) else LENS[:5]
+    lens = lens_of(np.array([there.get(key, 0.0) for key in keys]), f"[{of_lens}] in {path}")
+    return FactoryCamera(intrinsics(fx, fy, cx, cy), SIZES[name], lens)
 
 
 def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
@@ -93,7 +96,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     ``Baseline``, ``TY``, ``TZ`` point from the left camera to the right one: ``x_right = R x_left - T``.
 
     Raises:
-        ValueError: no section of that resolution, an entry is missing, or lens distortion.
+        ValueError: no section of that resolution, or an entry is missing.
 
     Source: calibration.hpp of stereolabs/zed-opencv-native.
     """
