@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from geodiff_plugin._checks import InputError
@@ -12,6 +13,7 @@ from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.cli.lenses import lenses_of
 from geodiff_plugin.cli.photographs import known_length
 from geodiff_plugin.formats.distortion import distortion_from_text
+from geodiff_plugin.types import Rig
 
 
 def test_a_known_length_is_five_numbers() -> None:
@@ -29,9 +31,10 @@ def test_they_need_estimate_pose(given, tmp_path) -> None:
         check_arguments(arguments)
 
 
-def told(*, own=(None, None), **given) -> list[float | None]:
+def told(*, own=(None, None), rectified=False, **given) -> list[float | None]:
     """First coefficient of every lens."""
-    lenses = lenses_of(DepthArguments(Path("l.png"), Path("r.png"), **given), own)
+    rig = Rig(np.eye(3), np.eye(3), np.eye(4), source="calib.txt", distortion=own, rectified=rectified)
+    lenses = lenses_of(DepthArguments(Path("l.png"), Path("r.png"), **given), rig)
     return [None if lens is None else float(lens.coefficients[0]) for lens in lenses]
 
 
@@ -51,6 +54,14 @@ def test_every_photograph_has_its_lens() -> None:
     assert told(view=view, view_k=view) == [None, None, None]
     with pytest.raises(InputError, match="--view-distortion must be k1"):
         told(view=view, view_distortion=("round",))
+
+
+def test_rectified_images_have_no_lens() -> None:
+    said = r"--distortion must be left out where .* rectified images \(calib.txt\); got 0.1,0,0,0. Drop it"
+    with pytest.raises(InputError, match=said):
+        told(distortion=("0.1,0,0,0",), rectified=True)
+    assert told(distortion=("0,0,0,0",), rectified=True) == [None, None], "it says the same as the file"
+    assert told(distortion=("0.1,0,0,0",)) == [0.1, 0.1], "cameras as they took the images"
 
 
 def test_lenses_are_counted_with_their_views(tmp_path) -> None:

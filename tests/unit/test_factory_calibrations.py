@@ -150,6 +150,8 @@ def test_kalibr_chain_of_three(reading):
         ("distortion_coeffs: [0.0", "distortion_coeffs: [-0.28", "Lens distortion of the left camera"),
         ("camera_model: pinhole", "camera_model: omni", "camera_model of cam0.*pinhole.*omni"),
         ("cam1:", "cam3:", "'cam1'"),
+        ("distortion_model: radtan", "distortion_model: fov", "distortion_model of cam0.*'fov'.*undistort"),
+        ("distortion_coeffs: [0.0, ", "distortion_coeffs: [", "distortion_coeffs of cam0.*4 numbers; got 3"),
         ("intrinsics: [700.0", "intrinsics: [.nan", "intrinsics of cam0"),
     ],
 )

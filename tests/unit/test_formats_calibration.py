@@ -280,7 +280,7 @@ def test_lens_distortion_is_refused_with_the_cure(tmp_path):
     K, T = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]), np.array([[-0.12], [0], [0]])
     D = np.array([[-0.2, 0.1, 0, 0, 0]])
     path = storage(cv2, tmp_path / "s.yml", K1=K, D1=np.zeros((1, 5)), K2=K, D2=D, R=np.eye(3), T=T)
-    with pytest.raises(ValueError, match=r"(?s)Lens distortion D2 in .*s\.yml must be zero.*-0\.2.*rectify"):
+    with pytest.raises(ValueError, match=r"(?s)of the right camera in .*s\.yml must be zero.*-0\.2.*rectify"):
         read_calibration(path)
 
 
