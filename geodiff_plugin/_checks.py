@@ -21,7 +21,7 @@ __all__ = [
     "bad_value",
     "check_choice",
     "check_flag",
-    "check_map_in_metres",
+    "check_metres",
     "check_number",
     "check_range",
     "check_size",
@@ -89,11 +89,14 @@ def _short(value: object) -> str:
     return str(value)
 
 
-def check_map_in_metres(array: np.ndarray, name: str, got: str = "") -> None:
-    """Refuse a depth map ``(H, W)`` of integers: some file's unit. ``(N, 3)`` points may be whole."""
-    if array.dtype.kind != "f" and array.shape[1] != 3:
-        cure = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."
-        bad_value(name, "metres as floats", got or f"dtype {array.dtype}", cure)
+def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
+    """Refuse integers: of a depth map ``(H, W)`` some file's unit, of points ``(N, 3)`` that or metres cut off."""
+    if array.dtype.kind == "f":
+        return
+    cure = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."
+    if array.shape[1] == 3:
+        cure = "Divide millimetres by 1000; metres lose their fraction as integers: keep them floats."
+    bad_value(name, "metres as floats", got or f"dtype {array.dtype}", cure)
 
 
 def check_number(value: Any, name: str, low: float, high: float, *, integer: bool = False) -> Any:

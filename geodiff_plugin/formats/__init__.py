@@ -19,6 +19,7 @@ _MODULE_OF = {
     "check_file": "files",
     "flying_points": "pointcloud",
     "make_cloud": "pointcloud",
+    "picture_size": "images",
     "read_calibration": "reading",
     "read_depth_mm_png": "depth",
     "read_disparity_kitti_png": "depth",

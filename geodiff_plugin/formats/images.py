@@ -18,7 +18,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.formats.files import check_file
 
-__all__ = ["MIN_SIDE", "as_image_01", "read_image"]
+__all__ = ["MIN_SIDE", "as_image_01", "picture_size", "read_image"]
 
 #: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
 MIN_SIDE = 32
@@ -68,6 +68,17 @@ def _check_floats(values: np.ndarray, name: str) -> np.ndarray:
         cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
         bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
     return values.astype(np.float32, copy=False).clip(0.0, 1.0)
+
+
+def _dark_notes(image: Image.Image | np.ndarray, name: str) -> list[str]:
+    """A sentence if an image has 16 bits of which a camera of 10 or 12 filled the lowest; else nothing."""
+    deep = image.mode.startswith("I") if isinstance(image, Image.Image) else image.dtype == np.uint16
+    if not deep or (most := int(np.asarray(image).max())) >= DARK_16_BITS:
+        return []
+    return [
+        f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
+        "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
+    ]
 
 
 def _check_sides(height: int, width: int, name: str) -> None:
@@ -120,11 +131,7 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
         )
     _check_sides(upright.height, upright.width, name)
     notes = [ALPHA_DROPPED.format(name=name)] if alpha else []
-    if upright.mode.startswith("I") and (most := int(np.asarray(upright).max())) < DARK_16_BITS:
-        notes.append(
-            f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
-            "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
-        )
+    notes += _dark_notes(upright, name)
     if turn is not None:
         notes.append(
             f"{name} was {turn} to {upright.width}x{upright.height}, as its EXIF orientation says; "
@@ -173,16 +180,39 @@ def _scaled(value: np.ndarray, name: str) -> np.ndarray:
         return value.astype(np.float32) / np.iinfo(value.dtype).max
     if value.dtype.kind == "f":
         return _check_floats(value, name)
-    bad_value(
-        name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", "Convert it with astype('uint8')."
-    )
+    times = " * 255" if value.dtype == bool else ""
+    cure = f"Convert it with astype('uint8'){times}."
+    bad_value(name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", cure)
+
+
+def _raw(value: Any, name: str) -> Image.Image | np.ndarray:
+    """A PIL image as it is, or an array ``(H, W, C)`` with 1, 3 or 4 channels; large enough."""
+    if isinstance(value, Image.Image):
+        _check_sides(value.height, value.width, name)
+        return value
+    if not isinstance(value, (np.ndarray, torch.Tensor)):
+        bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
+    raw = _array_to_hwc(value, name) if isinstance(value, np.ndarray) else _tensor_to_hwc(value, name)
+    _check_sides(raw.shape[0], raw.shape[1], name)
+    return raw
+
+
+def picture_size(value: Any, name: str) -> tuple[int, int]:
+    """``(width, height)`` of what ``as_image_01`` takes, without a look at its pixels, nor its warnings.
+
+    Raises:
+        TypeError, ValueError: no image by its type or shape, or a side under 32 pixels.
+    """
+    raw = _raw(value, name)
+    return raw.size if isinstance(raw, Image.Image) else (raw.shape[1], raw.shape[0])
 
 
 def as_image_01(value: Any, name: str) -> torch.Tensor:
     """An image from memory as a tensor.
 
     A PIL image is taken as it lies in memory, as diffusers does; one that still carries an EXIF turn gets a
-    warning. A fourth channel is alpha and is dropped with a warning; one channel is repeated.
+    warning. A fourth channel is alpha and is dropped with a warning; one channel is repeated. 16 bits of which
+    few are used get a warning.
 
     Args:
         value: PIL image; numpy ``(H, W, C)`` or ``(H, W)``, or torch ``(C, H, W)``, of uint8, uint16 or
@@ -196,25 +226,23 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         TypeError: none of these types.
         ValueError: wrong rank or channels, NaN or infinity, floats outside [0, 1], a side under 32 pixels.
     """
-    if isinstance(value, Image.Image):
-        if value.getexif().get(EXIF_ORIENTATION) in TURNS:
+    raw = _raw(value, name)
+    if isinstance(raw, Image.Image):
+        if raw.getexif().get(EXIF_ORIENTATION) in TURNS:
             warnings.warn(
                 f"{name} carries an EXIF orientation that is not applied; "
                 "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image.",
                 stacklevel=3,
             )
-        if _has_alpha(value):
+        if _has_alpha(raw):
             warnings.warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
-        hwc = _pil_to_array(value, name)
-    elif isinstance(value, (np.ndarray, torch.Tensor)):
-        raw = _array_to_hwc(value, name) if isinstance(value, np.ndarray) else _tensor_to_hwc(value, name)
-        _check_sides(raw.shape[0], raw.shape[1], name)
+        hwc = _pil_to_array(raw, name)
+    else:
         if raw.shape[-1] == 4:
             warnings.warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
             raw = raw[..., :3]
         hwc = _scaled(raw, name)
-    else:
-        bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
-    _check_sides(hwc.shape[0], hwc.shape[1], name)
+    for note in _dark_notes(raw, name):
+        warnings.warn(note, stacklevel=3)
     hwc = np.repeat(hwc, 3, axis=-1) if hwc.shape[-1] == 1 else hwc
     return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))

@@ -144,10 +144,6 @@ def write_ply(
 
     Args:
         path: the file.
-        depth_m: as in ``make_cloud``.
-        image_01: as in ``make_cloud``.
-        K: as in ``make_cloud``.
-        valid: as in ``make_cloud``.
         depth_m: ``(H, W)`` metres, z of the left camera.
         image_01: ``(H, W, 3)`` in [0, 1], the colours.
         K: ``(3, 3)`` pixels of this grid.

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value, check_map_in_metres, check_number
+from geodiff_plugin._checks import bad_value, check_metres, check_number
 from geodiff_plugin.formats.depth import read_depth_png, read_pfm
 from geodiff_plugin.formats.files import check_file, read_text, refuse_decimal_commas
 from geodiff_plugin.formats.lidar import read_velodyne
@@ -153,8 +153,8 @@ def read_points(
         bad_value(name, "a map (H, W) or points (N, 3) of numbers", f"{found} of shape {values.shape}")
     if values.shape[1] in COLUMNS:
         values = values[:, :3]
-    elif scale is None:
-        check_map_in_metres(values, name, f"{found} of {values.dtype}")
+    if scale is None:
+        check_metres(values, name, f"{found} of {values.dtype}")
     with np.errstate(over="ignore"):
         values = (values / (scale or 1.0)).astype(np.float32)
     return values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))

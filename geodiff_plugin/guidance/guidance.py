@@ -18,7 +18,7 @@ from geodiff_plugin._camera_checks import check_calibrated_size, check_intrinsic
 from geodiff_plugin._checks import bad_type, bad_value, check_number, check_size
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs
-from geodiff_plugin.formats import as_image_01, read_calibration
+from geodiff_plugin.formats import picture_size, read_calibration
 from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.guidance.config import GuidanceConfig, UpdatePlan
 from geodiff_plugin.guidance.evidence_store import EvidenceStore, make_evidence
@@ -48,7 +48,7 @@ class GeometryGuidance:
         E: ``(4, 4)`` pose of the right camera in the left camera's frame, metres; or a tuple
             ``(E_left, E_right, ...)`` of camera-to-world poses; ``None`` without a right view.
         points: known depths, metres: a sparse map ``(H, W)`` of the left image's size (0, NaN and infinity
-            mean unknown), or ``(N, 3)`` points in the left camera's frame.
+            mean unknown), or ``(N, 3)`` points in the left camera's frame; floats.
         left_size: ``(width, height)`` that the left image must have; ``None`` for any that fits ``K``.
         cropped: the images are crops, so the principal point may lie outside of the image.
         previous: the output of the previous frame, called with ``output_latent=True``. The call then starts
@@ -144,7 +144,7 @@ class GeometryGuidance:
         """
         size = knobs.get("left_size")
         if size is None and right is not None and not isinstance(right, (list, tuple)):
-            size = as_image_01(right, "right").shape[:0:-1]  # the two cameras of a rig have one resolution
+            size = picture_size(right, "right")  # the two cameras of a rig have one resolution
         rig = read_calibration(path, cameras, image_names=image_names, image_size=size, baseline_m=baseline_m)
         guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **{"left_size": rig.size_left} | knobs)
         for image in guidance.rights:

@@ -21,8 +21,8 @@ from geodiff_plugin._camera_checks import (
     check_pose,
     warn_of_other_size,
 )
-from geodiff_plugin._checks import bad_type, bad_value, check_map_in_metres
-from geodiff_plugin.formats import as_image_01
+from geodiff_plugin._checks import bad_type, bad_value, check_metres
+from geodiff_plugin.formats import as_image_01, picture_size
 from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.types import CameraView, Rig
 
@@ -105,12 +105,13 @@ def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int, cropp
         label("right") if len(views) == 1 else f"{label('right')}, view {v + 1}," for v in range(len(views))
     ]
     images = tuple(as_image_01(image, name) for image, name in zip(views, names, strict=True))
-    K_left, K_rights = _intrinsics(_entry(K, "K", i, count), label("K"), len(images))
+    own_K = _entry(K, "K", i, count)
+    K_left, K_rights = _intrinsics(own_K, label("K"), len(images))
     poses = _poses(_entry(E, "E", i, count), label("E"), len(images))
     for v, (K_right, image) in enumerate(zip(K_rights, images, strict=True)):
         if cropped:
             break
-        name = label("K_right") if len(images) == 1 else f"{label('K')}[{_view(v, len(images))}]"
+        name = f"{label('K')}[{_view(v, len(images))}]" if isinstance(own_K, tuple) else label("K")
         fit = (K_right, image.shape[-1], image.shape[-2], name, "the right image")
         check_intrinsics_fit(*fit)
         warn_of_other_size(*fit)
@@ -204,7 +205,8 @@ def _as_points(value: Any, name: str) -> Tensor:
         bad_value(name, forms, f"shape {array.shape}")
     if array.shape[1] in (4, 6):  # with an intensity, or a colour; no image is that narrow
         array = array[:, :3]
-    check_map_in_metres(array, name)
+    if array.shape[1] != 3 or not isinstance(value, (list, tuple)):  # whole metres typed by hand are meant so
+        check_metres(array, name)
     array = array.astype(np.float32)
     finite = np.isfinite(array)
     if array.shape[1] == 3:
@@ -241,7 +243,7 @@ def split_views(
     images, Ks, Es = (tuple(column) for column in zip(*views, strict=True))
     if images[0] is None:
         return None, images[1:], Ks, Es
-    height, width = as_image_01(images[0], "the left view's image").shape[-2:]
+    width, height = picture_size(images[0], "the left view's image")
     K_left = check_intrinsics(Ks[0], "K[left]")
     check_intrinsics_fit(K_left, width, height, "K[left]", "the left view's image")
     if isinstance(images[0], Image.Image):

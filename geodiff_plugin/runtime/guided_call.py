@@ -24,8 +24,9 @@ from geodiff_plugin.priors.tiny import tiny_autoencoder
 from geodiff_plugin.runtime.ensembling import ensemble_metric
 from geodiff_plugin.runtime.exclusive import Exclusive, exclusive_call
 from geodiff_plugin.runtime.grid import ProcessingGrid
+from geodiff_plugin.runtime.lefts import check_lefts
 from geodiff_plugin.runtime.output import assemble_output
-from geodiff_plugin.runtime.preconditions import check_guidable
+from geodiff_plugin.runtime.preconditions import check_arguments, check_guidable
 from geodiff_plugin.runtime.prompting import prompt_of
 from geodiff_plugin.runtime.rounds import plan_steps
 from geodiff_plugin.runtime.run import GuidedRun
@@ -61,7 +62,7 @@ class GuidedCall(_Stock):
         """The stock call; with ``guidance`` its depth is in metres.
 
         Args:
-            image: left image(s), as the stock call takes them.
+            image: left image(s), as the stock call takes them; guided, all that ``right`` takes as well.
             *args: as the stock call takes them.
             guidance: the second view; ``None`` is the stock call, bit for bit.
             callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
@@ -76,7 +77,8 @@ class GuidedCall(_Stock):
 
         Raises:
             TypeError: ``guidance`` is no ``GeometryGuidance``; a scheduler that cannot be guided.
-            ValueError: inputs that do not fit each other; offloading that forbids guidance.
+            ValueError: an image that the right one could not be either; inputs that do not fit each other;
+                offloading that forbids guidance.
             RuntimeError: called inside ``torch.inference_mode()``, or by a hook of a guided call's own
                 networks. From ``callback_on_step_end`` the pipeline may be called, guided or not: there it
                 is as the user left it. A call in another thread waits.
@@ -113,7 +115,9 @@ class GuidedCall(_Stock):
                 "A guided call needs gradients, which torch.inference_mode() forbids; "
                 "use torch.no_grad() or nothing."
             )
+        image, count = check_lefts(image)
         call, prior = _bind(stock_call, image, *args, **kwargs), find_adapter(self)(self)
+        check_arguments(call, count)
         call["num_inference_steps"], rounds = plan_steps(
             guidance, prior, call["num_inference_steps"], self.default_denoising_steps
         )
@@ -121,7 +125,10 @@ class GuidedCall(_Stock):
         check_guidable(self, prior, guidance)
         tiny = tiny_autoencoder(self, prior, guidance.config.decoder)
         if prior.deterministic and call["ensemble_size"] > 1:
-            call |= {"ensemble_size": 1, "output_uncertainty": False}
+            generator = call["generator"]
+            if isinstance(generator, list):
+                generator = generator[:: call["ensemble_size"]]
+            call |= {"ensemble_size": 1, "output_uncertainty": False, "generator": generator}
             warnings.warn(
                 "This prior gives the same map every time: of the ensemble one member runs.",
                 stacklevel=4,

@@ -6,16 +6,41 @@ Paper: none.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 
-__all__ = ["check_guidable", "check_network_input", "check_offloading", "needs_network"]
+__all__ = ["check_arguments", "check_guidable", "check_network_input", "check_offloading", "needs_network"]
+
+
+def check_arguments(call: Mapping[str, Any], images: int) -> None:
+    """Refuse arguments of the call that no pipeline takes, in our own words.
+
+    Args:
+        call: arguments of the stock call by name.
+        images: number of left images.
+
+    Raises:
+        TypeError, ValueError: another output type than ``"np"`` and ``"pt"``; an ensemble of no size; no
+            generator, or a list of another number than that of all members.
+    """
+    check_choice(call["output_type"], "output_type", ("np", "pt"))
+    members = images * check_number(call["ensemble_size"], "ensemble_size", 1, 1 << 20, integer=True)
+    given = call["generator"]
+    generators = given if isinstance(given, list) else [] if given is None else [given]
+    if not all(isinstance(generator, torch.Generator) for generator in generators):
+        bad_type("generator", "None, a torch.Generator or a list of them", given)
+    if isinstance(given, list) and len(given) != members:
+        expected = (
+            f"one torch.Generator, or a list of {members}: one for every image and member of its ensemble"
+        )
+        bad_value("generator", expected, f"a list of {len(given)}")
 
 
 def check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) -> None:

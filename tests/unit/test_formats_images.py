@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.formats import as_image_01, read_image
+from geodiff_plugin.formats import as_image_01, picture_size, read_image
 
 H, W = 40, 48
 
@@ -211,3 +211,44 @@ def test_as_image_01_errors(value, error, match):
 def test_resampling_overshoot_is_clipped():
     image = as_image_01(with_value(1.0005), "right")
     assert image.max() == 1.0
+
+
+@pytest.mark.parametrize("times", [4, 16])
+@pytest.mark.parametrize("kind", ["numpy", "colour", "torch", "pil", "pil I"])
+def test_as_image_01_tells_of_10_or_12_bits_in_16_once(kind, times):
+    colour = ramp().astype(np.uint16) * times
+    grey = colour[..., 0]
+    value = {
+        "numpy": grey,
+        "colour": colour,
+        "torch": torch.from_numpy(colour).permute(2, 0, 1),
+        "pil": Image.fromarray(grey),
+        "pil I": Image.fromarray(grey.astype(np.int32)),
+    }[kind]
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        as_image_01(value, "right")
+        picture_size(value, "right")
+    (sentence,) = (str(w.message) for w in said)
+    most = int(np.max(colour if kind in ("colour", "torch") else grey))
+    assert sentence.startswith(
+        f"right is a 16-bit image that is nearly black: its values reach {most} of 65535."
+    )
+    assert "12 bits, multiply them by 16; with 10 bits, by 64." in sentence
+
+
+def test_as_image_01_says_nothing_of_full_16_bits():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        as_image_01(ramp().astype(np.uint16) * 257, "right")
+        as_image_01(ramp() // 8, "right")  # dark, but not by its number of bits
+
+
+def test_picture_size_is_that_of_the_image():
+    x = ramp()
+    for value in (x, x[..., 0], Image.fromarray(x), torch.from_numpy(x).permute(2, 0, 1)):
+        assert picture_size(value, "right") == (W, H)
+    with pytest.raises(ValueError, match="at least 32 pixels a side; got 48x31"):
+        picture_size(x[:31], "right")
+    with pytest.raises(TypeError, match="right must be a PIL image.*got str"):
+        picture_size("right.png", "right")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin import GeometryGuidance
+from geodiff_plugin import GeometryGuidance, InputError
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
 E = np.eye(4)
@@ -60,3 +62,53 @@ def test_a_crop_says_so():
     with pytest.raises(ValueError, match="K must be for the left image"):
         GeometryGuidance.from_points(np.full((48, 64), 2.0), off).prepare(lefts)
     assert GeometryGuidance.from_points(np.full((48, 64), 2.0), off, cropped=True).prepare(lefts)
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.uint16])
+def test_integer_points_are_refused_as_an_integer_map_is(dtype):
+    for points, cure in (
+        (np.array([[0, 0, 2], [1, 0, 3]], dtype), "keep them floats"),
+        (np.array([[0, 0, 2, 9], [1, 0, 3, 9]], dtype), "keep them floats"),
+        (np.full((48, 64), 2, dtype), "1000 for millimetres"),
+    ):
+        for value in (points, torch.from_numpy(points)):
+            with pytest.raises(InputError, match=f"points must be metres as floats; got dtype .*{cure}"):
+                GeometryGuidance.from_points(value, K)
+    with pytest.raises(InputError, match=r"points\[1\] must be metres as floats"):
+        GeometryGuidance.from_points([np.ones((2, 3)), np.ones((2, 3), dtype)], K)
+
+
+def test_whole_metres_typed_by_hand_are_points():
+    (own,) = GeometryGuidance.from_points([[0, 0, 2], [1, 0, 3]], K).inputs
+    np.testing.assert_array_equal(own.points.numpy(), [[0.0, 0.0, 2.0], [1.0, 0.0, 3.0]])
+
+
+@pytest.mark.parametrize(
+    ("rights", "cameras", "names"),
+    [
+        (RIGHT, lambda K: K, ["K"]),
+        (RIGHT, lambda K: (K, K), ["K[right]"]),
+        ((RIGHT, RIGHT), lambda K: K, ["K", "K"]),
+        ((RIGHT, RIGHT), lambda K: (K, K, K), ["K[right view 1]", "K[right view 2]"]),
+        ([RIGHT, RIGHT], lambda K: K, ["K[0]", "K[1]"]),
+    ],
+)
+def test_warnings_name_the_camera_matrix_that_was_given(rights, cameras, names):
+    poses = (np.eye(4), E, E) if isinstance(rights, tuple) else E
+    border = K - [[0, 0, 25], [0, 0, 19], [0, 0, 0]]
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        GeometryGuidance(rights, cameras(border), poses)
+    assert [str(w.message).split(" has its principal point")[0] for w in said] == names
+    with pytest.raises(InputError) as refused:
+        GeometryGuidance(rights, cameras(K + [[0, 0, 90], [0, 0, 0], [0, 0, 0]]), poses)
+    assert str(refused.value).startswith(f"{names[0]} must be for the right image")
+
+
+def test_the_size_of_an_image_is_read_without_a_second_warning():
+    dark = RIGHT.astype(np.uint16) * 4
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        GeometryGuidance.from_views([(dark, K, np.eye(4)), (dark, K, E)])
+    (sentence,) = (str(w.message) for w in said)
+    assert sentence.startswith("right is a 16-bit image that is nearly black")

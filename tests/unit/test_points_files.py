@@ -187,3 +187,12 @@ def test_units_by_name_and_by_number(tmp_path):
     for scale in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="points-scale must be between"):
             read_points(tmp_path / "points.npy", scale=scale)
+
+
+def test_integers_are_refused_without_a_unit(tmp_path):
+    np.save(tmp_path / "points.npy", (POINTS * 1000).astype(np.int32))
+    with pytest.raises(
+        ValueError, match="points must be metres as floats; got .*of int32. Divide millimetres"
+    ):
+        read_points(tmp_path / "points.npy")
+    np.testing.assert_allclose(read_points(tmp_path / "points.npy", scale=1000), POINTS, atol=1e-3)
