@@ -90,7 +90,7 @@ def _short(value: object) -> str:
 
 
 def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
-    """Refuse integers: of a depth map ``(H, W)`` some file's unit, of points ``(N, 3)`` that or metres cut off."""
+    """Refuse integers: in a map ``(H, W)`` some file's unit, in points ``(N, 3)`` that or metres cut off."""
     if array.dtype.kind == "f":
         return
     cure = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."

@@ -211,8 +211,8 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
     """An image from memory as a tensor.
 
     A PIL image is taken as it lies in memory, as diffusers does; one that still carries an EXIF turn gets a
-    warning. A fourth channel is alpha and is dropped with a warning; one channel is repeated. 16 bits of which
-    few are used get a warning.
+    warning. A fourth channel is alpha and is dropped with a warning; one channel is repeated. 16 bits of
+    which few are used get a warning.
 
     Args:
         value: PIL image; numpy ``(H, W, C)`` or ``(H, W)``, or torch ``(C, H, W)``, of uint8, uint16 or

@@ -92,7 +92,8 @@ def test_what_the_stock_call_does_not_read_is_read_as_the_right_image_is(call, i
 
 
 def test_a_batch_with_alpha_or_of_two_kinds_becomes_tensors(call):
-    out = call([ALPHA, Image.fromarray(LEFT)], rights=2)
+    with pytest.warns(UserWarning, match=r"^image\[0\] has an alpha channel"):
+        out = call([ALPHA, Image.fromarray(LEFT)], rights=2)
     np.testing.assert_allclose(out.prediction, call([LEFT, LEFT], rights=2).prediction, rtol=1e-3)
 
 
