@@ -353,10 +353,11 @@ def test_guidance_of_the_wrong_type(make_pipeline, left):
         pipe(left, guidance={"right": left})
 
 
-def test_left_image_of_another_size_than_its_K(make_pipeline, textured_plane):
-    pipe = enable_geometry_guidance(make_pipeline())
+def test_left_image_of_another_size_than_its_K(make_pipeline, textured_plane, left):
+    pair, pipe = textured_plane, enable_geometry_guidance(make_pipeline())
+    larger = np.diag([3.0, 3.0, 1.0]) @ pair.K
     with pytest.raises(ValueError, match="another resolution"):
-        pipe(Image.fromarray(textured_plane.left).resize((24, 18)), guidance=guidance_for(textured_plane))
+        pipe(left, guidance=GeometryGuidance(pair.right, (larger, pair.K), pair.E, **FAST))
 
 
 def test_a_pipeline_without_adapter_is_refused():
