@@ -42,7 +42,7 @@ class Rig:
         size_right: likewise for ``K_right``.
         source: file or option it comes from, for messages and reports.
         distortion: of the left and the right lens; ``None`` for none.
-        rectified: whether the source says that its images are rectified, so that no lens is left in them.
+        rectified: whether the source says that its images are rectified, free of lens distortion.
 
     Convention:
         A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.

@@ -14,7 +14,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.rigs import is_distorted, make_rig
 from geodiff_plugin.types import Distortion, Rig
 
-__all__ = ["COUNTS", "FactoryCamera", "lens_of", "rig_of_cameras", "scaled_to"]
+__all__ = ["COUNTS", "NO_MODEL", "FactoryCamera", "lens_of", "rig_of_cameras", "scaled_to"]
 
 #: How many coefficients OpenCV's functions take.
 COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
@@ -22,6 +22,8 @@ ORDERS = {
     "opencv": "k1, k2, p1, p2, k3, ... of OpenCV's model",
     "fisheye": "k1 to k4 of OpenCV's fisheye model",
 }
+#: Cure for a lens of a model that OpenCV cannot undistort.
+NO_MODEL = "OpenCV does not have this model: undistort or rectify both images first."
 
 #: Images of one sensor differ in their ratio of sides by rounding only; beyond this one of them was cropped.
 RATIO_TOLERANCE = 0.01
@@ -106,7 +108,6 @@ def rig_of_cameras(
     Raises:
         ValueError: a matrix that is none.
     """
-    lenses = (left.lens, right.lens)
     return make_rig(
         left.K,
         right.K,
@@ -114,6 +115,6 @@ def rig_of_cameras(
         source,
         size=left.size,
         size_right=right.size,
-        distortion=lenses,
+        distortion=(left.lens, right.lens),
         rectified=rectified,
     )

@@ -14,7 +14,7 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.lenses import FactoryCamera, lens_of, rig_of_cameras, scaled_to
+from geodiff_plugin.formats.lenses import NO_MODEL, FactoryCamera, lens_of, rig_of_cameras, scaled_to
 from geodiff_plugin.formats.rigs import check_rigid, pose_to_the_right
 from geodiff_plugin.formats.structured import array_of, entry, parse_json
 from geodiff_plugin.types import Distortion, Rig
@@ -57,8 +57,7 @@ def _lens(cameras: dict[int, dict[str, Any]], socket: int, path: Path) -> Distor
     numbers = array_of(entry(cameras[socket], "distortionCoeff", where), (-1,), name)
     kind = cameras[socket].get("cameraType", 0)
     if kind not in LENSES:
-        cure = "OpenCV does not have this model: undistort or rectify both images first."
-        bad_value(f"cameraType of {where}", "0 (perspective) or 1 (fisheye)", repr(kind), cure)
+        bad_value(f"cameraType of {where}", "0 (perspective) or 1 (fisheye)", repr(kind), NO_MODEL)
     # A fisheye has four, in a list that may be filled up with zeros.
     numbers = numbers if LENSES[kind] == "opencv" or numbers[4:].any() else numbers[:4]
     return lens_of(numbers, name, LENSES[kind])

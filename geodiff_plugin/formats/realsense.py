@@ -15,7 +15,7 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.lenses import FactoryCamera, lens_of, rig_of_cameras
+from geodiff_plugin.formats.lenses import NO_MODEL, FactoryCamera, lens_of, rig_of_cameras
 from geodiff_plugin.formats.rigs import check_rigid, intrinsics, is_distorted, positive
 from geodiff_plugin.formats.structured import array_of, entry, parse_json
 from geodiff_plugin.types import Distortion, Rig
@@ -30,8 +30,15 @@ EXTRINSIC = re.compile(
     r'^\s*Extrinsic from "Infrared 1"\s+To\s+"Infrared 2"[^\n]*\n(.*?)(?=\n\s*Extrinsic|\Z)', re.M | re.S
 )
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
-LINES = {"Fx": "fx", "Fy": "fy", "PPX": "ppx", "PPY": "ppy", "Width": "width", "Height": "height"}
-LINES |= {"Distortion": "model"}
+LINES = {
+    "Fx": "fx",
+    "Fy": "fy",
+    "PPX": "ppx",
+    "PPY": "ppy",
+    "Width": "width",
+    "Height": "height",
+    "Distortion": "model",
+}
 #: rs2_distortion by its number.
 MODELS = (
     "none",
@@ -61,7 +68,7 @@ def _lens(values: dict[str, Any], where: str) -> Distortion | None:
             f"the distortion model of {where}",
             "brown conrady or kannala brandt4, unless its coefficients are zero",
             repr(model),
-            "OpenCV does not have this model: undistort or rectify both images first.",
+            NO_MODEL,
         )
     return lens_of(coefficients, f"coeffs of {where}")
 

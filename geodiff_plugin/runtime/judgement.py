@@ -157,7 +157,7 @@ def _bad(signs: Signs) -> list[str]:
     if signs.view_deg > TOO_WIDE_DEG:
         found.append(
             f"K gives the left image {signs.view_deg:.0f} degrees of view, which no lens without distortion "
-            "has: K must be in pixels of this image, not in shares of its width and height."
+            "has: K must be in pixels of this image, not normalised by its size."
         )
     points = _of_points(signs)
     if points is not None and abs(math.log(signs.points_ratio)) > POINTS_WRONG:

@@ -399,9 +399,7 @@ def test_the_video_of_a_rig(geodiff, folders, textured_plane, views, beside, cam
     root, command = folders
     if cameras == "--fx":
         K, at = textured_plane.K, command.index("--calib")
-        numbers = dict(
-            zip(("--fx", "--fy", "--cx", "--cy"), (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), strict=True)
-        )
+        numbers = {"--fx": K[0, 0], "--fy": K[1, 1], "--cx": K[0, 2], "--cy": K[1, 2]}
         typed = [word for name, value in numbers.items() for word in (name, float(value))]
         command = [*command[:at], *typed, "--baseline", 0.1, *command[at + 2 :]]
     if beside:

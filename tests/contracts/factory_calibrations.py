@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+
+from geodiff_plugin.formats import read_calibration
+from geodiff_plugin.types import Rig
 
 # Stereolabs: millimetres, one pair of sections a resolution.
 ZED_CAMERA = "fx={f}\nfy={f}\ncx={cx}\ncy={cy}\nk1=0\nk2=0\np1=0\np2=0\nk3=0\n"
@@ -205,3 +209,11 @@ COLMAP_IMAGES = """# Image list with two lines of data per image:
 
 """
 COLMAP_CHOICE = {"image_names": ("rig/left.jpg", "rig/right.jpg"), "baseline_m": 0.12}
+
+
+def read_texts(folder: Path, *texts: str, **choice) -> Rig:
+    """The rig of texts that are written to files first, ``choice`` as ``read_calibration`` takes it."""
+    paths = [folder / f"file{number}" for number in range(len(texts))]
+    for path, text in zip(paths, texts, strict=True):
+        path.write_text(text)
+    return read_calibration(paths[0] if len(paths) == 1 else paths, **choice)

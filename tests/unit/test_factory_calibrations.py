@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,14 +18,7 @@ from tests.contracts import factory_calibrations as factory
 @pytest.fixture
 def reading(tmp_path):
     """``reading(text, ..., **choice)`` writes the texts to files and reads them."""
-
-    def read(*texts: str, **choice):
-        paths = [tmp_path / f"file{number}" for number in range(len(texts))]
-        for path, text in zip(paths, texts, strict=True):
-            path.write_text(text)
-        return read_calibration(paths[0] if len(paths) == 1 else paths, **choice)
-
-    return read
+    return partial(factory.read_texts, tmp_path)
 
 
 # ZED

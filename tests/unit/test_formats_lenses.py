@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,7 +13,6 @@ import pytest
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.lenses import lenses_of, pinhole
-from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.guidance.config import GuidanceConfig
 from tests.contracts import factory_calibrations as factory
 from tests.contracts import test_formats_table as table
@@ -26,14 +26,7 @@ PLAIN = GuidanceConfig(clean_photographs=False)
 @pytest.fixture
 def reading(tmp_path):
     """``reading(text, ..., **choice)`` reads texts as files, for a caller that undistorts."""
-
-    def read(*texts: str, **choice):
-        paths = [tmp_path / f"file{number}" for number in range(len(texts))]
-        for path, text in zip(paths, texts, strict=True):
-            path.write_text(text)
-        return read_calibration(paths[0] if len(paths) == 1 else paths, **{"distorted": True} | choice)
-
-    return read
+    return partial(factory.read_texts, tmp_path, distorted=True)
 
 
 def opencv(left, right) -> str:

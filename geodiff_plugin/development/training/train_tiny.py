@@ -21,11 +21,15 @@ from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.bundled.loading import no_bars
 from geodiff_plugin.development.training.data import normalise_disparity, read_shard, shards
 from geodiff_plugin.development.training.schedule import learning_rate
+from geodiff_plugin.development.training.train_vae import edge_error
 
 __all__ = ["build_tiny", "distillation_loss", "draw_maps", "main", "perturbed", "train_tiny"]
 
-_EDGE = 0.5
+#: Weight of the latents' squared error beside that of maps.
 _CODE = 0.2
+#: Of the latents this share is blurred, and all get noise of up to this standard deviation.
+_BLURRED, _NOISE = 0.5, 0.2
+#: Side of a crop, pixels.
 _SIDE = 64
 _SAY_EVERY = 500
 
@@ -84,9 +88,9 @@ def draw_maps(disparity: torch.Tensor, batch: int, side: int, generator: torch.G
 def perturbed(codes: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     """Latents of unit spread as estimates of a clean latent are: a half blurred, all with a little noise."""
     blurred = F.avg_pool2d(F.pad(codes, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
-    n, (share, noise) = len(codes), (0.5, 0.2)
-    pick = torch.rand((n, 1, 1, 1), generator=generator).to(codes.device) < share
-    level = (noise * torch.rand((n, 1, 1, 1), generator=generator)).to(codes.device)
+    one_each = (len(codes), 1, 1, 1)
+    pick = torch.rand(one_each, generator=generator).to(codes.device) < _BLURRED
+    level = _NOISE * torch.rand(one_each, generator=generator).to(codes.device)
     grain = torch.randn(codes.shape, generator=generator).to(codes.device)
     return torch.where(pick, blurred, codes) + level * grain
 
@@ -121,7 +125,7 @@ def distillation_loss(
 def _map_error(images: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Mean absolute error of the channels' mean, which is what a prior reads, and of its slopes."""
     error = images.mean(dim=1, keepdim=True) - target
-    return error.abs().mean() + _EDGE * sum(error.diff(dim=axis).abs().mean() for axis in (-1, -2))
+    return error.abs().mean() + edge_error(error)
 
 
 def train_tiny(

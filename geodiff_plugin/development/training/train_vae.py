@@ -20,7 +20,7 @@ from geodiff_plugin.development.training.data import jitter, normalise_disparity
 from geodiff_plugin.development.training.models import build_vae
 from geodiff_plugin.development.training.schedule import learning_rate
 
-__all__ = ["finish_vae", "load_vae", "save_vae", "train_vae", "vae_loss"]
+__all__ = ["edge_error", "finish_vae", "load_vae", "save_vae", "train_vae", "vae_loss"]
 
 _KL = 2e-4
 _EDGE = 0.5
@@ -64,6 +64,11 @@ class _Crops:
         return torch.cat(pieces)
 
 
+def edge_error(difference: torch.Tensor) -> torch.Tensor:
+    """Weighted mean size of the slopes of a difference ``(N, C, H, W)``: what blurred edges cost."""
+    return _EDGE * sum(difference.diff(dim=axis).abs().mean() for axis in (-1, -2))
+
+
 def vae_loss(vae: AutoencoderKL, x: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
     """Reconstruction (L1 and squared), slope of edges, and a weak pull of the latents to a unit Gaussian.
 
@@ -78,10 +83,9 @@ def vae_loss(vae: AutoencoderKL, x: torch.Tensor, generator: torch.Generator | N
     posterior = vae.encode(x).latent_dist
     y = vae.decode(posterior.sample(generator)).sample.float()
     error = (y - x).abs()
-    slopes = [((y - x).diff(dim=axis)).abs().mean() for axis in (-1, -2)]
     mean, logvar = posterior.mean.float(), posterior.logvar.float()
     kl = 0.5 * (mean.square() + logvar.exp() - 1.0 - logvar).mean()
-    return error.mean() + (y - x).square().mean() + _EDGE * sum(slopes) + _KL * kl
+    return error.mean() + (y - x).square().mean() + edge_error(y - x) + _KL * kl
 
 
 class _Loss(torch.nn.Module):
