@@ -86,6 +86,7 @@ def _estimated(inputs: Inputs, output: MetricDepthOutput) -> dict[str, Any] | No
         "inliers": found.inliers,
         "parallax_deg": found.parallax_deg,
         "residual_px": found.residual_px,
+        "depth_spread": found.depth_spread,
         "scale_from": output.scale_from,
         "scale_spread": output.scale_spread,
         "assumed": found.notes,

@@ -24,6 +24,7 @@ from geodiff_plugin.pose.estimate import EstimatedPose, estimate_pose
 from geodiff_plugin.pose.matchers import Matcher, find_matcher
 from geodiff_plugin.pose.refine import polished
 from geodiff_plugin.pose.scale import Scale, find_scale
+from geodiff_plugin.pose.spread import depth_spread, open_pose
 from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
 from geodiff_plugin.pose.views import GreyViews, grey_views
 from geodiff_plugin.types import CameraView
@@ -42,6 +43,8 @@ class EstimatedRig:
         inliers: matches that each right view's pose explains.
         parallax_deg: median angle between the two rays of a point, one a right view.
         residual_px: median distance of the inliers from their epipolar lines, one a right view.
+        depth_spread: relative standard deviation of depth by errors of the poses, in the median of the
+            matches; ``None`` for a rectified pair, whose pose is taken as exact.
         scale: where the unit comes from.
         notes: sentences about what was assumed.
         warnings: sentences for the user.
@@ -53,6 +56,7 @@ class EstimatedRig:
     inliers: tuple[int, ...]
     parallax_deg: tuple[float, ...]
     residual_px: tuple[float, ...]
+    depth_spread: float | None
     scale: Scale
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -172,7 +176,7 @@ def estimate_rig(
     nowhere = posed([np.eye(4)] * (len(images) - 1))
     tracks, poses = _tracks(grey_views(images[0], nowhere, K_left), find_matcher(matcher))
     Ts = np.stack([pose.T for pose in poses])
-    rights = posed(Ts)
+    rights, spread = posed(Ts), None
     if not all(pose.rectified for pose in poses):
         Ts, tracks = polished(
             images[0],
@@ -181,6 +185,7 @@ def estimate_rig(
             lambda views: coarse_depth(images[0], views, K_left),
             tracks.seen_anywhere(),
         )
+        spread = depth_spread(tracks, Ts)
     factor = tracks.K_left[0, 0] / Ks[0][0, 0]
     scale = find_scale(tracks, Ts, factor, baseline_m, known_length, points)
     Ts[:, :3, 3] *= scale.factor
@@ -191,7 +196,8 @@ def estimate_rig(
         tuple(int(pose.inliers.sum()) for pose in poses),
         tuple(pose.parallax_deg for pose in poses),
         tuple(pose.residual_px for pose in poses),
+        spread,
         scale,
         tuple(notes),
-        tuple(sentence for pose in poses for sentence in pose.warnings) + scale.warnings,
+        (*(s for pose in poses for s in pose.warnings), *open_pose(spread or 0.0), *scale.warnings),
     )

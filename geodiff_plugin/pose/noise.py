@@ -16,11 +16,18 @@ import numpy as np
 
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
 
-__all__ = ["ResidualParts", "across_lines", "split_residuals"]
+__all__ = ["ResidualParts", "across_lines", "blocks", "split_residuals"]
 
 #: Blocks a row of the left image.
 BLOCKS = 10
 _FEWEST_IN_BLOCK, _FEWEST_BLOCKS = 5, 3
+
+
+def blocks(tracks: Tracks) -> np.ndarray:
+    """The block of the left image that every track lies in, ``(N,)``, numbered from 0 without gaps."""
+    width = max(2.0 * tracks.K_left[0, 2], 1.0)  # that of an image whose principal point is near its middle
+    column, row = (tracks.left_px // (width / BLOCKS)).astype(int).T
+    return np.unique(row * 1000 + column, return_inverse=True)[1]
 
 
 def across_lines(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,9 +69,8 @@ def split_residuals(tracks: Tracks, T: np.ndarray) -> ResidualParts:
     off, _ = across_lines(tracks, T)
     scale = max(1.4826 * float(np.median(np.abs(off))), 1e-3)
     kept = np.abs(off) < 3.0 * scale
-    width = max(2.0 * tracks.K_left[0, 2], 1.0)  # that of an image whose principal point is near its middle
-    column, row = (tracks.left_px[kept] // (width / BLOCKS)).astype(int).T
-    _, block, count = np.unique(row * 1000 + column, return_inverse=True, return_counts=True)
+    block = blocks(tracks.kept(kept))
+    count = np.bincount(block)
     mean = np.bincount(block, off[kept]) / count
     enough = count >= _FEWEST_IN_BLOCK
     count, mean = count[enough], mean[enough]

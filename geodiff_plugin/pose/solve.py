@@ -10,13 +10,14 @@ Paper: none. Minimises, over 6 degrees of freedom a right view and one inverse d
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.pose.tracks import Projected, Tracks, project_tracks, solve_inverse_depth
 
-__all__ = ["Prior", "solve_poses"]
+__all__ = ["Prior", "Whitened", "solve_poses", "whitened"]
 
 _STEPS = 12
 
@@ -61,13 +62,53 @@ def _jacobian(at: Projected, inverse_depth: np.ndarray) -> np.ndarray:
     return np.concatenate([at.by_point @ by_turn, at.by_point * inverse_depth[:, None, None]], axis=2)
 
 
-def _data_terms(tracks: Tracks, Ts: np.ndarray, scale: float) -> _Terms:
-    """Cost, gradient and normal matrix of the residuals with the inverse depths eliminated."""
+@dataclass(frozen=True, eq=False)
+class Whitened:
+    """Residuals of tracks and their derivatives, each times the root of its robust weight; n = 2 V.
+
+    Attributes:
+        cost: sum of log(1 + (residual / scale)^2).
+        inverse_depth: ``(N,)`` 1/m that fits the track best.
+        residuals: ``(N, n)``.
+        by_pose: ``(N, n, 6V)``, by ``_turned``'s step of every view.
+        by_depth: ``(N, n)``, by inverse depth.
+    """
+
+    cost: float
+    inverse_depth: np.ndarray
+    residuals: np.ndarray
+    by_pose: np.ndarray
+    by_depth: np.ndarray
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """``(N,)``, length of ``by_depth``."""
+        return np.maximum(np.linalg.norm(self.by_depth, axis=1), 1e-12)
+
+    @cached_property
+    def depth_by_pose(self) -> np.ndarray:
+        """``(N, 6V)``: what a step does to the inverse depth, times minus ``slopes``."""
+        return np.einsum("nk,nkp->np", self.by_depth / self.slopes[:, None], self.by_pose)
+
+    @cached_property
+    def left_by_pose(self) -> np.ndarray:
+        """``(N, n, 6V)``: what of ``by_pose`` no change of depth makes up for."""
+        return self.by_pose - (self.by_depth / self.slopes[:, None])[..., None] * self.depth_by_pose[:, None]
+
+
+def whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> Whitened:
+    """What the tracks say about the poses near ``Ts``.
+
+    Args:
+        tracks: of V right views.
+        Ts: ``(V, 4, 4)``, ``T_right_from_left``.
+        scale_px: residual from which on an observation counts for less, pixels of the right view.
+    """
     views = len(Ts)
     w = solve_inverse_depth(tracks, Ts)
     for _ in range(2 if views > 1 else 0):
-        w = solve_inverse_depth(tracks, Ts, _weights(tracks, Ts, w, scale)[0])
-    weights, offs, ats = _weights(tracks, Ts, w, scale)
+        w = solve_inverse_depth(tracks, Ts, _weights(tracks, Ts, w, scale_px)[0])
+    weights, offs, ats = _weights(tracks, Ts, w, scale_px)
     by_pose = np.zeros((len(tracks), views, 2, 6 * views))
     by_depth = np.zeros((len(tracks), views, 2))
     for v, at in enumerate(ats):
@@ -76,10 +117,15 @@ def _data_terms(tracks: Tracks, Ts: np.ndarray, scale: float) -> _Terms:
         by_depth[:, v] = at.by_inverse_depth * root
     r = (offs * np.sqrt(weights)[..., None]).transpose(1, 0, 2).reshape(len(tracks), -1)
     J, j = by_pose.reshape(len(tracks), 2 * views, -1), by_depth.reshape(len(tracks), -1)
-    j /= np.maximum(np.linalg.norm(j, axis=1, keepdims=True), 1e-12)
-    J = J - j[..., None] * np.einsum("nk,nkp->np", j, J)[:, None]  # what a change of depth cannot make up for
-    cost = np.log1p((offs**2).sum(-1) / scale**2)[tracks.seen].sum()
-    return cost, np.einsum("nkp,nk->p", J, r), np.einsum("nkp,nkq->pq", J, J)
+    cost = np.log1p((offs**2).sum(-1) / scale_px**2)[tracks.seen].sum()
+    return Whitened(float(cost), w, r, J, j)
+
+
+def _data_terms(tracks: Tracks, Ts: np.ndarray, scale: float) -> _Terms:
+    """Cost, gradient and normal matrix of the residuals with the inverse depths eliminated."""
+    at = whitened(tracks, Ts, scale)
+    J = at.left_by_pose
+    return at.cost, np.einsum("nkp,nk->p", J, at.residuals), np.einsum("nkp,nkq->pq", J, J)
 
 
 def _weights(

@@ -59,6 +59,7 @@ def test_a_pair_from_a_phone(geodiff, command, pair, tmp_path):
     report = report_of(tmp_path / "out")
     found = report["estimated_pose"]
     assert found["inliers"][0] > 50 and found["parallax_deg"][0] > 1 and found["residual_px"][0] < 1
+    assert 0 < found["depth_spread"] < 0.06
     assert found["scale_from"] == "baseline" and report["unit"] == "m"
     assert report["inputs"]["baseline_m"] == pytest.approx(baseline)
     # EXIF has whole millimetres, so the focal length and with it the pose are known to a few per cent.
