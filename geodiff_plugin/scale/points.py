@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -115,21 +116,21 @@ def refine_to_matches(
 
     Returns:
         ``near_m, far_m``, far within a factor of 2 of the start: matches alone have outliers, so they
-        refine what the lookup found and never replace it. Residuals are in log depth, each in units of its
-        match's own noise and of what the map leaves over, which is measured at every iteration: a map that is
-        right is fitted to the noise of its matches, one that errs as a whole.
+        refine what the lookup found and never replace it. Residuals are in the logarithm of inverse depth and
+        the noise of a match together: relative where matches are exact, even for noise of either sign near
+        infinity, where a plain logarithm favours matches that err towards the camera. Each is in units of its
+        match's own noise and of what the map leaves over, which is measured at every iteration: a map that
+        is right is fitted to the noise of its matches, one that errs as a whole.
     """
     height, width = matches.size
     at = matches.above(0.0)  # known points are few: not one may be missed
     if not len(at):
         return near_m, far_m
     at = at[:: max(1, len(at) // config.fit_samples)]
-    inverse = matches.inverse_depth.flatten()[at].clamp_min(1e-9)
-    # A match at infinity constrains nothing, and a wrong one would push far without end.
+    inverse = matches.inverse_depth.flatten()[at].clamp_min(0.0)
     confidence = matches.confidence.flatten()[at]
-    trusted = confidence * (inverse > matches.plane_step)
     doubt = ((1.0 - confidence) / _REFERENCE_DOUBT).clamp_min(_LEAST_DOUBT)
-    noise = doubt * (config.fit_noise * matches.plane_step / inverse) ** 2
+    fitted = _Fitted(inverse, confidence, doubt.sqrt(), config.fit_noise * matches.plane_step)
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
     form = SPACES[space]
     start = _ends(form, near_m, far_m)
@@ -138,7 +139,7 @@ def refine_to_matches(
     low, high = torch.minimum(reach, other), torch.maximum(reach, other)
     ends = start
     for _ in range(config.fit_iterations):
-        ends = _refine_once(form, ends, values, inverse, trusted, noise, (low, high), config)
+        ends = _refine_once(form, ends, values, fitted, (low, high), config)
     at_zero, at_one = (form.forward(end, torch.ones_like(end)) for end in ends.unbind(1))
     return ordered(*form.ends(at_zero, at_one))
 
@@ -153,13 +154,27 @@ def ordered(near_m: Tensor, far_m: Tensor) -> tuple[Tensor, Tensor]:
     return torch.minimum(near_m, far_m * 0.98), far_m
 
 
+class _Fitted(NamedTuple):
+    """What a map is fitted to, of P matches.
+
+    Attributes:
+        inverse: ``(P,)`` inverse depth, 1/m, >= 0.
+        trusted: ``(P,)`` confidence.
+        doubt: ``(P,)``, standard deviation in units of ``noise``.
+        noise: ``()``, that of a match of the reference confidence, 1/m.
+    """
+
+    inverse: Tensor
+    trusted: Tensor
+    doubt: Tensor
+    noise: Tensor
+
+
 def _refine_once(
     form: Space,
     ends: Tensor,
     values: Tensor,
-    inverse: Tensor,
-    trusted: Tensor,
-    noise: Tensor,
+    fitted: _Fitted,
     bounds: tuple[Tensor, Tensor],
     config: FitConfig,
 ) -> Tensor:
@@ -171,11 +186,16 @@ def _refine_once(
     shares = torch.stack([1.0 - values, values], -1)  # (B, P, 2)
     v, gap = (shares @ ends[:, :, None])[..., 0], (ends[:, 1:] - ends[:, :1]).abs()
     h = 1e-3 * torch.maximum(gap, 1e-2 * ends.abs().amax(1, keepdim=True))
-    residual = (log_depth(v) + inverse.log()).clamp(-1.0, 1.0)
-    slope = (log_depth(v + h) - log_depth(v - h)) / (2.0 * h)
-    left_over = 1.4826 * weighted_quantile(residual.abs(), trusted.expand_as(residual), 0.5)
-    variance = noise + left_over.clamp_min(config.fit_floor)[:, None] ** 2
-    weight = trusted / (variance * (1.0 + residual**2 / (config.fit_cauchy**2 * variance)))
+    # The noise is that of where the map puts a match: by where the match lies, the near ones of two that err
+    # alike would count for more.
+    mapped = (-log_depth(v)).exp()
+    above = mapped + fitted.noise
+    residual = ((fitted.inverse + fitted.noise) / above).log().clamp(-1.0, 1.0)
+    slope = mapped / above * (log_depth(v + h) - log_depth(v - h)) / (2.0 * h)
+    left_over = 1.4826 * weighted_quantile(residual.abs(), fitted.trusted.expand_as(residual), 0.5)
+    floor = left_over.clamp_min(config.fit_floor)[:, None]
+    variance = (fitted.doubt * fitted.noise / above) ** 2 + floor**2
+    weight = fitted.trusted / (variance * (1.0 + residual**2 / (config.fit_cauchy**2 * variance)))
     J = slope[..., None] * shares
     normal = torch.einsum("bpi,bp,bpj->bij", J, weight, J)
     gradient = torch.einsum("bpi,bp,bp->bi", J, weight, residual)
@@ -186,8 +206,8 @@ def _refine_once(
     # Where one end is stopped by its bound, the other one is the best for that.
     moved = bound - ends
     alone = ends - (gradient + normal.flip(2).diagonal(dim1=1, dim2=2) * moved.flip(1)) / (diagonal + 1e-20)
-    fitted = torch.where((bound != free).flip(1), alone, bound)
-    return torch.minimum(torch.maximum(fitted, bounds[0]), bounds[1])
+    settled = torch.where((bound != free).flip(1), alone, bound)
+    return torch.minimum(torch.maximum(settled, bounds[0]), bounds[1])
 
 
 def weighted_quantile(values: Tensor, weight: Tensor, share: float | Tensor) -> Tensor:

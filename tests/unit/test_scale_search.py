@@ -144,6 +144,24 @@ def test_refinement_finds_the_truth_among_outliers(scene, space):
     assert error_after < 0.5 * error_before and error_after < 0.06
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_far_matches_does_not_pull_the_far_end_nearer(scene, seed):
+    """Half of a street lies within two planes of infinity, where matches err by one."""
+    volume, _ = scene
+    step = torch.tensor(0.004)
+    generator = torch.Generator().manual_seed(seed)
+    inverse = step * torch.cat([torch.linspace(0.5, 2.0, 48 * 144), torch.linspace(2.0, 60.0, 48 * 144)])
+    noisy = (inverse + step * torch.randn(inverse.shape, generator=generator)).clamp_min(0.0).view(1, *SIZE)
+    matches = m.Matches(noisy, torch.full_like(noisy, 0.96), step, volume.K, volume.size)
+    depth = (1.0 / inverse).view(1, *SIZE)
+    true = (depth.amin()[None], depth.amax()[None])
+    near, far = refine_to_matches(
+        relative(depth, "disparity"), matches, true[0] * 1.05, true[1] * 0.8, "disparity"
+    )
+    assert float(near) == pytest.approx(float(true[0]), rel=0.02)
+    assert float(far) == pytest.approx(float(true[1]), rel=0.1)
+
+
 def test_refinement_without_matches_changes_nothing(scene):
     volume, depth = scene
     x = relative(depth, "depth")
