@@ -115,9 +115,9 @@ def _from_file(views: Views, fields: CameraFields, knobs: dict[str, Any]) -> Geo
             "calibration", "a calibration file", "none", "Choose one, or give focal length and baseline."
         )
     paths = [path for path in (fields.calibration, fields.second_calibration) if path is not None]
-    rig = read_calibration(
-        paths, image_names=views.names, image_size=views.size, baseline_m=fields.baseline_m
-    )
+    # The page keeps what is dropped in a folder of its own, so only the names themselves say something.
+    names = Path(views.names[0]).name, Path(views.names[1]).name
+    rig = read_calibration(paths, image_names=names, image_size=views.size, baseline_m=fields.baseline_m)
     return _guidance_of_rig(views, rig, fields, knobs)
 
 

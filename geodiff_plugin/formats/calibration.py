@@ -56,6 +56,7 @@ class CalibrationFormat:
         file_counts: how many files may describe one pair.
         uses_cameras: whether a file may hold more than two cameras, so that ``cameras`` has a meaning.
         has_unit: whether its lengths have a known unit (or are taken as metres); a warning says where not.
+        by_image: whether it has a pose for each of many images, which are found by their names.
     """
 
     summary: str
@@ -64,3 +65,4 @@ class CalibrationFormat:
     file_counts: tuple[int, ...] = (1,)
     uses_cameras: bool = False
     has_unit: bool = True
+    by_image: bool = False

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
+from geodiff_plugin.formats.image_names import names_of_pair
 from geodiff_plugin.formats.lenses import FactoryCamera, lens_of, rig_of_cameras
 from geodiff_plugin.formats.rigs import intrinsics, pose_from_world_to_camera
 from geodiff_plugin.formats.structured import array_of
@@ -67,16 +68,6 @@ def _cameras(file: CalibrationFile) -> dict[str, FactoryCamera]:
     return cameras
 
 
-def _named(images: dict[str, tuple[np.ndarray, str]], wanted: str, path: Path) -> tuple[np.ndarray, str]:
-    """The image whose name ends the wanted path; names may hold folders."""
-    parts = Path(wanted).parts
-    fitting = [name for name in images if Path(name).parts == parts[-len(Path(name).parts) :]]
-    if not fitting:
-        some = ", ".join(sorted(images)[:3])
-        bad_value("the image", f"one of the {len(images)} in {path} ({some}, ...)", wanted, "Check its name.")
-    return images[max(fitting, key=len)]
-
-
 def _images(file: CalibrationFile) -> dict[str, tuple[np.ndarray, str]]:
     """World-to-camera transform and number of the camera, by the image's name."""
     images = {}
@@ -104,11 +95,8 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     if len(by_kind) != 2:
         bad_value("calibration", "cameras.txt and images.txt", " and ".join(str(file.path) for file in files))
     cameras, images = _cameras(by_kind[True]), _images(by_kind[False])
-    if choice.image_names is None:
-        bad_value("image_names", "given for a COLMAP model, as ('left.jpg', 'right.jpg')", "none")
-    (T_left, left), (T_right, right) = (
-        _named(images, name, by_kind[False].path) for name in choice.image_names
-    )
+    names = names_of_pair(images, choice, by_kind[False].path, "a COLMAP model")
+    (T_left, left), (T_right, right) = (images[name] for name in names)
     for camera in (left, right):
         if camera not in cameras:
             bad_value(
@@ -120,5 +108,10 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
 
 
 COLMAP = CalibrationFormat(
-    "a COLMAP model (cameras.txt and images.txt)", matches, read, file_counts=(2,), has_unit=False
+    "a COLMAP model (cameras.txt and images.txt)",
+    matches,
+    read,
+    file_counts=(2,),
+    has_unit=False,
+    by_image=True,
 )

@@ -27,6 +27,7 @@ from geodiff_plugin.formats.kitti_cam_to_cam import KITTI_CAM_TO_CAM
 from geodiff_plugin.formats.kitti_projections import KITTI_PROJECTIONS
 from geodiff_plugin.formats.middlebury import MIDDLEBURY
 from geodiff_plugin.formats.mvsnet import MVSNET
+from geodiff_plugin.formats.nerf import NERF
 from geodiff_plugin.formats.oak import OAK
 from geodiff_plugin.formats.opencv import OPENCV
 from geodiff_plugin.formats.realsense import REALSENSE
@@ -36,7 +37,7 @@ from geodiff_plugin.formats.stereodemo import STEREODEMO
 from geodiff_plugin.formats.zed import ZED
 from geodiff_plugin.types import Rig
 
-__all__ = ["CALIBRATION_FORMATS", "read_calibration"]
+__all__ = ["CALIBRATION_FORMATS", "has_pose_per_image", "read_calibration"]
 
 #: Every format by name; exactly one recognises a well-formed file.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
@@ -54,9 +55,17 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "ros": ROS,
     "kalibr": KALIBR,
     "colmap": COLMAP,
+    "nerf": NERF,
 }
 
 PathLike = str | os.PathLike[str]
+
+
+def _files(path: PathLike | Sequence[PathLike]) -> tuple[CalibrationFile, ...]:
+    paths = _paths(path)
+    if len(paths) == 2 and paths[0] == paths[1]:
+        paths = paths[:1]
+    return tuple(CalibrationFile(p, read_text(p, "calibration", "a calibration file")) for p in paths)
 
 
 def _paths(path: PathLike | Sequence[PathLike]) -> tuple[Path, ...]:
@@ -148,9 +157,9 @@ def read_calibration(
         cameras: left and right camera of a file of many (KITTI, Kalibr, OAK-D); ``None`` goes by the folder,
             then by the file.
         image_folder_hint: name or path of the left image's folder (or of the image): ``image_2`` means 2, 3.
-        image_names: names or paths of both images, by which a COLMAP model knows them.
-        image_size: ``(width, height)`` of the left image, for files with several resolutions (ZED, RealSense)
-            or of the whole sensor (OAK-D).
+        image_names: names or paths of both images, by which a COLMAP model or a transforms.json knows them.
+        image_size: ``(width, height)`` of the left image, for files with several resolutions (ZED,
+            RealSense), of the whole sensor (OAK-D) or of none (NeRF's transforms.json).
         baseline_m: measured distance of the two cameras in metres; replaces that of the file.
         distorted: whether the caller takes lens distortion out of the images (``Rig.distortion``).
 
@@ -166,10 +175,7 @@ def read_calibration(
     Convention:
         A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
     """
-    paths = _paths(path)
-    if len(paths) == 2 and paths[0] == paths[1]:
-        paths = paths[:1]
-    files = tuple(CalibrationFile(p, read_text(p, "calibration", "a calibration file")) for p in paths)
+    files = _files(path)
     name = _one_format(files)
     _check_cameras(cameras, name)
     choice = CameraChoice(
@@ -183,6 +189,18 @@ def read_calibration(
         for side, lens in zip(("left", "right"), rig.distortion, strict=True):
             check_no_distortion(lens, f"Lens distortion of the {side} camera in {rig.source}")
     return _in_metres(rig, baseline_m, name)
+
+
+def has_pose_per_image(path: PathLike | Sequence[PathLike]) -> bool:
+    """Whether a calibration is another one for every pair of images, found by their names.
+
+    Args:
+        path: as in ``read_calibration``.
+
+    Raises:
+        OSError, TypeError, ValueError: as ``read_calibration``, where no format is recognised.
+    """
+    return CALIBRATION_FORMATS[_one_format(_files(path))].by_image
 
 
 def _one_format(files: tuple[CalibrationFile, ...]) -> str:

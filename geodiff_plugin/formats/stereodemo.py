@@ -10,6 +10,7 @@ from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
+from geodiff_plugin.formats.nerf import MARK as NERF_MARK
 from geodiff_plugin.formats.rigs import finite, intrinsics, make_rig, pose_to_the_right, positive
 from geodiff_plugin.formats.structured import parse_json
 from geodiff_plugin.types import Rig
@@ -20,8 +21,8 @@ KEYS = ("fx", "fy", "cx0", "cx1", "cy", "baseline_meters")
 
 
 def matches(text: str, path: Path) -> bool:
-    """Whether the text is a JSON object with ``"fx"`` in it (and not OpenCV's or RealSense's JSON)."""
-    others = ("opencv-matrix", '"ppx"')
+    """Whether the text is a JSON object with ``"fx"`` in it, and nothing of another format's JSON."""
+    others = ("opencv-matrix", '"ppx"', NERF_MARK)
     return text.lstrip().startswith("{") and '"fx"' in text and not any(mark in text for mark in others)
 
 

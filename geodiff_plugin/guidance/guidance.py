@@ -134,7 +134,7 @@ class GeometryGuidance:
             right: as in the constructor.
             path: file, or tuple of two files; docs/reference/calibration.md lists the formats.
             cameras: (left, right) numbers, for a file with more than two cameras, such as KITTI's.
-            image_names: names of both images in a COLMAP model.
+            image_names: names of both images in a COLMAP model or a transforms.json.
             baseline_m: measured distance between the cameras in metres; replaces that of the file.
             **knobs: further arguments of the constructor.
 

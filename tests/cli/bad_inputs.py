@@ -14,6 +14,9 @@ __all__ = ["KINDS"]
 Words = list[str]
 CAMERA = ("--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.12").split()
 OPENCV = "{}: !!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [{}]\n"
+NERF = """{"fl_x": 60, "w": 64, "h": 48, "frames": [
+{"file_path": "./left.png", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]},
+{"file_path": "./right.png", "transform_matrix": [[1, 0, 0, 0.12], [0, 1, 0, 0], [0, 0, 1, 0]]}]}"""
 P = "700 0 320 {} 0 700 240 0 0 0 1 0"
 
 
@@ -200,6 +203,11 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "calib-json-missing": _calib('{"fx": 700}'),
     "calib-opencv-cut": _calib("%YAML:1.0\n---\nP1: !!opencv-matrix\n   rows: 3\n"),
     "calib-entities": _calib('<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage></opencv_storage>'),
+    "calib-nerf-other-images": _calib(NERF.replace("left", "elsewhere")),
+    "calib-nerf-lens": _calib(NERF.replace('"w"', '"camera_model": "EQUIRECTANGULAR", "w"')),
+    "calib-nerf-degrees": _calib(NERF.replace('"fl_x": 60', '"camera_angle_x": 56')),
+    "calib-nerf-scaled": _calib(NERF.replace("[1, 0, 0, 0.12]", "[1.5, 0, 0, 0.12]")),
+    "calib-nerf-of-another-size": _calib(NERF.replace("64", "128").replace("48", "96")),
     "calib-mvsnet-one": _calib("extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
     "calib-of-another-size": _calib(
         "cam0=[60 0 32; 0 60 24; 0 0 1]\ncam1=[60 0 32; 0 60 24; 0 0 1]\ndoffs=0\nbaseline=120\nwidth=128\n"

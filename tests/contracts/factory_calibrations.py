@@ -210,6 +210,24 @@ COLMAP_IMAGES = """# Image list with two lines of data per image:
 """
 COLMAP_CHOICE = {"image_names": ("rig/left.jpg", "rig/right.jpg"), "baseline_m": 0.12}
 
+# One unit is 24 cm: the cameras stand half a unit apart, in a world whose z is up and whose y is forward.
+NERF = """{
+  "camera_model": "OPENCV",
+  "fl_x": 700.0, "fl_y": 700.0, "cx": 300.5, "cy": 200.5, "w": 640, "h": 480,
+  "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
+  "frames": [
+    {"file_path": "./images/left.jpg", "colmap_im_id": 1,
+     "transform_matrix": [[1, 0, 0, 3.25], [0, 0, -1, 4], [0, 1, 0, 5], [0, 0, 0, 1]]},
+    {"file_path": "./images/other.jpg", "colmap_im_id": 2,
+     "transform_matrix": [[0, 1, 0, 7], [0, 0, -1, 8], [-1, 0, 0, 9], [0, 0, 0, 1]]},
+    {"file_path": "./images/right.jpg", "colmap_im_id": 3,
+     "transform_matrix": [[1, 0, 0, 3.75], [0, 0, -1, 4], [0, 1, 0, 5], [0, 0, 0, 1]]}
+  ],
+  "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]
+}
+"""
+NERF_CHOICE = {"image_names": ("images/left.jpg", "images/right.jpg"), "baseline_m": 0.12}
+
 
 def read_texts(folder: Path, *texts: str, **choice) -> Rig:
     """The rig of texts that are written to files first, ``choice`` as ``read_calibration`` takes it."""

@@ -159,9 +159,14 @@ SAMPLES: dict[str, tuple[str, tuple[str, ...]]] = {
     "ros_echo": ("ros", (factory.ROS_ECHO_LEFT, factory.ROS_ECHO_RIGHT)),
     "kalibr": ("kalibr", (factory.KALIBR,)),
     "colmap": ("colmap", (factory.COLMAP_CAMERAS, factory.COLMAP_IMAGES)),
+    "nerf": ("nerf", (factory.NERF,)),
 }
 #: What a sample needs beside its text.
-CHOICES = {"zed": {"image_size": (1280, 720)}, "colmap": factory.COLMAP_CHOICE}
+CHOICES = {
+    "zed": {"image_size": (1280, 720)},
+    "colmap": factory.COLMAP_CHOICE,
+    "nerf": factory.NERF_CHOICE,
+}
 
 
 def choice(sample: str) -> dict:

@@ -72,6 +72,10 @@ CALIBRATIONS = {
         + MATRIX.format("baselineLR", 1, 1, "120", "baselineLR")
     ),
     "mvsnet": MVSNET.format(0),
+    "nerf": '{"fl_x": 700, "cx": 320, "cy": 240, "w": 640, "h": 480, "k1": 0, "camera_model": "OPENCV", '
+    '"frames": [\n'
+    '{"file_path": "./a", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, '
+    '{"file_path": "./b", "transform_matrix": [[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}]}',
 }
 WORDS = b"nan inf -inf 1e999 -1 0 1e-300 [ ] { } : , ; = < > 1e5 # rows:"
 TOKENS = [

@@ -43,15 +43,15 @@ def test_calibrations(tmp_path, kind, size):
     path, other = tmp_path / "calib.txt", tmp_path / "other.txt"
     whole = CALIBRATIONS[kind].encode()
     other.write_bytes(CALIBRATIONS["mvsnet"].replace("1 0 0 0", "1 0 0 -0.12", 1).encode())
-    pair = (path, other) if kind == "mvsnet" else path
+    pair, names = (path, other) if kind == "mvsnet" else path, ("a.png", "b.png")
     path.write_bytes(whole)
-    assert survives(lambda: read_calibration(pair)), "the whole file must be understood"
+    assert survives(lambda: read_calibration(pair, image_names=names)), "the whole file must be understood"
 
     @size
     @given(data=damaged(whole), cameras=st.sampled_from([None, (0, 1), (2, 3), (7, 7)]))
     def check(data, cameras):
         path.write_bytes(data)
-        survives(lambda: read_calibration(pair, cameras=cameras))
+        survives(lambda: read_calibration(pair, cameras=cameras, image_names=names))
 
     check()
 

@@ -6,18 +6,18 @@ Paper: none.
 
 from __future__ import annotations
 
-import os
+from pathlib import Path
 from typing import Any
 
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.inputs import read_rig
+from geodiff_plugin.formats.reading import has_pose_per_image
 from geodiff_plugin.types import Rig
 
 __all__ = ["RigStore"]
 
 #: What stands before the number of a camera in names of KITTI.
 NUMBERED = "image_"
-COLMAP_FILES = ("cameras.txt", "images.txt", "cameras.bin", "images.bin")
 Size = tuple[int, int]
 #: What of the arguments cameras are read from, beside the images' names.
 CAMERA_OPTIONS = ("calib", "fx", "fy", "cx", "cy", "baseline", "k", "e", "k_right", "cropped")
@@ -29,13 +29,19 @@ class RigStore:
     def __init__(self) -> None:
         self._key: Any = None
         self._rig: Rig | None = None
+        self._by_image: dict[tuple[Path, ...], bool] = {}
+
+    def _is_by_image(self, calib: tuple[Path, ...]) -> bool:
+        if calib and calib not in self._by_image:
+            self._by_image[calib] = has_pose_per_image(calib)
+        return self._by_image.get(calib, False)
 
     def read(
         self, arguments: DepthArguments, cameras: Size | None, left_size: Size, right_size: Size | None
     ) -> Rig:
-        """As ``read_rig``; KITTI's asks names for the camera's number, and COLMAP has one for every image."""
+        """As ``read_rig``; KITTI's asks names for the camera's number, some have a pose for every image."""
         views: tuple[Any, ...] = (arguments.left, arguments.right)
-        if not any(os.path.isdir(path) or path.name in COLMAP_FILES for path in arguments.calib):
+        if not self._is_by_image(arguments.calib):
             views = tuple(
                 path.parent if path is not None and NUMBERED not in path.name else path for path in views
             )
