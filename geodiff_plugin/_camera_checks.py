@@ -14,11 +14,13 @@ import numpy as np
 from geodiff_plugin._checks import bad_type, bad_value
 
 __all__ = [
+    "LONG_BASELINE_M",
     "check_baseline",
     "check_calibrated_size",
     "check_intrinsics",
     "check_intrinsics_fit",
     "check_pose",
+    "warn_of_long_baseline",
     "warn_of_other_size",
 ]
 
@@ -150,7 +152,7 @@ def check_pose(E: Any, name: str = "E") -> np.ndarray:
 
 
 def check_baseline(E: np.ndarray, name: str = "E") -> None:
-    """Refuse a relative pose without translation; warn of one that looks like millimetres."""
+    """Refuse a relative pose without translation."""
     baseline = float(np.linalg.norm(E[:3, 3]))
     if baseline < 1e-6:
         bad_value(
@@ -160,9 +162,17 @@ def check_baseline(E: np.ndarray, name: str = "E") -> None:
             "Without a baseline two views do not tell the scale; "
             "give the distance between the cameras in metres.",
         )
+
+
+def warn_of_long_baseline(E: np.ndarray, name: str) -> None:
+    """Warn of a relative pose whose translation looks like millimetres.
+
+    It is said here, before anything is computed, and nowhere else.
+    """
+    baseline = float(np.linalg.norm(E[:3, 3]))
     if baseline > LONG_BASELINE_M:
         warnings.warn(
             f"{name} has a baseline of {baseline:.4g} m. "
-            "If that is millimetres, divide the translation by 1000.",
+            "If that is millimetres, divide the translation, or baseline_m (--baseline), by 1000.",
             stacklevel=3,
         )

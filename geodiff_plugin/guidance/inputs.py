@@ -19,6 +19,7 @@ from geodiff_plugin._camera_checks import (
     check_intrinsics,
     check_intrinsics_fit,
     check_pose,
+    warn_of_long_baseline,
     warn_of_other_size,
 )
 from geodiff_plugin._checks import bad_type, bad_value, check_metres
@@ -185,7 +186,9 @@ def _poses(E: Any, name: str, views: int) -> list[np.ndarray]:
     else:
         poses = [check_pose(E, name)]
     for v, pose in enumerate(poses):
-        check_baseline(pose, name if views == 1 else f"{name}[{_view(v, views)}]")
+        named = name if views == 1 else f"{name}[{_view(v, views)}]"
+        check_baseline(pose, named)
+        warn_of_long_baseline(pose, named)
     return poses
 
 

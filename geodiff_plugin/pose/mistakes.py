@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from geodiff_plugin._camera_checks import LONG_BASELINE_M
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
 __all__ = ["INVERSE", "find_mistake", "implausible_unit"]
@@ -56,6 +57,8 @@ NEAR_PX = 4.0
 # are close together, a wrong K too leaves all matches within a few pixels of their lines.
 _FINE_PX = 1.5
 _CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
+#: A baseline from this on may be millimetres, where what it shows is as large.
+SUSPECT_BASELINE_M = 5.0
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -119,7 +122,8 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
 def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
     """A sentence where baseline and scene are both a thousand times too large, or ``None``.
 
-    Epipolar lines do not know the unit of a translation; only the size of what comes out does.
+    Epipolar lines do not know the unit of a translation; only the size of what comes out does. A baseline
+    above ``LONG_BASELINE_M`` was warned of when it was given.
 
     Args:
         tracks: of one right view.
@@ -128,7 +132,7 @@ def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
     baseline = float(np.linalg.norm(T[:3, 3]))
     inverse_depth = solve_inverse_depth(tracks, T[None])
     ahead = inverse_depth > 0
-    if baseline < 5.0 or ahead.sum() < 20:
+    if not SUSPECT_BASELINE_M <= baseline <= LONG_BASELINE_M or ahead.sum() < 20:
         return None
     depth_m = float(np.median(1.0 / inverse_depth[ahead]))
     if depth_m < 200.0 or depth_m / baseline > 200.0:

@@ -28,9 +28,9 @@ WEAK_CONFIDENCE, WEAK_MATCHED, WEAK_ORDER = 0.55, 0.4, 0.45
 LEAST_SPREAD = 0.15
 #: Points and matches that differ by these factors are said to; and cost trust.
 POINTS_SAID, POINTS_WRONG = math.log(1.08), math.log(1.2)
-#: A rig's baseline in metres lies between these, and a lens's horizontal field of view, in degrees: that of
-#: 135 mm and that of 10 mm in 35 mm equivalent.
-BASELINES_M, VIEWS_DEG = (1e-3, 20.0), (15.0, 120.0)
+#: A rig's baseline in metres is longer, and a lens's horizontal field of view lies between these, in degrees:
+#: that of 135 mm and that of 10 mm in 35 mm equivalent. Of a long baseline a warning tells when it is given.
+LEAST_BASELINE_M, VIEWS_DEG = 1e-3, (15.0, 120.0)
 #: No lens that keeps lines straight sees as much, degrees.
 TOO_WIDE_DEG = 150.0
 #: From this factor on it is said that a metric prior's own metres are others.
@@ -173,15 +173,10 @@ def _bad(signs: Signs) -> list[str]:
 
 def _odd(signs: Signs, trusted: bool) -> list[str]:
     found = []
-    if 0 < signs.baseline_m < BASELINES_M[0]:
+    if 0 < signs.baseline_m < LEAST_BASELINE_M:
         found.append(
             f"The baseline is {1000 * signs.baseline_m:.3g} mm: was it divided by 1000 once too often? "
             "Baselines and poses are in metres."
-        )
-    if signs.baseline_m > BASELINES_M[1]:
-        found.append(
-            f"The baseline is {signs.baseline_m:.4g} m. If that is millimetres, divide the translation by "
-            "1000."
         )
     if signs.view_deg < VIEWS_DEG[0] or VIEWS_DEG[1] < signs.view_deg <= TOO_WIDE_DEG:
         found.append(

@@ -81,6 +81,16 @@ def test_warnings_are_sentences(monkeypatch, geodiff, pair_files):
     assert "alpha" in lines[0] and "EXIF" in lines[1]
 
 
+def test_millimetres_of_a_further_view_are_told_once(monkeypatch, geodiff, pair_files):
+    monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", stop)
+    pose, third = pair_files.folder / "E.txt", pair_files.folder / "third.png"
+    np.savetxt(pose, np.eye(4) + 100.0 * np.eye(4, k=3))
+    Image.new("RGB", (64, 48)).save(third)
+    warned, interrupted = geodiff(*pair_files.command, "--view", third, "--view-E", pose).err.splitlines()
+    assert warned.startswith("warning: E[right view 2] has a baseline of 100 m.")
+    assert interrupted == "geodiff: interrupted"
+
+
 def test_a_focal_length_that_the_exif_of_a_photograph_contradicts(monkeypatch, geodiff, pair_files):
     monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", stop)
     exif = Image.Exif()

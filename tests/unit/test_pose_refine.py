@@ -234,11 +234,14 @@ def test_an_inexact_pose_of_near_cameras_is_no_wrong_intrinsics() -> None:
 
 def test_millimetres_show_in_the_size_of_the_scene_only() -> None:
     tracks, Ts, _ = make_tracks([TRUE])
-    in_mm = Ts[0].copy()
-    in_mm[:3, 3] *= 1000
-    assert np.allclose(residuals_px(tracks, Ts), residuals_px(tracks, in_mm[None]), atol=1e-4)
+    in_m, in_mm, far = Ts[0].copy(), Ts[0].copy(), Ts[0].copy()
+    in_m[:3, 3] *= 0.06  # a rig of 19 mm before a scene of 12 to 48 cm
+    in_mm[:3, 3] = 1000 * in_m[:3, 3]
+    far[:3, 3] = 1.1 * in_mm[:3, 3]
+    assert np.allclose(residuals_px(tracks, in_m[None]), residuals_px(tracks, in_mm[None]), atol=1e-4)
     assert "millimetres" in implausible_unit(tracks, in_mm)
-    assert implausible_unit(tracks, Ts[0]) is None
+    assert implausible_unit(tracks, in_m) is None
+    assert implausible_unit(tracks, far) is None, "beyond 20 m it was said when the pose was given"
 
 
 def bent(tracks: Tracks, px: float) -> Tracks:
