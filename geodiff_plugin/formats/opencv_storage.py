@@ -18,7 +18,7 @@ from geodiff_plugin.formats.structured import parse_json
 __all__ = ["is_storage", "parse_storage"]
 
 MATRIX = re.compile(
-    r"^[ \t]*(\w+)[ \t]*:[ \t]*!!opencv-matrix\s+"
+    r"^[ \t]*([\w.]+)[ \t]*:[ \t]*!!opencv-matrix\s+"
     r"rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\S+\s+data:\s*\[([^\]]*)\]",
     re.MULTILINE,
 )
@@ -26,8 +26,8 @@ JSON_MARK = '"opencv-matrix"'
 #: Older versions write 1. and .Nan into JSON, which has no such numbers.
 BARE_POINT = re.compile(r"(?<=\d)\.(?=[\s,\]}eE])")
 NOT_FINITE = re.compile(r"(-?)\.(Nan|Inf)")
-SEQUENCE = re.compile(r"^(\w+)[ \t]*:[ \t]*\[([^\]]*)\]", re.MULTILINE)
-SCALAR = re.compile(r"^(\w+)[ \t]*:[ \t]*([-+.\d]\S*)[ \t]*$", re.MULTILINE)
+SEQUENCE = re.compile(r"^([\w.]+)[ \t]*:[ \t]*\[([^\]]*)\]", re.MULTILINE)
+SCALAR = re.compile(r"^([\w.]+)[ \t]*:[ \t]*([-+.\d]\S*)[ \t]*$", re.MULTILINE)
 
 
 def is_storage(text: str) -> bool:

@@ -306,6 +306,77 @@ def test_opencv_malformed_matrices(tmp_path, entries, match):
         read_calibration(storage(cv2, tmp_path / "s.yml", **(good | entries)))
 
 
+STEREO = "K1 D1 K2 D2 R T"
+ALIASES = (
+    "cameraMatrix1 distCoeffs1 cameraMatrix2 distCoeffs2 R T",
+    "M1 D1 M2 D2 R T",
+    "K_left dist_left K_right dist_right R T",
+    "K_l D_l K_r D_r R t",
+    "Ml dl Mr dr R T",
+    "mtxL distL mtxR distR Rot Trans",
+    "cameraMatrixL distCoeffsL cameraMatrixR distCoeffsR RotationMatrix TranslationVector",
+    "camera_matrix_left dist_coeffs_left camera_matrix_right dist_coeffs_right rotation_matrix translation",
+    "left_camera_matrix left_distortion_coefficients right_camera_matrix right_distortion_coefficients R T",
+    "Camera_Matrix_1 Distortion_Coeffs_1 Camera_Matrix_2 Distortion_Coeffs_2 rotation Translation_Vector",
+)
+
+
+def stereo(cv2, path, names):
+    K1 = np.array([[700.0, 0, 320], [0, 702, 240], [0, 0, 1]])
+    K2 = np.array([[710.0, 0, 330], [0, 709, 236], [0, 0, 1]])
+    D1, D2 = np.array([[-0.2, 0.1, 0.001, 0.0, 0.0]]), np.array([[-0.1, 0.2, 0.0, 0.0, 0.0]])
+    R, T = rotation((0.2, 1, 0.1), 12.0), np.array([[-0.12], [0.02], [0.04]])
+    return storage(cv2, path, **dict(zip(names, (K1, D1, K2, D2, R, T), strict=True)), image_width=640)
+
+
+@pytest.mark.parametrize("names", ALIASES)
+@pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+def test_opencv_by_the_names_of_tutorials(tmp_path, names, suffix):
+    cv2 = pytest.importorskip("cv2")
+    expected = read_calibration(stereo(cv2, tmp_path / "a.yml", STEREO.split()), distorted=True)
+    assert expected.distortion[0].coefficients[0] == -0.2 and expected.distortion[1].coefficients[0] == -0.1
+    rig = read_calibration(stereo(cv2, tmp_path / f"b.{suffix}", names.split()), distorted=True)
+    for name in ("K_left", "K_right", "E"):
+        np.testing.assert_allclose(getattr(rig, name), getattr(expected, name), atol=1e-12)
+    for lens, other in zip(rig.distortion, expected.distortion, strict=True):
+        np.testing.assert_array_equal(lens.coefficients, other.coefficients)
+
+
+def test_projections_by_other_names_and_with_points_as_in_orb_slam(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    P = K @ np.eye(3, 4), K @ np.hstack([np.eye(3), [[-0.2], [0], [0]]])
+    sides = {"image_width": np.array([[640]]), "image_height": np.array([[480]])}
+    plain = storage(cv2, tmp_path / "plain.yml", LEFT_P=P[0], RIGHT_P=P[1])
+    settings = plain.read_text().replace("LEFT_P", "LEFT.P").replace("RIGHT_P", "RIGHT.P")
+    settings += "Camera.k1: 0.1\nLEFT.width: 640\nLEFT.height: 480\n"
+    paths = [
+        storage(cv2, tmp_path / "a.yml", projMatrixL=P[0], projMatrixR=P[1], **sides),
+        storage(cv2, tmp_path / "b.yml", PL=P[0], PR=P[1], k1=0.1, k2=0.2, p1=0.0, p2=0.3),
+        put(tmp_path, settings, "euroc.yaml"),
+    ]
+    for path in paths:
+        rig = read_calibration(path)
+        assert rig.rectified and rig.E[0, 3] == pytest.approx(0.2) and rig.K_left[0, 0] == 700
+        assert rig.size_left == (None if path.name == "b.yml" else (640, 480))
+
+
+def test_lens_distortion_by_an_unknown_name_is_no_pinhole(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    path = stereo(cv2, tmp_path / "s.yml", "K1 dist_of_left K2 dist_of_right R T".split())
+    with pytest.raises(ValueError, match="must be .* D1, D2; got dist_of_left, dist_of_right. Rename"):
+        read_calibration(path, distorted=True)
+
+
+def test_two_entries_of_one_meaning_that_differ(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    K, T = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]), np.array([[-0.12], [0], [0]])
+    good = {"K1": K, "K2": K, "R": np.eye(3), "T": T}
+    assert read_calibration(storage(cv2, tmp_path / "a.yml", **good, mtxL=K)).K_left[0, 0] == 700
+    with pytest.raises(ValueError, match=r"M1 in .*b.yml must be there once; got k1, mtxl, which differ"):
+        read_calibration(storage(cv2, tmp_path / "b.yml", **good, mtxL=np.diag([2, 2, 1]) @ K))
+
+
 def test_two_single_camera_files_are_no_rig(tmp_path):
     cv2 = pytest.importorskip("cv2")
     K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
