@@ -33,21 +33,36 @@ def _first(info: dict[str, Any], names: tuple[str, ...]) -> Any:
     return next((info[name] for name in names if name in info), None)
 
 
+def _size(info: dict[str, Any], path: Path) -> tuple[int, int] | None:
+    """``(width, height)``; ``None`` where the file has neither."""
+    given = {side: _first(info, (f"image_{side}", side)) for side in ("width", "height")}
+    if all(value is None for value in given.values()):
+        return None
+    width, height = (_whole(value, f"image_{side} in {path}") for side, value in given.items())
+    return width, height
+
+
+def _whole(value: Any, name: str) -> int:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or value < 1 or value % 1 != 0:  # infinity % 1 is NaN
+        cure = "It is what the images are checked against; leave out both sides where they are not known."
+        bad_value(name, "a whole number of pixels above 0", "none" if value is None else repr(value), cure)
+    return int(value)
+
+
 def _projection(file: CalibrationFile) -> tuple[np.ndarray, tuple[int, int] | None]:
     info = parse_yaml(file.text, file.path)
     matrix = _first(info, ("projection_matrix", "P", "p"))
     matrix = matrix.get("data") if isinstance(matrix, dict) else matrix
     if matrix is None:
         bad_value(f"{file.path}", "a camera_info with projection_matrix (or P)", "none", "Is it cut off?")
-    size = (_first(info, ("image_width", "width")), _first(info, ("image_height", "height")))
-    known = all(isinstance(side, int) and side > 0 for side in size)
     P = array_of(matrix, (3, 4), f"projection_matrix in {file.path}")
     if not P.any():
         refuse(
             f"{file.path} is of a camera that is not calibrated: its projection_matrix (P) is all zeros. "
             "Calibrate the pair (camera_calibration with two topics)."
         )
-    return P, size if known else None
+    return P, _size(info, file.path)
 
 
 def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
@@ -57,7 +72,8 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     right camera is ``-fx * baseline``, in metres.
 
     Raises:
-        ValueError: no projection, a camera that is not calibrated, or none of the two knows the other camera.
+        ValueError: no projection, a camera that is not calibrated, a size that is none, or none of the two
+            knows the other camera.
     """
     (P_left, size), (P_right, size_right) = (_projection(file) for file in files)
     source = " and ".join(str(file.path) for file in files)

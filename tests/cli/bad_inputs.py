@@ -202,6 +202,22 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "calib-json-nested": _calib('{"fx": ' + "[" * 100_000),
     "calib-json-missing": _calib('{"fx": 700}'),
     "calib-opencv-cut": _calib("%YAML:1.0\n---\nP1: !!opencv-matrix\n   rows: 3\n"),
+    "calib-opencv-other-names": _calib(OPENCV.format("A1", 3, 3, "60, 0, 31.5, 0, 60, 23.5, 0, 0, 1")),
+    "calib-opencv-other-lens": _calib(
+        "".join(OPENCV.format(name, 3, 3, "60, 0, 31.5, 0, 60, 23.5, 0, 0, 1") for name in ("K1", "K2"))
+        + OPENCV.format("R", 3, 3, "1, 0, 0, 0, 1, 0, 0, 0, 1")
+        + OPENCV.format("T", 3, 1, "-0.12, 0, 0")
+        + OPENCV.format("left_dist_vector", 1, 4, "-0.1, 0, 0, 0")
+    ),
+    "calib-ros-size": lambda f: [
+        *_calib(
+            f"image_width: '64'\nimage_height: 48\nP: [{P.format(0).replace(' ', ', ')}]\n"
+            "distortion_model: plumb_bob\n",
+            "l.yaml",
+        )(f),
+        *_calib(f"distortion_model: plumb_bob\nP: [{P.format(-84).replace(' ', ', ')}]\n", "r.yaml")(f)[2:],
+    ],
+    "distortion-of-rectified": _with("--distortion", "-0.1,0,0,0"),
     "calib-entities": _calib('<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage></opencv_storage>'),
     "calib-nerf-other-images": _calib(NERF.replace("left", "elsewhere")),
     "calib-nerf-lens": _calib(NERF.replace('"w"', '"camera_model": "EQUIRECTANGULAR", "w"')),

@@ -132,6 +132,23 @@ def test_ros_swapped_files_put_the_camera_on_the_other_side(reading):
     assert reading(factory.ROS_RIGHT, factory.ROS_LEFT).E[0, 3] == pytest.approx(-0.12)
 
 
+def test_ros_sizes_are_whole_numbers(reading):
+    def sized(width):
+        return reading(
+            *(text.replace(": 640", f": {width}") for text in (factory.ROS_LEFT, factory.ROS_RIGHT))
+        )
+
+    assert sized("640.0").size_left == sized("640.").size_right == (640, 480)
+    for width in ("'640'", "640.5", "0", "-640", ".nan", ".inf", "true", "", "[640]"):
+        with pytest.raises(ValueError, match=r"image_width in .* must be a whole number of pixels above 0"):
+            sized(width)
+    echoed = (factory.ROS_ECHO_LEFT, factory.ROS_ECHO_RIGHT)
+    without = [text.replace("width: 640\n", "").replace("height: 480\n", "") for text in echoed]
+    assert reading(*without).size_left is None
+    with pytest.raises(ValueError, match="image_height in .* got none"):
+        reading(*(text.replace("height: 480\n", "") for text in echoed))
+
+
 def test_kalibr_chain_of_three(reading):
     third = factory.KALIBR[factory.KALIBR.index("cam1:") :].replace("cam1:", "cam2:")
     rig = reading(factory.KALIBR + third.replace("-0.12", "-0.3"), cameras=(0, 2))
