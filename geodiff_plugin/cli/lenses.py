@@ -67,7 +67,8 @@ def lenses_of(arguments: DepthArguments, rig: Rig | None = None) -> Lenses:
             "--distortion",
             f"left out where the calibration is of rectified images ({rig.source})",
             " and ".join(arguments.distortion),
-            "Drop it and give the rectified images, or give K and E of the raw cameras (--K, --E).",
+            "Drop it and give the rectified images. If its numbers are of the raw cameras, give them as "
+            "--fx --fy --cx --cy --baseline (parallel cameras with one K), or as --K, --K-right and --E.",
         )
     own = (None, None) if rig is None else rig.distortion
     found = (typed[0], typed[-1]) if typed else own
