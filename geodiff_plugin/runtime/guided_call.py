@@ -110,6 +110,8 @@ class GuidedCall(_Stock):
     ) -> Any:
         if not isinstance(guidance, GeometryGuidance):
             bad_type("guidance", "a GeometryGuidance", guidance, "GeometryGuidance(right, K, E)")
+        if callback is not None and not callable(callback):
+            bad_type("callback_on_step_end", "a function", callback)
         if torch.is_inference_mode_enabled():
             raise RuntimeError(
                 "A guided call needs gradients, which torch.inference_mode() forbids; "
@@ -143,8 +145,9 @@ class GuidedCall(_Stock):
                 call["prompt_depth"] = prompt_of(evidence)
         warm = plan_warm_start(self, prior, guidance, call, grid.size)
         if warm is not None and warm.latents is not None:
-            # The latents hold the noise already. Beside latents Marigold takes no channels-last image.
-            call |= {"image": lefts_01, "latents": warm.latents, "generator": None}
+            call |= {"latents": warm.latents, "generator": None}  # the latents hold the noise already
+        if call["latents"] is not None:
+            call["image"] = lefts_01  # beside latents Marigold takes no channels-last image
         run = GuidedRun(
             self,
             prior,

@@ -18,19 +18,30 @@ from geodiff_plugin.runtime.noise_levels import check_scheduler
 
 __all__ = ["check_arguments", "check_guidable", "check_network_input", "check_offloading", "needs_network"]
 
+#: Ways of resampling that the stock pipeline takes.
+RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
+
 
 def check_arguments(call: Mapping[str, Any], images: int) -> None:
     """Refuse arguments of the call that no pipeline takes, in our own words.
+
+    What the stock pipeline refuses in a sentence that names the argument is left to it.
 
     Args:
         call: arguments of the stock call by name.
         images: number of left images.
 
     Raises:
-        TypeError, ValueError: another output type than ``"np"`` and ``"pt"``; an ensemble of no size; no
-            generator, or a list of another number than that of all members.
+        TypeError, ValueError: another output type than ``"np"`` and ``"pt"``; a number of steps, resolution,
+            batch or ensemble that is none; a way of resampling that does not exist; no generator, or a list
+            of another number than that of all members.
     """
     check_choice(call["output_type"], "output_type", ("np", "pt"))
+    check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
+    check_number(call["batch_size"], "batch_size", 1, 1 << 20, integer=True)
+    for name, least in (("num_inference_steps", 1), ("processing_resolution", 0)):
+        if call[name] is not None:
+            check_number(call[name], name, least, 1 << 20, integer=True)
     members = images * check_number(call["ensemble_size"], "ensemble_size", 1, 1 << 20, integer=True)
     given = call["generator"]
     generators = given if isinstance(given, list) else [] if given is None else [given]

@@ -143,6 +143,18 @@ def test_12_bits_in_16_are_told_once_of_either_image(make_pipeline, textured_pla
         ({"generator": []}, "got a list of 0"),
         ({"generator": 7}, "generator must be None, a torch.Generator or a list of them; got int"),
         ({"ensemble_size": 0}, "ensemble_size must be between 1"),
+        ({"batch_size": 0}, "batch_size must be between 1"),
+        ({"batch_size": None}, "batch_size must be an integer; got NoneType"),
+        ({"num_inference_steps": "4"}, "num_inference_steps must be an integer; got str"),
+        ({"num_inference_steps": 4.0}, "num_inference_steps must be an integer; got float"),
+        ({"processing_resolution": "768"}, "processing_resolution must be an integer; got str"),
+        ({"processing_resolution": -8}, "processing_resolution must be between 0"),
+        (
+            {"resample_method_input": "lanczos"},
+            "resample_method_input must be one of .* got 'lanczos'",
+        ),
+        ({"resample_method_input": None}, "resample_method_input must be one of area, .*; got None"),
+        ({"callback_on_step_end": 3}, "callback_on_step_end must be a function; got int"),
     ],
 )
 def test_other_arguments_are_checked_first_too(call, monkeypatch, arguments, message):
@@ -153,6 +165,14 @@ def test_other_arguments_are_checked_first_too(call, monkeypatch, arguments, mes
 
 def test_one_generator_for_every_member(call):
     assert call(LEFT, generator=[torch.Generator() for _ in range(3)], ensemble_size=3).scale.shape == (1, 3)
+
+
+def test_latents_go_with_any_form_of_the_image(call):
+    noise = torch.randn(1, 4, 24, 32, generator=torch.Generator().manual_seed(0))
+    forms = (Image.fromarray(LEFT), LEFT, FLOATS, [LEFT])
+    first, *others = (call(image, latents=noise, generator=None).prediction for image in forms)
+    for prediction in others:
+        np.testing.assert_array_equal(prediction, first)
 
 
 def test_without_guidance_the_errors_are_the_stock_ones(make_pipeline):
