@@ -57,7 +57,7 @@ NEAR_PX = 4.0
 # are close together, a wrong K too leaves all matches within a few pixels of their lines.
 _FINE_PX = 1.5
 _CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
-#: A baseline from this on may be millimetres, where what it shows is as large.
+#: A baseline from this on may be centimetres or millimetres, where what it shows is as large.
 SUSPECT_BASELINE_M = 5.0
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -120,10 +120,11 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
 
 
 def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
-    """A sentence where baseline and scene are both a thousand times too large, or ``None``.
+    """A sentence where baseline and scene are both a hundred or a thousand times too large, or ``None``.
 
     Epipolar lines do not know the unit of a translation; only the size of what comes out does. A baseline
-    above ``LONG_BASELINE_M`` was warned of when it was given.
+    above ``LONG_BASELINE_M`` was warned of when it was given. Nearer scenes are left in peace: from 100 m
+    above the ground a drone moves on by as much as centimetres taken for metres would be.
 
     Args:
         tracks: of one right view.
@@ -139,5 +140,5 @@ def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
         return None
     return (
         f"With a baseline of {baseline:.4g} m the matches lie {depth_m:.0f} m away in the median. "
-        "If the translation is in millimetres, divide it by 1000."
+        "If the translation is in centimetres, divide it by 100; if it is in millimetres, by 1000."
     )

@@ -239,7 +239,7 @@ def test_millimetres_show_in_the_size_of_the_scene_only() -> None:
     in_mm[:3, 3] = 1000 * in_m[:3, 3]
     far[:3, 3] = 1.1 * in_mm[:3, 3]
     assert np.allclose(residuals_px(tracks, in_m[None]), residuals_px(tracks, in_mm[None]), atol=1e-4)
-    assert "millimetres" in implausible_unit(tracks, in_mm)
+    assert "in centimetres, divide it by 100; if it is in millimetres" in implausible_unit(tracks, in_mm)
     assert implausible_unit(tracks, in_m) is None
     assert implausible_unit(tracks, far) is None, "beyond 20 m it was said when the pose was given"
 
