@@ -132,7 +132,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
 
     Raises:
         ValueError: no such images, no names, an entry that is missing or malformed, a ``camera_model`` that
-            OpenCV does not have.
+            OpenCV does not have, Mitsuba's axes.
 
     Source: data conventions of nerfstudio's documentation, its ``colmap_utils.py`` (intrinsics are written as
         COLMAP has them) and ``cameras.py`` (rays through pixel + 0.5); ``nerf_loader.cu`` of instant-ngp.
@@ -140,6 +140,9 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     path = files[0].path
     data = parse_json(files[0].text, path)
     frames = _frames(data, path)
+    if data.get("from_mitsuba"):
+        cure = "Its cameras have other axes: export camera-to-world matrices with y up and z backward."
+        bad_value(f"from_mitsuba in {path}", "false or left out", "true", cure)
     names = names_of_pair(frames, choice, path, "a transforms.json")
     places = [f"{name} in {path}" for name in names]
     left, right = (

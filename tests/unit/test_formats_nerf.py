@@ -174,6 +174,11 @@ def test_fisheyes(reading, data, said):
         reading(given, distorted=False)
 
 
+def test_axes_of_mitsuba_are_refused(reading, data):
+    with pytest.raises(InputError, match="from_mitsuba in .* y up and z backward"):
+        reading(data | {"from_mitsuba": True})
+
+
 @pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", None])
 def test_models_of_a_pinhole(reading, data, model):
     given = without(data, "camera_model") | ({} if model is None else {"camera_model": model})
