@@ -200,7 +200,8 @@ def _refine_once(
     normal = torch.einsum("bpi,bp,bpj->bij", J, weight, J)
     gradient = torch.einsum("bpi,bp,bp->bi", J, weight, residual)
     diagonal = normal.diagonal(dim1=1, dim2=2)
-    damped = normal + torch.diag_embed(1e-6 * diagonal + 1e-12 * diagonal.sum(1, keepdim=True) + 1e-20)
+    # Enough for float32 where one point leaves a direction open; with less its rounding decides there.
+    damped = normal + torch.diag_embed(1e-4 * diagonal + 1e-12 * diagonal.sum(1, keepdim=True) + 1e-20)
     free = ends - torch.linalg.solve_ex(damped, gradient).result  # unchecked: a check waits for the device
     bound = torch.minimum(torch.maximum(free, bounds[0]), bounds[1])
     # Where one end is stopped by its bound, the other one is the best for that.
