@@ -17,14 +17,13 @@ import numpy as np
 
 from geodiff_plugin.formats.atomic import atomic_path
 from geodiff_plugin.formats.pointcloud import Cloud
+from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 
 __all__ = ["write_glb"]
 
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 ARRAY_BUFFER, ELEMENT_BUFFER, FLOAT, UNSIGNED_BYTE, UNSIGNED_INT = 34962, 34963, 5126, 5121, 5125
 POINTS, LINES = 0, 1
-#: glTF has y up and looks along -z, we have y down and look along +z.
-GLTF_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 #: A camera's pyramid is drawn to this share of the cloud's median depth.
 PYRAMID_SHARE = 0.08
 CAMERA_COLOURS = ((255, 255, 255), (255, 170, 0), (0, 200, 255), (160, 255, 120))
@@ -60,7 +59,7 @@ class _Buffer:
 
     def vertices(self, points_m: np.ndarray, colours: np.ndarray) -> dict[str, int]:
         """Attributes of coloured vertices given in the left camera's frame."""
-        positions = (points_m @ GLTF_FROM_CAMERA).astype("<f4")
+        positions = (points_m @ OPENGL_FROM_OPENCV[:3, :3]).astype("<f4")
         opaque = np.full((len(colours), 1), 255, dtype=np.uint8)
         bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
         rgba = np.ascontiguousarray(np.hstack([colours.astype(np.uint8), opaque]))

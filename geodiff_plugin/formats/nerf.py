@@ -18,6 +18,7 @@ from geodiff_plugin.formats.image_names import names_of_pair
 from geodiff_plugin.formats.lenses import NO_MODEL, FactoryCamera, lens_of, rig_of_cameras
 from geodiff_plugin.formats.rigs import check_rigid, finite, intrinsics, positive
 from geodiff_plugin.formats.structured import array_of, entry, parse_json
+from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.types import Distortion, Rig
 
 __all__ = ["MARK", "NERF", "matches", "read"]
@@ -39,8 +40,6 @@ LENSES = {
 }
 #: The order of nerfstudio's ``distortion_params``.
 PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
-#: From OpenCV's camera frame (y down, z forward) to OpenGL's (y up, z backward).
-OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 Size = tuple[int, int]
 

@@ -72,8 +72,8 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     right camera is ``-fx * baseline``, in metres.
 
     Raises:
-        ValueError: no projection, a camera that is not calibrated, a size that is none, or none of the two
-            knows the other camera.
+        ValueError: no projection, a camera that is not calibrated, a size that is no whole number of
+            pixels, or none of the two knows the other camera.
     """
     (P_left, size), (P_right, size_right) = (_projection(file) for file in files)
     source = " and ".join(str(file.path) for file in files)

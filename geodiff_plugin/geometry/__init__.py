@@ -5,6 +5,7 @@ Paper: S3.3, S7.2.
 """
 
 from geodiff_plugin.geometry.cameras import (
+    OPENGL_FROM_OPENCV,
     image_size,
     invert_rigid,
     is_rectified,
@@ -26,6 +27,7 @@ from geodiff_plugin.geometry.warping import Warped, hidden_in_right, sample_at, 
 
 __all__ = [
     "NEAREST_M",
+    "OPENGL_FROM_OPENCV",
     "PlaneRays",
     "Warped",
     "hidden_in_right",

@@ -6,9 +6,11 @@ Paper: S3.3, S7.2 Eq. 25 (eq:forward-warp_supp).
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 __all__ = [
+    "OPENGL_FROM_OPENCV",
     "invert_rigid",
     "is_rectified",
     "nearest_rotation",
@@ -19,6 +21,9 @@ __all__ = [
 
 #: Two cameras count as rectified to a milliradian, and to a baseline that is sideways to 1 %.
 ANGLE_TOLERANCE, SIDEWAYS_TOLERANCE = 1e-3, 0.01
+#: ``(4, 4)``, from a camera's frame with y down and z forward to one with y up and z backward, and back.
+#: OpenGL, Blender, NeRF and glTF use the latter.
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def image_size(image: torch.Tensor) -> tuple[int, int]:

@@ -43,7 +43,7 @@ class EstimatedRig:
         inliers: matches that each right view's pose explains.
         parallax_deg: median angle between the two rays of a point, one a right view.
         residual_px: median distance of the inliers from their epipolar lines, one a right view.
-        depth_spread: relative standard deviation of depth by errors of the poses, in the median of the
+        depth_spread: relative standard deviation of depth caused by errors of the poses, in the median of the
             matches; ``None`` for a rectified pair, whose pose is taken as exact.
         scale: where the unit comes from.
         notes: sentences about what was assumed.
@@ -199,5 +199,5 @@ def estimate_rig(
         spread,
         scale,
         tuple(notes),
-        (*(s for pose in poses for s in pose.warnings), *open_pose(spread or 0.0), *scale.warnings),
+        (*(s for pose in poses for s in pose.warnings), *open_pose(spread), *scale.warnings),
     )

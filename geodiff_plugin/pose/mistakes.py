@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from geodiff_plugin._camera_checks import LONG_BASELINE_M
+from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
 __all__ = ["INVERSE", "find_mistake", "implausible_unit"]
@@ -59,7 +60,6 @@ _FINE_PX = 1.5
 _CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
 #: A baseline from this on may be centimetres or millimetres, where what it shows is as large.
 SUSPECT_BASELINE_M = 5.0
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def _share(tracks: Tracks, T: np.ndarray, near_px: float = NEAR_PX) -> float:
@@ -85,8 +85,8 @@ def _refocused(K: np.ndarray, factor: float) -> np.ndarray:
 def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np.ndarray]]:
     inverse = np.linalg.inv(T)
     yield INVERSE, tracks, inverse
-    yield _OPENGL, tracks, _FLIP @ T @ _FLIP
-    yield _OPENGL_INVERSE, tracks, _FLIP @ inverse @ _FLIP
+    yield _OPENGL, tracks, OPENGL_FROM_OPENCV @ T @ OPENGL_FROM_OPENCV
+    yield _OPENGL_INVERSE, tracks, OPENGL_FROM_OPENCV @ inverse @ OPENGL_FROM_OPENCV
     E, turned, mixed = inverse.copy(), inverse.copy(), inverse.copy()
     turned[:3, :3] = E[:3, :3].T
     yield _TRANSPOSED, tracks, np.linalg.inv(turned)

@@ -86,14 +86,19 @@ class Whitened:
         return np.maximum(np.linalg.norm(self.by_depth, axis=1), 1e-12)
 
     @cached_property
+    def along(self) -> np.ndarray:
+        """``(N, n)``, direction of ``by_depth``."""
+        return self.by_depth / self.slopes[:, None]
+
+    @cached_property
     def depth_by_pose(self) -> np.ndarray:
         """``(N, 6V)``: what a step does to the inverse depth, times minus ``slopes``."""
-        return np.einsum("nk,nkp->np", self.by_depth / self.slopes[:, None], self.by_pose)
+        return np.einsum("nk,nkp->np", self.along, self.by_pose)
 
     @cached_property
     def left_by_pose(self) -> np.ndarray:
         """``(N, n, 6V)``: what of ``by_pose`` no change of depth makes up for."""
-        return self.by_pose - (self.by_depth / self.slopes[:, None])[..., None] * self.depth_by_pose[:, None]
+        return self.by_pose - self.along[..., None] * self.depth_by_pose[:, None]
 
 
 def whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> Whitened:

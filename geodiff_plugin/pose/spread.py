@@ -21,7 +21,7 @@ MOST_SPREAD = 0.06
 
 
 def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
-    """The relative standard deviation of the depth of a track, in the median, by errors of free poses.
+    """The relative standard deviation of the depth of a track, in the median, caused by errors of free poses.
 
     Args:
         tracks: of V right views, those that the poses explain and some that they do not.
@@ -49,9 +49,9 @@ def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
     return float(np.median(np.einsum("np,pq,nq->n", by_step, covariance, by_step)) ** 0.5)
 
 
-def open_pose(spread: float) -> tuple[str, ...]:
-    """A sentence where the matches leave an estimated pose, and with it the depth, open."""
-    if spread <= MOST_SPREAD:
+def open_pose(spread: float | None) -> tuple[str, ...]:
+    """A sentence where the matches leave an estimated pose, and so the depth, open; none for ``None``."""
+    if spread is None or spread <= MOST_SPREAD:
         return ()
     return (
         f"The matches leave the estimated pose open: by it alone depths may be off by {100 * spread:.0f} % "

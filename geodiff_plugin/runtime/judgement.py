@@ -29,7 +29,7 @@ LEAST_SPREAD = 0.15
 #: Points and matches that differ by these factors are said to; and cost trust.
 POINTS_SAID, POINTS_WRONG = math.log(1.08), math.log(1.2)
 #: A rig's baseline in metres is longer, and a lens's horizontal field of view lies between these, in degrees:
-#: that of 135 mm and that of 10 mm in 35 mm equivalent. Of a long baseline a warning tells when it is given.
+#: that of 135 mm and that of 10 mm in 35 mm equivalent. A long baseline is warned of when it is given.
 LEAST_BASELINE_M, VIEWS_DEG = 1e-3, (15.0, 120.0)
 #: No lens that keeps lines straight sees as much, degrees.
 TOO_WIDE_DEG = 150.0

@@ -32,9 +32,9 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
         images: number of left images.
 
     Raises:
-        TypeError, ValueError: another output type than ``"np"`` and ``"pt"``; a number of steps, resolution,
-            batch or ensemble that is none; a way of resampling that does not exist; no generator, or a list
-            of another number than that of all members.
+        TypeError, ValueError: another output type than ``"np"`` and ``"pt"``; a number of steps, a
+            resolution, a batch or ensemble size that is no whole number or too small; a way of resampling
+            that does not exist; no generator, or a list of another number than that of all members.
     """
     check_choice(call["output_type"], "output_type", ("np", "pt"))
     check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)

@@ -186,8 +186,8 @@ def _refine_once(
     shares = torch.stack([1.0 - values, values], -1)  # (B, P, 2)
     v, gap = (shares @ ends[:, :, None])[..., 0], (ends[:, 1:] - ends[:, :1]).abs()
     h = 1e-3 * torch.maximum(gap, 1e-2 * ends.abs().amax(1, keepdim=True))
-    # The noise is that of where the map puts a match: by where the match lies, the near ones of two that err
-    # alike would count for more.
+    # A match's relative noise is taken at the map's depth. At the match's own, of two far matches with
+    # opposite errors the one that comes out nearer would count for more.
     mapped = (-log_depth(v)).exp()
     above = mapped + fitted.noise
     residual = ((fitted.inverse + fitted.noise) / above).log().clamp(-1.0, 1.0)
@@ -200,7 +200,7 @@ def _refine_once(
     normal = torch.einsum("bpi,bp,bpj->bij", J, weight, J)
     gradient = torch.einsum("bpi,bp,bp->bi", J, weight, residual)
     diagonal = normal.diagonal(dim1=1, dim2=2)
-    # Enough for float32 where one point leaves a direction open; with less its rounding decides there.
+    # One point alone leaves a direction open. Damped less, float32's rounding errors choose along it.
     damped = normal + torch.diag_embed(1e-4 * diagonal + 1e-12 * diagonal.sum(1, keepdim=True) + 1e-20)
     free = ends - torch.linalg.solve_ex(damped, gradient).result  # unchecked: a check waits for the device
     bound = torch.minimum(torch.maximum(free, bounds[0]), bounds[1])

@@ -6,7 +6,7 @@ Paper: none; ``l1l2`` is the loss of Marigold-DC (Viola et al. 2024, Eq. 4).
 
 from __future__ import annotations
 
-import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.terms.base import Estimate, cauchy, masked_mean
@@ -14,8 +14,8 @@ from geodiff_plugin.guidance.presets import DEFAULT
 
 __all__ = ["points"]
 
-# A point that is met to this share of the unit, float32's rounding, pulls no more: a rule that gives every
-# gradient the same length would follow the sign of the rounding.
+# Errors up to this share of the unit are float32's rounding and pull no more: a rule that gives every
+# gradient the same length would follow their sign.
 _MET = 1e-3
 
 
@@ -42,8 +42,7 @@ def points(
     assert target is not None  # of Term.needs_points
     if points_loss == "robust":
         e = (1.0 / estimate.depth_m - target.inverse_depth) / target.plane_step.view(-1, 1, 1, 1)
-        e = torch.where(e.abs() < _MET, torch.zeros_like(e), e)
-        return masked_mean(cauchy(e, points_cauchy), target.confidence)
+        return masked_mean(cauchy(F.hardshrink(e, _MET), points_cauchy), target.confidence)
     known = target.confidence > 0
     e = (estimate.depth_m - 1.0 / target.inverse_depth.where(known, target.inverse_depth.new_ones(()))).abs()
     return masked_mean(e + e * e, known)
