@@ -15,11 +15,11 @@ import numpy as np
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
 from geodiff_plugin.formats.lenses import FactoryCamera, lens_of, rig_of_cameras
-from geodiff_plugin.formats.rigs import check_rigid, intrinsics, pose_from_world_to_camera
+from geodiff_plugin.formats.rigs import check_rigid, intrinsics, pose_from_world_to_camera, whole_pixels
 from geodiff_plugin.formats.structured import array_of, entry, parse_yaml
 from geodiff_plugin.types import Distortion, Rig
 
-__all__ = ["KALIBR", "matches", "read"]
+__all__ = ["KALIBR", "matches", "pinhole_camera", "read"]
 
 MARK = re.compile(r"^cam\d+:\s*(?:#.*)?$", re.MULTILINE)
 #: OpenCV's name of a distortion model.
@@ -32,26 +32,43 @@ def matches(text: str, path: Path) -> bool:
     return MARK.search(text) is not None
 
 
-def _lens(camera: dict[str, Any], where: str) -> Distortion | None:
-    name = f"distortion_coeffs of {where}"
-    coefficients = array_of(entry(camera, "distortion_coeffs", where), (-1,), name)
+def _lens(camera: dict[str, Any], key: str, models: dict[str, str], where: str) -> Distortion | None:
+    name = f"{key} of {where}"
+    coefficients = array_of(entry(camera, key, where), (-1,), name)
     model = entry(camera, "distortion_model", where)
     if model == "none":
         return None
-    if model not in LENSES:
-        bad_value(f"distortion_model of {where}", f"one of {', '.join(LENSES)}, none", repr(model), CURE)
-    return lens_of(array_of(coefficients, (4,), name), name, LENSES[model])
+    if model not in models:
+        bad_value(f"distortion_model of {where}", f"one of {', '.join(models)}, none", repr(model), CURE)
+    return lens_of(array_of(coefficients, (4,), name), name, models[model])
 
 
-def _camera(chain: dict[str, Any], name: str, path: Path) -> FactoryCamera:
-    where = f"{name} in {path}"
-    camera = entry(chain, name, f"{path}")
+def pinhole_camera(
+    camera: dict[str, Any], where: str, coefficients: str, models: dict[str, str]
+) -> FactoryCamera:
+    """A camera of ``camera_model``, ``intrinsics``, ``resolution`` and ``distortion_model``.
+
+    Args:
+        camera: its entries.
+        where: for messages.
+        coefficients: the name of the entry with those of its lens.
+        models: OpenCV's name of each ``distortion_model``.
+
+    Raises:
+        ValueError: an entry is missing or malformed, or another model of a camera or a lens.
+    """
     model = entry(camera, "camera_model", where)
     if model != "pinhole":
         bad_value(f"camera_model of {where}", "pinhole", repr(model), CURE)
     numbers = array_of(entry(camera, "intrinsics", where), (4,), f"intrinsics of {where}")
-    width, height = array_of(entry(camera, "resolution", where), (2,), f"resolution of {where}")
-    return FactoryCamera(intrinsics(*numbers), (int(width), int(height)), _lens(camera, where))
+    name = f"resolution of {where}"
+    width, height = (whole_pixels(n, name) for n in array_of(entry(camera, "resolution", where), (2,), name))
+    return FactoryCamera(intrinsics(*numbers), (width, height), _lens(camera, coefficients, models, where))
+
+
+def _camera(chain: dict[str, Any], name: str, path: Path) -> FactoryCamera:
+    camera = entry(chain, name, f"{path}")
+    return pinhole_camera(camera, f"{name} in {path}", "distortion_coeffs", LENSES)
 
 
 def _from_first(chain: dict[str, Any], number: int, path: Path) -> np.ndarray:

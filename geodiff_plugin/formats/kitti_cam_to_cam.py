@@ -14,7 +14,7 @@ import numpy as np
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
 from geodiff_plugin.formats.kitti_cameras import choose_cameras
-from geodiff_plugin.formats.rigs import make_rig, pose_from_projections
+from geodiff_plugin.formats.rigs import make_rig, pose_from_projections, whole_pixels
 from geodiff_plugin.types import Rig
 
 __all__ = ["KITTI_CAM_TO_CAM", "kitti_row", "matches", "read"]
@@ -70,7 +70,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
 def _size(text: str, key: str, path: Path) -> tuple[int, int] | None:
     if key not in text:
         return None
-    width, height = (int(value) for value in kitti_row(text, key, 2, path))
+    width, height = (whole_pixels(value, f"{key} in {path}") for value in kitti_row(text, key, 2, path))
     return width, height
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.rigs import make_rig, pose_to_the_right, positive
+from geodiff_plugin.formats.rigs import make_rig, pose_to_the_right, positive, whole_pixels
 from geodiff_plugin.types import Rig
 
 __all__ = ["MIDDLEBURY", "matches", "read"]
@@ -95,7 +95,7 @@ def _number(value: str, name: str) -> float:
 def _size(entries: dict[str, str], path: Path) -> tuple[int, int] | None:
     if "width" not in entries or "height" not in entries:
         return None
-    width, height = (int(positive(entries[key], f"{key} in {path}")) for key in ("width", "height"))
+    width, height = (whole_pixels(entries[key], f"{key} in {path}") for key in ("width", "height"))
     return width, height
 
 

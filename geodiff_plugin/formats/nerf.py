@@ -16,7 +16,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
 from geodiff_plugin.formats.image_names import names_of_pair
 from geodiff_plugin.formats.lenses import NO_MODEL, FactoryCamera, lens_of, rig_of_cameras
-from geodiff_plugin.formats.rigs import check_rigid, finite, intrinsics, positive
+from geodiff_plugin.formats.rigs import check_rigid, finite, intrinsics, positive, whole_pixels
 from geodiff_plugin.formats.structured import array_of, entry, parse_json
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.types import Distortion, Rig
@@ -97,7 +97,7 @@ def _focal_px(frame: dict[str, Any], axis: str, side: int, where: str) -> float 
 def _camera(frame: dict[str, Any], image_size: Size | None, where: str) -> FactoryCamera:
     size: Size | None = image_size
     if "w" in frame and "h" in frame:
-        width, height = (int(positive(frame[key], f"{key} of {where}")) for key in "wh")
+        width, height = (whole_pixels(frame[key], f"{key} of {where}") for key in "wh")
         size = (width, height)
     if size is None:
         bad_value(where, "entries 'w' and 'h'", "none", "Give image_size, the (width, height) of the images.")

@@ -15,7 +15,7 @@ import numpy as np
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
 from geodiff_plugin.formats.lenses import NO_MODEL, FactoryCamera, lens_of, rig_of_cameras, scaled_to
-from geodiff_plugin.formats.rigs import check_rigid, pose_to_the_right
+from geodiff_plugin.formats.rigs import check_rigid, pose_to_the_right, whole_pixels
 from geodiff_plugin.formats.structured import array_of, entry, parse_json
 from geodiff_plugin.types import Distortion, Rig
 
@@ -47,7 +47,9 @@ def _camera(cameras: dict[int, dict[str, Any]], socket: int, path: Path) -> Fact
         bad_value("cameras", f"sockets of {path} ({', '.join(map(str, sorted(cameras)))})", socket)
     camera = cameras[socket]
     K = array_of(entry(camera, "intrinsicMatrix", where), (3, 3), f"intrinsicMatrix of {where}")
-    width, height = (int(array_of(entry(camera, key, where), (1,), key)[0]) for key in ("width", "height"))
+    width, height = (
+        whole_pixels(entry(camera, key, where), f"{key} of {where}") for key in ("width", "height")
+    )
     return FactoryCamera(K, (width, height))
 
 

@@ -12,8 +12,10 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
+from geodiff_plugin.formats.euroc import MARK as EUROC_MARK
 from geodiff_plugin.formats.lenses import lens_of
 from geodiff_plugin.formats.opencv_storage import is_storage, parse_storage
+from geodiff_plugin.formats.orb_slam import matches as is_orb_slam
 from geodiff_plugin.formats.rigs import check_rigid, make_rig, pose_from_projections
 from geodiff_plugin.types import Distortion, Rig
 
@@ -54,8 +56,9 @@ NUMBERS = ("image_width", "image_height")
 
 
 def matches(text: str, path: Path) -> bool:
-    """Whether OpenCV wrote it and it is not Booster's."""
-    return is_storage(text) and "proj_matL" not in text
+    """Whether it is written as OpenCV does and no other program's."""
+    others = "proj_matL" in text or EUROC_MARK.search(text) is not None or is_orb_slam(text, path)
+    return is_storage(text) and not others
 
 
 def _plain(key: str) -> str:

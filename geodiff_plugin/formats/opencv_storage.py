@@ -27,7 +27,7 @@ JSON_MARK = '"opencv-matrix"'
 BARE_POINT = re.compile(r"(?<=\d)\.(?=[\s,\]}eE])")
 NOT_FINITE = re.compile(r"(-?)\.(Nan|Inf)")
 SEQUENCE = re.compile(r"^([\w.]+)[ \t]*:[ \t]*\[([^\]]*)\]", re.MULTILINE)
-SCALAR = re.compile(r"^([\w.]+)[ \t]*:[ \t]*([-+.\d]\S*)[ \t]*$", re.MULTILINE)
+SCALAR = re.compile(r"^([\w.]+)[ \t]*:[ \t]*([-+.\d][^\s#]*)[ \t]*(?:#.*)?$", re.MULTILINE)
 
 
 def is_storage(text: str) -> bool:

@@ -20,6 +20,7 @@ from geodiff_plugin._checks import FolderError, bad_type, bad_value, check_numbe
 from geodiff_plugin.formats.booster import BOOSTER
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
 from geodiff_plugin.formats.colmap import COLMAP
+from geodiff_plugin.formats.euroc import EUROC
 from geodiff_plugin.formats.files import read_text
 from geodiff_plugin.formats.foundation_stereo import FOUNDATION_STEREO
 from geodiff_plugin.formats.kalibr import KALIBR
@@ -30,6 +31,7 @@ from geodiff_plugin.formats.mvsnet import MVSNET
 from geodiff_plugin.formats.nerf import NERF
 from geodiff_plugin.formats.oak import OAK
 from geodiff_plugin.formats.opencv import OPENCV
+from geodiff_plugin.formats.orb_slam import ORB_SLAM
 from geodiff_plugin.formats.realsense import REALSENSE
 from geodiff_plugin.formats.rigs import check_no_distortion
 from geodiff_plugin.formats.ros import ROS
@@ -54,6 +56,8 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "oak": OAK,
     "ros": ROS,
     "kalibr": KALIBR,
+    "euroc": EUROC,
+    "orb_slam": ORB_SLAM,
     "colmap": COLMAP,
     "nerf": NERF,
 }

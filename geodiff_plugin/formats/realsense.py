@@ -16,7 +16,7 @@ import numpy as np
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
 from geodiff_plugin.formats.lenses import NO_MODEL, FactoryCamera, lens_of, rig_of_cameras
-from geodiff_plugin.formats.rigs import check_rigid, intrinsics, is_distorted, positive
+from geodiff_plugin.formats.rigs import check_rigid, intrinsics, is_distorted, positive, whole_pixels
 from geodiff_plugin.formats.structured import array_of, entry, parse_json
 from geodiff_plugin.types import Distortion, Rig
 
@@ -77,7 +77,7 @@ def _camera(values: dict[str, Any], where: str) -> FactoryCamera:
     fx, fy = (positive(entry(values, key, where), f"{key} of {where}") for key in ("fx", "fy"))
     cx, cy = array_of([entry(values, key, where) for key in ("ppx", "ppy")], (2,), f"ppx, ppy of {where}")
     width, height = (
-        int(positive(entry(values, key, where), f"{key} of {where}")) for key in ("width", "height")
+        whole_pixels(entry(values, key, where), f"{key} of {where}") for key in ("width", "height")
     )
     return FactoryCamera(intrinsics(fx, fy, cx, cy), (width, height), _lens(values, where))
 

@@ -30,6 +30,7 @@ __all__ = [
     "pose_to_the_right",
     "positive",
     "rig_from_parameters",
+    "whole_pixels",
 ]
 
 #: Coefficients below this move no pixel of a 12 megapixel image by a tenth of a pixel.
@@ -56,6 +57,22 @@ def positive(value: Any, name: str) -> float:
     if not (np.isfinite(number) and number > 0):
         bad_value(name, "a finite number above 0", number, "Check the calibration file.")
     return number
+
+
+def whole_pixels(value: Any, name: str) -> int:
+    """A side of an image, as int; ``640.0`` is one too.
+
+    Raises:
+        ValueError: it is not a whole number above 0.
+    """
+    try:
+        number = 0.0 if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = 0.0
+    if not number >= 1 or number % 1 != 0:  # infinity % 1 is NaN
+        cure = "The images are checked against it; leave out both sides where they are not known."
+        bad_value(name, "a whole number of pixels above 0", "none" if value is None else repr(value), cure)
+    return int(number)
 
 
 def finite(value: Any, name: str) -> float:

@@ -14,8 +14,9 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
+from geodiff_plugin.formats.euroc import MARK as EUROC_MARK
 from geodiff_plugin.formats.kalibr import MARK as KALIBR_MARK
-from geodiff_plugin.formats.rigs import make_rig, pose_from_projections
+from geodiff_plugin.formats.rigs import make_rig, pose_from_projections, whole_pixels
 from geodiff_plugin.formats.structured import array_of, parse_yaml
 from geodiff_plugin.types import Rig
 
@@ -26,7 +27,8 @@ MARK = re.compile(r"^(projection_matrix|distortion_model|rectification_matrix)\s
 
 def matches(text: str, path: Path) -> bool:
     """Whether a line at the margin is an entry of ``camera_info`` that no other format has there."""
-    return MARK.search(text) is not None and not KALIBR_MARK.search(text) and "!!opencv-matrix" not in text
+    others = any(mark.search(text) for mark in (KALIBR_MARK, EUROC_MARK)) or "!!opencv-matrix" in text
+    return MARK.search(text) is not None and not others
 
 
 def _first(info: dict[str, Any], names: tuple[str, ...]) -> Any:
@@ -38,16 +40,8 @@ def _size(info: dict[str, Any], path: Path) -> tuple[int, int] | None:
     given = {side: _first(info, (f"image_{side}", side)) for side in ("width", "height")}
     if all(value is None for value in given.values()):
         return None
-    width, height = (_whole(value, f"image_{side} in {path}") for side, value in given.items())
+    width, height = (whole_pixels(value, f"image_{side} in {path}") for side, value in given.items())
     return width, height
-
-
-def _whole(value: Any, name: str) -> int:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not number or value < 1 or value % 1 != 0:  # infinity % 1 is NaN
-        cure = "It is what the images are checked against; leave out both sides where they are not known."
-        bad_value(name, "a whole number of pixels above 0", "none" if value is None else repr(value), cure)
-    return int(value)
 
 
 def _projection(file: CalibrationFile) -> tuple[np.ndarray, tuple[int, int] | None]:

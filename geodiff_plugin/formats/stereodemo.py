@@ -11,7 +11,14 @@ from pathlib import Path
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
 from geodiff_plugin.formats.nerf import MARK as NERF_MARK
-from geodiff_plugin.formats.rigs import finite, intrinsics, make_rig, pose_to_the_right, positive
+from geodiff_plugin.formats.rigs import (
+    finite,
+    intrinsics,
+    make_rig,
+    pose_to_the_right,
+    positive,
+    whole_pixels,
+)
 from geodiff_plugin.formats.structured import parse_json
 from geodiff_plugin.types import Rig
 
@@ -45,7 +52,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     baseline_m = positive(numbers["baseline_meters"], f"baseline_meters in {path}")
     size = None
     if "width" in data and "height" in data:
-        width, height = (int(positive(data[key], f"{key} in {path}")) for key in ("width", "height"))
+        width, height = (whole_pixels(data[key], f"{key} in {path}") for key in ("width", "height"))
         size = (width, height)
     focal, cy = (numbers["fx"], numbers["fy"]), numbers["cy"]
     K_left, K_right = (intrinsics(*focal, numbers[cx], cy) for cx in ("cx0", "cx1"))

@@ -211,7 +211,7 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     ),
     "calib-ros-size": lambda f: [
         *_calib(
-            f"image_width: '64'\nimage_height: 48\nP: [{P.format(0).replace(' ', ', ')}]\n"
+            f"image_width: 64.5\nimage_height: 48\nP: [{P.format(0).replace(' ', ', ')}]\n"
             "distortion_model: plumb_bob\n",
             "l.yaml",
         )(f),

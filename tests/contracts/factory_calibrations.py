@@ -191,6 +191,85 @@ cam1:
   rostopic: /cam1/image_raw
 """
 
+# EuRoC: each camera's pose in the body's frame, whose x axis is the cameras' z.
+_EUROC = """# General sensor definitions.
+sensor_type: camera
+comment: VI-Sensor cam (MT9M034)
+
+# Sensor extrinsics wrt. the body-frame.
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0, 0.0, 1.0, 0.3,
+         -1.0, 0.0, 0.0, {y},
+         0.0, -1.0, 0.0, 0.2,
+         0.0, 0.0, 0.0, 1.0]
+
+# Camera specific definitions.
+rate_hz: 20
+resolution: [640, 480]
+camera_model: pinhole
+intrinsics: [700.0, 700.0, 300.0, 200.0] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [0.0, 0.0, 0.0, 0.0]
+"""
+EUROC_LEFT, EUROC_RIGHT = _EUROC.format(y=0.06), _EUROC.format(y=-0.06)
+
+# ORB-SLAM3's settings of version 1.0, and those before it of rectified images.
+ORB_SLAM = """%YAML:1.0
+
+File.version: "1.0"
+
+Camera.type: "PinHole"
+
+# Left camera
+Camera1.fx: 700.0
+Camera1.fy: 700.0 # pixels
+Camera1.cx: 300.0
+Camera1.cy: 200.0
+Camera1.k1: 0.0
+Camera1.k2: 0.0
+Camera1.p1: 0.0
+Camera1.p2: 0.0
+
+Camera2.fx: 700.0
+Camera2.fy: 700.0
+Camera2.cx: 300.0
+Camera2.cy: 200.0
+
+Camera.width: 640
+Camera.height: 480
+Camera.fps: 20
+
+Stereo.T_c1_c2: !!opencv-matrix
+  rows: 4
+  cols: 4
+  dt: f
+  data: [1.0, 0.0, 0.0, 0.12,
+         0.0, 1.0, 0.0, 0.0,
+         0.0, 0.0, 1.0, 0.0,
+         0.0, 0.0, 0.0, 1.0]
+"""
+ORB_SLAM_RECTIFIED = """%YAML:1.0
+Camera.fx: 700.0
+Camera.fy: 700.0
+Camera.cx: 300.0
+Camera.cy: 200.0
+
+Camera.k1: 0.0
+Camera.k2: 0.0
+Camera.p1: 0.0
+Camera.p2: 0.0
+
+Camera.width: 640
+Camera.height: 480
+
+# stereo baseline times fx
+Camera.bf: 84.0
+
+ThDepth: 35 # times the baseline
+"""
+
 COLMAP_CAMERAS = """# Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
 # Number of cameras: 1

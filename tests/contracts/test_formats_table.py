@@ -158,6 +158,9 @@ SAMPLES: dict[str, tuple[str, tuple[str, ...]]] = {
     "ros": ("ros", (factory.ROS_LEFT, factory.ROS_RIGHT)),
     "ros_echo": ("ros", (factory.ROS_ECHO_LEFT, factory.ROS_ECHO_RIGHT)),
     "kalibr": ("kalibr", (factory.KALIBR,)),
+    "euroc": ("euroc", (factory.EUROC_LEFT, factory.EUROC_RIGHT)),
+    "orb_slam": ("orb_slam", (factory.ORB_SLAM,)),
+    "orb_slam_rectified": ("orb_slam", (factory.ORB_SLAM_RECTIFIED,)),
     "colmap": ("colmap", (factory.COLMAP_CAMERAS, factory.COLMAP_IMAGES)),
     "nerf": ("nerf", (factory.NERF,)),
 }
