@@ -116,11 +116,11 @@ def _plan(state: Trajectory, at: StepContext) -> list[tuple[int, bool]]:
     for i in active or at.rounds[:1]:
         updates = state.plan.inner_steps if active and (i + 1) / at.count > state.plan.updates_from else 0
         corrected = i in chosen and not fresh
-        if corrected or updates or not corrects:
+        if corrected or updates:
             rounds.append((updates, corrected))
             fresh = (corrected or fresh) and updates == 0
     if not rounds and at.rounds[-1] == at.count - 1 and not state.has_scale:
-        rounds.append((0, False))  # the output needs a scale, even if no step is guided
+        rounds.append((0, False))  # the output needs a scale, even if no step corrects or moves anything
     return rounds
 
 

@@ -22,6 +22,9 @@ from geodiff_plugin.formats.out_folder import OutFolder
 
 __all__ = ["measure", "remarks_on", "run_pairs"]
 
+#: First line of the page of ``pairs``.
+PURPOSE = "Each pair, interval, region and metric behind a comparison of methods."
+
 
 def measure(
     refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions
@@ -98,7 +101,7 @@ def run_pairs(options: PairsOptions) -> Page | None:
     count = processes(options.settings).num_processes
     if count > 1:
         remarks.append(f"Run by {count} processes.")
-    page = Page("Results", facts, tuple(pairs_tables(records)), tuple(remarks))
+    page = Page("Results pair by pair", facts, tuple(pairs_tables(records)), tuple(remarks), PURPOSE)
     write_page(page, options.out, "table")
     if options.results is not None:
         write_text(options.results, page.markdown())

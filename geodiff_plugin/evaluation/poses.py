@@ -25,6 +25,9 @@ from geodiff_plugin.formats.out_folder import OutFolder
 
 __all__ = ["Column", "PosesOptions", "poses_table", "run_poses"]
 
+#: First line of the page.
+PURPOSE = "How accurate depth is if poses are exact, perturbed, refined or withheld."
+
 #: An error above this is of the kind that a wrong scale makes, and must be said.
 BY_A_FACTOR = 0.25
 _HEADINGS = {"given": "given", "refine": "refined", "estimated": "estimated"}
@@ -242,7 +245,7 @@ def run_poses(options: PosesOptions) -> Page:
     words += ["--perturb {:g},{:g}".format(*options.perturb), "--drift {:g},{:g}".format(*options.drift)]
     settings = options.settings
     remark = f"Prior {settings.prior}, seed {settings.seed}. All pixels with truth, metres as they come out."
-    page = Page("Results by pose", run_facts(" ".join(words)), tuple(tables), (remark,))
+    page = Page("Results by pose", run_facts(" ".join(words)), tuple(tables), (remark,), PURPOSE)
     write_page(page, options.out, "poses")
     if options.results is not None:
         write_text(options.results, page.markdown())

@@ -53,12 +53,14 @@ class Page:
         facts: of ``run_facts``.
         tables: in reading order.
         remarks: sentences that belong above the tables, e.g. how many samples were broken.
+        purpose: what the page is for, its first line; "" where the title says it.
     """
 
     title: str
     facts: dict[str, Any]
     tables: tuple[Table, ...]
     remarks: tuple[str, ...] = ()
+    purpose: str = ""
 
     def origin(self) -> str:
         """One line: date, versions, machine."""
@@ -66,8 +68,9 @@ class Page:
         return f"{self.facts['date']}; {named}; {self.facts['machine']}."
 
     def markdown(self) -> str:
-        """How it was made, the remarks, then the tables."""
-        head = [f"# {self.title}", "", f"    {self.facts['command']}", "", self.origin(), ""]
+        """What it is for, how it was made, the remarks, then the tables."""
+        head = [f"# {self.title}", "", *([self.purpose, ""] if self.purpose else [])]
+        head += [f"    {self.facts['command']}", "", self.origin(), ""]
         for remark in self.remarks:
             head += [remark, ""]
         return "\n".join(head) + "\n" + "\n".join(table.markdown() for table in self.tables)

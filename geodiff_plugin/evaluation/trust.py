@@ -40,6 +40,9 @@ from geodiff_plugin.runtime.signs import Signs
 
 __all__ = ["TEN", "TrustOptions", "run_trust"]
 
+#: First line of the page.
+PURPOSE = "How many wrong calibrations a run detects, and how many correct ones it does not trust."
+
 #: The ten kinds of wrong calibration that every pair is given with.
 TEN = (
     "swapped", "inverse", "axis", "tilted", "mirrored",
@@ -50,7 +53,7 @@ OFF = 0.2
 RECORDS = "trust.jsonl"
 NOTE = (
     "Median error of the depth as a share of the truth; left and right exchanged, there is no truth. A wrong "
-    "focal length of a rectified pair scales the depth and changes nothing else: no two views tell it."
+    "focal length of a rectified pair scales the depth and changes nothing else: two views cannot show it."
 )
 
 
@@ -152,7 +155,7 @@ def _beyond_views(record: dict[str, Any]) -> bool:
 
 
 def _share(part: int, whole: int) -> str:
-    return "-" if whole == 0 else f"{part} of {whole} ({100 * part / whole:.0f} %)"
+    return "-" if whole == 0 else f"{part} of {whole} ({100 * part // whole} %)"
 
 
 def _table(group: str, records: Sequence[dict[str, Any]], kinds: Sequence[str]) -> Table:
@@ -208,7 +211,7 @@ def run_trust(options: TrustOptions) -> Page:
         words += [] if options.limit is None else [f"--limit {options.limit}"]
         groups = dict.fromkeys(record["group"] for record in records)
         tables = [_table(g, [r for r in records if r["group"] == g], options.kinds) for g in groups]
-        page = Page("Trust", run_facts(" ".join(words)), tuple(tables))
+        page = Page("Trust", run_facts(" ".join(words)), tuple(tables), purpose=PURPOSE)
         write_page(page, options.out, "trust")
         if options.results is not None:
             write_text(options.results, page.markdown())

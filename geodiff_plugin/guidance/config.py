@@ -91,7 +91,11 @@ class GuidanceConfig(Checked):
         paper="-",
     )
     loss_resolution: int = integer(
-        640, 32, 1 << 16, "bound of the longer side of the grid that losses are computed on, px", paper="-"
+        640,
+        32,
+        1 << 16,
+        "bound of the longer side of the grid that losses are computed on, px",
+        paper="{} (S9, without saying for what)",
     )
     depth_range: tuple[float, float] | None = pair(
         None,

@@ -33,7 +33,9 @@ class ReflectionsConfig(Checked):
     reflection_spreads: float = number(
         2.0, 0, 1e6, "how far behind, in spreads of the matches around the prior's log depth", paper="-"
     )
-    reflection_floor: float = number(0.2, TINY, 1e3, "and at least this far, in log depth", paper="-")
+    reflection_floor: float = number(
+        0.2, TINY, 1e3, "least distance behind the prior that counts as a reflection, in log depth", paper="-"
+    )
     reflection_least_spread: float = number(
         0.05, 0, 1e3, "least spread that is assumed, in log depth", paper="-"
     )
@@ -105,8 +107,8 @@ class CorrectionConfig(Checked):
     stiffness_power: float = number(
         4.0, 0, 10, "power of the prior's error that smoothness falls with", paper="-"
     )
-    loosest: float = number(0.03, TINY, 1e6, "and never below this, however wrong the prior is", paper="-")
-    stiffest: float = number(100.0, TINY, 1e6, "or above this", paper="-")
+    loosest: float = number(0.03, TINY, 1e6, "smallest smoothness, however wrong the prior is", paper="-")
+    stiffest: float = number(100.0, TINY, 1e6, "largest smoothness", paper="-")
     inertia: float = number(
         0.015,
         TINY,
@@ -115,8 +117,8 @@ class CorrectionConfig(Checked):
         "keeps its depth; it falls with the fourth power of that error",
         paper="-",
     )
-    least_inertia: float = number(5e-4, TINY, 1e6, "and is never below this,", paper="-")
-    most_inertia: float = number(0.03, TINY, 1e6, "or above this", paper="-")
+    least_inertia: float = number(5e-4, TINY, 1e6, "smallest inertia", paper="-")
+    most_inertia: float = number(0.03, TINY, 1e6, "largest inertia", paper="-")
     broad_smoothness: float = number(
         50.0,
         TINY,
@@ -157,7 +159,9 @@ class CorrectionConfig(Checked):
     least_error: float = number(
         0.01, TINY, 1, "least error that is assumed of a prior, in log depth", paper="-"
     )
-    most_error: float = number(0.5, TINY, 10, "and the largest", paper="-")
+    most_error: float = number(
+        0.5, TINY, 10, "largest error that is assumed of a prior, in log depth", paper="-"
+    )
     image_edge: float = number(
         0.1,
         TINY,

@@ -27,7 +27,7 @@ from geodiff_plugin.formats import as_image_01, picture_size
 from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.types import CameraView, Rig
 
-__all__ = ["ImageInputs", "read_inputs", "split_views"]
+__all__ = ["ImageInputs", "as_points", "read_inputs", "split_views"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int, cropp
     rigs = tuple(Rig(K_left, K_right, pose) for K_right, pose in zip(K_rights, poses, strict=True))
     own_points = _entry(points, "points", i, count)
     return ImageInputs(
-        K_left, images, rigs, None if own_points is None else _as_points(own_points, label("points"))
+        K_left, images, rigs, None if own_points is None else as_points(own_points, label("points"))
     )
 
 
@@ -192,7 +192,7 @@ def _poses(E: Any, name: str, views: int) -> list[np.ndarray]:
     return poses
 
 
-def _as_points(value: Any, name: str) -> Tensor:
+def as_points(value: Any, name: str) -> Tensor:
     """``(N, 3)`` of finite rows, or ``(H, W)`` with 0 where unknown, float32, metres."""
     forms = "a sparse depth map (H, W) or points (N, 3) in the left camera's frame, metres"
     if isinstance(value, Tensor):

@@ -12,6 +12,7 @@ writes the tables anew between the page's marks.
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import Field, fields
@@ -27,6 +28,8 @@ __all__ = ["config_from_text", "knob_lines", "knob_tables", "value_of", "with_ta
 
 #: Leaves that are dicts: one entry is written as ``weights.TERM=VALUE``.
 BY_NAME = ("weights", "options")
+#: A link of the page to another one; a terminal has no use for it.
+LINK = re.compile(r" \(\[[^]]*\]\([^)]*\)\)")
 BEGIN, END = "<!-- made by geodiff_plugin.guidance.knobs -->", "<!-- end -->"
 
 
@@ -64,6 +67,7 @@ def value_of(name: str, config: GuidanceConfig) -> Any:
 
     Raises:
         InputError: no such leaf.
+        KeyError: no such term.
     """
     leaf, _, part = name.partition(".")
     if leaf not in LEAVES:
@@ -116,7 +120,8 @@ def knob_lines() -> list[str]:
         for one in own:
             knob = Knob.of(one)
             shown = knob.unset if default[one.name] is None else _shown(default[one.name])
-            lines.append(f"  {one.name} = {shown}  [{knob.values}]  {knob.doc}".replace("`", ""))
+            doc = LINK.sub("", knob.doc)
+            lines.append(f"  {one.name} = {shown}  [{knob.values}]  {doc}".replace("`", ""))
     return lines[1:]
 
 

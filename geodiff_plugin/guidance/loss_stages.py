@@ -56,8 +56,8 @@ class TermsConfig(Checked):
     )
     z_test: bool = flag(
         True,
-        "pixels that the estimate hides from a right camera take no part in the photometric term, as the "
-        "right image shows something else there",
+        "pixels that the estimate hides from a right camera take no part in the photometric term of updates, "
+        "as the right image shows something else there",
     )
     min_visible: float = number(0.1, 0, 1, "share in view below which the photometric term is off")
     pull_to: str = choice(

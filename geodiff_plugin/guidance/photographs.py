@@ -18,6 +18,8 @@ from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit
 from geodiff_plugin._checks import bad_type, bad_value, check_number
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
+from geodiff_plugin.guidance.inputs import as_points
 from geodiff_plugin.guidance.posing import cleaned, coarse_depth
 from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.pose.estimate import EstimatedPose, estimate_pose
@@ -133,6 +135,15 @@ def _same_unit(tracks: Tracks, poses: Sequence[EstimatedPose], v: int) -> Estima
     return replace(poses[v], T=T)
 
 
+def _listed(points: Tensor, K_left: Tensor, size: tuple[int, int]) -> np.ndarray:
+    """Points ``(N, 3)`` as they are, or those of a depth map of the left photograph, of any resolution."""
+    if points.shape[1] == 3:
+        return points.double().numpy()
+    K = resize_intrinsics(K_left[None], size, image_size(points))
+    xyz = unproject(points[None, None], K).reshape(-1, 3)
+    return xyz[xyz[:, 2] > 0].double().numpy()
+
+
 def estimate_rig(
     photographs: Sequence[Any],
     *,
@@ -151,7 +162,7 @@ def estimate_rig(
         fov: horizontal field of view of all, degrees.
         baseline_m: distance of the first right camera from the left one.
         known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left photograph and their distance.
-        points: ``(N, 3)`` metres in the left camera's frame.
+        points: ``(N, 3)`` metres in the left camera's frame, or a sparse depth map ``(H, W)`` of it.
         matcher: of distinct points, see ``pose.matchers.find_matcher``.
 
     Raises:
@@ -165,6 +176,8 @@ def estimate_rig(
     if baseline_m is not None:
         check_number(baseline_m, "baseline_m", 1e-6, 1e6)
     K_left = torch.as_tensor(Ks[0], dtype=torch.float32)
+    size = image_size(images[0])
+    own_points = None if points is None else _listed(as_points(points, "points"), K_left, size)
     images = [cleaned(image, DEFAULT) for image in images]
 
     def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
@@ -187,7 +200,7 @@ def estimate_rig(
         )
         spread = depth_spread(tracks, Ts)
     factor = tracks.K_left[0, 0] / Ks[0][0, 0]
-    scale = find_scale(tracks, Ts, factor, baseline_m, known_length, points)
+    scale = find_scale(tracks, Ts, factor, baseline_m, known_length, own_points)
     Ts[:, :3, 3] *= scale.factor
     return EstimatedRig(
         (images[0].shape[-1], images[0].shape[-2]),

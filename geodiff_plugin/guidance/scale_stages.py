@@ -64,7 +64,7 @@ class SweepConfig(Checked):
         1.25, TINY, 1e3, "the planes reach this factor nearer than the nearest of its matches", paper="-"
     )
     least_shift: float = number(
-        0.03, 0, 1, "and at least to the depth of this shift, in image widths", paper="-"
+        0.03, 0, 1, "the planes reach at least to the depth of this shift, in image widths", paper="-"
     )
 
 
@@ -180,7 +180,11 @@ class FitConfig(Checked):
         0.5, 0, 1e3, "standard deviation of a match of confidence .96 in the fit, planes", paper="-"
     )
     fit_floor: float = number(
-        4e-3, TINY, 1, "and at least this, in log depth, for what a map leaves over", paper="-"
+        4e-3,
+        TINY,
+        1,
+        "least standard deviation of a match in the fit, in log depth, for what a map leaves over",
+        paper="-",
     )
     fit_cauchy: float = number(
         2.0,

@@ -7,9 +7,9 @@ Paper: none.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, residuals_px, solve_inverse_depth
@@ -69,7 +69,7 @@ def find_scale(
     factor: float,
     baseline_m: float | None,
     known_length: tuple[float, float, float, float, float] | None,
-    points: Any,
+    points: np.ndarray | None,
 ) -> Scale:
     """Metres a unit, from whichever length is known.
 
@@ -105,16 +105,15 @@ def find_scale(
             bad_value("known length", "between two places", "the same place twice")
         return Scale("known length", metres / length, float(np.hypot(s1, s2)))
     if points is not None:
-        return _by_points(tracks, inverse_depth, np.asarray(points, dtype=np.float64))
+        return _by_points(tracks, inverse_depth, points)
     return Scale("none", 1.0, None, (NO_UNIT,))
 
 
 def _by_points(tracks: Tracks, inverse_depth: np.ndarray, points: np.ndarray) -> Scale:
     ahead = points[points[:, 2] > 0]
     px = project_tracks(ahead, np.zeros(len(ahead)), tracks.K_left, np.eye(4)).px
-    away = np.linalg.norm(px[:, None] - tracks.left_px[None], axis=2)
-    nearest = away.argmin(1)
-    close = away[np.arange(len(px)), nearest] < _NEAR_PX / 4
+    away, nearest = cKDTree(tracks.left_px).query(px)
+    close = away < _NEAR_PX / 4
     if close.sum() < 5:
         bad_value("points", "with at least 5 near matched points", f"{int(close.sum())}")
     ratios = ahead[close, 2] * inverse_depth[nearest[close]]

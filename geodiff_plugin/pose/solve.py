@@ -190,10 +190,10 @@ def solve_poses(
         ``(V, 4, 4)``.
     """
     Ts = np.array(given if start is None else start, dtype=np.float64)
-    w_given = np.clip(solve_inverse_depth(tracks, Ts), 0.0, None)
+    w_start = np.clip(solve_inverse_depth(tracks, Ts), 0.0, None)
 
     def terms(at: np.ndarray) -> _Terms:
-        data, held = _data_terms(tracks, at, scale_px), _prior_terms(tracks, at, given, w_given, prior)
+        data, held = _data_terms(tracks, at, scale_px), _prior_terms(tracks, at, given, w_start, prior)
         return trust * data[0] + held[0], trust * data[1] + held[1], trust * data[2] + held[2]
 
     damping, (cost, gradient, normal) = 1e-3, terms(Ts)

@@ -63,8 +63,10 @@ def assemble_output(
         uncertainty = _uncertainty(run, depth_m, lefts_01, call)
     grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
-    known = [own.on(depth_m.device) for own in guidance.inputs]
-    K = resize_intrinsics(torch.stack([K_left for _, K_left, _ in known]), size, grid)
+    K_lefts = torch.stack(
+        [torch.as_tensor(own.K_left, dtype=torch.float32, device=depth_m.device) for own in guidance.inputs]
+    )
+    K = resize_intrinsics(K_lefts, size, grid)
     seen = [
         reprojection(own.native, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1], run.config.terms)
         for i, own in enumerate(run.evidence)
@@ -86,7 +88,7 @@ def assemble_output(
         own_ratios = over_own.reshape(count, -1).median(1).values.tolist()
     measured = guidance.points_measured
     judgements = [
-        _judged(run, i, lefts_01[i], known[i][1], confidence, own_ratios[i], measured) for i in range(count)
+        _judged(run, i, lefts_01[i], K_lefts[i], confidence, own_ratios[i], measured) for i in range(count)
     ]
     if confidence is not None:
         agreed = confidence.new_tensor([agreement_of_points(each.signs) for each in judgements])

@@ -15,6 +15,7 @@ from torch import Tensor
 from geodiff_plugin.algorithm.correction import prior_error, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.known import stacked
+from geodiff_plugin.guidance.config import CorrectionConfig
 from geodiff_plugin.matching import with_points
 
 __all__ = ["PROMPT_LONG_EDGE", "prompt_of"]
@@ -23,21 +24,22 @@ __all__ = ["PROMPT_LONG_EDGE", "prompt_of"]
 PROMPT_LONG_EDGE = 256
 
 
-def prompt_of(evidence: Sequence[Evidence]) -> Tensor | None:
+def prompt_of(evidence: Sequence[Evidence], config: CorrectionConfig) -> Tensor | None:
     """Matches that are sure and points, spread along surfaces.
 
     Args:
         evidence: one entry per image, all of one size.
+        config: how they are spread.
 
     Returns:
         ``(N, 1, h, w)`` metres everywhere, the median of what is known far from all of it; ``None`` where of
         an image nothing is known.
     """
-    maps = [found for one in evidence if (found := _dense(one)) is not None]
+    maps = [found for one in evidence if (found := _dense(one, config)) is not None]
     return torch.cat(maps) if len(maps) == len(evidence) else None
 
 
-def _dense(evidence: Evidence) -> Tensor | None:
+def _dense(evidence: Evidence, config: CorrectionConfig) -> Tensor | None:
     """``(1, 1, h, w)`` metres: a flat map brought to what is known, as a prior's own would be."""
     sure, points = stacked([evidence.sure]), stacked([evidence.points])
     known = sure if points is None else with_points(sure, points)
@@ -49,5 +51,6 @@ def _dense(evidence: Evidence) -> Tensor | None:
     median = 1.0 / known.inverse_depth[known.confidence > 0].median()
     flat = median.expand(1, 1, height, width)
     left = evidence.left_01[None]
-    depth_m = refine_depth(flat, known, left, prior_error(flat, known, left)).depth_m
+    error = prior_error(flat, known, left, config=config)
+    depth_m = refine_depth(flat, known, left, error, config=config).depth_m
     return F.interpolate(depth_m, size, mode="bilinear", antialias=True)

@@ -42,7 +42,6 @@ class Signs:
         order: rank correlation of the prior's first map with matches or points, [-1, 1].
         spread: of the matched depths, log of their 95 % over their 5 % quantile.
         points_ratio: median of known points over matched depths at the same places.
-        points_spread: how far that ratio varies, median absolute deviation of its log.
         points: known depths within the image, a number of pixels; 0 without any.
         at_end: share of the sure matches that lie on the first or the last plane of a given range, [0, 1].
         baseline_m: distance of the first right camera; 0 without one.
@@ -62,7 +61,6 @@ class Signs:
     order: float = math.nan
     spread: float = math.nan
     points_ratio: float = math.nan
-    points_spread: float = math.nan
     points: int = 0
     at_end: float = 0.0
     baseline_m: float = 0.0
@@ -84,7 +82,6 @@ class _OfMatches(TypedDict, total=False):
     flat: bool
     at_end: float
     points_ratio: float
-    points_spread: float
 
 
 def _is_same(left_01: Tensor, rights: Sequence[CameraView]) -> bool:
@@ -97,18 +94,16 @@ def _alike(one: Tensor, other: Tensor) -> bool:
     return all(float((one[:, rows] - other[:, rows]).abs().max()) < SAME for rows in strips)
 
 
-def _points_against(matches: Matches, points: Matches) -> tuple[float, float]:
-    """Median ratio of points to matched depths, and its spread; NaN for too few that can be compared."""
+def _points_against(matches: Matches, points: Matches) -> float:
+    """Median ratio of points to matched depths; NaN for too few that can be compared."""
     sure = (matches.confidence > SURE).float()
     window = (2 * REACH_PX + 1, 1, REACH_PX)
     near = F.avg_pool2d(sure[None], *window)[0]
     mean = F.avg_pool2d((sure * matches.inverse_depth)[None], *window)[0] / near.clamp_min(1e-6)
     at = (points.confidence > 0) & (near > 0) & (mean > matches.plane_step)
     if int(at.sum()) < FEWEST_COMPARED:
-        return math.nan, math.nan
-    ratio = (mean[at] / points.inverse_depth[at]).log()
-    middle = ratio.median()
-    return float(middle.exp()), float((ratio - middle).abs().median())
+        return math.nan
+    return float((mean[at] / points.inverse_depth[at]).median())
 
 
 def _of_matches(matches: Matches, planes: Tensor | None) -> _OfMatches:
@@ -167,7 +162,7 @@ def read_signs(
     planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
     found: dict[str, Any] = {} if matches is None else {**_of_matches(matches, planes)}
     if matches is not None and points is not None and points_measured:
-        found["points_ratio"], found["points_spread"] = _points_against(matches, points)
+        found["points_ratio"] = _points_against(matches, points)
     known = evidence.points
     found |= {} if evidence.pose is None else _of_pose(evidence.pose)
     return Signs(

@@ -11,6 +11,7 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.geometry import unproject
 from geodiff_plugin.guidance.photographs import estimate_rig
 from geodiff_plugin.pose.estimate import estimate_pose
 from geodiff_plugin.pose.scale import find_scale
@@ -143,6 +144,21 @@ def test_each_known_length_gives_the_scale() -> None:
 @pytest.fixture(scope="module")
 def pair():
     return render_pair(3, size=(240, 320), exposure=True, posed=True)
+
+
+def test_known_points_may_be_a_map_or_carry_an_intensity(pair) -> None:
+    photographs, K = [pair.left.image_01, pair.right.image_01], pair.K_left.numpy()
+    sparse = torch.zeros_like(pair.left.depth_m[0])
+    sparse[4::9, 4::9] = pair.left.depth_m[0, 4::9, 4::9]
+    rows = unproject(sparse[None, None], pair.K_left[None].float()).reshape(-1, 3)
+    rows = rows[rows[:, 2] > 0]
+    rows = torch.cat([rows, torch.ones(len(rows), 1)], 1)  # a lidar's fourth column
+    by_map, by_rows = (estimate_rig(photographs, K=K, points=points).scale for points in (sparse, rows))
+    true = float(np.linalg.norm(pair.E[:3, 3]))
+    assert by_map.source == "points" and by_map.factor == pytest.approx(true, rel=0.1)
+    assert by_rows.factor == pytest.approx(by_map.factor, rel=1e-4)
+    with pytest.raises(ValueError, match="points must be .*shape"):
+        estimate_rig(photographs, K=K, points=rows[:, :2])
 
 
 def as_pil(view) -> Image.Image:

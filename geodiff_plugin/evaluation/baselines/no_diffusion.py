@@ -1,6 +1,6 @@
-"""The default preset without the U-Net: the same losses on a latent that starts as a ramp.
+"""The default preset without the U-Net: the same corrections of a latent that starts as a ramp.
 
-Data flow: ``StereoSample`` -> latent of a ramp -> the default's updates of it, scale and shift -> metres.
+Data flow: ``StereoSample`` -> latent of a ramp -> the default's corrections of it and scale -> metres.
 Paper: none; what is left of the default once the diffusion is taken out.
 """
 
@@ -37,7 +37,7 @@ def _start(pipe: Any, sample: StereoSample, settings: Settings) -> Start:
 NO_DIFFUSION = constant_method(
     "no-diffusion",
     "no diffusion",
-    "the default preset without the U-Net: the same search, losses and updates on the latent of a ramp",
+    "the default preset without the U-Net: its search, corrections and refinement on the latent of a ramp",
     partial(GeometryGuidance, reject_reflections=False),  # a ramp contradicts nothing
     _start,
 )

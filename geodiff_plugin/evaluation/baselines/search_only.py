@@ -1,4 +1,4 @@
-"""The default preset without gradient updates: the search for the scale alone.
+"""The search for the scale alone: no correction, no gradient updates, no refinement.
 
 Data flow: ``StereoSample`` -> pipeline, scale and shift from the search -> metres.
 Paper: S7.3 (the pre-selected g_s), extended to near and far.
@@ -12,5 +12,8 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance
 __all__ = ["SEARCH_ONLY"]
 
 SEARCH_ONLY = guided_method(
-    "search-only", "search only", "the same run without gradient updates", GeometryGuidance.search_only
+    "search-only",
+    "search only",
+    "the search for the scale alone: no correction, no gradient updates, no refinement",
+    GeometryGuidance.search_only,
 )
