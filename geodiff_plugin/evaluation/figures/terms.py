@@ -114,8 +114,8 @@ def _resized(values: Tensor, size: tuple[int, ...]) -> Tensor:
 def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -> TermByTerm:
     """Guide one pair by the default preset and keep what it went through.
 
-    The estimate of the first guided step is that of a second call, which searches in every step and moves
-    nothing: the steps before are the prior's own in either.
+    The estimate of the first guided step is that of a second call, which searches in every step and whose
+    updates have size 0: the steps before are the prior's own in either.
 
     Raises:
         ValueError: an ensemble, whose members differ in every map but the last.
@@ -125,7 +125,7 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
     pipe, left = priors.get(settings), Image.fromarray(sample.left)
     views, size = posed_views(sample, settings.views), sample.left.shape[:2]
     guidance = GeometryGuidance(*views)
-    unmoved = GeometryGuidance(*views, correct=False, inner_steps=0)
+    unmoved = GeometryGuidance(*views, correct=False, inner_steps=1, optimize_latents=False, step_affine=0)
     held, estimates = _followed(pipe, left, unmoved, settings)
     out, steps = _followed(pipe, left, guidance, settings)
     evidence = guidance.prepare(as_image_01(sample.left, "left")[None])
