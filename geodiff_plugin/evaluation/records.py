@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,26 @@ from geodiff_plugin.formats import atomic_path
 __all__ = ["append_record", "clean_records", "read_records", "record_key"]
 
 
+def _content(path: Path) -> str | None:
+    """A fingerprint of a file; ``None`` for a folder, or a file that is not there."""
+    if not path.is_file():
+        return None
+    found = path.stat()
+    return _fingerprint(path, found.st_size, found.st_mtime_ns)
+
+
+@lru_cache(maxsize=4096)
+def _fingerprint(path: Path, size: int, changed_ns: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def record_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: str, version: str) -> str:
     """Name of a result: the same inputs give the same key, anything else another.
 
     Args:
-        ref: the sample; its paths do not count, its other entries (cameras, views) do.
+        ref: the sample; not where its files lie but what is in them counts, and its other entries (cameras,
+            views). Of a folder, such as a scan with many views, the name of the sample alone counts.
         method: its name.
         configuration: everything that changes the method's result beside the prior, JSON values.
         prior: name and fingerprint of the prior, empty for a method without one.
@@ -32,8 +48,11 @@ def record_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior
         20 hexadecimal digits.
     """
     choices = {
-        name: value for name, value in ref.files.items() if not isinstance(value, Path) and value is not None
+        name: _content(value) if isinstance(value, Path) else value
+        for name, value in ref.files.items()
+        if value is not None
     }
+    choices = {name: value for name, value in choices.items() if value is not None}
     named = [method, configuration, prior, version, ref.dataset, ref.name, choices]
     return hashlib.sha256(json.dumps(named, sort_keys=True, default=str).encode()).hexdigest()[:20]
 

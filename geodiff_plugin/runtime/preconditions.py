@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, refuse
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.noise_levels import check_scheduler
@@ -20,6 +20,13 @@ __all__ = ["check_arguments", "check_guidable", "check_network_input", "check_of
 
 #: Ways of resampling that the stock pipeline takes.
 RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
+
+
+#: What every stock pipeline's call takes, whatever the prior.
+STOCK_ARGUMENTS = (
+    *("output_type", "resample_method_input", "batch_size", "num_inference_steps", "processing_resolution"),
+    *("ensemble_size", "generator"),
+)
 
 
 def check_arguments(call: Mapping[str, Any], images: int) -> None:
@@ -36,6 +43,12 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
             resolution, a batch or ensemble size that is no whole number or too small; a way of resampling
             that does not exist; no generator, or a list of another number than that of all members.
     """
+    missing = [name for name in STOCK_ARGUMENTS if name not in call]
+    if missing:
+        refuse(
+            f"The pipeline's __call__ must name the arguments of the stock pipeline that it overrides; "
+            f"it has no {', '.join(missing)}. A **kwargs that hands them on hides them: write them out."
+        )
     check_choice(call["output_type"], "output_type", ("np", "pt"))
     check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
     check_number(call["batch_size"], "batch_size", 1, 1 << 20, integer=True)

@@ -185,6 +185,18 @@ def test_one_update_of_the_paper_is_algorithm_1(make_pipeline, textured_plane, l
     torch.testing.assert_close(moves[1], 2 * moves[0], atol=1e-6, rtol=0.05)
 
 
+def test_a_call_that_hides_the_stock_arguments_is_refused(make_pipeline, textured_plane, left):
+    pipe = make_pipeline()
+
+    class Own(type(pipe)):
+        def __call__(self, image, **kwargs):
+            return super().__call__(image, **kwargs)
+
+    pipe.__class__ = Own
+    with pytest.raises(ValueError, match=r"must name the arguments .* no output_type.*write them out"):
+        enable_geometry_guidance(pipe)(left, guidance=guidance_for(textured_plane, **FAST))
+
+
 @pytest.mark.parametrize("batch_size", [1, 2, 4])
 def test_members_do_not_depend_on_the_batch_size(make_pipeline, textured_plane, left, batch_size):
     pipe = enable_geometry_guidance(make_pipeline())

@@ -22,6 +22,7 @@ from geodiff_plugin.evaluation.baselines import (
 )
 from geodiff_plugin.evaluation.baselines._constant import constant_method
 from geodiff_plugin.evaluation.baselines._guidance import guided_prediction
+from geodiff_plugin.evaluation.datasets.folder import find_folder, load_folder
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm_png, write_pfm
@@ -287,3 +288,42 @@ def test_reprojection_only_starts_from_the_map_of_the_prior_and_moves_its_pixels
     moved = (seen[-1] - seen[0]).abs()
     assert 0.01 < moved.max() and (moved > 0).float().mean() > 0.9
     assert np.median(np.abs(prediction.depth_m / depth_m - 1)) < 0.05
+
+
+def written_pair(folder, right_shape=SHAPE):
+    """Two grey images of one camera, 0.2 m apart, in the layout of own pairs."""
+    folder.mkdir(parents=True)
+    Image.new("RGB", SHAPE[::-1]).save(folder / "left.png")
+    Image.new("RGB", right_shape[::-1]).save(folder / "right.png")
+    (folder / "calib.txt").write_text(
+        "cam0=[30 0 23.5; 0 30 15.5; 0 0 1]\ncam1=[30 0 23.5; 0 30 15.5; 0 0 1]\ndoffs=0\nbaseline=200\n"
+        f"width={SHAPE[1]}\nheight={SHAPE[0]}\n"
+    )
+    return folder
+
+
+@pytest.mark.parametrize("missing", ["left.png", "right.png", "calib.txt"])
+def test_an_own_pair_with_a_missing_file_is_no_silent_gap(tmp_path, missing):
+    (written_pair(tmp_path / "data" / "one") / missing).unlink()
+    (ref,) = find_folder(tmp_path / "data")
+    with pytest.raises(FileNotFoundError, match=missing):
+        load_folder(ref)
+
+
+def test_a_folder_that_is_no_pair_is_none(tmp_path):
+    folder = written_pair(tmp_path / "data" / "one")
+    (folder / "left.png").unlink()
+    (folder / "right.png").unlink()
+    assert find_folder(tmp_path / "data") == []
+
+
+def test_own_right_images_have_the_size_of_their_calibration(tmp_path):
+    (ref,) = find_folder(written_pair(tmp_path / "data" / "one", (16, 24)).parent)
+    with pytest.raises(ValueError, match="24"):
+        load_folder(ref)
+
+
+def test_sgbm_does_not_apply_to_views_of_different_sizes():
+    sample = make_sample()
+    with pytest.raises(NotApplicable, match="different sizes"):
+        run("sgbm", replace(sample, right=sample.right[:16]))

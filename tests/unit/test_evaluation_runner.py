@@ -304,6 +304,19 @@ def test_key_depends_on_everything_but_where_the_files_lie():
     assert len({key, *(record_key(*other) for other in others)}) == 6
 
 
+def test_key_depends_on_what_the_files_hold(tmp_path):
+    keys = []
+    for folder, text in (("a", "1.0"), ("b", "2.0"), ("c", "1.0")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "depth.npy").write_text(text)
+        ref = SampleRef("folder", "pair", {"depth": tmp_path / folder / "depth.npy", "left": None})
+        keys.append(record_key(ref, "guided", {}, "", "0.1.0"))
+    assert keys[0] == keys[2] != keys[1]
+    (tmp_path / "a" / "depth.npy").write_text("3.00")
+    ref = SampleRef("folder", "pair", {"depth": tmp_path / "a" / "depth.npy", "left": None})
+    assert record_key(ref, "guided", {}, "", "0.1.0") not in keys
+
+
 def test_cleaning_leaves_a_clean_file_alone(tmp_path):
     path = tmp_path / "samples.jsonl"
     clean_records(path)

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.bundled.loading import no_bars
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.priors import load_prior
@@ -121,7 +122,10 @@ class PriorCache:
         key = _which(settings)
         if key not in self._pipes:
             said = {} if settings.space is None else {"space": settings.space}
-            pipe = load_prior(settings.prior, device=settings.device, dtype=settings.weights_dtype, **said)
+            with no_bars():
+                pipe = load_prior(
+                    settings.prior, device=settings.device, dtype=settings.weights_dtype, **said
+                )
             pipe.set_progress_bar_config(disable=True)
             enable_geometry_guidance(pipe)
             self._pipes[key] = pipe

@@ -79,6 +79,8 @@ def sgbm_shift(sample: StereoSample) -> np.ndarray:
 def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     if not sample.rectified:
         raise NotApplicable("not rectified")
+    if sample.left.shape != sample.right.shape:
+        raise NotApplicable("views of different sizes")
     with_holes = sgbm_shift(sample)
     depth_m = sample.K_left[0, 0] * sample.E[0, 3] / fill_background(with_holes)
     notes = {"density": float(np.isfinite(with_holes).mean())}

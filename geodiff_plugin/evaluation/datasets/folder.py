@@ -29,6 +29,8 @@ def _first(folder: Path, stem: str, suffixes: tuple[str, ...]) -> Path | None:
 def find_folder(root: Path) -> list[SampleRef]:
     """References to ``root`` and the folders right below it with ``left.*``, ``right.*`` and ``calib.*``.
 
+    A folder that lacks one of the three counts as a pair: reading it names the file that is missing.
+
     The calibration is one file of any known format, or ``calib_left.*`` and ``calib_right.*``. Depth, if
     there, is ``depth.npy`` or ``depth.pfm`` (metres) or ``depth.png`` (16 bit, millimetres); 0, NaN and
     infinity are unknown.
@@ -38,13 +40,15 @@ def find_folder(root: Path) -> list[SampleRef]:
         left, right = _first(folder, "left", _IMAGES), _first(folder, "right", _IMAGES)
         single = sorted(folder.glob("calib.*"))
         pair = [*sorted(folder.glob("calib_left.*"))[:1], *sorted(folder.glob("calib_right.*"))[:1]]
-        if left is None or right is None or not (single or len(pair) == 2):
+        calibrated = bool(single) or len(pair) == 2
+        if (left is None and right is None) or (left is not None) + (right is not None) + calibrated < 2:
             continue
+        # What is missing has a path as well, so that reading the pair says so.
         files = {
-            "left": left,
-            "right": right,
-            "calibration": single[0] if single else pair[0],
-            "calibration_right": None if single else pair[1],
+            "left": left or folder / "left.png",
+            "right": right or folder / "right.png",
+            "calibration": single[0] if single else pair[0] if calibrated else folder / "calib.txt",
+            "calibration_right": pair[1] if calibrated and not single else None,
             "depth": _first(folder, "depth", _DEPTHS),
         }
         refs.append(SampleRef("folder", folder.resolve().name, files))
@@ -78,6 +82,8 @@ def load_folder(ref: SampleRef) -> StereoSample:
     rig = read_calibration(first if second is None else (first, second))
     if rig.size_left is not None:
         check_size(first, rig.size_left[::-1], left.shape)
+    if rig.size_right is not None:
+        check_size(second or first, rig.size_right[::-1], right.shape)
     depth_m, truth = np.zeros(left.shape[:2], np.float32), "none"
     if files["depth"] is not None:
         depth_m, truth = _read_depth(files["depth"]), files["depth"].name
