@@ -20,11 +20,12 @@ __all__ = ["append_record", "clean_records", "read_records", "record_key"]
 
 
 def _content(path: Path) -> str | None:
-    """A fingerprint of a file; ``None`` for a folder, or a file that is not there."""
-    if not path.is_file():
+    """A fingerprint of a file; ``None`` for a folder, or a file that cannot be read: its loader says why."""
+    try:
+        found = path.stat()
+        return _fingerprint(path, found.st_size, found.st_mtime_ns)
+    except OSError:
         return None
-    found = path.stat()
-    return _fingerprint(path, found.st_size, found.st_mtime_ns)
 
 
 @lru_cache(maxsize=4096)
