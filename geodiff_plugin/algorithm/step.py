@@ -113,8 +113,8 @@ def _plan(state: Trajectory, at: StepContext) -> list[tuple[int, bool]]:
     active = [i for i in at.rounds if state.is_active(i / at.count)]
     rounds: list[tuple[int, bool]] = []
     fresh = False  # corrected, and not moved since
-    for i in active or at.rounds[:1]:
-        updates = state.plan.inner_steps if active and (i + 1) / at.count > state.plan.updates_from else 0
+    for i in active:
+        updates = state.plan.inner_steps if (i + 1) / at.count > state.plan.updates_from else 0
         corrected = i in chosen and not fresh
         if corrected or updates:
             rounds.append((updates, corrected))

@@ -14,7 +14,7 @@ from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_pr
 from geodiff_plugin.evaluation.datasets.perturbed import perturbed_ref
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.runner import processes, run
 from geodiff_plugin.evaluation.seed_tables import without_copies
 from geodiff_plugin.evaluation.tables import pairs_tables
@@ -102,7 +102,5 @@ def run_pairs(options: PairsOptions) -> Page | None:
     if count > 1:
         remarks.append(f"Run by {count} processes.")
     page = Page("Results pair by pair", facts, tuple(pairs_tables(records)), tuple(remarks), PURPOSE)
-    write_page(page, options.out, "table")
-    if options.results is not None:
-        write_text(options.results, page.markdown())
+    write_page(page, options.out, "table", options.results)
     return page

@@ -18,7 +18,7 @@ from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.perturbed import drifted_ref, perturbed_ref
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.layout import Table
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.runner import headline, run
 from geodiff_plugin.evaluation.statistics import mean_with_interval
 from geodiff_plugin.formats.out_folder import OutFolder
@@ -246,7 +246,5 @@ def run_poses(options: PosesOptions) -> Page:
     settings = options.settings
     remark = f"Prior {settings.prior}, seed {settings.seed}. All pixels with truth, metres as they come out."
     page = Page("Results by pose", run_facts(" ".join(words)), tuple(tables), (remark,), PURPOSE)
-    write_page(page, options.out, "poses")
-    if options.results is not None:
-        write_text(options.results, page.markdown())
+    write_page(page, options.out, "poses", options.results)
     return page

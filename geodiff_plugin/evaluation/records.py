@@ -48,12 +48,8 @@ def record_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior
     Returns:
         20 hexadecimal digits.
     """
-    choices = {
-        name: _content(value) if isinstance(value, Path) else value
-        for name, value in ref.files.items()
-        if value is not None
-    }
-    choices = {name: value for name, value in choices.items() if value is not None}
+    read = {name: _content(v) if isinstance(v, Path) else v for name, v in ref.files.items()}
+    choices = {name: value for name, value in read.items() if value is not None}
     named = [method, configuration, prior, version, ref.dataset, ref.name, choices]
     return hashlib.sha256(json.dumps(named, sort_keys=True, default=str).encode()).hexdigest()[:20]
 

@@ -76,9 +76,11 @@ class Page:
         return "\n".join(head) + "\n" + "\n".join(table.markdown() for table in self.tables)
 
 
-def write_page(page: Page, out: Path, stem: str) -> None:
-    """Write ``<stem>.md``, ``<stem>.tex`` and ``<stem>.json`` into ``out``."""
+def write_page(page: Page, out: Path, stem: str, results: Path | None = None) -> None:
+    """Write ``<stem>.md``, ``<stem>.tex`` and ``<stem>.json`` into ``out``, the page to ``results`` too."""
     write_text(out / f"{stem}.md", page.markdown())
+    if results is not None:
+        write_text(results, page.markdown())
     write_text(out / f"{stem}.tex", "\n".join(table.latex() for table in page.tables))
     tables = [table.as_json() for table in page.tables]
     plain = page.facts | {"remarks": list(page.remarks), "tables": tables}

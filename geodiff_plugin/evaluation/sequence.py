@@ -20,7 +20,7 @@ from geodiff_plugin._checks import check_choice, check_number
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.records import append_record, read_records
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior
@@ -166,9 +166,7 @@ def run_sequence(options: SequenceOptions) -> Page:
         f"pixels, prior {options.prior}, {options.steps} steps, seed {options.seed} for every frame.",
     )
     page = Page("Sequences", run_facts(options.command), (sequence_table(records),), remarks)
-    write_page(page, options.out, "sequence")
-    if options.results is not None:
-        write_text(options.results, page.markdown())
+    write_page(page, options.out, "sequence", options.results)
     return page
 
 

@@ -25,7 +25,7 @@ from geodiff_plugin.evaluation.emulated import DENSE, SPACES, STRENGTHS, Emulate
 from geodiff_plugin.evaluation.figures.strength import draw_strength, shaded
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.records import append_record, read_records
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.strength_tables import strength_tables
 from geodiff_plugin.evaluation.surfaces import DenseTruth
 
@@ -128,9 +128,7 @@ def run_strength(options: StrengthOptions) -> Page:
         remarks += (f"![What guidance gains by the prior's error; surfaces, lit]({picture})",)
     tables = strength_tables(records)
     page = Page("Priors from exact to weak", run_facts(options.command), tables, remarks, PURPOSE)
-    write_page(page, options.out, "strength")
-    if options.results is not None:
-        write_text(options.results, page.markdown())
+    write_page(page, options.out, "strength", options.results)
     if options.figure is not None:
         labels = {record["pair"] for record in records}
         sample = load(next(ref for ref in refs if ref.label in labels))

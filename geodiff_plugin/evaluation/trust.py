@@ -31,7 +31,7 @@ from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page, write_text
+from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, Case, case_kinds, cases_of
 from geodiff_plugin.formats.out_folder import OutFolder
 from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -212,7 +212,5 @@ def run_trust(options: TrustOptions) -> Page:
         groups = dict.fromkeys(record["group"] for record in records)
         tables = [_table(g, [r for r in records if r["group"] == g], options.kinds) for g in groups]
         page = Page("Trust", run_facts(" ".join(words)), tuple(tables), purpose=PURPOSE)
-        write_page(page, options.out, "trust")
-        if options.results is not None:
-            write_text(options.results, page.markdown())
+        write_page(page, options.out, "trust", options.results)
     return page

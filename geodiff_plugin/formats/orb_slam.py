@@ -54,6 +54,10 @@ def _number(entries: _Entries, key: str, path: Path) -> float:
     return float(value.item())
 
 
+def _positive(entries: _Entries, key: str, path: Path) -> float:
+    return positive(_number(entries, key, path), f"{key} in {path}")
+
+
 def _size(entries: _Entries, path: Path) -> tuple[int, int] | None:
     keys = ("Camera.width", "Camera.height")
     if not any(key.lower() in entries for key in keys):
@@ -63,9 +67,7 @@ def _size(entries: _Entries, path: Path) -> tuple[int, int] | None:
 
 
 def _K(entries: _Entries, name: str, path: Path) -> np.ndarray:
-    fx, fy = (
-        positive(_number(entries, f"{name}.{key}", path), f"{name}.{key} in {path}") for key in ("fx", "fy")
-    )
+    fx, fy = (_positive(entries, f"{name}.{key}", path) for key in ("fx", "fy"))
     return intrinsics(fx, fy, *(_number(entries, f"{name}.{key}", path) for key in ("cx", "cy")))
 
 
@@ -101,7 +103,7 @@ def _as_taken(entries: _Entries, pose: str, kind: str, path: Path) -> Rig:
     return rig_of_cameras(left, right, E, str(path))
 
 
-def _rectified(entries: _Entries, path: Path) -> Rig:
+def _rectified(entries: _Entries, baseline: str, path: Path) -> Rig:
     name = _left(entries)
     lens = _lens(entries, name, "PinHole", path)
     if lens is not None:
@@ -112,11 +114,8 @@ def _rectified(entries: _Entries, path: Path) -> Rig:
             "Is it of a single camera?",
         )
     K = _K(entries, name, path)
-    if name == "Camera1":
-        baseline_m = positive(_number(entries, "Stereo.b", path), f"Stereo.b in {path}")
-    else:
-        baseline_m = positive(_number(entries, "Camera.bf", path), f"Camera.bf in {path}") / K[0, 0]
-    E = pose_to_the_right(baseline_m)
+    length = _positive(entries, baseline, path)
+    E = pose_to_the_right(length if baseline == "Stereo.b" else length / K[0, 0])
     return make_rig(K, K, E, path, size=_size(entries, path), rectified=True)
 
 
@@ -137,10 +136,13 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     pose = next((name for name in POSES if name.lower() in entries), None)
     if pose is not None:
         return _as_taken(entries, pose, kind, path)
-    baseline = "Stereo.b" if "camera1.fx" in entries else "Camera.bf"
+    # Settings of version 1.0 say of rectified images that they are; older ones call them a pinhole's.
+    baseline, types = {
+        "Camera1": ("Stereo.b", ("Rectified",)),
+        "Camera": ("Camera.bf", ("Rectified", "PinHole")),
+    }[_left(entries)]
+    # Of a single camera with a depth sensor, the baseline is made up.
     depth_sensor = any(key.endswith("depthmapfactor") for key in entries)
-    # Of a single camera with a depth sensor, Stereo.b and Camera.bf are made up.
-    types = ("Rectified",) if baseline == "Stereo.b" else ("Rectified", "PinHole")
     if depth_sensor or baseline.lower() not in entries or kind not in types:
         bad_value(
             f"{path}",
@@ -148,7 +150,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
             f"those of a camera of type {kind} {'with a depth sensor' if depth_sensor else 'without them'}",
             "Give the settings that ORB-SLAM runs in stereo with.",
         )
-    return _rectified(entries, path)
+    return _rectified(entries, baseline, path)
 
 
 ORB_SLAM = CalibrationFormat("ORB-SLAM's stereo settings (Camera1.fx, Camera.bf)", matches, read)

@@ -318,8 +318,8 @@ def test_a_folder_that_is_no_pair_is_none(tmp_path):
 
 
 def test_own_right_images_have_the_size_of_their_calibration(tmp_path):
-    (ref,) = find_folder(written_pair(tmp_path / "data" / "one", (16, 24)).parent)
-    with pytest.raises(ValueError, match="24"):
+    (ref,) = find_folder(written_pair(tmp_path / "data" / "one", (40, 56)).parent)
+    with pytest.raises(ValueError, match="calib.txt must be for 56 x 40 pixels as the right image"):
         load_folder(ref)
 
 

@@ -19,7 +19,7 @@ from geodiff_plugin.formats import check_file, read_image
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.types import Rig
 
-__all__ = ["check_size", "folders", "make_sample", "read_npy", "read_rgb"]
+__all__ = ["check_calibrated_sizes", "check_size", "folders", "make_sample", "read_npy", "read_rgb"]
 
 
 def read_rgb(path: Path, name: str) -> np.ndarray:
@@ -40,15 +40,35 @@ def read_npy(path: Path, name: str) -> np.ndarray:
     return values
 
 
-def check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    """Raise ``ValueError`` naming ``path`` where its ``(H, W)`` is not the expected one."""
+def check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...], side: str = "left") -> None:
+    """Raise ``ValueError`` naming ``path`` where its ``(H, W)`` is not that of the image of a ``side``."""
     if tuple(got[:2]) != tuple(expected[:2]):
         bad_value(
             str(path),
-            f"for {expected[1]} x {expected[0]} pixels as the left image",
+            f"for {expected[1]} x {expected[0]} pixels as the {side} image",
             f"{got[1]} x {got[0]}",
             "Image, calibration and truth must be of one resolution.",
         )
+
+
+def check_calibrated_sizes(
+    calibration: tuple[Path, Path], rig: Rig, left: np.ndarray, right: np.ndarray
+) -> None:
+    """Refuse images that are not of the size that their calibration is for, where it says one.
+
+    Args:
+        calibration: the files of the left and the right camera, often the same.
+        rig: what they hold.
+        left: ``(H, W, 3)``.
+        right: ``(H, W, 3)``.
+
+    Raises:
+        ValueError: another size, naming the file.
+    """
+    sizes, sides = (rig.size_left, rig.size_right), ("left", "right")
+    for path, size, image, side in zip(calibration, sizes, (left, right), sides, strict=True):
+        if size is not None:
+            check_size(path, size[::-1], image.shape, side)
 
 
 def folders(root: Path, depth: int) -> list[Path]:

@@ -10,7 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin.evaluation.datasets._files import check_size, folders, make_sample, read_npy, read_rgb
+from geodiff_plugin.evaluation.datasets._files import (
+    check_calibrated_sizes,
+    check_size,
+    folders,
+    make_sample,
+    read_npy,
+    read_rgb,
+)
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 from geodiff_plugin.formats import read_calibration, read_depth_mm_png, read_pfm
 
@@ -80,10 +87,7 @@ def load_folder(ref: SampleRef) -> StereoSample:
     left, right = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
     first, second = files["calibration"], files["calibration_right"]
     rig = read_calibration(first if second is None else (first, second))
-    if rig.size_left is not None:
-        check_size(first, rig.size_left[::-1], left.shape)
-    if rig.size_right is not None:
-        check_size(second or first, rig.size_right[::-1], right.shape)
+    check_calibrated_sizes((first, second or first), rig, left, right)
     depth_m, truth = np.zeros(left.shape[:2], np.float32), "none"
     if files["depth"] is not None:
         depth_m, truth = _read_depth(files["depth"]), files["depth"].name

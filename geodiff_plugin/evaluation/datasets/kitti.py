@@ -8,7 +8,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from geodiff_plugin.evaluation.datasets._files import check_size, make_sample, read_rgb
+from geodiff_plugin.evaluation.datasets._files import (
+    check_calibrated_sizes,
+    check_size,
+    make_sample,
+    read_rgb,
+)
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample, disparity_to_depth
 from geodiff_plugin.formats import read_calibration, read_disparity_kitti_png
 
@@ -36,8 +41,7 @@ def load_kitti(ref: SampleRef) -> StereoSample:
     files = ref.files
     left, right = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
     rig = read_calibration(files["calibration"], cameras=files["cameras"])
-    if rig.size_left is not None:
-        check_size(files["calibration"], rig.size_left[::-1], left.shape)
+    check_calibrated_sizes((files["calibration"],) * 2, rig, left, right)
     disparity, valid = read_disparity_kitti_png(files["disparity"], "true disparity")
     check_size(files["disparity"], disparity.shape, left.shape)
     occluded = None

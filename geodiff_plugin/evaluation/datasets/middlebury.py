@@ -11,7 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin.evaluation.datasets._files import check_size, folders, make_sample, read_rgb
+from geodiff_plugin.evaluation.datasets._files import (
+    check_calibrated_sizes,
+    check_size,
+    folders,
+    make_sample,
+    read_rgb,
+)
 from geodiff_plugin.evaluation.datasets.sample import (
     Dataset,
     SampleRef,
@@ -81,8 +87,7 @@ def load_middlebury(ref: SampleRef) -> StereoSample:
     files = ref.files
     left, right = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
     rig = read_calibration(files["calibration"])
-    if rig.size_left is not None:
-        check_size(files["calibration"], rig.size_left[::-1], left.shape)
+    check_calibrated_sizes((files["calibration"],) * 2, rig, left, right)
     disparity = read_pfm(files["disparity"], "true disparity")
     check_size(files["disparity"], disparity.shape, left.shape)
     valid = np.isfinite(disparity)
