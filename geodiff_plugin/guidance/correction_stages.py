@@ -82,6 +82,49 @@ class CorrectionConfig(Checked):
         paper="-",
     )
     refine: bool = flag(True, "the result is fitted to its matches and points once more, at full resolution")
+    sharpen: bool = flag(
+        True,
+        "before the result is refined, pixels of it that hang between a near and a far surface get the depth "
+        "of one of them, by a weighted median of their neighbours (after Ma et al. 2013)",
+    )
+    ramp_step: float = number(
+        0.02,
+        TINY,
+        1e3,
+        "relative step in inverse depth to each of two opposite neighbours from which a pixel between them "
+        "may hang in the air",
+        paper="-",
+    )
+    ramp_contrast: float = number(
+        2.0,
+        0,
+        1e6,
+        "it does where the slope there is this many times that of the surfaces on both sides",
+        paper="-",
+    )
+    ramp_slope: float = number(
+        0.04,
+        TINY,
+        1e3,
+        "slope in log depth, for each pixel of the prior's grid, at which a neighbour counts half in that "
+        "median",
+        paper="-",
+    )
+    sharpen_colour: float = number(
+        0.12,
+        TINY,
+        1e6,
+        "difference in brightness at which a neighbour's weight falls to a third",
+        paper="-",
+    )
+    sharpen_reach: float = number(
+        1.5,
+        TINY,
+        1e3,
+        "standard deviation of the fall of that weight with distance, in pixels of the prior's grid, in a "
+        "window of five by five",
+        paper="-",
+    )
     match_noise: float = number(
         0.02,
         TINY,

@@ -15,17 +15,16 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from diffusers.pipelines.marigold import MarigoldDepthOutput
-from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from torch import Tensor
 
-from geodiff_plugin.algorithm.known import Known
 from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.scale import NO_UNIT
 from geodiff_plugin.runtime.confidence import depth_confidence
-from geodiff_plugin.runtime.ensembling import median, spread_around
+from geodiff_plugin.runtime.ensembling import median
 from geodiff_plugin.runtime.judgement import Judgement, agreement_of_points, judge
+from geodiff_plugin.runtime.refinement import refine_result, spread_of_members
 from geodiff_plugin.runtime.reprojection import reprojection
 from geodiff_plugin.runtime.run import GuidedRun
 from geodiff_plugin.runtime.signs import read_signs
@@ -57,10 +56,10 @@ def assemble_output(
     count, size = lefts_01.shape[0], image_size(lefts_01)
     depth_m = _as_maps(stock.prediction).to(lefts_01.device)  # (N, 1, H, W) or the processing grid
     known_of = [run.known(i) for i in range(count)]
-    depth_m, support = _refined(run, known_of, depth_m, lefts_01)
+    depth_m, support = refine_result(run, known_of, depth_m, lefts_01)
     uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
     if uncertainty is not None and support is not None:
-        uncertainty = _uncertainty(run, depth_m, lefts_01, call)
+        uncertainty = spread_of_members(run, depth_m, lefts_01, call)
     grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
     K_lefts = torch.stack(
@@ -213,38 +212,6 @@ def _as_maps(values: Any) -> Tensor:
     if isinstance(values, Tensor):
         return values.float()
     return torch.from_numpy(values).permute(0, 3, 1, 2).float()
-
-
-def _refined(
-    run: GuidedRun, known_of: Sequence[Known], depth_m: Tensor, lefts_01: Tensor
-) -> tuple[Tensor, Tensor | None]:
-    """The depth of every image fitted to what is known, and how far that decided it."""
-    if not run.config.correction.refine:
-        return depth_m, None
-    images = zip(known_of, depth_m.split(1), lefts_01.split(1), strict=True)
-    refined = [one for own, depth, left in images if (one := own.refine(depth, left)) is not None]
-    if len(refined) < len(depth_m):
-        return depth_m, None
-    return torch.cat([r.depth_m for r in refined]), torch.cat([r.support for r in refined])
-
-
-def _uncertainty(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: Mapping[str, Any]) -> Tensor:
-    """How far the members of every ensemble, refined one by one, lie from its result: ``(N, 1, H, W)`` m.
-
-    It costs a refinement a member: their spread before it is that of a map that is not given out.
-    """
-    size, method = image_size(depth_m), call["resample_method_output"]
-    reduction = (call["ensembling_kwargs"] or {}).get("reduction", "median")
-    spreads = []
-    for i, members in enumerate(run.members):
-        members = members.float().to(depth_m.device)
-        if image_size(members) != size:  # as the stock call brings the ensemble to its output
-            members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
-        left = lefts_01[i : i + 1]
-        fits = [run.known(i, m).refine(member, left) for m, member in enumerate(members.split(1))]
-        refined = torch.cat([fit.depth_m for fit in fits if fit is not None])
-        spreads.append(spread_around(depth_m[i : i + 1], refined, reduction))
-    return torch.cat(spreads)
 
 
 def _warnings(run: GuidedRun, visible: Tensor | None, judgements: Sequence[Judgement]) -> list[str]:
