@@ -51,12 +51,12 @@ def least_squares(values: np.ndarray, target: np.ndarray, mask: np.ndarray) -> t
         says.
 
     Raises:
-        ValueError: the mask is empty.
+        ValueError: the mask is empty: map and truth have no pixel in common.
 
     Source: Marigold, ``align_depth_least_square`` (without its optional downscaling), in float64.
     """
     if not mask.any():
-        bad_value("mask", "true for at least one pixel", "none")
+        bad_value("the map to align", "known for at least one pixel with truth", "known for none")
     x, y = np.asarray(values, np.float64)[mask], np.asarray(target, np.float64)[mask]
     system = np.stack([x, np.ones_like(x)], axis=1)
     scale, shift = np.linalg.lstsq(system, y, rcond=None)[0]

@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from typing import Any
 
 from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_priors, with_seeds
+from geodiff_plugin.evaluation.cells import label_of
 from geodiff_plugin.evaluation.datasets.perturbed import perturbed_ref
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
@@ -73,10 +74,14 @@ def remarks_on(records: Sequence[dict[str, Any]], options: PairsOptions) -> list
             key = (find_method(record["method"]).title, record["reason"])
             reasons[key] = reasons.get(key, 0) + 1
     remarks += [f"{title}: '-' for {n} pairs, {reason}." for (title, reason), n in reasons.items()]
-    broken = [record for record in records if record["status"] == "broken"]
+    broken: dict[tuple[str, str], list[str]] = {}
+    for record in records:
+        if record["status"] == "broken":
+            broken.setdefault((label_of(record), record["error"]), []).append(record["method"])
     if broken:
-        remarks.append(f"{len({(r['dataset'], r['sample']) for r in broken})} broken samples were skipped:")
-        remarks += [f"- {r['dataset']}/{r['sample']} ({r['method']}): {r['error']}" for r in broken]
+        count = len({label for label, _ in broken})
+        remarks.append(f"{count} broken {'sample was' if count == 1 else 'samples were'} skipped:")
+        remarks += [f"- {label} ({', '.join(names)}): {error}" for (label, error), names in broken.items()]
     return remarks
 
 

@@ -7,7 +7,7 @@ Paper: Algorithm 1 around ``algorithm.guided_step``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any
 
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from geodiff_plugin._checks import bad_type
 from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.known import Known
@@ -273,7 +274,11 @@ class GuidedRun:
         if self.callback is not None:
             values = {"latents": latents, **self._seen_by_callback(latents)}
             with self._suspended():
-                answer = self.callback(self.pipe, self.step_index, timestep, values) or {}
+                answer = self.callback(self.pipe, self.step_index, timestep, values)
+            answer = {} if answer is None else answer
+            if not isinstance(answer, Mapping):
+                cure = "Return callback_kwargs, or nothing to leave the latents as they are."
+                bad_type("the answer of callback_on_step_end", "a dict or None", answer, cure)
             if "latents" in answer:
                 latents, self.trajectories[-1].result = answer["latents"], None
         self.step_index += 1

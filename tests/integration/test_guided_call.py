@@ -282,6 +282,13 @@ def test_callback_sees_and_replaces(make_pipeline, textured_plane, left):
     assert out.latent.abs().max() == 0
 
 
+def test_a_callback_that_answers_with_something_else_is_told_so(make_pipeline, textured_plane, left):
+    pipe = enable_geometry_guidance(make_pipeline())
+    with pytest.raises(TypeError, match="the answer of callback_on_step_end must be a dict or None"):
+        pipe(left, guidance=guidance_for(textured_plane), callback_on_step_end=lambda *_: [1.0])
+    assert pipe(left).prediction is not None
+
+
 def test_same_seed_same_answer(make_pipeline, textured_plane, left):
     pipe = enable_geometry_guidance(make_pipeline())
     outs = [pipe(left, guidance=guidance_for(textured_plane), generator=seeded(3)) for _ in range(2)]

@@ -22,6 +22,7 @@ from geodiff_plugin.evaluation.baselines import (
 )
 from geodiff_plugin.evaluation.baselines._constant import constant_method
 from geodiff_plugin.evaluation.baselines._guidance import guided_prediction
+from geodiff_plugin.evaluation.baselines.files import map_name
 from geodiff_plugin.evaluation.datasets.folder import find_folder, load_folder
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
@@ -133,6 +134,14 @@ def test_guided_metres_are_aligned_in_the_space_of_the_prior(make_pipeline, spac
     stretched = SPACES[space].forward(1.7 * value + 0.2, torch.ones((), dtype=torch.float64)).numpy()
     record = score(sample, replace(prediction, depth_m=stretched), None)["all_pixels"]
     assert record["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6) and record["raw"]["abs_rel"] > 0.1
+
+
+def test_integers_are_no_metres(tmp_path):
+    sample = make_sample()
+    np.save(tmp_path / f"{map_name(sample.dataset, sample.name)}.npy", np.full(sample.depth_m.shape, 2000))
+    with pytest.raises(ValueError, match=r"map must be metres as floats.*int64.*1000 for millimetres"):
+        run(f"files:{tmp_path}", sample)
+    assert run(f"files:relative-depth:{tmp_path}", sample).relative is not None
 
 
 def test_bad_folders_of_maps_are_named(tmp_path):

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines._folder import folder_fingerprint
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
-from geodiff_plugin.evaluation.datasets._files import read_npy
+from geodiff_plugin.evaluation.datasets._files import read_npy, read_npy_m
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth
 from geodiff_plugin.formats import read_depth_mm_png, read_disparity_kitti_png, read_pfm
 
@@ -44,7 +44,8 @@ def _read(path: Path, kind: str) -> np.ndarray:
         read = read_depth_mm_png if kind == "depth" else read_disparity_kitti_png
         values, known = read(path)
     else:
-        values = read_pfm(path, "map") if path.suffix == ".pfm" else read_npy(path, "map")
+        read_values = read_pfm if path.suffix == ".pfm" else read_npy_m if kind == "depth" else read_npy
+        values = read_values(path, "map")
         known = np.isfinite(values) if kind.startswith("relative") else np.isfinite(values) & (values > 0)
     if values.ndim != 2:
         bad_value("map", "of shape (H, W)", f"{path} of shape {values.shape}")

@@ -13,13 +13,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, check_metres
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 from geodiff_plugin.formats import check_file, read_image
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.types import Rig
 
-__all__ = ["check_calibrated_sizes", "check_size", "folders", "make_sample", "read_npy", "read_rgb"]
+__all__ = [
+    "check_calibrated_sizes",
+    "check_size",
+    "folders",
+    "make_sample",
+    "read_npy",
+    "read_npy_m",
+    "read_rgb",
+]
 
 
 def read_rgb(path: Path, name: str) -> np.ndarray:
@@ -37,6 +45,13 @@ def read_npy(path: Path, name: str) -> np.ndarray:
         bad_value(name, "a whole npy file", f"{found}, which does not load ({error})", "Is it cut off?")
     if not isinstance(values, np.ndarray) or values.ndim != 2:
         bad_value(name, "a map of shape (H, W)", f"{found} of shape {np.shape(values)}")
+    return values
+
+
+def read_npy_m(path: Path, name: str) -> np.ndarray:
+    """``(H, W)`` metres of an npy file; as ``read_npy``, and ``ValueError`` for integers."""
+    values = read_npy(path, name)
+    check_metres(values, name, f"{path}, {values.dtype}")
     return values
 
 

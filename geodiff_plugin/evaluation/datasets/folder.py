@@ -15,7 +15,7 @@ from geodiff_plugin.evaluation.datasets._files import (
     check_size,
     folders,
     make_sample,
-    read_npy,
+    read_npy_m,
     read_rgb,
 )
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
@@ -66,7 +66,7 @@ def _read_depth(path: Path) -> np.ndarray:
     """``(H, W)`` metres, 0 or not finite where unknown."""
     if path.suffix == ".png":
         return read_depth_mm_png(path)[0]
-    return read_pfm(path, "depth") if path.suffix == ".pfm" else read_npy(path, "depth")
+    return read_pfm(path, "depth") if path.suffix == ".pfm" else read_npy_m(path, "depth")
 
 
 def load_folder(ref: SampleRef) -> StereoSample:
