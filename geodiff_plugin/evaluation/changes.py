@@ -49,6 +49,7 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("with gradient updates", "guided:inner_steps=5"),
         ("with gradient updates at every step", "guided:inner_steps=5+updates_from=0"),
         ("without refinement of the result", "guided:refine=false"),
+        ("without sharpening of depth edges", "guided:sharpen=false"),
         ("without rejection of reflections", "guided:reject_reflections=false"),
         ("without cleaning of photographs", "guided:clean_photographs=false"),
         ("without exposure", "guided:exposure=false"),
@@ -68,6 +69,7 @@ NUMBERS = (
     *("weights.photometric", "weights.matches", "weights.anchor", "loss_resolution"),
     *("match_noise", "correction_cauchy", "smoothness", "stiffest", "inertia", "most_inertia"),
     *("image_edge", "depth_edge", "edge_step"),
+    *("ramp_step", "ramp_contrast", "ramp_slope", "sharpen_colour", "sharpen_reach"),
     *("reflection_region", "reflection_spreads", "reflection_floor", "basin_cauchy", "fit_cauchy"),
 )
 """The numbers that decide the default's result, by leaf."""

@@ -20,7 +20,7 @@ RIGHT_WITHIN = 0.1
 #: (``python -m geodiff_plugin.evaluation.calibrate`` refits them): constant, by certainty, by the prior's
 #: strength, by photometric agreement, by the relative spread of an ensemble (set by hand: members that differ
 #: by 10 % halve the odds twice).
-BY_EVIDENCE = (-0.524, 0.835, 1.26, 0.135, -15.0)
+BY_EVIDENCE = (-0.221, 0.73, 2.43, 0.113, -15.0)
 #: Which sign each of them may have; 0 for any. Agreement can only raise confidence, and a pixel that no right
 #: camera sees has none, so not being in view can never raise it.
 SIGNS = (0, 1, 1, 1, -1)
@@ -31,6 +31,9 @@ _LEAST_ERROR, _MOST_ERROR, _STRONG, _WEAK = 0.01, 0.1, 0.03, 0.15
 _LEAST_LEFT, _MOST_LEFT = 0.0005, 0.05
 # Errors of the prior in log depth: of the best that matches can tell, of one that is of no use.
 _BEST, _USELESS = 0.01, 0.5
+# Support at which the prior's error is half known: it is measured where matches are, and a prior that is
+# right on the street may be wrong on the trees above it.
+_HALF_KNOWN = 0.1
 
 
 def depth_evidence(
@@ -46,19 +49,22 @@ def depth_evidence(
         prior_error: likewise.
 
     Returns:
-        ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. Certainty is the log of .05 over what is
-        left of the prior's error, ``(1 - support) * prior_error``: from 0 (.05 and more) to 4.6 (.0005 and
-        less). Strength is the log of .15 over the prior's error, from 0 to 1.6: with a good prior wrong
-        matches lose their weight, a poor one follows them. Agreement is how far the log of the photometric
-        error lies below that of .1: from 0 (error .1 and more, or not seen) to 2.3 (error .01 and less).
+        ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. Of the prior's error as much is believed
+        as a pixel has support; far from every match the prior counts as useless. Certainty is the log of .05
+        over what is left of that error, ``(1 - support) * error``: from 0 (.05 and more) to 4.6 (.0005 and
+        less). Strength is the log of .15 over it, from 0 to 1.6: with a good prior wrong matches lose their
+        weight, a poor one follows them. Agreement is how far the log of the photometric error lies below that
+        of .1: from 0 (error .1 and more, or not seen) to 2.3 (error .01 and less).
     """
     agreement = -(error.clamp(_LEAST_ERROR, _MOST_ERROR) / _MOST_ERROR).log()
-    known = support.new_tensor(_USELESS) if prior_error is None else prior_error
-    left = (1.0 - support) * known.clamp(_BEST, _USELESS)
+    measured = support.new_tensor(_USELESS) if prior_error is None else prior_error.clamp(_BEST, _USELESS)
+    share = support / (support + _HALF_KNOWN)
+    own = measured**share * _USELESS ** (1.0 - share)
+    left = (1.0 - support) * own
     evidence = [
         torch.ones_like(support),
         -(left.clamp(_LEAST_LEFT, _MOST_LEFT) / _MOST_LEFT).log(),
-        -(known.clamp(_STRONG, _WEAK) / _WEAK).log().expand_as(support),
+        -(own.clamp(_STRONG, _WEAK) / _WEAK).log(),
         torch.where(visible, agreement, torch.zeros_like(agreement)),
         torch.zeros_like(support) if spread is None else spread,
     ]
