@@ -57,11 +57,14 @@ def sharpen_edges(
     halo = (BESIDE + 1) * spacing
     out = depth_m.clone()
     for index in range(len(depth_m)):
-        depth = F.pad(depth_m[index : index + 1].float(), (halo,) * 4, mode="replicate")[0, 0]
-        image = F.pad(left_01[index : index + 1].float(), (halo,) * 4, mode="replicate")[0]
         for rows in row_strips(height, width):
-            part = slice(rows.start, rows.stop + 2 * halo)
-            strip = _Strip(depth[part], image[:, part], spacing, config)
+            part = slice(max(0, rows.start - halo), min(height, rows.stop + halo))
+            missing = halo, halo, halo - rows.start + part.start, halo - part.stop + rows.stop
+            depth, image = (
+                F.pad(whole[index : index + 1, :, part].float(), missing, mode="replicate")[0]
+                for whole in (depth_m, left_01)
+            )
+            strip = _Strip(depth[0], image, spacing, config)
             v, u = strip.on_ramp().nonzero(as_tuple=True)
             target = out[index, 0, rows]
             for at in zip(v.split(CHUNK), u.split(CHUNK), strict=True):
