@@ -20,7 +20,7 @@ RIGHT_WITHIN = 0.1
 #: (``python -m geodiff_plugin.evaluation.calibrate`` refits them): constant, by certainty, by the prior's
 #: strength, by photometric agreement, by the relative spread of an ensemble (set by hand: members that differ
 #: by 10 % halve the odds twice).
-BY_EVIDENCE = (-0.221, 0.73, 2.43, 0.113, -15.0)
+BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
 #: Which sign each of them may have; 0 for any. Agreement can only raise confidence, and a pixel that no right
 #: camera sees has none, so not being in view can never raise it.
 SIGNS = (0, 1, 1, 1, -1)

@@ -18,7 +18,7 @@ __all__ = ["EPIPOLAR_PX", "Judgement", "agreement_of_points", "judge"]
 
 #: Below these a run is not to be trusted: mean confidence, share matched; and a rank correlation of near and
 #: far that is this far below 0. Right pairs, real and rendered, had .58 to .98, .32 to .96 and +.18 to +.97;
-#: where nothing is matched, confidence is about .4.
+#: where nothing is matched, confidence is about .45.
 LEAST_CONFIDENCE, LEAST_MATCHED, MOST_EXCHANGED = 0.45, 0.12, -0.2
 #: No agreement on near and far is bad where few matches speak for themselves: a poor prior may be at fault.
 LEAST_ORDER, MATCHED_ENOUGH = 0.2, 0.5
