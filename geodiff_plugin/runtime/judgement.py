@@ -17,13 +17,13 @@ from geodiff_plugin.runtime.signs import Signs
 __all__ = ["EPIPOLAR_PX", "Judgement", "agreement_of_points", "judge"]
 
 #: Below these a run is not to be trusted: mean confidence, share matched; and a rank correlation of near and
-#: far that is this far below 0. Right pairs, real and rendered, had .58 to .98, .32 to .96 and +.18 to +.97;
+#: far that is this far below 0. Right pairs, real and rendered, had .66 to .98, .32 to .96 and +.18 to +.97;
 #: where nothing is matched, confidence is about .45.
-LEAST_CONFIDENCE, LEAST_MATCHED, MOST_EXCHANGED = 0.45, 0.12, -0.2
+LEAST_CONFIDENCE, LEAST_MATCHED, MOST_EXCHANGED = 0.5, 0.12, -0.2
 #: No agreement on near and far is bad where few matches speak for themselves: a poor prior may be at fault.
 LEAST_ORDER, MATCHED_ENOUGH = 0.2, 0.5
 #: Two weak signs together weigh as much as one that is bad.
-WEAK_CONFIDENCE, WEAK_MATCHED, WEAK_ORDER = 0.55, 0.4, 0.45
+WEAK_CONFIDENCE, WEAK_MATCHED, WEAK_ORDER = 0.6, 0.4, 0.45
 #: A rank correlation says nothing of a scene whose matched depths all lie within this (log of 95 % over 5 %).
 LEAST_SPREAD = 0.15
 #: Points and matches that differ by these factors are said to; and cost trust.
