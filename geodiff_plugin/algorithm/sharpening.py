@@ -20,6 +20,7 @@ from geodiff_plugin.formats.strips import row_strips
 from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.guidance.config import CorrectionConfig
 from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.scale.points import weighted_quantile
 
 __all__ = ["sharpen_edges"]
 
@@ -40,8 +41,8 @@ def sharpen_edges(
 
     A pixel is on a ramp if its inverse depth lies between those of two opposite neighbours, with a step to
     each, and the ramp is steeper than the surfaces at its ends. A plane, however oblique, has the same slope
-    everywhere in inverse depth, and is none. The new depth is the median over a window. In it neighbours
-    count for less that are on the ramp themselves, look different, or are far away.
+    everywhere in inverse depth, and is none. The new depth is the median over a window. Neighbours that are
+    on the ramp themselves, look different or are far away count for less in it.
 
     Args:
         depth_m: ``(B, 1, H, W)`` metres, > 0.
@@ -87,24 +88,20 @@ class _Strip:
         self.inverse = 1.0 / depth_m
         self.halo = (BESIDE + 1) * spacing
 
-    def _shifted(self, down: int, right: int) -> Tensor:
-        """``(h, w)`` inverse depth of the pixel so many spacings away from every pixel."""
+    def _along(self, direction: tuple[int, int], steps: int) -> Tensor:
+        """``(h, w)`` inverse depth of the pixel so many spacings away from every pixel in a direction."""
         height, width = (side - 2 * self.halo for side in self.inverse.shape)
-        top, first = self.halo + self.spacing * down, self.halo + self.spacing * right
+        top, first = (self.halo + self.spacing * steps * way for way in direction)
         return self.inverse[top : top + height, first : first + width]
 
     def on_ramp(self) -> Tensor:
         """``(h, w)`` whether a pixel hangs between two surfaces."""
-        centre = self._shifted(0, 0)
+        centre = self._along((0, 0), 0)
         found = torch.zeros_like(centre, dtype=torch.bool)
-        for down, right in DIRECTIONS:
-
-            def along(steps: int, down: int = down, right: int = right) -> Tensor:
-                return self._shifted(steps * down, steps * right)
-
-            ahead, behind = along(1) - centre, centre - along(-1)
+        for way in DIRECTIONS:
+            ahead, behind = self._along(way, 1) - centre, centre - self._along(way, -1)
             stepped = torch.minimum(ahead.abs(), behind.abs()) > self.config.ramp_step * centre
-            ends = [(along(end + 1) - along(end - 1)).abs() for end in (-BESIDE, BESIDE)]
+            ends = [(self._along(way, k + 1) - self._along(way, k - 1)).abs() for k in (-BESIDE, BESIDE)]
             steep = (ahead + behind).abs() > self.config.ramp_contrast * torch.maximum(*ends)
             found |= (ahead * behind > 0) & stepped & steep
         return found
@@ -120,10 +117,7 @@ class _Strip:
         unlike = (image[:, window] - image[:, centre, None]).abs().mean(0) / config.sharpen_colour
         away = (down**2 + right**2) / (2.0 * config.sharpen_reach**2)
         flat = 1.0 / (1.0 + (self._slope.flatten()[window] / config.ramp_slope) ** 2)
-        depths, order = self.depth_m.flatten()[window].sort(1)
-        below = (flat * torch.exp(-unlike - away)).gather(1, order).cumsum(1)
-        middle = (below < 0.5 * below[:, -1:]).sum(1, keepdim=True)
-        return depths.gather(1, middle)[:, 0]
+        return weighted_quantile(self.depth_m.flatten()[window], flat * torch.exp(-unlike - away), 0.5)
 
     @cached_property
     def _slope(self) -> Tensor:

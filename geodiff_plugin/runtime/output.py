@@ -56,12 +56,12 @@ def assemble_output(
     count, size = lefts_01.shape[0], image_size(lefts_01)
     depth_m = _as_maps(stock.prediction).to(lefts_01.device)  # (N, 1, H, W) or the processing grid
     known_of = [run.known(i) for i in range(count)]
-    depth_m, support = refine_result(run, known_of, depth_m, lefts_01)
-    uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
-    if uncertainty is not None and support is not None:
-        uncertainty = spread_of_members(run, depth_m, lefts_01, call)
     grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
+    depth_m, support = refine_result(run, known_of, depth_m, lefts_01, lefts)
+    uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
+    if uncertainty is not None and support is not None:
+        uncertainty = spread_of_members(run, depth_m, lefts_01, lefts, call)
     K_lefts = torch.stack(
         [torch.as_tensor(own.K_left, dtype=torch.float32, device=depth_m.device) for own in guidance.inputs]
     )

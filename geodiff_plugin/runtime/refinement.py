@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from torch import Tensor
 
@@ -25,7 +24,7 @@ __all__ = ["refine_result", "spread_of_members"]
 
 
 def refine_result(
-    run: GuidedRun, known_of: Sequence[Known], depth_m: Tensor, lefts_01: Tensor
+    run: GuidedRun, known_of: Sequence[Known], depth_m: Tensor, lefts_01: Tensor, lefts: Tensor
 ) -> tuple[Tensor, Tensor | None]:
     """The depth of every image refined, and how far matches and points decided it.
 
@@ -33,7 +32,8 @@ def refine_result(
         run: the finished run.
         known_of: of every image.
         depth_m: ``(N, 1, H, W)`` metres on the grid of the output.
-        lefts_01: ``(N, 3, h, w)`` in [0, 1].
+        lefts_01: ``(N, 3, h, w)`` in [0, 1], at native size.
+        lefts: ``(N, 3, H, W)``, the same on the grid of the output.
 
     Returns:
         ``(N, 1, H, W)`` metres, and support in [0, 1]; the depth as it was given and ``None`` where the
@@ -41,14 +41,16 @@ def refine_result(
     """
     if not run.config.correction.refine:
         return depth_m, None
-    images = zip(known_of, depth_m.split(1), lefts_01.split(1), strict=True)
-    fits = [fit for own, depth, left in images if (fit := _refined(run, own, depth, left)) is not None]
+    images = zip(known_of, depth_m.split(1), lefts_01.split(1), lefts.split(1), strict=True)
+    fits = [fit for own, *maps in images if (fit := _refined(run, own, *maps)) is not None]
     if len(fits) < len(depth_m):
         return depth_m, None
     return torch.cat([fit.depth_m for fit in fits]), torch.cat([fit.support for fit in fits])
 
 
-def spread_of_members(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: Mapping[str, Any]) -> Tensor:
+def spread_of_members(
+    run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, lefts: Tensor, call: Mapping[str, Any]
+) -> Tensor:
     """How far the members of every ensemble, refined one by one, lie from its result: ``(N, 1, H, W)`` m.
 
     It costs a refinement a member: their spread before it is that of a map that is not given out.
@@ -56,7 +58,8 @@ def spread_of_members(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: M
     Args:
         run: the finished run.
         depth_m: ``(N, 1, H, W)`` metres, refined.
-        lefts_01: ``(N, 3, h, w)`` in [0, 1].
+        lefts_01: as ``refine_result``.
+        lefts: likewise.
         call: arguments of the stock call by name.
     """
     size, method = image_size(depth_m), call["resample_method_output"]
@@ -66,24 +69,20 @@ def spread_of_members(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: M
         members = members.float().to(depth_m.device)
         if image_size(members) != size:  # as the stock call brings the ensemble to its output
             members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
-        left = lefts_01[i : i + 1]
-        fits = [_refined(run, run.known(i, m), member, left) for m, member in enumerate(members.split(1))]
+        views = lefts_01[i : i + 1], lefts[i : i + 1]
+        fits = [_refined(run, run.known(i, m), member, *views) for m, member in enumerate(members.split(1))]
         refined = torch.cat([fit.depth_m for fit in fits if fit is not None])
         spreads.append(spread_around(depth_m[i : i + 1], refined, reduction))
     return torch.cat(spreads)
 
 
-def _refined(run: GuidedRun, known: Known, depth_m: Tensor, left_01: Tensor) -> Refined | None:
+def _refined(run: GuidedRun, known: Known, depth_m: Tensor, left_01: Tensor, left: Tensor) -> Refined | None:
     """One map ``(1, 1, H, W)`` with its edges sharpened, fitted to what is known; ``None`` where nothing is.
 
     Edges first: a fit that finds them steep does not carry the depth of one surface over to the other, and
     the fit takes back what a poor prior's edges get wrong.
     """
-    size = image_size(depth_m)
     if run.config.correction.sharpen and known.size is not None:
-        left = left_01
-        if image_size(left) != size:
-            left = F.interpolate(left, size, mode="bilinear", antialias=True)
-        spacing = max(1, round(max(size) / max(run.grid.content)))
+        spacing = max(1, round(max(image_size(depth_m)) / max(run.grid.content)))
         depth_m = sharpen_edges(depth_m, left, spacing, run.config.correction)
     return known.refine(depth_m, left_01)

@@ -17,9 +17,9 @@ import torch.nn.functional as F
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines._folder import folder_fingerprint
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
-from geodiff_plugin.evaluation.datasets._files import read_npy, read_npy_m
+from geodiff_plugin.evaluation.datasets._files import read_depth_m, read_npy
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth
-from geodiff_plugin.formats import read_depth_mm_png, read_disparity_kitti_png, read_pfm
+from geodiff_plugin.formats import read_disparity_kitti_png, read_pfm
 
 __all__ = ["KINDS", "files_method", "map_name"]
 
@@ -40,15 +40,17 @@ def map_name(dataset: str, sample: str) -> str:
 
 def _read(path: Path, kind: str) -> np.ndarray:
     """``(H, W)`` float64; NaN where it is not known: 0 in metric maps and PNG files, not finite anywhere."""
-    if path.suffix == ".png":
-        read = read_depth_mm_png if kind == "depth" else read_disparity_kitti_png
-        values, known = read(path)
+    signed = False
+    if kind == "depth":
+        values = read_depth_m(path, "map")
+    elif path.suffix == ".png":
+        values, _ = read_disparity_kitti_png(path, "map")
     else:
-        read_values = read_pfm if path.suffix == ".pfm" else read_npy_m if kind == "depth" else read_npy
-        values = read_values(path, "map")
-        known = np.isfinite(values) if kind.startswith("relative") else np.isfinite(values) & (values > 0)
+        values = read_pfm(path, "map") if path.suffix == ".pfm" else read_npy(path, "map")
+        signed = kind.startswith("relative")
     if values.ndim != 2:
         bad_value("map", "of shape (H, W)", f"{path} of shape {values.shape}")
+    known = np.isfinite(values) & (signed | (values > 0))
     return np.where(known, values.astype(np.float64), np.nan)
 
 

@@ -15,7 +15,7 @@ import torch
 
 from geodiff_plugin._checks import bad_value, check_metres
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
-from geodiff_plugin.formats import check_file, read_image
+from geodiff_plugin.formats import check_file, npy, read_depth_mm_png, read_image, read_pfm
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.types import Rig
 
@@ -24,8 +24,8 @@ __all__ = [
     "check_size",
     "folders",
     "make_sample",
+    "read_depth_m",
     "read_npy",
-    "read_npy_m",
     "read_rgb",
 ]
 
@@ -37,19 +37,24 @@ def read_rgb(path: Path, name: str) -> np.ndarray:
 
 
 def read_npy(path: Path, name: str) -> np.ndarray:
-    """``(H, W)`` array of an npy file; ``ValueError`` naming it where it is cut off or of another rank."""
-    found = check_file(path, name, "an npy file")
-    try:
-        values = np.load(found, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        bad_value(name, "a whole npy file", f"{found}, which does not load ({error})", "Is it cut off?")
-    if not isinstance(values, np.ndarray) or values.ndim != 2:
-        bad_value(name, "a map of shape (H, W)", f"{found} of shape {np.shape(values)}")
+    """``(H, W)`` array of an npy file; ``ValueError`` naming it where it is damaged or of another rank."""
+    values = npy.read_npy(check_file(path, name, "an npy file"), name, "a map of shape (H, W)")
+    if values.ndim != 2:
+        bad_value(name, "a map of shape (H, W)", f"{path} of shape {values.shape}")
     return values
 
 
-def read_npy_m(path: Path, name: str) -> np.ndarray:
-    """``(H, W)`` metres of an npy file; as ``read_npy``, and ``ValueError`` for integers."""
+def read_depth_m(path: Path, name: str) -> np.ndarray:
+    """``(H, W)`` metres of an npy or PFM file, or of a 16-bit PNG of millimetres; 0 or not finite is unknown.
+
+    Raises:
+        OSError: no readable file.
+        ValueError: it is damaged, or an npy file of integers.
+    """
+    if path.suffix == ".png":
+        return read_depth_mm_png(path, name)[0]
+    if path.suffix == ".pfm":
+        return read_pfm(path, name)
     values = read_npy(path, name)
     check_metres(values, name, f"{path}, {values.dtype}")
     return values

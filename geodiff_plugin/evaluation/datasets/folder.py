@@ -15,11 +15,11 @@ from geodiff_plugin.evaluation.datasets._files import (
     check_size,
     folders,
     make_sample,
-    read_npy_m,
+    read_depth_m,
     read_rgb,
 )
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
-from geodiff_plugin.formats import read_calibration, read_depth_mm_png, read_pfm
+from geodiff_plugin.formats import read_calibration
 
 __all__ = ["FOLDER", "find_folder", "load_folder"]
 
@@ -62,13 +62,6 @@ def find_folder(root: Path) -> list[SampleRef]:
     return refs
 
 
-def _read_depth(path: Path) -> np.ndarray:
-    """``(H, W)`` metres, 0 or not finite where unknown."""
-    if path.suffix == ".png":
-        return read_depth_mm_png(path)[0]
-    return read_pfm(path, "depth") if path.suffix == ".pfm" else read_npy_m(path, "depth")
-
-
 def load_folder(ref: SampleRef) -> StereoSample:
     """Read one own pair.
 
@@ -90,7 +83,7 @@ def load_folder(ref: SampleRef) -> StereoSample:
     check_calibrated_sizes((first, second or first), rig, left, right)
     depth_m, truth = np.zeros(left.shape[:2], np.float32), "none"
     if files["depth"] is not None:
-        depth_m, truth = _read_depth(files["depth"]), files["depth"].name
+        depth_m, truth = read_depth_m(files["depth"], "depth"), files["depth"].name
         check_size(files["depth"], depth_m.shape, left.shape)
     return make_sample(ref, (left, right), rig, depth_m, {"truth": truth})
 
