@@ -84,45 +84,46 @@ class CorrectionConfig(Checked):
     refine: bool = flag(True, "the result is fitted to its matches and points once more, at full resolution")
     sharpen: bool = flag(
         True,
-        "before the result is refined, pixels of it that hang between a near and a far surface get the depth "
-        "of one of them, by a weighted median of their neighbours (after Ma et al. 2013)",
+        "before the result is refined, pixels that hang in the air between a near and a far surface get the "
+        "depth of one of them, the weighted median of their neighbours (after Ma et al. 2013)",
     )
     ramp_step: float = number(
         0.02,
         TINY,
         1e3,
-        "relative step in inverse depth to each of two opposite neighbours from which a pixel between them "
-        "may hang in the air",
+        "least relative step in inverse depth from a pixel that hangs in the air to each of two opposite "
+        "neighbours",
         paper="-",
     )
     ramp_contrast: float = number(
         2.0,
         0,
         1e6,
-        "it does where the slope there is this many times that of the surfaces on both sides",
+        "how many times steeper than the surfaces on both sides the slope must be at a pixel that hangs in "
+        "the air",
         paper="-",
     )
     ramp_slope: float = number(
         0.04,
         TINY,
         1e3,
-        "slope in log depth, for each pixel of the prior's grid, at which a neighbour counts half in that "
-        "median",
+        "slope in log depth, for each pixel of the prior's grid, at which a neighbour counts half in the "
+        "median of `sharpen`",
         paper="-",
     )
     sharpen_colour: float = number(
         0.12,
         TINY,
         1e6,
-        "difference in brightness at which a neighbour's weight falls to a third",
+        "difference in brightness at which a neighbour's weight in the median of `sharpen` falls to a third",
         paper="-",
     )
     sharpen_reach: float = number(
         1.5,
         TINY,
         1e3,
-        "standard deviation of the fall of that weight with distance, in pixels of the prior's grid, in a "
-        "window of five by five",
+        "distance, in pixels of the prior's grid, over which a neighbour's weight in the median of `sharpen` "
+        "falls: the standard deviation of a Gaussian, in a window of five by five",
         paper="-",
     )
     match_noise: float = number(

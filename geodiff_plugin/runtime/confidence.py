@@ -49,12 +49,12 @@ def depth_evidence(
         prior_error: likewise.
 
     Returns:
-        ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. Of the prior's error as much is believed
-        as a pixel has support; far from every match the prior counts as useless. Certainty is the log of .05
-        over what is left of that error, ``(1 - support) * error``: from 0 (.05 and more) to 4.6 (.0005 and
-        less). Strength is the log of .15 over it, from 0 to 1.6: with a good prior wrong matches lose their
-        weight, a poor one follows them. Agreement is how far the log of the photometric error lies below that
-        of .1: from 0 (error .1 and more, or not seen) to 2.3 (error .01 and less).
+        ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. The measured error of the prior
+        counts only as far as the pixel has support; without any the prior counts as useless. Certainty is the
+        log of .05 over what is left of that error, ``(1 - support) * error``: from 0 (.05 and more) to 4.6
+        (.0005 and less). Strength is the log of .15 over it, from 0 to 1.6: with a good prior wrong matches
+        lose their weight, a poor one follows them. Agreement is how far the log of the photometric error lies
+        below that of .1: from 0 (error .1 and more, or not seen) to 2.3 (error .01 and less).
     """
     agreement = -(error.clamp(_LEAST_ERROR, _MOST_ERROR) / _MOST_ERROR).log()
     measured = support.new_tensor(_USELESS) if prior_error is None else prior_error.clamp(_BEST, _USELESS)
