@@ -134,7 +134,7 @@ def versus_table(records: Sequence[dict[str, Any]], reference: str) -> Table:
         f"{find_method(reference).title} against each other method, AbsRel",
         ("method", "pairs", "mean difference [95 %]", "pairs won"),
         tuple(rows),
-        "Negative: fewer errors. An interval without 0 tells the two apart.",
+        "Negative: smaller error than the other method. An interval without 0 tells the two apart.",
     )
 
 

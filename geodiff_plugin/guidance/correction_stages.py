@@ -86,6 +86,7 @@ class CorrectionConfig(Checked):
         True,
         "before the result is refined, pixels that hang in the air between a near and a far surface get the "
         "depth of one of them, the weighted median of their neighbours (after Ma et al. 2013)",
+        paper="-",
     )
     ramp_step: float = number(
         0.02,

@@ -62,7 +62,7 @@ def tiny_autoencoder(pipe: Any, prior: DepthPrior, decoder: str) -> AutoencoderT
     if decoder == TINY:
         known = KNOWN.get((*own, vae.config.get("scaling_factor")))
         if known is None:
-            cure = f"None is known for its latent of {own[0]} channels; give a folder or a hub id of one."
+            cure = f"None is published for its latent of {own[0]} channels; give a folder or a hub id of one."
             bad_value("decoder", f"{FULL!r} with {prior.__class__.__name__}", repr(decoder), cure)
         decoder = known
     tiny = _loaded(decoder, pipe.dtype, str(pipe._execution_device))
