@@ -36,15 +36,17 @@ STRETCHED = 2.0
 SCALED_K = "with s = new size / old size take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy"
 
 
-def _as_matrix(value: Any, name: str, shape: tuple[int, int], cure: str) -> np.ndarray:
+def _as_matrix(value: Any, name: str, cure: str, *shapes: tuple[int, int]) -> np.ndarray:
+    """A finite float64 matrix of one of some shapes; messages tell the first."""
+    rows, columns = shapes[0]
     if hasattr(value, "detach"):
         value = value.detach().cpu().double().numpy()  # numpy has no bfloat16
     try:
         matrix = np.array(value, dtype=np.float64)  # a copy: the caller may go on to change theirs
     except (TypeError, ValueError, OverflowError):
-        bad_type(name, f"a {shape[0]}x{shape[1]} matrix of numbers", value, cure)
-    if matrix.shape != shape:
-        bad_value(name, f"a {shape[0]}x{shape[1]} matrix", f"shape {matrix.shape}", cure)
+        bad_type(name, f"a {rows}x{columns} matrix of numbers", value, cure)
+    if matrix.shape not in shapes:
+        bad_value(name, f"a {rows}x{columns} matrix", f"shape {matrix.shape}", cure)
     if not np.isfinite(matrix).all():
         bad_value(name, "finite", "NaN or infinity in it", "Check the calibration file.")
     return matrix
@@ -57,7 +59,7 @@ def check_intrinsics(K: Any, name: str = "K") -> np.ndarray:
         TypeError, ValueError: not 3x3, not finite, zero or negative focal length, last row not (0, 0, 1).
     """
     cure = "K is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the image it comes with."
-    K = _as_matrix(K, name, (3, 3), cure)
+    K = _as_matrix(K, name, cure, (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         got = f"{K[0, 0]:g} and {K[1, 1]:g}"
         bad_value(f"{name}[0, 0] and {name}[1, 1] (fx, fy)", "positive focal lengths in pixels", got, cure)
@@ -130,9 +132,9 @@ def check_pose(E: Any, name: str = "E") -> np.ndarray:
             mirrored.
     """
     cure = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t], [0, 1]], t in metres."
-    if np.shape(E) == (3, 4):
-        E = np.vstack([_as_matrix(E, name, (3, 4), cure), (0.0, 0.0, 0.0, 1.0)])
-    E = _as_matrix(E, name, (4, 4), cure)
+    E = _as_matrix(E, name, cure, (4, 4), (3, 4))
+    if len(E) == 3:
+        E = np.vstack([E, (0.0, 0.0, 0.0, 1.0)])
     if not np.allclose(E[3], (0, 0, 0, 1), atol=1e-6):
         bad_value(
             name, "rigid with last row (0, 0, 0, 1)", f"last row {E[3].tolist()}", cure + " Is it transposed?"

@@ -17,6 +17,7 @@ from PIL import Image, ImageOps
 from geodiff_plugin._camera_checks import check_calibrated_size
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import read_calibration, rig_from_parameters
+from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
 
@@ -100,9 +101,13 @@ def _third_pose(text: str | None) -> np.ndarray:
 
 
 def _guidance_of_rig(views: Views, rig: Rig, fields: CameraFields, knobs: dict[str, Any]) -> GeometryGuidance:
-    for side, image, size in (("left", views.left, rig.size_left), ("right", views.right, rig.size_right)):
-        cure = "Use the photographs that the calibration is for, or give the numbers scaled to these."
-        check_calibrated_size(image.shape[1::-1], size, f"the {side} photograph", Path(rig.source).name, cure)
+    cure = "Use the photographs that the calibration is for, or give the numbers scaled to these."
+    for image, path, K, size, name in (
+        (views.left, views.names[0], rig.K_left, rig.size_left, "the left photograph"),
+        (views.right, views.names[1], rig.K_right, rig.size_right, "the right photograph"),
+    ):
+        check_calibrated_size(image.shape[1::-1], size, name, Path(rig.source).name, cure)
+        warn_of_other_lens(path, K, name)
     posed = [(views.left, rig.K_left, np.eye(4)), (views.right, rig.K_right, rig.E)]
     if views.third is not None:
         posed.append((views.third, rig.K_left, _third_pose(fields.third_pose)))

@@ -17,7 +17,7 @@ from geodiff_plugin.app.examples import EXAMPLES
 from geodiff_plugin.app.job import MOST_MEMBERS, MOST_STEPS, PRESETS, Request
 from geodiff_plugin.app.priors import Priors
 
-__all__ = ["Form", "build_form"]
+__all__ = ["Form", "build_form", "photograph_field"]
 
 PICTURE_HEIGHT = 190
 #: Labels of the fields that hold a number or nothing.
@@ -74,24 +74,25 @@ def _optional(name: str, placeholder: str, **more: Any) -> gr.Textbox:
     )
 
 
+def photograph_field(label: str, name: str) -> gr.Image:
+    """A field for one photograph, whose value is the path of the file that was dropped, unchanged."""
+    return gr.Image(
+        label=label,
+        type="filepath",
+        image_mode=None,  # the file as it is: gradio's own conversion clips 16 bits and drops EXIF
+        sources=["upload", "clipboard"],
+        height=PICTURE_HEIGHT,
+        elem_id=name,
+    )
+
+
 def _photographs() -> dict[str, Any]:
     found: dict[str, Any] = {}
     with gr.Row():
         for name, label in (("left", "Left photograph"), ("right", "Right photograph")):
-            found[name] = gr.Image(
-                label=label,
-                type="filepath",
-                sources=["upload", "clipboard"],
-                height=PICTURE_HEIGHT,
-                elem_id=name,
-            )
+            found[name] = photograph_field(label, name)
     with gr.Accordion("A third photograph", open=False):
-        found["third"] = gr.Image(
-            label="Third photograph, of the left camera",
-            type="filepath",
-            sources=["upload", "clipboard"],
-            height=PICTURE_HEIGHT,
-        )
+        found["third"] = photograph_field("Third photograph, of the left camera", "third")
         found["third_pose"] = gr.Textbox(
             label="Its pose in the left camera's frame, metres",
             info="4x4, row by row: a camera 0.1 m higher has -0.1 as the fourth number of the second row.",

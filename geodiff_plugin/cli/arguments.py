@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["OUTPUT_FILES", "DepthArguments", "demo_arguments"]
+__all__ = ["DepthArguments", "demo_arguments", "undistorted_name"]
 
-#: Everything that a run may write; what an earlier run left of these goes when a new one replaces it.
-OUTPUT_FILES = (
+#: What a run writes, or may write by its prior and its lenses.
+FILES = (
     "depth.npy",
     "depth_mm.png",
     "depth.png",
@@ -26,12 +26,15 @@ OUTPUT_FILES = (
     "normals.npy",
     "cloud.ply",
     "undistorted.png",
-    "cloud.glb",
-    "cameras.txt",
-    "images.txt",
-    "points3D.txt",
     "report.json",
 )
+#: What ``--export`` adds.
+EXPORT_FILES = {"glb": ("cloud.glb",), "colmap": ("cameras.txt", "images.txt", "points3D.txt")}
+
+
+def undistorted_name(number: int) -> str:
+    """File of a view without its lens distortion: 1 for the left one, 2 for the right one, and so on."""
+    return "undistorted.png" if number == 1 else f"undistorted-{number}.png"
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,13 @@ class DepthArguments:
     show: str | None = None
     quiet: bool = False
     json: bool = False
+
+    def output_files(self) -> set[str]:
+        """Names of all files that a run with these options may write."""
+        names = {*FILES, *(name for kind in self.export for name in EXPORT_FILES.get(kind, ()))}
+        if "colmap" in self.export:
+            names.update(undistorted_name(number) for number in range(2, 3 + len(self.view)))
+        return names
 
     def as_json(self) -> dict[str, Any]:
         """The options as JSON can hold them."""

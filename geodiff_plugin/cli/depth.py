@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments
+from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.estimate import StopWatch, guided_call, load_guided_prior
 from geodiff_plugin.cli.exports import Scene, check_exports, make_scene, show_scene, write_exports
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
@@ -109,9 +109,7 @@ def write_result(
                 write_undistorted(folder, inputs.left)
             if arguments.export:
                 write_exports(folder, arguments.export, _scene(output, inputs, arguments))
-        report["files"]["names"] = [name for name in OUTPUT_FILES if (folder / name).exists()] + [
-            "report.json"
-        ]
+        report["files"]["names"] = [*sorted(path.name for path in folder.iterdir()), "report.json"]
         report["seconds"] = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
         return write_report(folder, report)
 

@@ -15,8 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.cli.arguments import undistorted_name
 from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.messages import say
+from geodiff_plugin.cli.outputs import write_undistorted
 from geodiff_plugin.cli.report import rescaled_pose, single_map
 from geodiff_plugin.formats import Cloud, flying_points, make_cloud, write_colmap, write_glb
 from geodiff_plugin.types import MetricDepthOutput
@@ -31,14 +33,17 @@ class Scene:
     Attributes:
         cloud: the sure points, without those that hang between two surfaces.
         cameras: ``(K, E, (width, height))``, the left one first.
-        names: of their images.
+        names: of their images, which a pinhole camera took: the photographs, or without lens distortion
+            those of ``write_undistorted``.
         left: ``(H, W, 3)`` in [0, 1].
+        further: likewise, the other views without lens distortion; empty where the names are photographs.
     """
 
     cloud: Cloud
     cameras: tuple[tuple[np.ndarray, np.ndarray, tuple[int, int]], ...]
     names: tuple[str, ...]
     left: np.ndarray
+    further: tuple[np.ndarray, ...] = ()
 
 
 def make_scene(
@@ -60,7 +65,11 @@ def make_scene(
     for rig, image in zip(inputs.guidance.rigs, inputs.guidance.rights, strict=True):
         cameras.append((rig.K_right, rescaled_pose(rig.E, output), (image.shape[-1], image.shape[-2])))
     cloud = make_cloud(depth_m, inputs.left, K, keep)
-    return Scene(cloud, tuple(cameras), tuple(path.name for path in names), inputs.left)
+    if not inputs.undistorted:
+        return Scene(cloud, tuple(cameras), tuple(path.name for path in names), inputs.left)
+    further = tuple(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)
+    written = tuple(undistorted_name(number) for number in range(1, 2 + len(further)))
+    return Scene(cloud, tuple(cameras), written, inputs.left, further)
 
 
 def _glb(folder: Path, scene: Scene) -> None:
@@ -68,6 +77,8 @@ def _glb(folder: Path, scene: Scene) -> None:
 
 
 def _colmap(folder: Path, scene: Scene) -> None:
+    for number, image_01 in enumerate(scene.further, 2):  # the left one is there without any export
+        write_undistorted(folder, image_01, number)
     views = [(name, *camera) for name, camera in zip(scene.names, scene.cameras, strict=True)]
     write_colmap(folder, views, scene.cloud)
 

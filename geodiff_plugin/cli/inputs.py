@@ -27,13 +27,14 @@ from geodiff_plugin.cli.lenses import Lenses, lenses_of, pinhole
 from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.cli.start import PARAMETERS, calibration_way
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
+from geodiff_plugin.formats.distortion import undistorted_points
 from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.formats.rigs import intrinsics
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.types import Rig
+from geodiff_plugin.types import Distortion, Rig
 
-__all__ = ["Inputs", "read_inputs", "read_rig"]
+__all__ = ["Inputs", "read_inputs", "read_known", "read_rig"]
 
 MOST_PIXELS = 1e6
 
@@ -178,18 +179,53 @@ def _read_further_views(
     return views
 
 
+def read_known(
+    arguments: DepthArguments, K: np.ndarray, lens: Distortion | None, size: tuple[int, int]
+) -> np.ndarray | None:
+    """The depths of ``--points`` as the left image without lens distortion has them; ``None`` for none.
+
+    Points in the camera's frame stay as they are. The pixels of a map are those of the image as it was
+    taken, so behind a lens with distortion its depths become points.
+
+    Args:
+        arguments: the options.
+        K: ``(3, 3)`` pixels of the left image.
+        lens: that it was taken through; ``None`` for a lens without distortion.
+        size: ``(width, height)`` of the left image.
+
+    Returns:
+        ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)`` float32 metres.
+
+    Raises:
+        OSError, ValueError: as ``read_points``; a map of another size than the image behind a lens.
+    """
+    if arguments.points is None:
+        return None
+    scale, calibration = arguments.points_scale, arguments.points_calib
+    known = read_points(arguments.points, "--points", scale=scale, calibration=calibration)
+    if lens is None or known.shape[1] == 3:
+        return known
+    if _size(known) != size:
+        expected, got = ("{}x{}".format(*of) for of in (size, _size(known)))
+        cure = "A map belongs to the image as it was taken, pixel by pixel; else give points (N, 3)."
+        bad_value("--points", f"a map of the left image's {expected} pixels", got, cure)
+    return undistorted_points(known, K, lens)
+
+
 def _make_guidance(
-    arguments: DepthArguments, settings: Settings, right: np.ndarray | None, rig: Rig, lenses: Lenses
+    arguments: DepthArguments,
+    settings: Settings,
+    views: tuple[np.ndarray, np.ndarray | None],
+    rig: Rig,
+    lenses: Lenses,
 ) -> GeometryGuidance:
-    config, points, cropped = settings.config, None, arguments.cropped
-    if arguments.points is not None:
-        scale, calibration = arguments.points_scale, arguments.points_calib
-        points = read_points(arguments.points, "--points", scale=scale, calibration=calibration)
+    (left, right), config, cropped = views, settings.config, arguments.cropped
+    points = read_known(arguments, rig.K_left, lenses[0], _size(left))
     if right is None:
         return GeometryGuidance(None, rig.K_left, points=points, cropped=cropped, config=config)
-    further = _read_further_views(arguments, rig.K_left, lenses, config)
-    views = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E), *further]
-    return GeometryGuidance.from_views(views, points=points, cropped=cropped, config=config)
+    further = _read_further_views(arguments, rig.K_left, lenses[2:], config)
+    posed = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E), *further]
+    return GeometryGuidance.from_views(posed, points=points, cropped=cropped, config=config)
 
 
 def _compare_with_exif(arguments: DepthArguments, rig: Rig) -> None:
@@ -229,5 +265,5 @@ def read_inputs(
     left = pinhole(left, rig.K_left, lenses[0], settings.config)
     if right is not None:
         right = pinhole(right, rig.K_right, lenses[1], settings.config)
-    guidance = _make_guidance(arguments, settings, right, rig, lenses[2:])
+    guidance = _make_guidance(arguments, settings, (left, right), rig, lenses)
     return Inputs(left, rig, guidance, any(lens is not None for lens in lenses))

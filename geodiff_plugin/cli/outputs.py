@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from geodiff_plugin.cli.arguments import undistorted_name
 from geodiff_plugin.cli.report import single_map
 from geodiff_plugin.formats import flying_points, write_depth_mm_png, write_depth_npy, write_ply
 from geodiff_plugin.plotting.figures import depth_figure
@@ -68,9 +69,10 @@ def write_maps(
     }
 
 
-def write_undistorted(folder: Path, left: np.ndarray) -> None:
-    """Write the left image without its lens distortion: the one that the depth belongs to."""
-    Image.fromarray(np.rint(left.clip(0, 1) * 255).astype(np.uint8)).save(folder / "undistorted.png")
+def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> None:
+    """Write a view without its lens distortion; the depth belongs to the first, which is the left one."""
+    image = Image.fromarray(np.rint(image_01.clip(0, 1) * 255).astype(np.uint8))
+    image.save(folder / undistorted_name(number))
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> str:

@@ -16,14 +16,17 @@ from geodiff_plugin._camera_checks import check_intrinsics
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_positive
-from geodiff_plugin.cli.inputs import Inputs
+from geodiff_plugin.cli.inputs import Inputs, read_known
 from geodiff_plugin.cli.lenses import lenses_of, pinhole
 from geodiff_plugin.cli.messages import say
 from geodiff_plugin.cli.settings import Settings
-from geodiff_plugin.formats import read_image, read_matrix, read_points
+from geodiff_plugin.cli.start import intrinsics_way
+from geodiff_plugin.formats import read_image, read_matrix
+from geodiff_plugin.formats.distortion import undistorted_pixels
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.rigs import intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.types import Distortion
 
 __all__ = ["known_length", "read_photographs"]
 
@@ -46,23 +49,40 @@ def known_length(text: str | None) -> tuple[float, float, float, float, float] |
 
 def _intrinsics(arguments: DepthArguments, path: Path, i: int, size: tuple[int, int]) -> np.ndarray:
     """K of photograph ``i``, 0 being the left one, from the options, else from its EXIF."""
+    way = intrinsics_way(arguments)
     if i > 1 and arguments.view_k:
         path = arguments.view_k[i - 2]
         return check_intrinsics(read_matrix(path, "--view-K"), f"--view-K {path}")
-    typed = [getattr(arguments, name) for name in ("fx", "fy", "cx", "cy")]
-    if arguments.k is not None:
-        own = arguments.k_right if i > 0 and arguments.k_right is not None else arguments.k
-        return check_intrinsics(read_matrix(own, "--K"), "--K")
-    if any(value is not None for value in typed):
-        if any(value is None for value in typed):
-            bad_value("--fx --fy --cx --cy", "given all together", "some of them")
-        return intrinsics(*typed)
+    if way == "matrices":
+        option, own = "--K", arguments.k
+        if i > 0 and arguments.k_right is not None:
+            option, own = "--K-right", arguments.k_right
+        assert own is not None
+        return check_intrinsics(read_matrix(own, option), option)
+    if way == "parameters":
+        return intrinsics(*(getattr(arguments, name) for name in ("fx", "fy", "cx", "cy")))
     if arguments.fov is not None:
         return intrinsics_from_fov(arguments.fov, size)
     K, notes = intrinsics_from_exif(path, path.name)
     for note in notes:
         say(note)
     return K
+
+
+def _straight_length(
+    typed: tuple[float, float, float, float, float] | None, K: np.ndarray, lens: Distortion | None
+) -> tuple[float, float, float, float, float] | None:
+    """A known length of LEFT as it was taken, its ends where the image without lens distortion has them."""
+    if typed is None or lens is None:
+        return typed
+    *ends, metres = typed
+    straight = undistorted_pixels(np.reshape(ends, (2, 2)), K, lens)
+    if not np.isfinite(straight).all():
+        got = f"{ends}, of which the lens model has no ray"
+        cure = "Choose ends nearer to the middle of LEFT, or check --distortion."
+        bad_value("--known-length", "between two pixels that the lens shows", got, cure)
+    (x1, y1), (x2, y2) = straight.tolist()
+    return x1, y1, x2, y2, metres
 
 
 def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
@@ -72,14 +92,6 @@ def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
         OSError, TypeError, ValueError: naming the option, the file or the package that is missing, or why
             there is no pose to be had.
     """
-    for option, given in (("--calib", arguments.calib), ("--E", arguments.e), ("--view-E", arguments.view_e)):
-        if given:
-            bad_value(
-                option,
-                "left out with --estimate-pose",
-                "both",
-                "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy.",
-            )
     if arguments.baseline is not None:
         check_positive(arguments.baseline, "--baseline", "metres")
     images, Ks, lenses = [], [], lenses_of(arguments)
@@ -90,16 +102,16 @@ def read_photographs(arguments: DepthArguments, settings: Settings) -> Inputs:
             warnings.warn(note, stacklevel=2)
         Ks.append(_intrinsics(arguments, path, i, (image.shape[1], image.shape[0])))
         images.append(pinhole(image, Ks[-1], lenses[i], settings.config))
-    points = None if arguments.points is None else read_points(arguments.points, "--points")
+    sizes = [(image.shape[1], image.shape[0]) for image in images[:2]]
     guidance = GeometryGuidance.from_photographs(
         images,
         K=Ks,
         baseline_m=arguments.baseline,
-        known_length=known_length(arguments.known_length),
-        points=points,
+        known_length=_straight_length(known_length(arguments.known_length), Ks[0], lenses[0]),
+        points=read_known(arguments, Ks[0], lenses[0], sizes[0]),
         matcher=arguments.matcher or "sift",
+        cropped=arguments.cropped,
         config=settings.config,
     )
-    sizes = [(image.shape[1], image.shape[0]) for image in images[:2]]
     rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
     return Inputs(images[0], rig, guidance, any(lens is not None for lens in lenses))

@@ -16,17 +16,28 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments
+from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.cli.many.pairs import PairRef, arguments_of, find_pairs
+from geodiff_plugin.cli.many.summary import check_summary
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.out_folder import OutFolder
 from geodiff_plugin.formats.out_place import check_out
 
-__all__ = ["CALIBRATION_WAYS", "PARAMETERS", "calibration_way", "check_files", "start_many", "start_run"]
+__all__ = [
+    "CALIBRATION_WAYS",
+    "PARAMETERS",
+    "calibration_way",
+    "check_files",
+    "intrinsics_way",
+    "out_folder_of",
+    "start_many",
+    "start_run",
+]
 
 CALIBRATION_WAYS = "--calib FILE, or --fx --fy --cx --cy --baseline, or --K FILE --E FILE"
 CAMERA_WAYS = "--calib FILE, or --fx --fy --cx --cy, or --K FILE"
+INTRINSICS_WAYS = "--K FILE, or --fx --fy --cx --cy, or --fov, or EXIF"
 PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
 
 
@@ -59,6 +70,41 @@ def calibration_way(arguments: DepthArguments) -> str:
     return taken[0]
 
 
+def intrinsics_way(arguments: DepthArguments) -> str:
+    """How K of photographs without poses is given: as "matrices", "parameters", "--fov" or in "EXIF".
+
+    Raises:
+        ValueError: in more than one way, in parts, or beside options that only given poses go with.
+    """
+    for option, given in (
+        ("--calib", arguments.calib),
+        ("--cameras", arguments.cameras),
+        ("--E", arguments.e),
+        ("--view-E", arguments.view_e),
+    ):
+        if given:
+            cure = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
+            bad_value(option, "left out with --estimate-pose", "both", cure)
+    parameters = [getattr(arguments, name) is not None for name in PARAMETERS if name != "baseline"]
+    ways = {
+        "matrices": arguments.k is not None or arguments.k_right is not None,
+        "parameters": any(parameters),
+        "--fov": arguments.fov is not None,
+    }
+    taken = [way for way, is_taken in ways.items() if is_taken]
+    if len(taken) > 1:
+        bad_value("K", f"given in one way: {INTRINSICS_WAYS}", " and ".join(taken), "Drop the others.")
+    if arguments.k_right is not None and arguments.k is None:
+        bad_value("--K", "given with --K-right", "--K-right alone", "It is K of LEFT.")
+    if any(parameters) and not all(parameters):
+        bad_value("--fx --fy --cx --cy", "given all together", "some of them")
+    way = taken[0] if taken else "EXIF"
+    if arguments.cropped and way in ("--fov", "EXIF") and not arguments.view_k:
+        cure = "A field of view, or EXIF, does not tell where the principal point of a crop is."
+        bad_value("--cropped", "given with --K, or --fx --fy --cx --cy", f"K by {way}", cure)
+    return way
+
+
 def _photographs(arguments: DepthArguments) -> dict[str, Path]:
     photographs = {"LEFT": arguments.left}
     if arguments.right is not None:
@@ -89,8 +135,9 @@ def _is_colmap_model(path: Path) -> bool:
     return any(os.path.exists(path / name) for name in ("cameras.txt", "images.txt", "images.bin"))
 
 
-def _check_other_files(arguments: DepthArguments) -> None:
-    for name, paths in (
+def _other_files(arguments: DepthArguments) -> list[tuple[str, Path]]:
+    """Name and path of every input that is no photograph."""
+    named: tuple[tuple[str, tuple[Path | None, ...]], ...] = (
         ("calibration", arguments.calib),
         ("--K", (arguments.k,)),
         ("--E", (arguments.e,)),
@@ -99,10 +146,14 @@ def _check_other_files(arguments: DepthArguments) -> None:
         ("--view-E", arguments.view_e),
         ("--points", (arguments.points,)),
         ("--points-calib", arguments.points_calib),
-    ):
-        for path in paths:
-            if path is not None and not (name == "calibration" and _is_colmap_model(path)):
-                check_file(path, name, "a calibration file" if name == "calibration" else "a file")
+    )
+    return [(name, path) for name, paths in named for path in paths if path is not None]
+
+
+def _check_other_files(arguments: DepthArguments) -> None:
+    for name, path in _other_files(arguments):
+        if not (name == "calibration" and _is_colmap_model(path)):
+            check_file(path, name, "a calibration file" if name == "calibration" else "a file")
 
 
 def check_files(arguments: DepthArguments, videos: bool = False) -> None:
@@ -115,11 +166,21 @@ def check_files(arguments: DepthArguments, videos: bool = False) -> None:
     Raises:
         OSError, TypeError, ValueError: naming the option or the file.
     """
-    if not arguments.estimate_pose:
+    if arguments.estimate_pose:
+        intrinsics_way(arguments)
+    else:
         calibration_way(arguments)
     if not videos:
         _check_photographs(arguments)
     _check_other_files(arguments)
+
+
+def out_folder_of(arguments: DepthArguments) -> OutFolder:
+    """The output folder of one pair, which refuses to replace what the pair is made of."""
+    inputs = [*_photographs(arguments).values(), *(path for _, path in _other_files(arguments))]
+    inputs += [path / name for path in arguments.calib for name in ("cameras.txt", "images.txt")]
+    names, overwrite = arguments.output_files(), arguments.overwrite
+    return OutFolder(arguments.out, names, inputs=inputs, overwrite=overwrite)
 
 
 def start_many(arguments: DepthArguments) -> list[PairRef]:
@@ -143,12 +204,15 @@ def start_many(arguments: DepthArguments) -> list[PairRef]:
         )
     first = arguments_of(refs[0], arguments)
     check_arguments(first if first.right is not None else replace(first, right=first.left))
-    if not arguments.estimate_pose and all(ref.calib is None for ref in refs):
+    if arguments.estimate_pose:
+        intrinsics_way(first)
+    elif all(ref.calib is None for ref in refs):
         calibration_way(first)
     _check_other_files(arguments)
     if (check_out(arguments.out) / "report.json").exists():
         got = f"{arguments.out}, which holds the result of one pair"
         bad_value("--out", "a folder for the folders of many pairs", got, "Name another.")
+    check_summary(arguments.out)
     return refs
 
 
@@ -163,5 +227,5 @@ def start_run(arguments: DepthArguments) -> Iterator[OutFolder]:
         bad_value("--warm-start", "given with many pairs", "one pair", "It goes on from the pair before.")
     check_arguments(arguments)
     check_files(arguments)
-    with OutFolder(arguments.out, OUTPUT_FILES, overwrite=arguments.overwrite) as out:
+    with out_folder_of(arguments) as out:
         yield out

@@ -36,14 +36,17 @@ def _map(path: Path) -> np.ndarray:
 
 
 def _photograph(folder: Path) -> Image.Image:
-    """The left image of a result, where it lay when the result was made."""
+    """The left image that the depth of a result belongs to, where it lay when the result was made."""
     report = check_file(folder / "report.json", "--photographs", "the report of a folder of geodiff depth")
     try:
         result = json.loads(report.read_text(encoding="utf-8"))
         arguments, frame = result["arguments"], result.get("pair", {}).get("frame")
+        undistorted = result["undistorted"]
         left = Path(arguments["left"])
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         bad_value("--photographs", "the report of a folder of geodiff depth", f"{report}, which is damaged")
+    if undistorted:
+        return Image.open(check_file(folder / "undistorted.png", f"the undistorted left image of {folder}"))
     if frame is not None:
         with VideoReader(left, f"the left video of {folder}") as video:
             image = video.read(frame)

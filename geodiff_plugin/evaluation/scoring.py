@@ -158,7 +158,8 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
         if values is not None and values.shape != truth.shape:
             bad_value(f"prediction.{name}", f"of the left image's shape {truth.shape}", values.shape)
     if not valid.any():
-        bad_value(f"the truth of {sample.label}", "known for at least one pixel", "none")
+        got = f"none ({sample.notes['truth']})" if "truth" in sample.notes else "none"
+        bad_value(f"the truth of {sample.label}", "known for at least one pixel", got)
     values, depth_m = prediction.relative, prediction.depth_m
     if values is None:
         # Metres are aligned in the prior's own space, as its relative map would be.

@@ -1,6 +1,6 @@
-"""Undistorts photographs, with OpenCV's model or its fisheye model.
+"""Undistorts photographs and what is known of their pixels, with OpenCV's model or its fisheye model.
 
-Data flow: image, K, coefficients -> the image that a pinhole camera of the same K would have taken.
+Data flow: image, pixels or map of depths, K, coefficients -> those of a pinhole camera with the same K.
 Paper: none; every formula of the package is of a pinhole camera.
 """
 
@@ -13,7 +13,14 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.lenses import COUNTS
 from geodiff_plugin.types import Distortion
 
-__all__ = ["distortion_from_text", "undistorted"]
+__all__ = ["distortion_from_text", "undistorted", "undistorted_pixels", "undistorted_points"]
+
+#: Most steps of Newton's method; near the middle of an image three suffice.
+MOST_STEPS = 50
+#: A pixel that comes back to itself this well is found.
+TOLERANCE_PX = 1e-3
+#: Of the differences that stand for derivatives.
+STEP_PX = 1e-3
 
 
 def distortion_from_text(text: str, name: str = "--distortion") -> Distortion:
@@ -51,3 +58,65 @@ def undistorted(image_01: np.ndarray, K: np.ndarray, distortion: Distortion) -> 
     else:
         straight = cv2.undistort(image_01, K, coefficients)
     return straight.clip(0.0, 1.0).astype(np.float32)
+
+
+def _as_taken(straight_px: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
+    """Where the lens shows what a pinhole camera has at these pixels, ``(N, 1, 2)`` both."""
+    rays = np.concatenate([straight_px, np.ones_like(straight_px[..., :1])], axis=2) @ np.linalg.inv(K).T
+    if distortion.model == "fisheye":
+        return np.asarray(cv2.fisheye.distortPoints(rays[..., :2], K, distortion.coefficients))
+    return np.asarray(cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, distortion.coefficients)[0])
+
+
+def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
+    """Where pixels of the image as it was taken lie in the image that ``undistorted`` makes of it.
+
+    Args:
+        pixels: ``(N, 2)`` x and y, the centre of the first pixel at (0, 0).
+        K: ``(3, 3)`` pixels, of both images.
+        distortion: of the lens.
+
+    Returns:
+        ``(N, 2)`` float64, also outside of the image; NaN where the lens model sends no ray to the pixel.
+    """
+    taken, K = np.asarray(pixels, np.float64).reshape(-1, 1, 2), np.asarray(K, np.float64)
+    straight, found = taken.copy(), np.zeros(len(taken), bool)
+    left = np.arange(len(taken))
+    # Newton's method: OpenCV's own way back stops after five iterations, pixels off behind a strong lens.
+    for _ in range(MOST_STEPS):
+        if not left.size:
+            break
+        here = straight[left]
+        bent = _as_taken(here, K, distortion)
+        error = (bent - taken[left])[:, 0]
+        moved = [_as_taken(here + step, K, distortion) - bent for step in STEP_PX * np.eye(2)]
+        (a, c), (b, d) = (step[:, 0].T / STEP_PX for step in moved)
+        area = a * d - b * c
+        ahead = (area > 0) & (a + d > 0)  # neither mirrored nor turned over, as behind the edge of a lens
+        near = np.abs(error).max(axis=1) < TOLERANCE_PX
+        found[left[near & ahead]] = True
+        left, error = left[~near & ahead], error[~near & ahead]
+        a, b, c, d, area = (entry[~near & ahead] for entry in (a, b, c, d, area))
+        x, y = error.T
+        straight[left, 0] -= np.stack([(d * x - b * y) / area, (a * y - c * x) / area], axis=1)
+    straight[~found] = np.nan
+    return straight[:, 0]
+
+
+def undistorted_points(depth_m: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
+    """The known depths of an image as it was taken, as points; no two are mixed, and none is rounded.
+
+    Args:
+        depth_m: ``(H, W)`` metres along the optical axis, 0 or not finite where unknown.
+        K: ``(3, 3)`` pixels of the image.
+        distortion: of the lens.
+
+    Returns:
+        ``(N, 3)`` float32 metres in the camera's frame; those that no ray of the lens model belongs to are
+        left out.
+    """
+    rows, columns = np.nonzero(np.isfinite(depth_m) & (depth_m > 0))
+    straight = undistorted_pixels(np.stack([columns, rows], axis=1), K, distortion)
+    rays = np.concatenate([straight, np.ones((len(straight), 1))], axis=1) @ np.linalg.inv(K).T
+    points = rays * depth_m[rows, columns, None]
+    return points[np.isfinite(points).all(axis=1)].astype(np.float32)

@@ -9,6 +9,7 @@ Nothing here imports torch: what is wrong with a folder is said at once.
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import sys
@@ -39,10 +40,21 @@ __all__ = ["EXIT_ELSEWHERE", "OutFolder"]
 
 #: Exit code of a run whose result could not be written where it was asked for, and was written elsewhere.
 EXIT_ELSEWHERE = 3
+#: Lists what a run wrote, and is written last.
+REPORT = "report.json"
 #: How long a run on a terminal waits before it tries again to write a result that fits nowhere.
 RETRY_S = 10.0
 
 Result = TypeVar("Result")
+
+
+def _own_files(folder: Path) -> set[str]:
+    """Names of the files that an earlier run wrote there, as its report lists them."""
+    try:
+        names = json.loads((folder / REPORT).read_text(encoding="utf-8"))["files"]["names"]
+        return {name for name in names if Path(name).name == name} if isinstance(names, list) else set()
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # none, or of something else
+        return set()
 
 
 def _say(line: str) -> None:
@@ -55,8 +67,10 @@ class OutFolder:
 
     Args:
         path: as typed; it need not exist.
-        names: every file that a run may write; those of an earlier run that a new one does not write go.
-        overwrite: take a folder that holds files; files that are not among ``names`` stay.
+        names: every file that the run may write.
+        inputs: files that the run reads, none of which it may replace or delete.
+        overwrite: take a folder that holds files. Those that its report lists as an earlier run's own go
+            where the new run does not write them; all others stay.
         resume: the folder is written to directly, file by file, and may hold an earlier part of the same.
         option: what ``path`` was given as, for messages.
 
@@ -65,8 +79,8 @@ class OutFolder:
         elsewhere: the sentence that says so, or ``None``.
 
     Raises:
-        ValueError: on entry: what ``check_out`` refuses; files in it; it cannot be written to; another run
-            has it.
+        ValueError: on entry: what ``check_out`` refuses; files in it, or an input that the run would replace
+            or delete; it cannot be written to; another run has it.
     """
 
     def __init__(
@@ -74,13 +88,16 @@ class OutFolder:
         path: Path,
         names: Collection[str] = (),
         *,
+        inputs: Collection[Path] = (),
         overwrite: bool = False,
         resume: bool = False,
         option: str = "--out",
     ) -> None:
         self.path = Path(path)
         self.elsewhere: str | None = None
-        self._names, self._overwrite, self._resume, self._option = set(names), overwrite, resume, option
+        self._names, self._inputs = set(names), inputs
+        self._overwrite, self._resume, self._option = overwrite, resume, option
+        self._earlier: set[str] = set()
         self._made: list[Path] = []
         self._stack = ExitStack()
 
@@ -89,6 +106,9 @@ class OutFolder:
         if holds_files(self._target) and not (self._overwrite or self._resume):
             cure = "Name another, or add --overwrite."
             bad_value(self._option, "a new or empty folder", f"{self.path}, which holds files", cure)
+        if self._overwrite:
+            self._earlier = _own_files(self._target)
+            self._refuse_inputs()
         with ExitStack() as stack:
             stack.callback(self._remove_made)
             try:
@@ -109,6 +129,15 @@ class OutFolder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
+
+    def _refuse_inputs(self) -> None:
+        """Refuse a folder with an input of this run among the files that it replaces or deletes."""
+        own = [self._target / name for name in sorted(self._names | self._earlier)]
+        own = [path for path in own if path.exists()]
+        for path in self._inputs:
+            if any(path.exists() and path.samefile(other) for other in own):
+                got = f"{self.path}, where the run would replace or delete {path}, which it reads"
+                bad_value(self._option, "a folder that holds no input of the run", got, "Name another.")
 
     def _make(self, folder: Path) -> None:
         """Make a folder and those above it, and remember which were new."""
@@ -155,9 +184,10 @@ class OutFolder:
     def write(self, fill: Callable[[Path], Result]) -> Result:
         """Let ``fill`` write into an empty folder, whose files then are this folder's.
 
-        A new folder appears by one rename. In one that exists each file is replaced by one rename, the
-        report last. Where that fails the result is written elsewhere, ``elsewhere`` says where; on a terminal
-        a result that fits nowhere is kept and tried again until it fits or Ctrl-C.
+        A new folder appears by one rename. In one that exists each file is replaced by one rename, then what
+        only an earlier run wrote goes, and the report is replaced last. Where that fails the result is
+        written elsewhere, ``elsewhere`` says where; on a terminal a result that fits nowhere is kept and
+        tried again until it fits or Ctrl-C.
 
         Args:
             fill: writes all files into the folder that it is given; it is called again for every attempt.
@@ -206,11 +236,14 @@ class OutFolder:
                 if error.errno not in (errno.EXDEV, errno.ENOTEMPTY, errno.EEXIST):
                     raise
             self._target.mkdir(exist_ok=True)
-        written = sorted(self._staging.iterdir(), key=lambda path: path.name == "report.json")
-        for path in written:
-            _move(path, self._target / path.name)
-        for name in self._names - {path.name for path in written}:
-            (self._target / name).unlink(missing_ok=True)
+        written = {path.name for path in self._staging.iterdir()}
+        for name in sorted(written - {REPORT}):
+            _move(self._staging / name, self._target / name)
+        for path in (self._target / name for name in self._earlier - written):
+            if path.is_file():
+                path.unlink()
+        if REPORT in written:  # last: until then the old one lists what is still to go
+            _move(self._staging / REPORT, self._target / REPORT)
         return result
 
 

@@ -193,6 +193,7 @@ class GeometryGuidance:
         known_length: tuple[float, float, float, float, float] | None = None,
         points: Any = None,
         matcher: str = "sift",
+        cropped: bool = False,
         **knobs: Any,
     ) -> Self:
         """Two or more photographs without poses, which are estimated from matches (extra ``pose``).
@@ -210,6 +211,7 @@ class GeometryGuidance:
             points: ``(N, 3)`` as in the constructor; they give the scale if nothing else does.
             matcher: feature matcher: ``"sift"``, or ``"lightglue"``, ``"superglue"`` or a folder with weights
                 of either, if they are on this machine.
+            cropped: as in the constructor; the principal point of a K that is given may lie outside.
             **knobs: further arguments of the constructor.
 
         Returns:
@@ -230,10 +232,13 @@ class GeometryGuidance:
             known_length=known_length,
             points=points,
             matcher=matcher,
+            cropped=cropped,
         )
         views = zip((None, *photographs[1:]), found.Ks, (np.eye(4), *found.Es), strict=True)
         points = points if found.scale.unit else None
-        guidance = cls.from_views(list(views), points=points, left_size=found.size_left, **knobs)
+        guidance = cls.from_views(
+            list(views), points=points, left_size=found.size_left, cropped=cropped, **knobs
+        )
         guidance.estimated = found
         return guidance
 

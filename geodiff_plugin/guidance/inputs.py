@@ -7,6 +7,7 @@ Paper: S3.3 (two views with known cameras); more views and points go beyond it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -78,10 +79,10 @@ def read_inputs(right: Any, K: Any, E: Any, points: Any, *, cropped: bool = Fals
     """
     if right is None and points is None:
         bad_value("right", "an image, or None together with points", "None without points")
-    if right is not None:
-        K, E = _as_tuple(K, right), _as_tuple(E, right)
     batch = next((x for x in (right, points) if isinstance(x, list) and not _is_nested_matrix(x)), [None])
     count = len(batch)
+    if right is not None and not isinstance(right, list) and count == 1:
+        K, E = _as_tuple(K), _as_tuple(E)
     if count == 0:
         bad_value("right", "an image or a list with one image per left image", "an empty list")
     found = [_read_one(right, K, E, points, i, count, cropped) for i in range(count)]
@@ -129,16 +130,13 @@ def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int, cropp
 def _is_nested_matrix(value: list[Any]) -> bool:
     """A matrix written as nested lists of numbers, as opposed to a list with one entry per image."""
     rows = bool(value) and all(isinstance(row, (list, tuple)) for row in value)
-    return rows and all(isinstance(entry, (int, float)) for row in value for entry in row)
+    return rows and all(isinstance(entry, Real) for row in value for entry in row)
 
 
-def _as_tuple(value: Any, right: Any) -> Any:
-    """A list of matrices for one right view (or a tuple of them) is the tuple that is meant.
-
-    Where ``right`` is a list, a list has one entry per image, and stays.
-    """
+def _as_tuple(value: Any) -> Any:
+    """A list of matrices beside one left image is the tuple of cameras that is meant."""
     matrices = isinstance(value, list) and len(value) > 1 and not _is_nested_matrix(value)
-    return tuple(value) if matrices and not isinstance(right, list) else value
+    return tuple(value) if matrices else value
 
 
 def _entry(value: Any, name: str, i: int, count: int) -> Any:

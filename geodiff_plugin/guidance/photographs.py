@@ -65,7 +65,7 @@ class EstimatedRig:
 
 
 def _cameras(
-    photographs: Sequence[Any], images: Sequence[Tensor], K: Any, fov: float | None
+    photographs: Sequence[Any], images: Sequence[Tensor], K: Any, fov: float | None, cropped: bool
 ) -> tuple[list[np.ndarray], list[str]]:
     """K of every photograph, and what was assumed for it."""
     given = list(K) if isinstance(K, (tuple, list)) and np.ndim(K[0]) == 2 else [K] * len(images)
@@ -79,7 +79,8 @@ def _cameras(
         )
         if own is not None:
             own = check_intrinsics(own, f"K of {name}")
-            check_intrinsics_fit(own, *size, f"K of {name}", name)
+            if not cropped:
+                check_intrinsics_fit(own, *size, f"K of {name}", name)
         elif fov is not None:
             own = intrinsics_from_fov(fov, size)
         elif hasattr(photograph, "getexif"):
@@ -153,6 +154,7 @@ def estimate_rig(
     known_length: tuple[float, float, float, float, float] | None = None,
     points: Any = None,
     matcher: str = "sift",
+    cropped: bool = False,
 ) -> EstimatedRig:
     """Cameras of two photographs or more, left one first.
 
@@ -164,6 +166,7 @@ def estimate_rig(
         known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left photograph and their distance.
         points: ``(N, 3)`` metres in the left camera's frame, or a sparse depth map ``(H, W)`` of it.
         matcher: of distinct points, see ``pose.matchers.find_matcher``.
+        cropped: the photographs are crops, so the principal point of a given K may lie outside of them.
 
     Raises:
         TypeError, ValueError: PoseLib is not installed; no K, or no pose to be had (``pose.estimate``).
@@ -172,7 +175,7 @@ def estimate_rig(
         bad_type("photographs", "two images or more", photographs)
     names = ["left", *(f"right photograph {i}" for i in range(1, len(photographs)))]
     images = [as_image_01(p, n) for p, n in zip(photographs, names, strict=True)]
-    Ks, notes = _cameras(photographs, images, K, fov)
+    Ks, notes = _cameras(photographs, images, K, fov, cropped)
     if baseline_m is not None:
         check_number(baseline_m, "baseline_m", 1e-6, 1e6)
     K_left = torch.as_tensor(Ks[0], dtype=torch.float32)

@@ -9,7 +9,7 @@ What epipolar lines do not show is not told here: the unit of a translation, and
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from geodiff_plugin._camera_checks import LONG_BASELINE_M
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
-__all__ = ["INVERSE", "find_mistake", "implausible_unit"]
+__all__ = ["INVERSE", "find_mistake", "implausible_unit", "pose_change"]
 
 INVERSE = (
     "The inverse pose explains the views better than the given one: are left and right swapped, "
@@ -52,21 +52,43 @@ _FACTORS = {
     3.0: "a third of",
     4.0: "a quarter of",
 }
-#: Within so many pixels of its line, and in front of both cameras, a match speaks for a pose.
-NEAR_PX = 4.0
-# A mistake must also explain the matches within so many, about as well as the pose nearby: where the cameras
-# are close together, a wrong K too leaves all matches within a few pixels of their lines.
-_FINE_PX = 1.5
+# Within so many pixels of its line, and in front of both cameras, a match speaks for a pose. Coarsely, for a
+# mistaken pose may be inexact as well; and finely, for where the cameras are close together a wrong K or pose
+# too leaves most matches within a few pixels of their lines.
+_NEAR_PX = (4.0, 1.5)
+# A mistake explains so many times the matches that the given pose does, this share of all, and this share of
+# what the pose nearby does.
 _CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
+# What else may look so is an inexact pose, which another K or other axes can bring near the matches, but not
+# onto them. So either the median residual must be that of the pose nearby, but for this factor, or the
+# candidate must lie this far from the given pose, in degrees or shares of the baseline, or have another K.
+# Where only the fine shares tell it from the given pose, both must hold.
+_AS_EXACT, _FAR_DEG, _FAR_SHIFT = 1.2, 5.0, 0.8
+# Candidates whose share is this near the largest are told apart by a finer measure.
+_ALIKE = 0.95
 #: A baseline from this on may be centimetres or millimetres, where what it shows is as large.
 SUSPECT_BASELINE_M = 5.0
 
 
-def _share(tracks: Tracks, T: np.ndarray, near_px: float = NEAR_PX) -> float:
-    """How many of the matches speak for a pose, [0, 1]."""
+@dataclass(frozen=True)
+class _Fit:
+    """How well a pose explains the matches.
+
+    Attributes:
+        shares: of the matches that speak for it, [0, 1], coarsely and finely (``_NEAR_PX``).
+        median_px: distance of the matches from their epipolar lines.
+    """
+
+    shares: tuple[float, ...]
+    median_px: float
+
+
+def _fit(tracks: Tracks, T: np.ndarray) -> _Fit:
     inverse_depth = solve_inverse_depth(tracks, T[None])
     ahead = (inverse_depth > 0) & ((tracks.rays @ T[2, :3] + inverse_depth * T[2, 3]) > 0)
-    return float((ahead & (residuals_px(tracks, T[None])[0] < near_px)).mean())
+    off_px = residuals_px(tracks, T[None])[0]
+    shares = tuple(float((ahead & (off_px < near_px)).mean()) for near_px in _NEAR_PX)
+    return _Fit(shares, float(np.median(off_px)))
 
 
 def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
@@ -102,6 +124,54 @@ def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np
             yield sentence.format(factor=factor, size=size), other, T
 
 
+def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far poses lie from the given ones.
+
+    Args:
+        given: ``(V, 4, 4)``, ``T_right_from_left``.
+        Ts: likewise.
+
+    Returns:
+        ``(V,)`` turns in degrees, and ``(V,)`` shifts as shares of the given baselines.
+    """
+    change = Ts @ np.linalg.inv(given)
+    cosines = (np.trace(change[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    shifts = np.linalg.norm(change[:, :3, 3], axis=1) / np.linalg.norm(given[:, :3, 3], axis=1)
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1))), shifts
+
+
+@dataclass(frozen=True)
+class _Found:
+    """One candidate.
+
+    Attributes:
+        sentence: names it.
+        fit: of its pose and K.
+        far: whether the given pose is too far from it to be an inexact one.
+    """
+
+    sentence: str
+    fit: _Fit
+    far: bool
+
+
+def _found(tracks: Tracks, T: np.ndarray) -> list[_Found]:
+    found = []
+    for sentence, own, pose in _candidates(tracks, T):
+        (turned_deg,), (shift,) = pose_change(T[None], pose[None])
+        far = own is not tracks or turned_deg >= _FAR_DEG or shift >= _FAR_SHIFT
+        found.append(_Found(sentence, _fit(own, pose), bool(far)))
+    return found
+
+
+def _likeliest(found: list[_Found]) -> _Found:
+    """The candidate with the largest share; of several alike the one that also fits more finely."""
+    for level in range(len(_NEAR_PX)):
+        largest = max(one.fit.shares[level] for one in found)
+        found = [one for one in found if one.fit.shares[level] >= _ALIKE * largest]
+    return min(found, key=lambda one: one.fit.median_px)
+
+
 def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
     """A sentence on the mistake that would make the matches fit, or ``None``.
 
@@ -110,13 +180,17 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
         T: ``(4, 4)``, ``T_right_from_left`` as given.
         near: ``(4, 4)``, the pose near it that fits best: where only that fits, the pose is inexact.
     """
-    given = _share(tracks, T)
-    found = [(_share(own, pose), sentence, own, pose) for sentence, own, pose in _candidates(tracks, T)]
-    best, sentence, own, pose = max(found, key=lambda entry: entry[0])
-    if not best > max(_AT_LEAST, _CLEARLY * given, _NEARLY * _share(tracks, near)):
+    given, nearby = _fit(tracks, T), _fit(tracks, near)
+    likeliest = _likeliest(_found(tracks, T))
+    fit = likeliest.fit
+    if any(own <= _NEARLY * other for own, other in zip(fit.shares, nearby.shares, strict=True)):
         return None
-    fine = _share(own, pose, _FINE_PX) > _NEARLY * _share(tracks, near, _FINE_PX)
-    return sentence if fine else None
+    coarsely, finely = (
+        own > max(_AT_LEAST, _CLEARLY * other) for own, other in zip(fit.shares, given.shares, strict=True)
+    )
+    exactly = fit.median_px <= _AS_EXACT * nearby.median_px
+    clear = (exactly or likeliest.far) if coarsely else (finely and exactly and likeliest.far)
+    return likeliest.sentence if clear else None
 
 
 def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:

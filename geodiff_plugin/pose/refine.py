@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
+from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit, pose_change
 from geodiff_plugin.pose.settle import (
     FEWEST,
     FREE_PX,
@@ -106,21 +106,26 @@ def refine_views(
     before = median_residuals(tracks, given)
     Ts, free = settle_poses(tracks, given, near, before, rig)
     after = median_residuals(tracks, Ts)
-    warnings = _warnings(before, after) + undecided(tracks, Ts, free) + units
     found = found.changed(
         residual_px_given=_numbers(before),
         residual_px=_numbers(before),
         matches=_numbers(tracks.seen.sum(1)),
-        warnings=warnings,
     )
-    if not _acceptable(given, Ts, before, after):
-        return RefinedViews(tuple(rights), found.changed(status="kept"))
+    if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
+        warnings = _unimproved(before) + undecided(tracks, Ts, free) + units
+        return RefinedViews(tuple(rights), found.changed(status="kept", warnings=warnings))
+    turned_deg, shifts = pose_change(given, Ts)
+    far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
+    if far.any():
+        warnings = _too_far(before, after, far, turned_deg, shifts) + units
+        return RefinedViews(tuple(rights), found.changed(status="kept", warnings=warnings))
     bends = [
         None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views.rights[v].shape)
         for v, T in enumerate(Ts)
     ]
     found = found.changed(
         status="refined",
+        warnings=_improved(before, after) + undecided(tracks, Ts, free) + units,
         E=_as_E(Ts),
         residual_px=_numbers(_straight_medians(tracks, Ts, bends)),
         straightened_px=tuple(0.0 if bend is None else bend.rms_px for bend in bends),
@@ -199,15 +204,6 @@ def _straight_medians(tracks: Tracks, Ts: np.ndarray, bends: Sequence[Displaceme
     return median_residuals(moved, Ts)
 
 
-def _acceptable(given: np.ndarray, Ts: np.ndarray, before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether the refined poses are near the given ones and clearly better, all views together."""
-    change = Ts @ np.linalg.inv(given)
-    turned = np.degrees(np.arccos(np.clip((np.trace(change[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    shifted = np.linalg.norm(change[:, :3, 3], axis=1) / np.linalg.norm(given[:, :3, 3], axis=1)
-    near = (turned < _MOST_TURN_DEG).all() and (shifted < _MOST_SHIFT).all()
-    return bool(near and np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before))
-
-
 def _applied(
     rights: Sequence[CameraView], Ts: np.ndarray, bends: Sequence[Displacement | None] | None = None
 ) -> tuple[CameraView, ...]:
@@ -218,12 +214,38 @@ def _applied(
     )
 
 
-def _warnings(before: np.ndarray, after: np.ndarray) -> tuple[str, ...]:
+def _given(before: np.ndarray, v: int) -> str:
+    return "The pose as given" if len(before) == 1 else f"The pose of right view {v + 1} as given"
+
+
+def _improved(before: np.ndarray, after: np.ndarray) -> tuple[str, ...]:
     worst = int(np.argmax(np.nan_to_num(before)))
     if not before[worst] > WARNS_PX:
         return ()
-    which = "The pose as given" if len(before) == 1 else f"The pose of right view {worst + 1} as given"
     return (
-        f"{which} leaves matches {before[worst]:.1f} px off their epipolar lines in the median, a refined "
-        f"one {after[worst]:.1f} px. {_CAUSES}",
+        f"{_given(before, worst)} leaves matches {before[worst]:.1f} px off their epipolar lines in the "
+        f"median, a refined one {after[worst]:.1f} px. {_CAUSES}",
+    )
+
+
+def _unimproved(before: np.ndarray) -> tuple[str, ...]:
+    worst = int(np.argmax(np.nan_to_num(before)))
+    if not before[worst] > WARNS_PX:
+        return ()
+    return (
+        f"{_given(before, worst)} leaves matches {before[worst]:.1f} px off their epipolar lines in the "
+        f"median, and no pose near it leaves clearly less. {_CAUSES}",
+    )
+
+
+def _too_far(
+    before: np.ndarray, after: np.ndarray, far: np.ndarray, turned_deg: np.ndarray, shifts: np.ndarray
+) -> tuple[str, ...]:
+    if not np.nanmax(before) > WARNS_PX:
+        return ()
+    v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # of those too far, the worst
+    return (
+        f"{_given(before, v)} leaves matches {before[v]:.1f} px off their epipolar lines in the median. "
+        f"A pose {turned_deg[v]:.0f} degrees and {100 * shifts[v]:.0f} % of the baseline away "
+        f"fits to {after[v]:.1f} px, but is too far from the given one and was not used. {_CAUSES}",
     )

@@ -6,6 +6,7 @@ Paper: S4, Figure 3 (fig:framework).
 
 from __future__ import annotations
 
+import copy
 import inspect
 import warnings
 from collections.abc import Callable
@@ -66,8 +67,8 @@ class GuidedCall(_Stock):
             *args: as the stock call takes them.
             guidance: the second view; ``None`` is the stock call, bit for bit.
             callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
-                ``latents`` in what it returns replace the pipeline's. The others are ``None`` in the steps
-                before the first correction, which are the prior's own.
+                ``latents`` in what it returns replace the pipeline's. The others are those of the last step
+                that was corrected or updated, and ``None`` before the first.
             strict: a depth that is not to be trusted (``output.judgements``) is an error.
             **kwargs: as the stock call takes them.
 
@@ -127,10 +128,12 @@ class GuidedCall(_Stock):
         check_guidable(self, prior, guidance)
         tiny = tiny_autoencoder(self, prior, guidance.config.decoder)
         if prior.deterministic and call["ensemble_size"] > 1:
-            generator = call["generator"]
-            if isinstance(generator, list):
-                generator = generator[:: call["ensemble_size"]]
-            call |= {"ensemble_size": 1, "output_uncertainty": False, "generator": generator}
+            first = slice(None, None, call["ensemble_size"])
+            if isinstance(call["generator"], list):
+                call["generator"] = call["generator"][first]
+            if isinstance(call["latents"], Tensor):
+                call["latents"] = call["latents"][first]
+            call |= {"ensemble_size": 1, "output_uncertainty": False}
             warnings.warn(
                 "This prior gives the same map every time: of the ensemble one member runs.",
                 stacklevel=4,
@@ -211,13 +214,14 @@ class GuidedCall(_Stock):
         return DepthDiffusionPipeline.put_together(self, maps, *args, **kwargs)
 
     def save_pretrained(self, *args: Any, **kwargs: Any) -> None:
-        """Save the stock pipeline: the folder loads where this package is not installed."""
-        guided = type(self)
-        self.__class__ = stock_class(guided)
-        try:
-            self.save_pretrained(*args, **kwargs)
-        finally:
-            self.__class__ = guided
+        """Save the stock pipeline: the folder loads where this package is not installed.
+
+        A call that runs in another thread is waited for; one that begins meanwhile is not disturbed.
+        """
+        with exclusive_call(self, guided=False):
+            twin = copy.copy(self)
+        twin.__class__ = stock_class(type(self))
+        twin.save_pretrained(*args, **kwargs)
 
 
 def native_images(image: Any, device: torch.device) -> Tensor:

@@ -1,6 +1,6 @@
-"""Half precision on a CPU: images are resized in float32, because PyTorch lacks kernels for half.
+"""Half precision: images are read and resized in float32, and cast afterwards.
 
-Data flow: the pipeline's image processor, in half precision on a CPU -> the same, resizing in float32.
+Data flow: the pipeline's image processor -> the same, whatever its precision reading and resizing in float32.
 Paper: none.
 """
 
@@ -16,17 +16,16 @@ __all__ = ["ImagesInFloat32"]
 
 
 class ImagesInFloat32:
-    """Hides ``preprocess`` of an image processor by one that casts after it has resized; on a CPU only.
+    """Hides ``preprocess`` of an image processor by one that casts last.
 
-    It may be left and entered again in the middle of a call, as callbacks are.
+    PyTorch has no kernels for half precision on a CPU, and float16 has no number for the white of a 16-bit
+    image. It may be left and entered again in the middle of a call, as callbacks are.
     """
 
-    def __init__(self, processor: Any, device: torch.device) -> None:
-        self._processor, self._on_cpu = processor, device.type == "cpu"
+    def __init__(self, processor: Any) -> None:
+        self._processor = processor
 
     def __enter__(self) -> ImagesInFloat32:
-        if not self._on_cpu:
-            return self
         own = self._processor.preprocess
 
         def preprocess(
@@ -43,5 +42,4 @@ class ImagesInFloat32:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if self._on_cpu:
-            self._restore()
+        self._restore()

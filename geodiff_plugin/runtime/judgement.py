@@ -163,8 +163,9 @@ def _bad(signs: Signs) -> list[str]:
     if points is not None and abs(math.log(signs.points_ratio)) > POINTS_WRONG:
         found.append(points)
     if 0 < signs.points < LEAST_POINTS and math.isnan(signs.matched):
-        number = "One known depth does" if signs.points == 1 else f"{signs.points} known depths do"
-        found.append(f"{number} not fix both scale and shift; give at least {LEAST_POINTS}.")
+        found.append(
+            f"Too few known depths to fix both scale and shift, {signs.points}; give at least {LEAST_POINTS}."
+        )
     order = _of_order(signs)
     lines = _of_lines(signs) if signs.epipolar_px > EPIPOLAR_WRONG else None
     matches = _of_matches(signs)

@@ -102,7 +102,8 @@ def check_scheduler(scheduler: Any) -> None:
 
     Raises:
         TypeError: no family.
-        ValueError: noise prediction with zero terminal SNR: its first step is 0 / 0, NaN in diffusers too.
+        ValueError: noise prediction with zero terminal SNR: its first step is 0 / 0, NaN in diffusers too;
+            dynamic thresholding, which is made for pixels and bends latents.
     """
     if not isinstance(scheduler, tuple(FAMILIES)):
         noise_level(scheduler, torch.tensor(0))
@@ -116,6 +117,13 @@ def check_scheduler(scheduler: Any) -> None:
             f"{type(scheduler).__name__} with prediction_type='epsilon' and rescale_betas_zero_snr=True",
             "With no signal left a noise prediction says nothing; "
             "set rescale_betas_zero_snr=False or use v_prediction.",
+        )
+    if getattr(scheduler.config, "thresholding", False):
+        bad_value(
+            "pipe.scheduler",
+            "without dynamic thresholding, which is for pixels and not for latents",
+            f"{type(scheduler).__name__} with thresholding=True",
+            "pipe.scheduler = type(pipe.scheduler).from_config(pipe.scheduler.config, thresholding=False)",
         )
 
 

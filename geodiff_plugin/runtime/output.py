@@ -54,7 +54,7 @@ def assemble_output(
     """
     lefts_01 = _as_compared(run)
     count, size = lefts_01.shape[0], image_size(lefts_01)
-    depth_m = _as_maps(stock.prediction).to(lefts_01.device)  # (N, 1, H, W) or the processing grid
+    depth_m = run.within_range(_as_maps(stock.prediction).to(lefts_01.device))  # or the processing grid
     known_of = [run.known(i) for i in range(count)]
     grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)

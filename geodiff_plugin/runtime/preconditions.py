@@ -14,18 +14,15 @@ import torch
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, refuse
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
+from geodiff_plugin.priors.pipelines.base import RESAMPLING
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 
 __all__ = ["check_arguments", "check_guidable", "check_network_input", "check_offloading", "needs_network"]
 
-#: Ways of resampling that the stock pipeline takes.
-RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
-
-
 #: What every stock pipeline's call takes, whatever the prior.
 STOCK_ARGUMENTS = (
-    *("output_type", "resample_method_input", "batch_size", "num_inference_steps", "processing_resolution"),
-    *("ensemble_size", "generator"),
+    *("output_type", "resample_method_input", "resample_method_output", "batch_size", "num_inference_steps"),
+    *("processing_resolution", "ensemble_size", "generator", "latents"),
 )
 
 
@@ -51,6 +48,8 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
         )
     check_choice(call["output_type"], "output_type", ("np", "pt"))
     check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
+    if call["resample_method_output"] is not None:
+        check_choice(call["resample_method_output"], "resample_method_output", RESAMPLING)
     check_number(call["batch_size"], "batch_size", 1, 1 << 20, integer=True)
     for name, least in (("num_inference_steps", 1), ("processing_resolution", 0)):
         if call[name] is not None:

@@ -69,6 +69,7 @@ def spread_of_members(
         members = members.float().to(depth_m.device)
         if image_size(members) != size:  # as the stock call brings the ensemble to its output
             members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
+            members = run.within_range(members, i)
         views = lefts_01[i : i + 1], lefts[i : i + 1]
         fits = [_refined(run, run.known(i, m), member, *views) for m, member in enumerate(members.split(1))]
         refined = torch.cat([fit.depth_m for fit in fits if fit is not None])

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from geodiff_plugin._checks import bad_type
+from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.known import Known
@@ -96,6 +96,7 @@ class GuidedRun:
         self.step_index = 0
         self.timesteps: list[float] = []
         self._decoded_chunks = 0
+        self._ends_m: list[tuple[Tensor, Tensor]] = []  # nearest and farthest of the final maps of a chunk
         self._stack, self._bar = ExitStack(), None
         self._tap = None
         if self.full and prior.network_input is not None:
@@ -105,7 +106,7 @@ class GuidedRun:
         )
         self._hooks: list[AbstractContextManager[object]] = [
             FrozenWeights(pipe),
-            ImagesInFloat32(pipe.image_processor, pipe._execution_device),
+            ImagesInFloat32(pipe.image_processor),
             *([self._tap] if self._tap else []),
             self._scheduler,
             Running(pipe, self),
@@ -167,7 +168,26 @@ class GuidedRun:
             x = self.grid.padded(x)
         self.relative.append(self.grid.cropped(x))
         trajectory.watch.note("the map of the final latent", len(self.timesteps) - 1, x)
-        return trajectory.metric(x, trajectory.affine)
+        depth_m = trajectory.metric(x, trajectory.affine)
+        self._ends_m.append((depth_m.amin((1, 2, 3), keepdim=True), depth_m.amax((1, 2, 3), keepdim=True)))
+        return depth_m
+
+    def within_range(self, depth_m: Tensor, image: int | None = None) -> Tensor:
+        """Maps brought to another size, within the range that they had: bicubic enlargement overshoots.
+
+        Args:
+            depth_m: ``(M, 1, H, W)`` metres: of all images, or of the members of one.
+            image: whose members these are.
+
+        Returns:
+            ``(M, 1, H, W)`` metres.
+        """
+        own = [i for i, owner in enumerate(self.owners) if image in (None, owner)]
+        near_m, far_m = (
+            torch.cat(ends).to(depth_m)[own].view(len(depth_m), -1, 1, 1)
+            for ends in zip(*self._ends_m, strict=True)
+        )
+        return depth_m.clamp(near_m.amin(1, keepdim=True), far_m.amax(1, keepdim=True))
 
     def known(self, image: int, member: int | None = None) -> Known:
         """Matches and points of one image on the grid of the sweep, weighted by what the loop found of them.
@@ -273,14 +293,12 @@ class GuidedRun:
     def _on_done(self, timestep: Tensor, latents: Tensor) -> Tensor:
         if self.callback is not None:
             values = {"latents": latents, **self._seen_by_callback(latents)}
+            before = latents.clone()
             with self._suspended():
                 answer = self.callback(self.pipe, self.step_index, timestep, values)
-            answer = {} if answer is None else answer
-            if not isinstance(answer, Mapping):
-                cure = "Return callback_kwargs, or nothing to leave the latents as they are."
-                bad_type("the answer of callback_on_step_end", "a dict or None", answer, cure)
-            if "latents" in answer:
-                latents, self.trajectories[-1].result = answer["latents"], None
+            latents = _latents_of(answer, latents)
+            if not torch.equal(latents, before):  # replaced, or changed in place
+                self.trajectories[-1].result = None
         self.step_index += 1
         if self._bar is not None:
             history = self.trajectories[-1].history
@@ -304,3 +322,25 @@ class GuidedRun:
             "scale": affine.scale,
             "shift": affine.shift,
         }
+
+
+def _latents_of(answer: Any, latents: Tensor) -> Tensor:
+    """What a callback answered for the latents, checked; ``latents`` where it left them alone."""
+    name, cure = (
+        "the answer of callback_on_step_end",
+        "Return callback_kwargs, or nothing to leave the latents as they are.",
+    )
+    if answer is None:
+        return latents
+    if not isinstance(answer, Mapping):
+        bad_type(name, "a dict or None", answer, cure)
+    answered = answer.get("latents", latents)
+    if not isinstance(answered, Tensor):
+        bad_type(f"latents in {name}", "a tensor", answered, cure)
+    if answered.shape != latents.shape:
+        got = f"shape {tuple(answered.shape)}"
+        bad_value(f"latents in {name}", f"of shape {tuple(latents.shape)}", got, cure)
+    answered = answered.to(latents)
+    if not answered.isfinite().all():
+        bad_value(f"latents in {name}", "finite", "NaN or infinity", cure)
+    return answered

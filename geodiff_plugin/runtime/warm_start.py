@@ -86,7 +86,10 @@ def plan_warm_start(
         bad_value("previous", f"an output with a latent of {latent_size}", got, cure)
     noise = call["latents"]
     if noise is None:
-        noise = randn_tensor(z0.shape, generator=call["generator"], device=device, dtype=z0.dtype)
+        depth = z0[:, prior.latents]
+        noise = randn_tensor(depth.shape, generator=call["generator"], device=device, dtype=z0.dtype)
+        # What a prior denoises beside depth, GeoWizard's normals, starts from the same noise.
+        noise = noise.repeat(1, z0.shape[1] // depth.shape[1], 1, 1)
     elif noise.shape != z0.shape:
         bad_value("latents", f"of shape {tuple(z0.shape)}, as those of previous", f"{tuple(noise.shape)}")
     scheduler = copy.deepcopy(pipe.scheduler)
@@ -95,7 +98,7 @@ def plan_warm_start(
     timesteps = scheduler.timesteps if trailing is None else trailing
     level = noise_level(scheduler, timesteps[skipped])
     latents = level.alpha.to(device) * z0.float() + level.sigma.to(device) * noise.to(device).float()
-    return WarmStart(near, far, skipped, latents.to(z0.dtype))
+    return WarmStart(near, far, skipped, latents.to(pipe.dtype))
 
 
 def _ends(previous: MetricDepthOutput, space: str) -> tuple[Tensor, Tensor]:

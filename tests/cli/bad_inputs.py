@@ -181,6 +181,12 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "E-mirrored": _matrices(E=np.diag([1.0, 1, -1, 1])),
     "E-transposed": _matrices(E=MOVED.T),
     "E-still": _matrices(E=np.eye(4)),
+    "estimate-with-two-K": _bare("--estimate-pose", *CAMERA[:-2], "--fov", 60),
+    "estimate-with-K-right": _bare("--estimate-pose", "--K-right", "calib.txt"),
+    "estimate-with-part-of-K": _bare("--estimate-pose", "--fx", 60),
+    "estimate-with-calib": _with("--estimate-pose"),
+    "estimate-with-cameras": _bare("--estimate-pose", "--fov", 60, "--cameras", "2,3"),
+    "estimate-with-crops": _bare("--estimate-pose", "--fov", 60, "--cropped"),
     # calibration files
     "calib-missing": _bare("--calib", "nothing.txt"),
     "calib-folder": _bare("--calib", "."),
@@ -271,5 +277,9 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "out-full": _with("--out", "."),
     "out-root": _with("--out", "/"),
     "out-long": _with("--out", "x" * 300),
+    "out-of-its-input": lambda f: [
+        *_out(lambda f: (f / "res").mkdir() or np.save(f / "res" / "depth.npy", np.ones((48, 64))), "res")(f),
+        *("--points", "res/depth.npy", "--overwrite"),
+    ],
     "out-dangling": _out(lambda f: (f / "link").symlink_to("nothing"), "link"),
 }

@@ -252,6 +252,7 @@ def test_demo(geodiff, prior, pair_files, monkeypatch):
     (out / "depth.npy").write_text("of an earlier run")
     (out / "uncertainty.npy").write_text("of an earlier run")
     (out / "notes.txt").write_text("somebody's own")
+    (out / "report.json").write_text('{"files": {"names": ["depth.npy", "uncertainty.npy"]}}')
     answer = geodiff("demo", "--quiet", "--overwrite")
     assert answer.code == 0, answer.err
     assert "AbsRel" in answer.out and "delta1" in answer.out and "guided" in answer.out
@@ -287,5 +288,5 @@ def test_points_without_a_right_image(geodiff, pair_files, prior):
     one[20, 30] = 2.0
     np.save(pair_files.folder / "lidar.npy", one)
     answer = geodiff("depth", pair_files.left, *camera, *quick, "--strict", "--out", "strict")
-    assert answer.code == 2 and "One known depth does not fix" in answer.err
+    assert answer.code == 2 and "Too few known depths to fix both scale and shift, 1;" in answer.err
     assert not (pair_files.folder / "strict").exists()

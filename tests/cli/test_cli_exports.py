@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import shutil
 import sys
 import types
 
@@ -11,6 +13,7 @@ import pytest
 from PIL import Image
 
 from geodiff_plugin.formats import read_calibration
+from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 
 
 @pytest.fixture
@@ -55,6 +58,74 @@ def test_exports_stand_beside_the_ply(geodiff, quick, pair_files, textured_plane
     # A later run without them leaves none of them behind.
     assert geodiff(*quick, "-q", "--overwrite").code == 0
     assert not (out / "cloud.glb").exists() and not (out / "cameras.txt").exists()
+
+
+LENS = "-0.2,0.05,0,0"
+
+
+@pytest.fixture
+def bent(pair_files, prior):
+    """The pair as if its lenses had distortion, the camera by numbers."""
+    camera = "--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.12".split()
+    run = ["--prior", prior, "--device", "cpu", "--steps", 1, "--knob", "inner_steps=0", "-q"]
+    return [*pair_files.images, *camera, *run, "--distortion", LENS]
+
+
+def test_a_colmap_model_names_what_its_cameras_took(geodiff, bent, pair_files):
+    third, pose = pair_files.folder / "third.png", pair_files.folder / "pose.txt"
+    Image.fromarray(255 - np.asarray(Image.open(pair_files.right))).save(third)
+    np.savetxt(pose, np.eye(4) + 0.12 * np.eye(4, k=3))
+    view = ["--view", third, "--view-E", pose, "--view-distortion", "0,0,0,0"]
+    answer = geodiff(*bent, *view, "--export", "colmap")
+    assert answer.code == 0, answer.err
+    out = pair_files.folder / "geodiff-out"
+    written = ["undistorted.png", "undistorted-2.png", "undistorted-3.png"]
+    lines = (out / "images.txt").read_text().splitlines()
+    assert [line.split()[9] for line in lines if line and line[0] != "#"] == written
+    rig = read_calibration(out, image_names=tuple(written[:2]), baseline_m=0.12)
+    assert rig.size_right == (64, 48) and rig.K_left[0, 0] == 60
+    for name, path, lens in ((written[1], pair_files.right, LENS), (written[2], third, "0,0,0,0")):
+        image_01 = np.asarray(Image.open(path), np.float32) / 255
+        expected = undistorted(image_01, rig.K_left, distortion_from_text(lens))
+        found = np.asarray(Image.open(out / name), np.float32) / 255
+        assert np.abs(found - expected).mean() < 0.01, "but for cleaning"
+    report = json.loads((out / "report.json").read_text())
+    assert set(report["files"]["names"]) == {path.name for path in out.iterdir()}
+    # A later run without them leaves none of them behind.
+    assert geodiff(*bent, "--overwrite").code == 0
+    assert (out / "undistorted.png").exists() and not (out / "undistorted-2.png").exists()
+
+
+def test_video_of_undistorted_results(geodiff, bent, pair_files):
+    assert geodiff(*bent).code == 0
+    Image.new("RGB", (64, 48), "red").save("geodiff-out/undistorted.png")
+    assert geodiff("video", "geodiff-out", "--photographs", "--out", "both.webp").code == 0
+    with Image.open("both.webp") as video:
+        red, green, blue = np.asarray(video.convert("RGB"), float).transpose(2, 0, 1)
+    assert ((red > 200) & (green < 60) & (blue < 60)).mean() > 0.3, "not the photograph as it was taken"
+
+
+def test_a_model_in_the_folder_of_the_result_is_kept(geodiff, quick, pair_files, prior):
+    assert geodiff(*quick, "--export", "colmap", "-q").code == 0
+    model = pair_files.folder / "model"
+    model.mkdir()
+    files = ("cameras.txt", "images.txt", "points3D.txt")
+    for name in files:
+        shutil.copy(pair_files.folder / "geodiff-out" / name, model)
+    before = [(model / name).read_bytes() for name in files]
+    run = [*pair_files.images, *quick[5:], "--baseline", 0.12, "-q", "--overwrite"]
+    command = [*run, "--calib", model, "--out", model]
+    answer = geodiff(*command, "--export", "colmap")
+    assert answer.code == 2 and "--out must be a folder that holds no input" in answer.err, answer.err
+    for _ in range(2):  # over the model alone, and over the result beside it
+        answer = geodiff(*command)
+        assert answer.code == 0, answer.err
+        assert [(model / name).read_bytes() for name in files] == before
+    answer = geodiff(*command, "--points", model / "depth.npy", "--preset", "default")
+    assert answer.code == 2 and "replace or delete" in answer.err and "depth.npy" in answer.err
+    own = pair_files.folder / "geodiff-out"
+    answer = geodiff(*run, "--calib", own, "--out", own)
+    assert answer.code == 2 and "cameras.txt, which it reads" in answer.err, "written by an earlier run"
 
 
 def test_unknown_export_is_refused_before_anything_is_read(geodiff, quick):

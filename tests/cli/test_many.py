@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import subprocess
@@ -21,9 +22,11 @@ from PIL import Image
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.many.conveyor import Conveyor
+from geodiff_plugin.cli.many.digests import MODEL_FILES, file_digests
 from geodiff_plugin.cli.many.finished import _as_option, finished_report
 from geodiff_plugin.cli.many.pairs import assumption, find_pairs
 from geodiff_plugin.cli.many.processes import Processes
+from geodiff_plugin.cli.many.rigs import RigStore
 from geodiff_plugin.formats.video import VideoReader, both_halves, count_frames
 
 #: One update of one step: for tests of everything but the depth.
@@ -142,6 +145,17 @@ def test_folders_go_by_name_else_by_order(tmp_path, textured_plane):
     assert [(ref.left.name, ref.right.name) for ref in refs] == [("a.png", "a_R.png"), ("b.png", "b_R.png")]
 
 
+def test_numbers_in_names_are_sorted_as_numbers(tmp_path, textured_plane):
+    write_folders(tmp_path, textured_plane, ["f10", "f1", "f2"])
+    left, right = tmp_path / "left", tmp_path / "right"
+    assert names_of(left, right) == ["f1", "f2", "f10"]
+    for path in right.iterdir():
+        path.rename(path.with_stem(f"R{path.stem}"))
+    refs = find_pairs(DepthArguments(left, right))
+    assert [ref.left.stem for ref in refs] == ["f1", "f2", "f10"]
+    assert [ref.right.stem for ref in refs] == ["Rf1", "Rf2", "Rf10"]
+
+
 def test_folders_that_share_no_name_are_said_to_go_by_order(tmp_path, textured_plane):
     write_folders(tmp_path, textured_plane, ["10", "20", "30"])
     arguments = DepthArguments(tmp_path / "left", tmp_path / "right")
@@ -170,6 +184,40 @@ def test_lists_by_comma_tab_or_blank(tmp_path):
     assert [ref.name for ref in refs] == ["one_im 0", "two_im 0", "three_x"]
     assert refs[0].calib == tmp_path / "one" / "calib.txt" and refs[1].calib is None
     assert refs[2].right == tmp_path / "three" / "y.png"
+
+
+@pytest.mark.parametrize(
+    ("heading", "names"),
+    [
+        ("left_image,right_image,calib", ["a"]),
+        ("Left\tRight", ["a"]),
+        ("left.png,right.png", ["left", "a"]),  # a pair, also where its files are missing
+        ("left/0.png,right/0.png", ["0", "a"]),
+        ("leftmost,right", ["leftmost", "a"]),  # a file of that name is there
+        ("image,right", ["image", "a"]),
+    ],
+)
+def test_a_heading_begins_with_left_and_names_no_file(tmp_path, heading, names):
+    (tmp_path / "leftmost").touch()
+    (tmp_path / "pairs.csv").write_text(f"{heading}\na.png,b.png\n")
+    assert names_of(tmp_path / "pairs.csv") == names
+
+
+@pytest.mark.parametrize(
+    ("line", "cells"),
+    [
+        ("le, ft.png\tri, ght.png", ["le, ft.png", "ri, ght.png"]),  # tabs come first
+        ("a.png,b.png # second", ["a.png", "b.png"]),
+        ("a.png b.png\t#second, third", ["a.png", "b.png"]),
+        ("left#1.png,right#1.png", ["left#1.png", "right#1.png"]),
+        ('"left #1.png","right #1.png" # quoted', ["left #1.png", "right #1.png"]),
+    ],
+)
+def test_commas_in_names_and_comments_behind_a_line(tmp_path, line, cells):
+    listed = tmp_path / "pairs.tsv"
+    listed.write_text(f"{line}\n")
+    (ref,) = find_pairs(DepthArguments(listed))
+    assert [ref.left, ref.right, ref.calib] == [*(tmp_path / cell for cell in cells), None]
 
 
 def test_one_left_view_with_two_right_ones_has_two_names(tmp_path):
@@ -231,6 +279,28 @@ def test_the_prior_and_the_cameras_are_read_once(geodiff, folders, monkeypatch):
     assert counts == {"prior": 1, "rig": 1}
 
 
+def test_warnings_about_the_cameras_are_those_of_every_pair(geodiff, folders):
+    root, command = folders
+    calib = root / "calib.txt"
+    text = calib.read_text().splitlines()
+    text[1] = text[1].replace(" 0 ", " 0 1", 1)  # cam1 contradicts doffs
+    calib.write_text("\n".join(text))
+    answer = geodiff(*command)
+    assert answer.code == 0 and answer.err.count("for the right image") == 1, answer.err
+    for name in "abc":
+        (warning,) = json.loads((root / "out" / name / "report.json").read_text())["warnings"][:1]
+        assert "for the right image" in warning
+
+
+def test_a_calibration_that_was_corrected_meanwhile_is_read_anew(pair_files, textured_plane):
+    arguments, store, size = DepthArguments(*map(Path, pair_files.images[1:])), RigStore(), (64, 48)
+    arguments = replace(arguments, calib=(pair_files.calib,))
+    before = store.read(arguments, None, size, size)
+    assert store.read(arguments, None, size, size) is before
+    pair_files.write_calibration(textured_plane.K, 0.25, size)
+    assert store.read(arguments, None, size, size).E[0, 3] == pytest.approx(0.25)
+
+
 def test_finished_pairs_are_skipped_and_overwrite_does_them_anew(geodiff, folders):
     root, command = folders
     assert geodiff(*command, "-q").code == 0
@@ -257,9 +327,59 @@ def test_results_of_other_options_are_not_taken_for_these(geodiff, folders):
     assert before == {path: path.read_bytes() for path in (root / "out").rglob("*") if path.is_file()}
 
 
+def test_results_of_files_that_changed_are_not_taken_for_these(geodiff, folders, textured_plane, pair_files):
+    root, command = folders
+    assert geodiff(*command, "-q").code == 0
+    before = {path: path.read_bytes() for path in (root / "out").rglob("*") if path.is_file()}
+    Image.fromarray(textured_plane.right).save(root / "right" / "b.png")
+    answer = geodiff(*command)
+    assert answer.code == 2 and answer.err.count("\n") == 1, answer.err
+    changed = Path("right", "b.png")
+    assert f"same files; got {Path('out', 'b')}, made before {changed} changed. Name another" in answer.err
+    assert before == {path: path.read_bytes() for path in (root / "out").rglob("*") if path.is_file()}
+    for path in (root / "out" / "b").iterdir():
+        path.unlink()
+    answer = geodiff(*command)
+    assert answer.code == 0 and "1 done, 2 there already" in answer.out
+    pair_files.write_calibration(textured_plane.K, 0.25, (64, 48))
+    answer = geodiff(*command)
+    assert answer.code == 2 and f"{Path('out', 'a')}, made before {pair_files.calib} changed" in answer.err
+    answer = geodiff(*command, "--overwrite")
+    assert answer.code == 0 and "3 done, 0 there already" in answer.out
+
+
+def test_a_colmap_model_is_compared_by_its_texts(tmp_path):
+    for name in MODEL_FILES:
+        (tmp_path / name).write_text(name)
+    arguments = DepthArguments(tmp_path / "left.png", calib=(tmp_path,))
+    before = file_digests(arguments)
+    assert list(before) == [str(tmp_path / name) for name in MODEL_FILES]
+    (tmp_path / "images.txt").write_text("moved")
+    assert file_digests(arguments) != before
+
+
+def test_a_finished_pair_is_judged_with_strict(geodiff, folders):
+    root, command = folders
+    assert geodiff(*command, "-q").code == 0
+    for name, trusted in (("a", True), ("b", False), ("c", True)):
+        path = root / "out" / name / "report.json"
+        report = json.loads(path.read_text())
+        report["judgement"] |= {"trusted": trusted, "reasons": ["E is wrong."]}
+        path.write_text(json.dumps(report))
+    answer = geodiff(*command)
+    assert answer.code == 0 and "3 there already, 0 failed, 1 not to be trusted" in answer.out
+    answer = geodiff(*command, "--strict")
+    assert answer.code == 4 and "2 there already, 1 failed" in answer.out
+    said = f"b: The depth in {Path('out', 'b')} is not to be trusted: E is wrong."
+    assert f"geodiff: {said}" in answer.err
+    assert [row["result"] for row in rows_of(root / "out")] == ["there", "failed", "there"]
+
+
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
+        ("right", "b.png", "with RIGHT b.png"),
+        ("k_right", None, "without --K-right"),
         ("steps", None, "without --steps"),
         ("warm_start", True, "with --warm-start"),
         ("seed", 0, "with --seed 0"),
@@ -337,6 +457,60 @@ def test_options_of_one_pair_are_refused_at_once(geodiff, folders, option, told)
     (folders[0] / "one" / "report.json").write_text("{}")
     answer = geodiff(*folders[1], *option)
     assert answer.code == 2 and told in answer.err
+
+
+def never(*_, **__):
+    raise AssertionError("weights were loaded before the folder was checked")
+
+
+@pytest.mark.parametrize("kind", ["list", "linked list", "other table", "folder"])
+def test_what_the_table_may_not_replace_stays(geodiff, folders, monkeypatch, kind):
+    root, command = folders
+    monkeypatch.setattr("geodiff_plugin.cli.many.run.load_guided_prior", never)
+    (root / "mine").mkdir()
+    table, text = root / "mine" / "pairs.csv", "left,right\n../left/a.png,../right/a.png\n"
+    words, told = ["mine/pairs.csv"], "which is not the table of an earlier run"
+    if kind == "linked list":
+        words = ["list.csv"]
+        (root / "list.csv").symlink_to(table)
+    if kind in ("other table", "folder"):
+        words = ["left", "right"]
+    if kind == "folder":
+        table.mkdir()
+        told = "which is a folder"
+    else:
+        table.write_text(text)
+    answer = geodiff("depth", *words, *command[3:], "--out", "mine", "--overwrite")
+    assert answer.code == 2 and f"replaced; got {Path('mine', 'pairs.csv')}, {told}" in answer.err
+    assert table.is_dir() or table.read_text() == text
+    assert list((root / "mine").iterdir()) == [table]
+
+
+def test_a_folder_that_takes_no_table_is_refused_before_the_work(geodiff, folders, monkeypatch):
+    def no_file(dir):
+        assert dir.samefile(root)  # the nearest that is there
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    root, command = folders
+    monkeypatch.setattr("geodiff_plugin.cli.many.run.load_guided_prior", never)
+    monkeypatch.setattr("geodiff_plugin.cli.many.summary.TemporaryFile", no_file)
+    answer = geodiff(*command, "--out", "deep/out")
+    assert answer.code == 2 and "can be written to; got deep" in answer.err
+    assert "(Permission denied)" in answer.err and not (root / "deep").exists()
+
+
+def test_a_table_that_cannot_be_written_in_the_end_is_shown(geodiff, folders, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("geodiff_plugin.cli.many.summary.atomic_path", full)
+    root, command = folders
+    answer = geodiff(*command)
+    assert answer.code == 0 and "3 pairs: 3 done" in answer.out
+    told = f"geodiff: {Path('out', 'pairs.csv')} could not be written (No space left on device)."
+    assert answer.err.splitlines()[-1] == told
+    (root / "left" / "a.png").write_bytes(b"broken")
+    assert geodiff(*command, "--overwrite").code == 4
 
 
 def test_warm_start_of_one_pair_and_no_cameras_of_many_are_refused(geodiff, folders):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import signal
 import subprocess
@@ -12,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.cli.arguments import OUTPUT_FILES
 from geodiff_plugin.formats import out_folder
 from geodiff_plugin.formats.out_folder import OutFolder
 from geodiff_plugin.formats.out_place import LOCK, PARTIAL, free_folder
@@ -57,19 +57,84 @@ def test_nothing_half_written(tmp_path, error):
     assert names(tmp_path) == []
 
 
+def report_of(*own: str) -> str:
+    return json.dumps({"files": {"names": [*own, "report.json"]}})
+
+
 def test_own_files_are_replaced_and_others_stay(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    for name in OUTPUT_FILES:
+    """Own is what the report of an earlier run lists, not what has the name of a result."""
+    for name in ("notes.txt", "depth.npy", "cloud.ply", "cameras.txt"):
         (tmp_path / name).write_text("old")
+    (tmp_path / "report.json").write_text(report_of("depth.npy", "cloud.ply", "gone.npy"))
 
     def watched(folder):
         assert (tmp_path / "depth.npy").read_text() == "old"
         return fill(folder)
 
-    with OutFolder(tmp_path, OUTPUT_FILES, overwrite=True) as held:
+    with OutFolder(tmp_path, overwrite=True) as held:
         held.write(watched)
-    assert names(tmp_path) == ["depth.npy", "notes.txt", "report.json"]
+    assert names(tmp_path) == ["cameras.txt", "depth.npy", "notes.txt", "report.json"]
     assert (tmp_path / "depth.npy").read_text() == "new"
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        "",
+        "[]",
+        '{"files": 3}',
+        '{"files": {"names": [1]}}',
+        '{"files": {"names": "1"}}',
+        '{"files": {"names": ["../b", ".."]}}',
+    ],
+)
+def test_a_report_of_something_else_deletes_nothing(tmp_path, report):
+    out = tmp_path / "out"
+    out.mkdir()
+    for path in (tmp_path / "b", out / "cloud.ply", out / "1"):
+        path.write_text("mine")
+    (out / "report.json").write_text(report)
+    with OutFolder(out, overwrite=True) as held:
+        held.write(fill)
+    assert names(tmp_path) == ["b", "out"] and names(out) == ["1", "cloud.ply", "depth.npy", "report.json"]
+
+
+def test_the_report_goes_last(tmp_path, monkeypatch):
+    """Cut off before, the folder still says what is its own; cut off after, nothing is left to delete."""
+    (tmp_path / "cloud.ply").write_text("old")
+    (tmp_path / "report.json").write_text(report_of("cloud.ply"))
+    moved, real = [], out_folder._move
+
+    def move(source, target):
+        moved.append((target.name, (tmp_path / "cloud.ply").exists()))
+        real(source, target)
+
+    monkeypatch.setattr(out_folder, "_move", move)
+    with OutFolder(tmp_path, overwrite=True) as held:
+        held.write(fill)
+    assert moved == [("depth.npy", True), ("report.json", False)]
+
+
+def test_input_is_neither_replaced_nor_deleted(tmp_path):
+    out, link = tmp_path / "out", tmp_path / "link.npy"
+    out.mkdir()
+    for name in ("depth.npy", "cameras.txt", "left.png"):
+        (out / name).write_text("mine")
+    link.symlink_to(out / "depth.npy")
+    said = "--out must be a folder that holds no input of the run"
+    for own, report, given in (
+        ({"depth.npy"}, "", out / "depth.npy"),
+        ({"depth.npy"}, "", link),
+        (set(), report_of("cameras.txt"), out / "cameras.txt"),
+    ):
+        (out / "report.json").write_text(report)
+        assert said in refused(out, names=own, inputs=[given], overwrite=True)
+    before = names(out)
+    inputs = [out / "cameras.txt", out / "left.png", tmp_path / "nothing"]
+    (out / "report.json").write_text("")
+    with OutFolder(out, {"depth.npy"}, inputs=inputs, overwrite=True) as held:
+        held.write(fill)
+    assert names(out) == before and (out / "cameras.txt").read_text() == "mine"
 
 
 def test_the_unfinished_files_lie_inside_a_folder_that_exists(tmp_path):

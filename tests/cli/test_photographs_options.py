@@ -10,9 +10,13 @@ import pytest
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_arguments
+from geodiff_plugin.cli.inputs import read_inputs, read_known
 from geodiff_plugin.cli.lenses import lenses_of
-from geodiff_plugin.cli.photographs import known_length
+from geodiff_plugin.cli.photographs import known_length, read_photographs
+from geodiff_plugin.cli.settings import read_settings
+from geodiff_plugin.cli.start import intrinsics_way
 from geodiff_plugin.formats.distortion import distortion_from_text
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
 
 
@@ -69,3 +73,126 @@ def test_lenses_are_counted_with_their_views(tmp_path) -> None:
     arguments = DepthArguments(Path("l.png"), Path("r.png"), out=tmp_path / "new", **many)
     with pytest.raises(InputError, match="--view-distortion must be given once for each of 1"):
         check_arguments(arguments)
+
+
+FILE = Path("K.txt")
+FOUR = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"k": FILE, "fov": 60.0}, "K must be given in one way: .*; got matrices and --fov"),
+        ({"k": FILE, **FOUR}, "got matrices and parameters"),
+        ({"fov": 60.0, **FOUR}, "got parameters and --fov"),
+        ({"k_right": FILE, "fov": 60.0}, "got matrices and --fov"),
+        ({"k_right": FILE}, "--K must be given with --K-right"),
+        ({"fx": 60.0}, "--fx --fy --cx --cy must be given all together"),
+        ({"cameras": "2,3"}, "--cameras must be left out with --estimate-pose"),
+        ({"calib": (FILE,)}, "--calib must be left out with --estimate-pose"),
+        ({"e": FILE}, "--E must be left out with --estimate-pose"),
+        ({"cropped": True}, "--cropped must be given with --K, .*; got K by EXIF"),
+        ({"cropped": True, "fov": 60.0}, "got K by --fov"),
+    ],
+)
+def test_there_is_one_way_to_give_intrinsics(given, said) -> None:
+    with pytest.raises(InputError, match=said):
+        intrinsics_way(DepthArguments(Path("l.png"), Path("r.png"), estimate_pose=True, **given))
+
+
+@pytest.mark.parametrize(
+    ("given", "way"),
+    [
+        ({}, "EXIF"),
+        ({"fov": 60.0, "baseline": 0.1}, "--fov"),
+        ({"fov": 60.0, "view_k": (FILE,), "cropped": True}, "--fov"),
+        ({**FOUR, "cropped": True}, "parameters"),
+        ({"k": FILE, "k_right": FILE, "cropped": True}, "matrices"),
+    ],
+)
+def test_ways_to_give_intrinsics(given, way) -> None:
+    assert intrinsics_way(DepthArguments(Path("l.png"), Path("r.png"), estimate_pose=True, **given)) == way
+
+
+LENS = "0.2,0,0,0"
+
+
+def straight(x: float, y: float) -> tuple[float, float]:
+    """Where a pixel behind that lens lies without it: r (1 + 0.2 r^2) = R, solved by bisection."""
+    ray = np.array([x - 31.5, y - 23.5]) / 60
+    far, low, high = float(np.linalg.norm(ray)), 0.0, 2.0
+    for _ in range(60):
+        r = (low + high) / 2
+        low, high = (r, high) if r * (1 + 0.2 * r * r) < far else (low, r)
+    u, v = ray / far * r * 60 + (31.5, 23.5)
+    return float(u), float(v)
+
+
+@pytest.fixture
+def millimetres(pair_files) -> Path:
+    """A map of two depths, 2 m at (10, 12) and 3 m at (50, 40)."""
+    depth = np.zeros((48, 64))
+    depth[12, 10], depth[40, 50] = 2000.0, 3000.0
+    np.save(pair_files.folder / "mm.npy", depth)
+    return pair_files.folder / "mm.npy"
+
+
+def expected_points() -> np.ndarray:
+    at = np.array([straight(10, 12), straight(50, 40)])
+    return np.c_[(at - (31.5, 23.5)) / 60, np.ones(2)] * [[2.0], [3.0]]
+
+
+def told_to_estimate(pair_files, monkeypatch, **given) -> dict:
+    """What the estimation of poses is called with."""
+    told = {}
+
+    def stop(_images, **options):
+        told.update(options)
+        raise InterruptedError
+
+    monkeypatch.setattr(GeometryGuidance, "from_photographs", stop)
+    arguments = DepthArguments(
+        pair_files.left, pair_files.right, device="cpu", estimate_pose=True, **FOUR | given
+    )
+    with pytest.raises(InterruptedError):
+        read_photographs(arguments, read_settings(arguments))
+    return told
+
+
+def test_estimated_poses_take_points_in_their_unit(pair_files, monkeypatch, millimetres) -> None:
+    told = told_to_estimate(pair_files, monkeypatch, points=millimetres, points_scale=1000.0)
+    assert told["points"].shape == (48, 64) and told["points"][12, 10] == 2.0
+    told = told_to_estimate(
+        pair_files, monkeypatch, points=millimetres, points_scale=1000.0, distortion=(LENS,)
+    )
+    np.testing.assert_allclose(told["points"], expected_points(), atol=1e-4)
+
+
+def test_a_known_length_goes_through_the_lens(pair_files, monkeypatch) -> None:
+    given = {"known_length": "10,12,50,40,1.5"}
+    assert told_to_estimate(pair_files, monkeypatch, **given)["known_length"] == (10, 12, 50, 40, 1.5)
+    told = told_to_estimate(pair_files, monkeypatch, **given, distortion=(LENS,))
+    ends = (*straight(10, 12), *straight(50, 40), 1.5)
+    assert told["known_length"] == pytest.approx(ends, abs=0.01)
+    with pytest.raises(InputError, match="--known-length must be between two pixels that the lens shows"):
+        told_to_estimate(pair_files, monkeypatch, known_length="0,0,60,40,1", distortion=("-1,0,0,0",))
+
+
+def test_cropped_photographs_are_told_of(pair_files, monkeypatch) -> None:
+    assert told_to_estimate(pair_files, monkeypatch, cropped=True)["cropped"] is True
+
+
+def test_a_map_of_known_depths_goes_through_the_lens(pair_files, millimetres) -> None:
+    known = {"points": millimetres, "points_scale": 1000.0, "device": "cpu"}
+    cameras = FOUR | {"baseline": 0.12, "distortion": (LENS,)}
+    arguments = DepthArguments(pair_files.left, pair_files.right, **known, **cameras)
+    inputs = read_inputs(arguments, read_settings(arguments))
+    found = inputs.guidance._inputs[0].points.numpy()
+    np.testing.assert_allclose(found, expected_points(), atol=1e-4)
+    lens, K = distortion_from_text(LENS), inputs.rig.K_left
+    with pytest.raises(InputError, match="--points must be a map of .* 32x24 pixels; got 64x48"):
+        read_known(arguments, K, lens, (32, 24))
+    points = pair_files.folder / "points.txt"
+    points.write_text("0.1 0.2 2\n")
+    listed = DepthArguments(pair_files.left, points=points)
+    np.testing.assert_allclose(read_known(listed, K, lens, (64, 48)), [[0.1, 0.2, 2.0]], atol=1e-6)

@@ -5,6 +5,7 @@ real sample was at hand, so that page is all that there is to check them by. The
 """
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,15 @@ import pytest
 import torch
 from PIL import Image
 
+from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, find_pairs, load, load_pairs
 from geodiff_plugin.evaluation.datasets.mvsnet import find_mvsnet
 from geodiff_plugin.evaluation.datasets.robustmvd import KEY_VIEWS, find_robustmvd
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.datasets.synthetic import is_reflective
+from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm_png, write_pfm
+from tests.contracts import factory_calibrations as factory
 
 HEIGHT, WIDTH, F, CX, CY, BASELINE = 40, 64, 50.0, 31.0, 19.5, 0.2
 FAR_HOLE = (slice(0, 5), slice(0, 7))
@@ -415,6 +419,75 @@ def test_folder_takes_depth_in_three_formats(tmp_path):
     (tmp_path / "mine" / "depth.pfm").unlink()
     write_depth_mm_png(tmp_path / "mine" / "depth.png", expected)
     np.testing.assert_allclose(one(tmp_path, "folder").depth_m, expected, atol=5.1e-4)
+
+
+@pytest.mark.parametrize("suffixes", [(".JPG", ".jpeg"), (".tif", ".bmp"), (".webp", ".PNG")])
+def test_folder_takes_every_image_that_pillow_reads(tmp_path, suffixes):
+    folder(tmp_path)
+    for side, suffix in zip(("left", "right"), suffixes, strict=True):
+        path = tmp_path / "mine" / f"{side}.png"
+        with Image.open(path) as image:
+            image.save(tmp_path / "mine" / f"own{suffix}")
+        path.unlink()
+        (tmp_path / "mine" / f"own{suffix}").rename(tmp_path / "mine" / f"{side}{suffix}")
+    (tmp_path / "mine" / "left.txt").write_text("notes")
+    assert one(tmp_path, "folder").left.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_folder_takes_a_png_before_its_copies(tmp_path):
+    folder(tmp_path)
+    Image.new("RGB", (64, 48)).save(tmp_path / "mine" / "left.jpg")
+    assert one(tmp_path, "folder").left.shape == (HEIGHT, WIDTH, 3)
+
+
+TWO_SIZES = factory.REALSENSE_PRINTED.replace(
+    "Intrinsic Parameters:\n",
+    "Intrinsic Parameters:\n"
+    + "".join(
+        f'\n Intrinsic of "Infrared {camera}" / 320x240 / {{Y8}}\n  Width: 320\n  Height: 240\n  PPX: 150\n'
+        "  PPY: 100\n  Fx: 350\n  Fy: 350\n  Distortion: Brown Conrady\n  Coeffs: 0 0 0 0 0\n"
+        for camera in (1, 2)
+    ),
+)
+
+
+@pytest.mark.parametrize(
+    ("calibrations", "size", "focal_px", "baseline_m"),
+    [
+        ({"calib.txt": TWO_SIZES}, (640, 480), 700.0, 0.12),
+        ({"calib.txt": TWO_SIZES}, (320, 240), 350.0, 0.12),
+        ({"calib.json": factory.OAK}, (640, 400), 350.0, 0.12),
+        ({"calib.json": factory.NERF}, (640, 480), 700.0, 0.5),
+        (
+            {"calib_left.txt": factory.COLMAP_CAMERAS, "calib_right.txt": factory.COLMAP_IMAGES},
+            (640, 480),
+            700.0,
+            0.5,
+        ),
+    ],
+    ids=["RealSense", "RealSense-small", "OAK-D", "transforms.json", "COLMAP"],
+)
+@pytest.mark.filterwarnings("ignore:.*has no unit")
+def test_folder_takes_calibrations_that_go_by_size_or_name(
+    tmp_path, calibrations, size, focal_px, baseline_m
+):
+    (tmp_path / "mine").mkdir()
+    for side in ("left", "right"):
+        Image.new("RGB", size).save(tmp_path / "mine" / f"{side}.jpg")
+    for name, text in calibrations.items():
+        (tmp_path / "mine" / name).write_text(text)
+    sample = one(tmp_path, "folder")
+    assert sample.K_left[0, 0] == pytest.approx(focal_px)
+    assert sample.E[0, 3] == pytest.approx(baseline_m)
+
+
+def test_folder_without_depth_says_what_it_lacks(tmp_path):
+    folder(tmp_path)
+    (tmp_path / "mine" / "depth.npy").unlink()
+    sample = one(tmp_path, "folder")
+    said = f"at least one pixel; got none (no depth.npy, depth.pfm or depth.png in {tmp_path / 'mine'})"
+    with pytest.raises(ValueError, match=re.escape(said)):
+        score(sample, Prediction(depth_m=np.ones((HEIGHT, WIDTH))), None)
 
 
 def test_root_must_be_a_folder(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import threading
 import warnings
 import weakref
 
@@ -23,6 +24,7 @@ from PIL import Image
 from geodiff_plugin import (
     GeometryGuidance,
     GuidedMarigoldDepthPipeline,
+    InputError,
     disable_geometry_guidance,
     enable_geometry_guidance,
 )
@@ -289,6 +291,57 @@ def test_a_callback_that_answers_with_something_else_is_told_so(make_pipeline, t
     assert pipe(left).prediction is not None
 
 
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (None, "latents in the answer of callback_on_step_end must be a tensor; got NoneType"),
+        (torch.zeros(1, 2, 24, 32), r"must be of shape \(1, 4, 24, 32\); got shape \(1, 2, 24, 32\)"),
+        (torch.full((1, 4, 24, 32), torch.nan), "must be finite; got NaN or infinity"),
+    ],
+)
+def test_bad_latents_of_a_callback_are_told_as_such(make_pipeline, textured_plane, left, answer, message):
+    pipe = enable_geometry_guidance(make_pipeline())
+    with pytest.raises(InputError, match=message):
+        pipe(
+            left,
+            guidance=guidance_for(textured_plane),
+            callback_on_step_end=lambda *_: {"latents": answer},
+            generator=seeded(),
+        )
+
+
+def test_a_callback_that_hands_back_its_latents_changes_nothing(make_pipeline, textured_plane, left):
+    def add_in_place(pipe, i, t, values):
+        values["latents"] += 0.5
+
+    def call(callback):
+        pipe = enable_geometry_guidance(make_pipeline())
+        guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E)
+        extra = {"callback_on_step_end": callback, "generator": seeded(), "num_inference_steps": 2}
+        return pipe(left, guidance=guidance, **extra).prediction
+
+    alone = call(None)
+    for same in (
+        lambda p, i, t, values: values,
+        lambda p, i, t, values: {"latents": values["latents"].clone()},
+    ):
+        np.testing.assert_array_equal(call(same), alone)
+    assert not np.array_equal(call(add_in_place), alone)
+
+
+@pytest.mark.parametrize("knobs", [{}, {"refine": False}])
+def test_bicubic_enlargement_stays_within_the_map(make_oracle, textured_plane, knobs):
+    """It overshoots at a step of depth, below 0 m from 3 m to 60 m."""
+    pair = textured_plane
+    relative = np.zeros((24, 32), np.float32)
+    relative[:, 16:] = 1.0
+    pipe = enable_geometry_guidance(make_oracle(relative))
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, depth_range=(3.0, 60.0), **knobs)
+    call = {"processing_resolution": 32, "resample_method_output": "bicubic", "generator": seeded()}
+    depth_m = pipe(pair.left, guidance=guidance, **call).prediction
+    assert np.isfinite(depth_m).all() and depth_m.min() > 0
+
+
 def test_same_seed_same_answer(make_pipeline, textured_plane, left):
     pipe = enable_geometry_guidance(make_pipeline())
     outs = [pipe(left, guidance=guidance_for(textured_plane), generator=seeded(3)) for _ in range(2)]
@@ -407,6 +460,35 @@ def test_what_cannot_be_guided_is_refused_before_anything_is_computed(
     pipe.scheduler = EulerDiscreteScheduler()
     with pytest.raises(TypeError, match="EulerDiscreteScheduler"):
         pipe(left, guidance=guidance_for(textured_plane))
+
+
+def test_dynamic_thresholding_is_refused(make_pipeline, textured_plane, left):
+    pipe = enable_geometry_guidance(make_pipeline())
+    pipe.scheduler = DDIMScheduler(**SCHEDULER, thresholding=True)
+    with pytest.raises(InputError, match="without dynamic thresholding.*got DDIMScheduler with thresholding"):
+        pipe(left, guidance=guidance_for(textured_plane))
+
+
+def test_saving_does_not_disturb_a_call_that_begins_meanwhile(
+    make_pipeline, textured_plane, left, monkeypatch
+):
+    pipe, inside, results = enable_geometry_guidance(make_pipeline()), threading.Event(), []
+    done = threading.Event()
+
+    def slow(self, *args):
+        inside.set()
+        assert done.wait(60)
+
+    monkeypatch.setattr(DiffusionPipeline, "save_pretrained", slow)
+    saving = threading.Thread(target=pipe.save_pretrained, args=("nowhere",))
+    saving.start()
+    assert inside.wait(60)
+    try:
+        results.append(pipe(left, guidance=guidance_for(textured_plane), generator=seeded()).prediction)
+    finally:
+        done.set()
+        saving.join()
+    assert np.isfinite(results[0]).all()
 
 
 def test_half_precision_keeps_the_photometric_gradient(make_pipeline, textured_plane, left, monkeypatch):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.runtime.half_precision import ImagesInFloat32
 
 
 @pytest.mark.parametrize("gradient", ["denoised", "full"])
@@ -26,6 +27,17 @@ def test_a_handful_of_known_points_is_enough(make_pipeline, textured_plane, coun
         results.append(pipe(pair.left, guidance=guidance, **call).prediction)
     assert np.isfinite(results[0]).all()
     assert np.median(np.abs(results[0] / results[1] - 1)) < 0.1
+
+
+def test_white_of_16_bits_is_no_overflow(make_pipeline, textured_plane):
+    """float16 ends at 65504; what the processor is given is cast once it is in [0, 1]."""
+    pipe = make_pipeline().to(torch.float16)
+    image = textured_plane.left.astype(np.uint16) * 257
+    image[0, 0] = 65535
+    with ImagesInFloat32(pipe.image_processor):
+        images, *_ = pipe.image_processor.preprocess(image, 0, "bilinear", torch.device("cpu"), torch.float16)
+    assert images.dtype == torch.float16 and images.max() == 1.0
+    assert "preprocess" not in vars(pipe.image_processor)
 
 
 def test_an_overflow_of_the_decoder_names_step_tensor_and_cure(make_pipeline, textured_plane):

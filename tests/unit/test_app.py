@@ -104,6 +104,44 @@ def test_a_calibration_of_another_size_is_refused(views, tmp_path):
         CAMERA_WAYS["file"].guide(views, CameraFields(calibration=str(tmp_path / "calib.txt")), {})
 
 
+@pytest.mark.parametrize("way", ["file", "numbers"])
+def test_a_K_that_the_photographs_contradict_is_told(views, tmp_path, way):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 65  # mm in 35 mm equivalent: 120 px for 64x48
+    paths = [str(tmp_path / f"{side}.jpg") for side in ("left", "right")]
+    Image.new("L", (64, 48)).save(paths[0], exif=exif)
+    Image.new("L", (64, 48)).save(paths[1])
+    (tmp_path / "calib.txt").write_text(
+        "cam0=[60 0 31.5; 0 60 23.5; 0 0 1]\ncam1=[60 0 31.5; 0 60 23.5; 0 0 1]\n"
+        "doffs=0\nbaseline=120\nwidth=64\nheight=48\n"
+    )
+    fields = CameraFields(calibration=str(tmp_path / "calib.txt"))
+    if way == "numbers":
+        fields = CameraFields(fx=60.0, baseline_m=0.12)
+    with pytest.warns(UserWarning, match="60 px for the left photograph, 0.50 times the 120 px of its EXIF"):
+        CAMERA_WAYS[way].guide(Views(views.left, views.right, None, tuple(paths)), fields, {})
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # gradio 6.31 leaves them open
+def test_the_page_hands_on_photographs_as_they_are(tmp_path):
+    ImageData = pytest.importorskip("gradio.data_classes").ImageData
+    from geodiff_plugin.app.form import photograph_field
+
+    values = np.linspace(0, 65535, 48 * 64).reshape(48, 64).astype(np.uint16)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 65
+    deep, grey = tmp_path / "deep.png", tmp_path / "grey.jpg"
+    Image.fromarray(values).save(deep)
+    Image.fromarray((values >> 8).astype(np.uint8)).save(grey, exif=exif)
+    field = photograph_field("Left photograph", "left")
+    given = [field.preprocess(ImageData(path=str(path), orig_name=path.name)) for path in (deep, grey)]
+    np.testing.assert_allclose(read_image(given[0])[0][..., 0], values / 65535, atol=1e-6)
+    with Image.open(given[1]) as image:
+        assert image.getexif().get_ifd(0x8769)[0xA405] == 65
+    assert read_image(given[1])[0].shape == (64, 48, 3), "turned upright"
+
+
 def test_a_third_view_and_its_pose(views):
     third = Views(views.left, views.right, views.right, views.names)
     fields = CameraFields(fx=60.0, baseline_m=0.12, third_pose="1 0 0 0, 0 1 0 -0.1, 0 0 1 0")

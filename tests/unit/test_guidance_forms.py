@@ -43,6 +43,24 @@ def test_a_list_for_a_list_of_images_is_one_entry_each():
     assert [rig.K_left[0, 0] for rig in guidance.rigs] == [60.0, 120.0]
 
 
+def test_beside_one_right_image_a_list_is_one_entry_for_each_list_of_points():
+    other, points = np.array(E), np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0], [0.0, 0.1, 4.0]])
+    other[0, 3] = 0.2
+    guidance = GeometryGuidance(RIGHT, [K, K], [E, other], points=[points, points])
+    assert [rig.E[0, 3] for rig in guidance.rigs] == [E[0, 3], 0.2]
+
+
+def test_rows_of_numpy_numbers_are_a_matrix():
+    rows = [list(row) for row in K.astype(np.float32)]
+    (rig,) = GeometryGuidance(RIGHT, rows, E).rigs
+    np.testing.assert_allclose(rig.K_left, K)
+
+
+def test_a_ragged_pose_is_told_so():
+    with pytest.raises(InputError, match="E must be a 4x4 matrix of numbers; got list"):
+        GeometryGuidance(RIGHT, K, [[1, 0, 0, 0.1], [0, 1, 0], [0, 0, 1, 0]])
+
+
 def test_pairs_as_lists():
     guidance = GeometryGuidance(RIGHT, K, E, depth_range=[0.5, 9.0], left_size=[64, 48])
     assert tuple(guidance.config.depth_range) == (0.5, 9.0)

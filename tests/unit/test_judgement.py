@@ -49,7 +49,10 @@ def test_a_good_run_is_trusted_in_silence():
         ({"epipolar_px": 9.5}, "9.5 px beside"),
         ({"epipolar_px": 1.5, "confidence": 0.45}, "Likely causes"),
         ({"mistakes": ("E seems to be in the axes of OpenGL.",)}, "OpenGL"),
-        ({"points": 1, "matched": math.nan, "confidence": math.nan}, "One known depth does not fix"),
+        (
+            {"points": 1, "matched": math.nan, "confidence": math.nan},
+            "Too few known depths to fix both scale and shift, 1;",
+        ),
         ({"view_deg": 179.0}, "179 degrees of view"),
     ],
 )

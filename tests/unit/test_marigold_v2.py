@@ -83,6 +83,23 @@ def test_a_drawn_latent_makes_an_ensemble_worth_something():
     assert not torch.equal(*out.latent)
 
 
+@pytest.mark.parametrize("batch_size", [1, 2])
+def test_every_member_is_drawn_by_its_own_generator(batch_size):
+    drawn = MarigoldV2Pipeline(
+        **tiny_marigold_v2().components, sample_latent=True, default_processing_resolution=64
+    )
+    drawn.set_progress_bar_config(disable=True)
+    image = np.random.default_rng(0).random((32, 48, 3), np.float32)
+
+    def latents(*seeds):
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        call = {"ensemble_size": 2, "batch_size": batch_size, "output_latent": True, "generator": generators}
+        return drawn(image, **call).latent
+
+    one, other = latents(0, 1), latents(0, 2)
+    assert torch.equal(one[0], other[0]) and not torch.equal(one[1], other[1])
+
+
 def test_checkpointing_changes_no_gradient():
     pipe = tiny_marigold_v2()
     assert pipe.transformer.gradient_checkpointing

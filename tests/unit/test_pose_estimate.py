@@ -180,6 +180,18 @@ def test_photographs_become_a_guidance(pair) -> None:
         guidance.prepare(torch.rand(1, 3, 120, 160))
 
 
+def test_crops_may_lack_their_principal_point(pair) -> None:
+    K = pair.K_left.numpy().copy()
+    K[0, 2] -= 170
+    crops = [view.image_01[..., 170:] for view in (pair.left, pair.right)]
+    with pytest.raises(ValueError, match="principal point .* outside"):
+        GeometryGuidance.from_photographs(crops, baseline_m=0.1, K=K)
+    guidance = GeometryGuidance.from_photographs(crops, baseline_m=0.1, K=K, cropped=True)
+    E, found = pair.E.numpy(), guidance.rigs[0].E
+    assert angle_deg(found[:3, :3].T @ E[:3, :3]) < 1.0
+    assert found[:3, 3] @ E[:3, 3] / (0.1 * np.linalg.norm(E[:3, 3])) > 0.98
+
+
 def test_without_a_length_there_is_no_unit(pair) -> None:
     fov = math.degrees(2 * math.atan(160 / float(pair.K_left[0, 0])))
     guidance = GeometryGuidance.from_photographs(as_pil(pair.left), as_pil(pair.right), fov=fov)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -216,6 +217,37 @@ def test_intrinsics_of_another_size_are_named(factor: float, words: str, centred
     assert words in found and ("set to the middle" in found) == centred
 
 
+def near_cameras(turn_deg) -> tuple[Tracks, np.ndarray]:
+    """Tracks and true pose of cameras so close that other poses too leave matches near their lines."""
+    tracks, Ts, _ = make_tracks([pose(turn_deg, (0.09, 0.003, 0.01))], outliers=0.02)
+    return tracks, Ts[0]
+
+
+def test_of_several_factors_the_one_that_fits_best_is_named() -> None:
+    """Cameras this close leave matches within the coarse distance of their lines with most of them."""
+    tracks, T = near_cameras((0.3, 1.5, 0.3))
+    other = K * np.array([[2.0], [2.0], [1.0]])
+    other[:2, 2] = K[:2, 2]
+    tracks = Tracks(tracks.left_px, tracks.right_px, tracks.seen, other, other[None])
+    found = find_mistake(tracks, T, T)
+    assert "focal lengths times 0.5 " in found and "images of twice the width" in found
+
+
+def test_axes_of_opengl_are_named_where_most_matches_lie_near_the_wrong_lines() -> None:
+    tracks, T = near_cameras((0.5, 3.0, 0.2))
+    given = FLIP @ T @ FLIP
+    assert 0.5 < np.mean(residuals_px(tracks, given[None]) < 4.0), "coarsely it cannot be exceeded twice"
+    assert "OpenGL" in find_mistake(tracks, given, given)
+
+
+@pytest.mark.parametrize("degrees", [0.4, 1.5])
+def test_an_inexact_pose_of_near_cameras_has_no_mistaken_axes(degrees: float) -> None:
+    tracks, T = near_cameras((0.5, 3.0, 0.2))
+    for turn in np.random.default_rng(0).normal(size=(40, 3)):
+        given = T @ pose(degrees * turn / np.linalg.norm(turn), (0, 0, 0))
+        assert find_mistake(tracks, given, T) is None
+
+
 def test_right_and_inexact_poses_are_no_mistakes() -> None:
     tracks, Ts, _ = make_tracks([TRUE])
     inexact = np.linalg.inv(TRUE @ pose((1.0, 1.5, -1.0), (0.02, 0.02, 0)))
@@ -313,6 +345,28 @@ def test_images_bring_a_perturbed_pose_back(pair) -> None:
     assert angle_deg(report.E[0][:3, :3].T @ E[:3, :3]) < 0.2
     assert np.allclose(np.linalg.inv(found.rights[0][2].numpy()), report.E[0], atol=1e-5)
     assert np.allclose(report.E_given[0], wrong, atol=1e-6)
+
+
+def test_a_better_pose_that_is_too_far_is_not_said_to_be_used(pair) -> None:
+    wrong = pair.E.numpy() @ pose((0, 0, 10), (0, 0, 0))
+    left, rights, K_left = posed(pair, wrong)
+    found = pose_views(left, rights, K_left)
+    (sentence,) = found.report.warnings
+    assert found.report.status == "kept" and found.rights[0][2] is rights[0][2]
+    assert "A pose 10 degrees and " in sentence and "fits to 0.1 px, but is too far" in sentence
+    assert "was not used" in sentence and "refined" not in sentence
+
+
+def test_where_no_pose_fits_none_is_said_to_be_better(pair) -> None:
+    left, rights, K_left = posed(pair, pair.E.numpy())
+    image = rights[0].image_01.permute(1, 2, 0).numpy()
+    x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in image.shape[1::-1]))
+    waves = cv2.remap(image, x, y + 4 * np.sin(x * np.float32(2 * np.pi / 40)), cv2.INTER_LINEAR)
+    rights = [rights[0]._replace(image_01=torch.from_numpy(waves.transpose(2, 0, 1).copy()))]
+    found = pose_views(left, rights, K_left)
+    assert found.report.status == "kept" and found.rights[0] is rights[0]
+    assert "and no pose near it leaves clearly less" in found.report.warnings[0]
+    assert "refined" not in found.report.warnings[0]
 
 
 def test_a_pose_that_fits_is_not_touched(pair) -> None:

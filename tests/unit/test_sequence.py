@@ -13,9 +13,11 @@ from diffusers import DDIMScheduler, LCMScheduler
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.evaluation.sequence import SequenceOptions, flicker, run_sequence
+from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.warm_start import plan_warm_start
 from geodiff_plugin.synthetic import render_sequence
 from geodiff_plugin.types import MetricDepthOutput
+from tests.contracts.tiny_geowizard import make_geowizard
 
 FAST = {"inner_steps": 0, "loss_resolution": 64, "corrections": 4}
 
@@ -102,8 +104,6 @@ def test_its_latents_are_the_frame_before_at_the_level_of_that_step(pipe, textur
     """Mean over many draws: alpha z0; spread: sigma, by the scheduler's own table."""
     first = call(pipe, textured_plane)
     guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
-    from geodiff_plugin.priors import find_adapter
-
     prior, draws = find_adapter(pipe)(pipe), []
     generator = torch.Generator().manual_seed(1)
     told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": generator}
@@ -122,8 +122,6 @@ def test_its_scale_is_that_of_the_frame_before(pipe, textured_plane):
     first = call(pipe, textured_plane)
     told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": torch.zeros_like(first.latent)}
     guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
-    from geodiff_plugin.priors import find_adapter
-
     warm = plan_warm_start(pipe, find_adapter(pipe)(pipe), guidance, told, (48, 64))
     scale, shift, g_s = first.scale[0, 0], first.shift[0, 0], first.global_scale[0, 0]
     assert float(warm.near_m[0]) == pytest.approx(float(g_s * shift), rel=1e-5)
@@ -138,8 +136,6 @@ def test_metres_of_a_prior_become_baselines_again(pipe, textured_plane):
     first = call(pipe, textured_plane)
     told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": None}
     guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
-    from geodiff_plugin.priors import find_adapter
-
     prior = find_adapter(pipe)(pipe)
     plain = plan_warm_start(pipe, prior, guidance, told, (48, 64))
     first.rescaled, first.global_scale = 4.0, 4.0 * first.global_scale
@@ -173,3 +169,23 @@ def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane):
     for latents in (first.latent[..., :-1], first.latent[:, :1]):  # the latter would be spread silently
         with pytest.raises(InputError, match="latents must be of shape"):
             call(pipe, textured_plane, previous=first, latents=latents)
+
+
+def test_depth_and_normals_start_from_one_noise(textured_plane):
+    """As in GeoWizard's own call."""
+    pipe = enable_geometry_guidance(make_geowizard())
+    first = call(pipe, textured_plane)
+    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
+    told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": None}
+    factor = pipe.image_processor.config.vae_scale_factor
+    size = tuple(side * factor for side in first.latent.shape[-2:])
+    warm = plan_warm_start(pipe, find_adapter(pipe)(pipe), guidance, told, size)
+    alpha_bar = pipe.scheduler.alphas_cumprod[int(first.history[warm.skipped].timestep)]
+    depth, normals = (warm.latents - alpha_bar.sqrt() * first.latent).chunk(2, dim=1)
+    torch.testing.assert_close(depth, normals, rtol=0, atol=1e-4)
+
+
+def test_a_frame_of_another_precision_goes_on(pipe, textured_plane):
+    first = call(pipe, textured_plane)
+    half = call(pipe.to(torch.bfloat16), textured_plane, previous=first)
+    assert np.isfinite(half.prediction).all()

@@ -53,9 +53,12 @@ HAND_ON = {
     "runtime.both_views.guide_both_views",
     "runtime.reprojection.reprojection",  # to warp_right_to_left
     "cli.lenses.pinhole",  # to OpenCV
+    "cli.inputs.read_known",
     "formats.exif.warn_of_other_lens",  # the focal length alone
     "app.measure.read_pixel",
     "formats.distortion.undistorted",
+    "formats.distortion.undistorted_pixels",
+    "formats.distortion.undistorted_points",
     "formats.pointcloud.make_cloud",
     "guidance.photographs.estimate_rig",
     "guidance.posing.coarse_depth",

@@ -1,6 +1,6 @@
 """Pairs that an earlier run has finished.
 
-Data flow: the folder of a pair, what is asked of it -> its report, nothing, or why it cannot be gone on with.
+Data flow: the folder of a pair, what is asked of it -> its report, nothing, or why it is not what is asked.
 Paper: none.
 
 Nothing here imports torch.
@@ -14,9 +14,13 @@ from typing import Any
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.many.digests import file_digests
+from geodiff_plugin.cli.messages import in_options
 
-__all__ = ["finished_report"]
+__all__ = ["distrust", "finished_report"]
 
+#: As they are typed, where that is not the name with dashes.
+TYPED = {"left": "LEFT", "right": "RIGHT", "k": "--K", "e": "--E", "k_right": "--K-right"}
 #: Options by which a finished result is no other one.
 NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "show", "strict", "device"}
 
@@ -30,7 +34,7 @@ def finished_report(arguments: DepthArguments) -> dict[str, Any] | None:
         arguments: of this pair alone.
 
     Raises:
-        ValueError: it was made with other options.
+        ValueError: it was made with other options, or from files whose content has changed since.
     """
     report = _report(arguments.out)
     if report is None:
@@ -46,12 +50,36 @@ def finished_report(arguments: DepthArguments) -> dict[str, Any] | None:
         cure = "Name another --out, or add --overwrite."
         got = f"{arguments.out}, made {earlier} and now asked for {now}"
         bad_value("--out", "a folder of results of the same options", got, cure)
+    _check_files(arguments, report)
     return report
 
 
+def distrust(arguments: DepthArguments, report: dict[str, Any]) -> str | None:
+    """Why ``--strict`` refuses the result of a finished pair; ``None`` where it is trusted.
+
+    Args:
+        arguments: of this pair alone.
+        report: of ``finished_report``.
+    """
+    judgement = report["judgement"]
+    if judgement["trusted"]:
+        return None
+    return in_options(f"The depth in {arguments.out} is not to be trusted: {' '.join(judgement['reasons'])}")
+
+
+def _check_files(arguments: DepthArguments, report: dict[str, Any]) -> None:
+    """Refuse a result of files that have changed; only a run over many pairs notes what they held."""
+    made = report.get("pair", {}).get("sha256", {})
+    changed = [path for path, digest in file_digests(arguments).items() if made.get(path, digest) != digest]
+    if changed:
+        got = f"{arguments.out}, made before {' and '.join(changed)} changed"
+        cure = "Name another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
+        bad_value("--out", "a folder of results of the same files", got, cure)
+
+
 def _as_option(name: str, value: Any) -> str:
-    """An option as it stands on the command line."""
-    option = f"--{name.replace('_', '-')}"
+    """An option, or one of the views, as it stands on the command line."""
+    option = TYPED.get(name, f"--{name.replace('_', '-')}")
     if value is None or value is False or value == []:
         return f"without {option}"
     shown = " ".join(map(str, value)) if isinstance(value, list) else str(value)

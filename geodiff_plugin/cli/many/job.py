@@ -10,24 +10,26 @@ from __future__ import annotations
 import threading
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from geodiff_plugin._threads import WithinCores
-from geodiff_plugin.cli.arguments import OUTPUT_FILES, DepthArguments
+from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.cli.depth import write_result
 from geodiff_plugin.cli.estimate import StopWatch, guided_call
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
+from geodiff_plugin.cli.many.digests import file_digests
 from geodiff_plugin.cli.many.pairs import PairRef, arguments_of
 from geodiff_plugin.cli.many.rigs import RigStore
 from geodiff_plugin.cli.messages import in_options
 from geodiff_plugin.cli.photographs import read_photographs
 from geodiff_plugin.cli.report import build_report
 from geodiff_plugin.cli.settings import Settings
-from geodiff_plugin.cli.start import check_files
+from geodiff_plugin.cli.start import check_files, out_folder_of
 from geodiff_plugin.formats.out_folder import OutFolder
 from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
@@ -47,6 +49,7 @@ class Job:
         warnings: sentences about it.
         watch: its stages.
         out: its folder, held from before the work.
+        digests: SHA-256 of its files, as they were when it was read.
         inputs: views and cameras.
         output: of the guided call.
         began_from: name of the pair whose result the call went on from, or ``None``.
@@ -59,6 +62,7 @@ class Job:
     warnings: list[str] = field(default_factory=list)
     watch: StopWatch = field(default_factory=StopWatch)
     out: OutFolder | None = None
+    digests: dict[str, str] = field(default_factory=dict)
     inputs: Inputs | None = None
     output: MetricDepthOutput | None = None
     began_from: str | None = None
@@ -73,8 +77,7 @@ class Job:
 
     def hold(self) -> None:
         """Take the pair's folder, as a run of this pair alone would."""
-        folder = OutFolder(self.arguments.out, OUTPUT_FILES, overwrite=self.arguments.overwrite)
-        self.out = self._held.enter_context(folder)
+        self.out = self._held.enter_context(out_folder_of(self.arguments))
 
     def let_go(self) -> None:
         """Give the folder and the memory back."""
@@ -135,11 +138,13 @@ class Stages:
             check_arguments(_checkable(job))
             check_files(job.arguments, videos=job.ref.frame is not None)
             job.hold()
+            job.digests = file_digests(job.arguments)  # before: what changes later is another version
             if job.arguments.estimate_pose:
                 job.inputs = read_photographs(job.arguments, self._settings)
             else:
                 views = None if job.ref.frame is None else self._frames(job.ref, job.ref.frame)
-                job.inputs = read_inputs(job.arguments, self._settings, views, self._rigs.read)
+                rig_of = partial(self._rigs.read, sentences=job.warnings)
+                job.inputs = read_inputs(job.arguments, self._settings, views, rig_of)
 
     def _frames(self, ref: PairRef, frame: int) -> Any:
         views = [self._video(path).read(frame) for path in (ref.left, ref.right) if path is not None]
@@ -186,7 +191,12 @@ class Stages:
         assert job.inputs is not None and job.output is not None and job.out is not None
         job.warnings += [w for w in map(in_options, job.output.warnings) if w not in job.warnings]
         report = build_report(job.inputs, job.output, self._pipe, job.arguments, self._settings, job.warnings)
-        report["pair"] = {"name": job.ref.name, "frame": job.ref.frame, "began_from": job.began_from}
+        report["pair"] = {
+            "name": job.ref.name,
+            "frame": job.ref.frame,
+            "began_from": job.began_from,
+            "sha256": job.digests,
+        }
         write_result(job.arguments, job.out, job.inputs, job.output, report, job.watch)
         job.report = report
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,8 +27,10 @@ from geodiff_plugin.formats.video import VIDEOS, count_frames, is_video
 __all__ = ["LISTS", "PairRef", "arguments_of", "assumption", "find_pairs", "is_many"]
 
 LISTS = (".csv", ".tsv", ".txt")
-#: First words of a list's heading, which is no pair.
+#: A list's heading, which is no pair, begins with this.
 HEADING = "left"
+#: A comment in a line of a list, unless its mark is within quotes, which stay.
+COMMENT = re.compile(r'("[^"]*")|(?:^|\s)#.*')
 
 
 @dataclass(frozen=True)
@@ -95,8 +98,14 @@ def arguments_of(ref: PairRef, arguments: DepthArguments) -> DepthArguments:
 
 def _photographs(folder: Path) -> list[Path]:
     Image.init()
-    paths = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    return [path for path in paths if path.suffix.lower() in Image.EXTENSION]
+    paths = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    return sorted((path for path in paths if path.suffix.lower() in Image.EXTENSION), key=_natural)
+
+
+def _natural(path: Path) -> tuple[list[str | int], str]:
+    """Sorts names as people count: f2 before f10."""
+    parts = re.split(r"([0-9]+)", path.stem)  # text and numbers in turns, so that like meets like
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
 def _of_folders(left: Path, right: Path | None) -> list[PairRef]:
@@ -143,7 +152,7 @@ def _of_list(path: Path) -> list[PairRef]:
     rows: list[list[Path]] = []
     for number, line in enumerate(lines, 1):
         cells = _cells(line)
-        if not cells or (not rows and cells[0].lower() == HEADING):
+        if not cells or (not rows and _is_heading(cells[0], found.parent)):
             continue
         if len(cells) not in (2, 3):
             cure = "Separate them by commas, tabs, or blanks where no name has one."
@@ -158,12 +167,17 @@ def _of_list(path: Path) -> list[PairRef]:
     ]
 
 
+def _is_heading(cell: str, folder: Path) -> bool:
+    """Whether the first cell of a list is a word such as left_image, and no file or name of one."""
+    name = Path(cell)
+    plain = name.name == cell and not name.suffix
+    return cell.lower().startswith(HEADING) and plain and not os.path.isfile(folder / name)
+
+
 def _cells(line: str) -> list[str]:
-    """What stands in a line, by commas, else tabs, else blanks; nothing of an empty one or a comment."""
-    line = line.strip()
-    if not line or line.startswith("#"):
-        return []
-    separator = next((mark for mark in (",", "\t") if mark in line), None)
+    """What stands in a line, by tabs, else commas, else blanks; nothing of an empty one or a comment."""
+    line = COMMENT.sub(lambda found: found.group(1) or "", line).strip()
+    separator = next((mark for mark in ("\t", ",") if mark in line), None)
     if separator is None:
         return line.split()
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator)) if cell.strip()]

@@ -6,7 +6,6 @@ Paper: Algorithm 1, pair after pair.
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 import traceback
@@ -24,14 +23,15 @@ from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.estimate import load_guided_prior
 from geodiff_plugin.cli.exports import check_exports
 from geodiff_plugin.cli.many.conveyor import Conveyor
-from geodiff_plugin.cli.many.finished import finished_report
+from geodiff_plugin.cli.many.finished import distrust, finished_report
 from geodiff_plugin.cli.many.job import Job, Stages, ThreadWarnings
 from geodiff_plugin.cli.many.pairs import PairRef, assumption
 from geodiff_plugin.cli.many.processes import Processes, join_processes
+from geodiff_plugin.cli.many.summary import COLUMNS, SUMMARY, Row, write_summary
 from geodiff_plugin.cli.messages import collected_warnings, in_options, say
 from geodiff_plugin.cli.settings import Settings, read_settings
 from geodiff_plugin.cli.terminal import new_table, show
-from geodiff_plugin.formats.atomic import atomic_path
+from geodiff_plugin.formats.out_place import reason_of
 
 __all__ = ["EXIT_SOME_FAILED", "run_many"]
 
@@ -41,9 +41,6 @@ EXIT_SOME_FAILED = 4
 MOST_ON_THE_WAY = 4
 #: A table of more pairs than this has only those that want to be looked at.
 MOST_ROWS = 20
-COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "trusted", "confidence", "seconds", "message")
-
-Row = dict[str, Any]
 
 
 def run_many(arguments: DepthArguments, refs: Sequence[PairRef]) -> None:
@@ -54,7 +51,8 @@ def run_many(arguments: DepthArguments, refs: Sequence[PairRef]) -> None:
         refs: the pairs, in order.
 
     Raises:
-        ValueError: ``--out`` has results of other options; then nothing is computed, and nothing written.
+        ValueError: ``--out`` has results of other options, or of files that have changed since; then nothing
+            is computed, and nothing written.
     """
     settings = read_settings(arguments)
     check_exports(arguments.export, None)
@@ -66,11 +64,14 @@ def run_many(arguments: DepthArguments, refs: Sequence[PairRef]) -> None:
     rows = [row for _, row in sorted(_work(arguments, settings, refs, processes))]
     rows = processes.gather(rows)
     if processes.index == 0:
-        _write_rows(arguments.out / "pairs.csv", rows)
         if arguments.json:
             print(json.dumps(rows, indent=2))
         elif not arguments.quiet:
             _print(rows, arguments.out)
+        try:
+            write_summary(arguments.out, rows)
+        except OSError as error:  # what was found out is on the screen, and each result in its folder
+            say(f"geodiff: {arguments.out / SUMMARY} could not be written ({reason_of(error)}).")
     if any(row["result"] == "failed" for row in rows):
         sys.exit(EXIT_SOME_FAILED)
 
@@ -83,10 +84,13 @@ def _work(
     for number, ref in processes.share(list(enumerate(refs))):
         job = Job.of(ref, arguments)
         report = None if arguments.overwrite else finished_report(job.arguments)
-        if report is not None:
-            yield number, _row(ref.name, "there", report)
-        else:
+        if report is None:
             jobs.append((number, job))
+        elif arguments.strict and (reason := distrust(job.arguments, report)):
+            say(f"geodiff: {ref.name}: {reason}")
+            yield number, _row(ref.name, "failed", None, reason)
+        else:
+            yield number, _row(ref.name, "there", report)
     if jobs:
         yield from _run(arguments, settings, jobs, processes)
 
@@ -159,14 +163,6 @@ def _row(name: str, result: str, report: dict[str, Any] | None, message: str | N
         "seconds": round(sum(report["seconds"].values()), 3),
         "message": message or " ".join(report["warnings"]) or None,
     }
-
-
-def _write_rows(path: Path, rows: Sequence[Row]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _print(rows: Sequence[Row], out: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from geodiff_plugin.evaluation.datasets._files import (
     check_calibrated_sizes,
@@ -23,14 +24,19 @@ from geodiff_plugin.formats import read_calibration
 
 __all__ = ["FOLDER", "find_folder", "load_folder"]
 
-_IMAGES = (".png", ".jpg", ".jpeg")
-_DEPTHS = (".npy", ".pfm", ".png")
+_DEPTHS = ("depth.npy", "depth.pfm", "depth.png")
 
 
-def _first(folder: Path, stem: str, suffixes: tuple[str, ...]) -> Path | None:
-    return next(
-        (folder / (stem + suffix) for suffix in suffixes if (folder / (stem + suffix)).is_file()), None
-    )
+def _image(folder: Path, stem: str) -> Path | None:
+    """The image file of this name that Pillow knows, a PNG before others."""
+    Image.init()
+    files = (path for path in folder.glob(f"{stem}.*") if path.is_file())
+    found = [path for path in files if path.suffix.lower() in Image.EXTENSION]
+    return min(found, key=lambda path: (path.suffix.lower() != ".png", path.name), default=None)
+
+
+def _depth(folder: Path) -> Path | None:
+    return next((folder / name for name in _DEPTHS if (folder / name).is_file()), None)
 
 
 def find_folder(root: Path) -> list[SampleRef]:
@@ -38,13 +44,14 @@ def find_folder(root: Path) -> list[SampleRef]:
 
     A folder that lacks one of the three counts as a pair: reading it names the file that is missing.
 
-    The calibration is one file of any known format, or ``calib_left.*`` and ``calib_right.*``. Depth, if
-    there, is ``depth.npy`` or ``depth.pfm`` (metres) or ``depth.png`` (16 bit, millimetres); 0, NaN and
-    infinity are unknown.
+    Images are of any format that Pillow reads. The calibration is one file of any known format, or
+    ``calib_left.*`` and ``calib_right.*``; one with a pose per image knows these as ``left.*`` and
+    ``right.*``, in whatever folder. Depth, if there, is ``depth.npy`` or ``depth.pfm`` (metres) or
+    ``depth.png`` (16 bit, millimetres); 0, NaN and infinity are unknown.
     """
     refs = []
     for folder in folders(root, 1):
-        left, right = _first(folder, "left", _IMAGES), _first(folder, "right", _IMAGES)
+        left, right = _image(folder, "left"), _image(folder, "right")
         single = sorted(folder.glob("calib.*"))
         pair = [*sorted(folder.glob("calib_left.*"))[:1], *sorted(folder.glob("calib_right.*"))[:1]]
         calibrated = bool(single) or len(pair) == 2
@@ -56,7 +63,7 @@ def find_folder(root: Path) -> list[SampleRef]:
             "right": right or folder / "right.png",
             "calibration": single[0] if single else pair[0] if calibrated else folder / "calib.txt",
             "calibration_right": pair[1] if calibrated and not single else None,
-            "depth": _first(folder, "depth", _DEPTHS),
+            "depth": _depth(folder),
         }
         refs.append(SampleRef("folder", folder.resolve().name, files))
     return refs
@@ -70,7 +77,7 @@ def load_folder(ref: SampleRef) -> StereoSample:
             ``None``.
 
     Returns:
-        The sample; ``valid`` is False everywhere without depth.
+        The sample; without depth, ``valid`` is False everywhere and ``notes["truth"]`` says what was sought.
 
     Raises:
         OSError: a file is missing.
@@ -79,9 +86,15 @@ def load_folder(ref: SampleRef) -> StereoSample:
     files = ref.files
     left, right = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
     first, second = files["calibration"], files["calibration_right"]
-    rig = read_calibration(first if second is None else (first, second))
+    rig = read_calibration(
+        first if second is None else (first, second),
+        image_folder_hint=str(files["left"]),
+        image_names=(files["left"].name, files["right"].name),  # the pair's folder is the user's own choice
+        image_size=left.shape[1::-1],
+    )
     check_calibrated_sizes((first, second or first), rig, left, right)
-    depth_m, truth = np.zeros(left.shape[:2], np.float32), "none"
+    depth_m = np.zeros(left.shape[:2], np.float32)
+    truth = f"no {', '.join(_DEPTHS[:-1])} or {_DEPTHS[-1]} in {files['left'].parent}"
     if files["depth"] is not None:
         depth_m, truth = read_depth_m(files["depth"], "depth"), files["depth"].name
         check_size(files["depth"], depth_m.shape, left.shape)

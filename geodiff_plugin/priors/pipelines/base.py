@@ -23,7 +23,10 @@ from torch import Tensor
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin.priors.pipelines.hooks import Condition, Generators, PriorHooks
 
-__all__ = ["DepthDiffusionPipeline", "DepthOutput"]
+__all__ = ["RESAMPLING", "DepthDiffusionPipeline", "DepthOutput"]
+
+#: Ways of resampling that the stock pipeline takes.
+RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
 
 
 @dataclass
@@ -100,6 +103,8 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
             self.default_processing_resolution if processing_resolution is None else processing_resolution
         )
         self.check_call(steps, ensemble_size, resolution, batch_size, output_type, output_uncertainty)
+        check_choice(resample_method_input, "resample_method_input", RESAMPLING)
+        check_choice(resample_method_output or self.output_resampling, "resample_method_output", RESAMPLING)
         if latents is not None and generator is not None:
             bad_value("latents and generator", "given one at a time", "both")
         unknown = set(options) - set(self.call_options())

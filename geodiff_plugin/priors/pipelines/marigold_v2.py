@@ -112,10 +112,11 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
     ) -> Condition:
         """Latent of the image, of every member anew where it is drawn, and the prompt."""
         members = image.repeat_interleave(ensemble_size, dim=0) if self.config.sample_latent else image
-        parts = [
-            latents_of(self.vae, part, generator, self.config.sample_latent)
-            for part in members.split(batch_size)
-        ]
+        parts = []
+        for first in range(0, len(members), batch_size):
+            chunk = slice(first, first + batch_size)
+            own = generator[chunk] if isinstance(generator, list) else generator
+            parts.append(latents_of(self.vae, members[chunk], own, self.config.sample_latent))
         latent = torch.cat(parts).to(image.dtype)  # (N * E, 16, h, w)
         if not self.config.sample_latent:
             latent = latent.repeat_interleave(ensemble_size, dim=0)
