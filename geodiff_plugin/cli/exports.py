@@ -7,6 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 import importlib.util
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,10 +67,20 @@ def make_scene(
         cameras.append((rig.K_right, rescaled_pose(rig.E, output), (image.shape[-1], image.shape[-2])))
     cloud = make_cloud(depth_m, inputs.left, K, keep)
     if not inputs.undistorted:
-        return Scene(cloud, tuple(cameras), tuple(path.name for path in names), inputs.left)
+        return Scene(cloud, tuple(cameras), _image_names(names), inputs.left)
     further = tuple(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)
     written = tuple(undistorted_name(number) for number in range(1, 2 + len(further)))
     return Scene(cloud, tuple(cameras), written, inputs.left, further)
+
+
+def _image_names(paths: tuple[Path, ...]) -> tuple[str, ...]:
+    """Names of the images, with their folders below a common one where two of them are alike."""
+    names = tuple(path.name for path in paths)
+    if len(set(names)) == len(names):
+        return names
+    absolute = [path.absolute() for path in paths]
+    root = os.path.commonpath([path.parent for path in absolute])
+    return tuple(path.relative_to(root).as_posix() for path in absolute)
 
 
 def _glb(folder: Path, scene: Scene) -> None:

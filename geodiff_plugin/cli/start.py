@@ -202,6 +202,9 @@ def start_many(arguments: DepthArguments) -> list[PairRef]:
         bad_value(
             "--estimate-pose", "left out with a video", "given", "Extract some frames, and try it there."
         )
+    if "colmap" in arguments.export and refs[0].frame is not None:
+        cure = "A model names image files: extract the frames, and give their folders."
+        bad_value("--export colmap", "left out with a video", "given", cure)
     first = arguments_of(refs[0], arguments)
     check_arguments(first if first.right is not None else replace(first, right=first.left))
     if arguments.estimate_pose:

@@ -71,6 +71,18 @@ def bent(pair_files, prior):
     return [*pair_files.images, *camera, *run, "--distortion", LENS]
 
 
+def test_images_of_one_name_are_named_with_their_folders(geodiff, quick, pair_files):
+    command, *photographs = pair_files.images
+    images = []
+    for side, path in zip(("image_2", "image_3"), photographs, strict=True):
+        (pair_files.folder / side).mkdir()
+        images.append(shutil.copy(path, pair_files.folder / side / "000000.png"))
+    answer = geodiff(command, *images, *quick[3:], "--export", "colmap", "-q")
+    assert answer.code == 0, answer.err
+    lines = (pair_files.folder / "geodiff-out" / "images.txt").read_text().splitlines()
+    assert [line.split()[-1] for line in lines[3::2]] == ["image_2/000000.png", "image_3/000000.png"]
+
+
 def test_a_colmap_model_names_what_its_cameras_took(geodiff, bent, pair_files):
     third, pose = pair_files.folder / "third.png", pair_files.folder / "pose.txt"
     Image.fromarray(255 - np.asarray(Image.open(pair_files.right))).save(third)

@@ -595,6 +595,8 @@ def test_the_video_of_a_rig(geodiff, folders, textured_plane, views, beside, cam
     assert report["pair"]["frame"] == 2 and report["inputs"]["right_size"] == [64, 48]
     answer = geodiff("video", *sorted(root.glob("out/0*")), "--photographs", "--out", "depth.gif")
     assert answer.code == 0, answer.err
+    answer = geodiff(*words, "--export", "colmap", "--overwrite")
+    assert answer.code == 2 and "--export colmap must be left out with a video" in answer.err
 
 
 # Several processes
