@@ -9,12 +9,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.formats import atomic_path
+from geodiff_plugin.formats.files import file_digest
 
 __all__ = ["append_record", "clean_records", "read_records", "record_key"]
 
@@ -22,16 +22,9 @@ __all__ = ["append_record", "clean_records", "read_records", "record_key"]
 def _content(path: Path) -> str | None:
     """A fingerprint of a file; ``None`` for a folder, or a file that cannot be read: its loader says why."""
     try:
-        found = path.stat()
-        return _fingerprint(path, found.st_size, found.st_mtime_ns)
+        return file_digest(path)
     except OSError:
         return None
-
-
-@lru_cache(maxsize=4096)
-def _fingerprint(path: Path, size: int, changed_ns: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def record_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: str, version: str) -> str:

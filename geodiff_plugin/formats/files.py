@@ -7,9 +7,11 @@ Paper: none.
 from __future__ import annotations
 
 import codecs
+import hashlib
 import os
 import re
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 
 from geodiff_plugin._checks import (
@@ -21,7 +23,7 @@ from geodiff_plugin._checks import (
     quoted,
 )
 
-__all__ = ["check_file", "read_text", "refuse_decimal_commas"]
+__all__ = ["check_file", "file_digest", "read_text", "refuse_decimal_commas"]
 
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
@@ -104,3 +106,19 @@ def refuse_decimal_commas(lines: Iterable[str], path: str | os.PathLike[str], na
         if found and found.group() != line:
             cure = "Write points for commas, as 1.5 for 1,5."
             bad_value(name, "numbers with a decimal point", f"{path} with {found.group()}", cure)
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of what a file holds, read once as long as its size and time stay the same.
+
+    Raises:
+        OSError: it cannot be read, or is a folder.
+    """
+    found = path.stat()
+    return _digest(path.absolute(), found.st_size, found.st_mtime_ns)
+
+
+@lru_cache(maxsize=4096)
+def _digest(path: Path, size: int, changed_ns: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

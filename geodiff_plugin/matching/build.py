@@ -113,8 +113,12 @@ def _at_shift(
     rights: Sequence[CameraView], K: torch.Tensor, size: tuple[int, int], fraction: float
 ) -> torch.Tensor:
     """Inverse depth at which the view that moves most has moved by this fraction of the width."""
-    all_rays = [plane_rays(K[None], K_r[None], T[None], size) for _, K_r, T in rights]
-    return torch.stack([inverse_depth_at_shift(rays, fraction * size[1]) for rays in all_rays]).amin()
+    found = []
+    for v, (_, K_r, T) in enumerate(rights, 1):
+        name = "E" if len(rights) == 1 else f"E of right view {v}"
+        rays = plane_rays(K[None], K_r[None], T[None], size)
+        found.append(inverse_depth_at_shift(rays, fraction * size[1], name))
+    return torch.stack(found).amin()
 
 
 def _nearest_inverse_depth(pilot: CostVolume, config: SweepConfig, matching: MatchingConfig) -> torch.Tensor:

@@ -107,12 +107,13 @@ def _plane_uv(rays: PlaneRays, inverse_depth: torch.Tensor) -> tuple[torch.Tenso
     return p[:, :2] / torch.where(in_front, p[:, 2], torch.ones_like(p[:, 2]))[:, None], in_front
 
 
-def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor) -> torch.Tensor:
+def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor, name: str = "E") -> torch.Tensor:
     """How far the median pixel lies, in the right view, from where it would be at infinity.
 
     Args:
         rays: ``plane_rays`` of any grid of left pixels, batch of 1.
         inverse_depth: ``(N,)`` 1/m, >= 0.
+        name: of the pose, for messages.
 
     Returns:
         ``(N,)`` pixels of the right view; infinite where the plane passes behind the right camera. Measured
@@ -125,7 +126,7 @@ def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor) -> torch.Tensor:
     some = PlaneRays(rays.A[..., ::stride], rays.b)
     at_infinity, ahead = _plane_uv(some, rays.A.new_zeros(1))
     if not ahead.any():
-        bad_value("E", "a pose under which the views overlap", "a right camera that looks the other way")
+        bad_value(name, "a pose under which the views overlap", "a right camera that looks the other way")
     uv, in_front = _plane_uv(some, inverse_depth)
     dx, dy = (uv - at_infinity).unbind(dim=1)
     shift = torch.hypot(dx, dy)  # a norm over a dimension of 2 takes most of a sweep's time
@@ -133,12 +134,13 @@ def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor) -> torch.Tensor:
     return shift[:, ahead[0]].median(dim=1).values
 
 
-def inverse_depth_at_shift(rays: PlaneRays, shift_px: float) -> torch.Tensor:
+def inverse_depth_at_shift(rays: PlaneRays, shift_px: float, name: str = "E") -> torch.Tensor:
     """The inverse depth at which ``median_shift`` reaches so many pixels.
 
     Args:
         rays: ``plane_rays`` of any grid of left pixels, batch of 1.
         shift_px: pixels of the right view, > 0.
+        name: of the pose, for messages.
 
     Returns:
         ``()`` float32, 1/m, within 1 %. A camera that stands behind the other one sees no pixel move further
@@ -148,9 +150,9 @@ def inverse_depth_at_shift(rays: PlaneRays, shift_px: float) -> torch.Tensor:
         ValueError: the views do not overlap, or both cameras stand at one place.
     """
     exponents = rays.A.new_tensor([-8.0, 5.0])
-    most = float(median_shift(rays, 10.0 ** exponents[1:]))
+    most = float(median_shift(rays, 10.0 ** exponents[1:], name))
     if most < _LEAST_SHIFT_PX:
-        bad_value("E", "a pose with a baseline", "both cameras at one place")
+        bad_value(name, "a pose with a baseline", "both cameras at one place")
     shift_px = min(shift_px, 0.5 * most)
     for _ in range(16):  # the shift grows with inverse depth, so bisection of 13 decades reaches 0.05 %
         middle = exponents.mean()

@@ -445,6 +445,8 @@ def test_errors_name_the_argument():
     away[0, 3] = 0.1
     with pytest.raises(ValueError, match="E must be a pose under which the views overlap"):
         m.build_cost_volume(left, [(texture, K, away)], K)
+    with pytest.raises(ValueError, match="E of right view 2 must be a pose under which the views overlap"):
+        m.build_cost_volume(left, [(texture, K, T), (texture, K, away)], K)
     with pytest.raises(ValueError, match="depth_range"):
         m.build_cost_volume(left, [(texture, K, T)], K, depth_range=(3.0, 1.0))
 

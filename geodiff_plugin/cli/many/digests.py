@@ -8,13 +8,12 @@ Nothing here imports torch.
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterator
-from functools import lru_cache
 from pathlib import Path
 
 from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.formats.files import file_digest
 
 __all__ = ["CAMERA_FILES", "PAIR_FILES", "file_digests"]
 
@@ -38,8 +37,7 @@ def file_digests(arguments: DepthArguments, names: tuple[str, ...] = PAIR_FILES)
     digests = {}
     for path in _paths(arguments, names):
         try:
-            found = path.stat()
-            digests[str(path)] = _digest(path.absolute(), found.st_size, found.st_mtime_ns)
+            digests[str(path)] = file_digest(path)
         except OSError:
             continue
     return digests
@@ -53,9 +51,3 @@ def _paths(arguments: DepthArguments, names: tuple[str, ...]) -> Iterator[Path]:
                 yield from (path / file for file in MODEL_FILES)
             elif path is not None:
                 yield path
-
-
-@lru_cache(maxsize=64)
-def _digest(path: Path, size: int, changed_ns: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
