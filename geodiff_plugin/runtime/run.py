@@ -173,21 +173,21 @@ class GuidedRun:
         return depth_m
 
     def within_range(self, depth_m: Tensor, image: int | None = None) -> Tensor:
-        """Maps brought to another size, within the range that they had: bicubic enlargement overshoots.
+        """Keep maps brought to another size in the range that they had: bicubic enlargement overshoots.
 
         Args:
             depth_m: ``(M, 1, H, W)`` metres: of all images, or of the members of one.
             image: whose members these are.
 
         Returns:
-            ``(M, 1, H, W)`` metres.
+            The same tensor, changed in place.
         """
         own = [i for i, owner in enumerate(self.owners) if image in (None, owner)]
         near_m, far_m = (
             torch.cat(ends).to(depth_m)[own].view(len(depth_m), -1, 1, 1)
             for ends in zip(*self._ends_m, strict=True)
         )
-        return depth_m.clamp(near_m.amin(1, keepdim=True), far_m.amax(1, keepdim=True))
+        return depth_m.clamp_(near_m.amin(1, keepdim=True), far_m.amax(1, keepdim=True))
 
     def known(self, image: int, member: int | None = None) -> Known:
         """Matches and points of one image on the grid of the sweep, weighted by what the loop found of them.
