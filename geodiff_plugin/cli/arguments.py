@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["DepthArguments", "demo_arguments", "undistorted_name"]
+__all__ = ["MODEL_FILES", "DepthArguments", "demo_arguments", "undistorted_name"]
 
 #: What a run writes, or may write by its prior and its lenses.
 FILES = (
@@ -28,8 +28,10 @@ FILES = (
     "undistorted.png",
     "report.json",
 )
+#: What is read of a COLMAP model, the one kind of calibration that is a folder.
+MODEL_FILES = ("cameras.txt", "images.txt")
 #: What ``--export`` adds.
-EXPORT_FILES = {"glb": ("cloud.glb",), "colmap": ("cameras.txt", "images.txt", "points3D.txt")}
+EXPORT_FILES = {"glb": ("cloud.glb",), "colmap": (*MODEL_FILES, "points3D.txt")}
 
 
 def undistorted_name(number: int) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.arguments import MODEL_FILES, DepthArguments
 from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.cli.many.pairs import PairRef, arguments_of, find_pairs
 from geodiff_plugin.cli.many.summary import check_summary
@@ -132,7 +132,7 @@ def _check_photographs(arguments: DepthArguments) -> None:
 
 def _is_colmap_model(path: Path) -> bool:
     """The one kind of calibration that is a folder; missing files are reported when it is read."""
-    return any(os.path.exists(path / name) for name in ("cameras.txt", "images.txt", "images.bin"))
+    return any(os.path.exists(path / name) for name in (*MODEL_FILES, "images.bin"))
 
 
 def _other_files(arguments: DepthArguments) -> list[tuple[str, Path]]:
@@ -178,7 +178,7 @@ def check_files(arguments: DepthArguments, videos: bool = False) -> None:
 def out_folder_of(arguments: DepthArguments) -> OutFolder:
     """The output folder of one pair, which refuses to replace what the pair is made of."""
     inputs = [*_photographs(arguments).values(), *(path for _, path in _other_files(arguments))]
-    inputs += [path / name for path in arguments.calib for name in ("cameras.txt", "images.txt")]
+    inputs += [path / name for path in arguments.calib for name in MODEL_FILES]
     names, overwrite = arguments.output_files(), arguments.overwrite
     return OutFolder(arguments.out, names, inputs=inputs, overwrite=overwrite)
 

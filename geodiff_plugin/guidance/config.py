@@ -120,8 +120,7 @@ class GuidanceConfig(Checked):
         "`full`, `tiny`, a folder or a hub id",
         "what decodes and encodes between the steps: the prior's own autoencoder, the tiny one that is "
         "published for its latent, or another `AutoencoderTiny`; the result is always decoded by the "
-        "prior's own "
-        "([priors](../reference/priors.md#a-tiny-decoder))",
+        "prior's own ([priors](../reference/priors.md#a-tiny-decoder))",
         paper="-",
     )
     terms: TermsConfig = TermsConfig()

@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.arguments import MODEL_FILES, DepthArguments
 from geodiff_plugin.formats.files import file_digest
 
 __all__ = ["CAMERA_FILES", "PAIR_FILES", "file_digests"]
@@ -21,8 +21,6 @@ __all__ = ["CAMERA_FILES", "PAIR_FILES", "file_digests"]
 CAMERA_FILES = ("calib", "k", "e", "k_right")
 #: Arguments that name all files of a pair.
 PAIR_FILES = ("left", "right", *CAMERA_FILES)
-#: What is read of a COLMAP model, the one kind of calibration that is a folder.
-MODEL_FILES = ("cameras.txt", "images.txt")
 
 
 def file_digests(arguments: DepthArguments, names: tuple[str, ...] = PAIR_FILES) -> dict[str, str]:
