@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -12,6 +13,12 @@ import torch
 from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, ModelMixin, UNet2DConditionModel
 from diffusers.configuration_utils import ConfigMixin, register_to_config
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+
+# Networks and images are tiny here: a second thread costs more than it brings, above all where several
+# processes share the cores. Processes that a test starts read the variable.
+if "OMP_NUM_THREADS" not in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"
+    torch.set_num_threads(1)
 
 SCHEDULER = {
     "beta_schedule": "scaled_linear",

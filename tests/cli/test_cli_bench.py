@@ -43,7 +43,7 @@ def test_measure(make_pipeline, textured_plane, tmp_path, monkeypatch, gradient)
     pair = DemoPair(left, right, rig, depth_m, depth_m > 0)
     monkeypatch.setattr("geodiff_plugin.cli.bench.read_demo_pair", lambda: pair)
     monkeypatch.setattr("geodiff_plugin.priors.BUNDLED_FOLDER", tmp_path)
-    cost = measure(gradient, replace(BUNDLED, repeats=1), "cpu")
+    cost = measure(gradient, replace(BUNDLED, knobs={"inner_steps": 2}, repeats=1), "cpu")
     assert cost.seconds > 0 and cost.peak_bytes >= 0
 
 
