@@ -74,10 +74,11 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
 
     Returns:
         ``(H, W)`` float64, metres, at least ``FLOOR_M``, where Marigold's evaluation clips what least
-        squares sends behind the camera; not finite where ``values`` is not.
+        squares sends behind the camera; not finite where ``values`` is not, and nowhere finite where no pixel
+        has both truth and prediction.
 
     Raises:
-        ValueError: an unknown space, or no pixel has both truth and prediction.
+        ValueError: an unknown space.
 
     Source: Marigold's evaluation: ``least_square`` and ``least_square_disparity``, the latter over positive
         predictions only and clipped at 1e-3; the other spaces are the same idea.
@@ -86,6 +87,8 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
     known = valid & np.isfinite(values) & (truth_m > 0)
     if space == "disparity":
         known &= np.nan_to_num(values) > 0
+    if not known.any():  # a method that finds nothing has no errors, as without alignment
+        return np.full(np.shape(truth_m), np.nan)
     target = np.zeros(np.shape(truth_m))
     target[known] = to_space(np.asarray(truth_m, np.float64)[known], space)
     scale, shift = least_squares(values, target, known)

@@ -23,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.evaluation.baselines._guidance import call_arguments, posed_views
 from geodiff_plugin.evaluation.baselines._sweep import sweep
 from geodiff_plugin.evaluation.baselines.base import PriorCache, Settings
@@ -200,6 +201,10 @@ def main(
     what: Annotated[str, typer.Option(help="depth, matches or both.")] = "both",
 ) -> None:
     """Print coefficients of confidence, fitted on pairs with truth, and how they do on the other half."""
+    check_choice(what, "what", ("depth", "matches", "both"))
+    emulated = [name.strip() for name in strengths.split(",") if name.strip()]
+    for name in emulated:
+        check_choice(name, "strengths", STRENGTHS)
     refs = [(root, ref) for root in data for ref in find_pairs(root)]
     console, priors = Console(width=100), PriorCache()
     kinds: dict[str, tuple[Callable[..., Observed], tuple[Any, ...]]] = {
@@ -224,11 +229,14 @@ def main(
         for root, ref in tqdm(refs, desc=kind):  # what one pair shows under several priors stays in one half
             sample = load(ref)
             own = [observe(sample, one, priors) for one in each]
-            if kind == "depth" and strengths:
-                own += observe_emulated(sample, strengths.split(","))
+            if kind == "depth" and emulated:
+                own += observe_emulated(sample, emulated)
             pair = _joined(own)
             if len(pair.right):
                 observed.setdefault(root, []).append(pair)
+        count = sum(map(len, observed.values()))
+        if count < 2:  # each half is judged by the other
+            bad_value("data", "folders with at least two pairs with truth", f"{count} in {', '.join(data)}")
         _print(console, kind, where, name, observed, signs, shipped)
 
 

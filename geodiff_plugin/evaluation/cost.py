@@ -36,6 +36,9 @@ def cost_table(records: Sequence[dict[str, Any]]) -> Table:
 
     Args:
         records: of a run in which ``PLAIN`` is one of the methods.
+
+    Raises:
+        ValueError: no pair on which ``PLAIN`` has worked.
     """
     costs = {}
     for name in dict.fromkeys(record["method"] for record in records):
@@ -43,6 +46,9 @@ def cost_table(records: Sequence[dict[str, Any]]) -> Table:
         if own:
             seconds = statistics.median(record["seconds"] for record in own)
             costs[name] = (len(own), seconds, max(record["peak_bytes"] for record in own))
+    if PLAIN not in costs:
+        cure = "See geodiff eval cost without --skip-broken for the reason."
+        bad_value("the pairs", f"some on which {PLAIN} works", "none", cure)
     _, plain_seconds, plain_bytes = costs[PLAIN]
     rows = [
         (
@@ -91,6 +97,7 @@ def run_cost(options: PairsOptions) -> Page:
                 options.out / "cost",
                 crop=options.crop,
                 skip_broken=options.skip_broken,
+                save_depth=options.save_depth,
                 progress=not options.quiet,
             )
             records += job.result()

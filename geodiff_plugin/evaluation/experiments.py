@@ -111,7 +111,13 @@ def run_changes(name: str, options: PairsOptions) -> Page | None:
         title, tables = "Flatness", [flatness_table(records)]
     else:
         title, tables = "Parts of the default", [changes_table(records, name), regions_table(records)]
-    page = Page(title, facts, tuple(tables), tuple(remarks_on(records, options)))
+    added = [record for record in records if record["method"] not in own]
+    if added:
+        labels = {label_of(record) for record in added}
+        heading = f"Further methods and priors, {count_of_pairs(len(labels))}"
+        tables.insert(1, summary_table(added, labels, heading))
+    shown = tuple(table for table in tables if table.rows)
+    page = Page(title, facts, shown, tuple(remarks_on(records, options)))
     write_page(page, options.out, name)
     return page
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import random
 import shlex
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -19,7 +20,15 @@ from geodiff_plugin.evaluation.crops import CROPS
 from geodiff_plugin.evaluation.datasets import find_pairs
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 
-__all__ = ["PAIRS_METHODS", "PairsOptions", "all_refs", "command_line", "select"]
+__all__ = [
+    "PAIRS_METHODS",
+    "PairsOptions",
+    "all_refs",
+    "command_line",
+    "first_pairs",
+    "select",
+    "settings_words",
+]
 
 PAIRS_METHODS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 
@@ -87,6 +96,39 @@ def all_refs(options: PairsOptions, datasets: Sequence[str] | None = None) -> li
     )
 
 
+def _check_count(name: str, count: int | None) -> None:
+    if count is not None and count < 1:
+        bad_value(name, "at least 1", count)
+
+
+def _check_names(option: str, refs: Sequence[SampleRef], data: Path) -> None:
+    """Refuse samples of one name, as two resolutions of a set have: records could not tell them apart."""
+    twice = [label for label, count in Counter(ref.label for ref in refs).items() if count > 1]
+    if twice:
+        cure = "Name the folder of one of them, for instance that of one resolution."
+        bad_value(option, "a folder with one sample of each name", f"{data} with several {twice[0]}", cure)
+
+
+def first_pairs(data: Path | None, limit: int | None) -> list[SampleRef]:
+    """The first pairs of a folder; none without a folder.
+
+    Args:
+        data: folder that holds data sets, or ``None``.
+        limit: at most so many; ``None`` for all.
+
+    Raises:
+        ValueError: a folder without pairs, two of one name, or a limit below 1.
+    """
+    _check_count("limit", limit)
+    if data is None:
+        return []
+    found = find_pairs(data)
+    if not found:
+        bad_value("--data", "a folder with pairs", str(data), "See: geodiff eval list.")
+    _check_names("--data", found, data)
+    return found[:limit]
+
+
 def select(refs: Sequence[SampleRef], options: PairsOptions) -> list[SampleRef]:
     """Keep the samples whose label contains one of ``scenes``, draw ``sample``, keep the first ``limit``.
 
@@ -94,24 +136,34 @@ def select(refs: Sequence[SampleRef], options: PairsOptions) -> list[SampleRef]:
         References in the order of ``refs``.
 
     Raises:
-        ValueError: nothing is left, more are to be drawn than there are, or a number is below 1.
+        ValueError: nothing is left, two samples have one name, more are to be drawn than there are, or a
+            number is below 1.
     """
     scenes, data = options.scenes, options.data
     for name in ("limit", "sample"):
-        count = getattr(options, name)
-        if count is not None and count < 1:
-            bad_value(name, "at least 1", count)
+        _check_count(name, getattr(options, name))
     kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
     if not kept:
         found = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
         wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
         bad_value("DIR", f"a folder with a sample{wanted}", f"{data} with {found}", "See: geodiff eval list.")
+    _check_names("DIR", kept, data)
     if options.sample is not None:
         if options.sample > len(kept):
             bad_value("sample", f"at most {len(kept)}, the number of samples found", options.sample)
         drawn = random.Random(options.settings.seed).sample(range(len(kept)), options.sample)
         kept = [kept[i] for i in sorted(drawn)]
     return kept[: options.limit]
+
+
+def settings_words(settings: Settings, without: Sequence[str] = ()) -> list[str]:
+    """Words of a command line that give these settings, defaults and those in ``without`` left out."""
+    words = []
+    for field in fields(Settings):
+        value: Any = getattr(settings, field.name)
+        if field.name not in without and value != field.default:
+            words += [f"--{field.name}", str(value)]
+    return words
 
 
 def command_line(
@@ -138,12 +190,7 @@ def command_line(
     if options.priors:
         words += ["--prior", options.settings.prior]
         words += [word for prior in options.priors for word in ("--prior", prior)]
-    for field in fields(Settings):
-        if options.priors and field.name == "prior":
-            continue
-        value: Any = getattr(options.settings, field.name)
-        if value != field.default:
-            words += [f"--{field.name}", str(value)]
+    words += settings_words(options.settings, () if not options.priors else ("prior",))
     if options.pose:
         words += ["--pose", ",".join(options.pose)]
     if options.perturb is not None:

@@ -6,6 +6,7 @@ Paper: none; it takes exact poses for granted (S3.3).
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.perturbed import drifted_ref, perturbed_ref
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.layout import Table
+from geodiff_plugin.evaluation.options import first_pairs, settings_words
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.runner import headline, run
 from geodiff_plugin.evaluation.statistics import mean_with_interval
@@ -222,12 +224,10 @@ def run_poses(options: PosesOptions) -> Page:
     """Measure, and write the tables.
 
     Raises:
-        InputError: neither real nor rendered pairs; a folder without pairs.
+        InputError: neither real nor rendered pairs; a folder without pairs; a limit below 1.
         OSError: missing or unreadable files.
     """
-    real = [] if options.data is None else find_pairs(options.data)[: options.limit]
-    if options.data is not None and not real:
-        bad_value("--data", "a folder with pairs", str(options.data), "See: geodiff eval list.")
+    real = first_pairs(options.data, options.limit)
     size = "" if options.rendered_size is None else "{}x{}".format(*options.rendered_size)
     asked = f"synthetic-posed:{options.rendered}" + (f"@{size}" if size else "")
     rendered = find_pairs(asked) if options.rendered else []
@@ -238,13 +238,14 @@ def run_poses(options: PosesOptions) -> Page:
         bench, tables = _Bench(options), []
         for part, refs in ((_real, real), (_rendered, rendered), (_drifted, rectified)):
             tables += part(bench, refs) if refs else []
-    words = ["geodiff eval poses", f"--rendered {options.rendered}"]
-    words += [f"--rendered-size {size}"] if size else []
-    words += [] if options.data is None else [f"--data {options.data.name}"]
-    words += [] if options.limit is None else [f"--limit {options.limit}"]
-    words += ["--perturb {:g},{:g}".format(*options.perturb), "--drift {:g},{:g}".format(*options.drift)]
+    words = ["geodiff", "eval", "poses", "--rendered", str(options.rendered)]
+    words += ["--rendered-size", size] if size else []
+    words += [] if options.data is None else ["--data", options.data.name]
+    words += [] if options.limit is None else ["--limit", str(options.limit)]
+    words += ["--perturb", "{:g},{:g}".format(*options.perturb)]
+    words += ["--drift", "{:g},{:g}".format(*options.drift), *settings_words(options.settings)]
     settings = options.settings
     remark = f"Prior {settings.prior}, seed {settings.seed}. All pixels with truth, metres as they come out."
-    page = Page("Results by pose", run_facts(" ".join(words)), tuple(tables), (remark,), PURPOSE)
+    page = Page("Results by pose", run_facts(shlex.join(words)), tuple(tables), (remark,), PURPOSE)
     write_page(page, options.out, "poses", options.results)
     return page

@@ -32,7 +32,7 @@ def record_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior
 
     Args:
         ref: the sample; not where its files lie but what is in them counts, and its other entries (cameras,
-            views). Of a folder, such as a scan with many views, the name of the sample alone counts.
+            views). A folder counts by the files of it that the sample names as well.
         method: its name.
         configuration: everything that changes the method's result beside the prior, JSON values.
         prior: name and fingerprint of the prior, empty for a method without one.

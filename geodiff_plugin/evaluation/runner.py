@@ -106,6 +106,17 @@ def _measure(
     return {"status": "ok", **cost, **scores, "notes": notes}, prediction
 
 
+def _depth_path(depth_folder: Path, ref: SampleRef, method: Method) -> Path:
+    """Where the depth map of a method and a sample is saved."""
+    own_folder = depth_folder / re.sub(r"[^\w.=+-]+", "_", method.name)
+    return own_folder / f"{map_name(ref.dataset, ref.name)}.npy"
+
+
+def _lacks_map(record: dict[str, Any], path: Path) -> bool:
+    """Whether a finished record is of a metric map that an earlier run has not saved."""
+    return record["status"] == "ok" and record["all_pixels"]["raw"] is not None and not path.is_file()
+
+
 def _finish(
     ref: SampleRef,
     method: Method,
@@ -125,8 +136,7 @@ def _finish(
             raise
         return {"status": "broken", "error": str(error)}, sample
     if depth_folder is not None and prediction is not None and prediction.depth_m is not None:
-        own_folder = depth_folder / re.sub(r"[^\w.=+-]+", "_", method.name)
-        target = own_folder / f"{map_name(ref.dataset, ref.name)}.npy"
+        target = _depth_path(depth_folder, ref, method)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_depth_npy(target, prediction.depth_m)
     return {"rectified": sample.rectified} | body, sample
@@ -176,7 +186,7 @@ def run(
         crop: region of the image that is scored, one of ``crops.CROPS``.
         skip_broken: go on after a sample that cannot be read or measured; its record says why.
         save_depth: write each metric depth map to ``out/depth/<method>/<dataset>_<sample>.npy``, where the
-            method ``files:out/depth/<method>`` finds it.
+            method ``files:out/depth/<method>`` finds it; what is finished but has no map is run again.
         progress: show a bar with each method's running AbsRel.
 
     Returns:
@@ -208,6 +218,8 @@ def run(
             for method in chosen:
                 key = keys[ref.label, method.name]
                 record = finished.get(key)
+                if record and depth_folder and _lacks_map(record, _depth_path(depth_folder, ref, method)):
+                    record = None
                 if record is None:
                     body, sample = _finish(
                         ref, method, sample, local, priors, crop, skip_broken, depth_folder

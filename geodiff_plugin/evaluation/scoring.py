@@ -42,7 +42,7 @@ def out_of_view(sample: StereoSample) -> np.ndarray:
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
     pixels = np.stack([columns, rows, np.ones_like(rows)], -1).reshape(-1, 3).T
     points = np.linalg.inv(sample.K_left) @ pixels * sample.depth_m.reshape(1, -1)
-    T = np.linalg.inv(sample.E)
+    T = np.linalg.inv(sample.E_scored)
     in_right = T[:3, :3] @ points + T[:3, 3:]
     z = np.where(in_right[2] > 1e-6, in_right[2], np.nan)
     u, v = (sample.K_right @ in_right)[:2] / z
@@ -127,7 +127,7 @@ def _both(
 
 def _disparity(sample: StereoSample, depth_m: np.ndarray) -> dict[str, float | None]:
     """Disparity errors of a rectified sample."""
-    cameras = (sample.K_left, sample.K_right, sample.E)
+    cameras = (sample.K_left, sample.K_right, sample.E_scored)
     true_px = depth_to_disparity(np.where(sample.valid, sample.depth_m, 1.0), *cameras)
     pred_px = depth_to_disparity(_positive(depth_m), *cameras)
     step_px = float(sample.notes.get("disparity_step_px", 0.0))

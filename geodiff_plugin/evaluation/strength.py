@@ -12,19 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from PIL import Image
 from tqdm import tqdm
 
+from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin.evaluation.alignment import align
-from geodiff_plugin.evaluation.baselines import PriorCache, Settings, find_method
+from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.emulated import DENSE, SPACES, STRENGTHS, EmulatedPrior, EmulatedPriors
 from geodiff_plugin.evaluation.figures.strength import draw_strength, shaded
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.records import append_record, read_records
+from geodiff_plugin.evaluation.records import append_record, read_records, record_key
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.strength_tables import strength_tables
 from geodiff_plugin.evaluation.surfaces import DenseTruth
@@ -90,8 +89,11 @@ class StrengthOptions:
         check_choice(self.space, "space", SPACES)
         check_number(self.follow, "follow", 0.0, 1.0)
         for name in self.methods:
-            if not find_method(name).uses_prior:
-                bad_value("methods", "methods that use a prior", repr(name))
+            method = find_method(name)
+            if not method.uses_prior or method.prior is not None:
+                bad_value("methods", "methods that use a prior, none named after an @", repr(name))
+        if self.figure is not None and ORACLE not in self.methods:
+            bad_value("methods", f"with {ORACLE}, the abscissa of the figure", repr(",".join(self.methods)))
 
 
 def run_strength(options: StrengthOptions) -> Page:
@@ -150,9 +152,15 @@ def _pictures(
     return {title: shaded(depth_m[window], float(sample.K_left[0, 0])) for title, depth_m in maps.items()}
 
 
-def _key(ref: SampleRef, strength: str, method: str, options: StrengthOptions) -> str:
-    how = (options.space, options.follow, options.steps, options.resolution, options.seed)
-    return "|".join(map(str, (ref.label, strength, method, *how)))
+def _key(ref: SampleRef, strength: str, name: str, options: StrengthOptions) -> str:
+    method = find_method(name)
+    configuration = method.configuration(method.own_settings(_settings(options)))
+    prior = f"emulated {options.space} {options.follow} {strength} {options.seed}"
+    return record_key(ref, name, configuration, prior, __version__)
+
+
+def _settings(options: StrengthOptions) -> Settings:
+    return Settings(steps=options.steps, resolution=options.resolution, seed=options.seed)
 
 
 def _measure(
@@ -192,20 +200,16 @@ def _depth(
     prior: EmulatedPrior,
     cache: PriorCache,
     strength: str,
-    method: str,
+    name: str,
     options: StrengthOptions,
 ) -> np.ndarray:
-    """``(H, W)`` metres of one method with a prior of one strength."""
+    """``(H, W)`` metres of one method with a prior of one strength; relative depth aligned to the truth."""
     prior.answer(sample, STRENGTHS[strength], options.resolution, options.seed)
-    settings = Settings(steps=options.steps, resolution=options.resolution, seed=options.seed)
-    if method != ORACLE:
-        depth_m = find_method(method).run(sample, settings, cache).depth_m
-        assert depth_m is not None
-        return depth_m
-    out = prior.pipe(
-        Image.fromarray(sample.left),
-        num_inference_steps=settings.steps,
-        processing_resolution=settings.resolution,
-        generator=torch.Generator().manual_seed(settings.seed),
-    )
-    return align(out.prediction[0, ..., 0], sample.depth_m, sample.valid, prior.space)
+    method = find_method(name)
+    try:
+        found = method.run(sample, method.own_settings(_settings(options)), cache)
+    except NotApplicable as reason:
+        bad_value("methods", "methods that work on every pair", f"{name}, not on {sample.label}: {reason}")
+    if found.depth_m is not None:
+        return found.depth_m
+    return align(found.relative, sample.depth_m, sample.valid, found.space)

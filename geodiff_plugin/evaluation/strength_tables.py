@@ -7,6 +7,7 @@ Paper: none; S5 measures one prior.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -54,7 +55,8 @@ def _table(title: str, records: Sequence[dict[str, Any]]) -> Table:
             worst = max(r["abs_rel"] for r in own)
             shown = [f"{means[n]:.2f}" if n == "surfaces" else f"{means[n]:.4f}" for n in _VALUES]
             rows.append((strength, find_method(method).title, *shown, f"{worst:.3f}"))
-    pairs = count_of_pairs(len({record["pair"] for record in records}))
+    # Not by label: pairs of one name in two folders are two.
+    pairs = count_of_pairs(max(Counter((r["strength"], r["method"]) for r in records).values()))
     note = (
         f"{pairs}. AbsRel and δ1 in metres, without alignment but for the prior with oracle; AbsRel within "
         f"3 px of the truth's edges; error of the slope of log depth away from them, per mille a pixel."

@@ -8,8 +8,8 @@ The folder keeps the signs of every call, so that other thresholds need no new c
 
 from __future__ import annotations
 
-import json
 import math
+import shlex
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -22,15 +22,17 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from geodiff_plugin import __version__
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.evaluation.baselines import Settings
-from geodiff_plugin.evaluation.baselines._guidance import call_arguments
+from geodiff_plugin.evaluation.baselines._guidance import call_arguments, guided_configuration
 from geodiff_plugin.evaluation.baselines.base import PriorCache
 from geodiff_plugin.evaluation.cells import count_of_pairs
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.layout import Table
-from geodiff_plugin.evaluation.records import append_record, clean_records, read_records
+from geodiff_plugin.evaluation.options import first_pairs, settings_words
+from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, Case, case_kinds, cases_of
 from geodiff_plugin.formats.out_folder import OutFolder
@@ -117,12 +119,12 @@ def _judged(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refs(options: TrustOptions) -> dict[str, list[SampleRef]]:
-    real = [] if options.data is None else find_pairs(options.data, None)[: options.limit]
-    if options.data is not None and not real:
-        bad_value("--data", "a folder with pairs", str(options.data), "See: geodiff eval list.")
     size = f"@{options.width}x{options.width * 3 // 4}"
     rendered = find_pairs(Path(f"synthetic:{options.rendered}{size}"), None) if options.rendered else []
-    return {"real": real, "rendered": rendered}
+    groups = {"real": first_pairs(options.data, options.limit), "rendered": rendered}
+    if "unrelated" in options.kinds and any(len(refs) == 1 for refs in groups.values()):
+        bad_value("--kinds", "without 'unrelated' where a pair is alone", "it", "Give two pairs or more.")
+    return groups
 
 
 def _records(options: TrustOptions) -> Iterator[dict[str, Any]]:
@@ -130,23 +132,32 @@ def _records(options: TrustOptions) -> Iterator[dict[str, Any]]:
     path, priors = options.out / RECORDS, PriorCache()
     clean_records(path)
     done = {record["key"]: record for record in read_records(path)}
-    for group, refs in _refs(options).items():
+    groups, configuration = _refs(options), guided_configuration(GeometryGuidance, options.settings)
+    prior = f"{options.settings.prior} {priors.fingerprint(options.settings)}"
+    for group, refs in groups.items():
         for i, ref in enumerate(tqdm(refs, desc=group, disable=options.quiet, file=sys.stderr)):
-            settings = asdict(options.settings) | {"width": options.width if group == "rendered" else 0}
+            other = refs[(i + 1) % len(refs)]
             keys = {
-                kind: json.dumps([ref.label, kind, settings], sort_keys=True)
+                kind: record_key(ref, kind, configuration | _other(kind, other), prior, __version__)
                 for kind in case_kinds(options.kinds)
             }
             if not done.keys() >= set(keys.values()):
                 sample = load(ref)
+                if not sample.valid.any():
+                    bad_value(f"the truth of {ref.label}", "known for at least one pixel", "none")
                 head = {"group": group, "sample": ref.label, "rectified": sample.rectified}
-                for case in cases_of(sample, partial(load, refs[(i + 1) % len(refs)]), options.kinds):
+                for case in cases_of(sample, partial(load, other), options.kinds):
                     key = keys[case.kind]
                     if key not in done:
                         found = _measure(case, priors.get(options.settings), options.settings)
                         done[key] = {"key": key, "kind": case.kind} | head | found
                         append_record(path, done[key])
             yield from (_judged(done[key]) for key in keys.values())
+
+
+def _other(kind: str, ref: SampleRef) -> dict[str, Any]:
+    """What beside the pair itself a kind depends on, for the key of its record."""
+    return {"other": record_key(ref, "", {}, "", "")} if kind == "unrelated" else {}
 
 
 def _beyond_views(record: dict[str, Any]) -> bool:
@@ -198,7 +209,7 @@ def run_trust(options: TrustOptions) -> Page:
     """Measure, write ``trust.jsonl`` and the table.
 
     Raises:
-        InputError: an unknown kind, no pairs.
+        InputError: an unknown kind, no pairs, a pair without truth, or one alone that has no unrelated one.
     """
     for kind in options.kinds:
         if kind not in WRONG and kind not in WRONG_POINTS:
@@ -206,11 +217,14 @@ def run_trust(options: TrustOptions) -> Page:
             bad_value("--kinds", f"some of {known}", repr(kind))
     with OutFolder(options.out, resume=True):
         records = list(_records(options))
-        words = ["geodiff eval trust", f"--rendered {options.rendered} --width {options.width}"]
-        words += [] if options.data is None else [f"--data {options.data.name}"]
-        words += [] if options.limit is None else [f"--limit {options.limit}"]
+        words = ["geodiff", "eval", "trust"]
+        words += ["--rendered", str(options.rendered), "--width", str(options.width)]
+        words += [] if options.data is None else ["--data", options.data.name]
+        words += [] if options.limit is None else ["--limit", str(options.limit)]
+        words += [] if options.kinds == TEN else ["--kinds", ",".join(options.kinds)]
+        words += settings_words(options.settings)
         groups = dict.fromkeys(record["group"] for record in records)
         tables = [_table(g, [r for r in records if r["group"] == g], options.kinds) for g in groups]
-        page = Page("Trust", run_facts(" ".join(words)), tuple(tables), purpose=PURPOSE)
+        page = Page("Trust", run_facts(shlex.join(words)), tuple(tables), purpose=PURPOSE)
         write_page(page, options.out, "trust", options.results)
     return page

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.geometry import resize_intrinsics
 from geodiff_plugin.synthetic.builder import rotation
 from geodiff_plugin.synthetic.cameras import intrinsics
 from geodiff_plugin.synthetic.effects import CameraEffects, apply_effects, sample_effects
@@ -101,7 +102,8 @@ def render_pair(
         E: ``(4, 4)`` pose of the right camera in the left camera's frame, instead of a drawn one.
         posed: draw a general pose: rotation up to about 15 degrees, translation with y and z.
         K_left: ``(3, 3)`` pixels; None for the scene's own field of view.
-        K_right: ``(3, 3)`` pixels; None for ``K_left`` at the right image's size.
+        K_right: ``(3, 3)`` pixels; None for ``K_left`` at the right image's size, or without one for the
+            scene's own field of view.
         size_right: ``(H, W)`` of the right image; None for ``size``.
         effects: True draws noise, blur and the like for both cameras; or give them.
 
@@ -124,11 +126,12 @@ def render_pair(
     E_ = torch.from_numpy(pose)
     size_right = size_right or size
     left_K = intrinsics(size, scene.fov_deg) if K_left is None else torch.as_tensor(K_left).double()
-    right_K = (
-        torch.as_tensor(K_right).double()
-        if K_right is not None
-        else (left_K.clone() if size_right == size else intrinsics(size_right, scene.fov_deg))
-    )
+    if K_right is not None:
+        right_K = torch.as_tensor(K_right).double()
+    elif K_left is not None:
+        right_K = resize_intrinsics(left_K[None], size, size_right)[0]
+    else:
+        right_K = intrinsics(size_right, scene.fov_deg)
     world_from_right = scene.T_world_from_camera.double() @ E_
     scene = clear_of(scene, world_from_right[:3, 3], scene.clearance_m * 0.6)
     views = (Camera(left_K, scene.T_world_from_camera), size), (Camera(right_K, world_from_right), size_right)

@@ -6,6 +6,7 @@ real sample was at hand, so that page is all that there is to check them by. The
 
 import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,11 @@ from PIL import Image
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, find_pairs, load, load_pairs
 from geodiff_plugin.evaluation.datasets.mvsnet import find_mvsnet
+from geodiff_plugin.evaluation.datasets.perturbed import perturbed_ref
 from geodiff_plugin.evaluation.datasets.robustmvd import KEY_VIEWS, find_robustmvd
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.datasets.synthetic import is_reflective
+from geodiff_plugin.evaluation.records import record_key
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm_png, write_pfm
 from tests.contracts import factory_calibrations as factory
@@ -350,6 +353,43 @@ def test_occlusion_masks_are_read(tmp_path, name):
     np.testing.assert_array_equal(sample.occluded, expected & sample.valid)
 
 
+def test_test_scenes_without_truth_belong_to_no_set(tmp_path):
+    """The archive of the images has them beside the training scenes."""
+    middeval3(tmp_path)
+    training, test = (tmp_path / "MiddEval3" / name for name in ("trainingQ", "testQ"))
+    shutil.copytree(training, test)
+    (test / "Scene" / "disp0GT.pfm").unlink()
+    assert [ref.label for ref in find_pairs(tmp_path)] == ["middeval3/Scene"]
+    (training / "Scene" / "disp0GT.pfm").unlink()  # a training scene whose truth is missing is no silent gap
+    with pytest.raises(FileNotFoundError, match=r"disp0\.pfm"):
+        load(find_pairs(tmp_path)[0])
+
+
+@pytest.mark.parametrize("changed", ["depths/00000000.pfm", "cams/00000001_cam.txt", "images/00000002.jpg"])
+def test_a_posed_pair_is_another_one_when_a_file_of_its_group_changes(tmp_path, changed):
+    mvsnet(tmp_path)
+
+    def key():
+        return record_key(find_mvsnet(tmp_path)[0], "guided", {}, "", "0.1.0")
+
+    before = key()
+    assert key() == before
+    with open(tmp_path / "scan1" / changed, "ab") as file:
+        file.write(b" ")
+    assert key() != before
+
+
+def test_a_pair_without_truth_cannot_be_perturbed(tmp_path):
+    mvsnet(tmp_path)
+    for path in (tmp_path / "scan1" / "depths").iterdir():
+        path.unlink()
+    with pytest.raises(ValueError, match="the truth of mvsnet/scan1-turn1-shift0.1 must be known"):
+        load(perturbed_ref(find_mvsnet(tmp_path)[0], (1.0, 0.1)))
+    with pytest.raises(ValueError, match=r"got none \(no .*00000000\.pfm\)"):
+        blind = load(find_mvsnet(tmp_path)[0])
+        score(blind, Prediction(np.ones(blind.depth_m.shape)), None)
+
+
 def test_booster_has_material_classes(tmp_path):
     booster(tmp_path)
     assert (one(tmp_path, "booster").material == 3).all()
@@ -534,6 +574,11 @@ def photometric_error(sample, factor):
     warped = warp_right_to_left(right, depth_m, *cameras)
     seen = warped.visible & torch.from_numpy(sample.valid)
     return ((warped.image - left).abs().mean(1, keepdim=True) * seen).sum() / seen.sum()
+
+
+def test_rendered_pairs_have_pixels():
+    with pytest.raises(ValueError, match="sides of at least 1 pixel"):
+        find_pairs("synthetic:1@0x96")
 
 
 def test_reflective_pairs_show_mirrors_or_glass():

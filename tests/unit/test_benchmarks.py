@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from geodiff_plugin._checks import InputError
+from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.development.benchmarks import calls, cost, large, many, operations
 from geodiff_plugin.development.benchmarks.matrix import deviation
 from geodiff_plugin.development.full_sizes import UNET, VAE
@@ -46,6 +47,13 @@ def test_exponent_of_a_power():
     values = (10, 20, 40)
     assert cost.exponent(values, [3.0 * v**1.5 for v in values]) == pytest.approx(1.5)
     assert cost.exponent(values, [7.0] * 3) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_resized_pictures_keep_their_middle():
+    left, _, cameras = cost._resized(read_demo_pair(), 224)
+    assert left.shape == (168, 224, 3)
+    for K in cameras:
+        np.testing.assert_allclose(K[:2, 2], (111.5, 83.5))
 
 
 def test_tables_stand_between_the_marks():

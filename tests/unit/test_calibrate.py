@@ -78,6 +78,19 @@ def test_the_command_prints_constants_that_can_be_pasted(capsys):
     assert "largest gap between promised and kept" in printed
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"what": "deep"}, "what must be one of"),
+        ({"strengths": "5%, 7%"}, "strengths must be one of"),
+        ({"data": ["synthetic:1@64x48"], "what": "matches"}, "at least two pairs with truth; got 1"),
+    ],
+)
+def test_options_that_would_fit_nothing_are_named(options, said):
+    with pytest.raises(ValueError, match=said):
+        main(**{"data": ["synthetic:2@64x48"]} | options)
+
+
 def test_emulated_priors_of_a_pair_are_observed_one_by_one():
     sample = load(find_pairs(Path("synthetic:1@64x96"))[0])
     strong, weak = observe_emulated(sample, ("2%", "20%"))

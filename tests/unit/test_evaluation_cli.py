@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 
@@ -61,6 +62,14 @@ def test_pairs_selects_scenes(data, tmp_path):
     assert len((tmp_path / "out" / "samples.jsonl").read_text().splitlines()) == 1
     with pytest.raises(ValueError, match="a sample with three in its name"):
         invoke("pairs", data, "--methods", "sgbm", "--scenes", "three", "-o", tmp_path / "out")
+
+
+def test_two_samples_of_one_name_are_refused(data, tmp_path):
+    """As two resolutions of a set side by side: one result would stand for both."""
+    shutil.copytree(data, data / "quarter")
+    with pytest.raises(ValueError, match="with several middlebury2014/one"):
+        invoke("pairs", data, "--methods", "sgbm", "-o", tmp_path / "out")
+    assert invoke("pairs", data / "quarter", "--methods", "sgbm", "-o", tmp_path / "out").exit_code == 0
 
 
 def test_pairs_names_bad_options(data, tmp_path):

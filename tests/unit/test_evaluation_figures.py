@@ -171,6 +171,15 @@ def test_a_method_that_does_not_apply_is_drawn_as_its_reason(draw, pair_folder):
     assert numbers["abs_rel"]["folder/plane"]["sgbm"] is None
 
 
+def test_poses_are_perturbed_where_a_figure_is_asked_to(draw, pair_folder, tmp_path):
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    write_depth_npy(maps / "folder_plane-turn3-shift0.1.npy", np.zeros((96, 128), np.float32))
+    words = ("--methods", f"files:{maps}", "--perturb", "3,0.1")
+    _, numbers = draw("qualitative", *words)
+    assert numbers["abs_rel"] == {"folder/plane-turn3-shift0.1": {f"files:{maps}": None}}  # an empty map
+
+
 def test_bad_options_are_named(draw):
     with pytest.raises(ValueError, match="the figure must be one of"):
         draw("pie")

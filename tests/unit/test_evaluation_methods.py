@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from geodiff_plugin.evaluation.baselines import (
 )
 from geodiff_plugin.evaluation.baselines._constant import constant_method
 from geodiff_plugin.evaluation.baselines._guidance import guided_prediction
+from geodiff_plugin.evaluation.baselines._sweep import native_depth
 from geodiff_plugin.evaluation.baselines.files import map_name
 from geodiff_plugin.evaluation.datasets.folder import find_folder, load_folder
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
@@ -336,3 +338,10 @@ def test_sgbm_does_not_apply_to_views_of_different_sizes():
     sample = make_sample()
     with pytest.raises(NotApplicable, match="different sizes"):
         run("sgbm", replace(sample, right=sample.right[:16]))
+
+
+def test_a_coarse_grid_is_read_at_the_nearest_of_its_pixels():
+    """Four cells over six pixels, which have their centres at 0.33, 1, 1.67, ... cells from the edge."""
+    volume = SimpleNamespace(plane_step=torch.tensor(0.001))
+    found = native_depth(torch.tensor([[1.0, 2.0, 3.0, 4.0]]), volume, (1, 6), "nearest-exact")
+    np.testing.assert_allclose(1.0 / found[0], [1, 2, 2, 3, 4, 4])

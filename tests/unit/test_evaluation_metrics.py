@@ -145,6 +145,12 @@ def test_depth_sent_behind_the_camera_is_clipped_not_dropped():
     assert aligned[0, 3] == FLOOR_M
 
 
+def test_a_map_without_a_value_is_aligned_to_nothing():
+    truth = np.full((4, 5), 2.0)
+    for space, hole in (("depth", np.nan), ("disparity", 0.0)):
+        assert np.isnan(align(np.full((4, 5), hole), truth, truth > 0, space)).all()
+
+
 def test_alignment_names_an_unknown_space():
     with pytest.raises(ValueError, match="space must be one of depth, disparity"):
         align(row(1.0), row(1.0), np.ones((1, 1), bool), "inverse")

@@ -159,6 +159,9 @@ def test_cost_is_told_as_multiples_of_the_plain_pipeline():
     assert table.title == "Cost on 3 pairs"
     assert table.rows[0] == ("plain pipeline", "3", "2.00", "1.00", "5", "1.00")
     assert table.rows[1][2:] == ("6.00", "3.00", "20", "4.00")
+    broken = [{"dataset": "a", "sample": "b", "method": "prior-aligned", "status": "broken", "error": "gone"}]
+    with pytest.raises(ValueError, match="the pairs must be some on which prior-aligned works"):
+        cost.cost_table(broken)
 
 
 def test_latex_is_escaped():
@@ -276,6 +279,10 @@ def test_parts_and_flatness_take_any_data(free_methods, scene, tmp_path):
     answer = invoke("parts", "--data", scene, "-o", tmp_path / "out")
     for title, _ in CHANGES["parts"]:
         assert re.search(f"{re.escape(title)} +1 ", answer.stdout)
+    assert "Further methods" not in answer.stdout
+    answer = invoke("parts", "--data", scene, "-o", tmp_path / "out", "--methods", "sweep-sgm")
+    further = answer.stdout.partition("Further methods and priors, 1 pair")[2]
+    assert re.search("sweep-sgm +1 +1.000", further) and not re.search("guided +1 ", further)
     answer = invoke("flatness", "--data", scene, "-o", tmp_path / "flat")
     assert re.search("`inertia` +0.015 ", answer.stdout) and (tmp_path / "flat" / "flatness.md").is_file()
 
@@ -304,11 +311,12 @@ def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, 
             return self.answer
 
     monkeypatch.setattr(cost, "ProcessPoolExecutor", Inline)
-    answer = invoke("cost", "--data", scene, "-o", tmp_path / "out")
+    answer = invoke("cost", "--data", scene, "-o", tmp_path / "out", "--save-depth")
     assert jobs == [[name] for name in cost.COST_METHODS]
     assert re.search("plain pipeline +1 ", answer.stdout) and "Denoising steps of each: 4." in answer.stdout
     assert (tmp_path / "out" / "cost" / "samples.jsonl").is_file()
     assert (tmp_path / "out" / "cost.tex").is_file()
+    assert (tmp_path / "out" / "cost" / "depth" / "guided" / "middlebury2014_one.npy").is_file()
 
 
 def test_every_built_in_row_is_a_method():

@@ -140,8 +140,12 @@ def test_the_page_of_poses(tmp_path, monkeypatch) -> None:
     run_poses(sized)
     assert "geodiff eval poses --rendered 2 --rendered-size 256x192 --perturb" in page.read_text()
     assert sizes == [(384, 512), (192, 256)]
+    run_poses(replace(options, settings=Settings("bundled", steps=2), out=tmp_path / "steps"))
+    assert "--drift 0.3,1.5 --steps 2\n" in page.read_text()
     with pytest.raises(ValueError, match="--data"):
         run_poses(replace(options, rendered=0))
+    with pytest.raises(ValueError, match="limit must be at least 1; got 0"):
+        run_poses(replace(options, data=tmp_path, limit=0))
 
 
 @pytest.mark.parametrize("text", ["256", "256x", "0x0", "256x32", "-256x192"])

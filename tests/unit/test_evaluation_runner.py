@@ -11,6 +11,7 @@ import pytest
 from geodiff_plugin.evaluation import runner
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, Settings
+from geodiff_plugin.evaluation.datasets.perturbed import with_perturbed_poses
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 from geodiff_plugin.evaluation.detail_tables import disparity_table, regions_table, uncertainty_table
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
@@ -98,6 +99,22 @@ def test_score_of_relative_depth_has_no_raw_column():
     assert record["all_pixels"]["raw"] is None and record["disparity"] is None
     assert record["all_pixels"]["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6)
     assert headline({"status": "ok"} | record) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_map_that_is_all_holes_has_no_errors_and_covers_nothing():
+    record = score(make_sample(), Prediction(depth_m=np.full(SHAPE, np.nan), space="disparity"), cap_m=None)
+    raw, aligned = record["all_pixels"]["raw"], record["all_pixels"]["aligned"]
+    assert raw["abs_rel"] is aligned["abs_rel"] is None and raw["coverage"] == 0
+    assert headline({"status": "ok"} | record) is None
+
+
+def test_poses_given_wrongly_change_no_mask_and_no_true_disparity():
+    sample = make_sample()
+    wrong = with_perturbed_poses(sample, (20.0, 0.5), "a")
+    assert not np.allclose(wrong.E, sample.E)
+    np.testing.assert_array_equal(out_of_view(wrong), out_of_view(sample))
+    double = Prediction(depth_m=2 * sample.depth_m)
+    assert score(wrong, double, None)["disparity"] == score(sample, double, None)["disparity"]
 
 
 def test_score_refuses_a_map_of_another_shape_and_a_sample_without_truth():
@@ -189,6 +206,15 @@ def test_depth_maps_are_saved_on_request(bench):
     again = find_method(f"files:{path.parent / 'depth' / 'double'}").run(samples["a"], Settings(), None)
     np.testing.assert_array_equal(again.depth_m, saved)
     assert not (path.parent / "depth" / "double" / "middlebury2014_c.npy").exists()
+
+
+def test_a_finished_run_that_saved_no_maps_saves_them_when_asked(bench):
+    go, calls, _, _, path = bench
+    first = go()
+    assert [r["status"] for r in go(save_depth=True)] == [r["status"] for r in first]
+    assert len(calls) == 5 and len(list(path.parent.glob("depth/*/*.npy"))) == 5
+    go(save_depth=True)
+    assert calls == []
 
 
 def test_tables_hold_pairs_means_and_differences(bench):

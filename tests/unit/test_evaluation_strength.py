@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, find_method
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.emulated import SPACES, STRENGTHS, EmulatedPrior, relative_map
 from geodiff_plugin.evaluation.strength import StrengthOptions, run_strength
@@ -91,6 +94,41 @@ def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkey
     monkeypatch.setattr("geodiff_plugin.evaluation.strength._measure", measured_again)
     run_strength(StrengthOptions(**{**vars(options), "figure": None}))
     assert (tmp_path / "strength.jsonl").read_text() == written
+
+
+def test_a_result_is_that_of_its_pair_and_its_seed(tmp_path):
+    """A pair of the same name and another size is another pair; a seed in a method's name counts."""
+
+    def measure(data, *methods):
+        given = {"strengths": ("5%",), "steps": 1, "resolution": 64, "out": tmp_path, "quiet": True}
+        table = run_strength(StrengthOptions(data, "", methods=methods, **given)).tables[0]
+        return [row[2:6] for row in table.rows], table.note
+
+    large, small = "synthetic:1+4@128x96", "synthetic:1+4@64x48"
+    ((first,), _), ((second,), _) = measure((large,), "prior-aligned"), measure((small,), "prior-aligned")
+    assert first != second
+    assert measure((large, small), "prior-aligned")[1].startswith("2 pairs.")
+    rows, _ = measure((large,), "prior-aligned", "prior-aligned#3")
+    assert rows[0] == first != rows[1]
+
+
+def test_a_method_that_does_not_apply_is_named(tmp_path, monkeypatch):
+    def refuses(*_):
+        raise NotApplicable("no pose could be estimated")
+
+    method = replace(find_method("prior-fit"), run=refuses)
+    monkeypatch.setitem(METHODS, "prior-fit", method)
+    options = {"strengths": ("5%",), "methods": ("prior-fit",), "out": tmp_path, "quiet": True}
+    with pytest.raises(ValueError, match=r"not on synthetic/seed0004: no pose could be estimated"):
+        run_strength(StrengthOptions((SMALL,), "", **options))
+
+
+@pytest.mark.parametrize(
+    ("methods", "figure"), [(("prior-fit@other",), None), (("prior-fit",), "figure.png")]
+)
+def test_methods_that_cannot_be_shown(methods, figure):
+    with pytest.raises(ValueError, match="methods must be"):
+        StrengthOptions((SMALL,), "", methods=methods, figure=figure)
 
 
 @pytest.mark.parametrize("wrong", [{"strengths": ("7%",)}, {"space": "inverse"}, {"methods": ("sgbm",)}])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -63,6 +63,8 @@ def test_counts_and_resumption(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(trust, "_measure", measure)
     monkeypatch.setattr(trust.PriorCache, "get", lambda *_: None)
+    monkeypatch.setattr(trust.PriorCache, "fingerprint", lambda *_: weights[-1])
+    weights = ["as they were"]
     options = trust.TrustOptions(None, 2, 64, ("swapped", "K-2"), None, Settings("bundled"), tmp_path, True)
     trust.run_trust(options)
     assert len(asked) == 6
@@ -70,6 +72,27 @@ def test_counts_and_resumption(tmp_path, monkeypatch, capsys):
     trust.run_trust(options)
     assert len(asked) == 6 and capsys.readouterr().out == ""
     page = (tmp_path / "trust.md").read_text()
+    assert "geodiff eval trust --rendered 2 --width 64 --kinds swapped,K-2\n" in page
     assert "3 of 4 (75 %)" in page and "1 of 2 (50 %)" in page and "2 of 2 (100 %)" in page
     with pytest.raises(InputError, match="--kinds must be some of swapped"):
-        trust.run_trust(trust.TrustOptions(None, 1, 64, ("bent",), None, Settings("bundled"), tmp_path, True))
+        trust.run_trust(replace(options, rendered=1, kinds=("bent",)))
+    monkeypatch.setattr(trust, "load", load)
+    weights.append("trained further")
+    trust.run_trust(replace(options, settings=Settings("bundled", seed=3)))
+    assert len(asked) == 12 and "--seed 3\n" in (tmp_path / "trust.md").read_text()
+
+
+def test_what_cannot_be_counted(tmp_path, monkeypatch, samples):
+    """A pair alone has no unrelated one; without truth nothing says whether a depth is off."""
+    monkeypatch.setattr(trust.PriorCache, "fingerprint", lambda *_: "")
+    options = trust.TrustOptions(
+        None, 1, 64, ("unrelated",), None, Settings("bundled"), tmp_path / "out", True
+    )
+    with pytest.raises(InputError, match="without 'unrelated' where a pair is alone"):
+        trust.run_trust(options)
+    blind = replace(samples[0], valid=np.zeros_like(samples[0].valid))
+    monkeypatch.setattr(trust, "load", lambda ref: blind)
+    with pytest.raises(InputError, match="the truth of synthetic/seed0000 must be known"):
+        trust.run_trust(replace(options, kinds=("swapped",)))
+    with pytest.raises(InputError, match="limit must be at least 1; got -1"):
+        trust.run_trust(replace(options, data=tmp_path, limit=-1))

@@ -11,7 +11,7 @@ import torch
 from diffusers import DDIMScheduler, LCMScheduler
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._checks import InputError, InputTypeError
 from geodiff_plugin.evaluation.sequence import SequenceOptions, flicker, run_sequence
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.warm_start import plan_warm_start
@@ -169,6 +169,8 @@ def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane):
     for latents in (first.latent[..., :-1], first.latent[:, :1]):  # the latter would be spread silently
         with pytest.raises(InputError, match="latents must be of shape"):
             call(pipe, textured_plane, previous=first, latents=latents)
+    with pytest.raises(InputTypeError, match="latents must be None or a torch.Tensor; got list"):
+        call(pipe, textured_plane, previous=first, latents=[first.latent])
 
 
 def test_depth_and_normals_start_from_one_noise(textured_plane):

@@ -170,3 +170,11 @@ def test_gpu_and_cpu_agree(kind):
     assert (close | ~here.left.valid).float().mean() > 0.999
     assert ((here.left.image_01 - there.left.image_01.cpu()).abs() < 1e-3).float().mean() > 0.995
     assert torch.equal(here.E, there.E)
+
+
+def test_a_right_image_of_another_size_has_the_left_camera_at_that_size():
+    K = torch.tensor([[100.0, 0.0, 31.5], [0.0, 100.0, 23.5], [0.0, 0.0, 1.0]])
+    pair = render_pair(0, "room", (48, 64), K_left=K, size_right=(96, 128))
+    # Twice as many pixels; the middle of the picture stays its middle.
+    twice = torch.tensor([[200.0, 0.0, 63.5], [0.0, 200.0, 47.5], [0.0, 0.0, 1.0]])
+    torch.testing.assert_close(pair.K_right, twice.double())

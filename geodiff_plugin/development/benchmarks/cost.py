@@ -29,6 +29,7 @@ from diffusers.utils import logging as diffusers_logging
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
 from geodiff_plugin.development.benchmarks.operations import Size, calls_of_all, count_operations
+from geodiff_plugin.geometry import resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.machine import PeakMemory
@@ -76,7 +77,7 @@ SIDE = 512
 
 
 def _resized(pair: DemoPair, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Both pictures with that longer side, and the factor of their cameras."""
+    """Both pictures with that longer side, and the cameras ``(2, 3, 3)`` that go with them."""
     height, width = pair.left.shape[:2]
     size = (round(height * side / max(height, width)), round(width * side / max(height, width)))
 
@@ -85,7 +86,8 @@ def _resized(pair: DemoPair, side: int) -> tuple[np.ndarray, np.ndarray, np.ndar
         large = F.interpolate(tensor, size, mode="bilinear", antialias=True).clamp(0.0, 1.0)
         return large[0].permute(1, 2, 0).numpy()
 
-    return scaled(pair.left), scaled(pair.right), np.diag([size[1] / width, size[0] / height, 1.0])
+    K = torch.from_numpy(np.stack([pair.rig.K_left, pair.rig.K_right]))
+    return scaled(pair.left), scaled(pair.right), resize_intrinsics(K, (height, width), size).numpy()
 
 
 def measure(
@@ -103,11 +105,11 @@ def measure(
         options: of the call.
     """
     torch.set_num_threads(1)
-    left, right, factor = _resized(read_demo_pair(), side)
-    rig = read_demo_pair().rig
+    pair = read_demo_pair()
+    left, right, (K_left, K_right) = _resized(pair, side)
     grids = {"loss_resolution": side, "sweep_side": side, "sweep_pixels": side * side}
-    K = factor @ rig.K_left, *[factor @ rig.K_right] * views
-    E = np.eye(4), *[rig.E] * views
+    K = K_left, *[K_right] * views
+    E = np.eye(4), *[pair.rig.E] * views
     guidance = GeometryGuidance((right,) * views, K, E, pose="given", **grids | (knobs or {}))
     pipe = enable_geometry_guidance(load_prior("bundled"))
     pipe.set_progress_bar_config(disable=True)

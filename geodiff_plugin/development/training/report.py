@@ -84,9 +84,10 @@ class Reporter:
 
     def _scenes(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Held-out scenes, rendered once and kept in the run's folder."""
-        path = self._options.out / "held_out.safetensors"
+        count = self._options.validation_scenes
+        path = self._options.out / f"held_out_{count}.safetensors"
         if not path.exists():
-            images, depth = held_out(self._options.validation_scenes)
+            images, depth = held_out(count)
             save_file({"images": images.contiguous(), "depth": depth.contiguous()}, path)
         kept = load_file(path)
         return kept["images"], kept["depth"]

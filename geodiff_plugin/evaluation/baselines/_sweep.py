@@ -49,12 +49,12 @@ def native_depth(
         inverse_depth: ``(H, W)`` 1/m on the volume's grid, NaN in holes.
         volume: its planes; nothing is farther than half a step from infinity.
         size: ``(H, W)`` of the left image.
-        mode: ``"nearest"`` keeps holes as they are; ``"bilinear"`` for maps without.
+        mode: ``"nearest-exact"`` keeps holes as they are; ``"bilinear"`` for maps without.
 
     Returns:
         ``(H, W)`` float64, metres, NaN in holes.
     """
     farthest = 0.5 * float(volume.plane_step)
-    options = {} if mode == "nearest" else {"align_corners": False}
+    options = {} if mode == "nearest-exact" else {"align_corners": False}
     full = F.interpolate(inverse_depth[None, None], size, mode=mode, **options)[0, 0]
     return 1.0 / np.maximum(full.cpu().numpy().astype(np.float64), farthest)

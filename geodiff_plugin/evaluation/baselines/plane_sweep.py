@@ -23,7 +23,7 @@ def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Predic
     cost = torch.where(volume.in_view, volume.cost, torch.inf)
     best, index = cost.min(dim=0)
     inverse_depth = torch.where(torch.isfinite(best), volume.inverse_depth[index], torch.nan)
-    depth_m = native_depth(inverse_depth, volume, sample.left.shape[:2], "nearest")
+    depth_m = native_depth(inverse_depth, volume, sample.left.shape[:2], "nearest-exact")
     return Prediction(depth_m=depth_m, space="disparity")
 
 

@@ -6,9 +6,9 @@ Paper: leaves this peer out; fill as KITTI's development kit does it for sparse 
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
+import cv2
 import numpy as np
 
 from geodiff_plugin.evaluation.baselines._fill import fill_background
@@ -31,15 +31,6 @@ PARAMETERS = {
 }
 
 
-def _opencv() -> Any:
-    try:
-        return importlib.import_module("cv2")
-    except ImportError as error:
-        raise ImportError(
-            "The method 'sgbm' needs OpenCV, which is not installed. Run: pip install 'geodiff-plugin[eval]'."
-        ) from error
-
-
 def sgbm_shift(sample: StereoSample) -> np.ndarray:
     """Shift of a rectified pair, ``f b / z``, with holes.
 
@@ -48,11 +39,7 @@ def sgbm_shift(sample: StereoSample) -> np.ndarray:
 
     Returns:
         ``(H, W)`` float32, pixels, disparity plus Middlebury's doffs; NaN where the match was rejected.
-
-    Raises:
-        ImportError: OpenCV is not installed.
     """
-    cv2 = _opencv()
     width, block = sample.left.shape[1], PARAMETERS["blockSize"]
     # Depth at infinity has the disparity cx_left - cx_right, which is 0 but for Middlebury's doffs.
     lowest = int(np.floor(sample.K_left[0, 2] - sample.K_right[0, 2]))

@@ -57,11 +57,14 @@ def sources_of(path: Path) -> dict[int, list[int]]:
 
 
 def pair_files(
-    group: Path, left: int, right: int, others: list[int], pixel_centre: float
+    group: Path, left: int, right: int, others: list[int], pixel_centre: float, truth: Path
 ) -> dict[str, Path | int | float | tuple[int, ...]]:
     """``files`` of a posed reference; of ``others``, further views, the first four are read with it."""
     further = tuple([view for view in others if view not in (left, right)][:MOST_OTHERS])
-    return {"group": group, "left": left, "right": right, "others": further, "pixel_centre": pixel_centre}
+    files = {"group": group, "left": left, "right": right, "others": further, "pixel_centre": pixel_centre}
+    # The loader needs no more; the key of a result is made of what these files hold.
+    read = {f"{kind} {v}": p for v in (left, right, *further) for kind, p in _view_files(group, v).items()}
+    return files | read | {"truth": truth}
 
 
 def _view_files(group: Path, view: int) -> dict[str, Path]:
@@ -74,12 +77,11 @@ def _view_files(group: Path, view: int) -> dict[str, Path]:
     }
 
 
-def load_posed(ref: SampleRef, truth: Path, read_truth: Callable[[Path], np.ndarray]) -> StereoSample:
+def load_posed(ref: SampleRef, read_truth: Callable[[Path], np.ndarray]) -> StereoSample:
     """Read one posed pair; the camera files' depth numbers are never used.
 
     Args:
         ref: ``files`` as ``pair_files`` gives them.
-        truth: where the depth of the left view lies, if there is any.
         read_truth: its reader, ``(H, W)`` metres.
 
     Returns:
@@ -100,7 +102,8 @@ def load_posed(ref: SampleRef, truth: Path, read_truth: Callable[[Path], np.ndar
         other = _view_files(files["group"], view)
         pose = read_calibration((first["camera"], other["camera"]))
         extra.append((read_rgb(other["image"], "further image"), pose.K_right - half, pose.E))
-    depth_m, named = np.zeros(images[0].shape[:2], np.float32), "none"
+    truth = files["truth"]
+    depth_m, named = np.zeros(images[0].shape[:2], np.float32), f"no {truth}"
     if truth.is_file():
         depth_m, named = read_truth(truth), f"{truth.parent.name}/{truth.name}"
         check_size(truth, depth_m.shape, images[0].shape)

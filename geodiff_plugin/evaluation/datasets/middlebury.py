@@ -28,6 +28,9 @@ from geodiff_plugin.formats import read_calibration, read_pfm
 
 __all__ = ["ETH3D", "MIDDEVAL3", "MIDDLEBURY2014", "find_scenes", "load_middlebury"]
 
+#: Folders of scenes whose truth is not published; the archives of the images have them as well.
+_TESTS = ("testF", "testH", "testQ", "two_view_test")
+
 
 def find_scenes(root: Path) -> list[SampleRef]:
     """References to every scene of the three sets below ``root``.
@@ -35,7 +38,7 @@ def find_scenes(root: Path) -> list[SampleRef]:
     A scene is a folder with ``im0.png`` and ``calib.txt``. Its truth is ``disp0.pfm`` (2014),
     ``disp0GT.pfm`` beside the images (MiddEval3), or ``disp0GT.pfm`` in ``two_view_training_gt/<scene>``
     (ETH3D). Which of the three it belongs to follows from the folder's name (``eth3d``, ``two_view``) and
-    else by the truth's name.
+    else by the truth's name. Test scenes without truth are none.
     """
     refs = []
     for folder in folders(root, 3):
@@ -44,7 +47,11 @@ def find_scenes(root: Path) -> list[SampleRef]:
         below_root = (root.resolve().name, *folder.relative_to(root).parts)
         beside = folder.parent.parent / "two_view_training_gt" / folder.name / "disp0GT.pfm"
         candidates = (folder / "disp0.pfm", folder / "disp0GT.pfm", beside)
-        truth = next((path for path in candidates if path.is_file()), folder / "disp0.pfm")
+        truth = next((path for path in candidates if path.is_file()), None)
+        if truth is None:
+            if folder.parent.name in _TESTS:
+                continue
+            truth = folder / "disp0.pfm"
         if any("eth3d" in part.lower() or "two_view" in part for part in below_root):
             dataset = "eth3d"
         else:

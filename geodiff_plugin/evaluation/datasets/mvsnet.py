@@ -51,7 +51,8 @@ def find_mvsnet(root: Path, pairs: str = "default", pixel_centre: float = 0.0) -
             chosen = [(views[0], views[1], views)] if len(views) > 1 else []
         for i, j, others in chosen:
             name = group.name if pairs == "default" else f"{group.name}-{i}-{j}"
-            refs.append(SampleRef("mvsnet", name, pair_files(group, i, j, others, pixel_centre)))
+            truth = group / "depths" / f"{i:08d}.pfm"
+            refs.append(SampleRef("mvsnet", name, pair_files(group, i, j, others, pixel_centre, truth)))
     return refs
 
 
@@ -68,8 +69,7 @@ def load_mvsnet(ref: SampleRef) -> StereoSample:
         FileNotFoundError: an image or a camera is missing.
         ValueError: a file is damaged, or the depth's size is not the image's.
     """
-    truth = ref.files["group"] / "depths" / f"{ref.files['left']:08d}.pfm"
-    return load_posed(ref, truth, lambda path: read_pfm(path, "true depth"))
+    return load_posed(ref, lambda path: read_pfm(path, "true depth"))
 
 
 MVSNET = Dataset(

@@ -137,11 +137,16 @@ def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: st
         sample: as it was taken.
         change: degrees and share, as for ``perturbed_pose``.
         name: of the result; the error is drawn from it.
+
+    Raises:
+        ValueError: a sample without truth, which says how far away its scene is.
     """
+    if not sample.valid.any():
+        bad_value(f"the truth of {sample.label}", "known for at least one pixel", "none")
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     depth_m = float(np.median(sample.depth_m[sample.valid]))
     E = perturbed_pose(sample.E, *change, depth_m, rng)
     extra = tuple(
         (image, K, perturbed_pose(other, *change, depth_m, rng)) for image, K, other in sample.extra_views
     )
-    return replace(sample, name=name, E=E, extra_views=extra)
+    return replace(sample, name=name, E=E, E_true=sample.E_scored, extra_views=extra)

@@ -62,8 +62,9 @@ def find_robustmvd(root: Path, pairs: str = "default", pixel_centre: float = 0.5
         sources = sources_of(scene / "pair.txt")
         for view in KEY_VIEWS[scene.name]:
             listed = sources.get(view, [])
+            truth = scene / "depth" / f"{view + 1:06d}.npz"
             for source in listed if pairs == "all" else listed[:1]:
-                files = pair_files(scene, view, source, listed, pixel_centre)
+                files = pair_files(scene, view, source, listed, pixel_centre, truth)
                 refs.append(SampleRef("robustmvd", f"{scene.name}-{view}-{source}", files))
     return refs
 
@@ -95,8 +96,8 @@ def load_robustmvd(ref: SampleRef) -> StereoSample:
         FileNotFoundError: an image, a camera or the truth is missing.
         ValueError: a file is damaged, or the depth's size is not the image's.
     """
-    truth = ref.files["group"] / "depth" / f"{ref.files['left'] + 1:06d}.npz"
-    return load_posed(ref, check_file(truth, "true depth", "an npz file"), _read_npz)
+    check_file(ref.files["truth"], "true depth", "an npz file")
+    return load_posed(ref, _read_npz)
 
 
 ROBUSTMVD = Dataset(

@@ -46,6 +46,8 @@ class StereoSample:
         rectified: whether rows are epipolar lines with equal focal lengths (``geometry.is_rectified``).
         notes: what a reader of the numbers should know, e.g. ``truth``, ``disparity_step_px``.
         extra_views: ``(image, K, E)`` of further views, ``E`` the pose in the left camera's frame.
+        E_true: ``(4, 4)`` the pose that the right image was taken from, where ``E`` is given wrongly on
+            purpose; ``None`` where ``E`` is it.
     """
 
     dataset: str
@@ -62,11 +64,17 @@ class StereoSample:
     rectified: bool = False
     notes: Mapping[str, Any] = field(default_factory=dict)
     extra_views: tuple[ExtraView, ...] = ()
+    E_true: np.ndarray | None = None
 
     @property
     def label(self) -> str:
         """``dataset/name``."""
         return f"{self.dataset}/{self.name}"
+
+    @property
+    def E_scored(self) -> np.ndarray:
+        """``(4, 4)`` the pose that truth and scores go by, whatever the methods are given."""
+        return self.E if self.E_true is None else self.E_true
 
 
 @dataclass(frozen=True)

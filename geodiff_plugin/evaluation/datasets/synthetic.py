@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.datasets._files import make_sample
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 from geodiff_plugin.synthetic import render_pair
@@ -40,6 +41,9 @@ def find_synthetic(root: Path) -> list[SampleRef]:
             with the same for the first N scenes with a mirror or glass on at least 1 % of the left image
             (one in seven has), ``synthetic-posed:`` for the first N that have a general pose. Any other path
             holds none. Even seeds give rectified pairs, odd ones a general pose.
+
+    Raises:
+        ValueError: a width or height of 0.
     """
     matched = _ROOT.fullmatch(str(root))
     if matched is None:
@@ -50,6 +54,8 @@ def find_synthetic(root: Path) -> list[SampleRef]:
     elif matched[1]:
         seeds = filter(is_reflective, seeds)
     size = (int(matched[5]), int(matched[4])) if matched[4] else SIZE
+    if min(size) < 1:
+        bad_value("DIR", "synthetic:N@WIDTHxHEIGHT with sides of at least 1 pixel", str(root))
     return [
         SampleRef("synthetic", f"seed{seed:04d}", {"seed": seed, "posed": seed % 2 == 1, "size": size})
         for seed in islice(seeds, int(matched[2]))

@@ -6,6 +6,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,7 @@ from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, find_method
 from geodiff_plugin.evaluation.baselines.base import Settings
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
+from geodiff_plugin.evaluation.datasets.perturbed import perturbed_ref
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
 
@@ -68,7 +70,7 @@ class MethodDepth:
     Attributes:
         title: of its column.
         depth_m: ``(H, W)`` metres, ``None`` where the method cannot work on the sample.
-        abs_rel: over all pixels with truth.
+        abs_rel: over all pixels with truth; ``None`` without a map, or where it is empty.
     """
 
     title: str
@@ -77,13 +79,14 @@ class MethodDepth:
 
 
 def references(options: FigureOptions) -> list[SampleRef]:
-    """The samples that a figure shows.
+    """The samples that a figure shows, their poses perturbed where the options say so.
 
     Raises:
         ValueError: none, or bad options.
     """
     run = options.run
-    return select(all_refs(run), run)
+    refs = select(all_refs(run), run)
+    return refs if run.perturb is None else [perturbed_ref(ref, run.perturb) for ref in refs]
 
 
 def samples(options: FigureOptions) -> list[StereoSample]:
@@ -111,4 +114,4 @@ def depths_of(sample: StereoSample, name: str, settings: Settings, priors: Prior
     if depth_m is None:
         depth_m = align(prediction.relative, sample.depth_m, sample.valid, prediction.space)
     abs_rel = evaluate_depth(depth_m, sample.depth_m, sample.valid)["abs_rel"]
-    return MethodDepth(method.title, depth_m, abs_rel)
+    return MethodDepth(method.title, depth_m, None if math.isnan(abs_rel) else abs_rel)

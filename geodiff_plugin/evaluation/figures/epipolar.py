@@ -49,7 +49,8 @@ def _line(tracks: Tracks, i: int, T: np.ndarray) -> np.ndarray:
 
 def draw_epipolar(options: FigureOptions) -> Drawing:
     """Lines and matches in the right image above, residuals of all matches in the left image below."""
-    sample = load(perturbed_ref(references(options)[0], options.run.perturb or PERTURBED))
+    first = references(options)[0]
+    sample = load(first if options.run.perturb else perturbed_ref(first, PERTURBED))
     left, right = (torch.from_numpy(v).permute(2, 0, 1) / 255 for v in (sample.left, sample.right))
     K_left, K_right, T = (
         torch.as_tensor(m).float() for m in (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
