@@ -115,7 +115,7 @@ class _Strip:
         window = centre[:, None] + self.spacing * (down * width + right)  # (n, samples), into flat maps
         image = self.image.flatten(1)
         unlike = (image[:, window] - image[:, centre, None]).abs().mean(0) / config.sharpen_colour
-        away = (down**2 + right**2) / (2.0 * config.sharpen_reach**2)
+        away = (down**2 + right**2).float() / (2.0 * config.sharpen_reach**2)
         flat = 1.0 / (1.0 + (self._slope.flatten()[window] / config.ramp_slope) ** 2)
         return weighted_quantile(self.depth_m.flatten()[window], flat * torch.exp(-unlike - away), 0.5)
 

@@ -156,7 +156,8 @@ class Trajectory:
     def _search_one_number(self, x: Tensor) -> None:
         zero = x.new_zeros(x.shape[0])
         low, high = self.config.search.g_s_range
-        candidates = torch.linspace(low, high, self.config.search.g_s_candidates, device=x.device)
+        count = self.config.search.g_s_candidates
+        candidates = torch.linspace(low, high, count, dtype=torch.float32, device=x.device)
 
         def cost(g_s: Tensor) -> Tensor:
             affine = AffineState(zero, zero, g_s.expand_as(zero))

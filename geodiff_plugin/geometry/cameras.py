@@ -138,7 +138,8 @@ def is_rectified(
         ``(...)`` bool: the rotation is the identity to 1e-3 an entry, ``|t_y|`` and ``|t_z|`` are below 1 %
         of ``|t_x|``, f agrees to 0.1 %, skew and cy to 0.1 % of f.
     """
-    turned = (T_right_from_left[..., :3, :3] - torch.eye(3).to(T_right_from_left)).abs().amax((-2, -1))
+    identity = torch.eye(3, dtype=T_right_from_left.dtype, device=T_right_from_left.device)
+    turned = (T_right_from_left[..., :3, :3] - identity).abs().amax((-2, -1))
     t = T_right_from_left[..., :3, 3].abs()
     focal = K_left[..., 1, 1]
     apart = (K_left - K_right).abs()

@@ -8,6 +8,7 @@ Paper: none (Collins 1996, "A space-sweep approach to true multi-image matching"
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -21,6 +22,8 @@ _AS_IT_IS_PX = 0.02
 _LEAST_RATIO = 0.02
 # Rounding at image edges: the last pixel centre itself must count as inside.
 _EDGE_PX = 1e-2
+# Said every time: where and as what else a tensor is made, the user's defaults decide.
+_HERE: dict[str, Any] = {"device": "cpu", "dtype": torch.float64}
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class AlignedView:
         Returns:
             ``(D, count + 2 * margin)`` float32, canvas pixels, not clipped.
         """
-        lines = torch.arange(-margin, count + margin, dtype=torch.float64).clamp_(0, count - 1)
+        lines = torch.arange(-margin, count + margin, **_HERE).clamp_(0, count - 1)
         at = self.scale[:, None] * lines + self.shift[:, axis, None]
         return at.to(self.grey.device, torch.float32)
 
@@ -68,7 +71,7 @@ class AlignedView:
         Returns:
             ``(D, w or h)`` int64; ``count`` where there is none.
         """
-        lines = torch.arange(self.size[1 - axis], dtype=torch.float64)
+        lines = torch.arange(self.size[1 - axis], **_HERE)
         scale = self.scale[:, None]
         at = ((lines - self.shift[:, axis, None]) / scale.clamp_min(1e-9)).round()
         known = (scale > 0) & (at >= 0) & (at < count)
@@ -119,9 +122,7 @@ def _turned(
     image: torch.Tensor, to_right: torch.Tensor, low: torch.Tensor, high: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """A right image under a homography, from column and row ``low`` to ``high``, and what of it is inside."""
-    columns, rows = (
-        torch.arange(int(a), int(b) + 1, dtype=torch.float64) for a, b in zip(low, high, strict=True)
-    )
+    columns, rows = (torch.arange(int(a), int(b) + 1, **_HERE) for a, b in zip(low, high, strict=True))
     row, column = torch.meshgrid(rows, columns, indexing="ij")
     p = torch.stack([column, row, torch.ones_like(row)], dim=-1) @ to_right.T
     uv, ahead = p[..., :2] / p[..., 2:].clamp_min(1e-9), p[..., 2] > 1e-9
@@ -135,8 +136,9 @@ def _turned(
 def _translation(to_right: torch.Tensor, size: tuple[int, int]) -> torch.Tensor | None:
     """The shift ``(2,)`` that a homography is on the left grid, or ``None`` if it is none."""
     height, width = size
-    corners = torch.tensor([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]])
-    p = corners.double() @ to_right.T
+    ends = [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]
+    corners = torch.tensor(ends, **_HERE)
+    p = corners @ to_right.T
     moved = p[:, :2] / p[:, 2:] - corners[:, :2]
     close = (p[:, 2] > 0).all() and (moved - moved.mean(0)).abs().amax() < _AS_IT_IS_PX
     return moved.mean(0) if close else None
@@ -150,11 +152,11 @@ def _extent(
     shift: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """First and last column and row ``(2,)`` of the canvas, in pixels of the left grid at infinity."""
-    far = torch.tensor([size[1] - 1.0, size[0] - 1.0], dtype=torch.float64)
+    far = torch.tensor([size[1] - 1.0, size[0] - 1.0], **_HERE)
     ends = torch.stack([shift, shift + scale[:, None] * far])[:, scale > 0].flatten(0, 1)
     low, high = (ends.amin(0), ends.amax(0)) if len(ends) else (torch.zeros_like(far), far)
     low, high = torch.maximum(low, -far), torch.minimum(high, 2 * far)
-    steps = torch.linspace(0, 1, 9, dtype=torch.float64)
+    steps = torch.linspace(0, 1, 9, **_HERE)
     u, v = steps * (size_right[1] - 1), steps * (size_right[0] - 1)
     grid = torch.stack(torch.meshgrid(u, v, indexing="ij"), -1).flatten(0, 1)
     back = torch.nn.functional.pad(grid, (0, 1), value=1.0) @ torch.linalg.inv(to_right).T

@@ -74,7 +74,8 @@ def _even_planes(
     shifts = [median_shift(plane_rays(K[None], K_r[None], T[None], size), ends) for _, K_r, T in rights]
     moved = max(float(shift[1] - shift[0]) for shift in shifts)
     wanted = round(moved / step_px) + 1 if math.isfinite(moved) else most  # not finite behind a camera
-    steps = torch.linspace(0.0, 1.0, min(max(wanted, _FEWEST_PLANES), most), device=ends.device)
+    count = min(max(wanted, _FEWEST_PLANES), most)
+    steps = torch.linspace(0.0, 1.0, count, dtype=ends.dtype, device=ends.device)
     return ends[0] + (ends[1] - ends[0]) * steps
 
 

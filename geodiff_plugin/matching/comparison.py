@@ -6,6 +6,8 @@ Paper: none.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from geodiff_plugin.matching.alignment import AlignedView
@@ -67,8 +69,10 @@ class ComparedView:
         """``census`` of the right view for all shifts of a phase, int8; kept until the row changes."""
         if (column, row) not in self._phases:
             self._phases = {key: votes for key, votes in self._phases.items() if key[1] == row}
-            lines = torch.arange(-MARGIN_PX, self._count + MARGIN_PX, device=self._columns.device)
-            rows = torch.arange(-MARGIN_PX, height + MARGIN_PX, device=lines.device).clamp_(0, height - 1)
+            # Whole numbers would become positions of the user's default dtype.
+            there: dict[str, Any] = {"dtype": torch.float32, "device": self._columns.device}
+            lines = torch.arange(-MARGIN_PX, self._count + MARGIN_PX, **there)
+            rows = torch.arange(-MARGIN_PX, height + MARGIN_PX, **there).clamp_(0, height - 1)
             at = rows + row / _ROW_PHASES, lines + (self._first + column / _PHASES)
             self._phases[column, row] = census(_resampled(self._view.grey, *at)).to(torch.int8)
         return self._phases[column, row]

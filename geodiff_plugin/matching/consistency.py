@@ -75,7 +75,7 @@ def _right_winners(volume: CostVolume, view: AlignedView, config: MatchingConfig
     """
     height, width = volume.size
     # One row and one column more: what a right view's pixel reads beside the left image.
-    plane = torch.full((height + 1, width + 1), float(UNSEEN_LEVEL), device=volume.levels.device)
+    plane = volume.left_01.new_full((height + 1, width + 1), UNSEEN_LEVEL)
     rows, columns = view.sources(height, 1)[:, ::_EVERY_ROW], view.sources(width, 0)
     size = (rows.shape[1], columns.shape[1])
     levels = room.cells("levels", len(volume.levels), size, volume.levels)
@@ -121,7 +121,7 @@ def _contrast(volume: CostVolume, index: torch.Tensor, reach: int) -> torch.Tens
     for levels, in_view in zip(volume.levels, volume.in_view, strict=True):
         total += levels
         seen += in_view
-    mean = (total - UNSEEN_LEVEL * (len(volume.levels) - seen)) / seen.clamp_min(1)
+    mean = (total - UNSEEN_LEVEL * (len(volume.levels) - seen)).float() / seen.clamp_min(1)
     gain = (mean - volume.levels.gather(0, index[None])[0]).clamp_min(0.0)[None] / COST_LEVELS
     for window in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
         padding = (window[0] // 2, window[1] // 2)

@@ -71,7 +71,7 @@ def points_to_matches(
     scale = uv.new_tensor([width / size[1], height / size[0]])
     cell = ((uv[inside] + 0.5) * scale).floor().long()
     at = cell[:, 1].clamp(0, height - 1) * width + cell[:, 0].clamp(0, width - 1)
-    nearest = torch.zeros(height * width, device=z.device).scatter_reduce_(0, at, 1.0 / z[inside], "amax")
+    nearest = z.new_zeros(height * width).scatter_reduce_(0, at, 1.0 / z[inside], "amax")
     inverse_depth = nearest.view(1, height, width)
     unit = UNIT * nearest[nearest > 0].median()
     return Matches(inverse_depth, (inverse_depth > 0).float(), unit, K_grid, size_grid), left_out

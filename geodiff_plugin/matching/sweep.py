@@ -63,7 +63,7 @@ class CostVolume:
     @property
     def cost(self) -> torch.Tensor:
         """``(D, H, W)`` float32 in [0, 1], the costs of all cells: four times the volume's own memory."""
-        return self.levels / COST_LEVELS
+        return self.levels.float() / COST_LEVELS
 
     def at_pixels(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Costs of some pixels.
@@ -75,7 +75,7 @@ class CostVolume:
             ``cost (D, P)`` float32 in [0, 1] and ``in_view (D, P)`` bool.
         """
         row, column = index // self.size[1], index % self.size[1]
-        return self.levels[:, row, column] / COST_LEVELS, self.in_view[:, row, column]
+        return self.levels[:, row, column].float() / COST_LEVELS, self.in_view[:, row, column]
 
     @property
     def size(self) -> tuple[int, int]:

@@ -209,7 +209,7 @@ def _applied(
 ) -> tuple[CameraView, ...]:
     bends = bends or [None] * len(rights)
     return tuple(
-        CameraView(image if bend is None else straightened(image, bend), K, torch.as_tensor(T).to(given))
+        CameraView(image if bend is None else straightened(image, bend), K, given.new_tensor(T))
         for (image, K, given), T, bend in zip(rights, Ts, bends, strict=True)
     )
 

@@ -59,7 +59,7 @@ def median_residuals(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
 
 def is_rig(tracks: Tracks, given: np.ndarray) -> bool:
     """Whether all poses as given ``(V, 4, 4)`` are those of a rectified rig."""
-    cameras = (torch.as_tensor(m) for m in (tracks.K_left, tracks.K_rights, given))
+    cameras = (torch.as_tensor(m, device="cpu") for m in (tracks.K_left, tracks.K_rights, given))
     return bool(is_rectified(*cameras).all())
 
 

@@ -103,7 +103,7 @@ def dense_tracks(views: GreyViews, depth_m: Tensor, Ts: np.ndarray) -> Tracks:
     seen = np.zeros((len(Ts), len(centres)), bool)
     for v, (image, K, T) in enumerate(zip(views.rights, views.K_rights, Ts, strict=True)):
         K_left, K_right, T_right = (
-            torch.as_tensor(m, dtype=torch.float32)[None] for m in (views.K_left, K, T)
+            torch.as_tensor(m, dtype=torch.float32, device="cpu")[None] for m in (views.K_left, K, T)
         )
         height, width = views.left.shape
         projected = project_rays(depth_m, plane_rays(K_left, K_right, T_right, (height, width)))

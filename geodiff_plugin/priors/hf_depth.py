@@ -196,13 +196,19 @@ class HFDepthModel:
         """
         height, width = image_01.shape[-2:]
         size = self.grid(height, width) if size is None else size
-        extra = {}
+        extra, unit = {}, None
         if prompt_m is not None:
             if not self.takes_prompt:
                 bad_value("prompt_depth", "left out with this model", "given", f"Only {PROMPTED} takes one.")
-            extra["prompt_depth"] = _with_a_span(prompt_m).to(image_01.device, self.model.dtype)
+            told = _with_a_span(prompt_m.to(image_01.device))
+            if self.model.dtype != torch.float32:  # metres would lose the digits that the model divides by
+                low, high = told.amin((1, 2, 3), keepdim=True), told.amax((1, 2, 3), keepdim=True)
+                unit, told = (low, high - low), (told - low) / (high - low)
+            extra["prompt_depth"] = told.to(self.model.dtype)
         output = self.model(pixel_values=self.preparation(image_01.float()).to(self.model.dtype), **extra)
         values = output.predicted_depth.float()[:, None]  # (B, 1, h', w')
+        if unit is not None:  # as the model itself does it
+            values = values * unit[1] + unit[0]
         fov = getattr(output, "field_of_view", None)
         if fov is not None:  # canonical inverse depth -> inverse metres: times width over focal length
             values = values * 2.0 * torch.tan(0.5 * torch.deg2rad(fov.float())).view(-1, 1, 1, 1)
@@ -231,6 +237,10 @@ class HFDepthModel:
 
 def _with_a_span(prompt_m: Tensor) -> Tensor:
     """A prompt that is not one number everywhere, as the library makes it: its span is divided by."""
-    flat = prompt_m.float().clone()
-    flat[:, :, 0, 0] += 1e-6 * (flat.amax((1, 2, 3)) == flat.amin((1, 2, 3)))[:, None]
-    return flat
+    prompt_m = prompt_m.float().clone()
+    corner = prompt_m[:, :, 0, 0]
+    # A millionth of a metre is lost beside tens of them.
+    above = torch.maximum(corner + 1e-6, torch.nextafter(corner, torch.full_like(corner, torch.inf)))
+    is_flat = (prompt_m.amax((1, 2, 3)) == prompt_m.amin((1, 2, 3)))[:, None]
+    prompt_m[:, :, 0, 0] = torch.where(is_flat, above, corner)
+    return prompt_m

@@ -56,7 +56,8 @@ class MapCodec:
 
     def decode_result(self, z0: Tensor) -> Tensor:
         """The same by the pipeline's full autoencoder, for a map that is a result."""
-        return self._grid.cropped(self._grid.filled(self._prior.decode(z0)))
+        x = self._prior.decode(z0).float()  # of a prior in float64 as well: the views are in float32
+        return self._grid.cropped(self._grid.filled(x))
 
     def encode(self, x: Tensor) -> Tensor:
         """Clean latent of a relative map ``(B, 1, H, W)``, padded as the image was; in the loop."""

@@ -87,7 +87,7 @@ def noise_level(scheduler: Any, timestep: Tensor) -> NoiseLevel:
     """
     for cls, family in FAMILIES.items():
         if isinstance(scheduler, cls):
-            return family(scheduler, torch.as_tensor(timestep))
+            return family(scheduler, timestep)
     names = ", ".join(cls.__name__ for cls in FAMILIES)
     bad_type(
         "pipe.scheduler",

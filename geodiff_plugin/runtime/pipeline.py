@@ -7,6 +7,7 @@ Paper: S4, Figure 3 (fig:framework).
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 from diffusers import DiffusionPipeline, MarigoldDepthPipeline
 
@@ -24,9 +25,17 @@ class GuidedMarigoldDepthPipeline(GuidedCall, MarigoldDepthPipeline):
 def _guided_class(stock: type) -> type:
     if stock is MarigoldDepthPipeline:
         return GuidedMarigoldDepthPipeline
-    return type(
-        f"Guided{stock.__name__}", (GuidedCall, stock), {"__doc__": GuidedMarigoldDepthPipeline.__doc__}
-    )
+    members = {"__doc__": GuidedMarigoldDepthPipeline.__doc__, "__reduce__": _reduced}
+    return type(f"Guided{stock.__name__}", (GuidedCall, stock), members)
+
+
+def _reduced(pipe: GuidedCall) -> tuple[Any, ...]:
+    """For pickle, which finds no class by name that was made at run time."""
+    return _without_state, (stock_class(type(pipe)),), vars(pipe)
+
+
+def _without_state(stock: type) -> Any:
+    return object.__new__(_guided_class(stock))
 
 
 def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:

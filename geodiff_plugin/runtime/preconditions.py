@@ -75,19 +75,22 @@ def check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) -> 
         guidance: what was configured.
 
     Raises:
-        TypeError, ValueError: a scheduler, offloading or network that cannot be guided.
+        TypeError, ValueError: a scheduler, offloading, casting or network that cannot be guided.
     """
     check_scheduler(pipe.scheduler)
     check_offloading(pipe, guidance.config.gradient)
+    check_casting(pipe, guidance)
     if needs_network(guidance):
         check_network_input(prior)
 
 
 def needs_network(guidance: GeometryGuidance) -> bool:
     """Whether gradients of z_t are taken through the network."""
-    config = guidance.config
-    moved = config.updates.optimize_latents and guidance.updates.inner_steps > 0
-    return config.gradient == "full" and moved
+    return guidance.config.gradient == "full" and _moves_latents(guidance)
+
+
+def _moves_latents(guidance: GeometryGuidance) -> bool:
+    return guidance.config.updates.optimize_latents and guidance.updates.inner_steps > 0
 
 
 def check_network_input(prior: DepthPrior) -> None:
@@ -132,3 +135,24 @@ def check_offloading(pipe: Any, gradient: str) -> None:
             "Decoding pushes the U-Net to the CPU before its backward pass; "
             "use gradient='denoised' or pipe.to(device).",
         )
+
+
+def check_casting(pipe: Any, guidance: GeometryGuidance) -> None:
+    """Refuse layerwise casting of a module that gradients go through: its weights are others by then.
+
+    Raises:
+        ValueError: it is cast, and the latents are moved by gradients.
+    """
+    if not _moves_latents(guidance):
+        return
+    modules = pipe.components.values() if guidance.config.gradient == "full" else [getattr(pipe, "vae", None)]
+    for module in modules:
+        children = module.modules() if isinstance(module, torch.nn.Module) else ()
+        registries = [getattr(child, "_diffusers_hook", None) for child in children]
+        if any(registry is not None and "layerwise_casting" in registry.hooks for registry in registries):
+            bad_value(
+                "pipe",
+                "without layerwise casting where gradients go through",
+                f"{type(module).__name__} whose weights are cast after each layer",
+                "Leave inner_steps at 0, or load the pipeline in half precision.",
+            )

@@ -163,7 +163,7 @@ class GuidedRun:
         # The map that was encoded last: decoding would add the autoencoder's loss and the scheduler's noise.
         x = trajectory.result
         if x is None:
-            x = self.grid.filled(self.prior.decode(latents[:, self.prior.latents]))
+            x = self.grid.filled(self.prior.decode(latents[:, self.prior.latents]).float())
         else:
             x = self.grid.padded(x)
         self.relative.append(self.grid.cropped(x))

@@ -104,7 +104,7 @@ class GuidedScheduler:
             previous = result[0] if is_tuple else result.prev_sample
             if shift is not None:
                 previous = (previous.float() + shift).to(previous.dtype)
-            previous = self._on_done(torch.as_tensor(given), previous)
+            previous = self._on_done(torch.as_tensor(given, device=previous.device), previous)
             if is_tuple:
                 return (previous, *result[1:])
             result.prev_sample = previous

@@ -17,7 +17,7 @@ from diffusers import DDIMScheduler
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.noise_levels import noise_level, trailing_timesteps
@@ -60,8 +60,8 @@ def plan_warm_start(
         size: ``(H, W)`` of the padded processing grid.
 
     Raises:
-        ValueError: an output of another number of images or members, or of another size; ``latents`` of
-            another shape than the output's.
+        TypeError, ValueError: an output of another number of images or members, or of another size;
+            ``latents`` of another shape than the output's, or no tensor.
     """
     previous = guidance.previous
     if previous is None:
@@ -90,6 +90,8 @@ def plan_warm_start(
         noise = randn_tensor(depth.shape, generator=call["generator"], device=device, dtype=z0.dtype)
         # What a prior denoises beside depth, GeoWizard's normals, starts from the same noise.
         noise = noise.repeat(1, z0.shape[1] // depth.shape[1], 1, 1)
+    elif not isinstance(noise, Tensor):
+        bad_type("latents", "None or a torch.Tensor", noise)
     elif noise.shape != z0.shape:
         bad_value("latents", f"of shape {tuple(z0.shape)}, as those of previous", f"{tuple(noise.shape)}")
     scheduler = copy.deepcopy(pipe.scheduler)

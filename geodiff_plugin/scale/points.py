@@ -77,7 +77,8 @@ def fit_to_points(
     values = F.interpolate(x.float(), points.size, mode="bilinear", align_corners=False).flatten(1)[:, at]
     nearest, farthest = depth_span(points)
     low, high = (nearest / config.basin_reach).log(), (farthest * config.basin_reach).log()
-    grid = torch.exp(low + (high - low) * torch.linspace(0, 1, config.basin_candidates, device=x.device))
+    steps = torch.linspace(0, 1, config.basin_candidates, dtype=low.dtype, device=x.device)
+    grid = torch.exp(low + (high - low) * steps)
     i, j = torch.triu_indices(len(grid), len(grid), 1, device=x.device)
     found = []
     for b, row in enumerate(values):

@@ -104,10 +104,10 @@ def search_scale(
     least = config.min_in_view_rectified if volume.rectified else config.min_in_view_posed
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
     coarse, fine = config.coarse_grid, config.fine_grid
-    grid = torch.linspace(0, 1, coarse, device=x.device)
+    grid = torch.linspace(0, 1, coarse, dtype=values.dtype, device=x.device)
     log_low, log_span = math.log(low), math.log(high / low)
     i, j = torch.triu_indices(coarse, coarse, 1, device=x.device)
-    offsets = torch.linspace(-1, 1, fine, device=x.device)
+    offsets = torch.linspace(-1, 1, fine, dtype=values.dtype, device=x.device)
     found = []
     for b in range(x.shape[0]):
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import pickle
 from functools import cache
 
 import numpy as np
@@ -100,6 +102,25 @@ def test_nothing_changes_without_guidance(key, left):
     assert np.array_equal(before.prediction, within.prediction)
     assert torch.equal(before.latent, within.latent)
     assert state_of(pipe) == state
+
+
+@pytest.mark.parametrize("key", PRIORS)
+def test_an_enabled_pipeline_can_be_copied_and_pickled(key, left):
+    pipe = enable_geometry_guidance(TINY[key]())
+    others = [copy.deepcopy(pipe), copy.copy(pipe)]
+    if key not in ("marigold-v2", "transformers"):  # hooks of the libraries' own in them cannot be pickled
+        others.append(pickle.loads(pickle.dumps(pipe)))
+    expected = run(pipe, left).prediction
+    for other in others:
+        assert type(other) is type(pipe)
+        assert vars(other).keys() == vars(pipe).keys()
+        assert np.array_equal(run(other, left).prediction, expected)
+
+
+@pytest.mark.parametrize("key", PRIORS)
+def test_latents_that_are_no_tensor_are_refused_by_name(key, left):
+    with pytest.raises((TypeError, ValueError), match="latents.* must be"):
+        TINY[key]()(left, latents=[torch.zeros(4, 8, 8)])
 
 
 @pytest.mark.parametrize("gradient", ["denoised", "full"])

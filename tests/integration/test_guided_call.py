@@ -533,6 +533,15 @@ def test_sequential_offloading_is_refused(make_pipeline, textured_plane, left):
         pipe(left, guidance=guidance_for(textured_plane))
 
 
+@pytest.mark.parametrize("part, gradient", [("vae", "denoised"), ("unet", "full")])
+def test_layerwise_casting_is_refused_where_gradients_go(make_pipeline, textured_plane, left, part, gradient):
+    pipe = enable_geometry_guidance(make_pipeline())
+    getattr(pipe, part).enable_layerwise_casting(torch.bfloat16, torch.float32)
+    assert pipe(left, guidance=guidance_for(textured_plane, inner_steps=0)).prediction.min() > 0
+    with pytest.raises(ValueError, match="layerwise casting"):
+        pipe(left, guidance=guidance_for(textured_plane, inner_steps=1, gradient=gradient))
+
+
 def test_model_offloading_works_with_the_cheap_gradient_only(make_pipeline, textured_plane, left):
     pipe = enable_geometry_guidance(make_pipeline())
     pipe._all_hooks = [object()]

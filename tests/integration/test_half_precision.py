@@ -1,4 +1,4 @@
-"""Guided calls of a prior in float16."""
+"""Guided calls of a prior in float16, and in float64."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.runtime.half_precision import ImagesInFloat32
+from tests.contracts.tiny_priors import make_e2e_ft
 
 
 @pytest.mark.parametrize("gradient", ["denoised", "full"])
@@ -48,3 +49,12 @@ def test_an_overflow_of_the_decoder_names_step_tensor_and_cure(make_pipeline, te
     )
     with pytest.raises(ValueError, match=r"decoded map of denoising step 3 .* float16.*bfloat16"):
         pipe(textured_plane.left, guidance=guidance)
+
+
+@pytest.mark.parametrize("inner_steps", [0, 1])
+def test_a_prior_in_float64_gives_the_same_depth(textured_plane, inner_steps):
+    pipe, pair = enable_geometry_guidance(make_e2e_ft()), textured_plane  # it draws nothing
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, inner_steps=inner_steps)
+    expected = pipe(pair.left, guidance=guidance).prediction
+    found = pipe.to(torch.float64)(pair.left, guidance=guidance).prediction
+    np.testing.assert_allclose(found, expected, rtol=1e-4)

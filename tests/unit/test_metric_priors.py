@@ -163,6 +163,17 @@ def test_a_prompt_of_ones_own_goes_before_ours_and_only_where_it_is_taken(textur
         )
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("varies_m", [0.0, 0.01])
+def test_a_prompt_of_a_wall_far_away_has_a_span(textured_plane, dtype, varies_m):
+    """A millionth of a metre is no step beside 40 m, nor is a centimetre one in half precision."""
+    pipe = make_transformers("prompt_depth_anything").to(dtype=dtype)
+    wall_m = 40.0 + varies_m * torch.linspace(0, 1, 24).view(1, 1, 4, 6)
+    out = pipe(Image.fromarray(textured_plane.left), processing_resolution=64, prompt_depth=wall_m)
+    assert np.isfinite(out.prediction).all()
+    assert pipe.own_range.allclose(torch.tensor(40.0), atol=0.1)
+
+
 def test_without_a_length_the_metres_are_those_of_a_metric_prior():
     """An estimated pose has no unit; the prior knows the depth in metres, so everything is in metres."""
     pytest.importorskip("poselib")

@@ -20,7 +20,7 @@ from diffusers import DiffusionPipeline, MarigoldDepthPipeline
 from diffusers.pipelines.marigold import MarigoldDepthOutput
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value, check_choice, check_number
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number
 from geodiff_plugin.priors.pipelines.hooks import Condition, Generators, PriorHooks
 
 __all__ = ["RESAMPLING", "DepthDiffusionPipeline", "DepthOutput"]
@@ -96,7 +96,7 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
             ``DepthOutput``, or the tuple (prediction, uncertainty, latent).
 
         Raises:
-            ValueError: an argument out of its range.
+            TypeError, ValueError: an argument of another type, or out of its range.
         """
         steps = self.default_denoising_steps if num_inference_steps is None else num_inference_steps
         resolution = (
@@ -105,6 +105,8 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
         self.check_call(steps, ensemble_size, resolution, batch_size, output_type, output_uncertainty)
         check_choice(resample_method_input, "resample_method_input", RESAMPLING)
         check_choice(resample_method_output or self.output_resampling, "resample_method_output", RESAMPLING)
+        if latents is not None and not isinstance(latents, Tensor):
+            bad_type("latents", "None or a torch.Tensor", latents)
         if latents is not None and generator is not None:
             bad_value("latents and generator", "given one at a time", "both")
         unknown = set(options) - set(self.call_options())

@@ -86,7 +86,7 @@ class DepthFMPipeline(DepthDiffusionPipeline):
         latent = self.image_latents(image, ensemble_size, batch_size)  # (N * E, 4, h, w)
         return {
             "image_latent": latent,
-            "prompt": self.prompt.embedding.to(latent).expand(len(latent), -1, -1),
+            "prompt": self.prompt().to(latent).expand(len(latent), -1, -1),
         }
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:

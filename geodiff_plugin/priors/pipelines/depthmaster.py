@@ -65,7 +65,7 @@ class DepthMasterPipeline(DepthDiffusionPipeline):
     ) -> Condition:
         """Mode of the image latent's posterior, and the empty prompt."""
         latent = self.image_latents(image, ensemble_size, batch_size)  # (N * E, 4, h, w)
-        prompt = text_embedding(self.tokenizer, self.text_encoder).to(latent)
+        prompt = text_embedding(self.tokenizer, self.text_encoder, latent.device).to(latent)
         return {"image_latent": latent, "prompt": prompt.expand(len(latent), -1, -1)}
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:

@@ -147,7 +147,7 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         if of_image:
             prompt = self._image_prompt(image)
         else:
-            words = text_embedding(self.tokenizer, self.text_encoder, f"{domain} geometry")
+            words = text_embedding(self.tokenizer, self.text_encoder, image.device, f"{domain} geometry")
             prompt = words.to(image.dtype).expand(len(image), -1, -1)
         labels = class_embedding(domain if of_image else None).to(image)
         return {
@@ -209,9 +209,10 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
 
 def class_embedding(domain: str | None) -> Tensor:
     """Sines and cosines of one-hot codes, ``(2, 10)``, ``(2, 4)`` without a domain; depth, then normals."""
-    codes = [torch.tensor([[0.0, 1.0], [1.0, 0.0]])]
+    here: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
+    codes = [torch.tensor([[0.0, 1.0], [1.0, 0.0]], **here)]
     if domain is not None:
-        codes.append(torch.eye(len(DOMAINS))[[DOMAINS.index(domain)] * 2])
+        codes.append(torch.eye(len(DOMAINS), **here)[[DOMAINS.index(domain)] * 2])
     return torch.cat([f(code) for code in codes for f in (torch.sin, torch.cos)], dim=1)
 
 

@@ -117,9 +117,9 @@ class LotusPipeline(DepthDiffusionPipeline):
     ) -> Condition:
         """Image latents (a draw each), embedded task and empty prompt, ``N * E`` of each."""
         latents = self.image_latents(image, ensemble_size, batch_size, generator, sample=True)
-        task = torch.tensor(DEPTH_TASK)
+        task = torch.tensor(DEPTH_TASK, dtype=torch.float32, device="cpu")
         task = torch.cat([task.sin(), task.cos()]).to(latents)  # (4,)
-        prompt = text_embedding(self.tokenizer, self.text_encoder)
+        prompt = text_embedding(self.tokenizer, self.text_encoder, latents.device)
         return {
             "image_latent": latents,  # (N * E, 4, h, w)
             "task": task.expand(len(latents), -1),

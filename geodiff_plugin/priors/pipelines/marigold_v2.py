@@ -122,7 +122,7 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
             latent = latent.repeat_interleave(ensemble_size, dim=0)
         return {
             "image_latent": latent,
-            "prompt": self.prompt.embedding.to(latent.device).expand(len(latent), -1, -1),
+            "prompt": self.prompt().to(latent.device).expand(len(latent), -1, -1),
         }
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:

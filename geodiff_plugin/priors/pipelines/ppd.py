@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from diffusers import FlowMatchEulerDiscreteScheduler
 from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
+from diffusers.utils.accelerate_utils import apply_forward_hook
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import Dinov2Model
@@ -37,13 +38,15 @@ def sampling_timesteps(steps: int) -> list[float]:
 
     For some n (29, 49, 58, ...) floating point gives the authors one more, -1; here there are n.
     """
-    return torch.arange(LAST_TIMESTEP, -1, -(LAST_TIMESTEP + 1) / steps).round()[:steps].tolist()
+    step = -(LAST_TIMESTEP + 1) / steps
+    times = torch.arange(LAST_TIMESTEP, -1, step, dtype=torch.float32, device="cpu")
+    return times.round()[:steps].tolist()
 
 
 def _coverage(before: int, after: int) -> Tensor:
     """``(after, before)``: what part of a new pixel lies on each old one; rows sum to 1."""
-    ends = torch.arange(after + 1, dtype=torch.float64) * (before / after)
-    old = torch.arange(before, dtype=torch.float64)
+    ends = torch.arange(after + 1, dtype=torch.float64, device="cpu") * (before / after)
+    old = torch.arange(before, dtype=torch.float64, device="cpu")
     overlap = torch.minimum(ends[1:, None], old + 1) - torch.maximum(ends[:-1, None], old)
     return (overlap.clamp_min(0) * (after / before)).float()
 
@@ -92,6 +95,12 @@ def semantic_tokens(encoder: Dinov2Model, image_01: Tensor) -> Tensor:
     rows, columns = image_01.shape[-2] // SIDE, image_01.shape[-1] // SIDE
     patch = encoder.config.patch_size
     view = F.interpolate((image_01 - mean) / std, (rows * patch, columns * patch), mode="bicubic")
+    return _tokens_of(encoder, view, rows, columns)
+
+
+@apply_forward_hook
+def _tokens_of(encoder: Dinov2Model, view: Tensor, rows: int, columns: int) -> Tensor:
+    """The parts of ``encoder.forward``, called one by one; the hook brings an offloaded encoder back."""
     embeddings = encoder.embeddings
     patches = embeddings.patch_embeddings(view)  # (B, n, C)
     tokens = torch.cat([embeddings.cls_token.expand(len(patches), -1, -1), patches], dim=1)

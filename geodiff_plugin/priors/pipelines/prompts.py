@@ -15,12 +15,15 @@ from transformers import CLIPTextModel, CLIPTokenizer
 __all__ = ["FixedPrompt", "text_embedding"]
 
 
-def text_embedding(tokenizer: CLIPTokenizer, text_encoder: CLIPTextModel, prompt: str = "") -> Tensor:
+def text_embedding(
+    tokenizer: CLIPTokenizer, text_encoder: CLIPTextModel, device: torch.device, prompt: str = ""
+) -> Tensor:
     """Embedding of a prompt, not padded, as Marigold and its descendants were trained with.
 
     Args:
         tokenizer: of the text encoder.
-        text_encoder: on the device where the prompt is wanted.
+        text_encoder: its weights may be offloaded.
+        device: where it computes.
         prompt: its words; empty for most depth priors, which leaves the start and the end token.
 
     Returns:
@@ -33,7 +36,7 @@ def text_embedding(tokenizer: CLIPTokenizer, text_encoder: CLIPTextModel, prompt
         truncation=True,
         return_tensors="pt",
     )
-    return text_encoder(tokens.input_ids.to(text_encoder.device))[0]
+    return text_encoder(tokens.input_ids.to(device))[0]
 
 
 class FixedPrompt(ModelMixin, ConfigMixin):
@@ -51,3 +54,7 @@ class FixedPrompt(ModelMixin, ConfigMixin):
     def __init__(self, length: int = 77, width: int = 1024) -> None:
         super().__init__()
         self.embedding = torch.nn.Parameter(torch.zeros(1, length, width), requires_grad=False)
+
+    def forward(self) -> Tensor:
+        """The embedding; a call brings it back where it is offloaded."""
+        return self.embedding
