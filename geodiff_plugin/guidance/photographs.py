@@ -178,14 +178,14 @@ def estimate_rig(
     Ks, notes = _cameras(photographs, images, K, fov, cropped)
     if baseline_m is not None:
         check_number(baseline_m, "baseline_m", 1e-6, 1e6)
-    K_left = torch.as_tensor(Ks[0], dtype=torch.float32)
+    K_left = torch.as_tensor(Ks[0], dtype=torch.float32, device="cpu")
     size = image_size(images[0])
     own_points = None if points is None else _listed(as_points(points, "points"), K_left, size)
     images = [cleaned(image, DEFAULT) for image in images]
 
     def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
         return [
-            CameraView(image, *(torch.as_tensor(m, dtype=torch.float32) for m in matrices))
+            CameraView(image, *(torch.as_tensor(m, dtype=torch.float32, device="cpu") for m in matrices))
             for image, *matrices in zip(images[1:], Ks[1:], Ts, strict=True)
         ]
 

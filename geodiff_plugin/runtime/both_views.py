@@ -7,7 +7,7 @@ Paper: none; it leaves a left-right term out (docs/reference/paper-map.md).
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -95,16 +95,16 @@ def _guidance(other: Any, rig: Rig, knobs: dict[str, Any], points: Tensor | None
 
 
 def _confidence(output: MetricDepthOutput) -> Tensor:
-    """``(1, 1, H, W)``."""
+    """``(1, 1, H, W)`` of an output in torch."""
     if output.confidence is None:
         cure = "Keep refine=True and a weight for matches."
         bad_value("knobs", "of a preset that knows how sure it is", "one without confidence", cure)
-    return torch.as_tensor(output.confidence)
+    return cast(Tensor, output.confidence)
 
 
 def _confident_points(output: MetricDepthOutput, rig: Rig, min_confidence: float) -> Tensor:
     """Points ``(N, 3)`` of a view's depth in the other view's frame, metres; only the confident ones."""
-    confidence, depth_m = _confidence(output), torch.as_tensor(output.prediction).float()
+    confidence, depth_m = _confidence(output), cast(Tensor, output.prediction).float()
     K = torch.as_tensor(rig.K_left, dtype=torch.float32, device=depth_m.device)[None]
     T = torch.as_tensor(rig.T_right_from_left, dtype=torch.float32, device=K.device)[None]
     points = transform(unproject(depth_m, K), T)  # (1, H, W, 3)

@@ -10,9 +10,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
-import torch
 from diffusers import DDIMScheduler
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
@@ -106,7 +105,7 @@ def plan_warm_start(
 def _ends(previous: MetricDepthOutput, space: str) -> tuple[Tensor, Tensor]:
     """Nearest and farthest depth of every sample's map, ``(N * E,)`` metres."""
     scale, shift, g_s = (
-        torch.as_tensor(v).flatten().float() for v in (previous.scale, previous.shift, previous.global_scale)
+        cast(Tensor, v).flatten().float() for v in (previous.scale, previous.shift, previous.global_scale)
     )
     formulas = SPACES[space]
     return formulas.ends(formulas.forward(shift, g_s), formulas.forward(scale + shift, g_s))

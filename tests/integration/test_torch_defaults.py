@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, guide_both_views
 from geodiff_plugin.guidance.posing import pose_views
 from geodiff_plugin.synthetic import render_pair
 from geodiff_plugin.types import CameraView
@@ -57,6 +57,43 @@ def test_a_guided_call_does_not_depend_on_them(kind, default):
     expected = _depth_m(pipe, pair, **knobs)
     with _default(default):
         assert np.array_equal(_depth_m(pipe, pair, **knobs), expected)
+
+
+@pytest.mark.parametrize("default", ["meta", torch.float64, torch.bfloat16], ids=str)
+def test_no_warm_start_does(default, textured_plane):
+    pipe = enable_geometry_guidance(TINY["marigold"]())
+    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E)
+    seed = torch.Generator("cpu").manual_seed(0)
+    first = pipe(textured_plane.left, guidance=guidance, generator=seed, output_latent=True)
+    expected = _depth_m(pipe, textured_plane, previous=first)
+    with _default(default):
+        assert np.array_equal(_depth_m(pipe, textured_plane, previous=first), expected)
+
+
+@pytest.mark.parametrize("default", ["meta", torch.float64, torch.bfloat16], ids=str)
+def test_no_pair_of_views_does(default, textured_plane):
+    pipe = enable_geometry_guidance(TINY["marigold"]())
+    views = textured_plane.left, textured_plane.right, textured_plane.K, textured_plane.E
+
+    def both():
+        outputs = guide_both_views(pipe, *views, generator=torch.Generator("cpu").manual_seed(0))
+        return np.stack([output.prediction for output in outputs])
+
+    expected = both()
+    with _default(default):
+        assert np.array_equal(both(), expected)
+
+
+@pytest.mark.parametrize("default", ["meta", torch.float64, torch.bfloat16], ids=str)
+def test_no_estimate_of_a_pose_does(default):
+    pytest.importorskip("poselib")
+    pair = render_pair(3, size=(240, 320), posed=True)
+    left, right = (view.image_01.float() for view in (pair.left, pair.right))
+    known = {"baseline_m": 0.3, "K": pair.K_left.numpy()}
+    expected = GeometryGuidance.from_photographs(left, right, **known)
+    with _default(default):
+        found = GeometryGuidance.from_photographs(left, right, **known)
+    assert np.array_equal(found.rigs[0].E, expected.rigs[0].E)
 
 
 @pytest.mark.parametrize("key", ["lotus", "geowizard", "ppd"])
