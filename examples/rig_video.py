@@ -21,13 +21,14 @@ import numpy as np
 import torch
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
-from geodiff_plugin.formats.video import VideoReader
+from geodiff_plugin.formats.video import VideoReader, count_frames
 from geodiff_plugin.plotting.video import depth_frames, write_depth_video
 from geodiff_plugin.synthetic.sequences import render_sequence
 
 
 def read_frames(left: Path, right: Path, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The first frames of both videos, ``(H, W, 3)`` in [0, 1] each."""
+    """The first frames of both videos, ``(H, W, 3)`` in [0, 1] each; as many as both have, at most."""
+    count = min(count, count_frames(left), count_frames(right))
     with VideoReader(left) as lefts, VideoReader(right) as rights:
         for i in range(count):
             yield lefts.read(i), rights.read(i)
@@ -48,7 +49,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "files", type=Path, nargs="*", metavar="LEFT RIGHT CALIB", help="rendered ones by default"
     )
-    parser.add_argument("--frames", type=int, default=4, help="how many, from the first one")
+    parser.add_argument("--frames", type=int, default=4, help="how many at most, from the first one")
     parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
     parser.add_argument("--steps", type=int, default=None, help="denoising steps; the prior's own by default")
     parser.add_argument("--out", type=Path, default=Path("rig_video.webp"), help=".webp, .gif or .mp4")
@@ -68,12 +69,14 @@ def main(argv: list[str] | None = None) -> None:
         # The same noise for every frame keeps flicker low.
         out = pipe(
             left,
-            guidance=GeometryGuidance(right, (rig.K_left, rig.K_right), rig.E),
+            guidance=GeometryGuidance(right, (rig.K_left, rig.K_right), rig.E, left_size=rig.size_left),
             num_inference_steps=options.steps,
             generator=torch.Generator("cpu").manual_seed(0),
         )
         depths_m.append(out.prediction[0, ..., 0])
         print(f"frame {len(depths_m)}: median {np.median(depths_m[-1]):.2f} m")
+        for sentence in out.warnings:
+            print(f"warning: {sentence}")
     write_depth_video(options.out, depth_frames(depths_m), fps=10)
     print(options.out)
 

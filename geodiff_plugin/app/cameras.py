@@ -97,7 +97,8 @@ def _third_pose(text: str | None) -> np.ndarray:
     if numbers.size not in (12, 16):
         cure = "Write the 4x4 pose of the third camera in the left camera's frame, row by row, in metres."
         bad_value("the third camera's pose", "12 or 16 numbers", f"{len(words)} words", cure)
-    return np.vstack([numbers.reshape(-1, 4)[:3], [0, 0, 0, 1]])
+    rows = numbers.reshape(-1, 4)
+    return rows if len(rows) == 4 else np.vstack([rows, [0, 0, 0, 1]])  # a last row is checked with the pose
 
 
 def _guidance_of_rig(views: Views, rig: Rig, fields: CameraFields, knobs: dict[str, Any]) -> GeometryGuidance:

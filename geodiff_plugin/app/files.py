@@ -46,8 +46,8 @@ def _cameras(result: Result) -> list[tuple[np.ndarray, np.ndarray, tuple[int, in
     rigs, rights = result.guidance.rigs, result.guidance.rights
     cameras = [(result.K, np.eye(4), result.views.size)]
     return cameras + [
-        (rig.K_right, rig.E, (image.shape[-1], image.shape[-2]))
-        for rig, image in zip(rigs, rights, strict=True)
+        (rig.K_right, E, (image.shape[-1], image.shape[-2]))
+        for rig, E, image in zip(rigs, result.Es, rights, strict=True)
     ]
 
 
@@ -73,7 +73,10 @@ def report_of(result: Result) -> dict[str, Any]:
         },
         "warnings": result.warnings,
         "K": result.K.tolist(),
-        "cameras": [{"K": rig.K_right.tolist(), "E": rig.E.tolist()} for rig in result.guidance.rigs],
+        "cameras": [
+            {"K": rig.K_right.tolist(), "E": E.tolist()}
+            for rig, E in zip(result.guidance.rigs, result.Es, strict=True)
+        ],
         "photographs": [Path(name).name for name in result.views.names],
         "settings": {
             name: getattr(request, name)

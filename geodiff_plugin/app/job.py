@@ -19,6 +19,7 @@ from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
 from geodiff_plugin.app.priors import Priors
 from geodiff_plugin.cli.messages import collected_warnings
+from geodiff_plugin.cli.report import used_poses
 from geodiff_plugin.formats import read_image
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.guidance.presets import DEFAULT, PAPER
@@ -28,6 +29,7 @@ __all__ = ["PRESETS", "Request", "Result", "Stopped", "run_job"]
 
 PRESETS = {"default": DEFAULT, "paper": PAPER}
 MOST_STEPS, MOST_MEMBERS, LARGEST_RESOLUTION = 100, 20, 4096
+LARGEST_SEED = 2**63 - 1
 Report = Callable[[float, str], None]
 
 
@@ -81,6 +83,7 @@ class Result:
         guidance: with the cameras as understood.
         depth_m: metres.
         K: ``(3, 3)`` pixels.
+        Es: ``(4, 4)`` each, metres, poses of the further views as the call used them.
         prior_map: the prior's own map without guidance, or ``None``.
         confidence: [0, 1], or ``None``.
         uncertainty_m: metres, or ``None``.
@@ -95,6 +98,7 @@ class Result:
     guidance: GeometryGuidance
     depth_m: np.ndarray
     K: np.ndarray
+    Es: tuple[np.ndarray, ...]
     prior_map: np.ndarray | None
     confidence: np.ndarray | None
     uncertainty_m: np.ndarray | None
@@ -136,6 +140,9 @@ def _call_options(request: Request) -> dict[str, Any]:
     check_number(request.steps, "steps", 0, MOST_STEPS, integer=True)
     check_number(request.members, "members", 1, MOST_MEMBERS, integer=True)
     check_number(request.resolution, "resolution", 0, LARGEST_RESOLUTION, integer=True)
+    if request.resolution % 8 or 0 < request.resolution < 32:
+        bad_value("resolution", "a multiple of 8 from 32 on, or 0 for the prior's own", request.resolution)
+    check_number(request.seed, "seed", 0, LARGEST_SEED, integer=True)
     return {
         "num_inference_steps": request.steps or None,
         "processing_resolution": request.resolution or None,
@@ -171,6 +178,7 @@ def _result(
         guidance=guidance,
         depth_m=_map(output.prediction).astype(np.float32),
         K=np.asarray(output.K)[0].astype(np.float64),
+        Es=used_poses(output, guidance),
         prior_map=prior_map,
         confidence=_map_if_any(output.confidence),
         uncertainty_m=_map_if_any(output.uncertainty),

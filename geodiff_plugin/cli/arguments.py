@@ -91,6 +91,10 @@ class DepthArguments:
     quiet: bool = False
     json: bool = False
 
+    def photographs(self) -> tuple[Path, ...]:
+        """Paths of the views of one pair, the left one first."""
+        return tuple(path for path in (self.left, self.right, *self.view) if path is not None)
+
     def output_files(self) -> set[str]:
         """Names of all files that a run with these options may write."""
         names = {*FILES, *(name for kind in self.export for name in EXPORT_FILES.get(kind, ()))}

@@ -13,7 +13,14 @@ from typing import Any
 
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.estimate import StopWatch, guided_call, load_guided_prior
-from geodiff_plugin.cli.exports import Scene, check_exports, make_scene, show_scene, write_exports
+from geodiff_plugin.cli.exports import (
+    Scene,
+    check_exports,
+    check_image_names,
+    make_scene,
+    show_scene,
+    write_exports,
+)
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
 from geodiff_plugin.cli.messages import collected_warnings, in_options, say
 from geodiff_plugin.cli.outputs import write_maps, write_report, write_undistorted
@@ -65,6 +72,7 @@ def estimate_and_write(arguments: DepthArguments, out: OutFolder) -> DepthRun:
         with watch.stage("calibration"):
             read = read_photographs if arguments.estimate_pose else read_inputs
             inputs = read(arguments, settings)
+            check_image_names(arguments, inputs)
         with watch.stage("load"):
             pipe = load_guided_prior(arguments, settings)
         with watch.stage("guided call"):
@@ -117,8 +125,7 @@ def write_result(
 
 
 def _scene(output: MetricDepthOutput, inputs: Inputs, arguments: DepthArguments) -> Scene:
-    names = [path for path in (arguments.left, arguments.right, *arguments.view) if path is not None]
-    return make_scene(output, inputs, tuple(names), arguments.min_confidence)
+    return make_scene(output, inputs, arguments.photographs(), arguments.min_confidence)
 
 
 def run_depth(arguments: DepthArguments, out: OutFolder) -> None:

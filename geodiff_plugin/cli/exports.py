@@ -16,15 +16,25 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.cli.arguments import undistorted_name
+from geodiff_plugin.cli.arguments import DepthArguments, undistorted_name
 from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.messages import say
 from geodiff_plugin.cli.outputs import write_undistorted
-from geodiff_plugin.cli.report import rescaled_pose, single_map
+from geodiff_plugin.cli.report import single_map, used_poses
 from geodiff_plugin.formats import Cloud, flying_points, make_cloud, write_colmap, write_glb
+from geodiff_plugin.formats.colmap_export import check_colmap_names
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["EXPORTS", "VIEWERS", "Scene", "check_exports", "make_scene", "show_scene", "write_exports"]
+__all__ = [
+    "EXPORTS",
+    "VIEWERS",
+    "Scene",
+    "check_exports",
+    "check_image_names",
+    "make_scene",
+    "show_scene",
+    "write_exports",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +43,7 @@ class Scene:
 
     Attributes:
         cloud: the sure points, without those that hang between two surfaces.
-        cameras: ``(K, E, (width, height))``, the left one first.
+        cameras: ``(K, E, (width, height))``, the left one first; poses as the call used them.
         names: of their images, which a pinhole camera took: the photographs, or without lens distortion
             those of ``write_undistorted``.
         left: ``(H, W, 3)`` in [0, 1].
@@ -45,6 +55,16 @@ class Scene:
     names: tuple[str, ...]
     left: np.ndarray
     further: tuple[np.ndarray, ...] = ()
+
+
+def check_image_names(arguments: DepthArguments, inputs: Inputs) -> None:
+    """Refuse photographs whose names an export cannot hold, before the work that would be lost.
+
+    Raises:
+        ValueError: naming the photograph.
+    """
+    if "colmap" in arguments.export and not inputs.undistorted:
+        check_colmap_names(_image_names(arguments.photographs()))
 
 
 def make_scene(
@@ -63,8 +83,9 @@ def make_scene(
     if output.confidence is not None:
         keep &= single_map(output.confidence) >= min_confidence
     cameras = [(K, np.eye(4), (depth_m.shape[1], depth_m.shape[0]))]
-    for rig, image in zip(inputs.guidance.rigs, inputs.guidance.rights, strict=True):
-        cameras.append((rig.K_right, rescaled_pose(rig.E, output), (image.shape[-1], image.shape[-2])))
+    Es = used_poses(output, inputs.guidance)
+    for rig, E, image in zip(inputs.guidance.rigs, Es, inputs.guidance.rights, strict=True):
+        cameras.append((rig.K_right, E, (image.shape[-1], image.shape[-2])))
     cloud = make_cloud(depth_m, inputs.left, K, keep)
     if not inputs.undistorted:
         return Scene(cloud, tuple(cameras), _image_names(names), inputs.left)

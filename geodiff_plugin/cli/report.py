@@ -16,10 +16,11 @@ import torch
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.settings import Settings
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["build_report", "depth_summary", "rescaled_pose", "single_map", "summary_line"]
+__all__ = ["build_report", "depth_summary", "single_map", "summary_line", "used_poses"]
 
 
 def single_map(value: Any) -> np.ndarray:
@@ -93,9 +94,19 @@ def _estimated(inputs: Inputs, output: MetricDepthOutput) -> dict[str, Any] | No
     }
 
 
-def rescaled_pose(E: np.ndarray, output: MetricDepthOutput) -> np.ndarray:
+def _rescaled_pose(E: np.ndarray, output: MetricDepthOutput) -> np.ndarray:
     """A pose of the guidance in the unit of the output."""
     return E * np.array([1.0, 1.0, 1.0, output.rescaled])
+
+
+def used_poses(output: MetricDepthOutput, guidance: GeometryGuidance) -> tuple[np.ndarray, ...]:
+    """``(4, 4)`` poses of the further views of one image, in the left camera's frame and the output's unit.
+
+    Where they were refined these are the refined ones, which the depth fits.
+    """
+    if output.poses and output.poses[0].status == "refined":
+        return output.poses[0].E
+    return tuple(_rescaled_pose(rig.E, output) for rig in guidance.rigs)
 
 
 def build_report(
@@ -149,10 +160,10 @@ def build_report(
             "calibration": rig.source,
             "K_left": rig.K_left,
             "K_right": rig.K_right,
-            "E": rescaled_pose(rig.E, output),
+            "E": _rescaled_pose(rig.E, output),
             "baseline_m": output.rescaled * float(np.linalg.norm(rig.E[:3, 3])),
             "further_views": [
-                {"K": other.K_right, "E": rescaled_pose(other.E, output)}
+                {"K": other.K_right, "E": _rescaled_pose(other.E, output)}
                 for other in inputs.guidance.rigs[1:]
             ],
         },

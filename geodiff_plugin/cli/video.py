@@ -11,10 +11,11 @@ import os
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats import check_file
+from geodiff_plugin.formats import check_file, read_image
+from geodiff_plugin.formats.npy import read_npy
 from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.plotting.video import depth_frames, write_depth_video
 
@@ -25,14 +26,15 @@ def _map(path: Path) -> np.ndarray:
     file = check_file(
         path / "depth.npy" if os.path.isdir(path) else path, "FRAME", "a folder of geodiff depth or a .npy"
     )
-    try:
-        depth_m = np.load(file, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        bad_value("FRAME", "a depth map that numpy.save wrote", f"{file} ({error})")
-    known = isinstance(depth_m, np.ndarray) and depth_m.ndim == 2 and depth_m.dtype.kind == "f"
-    if not (known and depth_m.size):
-        bad_value("FRAME", "a depth map (H, W) of floats in metres", f"{file}")
+    expected = "a depth map (H, W) of floats in metres"
+    depth_m = read_npy(file, "FRAME", expected)
+    if depth_m.ndim != 2 or depth_m.dtype.kind != "f" or not depth_m.size:
+        bad_value("FRAME", expected, f"{file}")
     return depth_m
+
+
+def _picture(image_01: np.ndarray) -> Image.Image:
+    return Image.fromarray(np.rint(image_01 * 255).astype(np.uint8))
 
 
 def _photograph(folder: Path) -> Image.Image:
@@ -46,13 +48,13 @@ def _photograph(folder: Path) -> Image.Image:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         bad_value("--photographs", "the report of a folder of geodiff depth", f"{report}, which is damaged")
     if undistorted:
-        return Image.open(check_file(folder / "undistorted.png", f"the undistorted left image of {folder}"))
+        return _picture(read_image(folder / "undistorted.png", f"the undistorted left image of {folder}")[0])
     if frame is not None:
         with VideoReader(left, f"the left video of {folder}") as video:
             image = video.read(frame)
         view = both_halves(image)[0] if arguments["right"] is None else image
-        return Image.fromarray(np.rint(view * 255).astype(np.uint8))
-    return ImageOps.exif_transpose(Image.open(check_file(left, f"the left image of {folder}")))
+        return _picture(view)
+    return _picture(read_image(left, f"the left image of {folder}")[0])
 
 
 def run_video(
@@ -69,6 +71,11 @@ def run_video(
         photographs: show the left images beside the depth.
     """
     depths_m = [_map(path) for path in frames]
+    for path, depth_m in zip(frames, depths_m, strict=True):
+        if depth_m.shape != depths_m[0].shape:
+            (height, width), (first_height, first_width) = depth_m.shape, depths_m[0].shape
+            expected = f"all of one shape, {first_width}x{first_height} pixels as {frames[0]}"
+            bad_value("FRAME", expected, f"{path} of {width}x{height}", "Make a video of each size.")
     pictures = depth_frames(
         depths_m, [_photograph(path) for path in frames] if photographs else None, near, far
     )

@@ -17,11 +17,22 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.atomic import atomic_path
 from geodiff_plugin.formats.pointcloud import Cloud
 
-__all__ = ["COLMAP_FILES", "write_colmap"]
+__all__ = ["COLMAP_FILES", "check_colmap_names", "write_colmap"]
 
 COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 #: A start for other programs, not a copy of the cloud: text of a million points is 50 MB.
 MOST_POINTS = 100_000
+
+
+def check_colmap_names(names: Sequence[str]) -> None:
+    """Refuse names of images that a model cannot hold.
+
+    Raises:
+        ValueError: a name with a blank.
+    """
+    for name in names:
+        if any(letter.isspace() for letter in name):
+            bad_value("the name of an image in a COLMAP model", "without blanks", repr(name), "Rename it.")
 
 
 def write_colmap(
@@ -52,9 +63,8 @@ def write_colmap(
             "#   POINTS2D[] as (X, Y, POINT3D_ID)",
         ],
     )
+    check_colmap_names([name for name, *_ in views])
     for number, (name, K, E, (width, height)) in enumerate(views, 1):
-        if any(letter.isspace() for letter in name):
-            bad_value("the name of an image in a COLMAP model", "without blanks", repr(name), "Rename it.")
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
         cameras.append(f"{number} PINHOLE {width} {height} {fx:.9g} {fy:.9g} {cx:.9g} {cy:.9g}")
         T = np.linalg.inv(E)

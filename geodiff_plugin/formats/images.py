@@ -194,7 +194,8 @@ def _raw(value: Any, name: str) -> Image.Image | np.ndarray:
         bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
     raw = _array_to_hwc(value, name) if isinstance(value, np.ndarray) else _tensor_to_hwc(value, name)
     _check_sides(raw.shape[0], raw.shape[1], name)
-    return raw
+    # Readers of TIFF and PGM leave the file's byte order, which says nothing about the values.
+    return raw.astype(raw.dtype.newbyteorder("="), copy=False)
 
 
 def picture_size(value: Any, name: str) -> tuple[int, int]:

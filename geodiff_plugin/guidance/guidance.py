@@ -166,7 +166,7 @@ class GeometryGuidance:
         Convention:
             If the first pose is the identity, the others are poses in the left camera's frame.
         """
-        left_size, images, Ks, Es = split_views(views)
+        left_size, images, Ks, Es = split_views(views, cropped=knobs.get("cropped", False))
         return cls(images, Ks, Es, **{"left_size": left_size} | knobs)
 
     @classmethod

@@ -222,12 +222,13 @@ def as_points(value: Any, name: str) -> Tensor:
 
 
 def split_views(
-    views: Any,
+    views: Any, *, cropped: bool = False
 ) -> tuple[tuple[int, int] | None, tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
     """Take ``[(image, K, E), ...]`` apart, the left view first.
 
     Args:
         views: as in ``GeometryGuidance.from_views``.
+        cropped: as in ``GeometryGuidance``.
 
     Returns:
         ``(width, height)`` of the left image or ``None``, the right images, all K's and all E's.
@@ -246,7 +247,8 @@ def split_views(
         return None, images[1:], Ks, Es
     width, height = picture_size(images[0], "the left view's image")
     K_left = check_intrinsics(Ks[0], "K[left]")
-    check_intrinsics_fit(K_left, width, height, "K[left]", "the left view's image")
+    if not cropped:
+        check_intrinsics_fit(K_left, width, height, "K[left]", "the left view's image")
     if isinstance(images[0], Image.Image):
         warn_of_other_lens(images[0], K_left, "the left view's image")
     return (width, height), images[1:], Ks, Es

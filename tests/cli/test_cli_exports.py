@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 
@@ -19,6 +20,10 @@ from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 @pytest.fixture
 def quick(pair_files, prior):
     return [*pair_files.command, "--prior", prior, "--device", "cpu", "--steps", 1, "--preset", "paper"]
+
+
+def never(*_, **__):
+    raise AssertionError("the work was begun")
 
 
 class Recorder(types.ModuleType):
@@ -106,6 +111,38 @@ def test_a_colmap_model_names_what_its_cameras_took(geodiff, bent, pair_files):
     # A later run without them leaves none of them behind.
     assert geodiff(*bent, "--overwrite").code == 0
     assert (out / "undistorted.png").exists() and not (out / "undistorted-2.png").exists()
+
+
+def test_exported_cameras_are_those_that_the_cloud_fits(geodiff, prior, tmp_path, monkeypatch):
+    """Of refined poses: the given ones leave the cloud beside what the right photograph shows."""
+    monkeypatch.chdir(tmp_path)
+    pair, turn = read_demo_pair(), np.radians(1.0)
+    moved = pair.rig.E.copy()
+    moved[1:3, 1:3] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    np.savetxt("K.txt", pair.rig.K_left)
+    np.savetxt("E.txt", moved)
+    views = [DEMO_PAIR_FOLDER / "left.png", DEMO_PAIR_FOLDER / "right.png", "--K", "K.txt", "--E", "E.txt"]
+    run = ["--prior", prior, "--device", "cpu", "--steps", 1, "--resolution", 64, "--export", "colmap"]
+    answer = geodiff("depth", *views, *run)
+    assert answer.code == 0, answer.err
+    pose = json.loads((tmp_path / "geodiff-out" / "report.json").read_text())["pose"]
+    assert pose["status"] == "refined"
+    rig = read_calibration("geodiff-out", image_names=("left.png", "right.png"), baseline_m=0.12)
+    np.testing.assert_allclose(rig.E[:3, :3], np.array(pose["E"][0])[:3, :3], atol=1e-5)
+    assert not np.allclose(rig.E[:3, :3], moved[:3, :3], atol=3e-3)
+
+
+def test_a_name_that_colmap_cannot_hold_is_refused_before_the_work(geodiff, bent, pair_files, monkeypatch):
+    assert geodiff(*bent, "--export", "colmap", "--out", "bent").code == 0, "it names undistorted.png"
+    monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", never)
+    monkeypatch.setattr("geodiff_plugin.cli.many.job.Stages.guide", never)
+    left = pair_files.left.rename(pair_files.folder / "left one.png")
+    command = [*pair_files.command[3:], "--prior", "bundled", "--export", "colmap"]
+    answer = geodiff("depth", left, pair_files.right, *command)
+    assert answer.code == 2 and "without blanks; got 'left one.png'" in answer.err
+    (pair_files.folder / "pairs.txt").write_text("left one.png,right.png\n")
+    answer = geodiff("depth", "pairs.txt", *command)
+    assert answer.code == 4 and "without blanks; got 'left one.png'" in answer.err
 
 
 def test_video_of_undistorted_results(geodiff, bent, pair_files):
@@ -219,19 +256,37 @@ def test_video_of_results_with_photographs(geodiff, quick, pair_files):
         assert both.width > 1.5 * depth.width
 
 
+def test_video_shows_photographs_as_they_were_read(geodiff, quick, pair_files):
+    """16 bits are no white picture, and a photograph that was damaged since is a sentence."""
+    for path in (pair_files.left, pair_files.right):
+        grey = np.asarray(Image.open(path).convert("L"))
+        Image.fromarray(grey.astype(np.uint16) * 257).save(path)
+    assert geodiff(*quick, "-q").code == 0
+    video = ["video", "geodiff-out", "--photographs", "--out", "both.webp"]
+    assert geodiff(*video).code == 0
+    with Image.open("both.webp") as both, Image.open(pair_files.left) as left:
+        shown = np.asarray(both.convert("L"), float)[:, : both.height]
+        assert abs(shown.mean() - np.asarray(left).mean() / 257) < 20
+    pair_files.left.write_bytes(b"damaged")
+    answer = geodiff(*video)
+    assert answer.code == 2 and "the left image of geodiff-out must be an image file" in answer.err
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["0.npy", "--out", "depth.avi"], "ends in .mp4, .webp, .gif"),
         (["0.npy", "nothing.npy"], "nothing.npy, which does not exist"),
-        (["0.npy", "other.npy"], "all of one shape"),
+        (["0.npy", "other.npy"], "all of one shape, 64x48 pixels as 0.npy; got other.npy of 4x4"),
         (["0.npy", "--near", "3", "--far", "2"], "near < far"),
         (["0.npy", "--fps", "0"], "fps must be between"),
         (["integers.npy"], "of floats in metres"),
+        (["picture.png"], "which numpy cannot load (pickled objects, which are never loaded)"),
     ],
 )
 def test_video_bad_input(geodiff, maps, arguments, said):
     np.save("other.npy", np.ones((4, 4), np.float32))
     np.save("integers.npy", np.ones((4, 4), np.int32))
+    Image.new("I;16", (4, 4)).save("picture.png")
     answer = geodiff("video", *arguments)
     assert answer.code == 2 and said in answer.err

@@ -6,6 +6,7 @@ import csv
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -529,6 +530,22 @@ def test_warm_start_goes_from_frame_to_frame(geodiff, folders):
     reports = [json.loads((root / "out" / name / "report.json").read_text()) for name in "abc"]
     assert [report["pair"]["began_from"] for report in reports] == [None, "a", "b"]
     assert [len(report["history"]) for report in reports] == [4, 3, 3]
+
+
+def test_warm_start_begins_anew_behind_a_pair_that_has_no_result_of_this_run(geodiff, folders):
+    root, command = folders
+    words = [word for word in command if word not in ("--preset", "paper")]
+    whole = (root / "right" / "b.png").read_bytes()
+    (root / "right" / "b.png").write_bytes(whole[: len(whole) // 2])  # fails before the guided call
+    assert geodiff(*words, "--warm-start", "-q").code == 4
+    last = root / "out" / "c" / "report.json"
+    assert json.loads(last.read_text())["pair"]["began_from"] is None
+    (root / "right" / "b.png").write_bytes(whole)
+    assert geodiff(*words, "--warm-start", "-q").code == 0
+    for name in "ac":
+        shutil.rmtree(root / "out" / name)
+    assert geodiff(*words, "--warm-start", "-q").code == 0  # b was there already
+    assert json.loads(last.read_text())["pair"]["began_from"] is None
 
 
 # Videos

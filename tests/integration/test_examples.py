@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -119,3 +120,21 @@ def test_rig_video(prior, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.count("median") == 2
     with Image.open("depth.gif") as video:
         assert video.n_frames == 2
+
+
+def test_rig_video_of_files(prior, pair, textured_plane, tmp_path, monkeypatch, capsys):
+    """A video that is shorter than what is asked for, and a calibration of another size."""
+    monkeypatch.chdir(tmp_path)
+    for side in ("left", "right"):
+        frame = np.ascontiguousarray(getattr(textured_plane, side)[..., ::-1])
+        writer = cv2.VideoWriter(f"{side}.avi", cv2.VideoWriter.fourcc(*"MJPG"), 10, frame.shape[1::-1])
+        for _ in range(2):
+            writer.write(frame)
+        writer.release()
+    options = ["--steps", "1", "--prior", str(prior), "--out", "depth.gif"]
+    arguments = ["left.avi", "right.avi", pair[2], *options]
+    load(EXAMPLES / "rig_video.py").main([*arguments, "--frames", "50"])
+    assert capsys.readouterr().out.count("median") == 2
+    Path(pair[2]).write_text(Path(pair[2]).read_text().replace("width=", "width=1"))
+    with pytest.raises(ValueError, match="as the left view"):
+        load(EXAMPLES / "rig_video.py").main(arguments)

@@ -147,6 +147,9 @@ def test_a_third_view_and_its_pose(views):
     fields = CameraFields(fx=60.0, baseline_m=0.12, third_pose="1 0 0 0, 0 1 0 -0.1, 0 0 1 0")
     guidance = CAMERA_WAYS["numbers"].guide(third, fields, {})
     assert guidance.rigs[1].E[1, 3] == pytest.approx(-0.1)
+    turned = CameraFields(fx=60.0, baseline_m=0.12, third_pose="1 0 0 0  0 1 0 0  0 0 1 0  0 -0.1 0 1")
+    with pytest.raises(ValueError, match="last row .* Is it transposed"):
+        CAMERA_WAYS["numbers"].guide(third, turned, {})
     with pytest.raises(ValueError, match="12 or 16 numbers; got 2 words"):
         CAMERA_WAYS["numbers"].guide(third, CameraFields(fx=60.0, baseline_m=0.12, third_pose="up 0.1"), {})
 
@@ -254,6 +257,8 @@ def test_a_stop_ends_a_job_between_steps(priors, asked):
         ({"near": 1.0}, "near and far must be both given"),
         ({"steps": 1000}, "steps must be between"),
         ({"resolution": 10_000}, "resolution must be between"),
+        ({"resolution": 33}, "resolution must be a multiple of 8"),
+        ({"seed": 2**70}, "seed must be between"),
     ],
 )
 def test_what_a_job_refuses(priors, asked, changes, said):

@@ -132,6 +132,7 @@ def test_as_image_01_all_kinds_agree():
         "pil": Image.fromarray(x),
         "uint8": x,
         "uint16": x.astype(np.uint16) * 257,
+        "uint16 of another byte order": (x.astype(np.uint16) * 257).astype(">u2"),
         "float64": x / 255.0,
         "torch_uint8": torch.from_numpy(x).permute(2, 0, 1),
         "torch": expected.clone().requires_grad_(True),

@@ -77,6 +77,10 @@ def test_a_crop_says_so():
         GeometryGuidance(RIGHT, off, E)
     guidance = GeometryGuidance(RIGHT, off, E, cropped=True)
     assert guidance.prepare(lefts)
+    views = [(RIGHT, off, np.eye(4)), (RIGHT, off, E)]
+    with pytest.raises(ValueError, match="the left view's image"):
+        GeometryGuidance.from_views(views)
+    assert GeometryGuidance.from_views(views, cropped=True).prepare(lefts)
     with pytest.raises(ValueError, match="K must be for the left image"):
         GeometryGuidance.from_points(np.full((48, 64), 2.0), off).prepare(lefts)
     assert GeometryGuidance.from_points(np.full((48, 64), 2.0), off, cropped=True).prepare(lefts)

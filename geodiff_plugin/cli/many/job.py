@@ -21,6 +21,7 @@ from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.cli.depth import write_result
 from geodiff_plugin.cli.estimate import StopWatch, guided_call
+from geodiff_plugin.cli.exports import check_image_names
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
 from geodiff_plugin.cli.many.digests import file_digests
 from geodiff_plugin.cli.many.pairs import PairRef, arguments_of
@@ -46,6 +47,7 @@ class Job:
     Attributes:
         ref: the pair.
         arguments: of ``geodiff depth`` for this pair alone.
+        number: of the pair in the whole run, from 0.
         warnings: sentences about it.
         watch: its stages.
         out: its folder, held from before the work.
@@ -59,6 +61,7 @@ class Job:
 
     ref: PairRef
     arguments: DepthArguments
+    number: int = 0
     warnings: list[str] = field(default_factory=list)
     watch: StopWatch = field(default_factory=StopWatch)
     out: OutFolder | None = None
@@ -71,9 +74,9 @@ class Job:
     _held: ExitStack = field(default_factory=ExitStack)
 
     @classmethod
-    def of(cls, ref: PairRef, arguments: DepthArguments) -> Job:
-        """The job of one pair of a run."""
-        return cls(ref, arguments_of(ref, arguments))
+    def of(cls, ref: PairRef, arguments: DepthArguments, number: int = 0) -> Job:
+        """The job of one pair of a run, the ``number``-th of all its pairs."""
+        return cls(ref, arguments_of(ref, arguments), number)
 
     def hold(self) -> None:
         """Take the pair's folder, as a run of this pair alone would."""
@@ -125,7 +128,7 @@ class Stages:
         self._pipe, self._settings, self._warned, self._warm_start = pipe, settings, warned, warm_start
         self._among = 2 if side_by_side else 1
         self._rigs, self._videos, self._held = RigStore(), dict[Path, VideoReader](), ExitStack()
-        self._before: tuple[str, tuple[int, ...], MetricDepthOutput] | None = None
+        self._before: tuple[Job, tuple[int, ...], MetricDepthOutput] | None = None
 
     def close(self) -> None:
         """Close the videos; to be called when the threads are done."""
@@ -145,6 +148,7 @@ class Stages:
                 views = None if job.ref.frame is None else self._frames(job.ref, job.ref.frame)
                 rig_of = partial(self._rigs.read, sentences=job.warnings)
                 job.inputs = read_inputs(job.arguments, self._settings, views, rig_of)
+            check_image_names(job.arguments, job.inputs)
 
     def _frames(self, ref: PairRef, frame: int) -> Any:
         views = [self._video(path).read(frame) for path in (ref.left, ref.right) if path is not None]
@@ -175,15 +179,16 @@ class Stages:
         assert job.inputs is not None
         guidance, size, before = job.inputs.guidance, job.inputs.left.shape, self._before
         self._before = None  # whatever happens now: a sequence with a hole begins anew
-        if before is not None and before[1] == size:
-            job.began_from, guidance.previous = before[0], before[2]
+        # A pair between that failed before this stage, or that was there already, has left no trace here.
+        if before is not None and before[0].number == job.number - 1 and before[1] == size:
+            job.began_from, guidance.previous = before[0].ref.name, before[2]
         with job.watch.stage("guided call"), WithinCores(self._among):
             further = {"output_latent": self._warm_start}
             quiet = replace(job.arguments, quiet=True)
             job.output = guided_call(self._pipe, job.inputs, quiet, self._settings, **further)
         guidance.evidence_store = guidance.previous = None
         if self._warm_start:
-            self._before = job.ref.name, size, _small(job.output)
+            self._before = job, size, _small(job.output)
 
     def write(self, job: Job) -> None:
         """The files, the report last."""

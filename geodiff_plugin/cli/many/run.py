@@ -82,10 +82,10 @@ def _work(
     """Number and row of every pair of this process's share."""
     jobs = []
     for number, ref in processes.share(list(enumerate(refs))):
-        job = Job.of(ref, arguments)
+        job = Job.of(ref, arguments, number)
         report = None if arguments.overwrite else finished_report(job.arguments)
         if report is None:
-            jobs.append((number, job))
+            jobs.append(job)
         elif arguments.strict and (reason := distrust(job.arguments, report)):
             say(f"geodiff: {ref.name}: {reason}")
             yield number, _row(ref.name, "failed", None, reason)
@@ -96,7 +96,7 @@ def _work(
 
 
 def _run(
-    arguments: DepthArguments, settings: Settings, jobs: list[tuple[int, Job]], processes: Processes
+    arguments: DepthArguments, settings: Settings, jobs: list[Job], processes: Processes
 ) -> Iterator[tuple[int, Row]]:
     pipe = load_guided_prior(replace(arguments, quiet=arguments.quiet or processes.index > 0), settings)
     warned = ThreadWarnings()
@@ -105,17 +105,16 @@ def _run(
     def failed(job: Job, error: Exception) -> None:
         job.error = _say_failed(job, error)
 
-    numbers = {job.ref.name: number for number, job in jobs}
     conveyor = Conveyor([stages.read, stages.evidence, stages.guide, stages.write], failed, MOST_ON_THE_WAY)
     bar = tqdm(total=len(jobs), desc="pairs", unit="pair", file=sys.stderr, disable=arguments.quiet)
     bar.set_description("pairs" if processes.count == 1 else f"pairs of process {processes.index + 1}")
     with ExitStack() as held:
         held.enter_context(bar)
         held.enter_context(collected_warnings(warned, _once()))
-        for _, job in jobs:  # those on the way when the run is stopped
+        for job in jobs:  # those on the way when the run is stopped
             held.callback(job.let_go)
         held.enter_context(closing(stages))
-        for job in held.enter_context(closing(conveyor.run(job for _, job in jobs))):
+        for job in held.enter_context(closing(conveyor.run(jobs))):
             elsewhere = None if job.out is None else job.out.elsewhere
             if job.error is None and elsewhere is not None:
                 job.error = elsewhere
@@ -123,7 +122,7 @@ def _run(
             row = _row(job.ref.name, "failed" if job.error else "done", job.report, job.error)
             job.let_go()
             bar.update()
-            yield numbers[job.ref.name], row
+            yield job.number, row
 
 
 def _once() -> Callable[[str], None]:
