@@ -37,12 +37,13 @@ class Rig:
     Attributes:
         K_left: ``(3, 3)`` float64, pixels of the left image.
         K_right: ``(3, 3)`` float64, pixels of the right image.
-        E: ``(4, 4)`` float64, metres; pose of the right camera in the left camera's frame.
+        E: ``(4, 4)`` float64, lengths in ``unit``; pose of the right camera in the left camera's frame.
         size_left: ``(width, height)`` of the images that ``K_left`` is for; ``None`` if unknown.
         size_right: likewise for ``K_right``.
         source: file or option it comes from, for messages and reports.
         distortion: of the left and the right lens; ``None`` for none.
         rectified: whether the source says that its images are rectified, free of lens distortion.
+        unit: ``"m"``, or ``None`` where the source does not say what its lengths are in.
 
     Convention:
         A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
@@ -56,6 +57,7 @@ class Rig:
     source: str = "arguments"
     distortion: tuple[Distortion | None, Distortion | None] = (None, None)
     rectified: bool = False
+    unit: str | None = "m"
 
     @property
     def T_right_from_left(self) -> np.ndarray:
@@ -173,10 +175,10 @@ class MetricDepthOutput(BaseOutput):
             for the channels.
         judgements: one ``runtime.judgement.Judgement`` per image: whether the depth can be trusted, and why
             not.
-        unit: ``"m"``, or ``None`` if poses were estimated and no length is known; lengths are then in units
-            of the first baseline instead of metres.
+        unit: ``"m"``, or ``None`` if no length is known; lengths are then in the unit of the given poses, or
+            in units of the first baseline where poses were estimated.
         scale_from: source of the scale of estimated poses: ``"baseline"``, ``"known length"``, ``"points"``,
-            ``"prior"`` or ``"none"``; ``None`` for given poses.
+            ``"prior"`` or ``"none"``; ``None`` for given poses, but ``"prior"`` where they had no unit.
         scale_spread: relative spread of that scale over matches or the prior's map; ``None`` if unknown.
         rescaled: factor from the lengths of ``GeometryGuidance`` to metres, if only the prior knows the unit;
             else 1.

@@ -124,6 +124,9 @@ def _from_file(views: Views, fields: CameraFields, knobs: dict[str, Any]) -> Geo
     # The page keeps what is dropped in a folder of its own, so only the names themselves say something.
     names = Path(views.names[0]).name, Path(views.names[1]).name
     rig = read_calibration(paths, image_names=names, image_size=views.size, baseline_m=fields.baseline_m)
+    if rig.unit is None:  # lengths are what the page is for
+        cure = "This file has no unit: measure how far the two cameras were from each other, in metres."
+        bad_value("the distance of the cameras", "given", "nothing", cure)
     return _guidance_of_rig(views, rig, fields, knobs)
 
 

@@ -225,7 +225,7 @@ def _make_guidance(
         return GeometryGuidance(None, rig.K_left, points=points, cropped=cropped, config=config)
     further = _read_further_views(arguments, rig.K_left, lenses[2:], config)
     posed = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E), *further]
-    return GeometryGuidance.from_views(posed, points=points, cropped=cropped, config=config)
+    return GeometryGuidance.from_views(posed, points=points, cropped=cropped, unit=rig.unit, config=config)
 
 
 def _compare_with_exif(arguments: DepthArguments, rig: Rig) -> None:

@@ -202,7 +202,8 @@ def summary_line(report: dict[str, Any], where: str) -> str:
         return f"no valid depth; {seconds:.1f} s -> {where}"
     own = report.get("own_scale")
     said = "" if own is None else f"; prior's own metres x {own[0][0]:.2f}"
-    unit = report.get("unit", "m") or "baselines (no unit)"
+    lengths = "the calibration's lengths" if report.get("estimated_pose") is None else "baselines"
+    unit = report.get("unit", "m") or f"{lengths} (no unit)"
     near, far, median = (_length(depth[name], unit) for name in ("min_m", "max_m", "median_m"))
     return (
         f"{near} to {far}, median {median}; {_quality(report['judgement'])}{said}; {seconds:.1f} s -> {where}"

@@ -51,6 +51,8 @@ class GeometryGuidance:
             mean unknown), or ``(N, 3)`` points in the left camera's frame; floats.
         left_size: ``(width, height)`` that the left image must have; ``None`` for any that fits ``K``.
         cropped: the images are crops, so the principal point may lie outside of the image.
+        unit: ``"m"``, or ``None`` where the lengths of ``E`` are in no known unit, as in a model of COLMAP.
+            The output then says so, and a metric prior gives the metres.
         previous: the output of the previous frame, called with ``output_latent=True``. The call then starts
             in the middle of the schedule, from that latent, and the scale search starts at that scale.
         config: the hyperparameters; the default preset, or another one of ``guidance.presets``.
@@ -84,13 +86,18 @@ class GeometryGuidance:
         points: Any = None,
         left_size: tuple[int, int] | None = None,
         cropped: bool = False,
+        unit: str | None = "m",
         previous: MetricDepthOutput | None = None,
         config: GuidanceConfig = DEFAULT,
         **knobs: Any,
     ) -> None:
         if not isinstance(config, GuidanceConfig):
             bad_type("config", "a GuidanceConfig", config, "GuidanceConfig.load reads a saved one.")
-        self._config = config.changed(**knobs)
+        if unit not in ("m", None):
+            bad_value(
+                "unit", "'m' or None", repr(unit), "Give lengths in metres, or None for any other unit."
+            )
+        self._config, self._unit = config.changed(**knobs), unit
         check_names(self._config)
         self._inputs = read_inputs(right, K, E, points, cropped=cropped)
         self.evidence_store: EvidenceStore | None = None
@@ -146,7 +153,9 @@ class GeometryGuidance:
         if size is None and right is not None and not isinstance(right, (list, tuple)):
             size = picture_size(right, "right")  # the two cameras of a rig have one resolution
         rig = read_calibration(path, cameras, image_names=image_names, image_size=size, baseline_m=baseline_m)
-        guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **{"left_size": rig.size_left} | knobs)
+        guidance = cls(
+            right, (rig.K_left, rig.K_right), rig.E, **{"left_size": rig.size_left, "unit": rig.unit} | knobs
+        )
         for image in guidance.rights:
             size = (image.shape[-1], image.shape[-2])
             cure = "Scale K with the images, or use these."
@@ -299,8 +308,8 @@ class GeometryGuidance:
 
     @property
     def unit(self) -> str | None:
-        """``"m"``, or ``None`` where poses were estimated and no length is known."""
-        return "m" if self.estimated is None else self.estimated.scale.unit
+        """``"m"``, or ``None`` where no length is known."""
+        return self._unit if self.estimated is None else self.estimated.scale.unit
 
     @property
     def config(self) -> GuidanceConfig:

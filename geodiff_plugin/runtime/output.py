@@ -85,9 +85,8 @@ def assemble_output(
     own_ratios = [math.nan] * count
     if over_own is not None and guidance.unit is not None:
         own_ratios = over_own.reshape(count, -1).median(1).values.tolist()
-    measured = guidance.points_measured
     judgements = [
-        _judged(run, i, lefts_01[i], K_lefts[i], confidence, own_ratios[i], measured) for i in range(count)
+        _judged(run, i, lefts_01[i], K_lefts[i], confidence, own_ratios[i], guidance) for i in range(count)
     ]
     if confidence is not None:
         agreed = confidence.new_tensor([agreement_of_points(each.signs) for each in judgements])
@@ -170,7 +169,7 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_own: Tensor) -> Metric
         for pose in output.poses
     ]
     output.unit, output.scale_from, output.scale_spread, output.rescaled = "m", "prior", spread, factor
-    output.warnings = [said if sentence == NO_UNIT else sentence for sentence in output.warnings]
+    output.warnings = [sentence for sentence in output.warnings if sentence != NO_UNIT] + [said]
     return output
 
 
@@ -181,7 +180,7 @@ def _judged(
     K_left: Tensor,
     confidence: Tensor | None,
     own_ratio: float,
-    points_measured: bool,
+    guidance: GeometryGuidance,
 ) -> Judgement:
     """What the signs of one image's run say of it."""
     own = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
@@ -196,7 +195,8 @@ def _judged(
         on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in own),
         range_given=run.config.depth_range is not None,
         own_ratio=own_ratio,
-        points_measured=points_measured,
+        points_measured=guidance.points_measured,
+        has_unit=guidance.unit is not None,
     )
     return judge(signs)
 

@@ -25,6 +25,8 @@ __all__ = ["Signs", "read_signs"]
 
 #: A match that counts as one, a pixel of the left image that shows the same as the right one, in [0, 1].
 SURE, SAME = 0.5, 1.5 / 255
+#: The same, as a share of the left image's contrast: all pictures that are nearly black differ by less.
+SAME_SHARE = 0.05
 #: Points that are compared with matches: at least so many, each with matches this near, pixels of the grid.
 FEWEST_COMPARED, REACH_PX = 12, 3
 FEWEST_MATCHES = 40
@@ -44,7 +46,7 @@ class Signs:
         points_ratio: median of known points over matched depths at the same places.
         points: known depths within the image, a number of pixels; 0 without any.
         at_end: share of the sure matches that lie on the first or the last plane of a given range, [0, 1].
-        baseline_m: distance of the first right camera; 0 without one.
+        baseline_m: distance of the first right camera; 0 without one, or where it has no unit.
         view_deg: horizontal field of view that K gives the left image.
         own_ratio: of the depth over a metric prior's own, median.
         epipolar_px: how far matches lie beside their epipolar lines, pixels, with the poses as used; of the
@@ -90,8 +92,13 @@ def _is_same(left_01: Tensor, rights: Sequence[CameraView]) -> bool:
 
 def _alike(one: Tensor, other: Tensor) -> bool:
     """Whether no value differs by more than rounding; most images differ in their first rows."""
-    strips = row_strips(*one.shape[-2:])
-    return all(float((one[:, rows] - other[:, rows]).abs().max()) < SAME for rows in strips)
+    most = 0.0
+    for rows in row_strips(*one.shape[-2:]):
+        most = max(most, float((one[:, rows] - other[:, rows]).abs().max()))
+        if most >= SAME:
+            return False
+    darkest, brightest = other.aminmax()
+    return most < SAME_SHARE * float(brightest - darkest)
 
 
 def _points_against(matches: Matches, points: Matches) -> float:
@@ -142,6 +149,7 @@ def read_signs(
     range_given: bool = False,
     own_ratio: float = math.nan,
     points_measured: bool = True,
+    has_unit: bool = True,
 ) -> Signs:
     """The signs of one image.
 
@@ -157,6 +165,7 @@ def read_signs(
         own_ratio: of the depth over a metric prior's own, NaN for a relative prior.
         points_measured: whether points tell anything of the calibration; those that another view's depth
             gives, where this view's matches are unsure, do not.
+        has_unit: whether lengths are in metres, so that the length of a baseline says something.
     """
     matches, points = evidence.sweep_matches, evidence.sweep_points
     planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
@@ -170,7 +179,7 @@ def read_signs(
         confidence=math.nan if confidence is None else float(confidence.mean()),
         order=order,
         points=0 if known is None else int((known.confidence > 0).sum()),
-        baseline_m=float(rights[0][2][:3, 3].norm()) if rights else 0.0,
+        baseline_m=float(rights[0][2][:3, 3].norm()) if rights and has_unit else 0.0,
         view_deg=2.0 * math.degrees(math.atan(0.5 * left_01.shape[-1] / float(K_left[0, 0]))),
         own_ratio=own_ratio,
         same=_is_same(left_01, rights),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -82,6 +83,27 @@ def test_without_a_length_there_is_no_unit(geodiff, command, tmp_path):
     assert any("no unit" in sentence for sentence in report["warnings"])
     assert "baselines (no unit)" in answer.out and " m to " not in answer.out
     assert b"no unit" in (tmp_path / "out" / "cloud.ply").read_bytes()[:600]
+
+
+def test_poses_of_structure_from_motion_have_none_either(geodiff, prior, pair_files, textured_plane):
+    K, axes = textured_plane.K, np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": path.name, "transform_matrix": (pose @ axes).tolist()}
+        for path, pose in ((pair_files.left, np.eye(4)), (pair_files.right, textured_plane.E))
+    ]
+    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5, "w": 64, "h": 48}
+    path = pair_files.folder / "transforms.json"
+    path.write_text(json.dumps(lens | {"frames": frames}))
+    views = [pair_files.left, pair_files.right, "--calib", path, "--prior", prior, "--device", "cpu"]
+    for options, unit, said in (
+        ([], None, "the calibration's lengths (no unit)"),
+        (["--baseline", "0.12"], "m", " m to "),
+    ):
+        answer = geodiff("depth", *views, "--steps", 1, "--preset", "paper", *options, "--overwrite")
+        assert answer.code == 0 and said in answer.out, answer
+        out = Path("geodiff-out")
+        assert report_of(out)["unit"] == unit
+        assert (b"no unit" in (out / "cloud.ply").read_bytes()[:600]) == (unit is None)
 
 
 def test_a_known_length_gives_the_unit(geodiff, command, pair, tmp_path):

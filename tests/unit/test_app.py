@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -102,6 +103,19 @@ def test_a_calibration_of_another_size_is_refused(views, tmp_path):
     )
     with pytest.raises(ValueError, match="the left photograph must be of 640x480 pixels, as calib.txt says"):
         CAMERA_WAYS["file"].guide(views, CameraFields(calibration=str(tmp_path / "calib.txt")), {})
+
+
+@pytest.mark.filterwarnings("ignore:.*has no unit")
+def test_a_calibration_without_a_unit_needs_the_distance(views, tmp_path):
+    frames = [{"file_path": Path(name).name, "transform_matrix": np.eye(4).tolist()} for name in views.names]
+    frames[1]["transform_matrix"][0][3] = 0.5
+    lens = {"fl_x": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(lens | {"frames": frames}))
+    with pytest.raises(ValueError, match="the distance of the cameras must be given.*has no unit"):
+        CAMERA_WAYS["file"].guide(views, CameraFields(calibration=str(path)), {})
+    guidance = CAMERA_WAYS["file"].guide(views, CameraFields(calibration=str(path), baseline_m=0.12), {})
+    assert guidance.unit == "m" and guidance.rigs[0].E[0, 3] == pytest.approx(0.12)
 
 
 @pytest.mark.parametrize("way", ["file", "numbers"])

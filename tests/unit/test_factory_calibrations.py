@@ -290,7 +290,8 @@ def test_colmap_without_a_measured_distance_warns_and_keeps_its_unit(reading):
             factory.COLMAP_IMAGES,
             image_names=("/home/x/rig/left.jpg", "rig/right.jpg"),
         )
-    assert rig.E[0, 3] == pytest.approx(0.5)
+    assert rig.E[0, 3] == pytest.approx(0.5) and rig.unit is None
+    assert reading(factory.COLMAP_CAMERAS, factory.COLMAP_IMAGES, **factory.COLMAP_CHOICE).unit == "m"
 
 
 def test_colmap_rotation_is_world_to_camera(reading):

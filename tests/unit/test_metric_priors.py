@@ -199,3 +199,21 @@ def test_without_a_length_the_metres_are_those_of_a_metric_prior():
     assert not any("no unit" in sentence for sentence in metric.warnings)
     assert relative.unit is None and relative.scale_from == "none" and relative.rescaled == 1.0
     assert any("no unit" in sentence for sentence in relative.warnings)
+
+
+def test_given_poses_without_a_unit_get_the_metres_of_a_metric_prior(textured_plane):
+    scaled = textured_plane.E.copy()
+    scaled[:3, 3] *= 0.001 / np.linalg.norm(scaled[:3, 3])  # as a model of COLMAP might have it
+    runs = {}
+    for kind in ("zoedepth", "depth_anything"):
+        pipe = enable_geometry_guidance(make_transformers(kind))
+        knows(pipe, textured_plane.depth_m)
+        guidance = GeometryGuidance(textured_plane.right, textured_plane.K, scaled, unit=None, **FAST)
+        runs[kind] = pipe(Image.fromarray(textured_plane.left), guidance=guidance, processing_resolution=64)
+    metric, relative = runs["zoedepth"], runs["depth_anything"]
+    assert metric.unit == "m" and metric.scale_from == "prior"
+    assert np.median(metric.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.03)
+    assert sum("metres are the prior's own" in sentence for sentence in metric.warnings) == 1
+    assert relative.unit is None and not any(" mm" in sentence for sentence in relative.warnings)
+    with pytest.raises(ValueError, match="unit must be 'm' or None; got 'mm'"):
+        GeometryGuidance(textured_plane.right, textured_plane.K, scaled, unit="mm")
