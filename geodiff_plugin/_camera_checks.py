@@ -14,6 +14,7 @@ import numpy as np
 from geodiff_plugin._checks import bad_type, bad_value
 
 __all__ = [
+    "FAR_SCENE_M",
     "LONG_BASELINE_M",
     "check_baseline",
     "check_calibrated_size",
@@ -26,6 +27,8 @@ __all__ = [
 
 #: A baseline longer than this is taken for millimetres that were meant as metres (with a warning).
 LONG_BASELINE_M = 20.0
+#: A scene all of which lies further away than this may be one in centimetres or millimetres.
+FAR_SCENE_M = 200.0
 #: A principal point in the outer fifth of an image is rather that of an image of another size.
 NEAR_BORDER = 0.2
 #: A principal point this far off the middle, in shares of the image, by nearly the same share both ways, is

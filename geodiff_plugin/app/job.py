@@ -6,6 +6,7 @@ Paper: Algorithm 1, run by the pipeline.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -129,8 +130,13 @@ def _knobs(request: Request) -> dict[str, Any]:
     check_choice(request.preset, "preset", PRESETS)
     if (request.near is None) != (request.far is None):
         bad_value("near and far", "both given or neither", f"{request.near} and {request.far}", "In metres.")
-    if request.near is None:
+    if request.near is None or request.far is None:
         return {"config": PRESETS[request.preset]}
+    for name, value in (("the nearest depth", request.near), ("the farthest depth", request.far)):
+        if not 0 < value < math.inf:
+            bad_value(name, "a number of metres above 0", value)
+    if request.near >= request.far:
+        bad_value("the nearest depth", f"below the farthest, {request.far:g} m", request.near)
     key = "g_s_range" if request.preset == "paper" else "depth_range"
     return {"config": PRESETS[request.preset], key: (request.near, request.far)}
 

@@ -17,20 +17,41 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import check_file, read_image
 from geodiff_plugin.formats.npy import read_npy
 from geodiff_plugin.formats.video import VideoReader, both_halves
-from geodiff_plugin.plotting.video import depth_frames, write_depth_video
+from geodiff_plugin.plotting.video import check_video, depth_frames, write_depth_video
 
 __all__ = ["run_video"]
 
 
+def _file(path: Path) -> Path:
+    return path / "depth.npy" if os.path.isdir(path) else path
+
+
 def _map(path: Path) -> np.ndarray:
-    file = check_file(
-        path / "depth.npy" if os.path.isdir(path) else path, "FRAME", "a folder of geodiff depth or a .npy"
-    )
+    file = check_file(_file(path), "FRAME", "a folder of geodiff depth or a .npy")
     expected = "a depth map (H, W) of floats in metres"
     depth_m = read_npy(file, "FRAME", expected)
     if depth_m.ndim != 2 or depth_m.dtype.kind != "f" or not depth_m.size:
         bad_value("FRAME", expected, f"{file}")
     return depth_m
+
+
+def _has_unit(path: Path) -> bool:
+    """Whether a map is in metres, as maps are unless the report beside them says that they have no unit."""
+    try:
+        report = json.loads((_file(path).parent / "report.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):  # no report, or one that says nothing
+        return True
+    return not isinstance(report, dict) or report.get("unit", "m") is not None
+
+
+def _unit(frames: list[Path]) -> str | None:
+    """``"m"``, or ``None`` where no map has a unit; one range of colours cannot show both kinds."""
+    in_metres = [_has_unit(path) for path in frames]
+    if any(in_metres) and not all(in_metres):
+        with_unit, without = frames[in_metres.index(True)], frames[in_metres.index(False)]
+        expected = "all in metres, or all without a unit"
+        bad_value("FRAME", expected, f"{with_unit} with and {without} without", "Make a video of each kind.")
+    return "m" if all(in_metres) else None
 
 
 def _picture(image_01: np.ndarray) -> Image.Image:
@@ -70,14 +91,15 @@ def run_video(
         far: depth of the first colour, metres, or ``None``.
         photographs: show the left images beside the depth.
     """
+    check_video(out, fps)
     depths_m = [_map(path) for path in frames]
     for path, depth_m in zip(frames, depths_m, strict=True):
         if depth_m.shape != depths_m[0].shape:
             (height, width), (first_height, first_width) = depth_m.shape, depths_m[0].shape
             expected = f"all of one shape, {first_width}x{first_height} pixels as {frames[0]}"
             bad_value("FRAME", expected, f"{path} of {width}x{height}", "Make a video of each size.")
-    pictures = depth_frames(
-        depths_m, [_photograph(path) for path in frames] if photographs else None, near, far
-    )
+    unit = _unit(frames)
+    lefts = [_photograph(path) for path in frames] if photographs else None
+    pictures = depth_frames(depths_m, lefts, near, far, unit)
     write_depth_video(out, pictures, fps)
     print(f"{len(pictures)} frames, {len(pictures) / fps:.1f} s -> {out}")

@@ -6,6 +6,7 @@ Paper: none; R, T of ``stereoCalibrate`` map left points to right ones.
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,20 @@ def _check_no_other_lens(entries: dict[str, np.ndarray], named: dict[str, np.nda
         )
 
 
+def _warn_of_one_lens(
+    named: dict[str, np.ndarray], lenses: tuple[Distortion | None, Distortion | None], source: str
+) -> None:
+    """Warn of distortion that is there for one camera alone: two lenses of a rig are rarely that unlike."""
+    if lenses == (None, None) or {"D1", "D2"} <= named.keys():
+        return
+    there, missing, side = ("D1", "D2", "right") if "D1" in named else ("D2", "D1", "left")
+    warnings.warn(
+        f"{source} has the lens distortion {there} and no {missing}: the {side} image is taken for one "
+        f"without distortion. Add {missing} to the file, zeros if that lens has none.",
+        stacklevel=3,
+    )
+
+
 def _merged(files: tuple[CalibrationFile, ...]) -> dict[str, np.ndarray]:
     entries: dict[str, np.ndarray] = {}
     for file in files:
@@ -178,6 +193,7 @@ def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
     cameras = _as_taken(named, source)
     _check_no_other_lens(entries, named, source)
     lenses = (_lens(named, "D1", "left", source), _lens(named, "D2", "right", source))
+    _warn_of_one_lens(named, lenses, source)
     return make_rig(*cameras, source, size=_size(named), distortion=lenses)
 
 

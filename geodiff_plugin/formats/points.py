@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geodiff_plugin._camera_checks import FAR_SCENE_M
 from geodiff_plugin._checks import bad_value, check_metres, check_number
 from geodiff_plugin.formats.depth import read_depth_png, read_pfm
 from geodiff_plugin.formats.files import check_file, read_text, refuse_decimal_commas
@@ -38,6 +39,8 @@ PICTURES, CLOUDS = (
     (".jpg", ".jpeg", ".tif", ".tiff", ".exr"),
     (".pcd", ".las", ".laz", ".obj", ".off", ".e57"),
 )
+#: How COLMAP opens its list of points, its name for the file, and the fewest numbers of its lines.
+COLMAP_MARK, COLMAP_STEM, COLMAP_COLUMNS = "# 3D point list with", "points3d", 8
 MOST_POINTS = 50_000_000
 NEAREST, FARTHEST_SCALE = 1e-9, 1e9
 
@@ -49,6 +52,7 @@ def _rows(path: Path, name: str) -> np.ndarray:
     ``#`` and ``//`` start a remark, anywhere in a line.
     """
     text = read_text(path, name, KINDS).replace('"', "")
+    _refuse_colmap(text, path, name)
     lines = [re.split(r"#|//", line)[0].strip(" \t,;") for line in text.splitlines()]
     refuse_decimal_commas(lines, path, name)
     rows = [re.split(r"[\s,;]+", line) for line in lines if line]
@@ -62,6 +66,23 @@ def _rows(path: Path, name: str) -> np.ndarray:
         lengths = sorted({len(row) for row in rows})
         bad_value(name, "points in metres, one a line", f"{path} with rows of {lengths or 'no'} numbers")
     return np.array(values)
+
+
+def _refuse_colmap(text: str, path: Path, name: str) -> None:
+    """Refuse the points of a COLMAP model, whose first three numbers are no x, y and z.
+
+    They cannot be read: they are in the frame and unit of the model, and the file tells neither.
+    """
+    named = path.stem.lower() == COLMAP_STEM
+    rows = (line.split() for line in text.splitlines() if not line.startswith("#"))
+    if COLMAP_MARK in text or (named and len(next(rows, [])) >= COLMAP_COLUMNS):
+        bad_value(
+            name,
+            "points in metres in the left camera's frame, one a line",
+            f"{path}, the points of a COLMAP model, in its frame and unit",
+            "Transform their X, Y and Z by the pose of the left image in images.txt, multiply them by the "
+            "metres in a unit of the model, and save them alone.",
+        )
 
 
 def _of(row: list[str], columns: list[int]) -> list[str]:
@@ -99,6 +120,18 @@ def _png_scale(path: Path, scale: float | None) -> float:
         )
         return KITTI_UNITS
     return MILLIMETRES
+
+
+def _warn_of_far(values: np.ndarray, path: Path) -> None:
+    """Warn of known depths all of which are so large that they look like millimetres."""
+    depths = values[:, 2] if values.shape[1] == 3 else values
+    nearest = float(np.min(depths, where=depths > 0, initial=np.inf))
+    if FAR_SCENE_M < nearest < np.inf:
+        warnings.warn(
+            f"{path} has no known depth nearer than {nearest:.4g} m. "
+            "If its numbers are millimetres, give --points-scale 1000 (scale=1000).",
+            stacklevel=3,
+        )
 
 
 def read_points(
@@ -157,4 +190,7 @@ def read_points(
         check_metres(values, name, f"{found} of {values.dtype}")
     with np.errstate(over="ignore"):
         values = (values / (scale or 1.0)).astype(np.float32)
-    return values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
+    values = values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
+    if scale is None:
+        _warn_of_far(values, found)
+    return values

@@ -1,4 +1,4 @@
-"""Video of a sequence of depth maps, in one range of colours with a legend in metres.
+"""Video of a sequence of depth maps, in one range of colours with a legend.
 
 Data flow: depth maps in metres -> frames -> GIF, WebP or MP4.
 Paper: none.
@@ -6,19 +6,20 @@ Paper: none.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import InputFileError, bad_value, check_number
+from geodiff_plugin.formats.atomic import atomic_path
 from geodiff_plugin.plotting.figures import depth_figure, depth_range
 
-__all__ = ["SUFFIXES", "depth_frames", "write_depth_video"]
+__all__ = ["SUFFIXES", "check_video", "depth_frames", "write_depth_video"]
 
 SUFFIXES = (".mp4", ".webp", ".gif")
 #: Of a frame with its photograph, pixels.
@@ -30,6 +31,7 @@ def depth_frames(
     photographs: Sequence[Image.Image] | None = None,
     near: float | None = None,
     far: float | None = None,
+    unit: str | None = "m",
 ) -> list[Image.Image]:
     """One picture a depth map, all of one size and in the same colours.
 
@@ -38,6 +40,7 @@ def depth_frames(
         photographs: one a map, shown on its left.
         near: depth of the last colour, metres; ``None`` takes the 2nd percentile over all maps.
         far: depth of the first colour, metres; ``None`` takes the 98th.
+        unit: of all maps, ``"m"``, or ``None`` for depths without one, as the legend then says.
 
     Raises:
         ValueError: no maps, maps of several shapes, or another number of photographs.
@@ -49,7 +52,7 @@ def depth_frames(
         bad_value("photographs", f"one for each of {len(depths_m)} maps", len(photographs))
     stack = np.concatenate([np.asarray(depth_m).reshape(1, -1) for depth_m in depths_m])
     near, far = depth_range(stack, near=near, far=far)
-    figures = [depth_figure(depth_m, near=near, far=far) for depth_m in depths_m]
+    figures = [depth_figure(depth_m, near=near, far=far, unit=unit) for depth_m in depths_m]
     if photographs is None:
         return figures
     shape = shapes[0]
@@ -71,23 +74,40 @@ def _beside(photograph: Image.Image, figure: Image.Image, shape: tuple[int, ...]
 
 
 def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
-    if importlib.util.find_spec("cv2") is None:
-        cure = "pip install opencv-python-headless, or write .webp or .gif, which need nothing."
-        bad_value("the video", "a kind that can be written here", path.suffix, cure)
-    import cv2
-
     # H.264 and its like want even sides.
     width, height = (side // 2 * 2 for side in frames[0].size)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
     if not writer.isOpened():
-        raise InputFileError(f"the video must be a file that can be written; got {path}.")
-    for frame in frames:
-        writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))
-    writer.release()
+        raise InputFileError("OpenCV cannot open it")  # the caller names the file
+    try:
+        for frame in frames:
+            writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))
+    finally:  # an open file can be neither renamed nor removed on Windows
+        writer.release()
+
+
+def check_video(path: str | os.PathLike[str], fps: float) -> None:
+    """Refuse a video that could not be written, before its frames are drawn.
+
+    Args:
+        path: the video to appear.
+        fps: frames a second, in [0.1, 120].
+
+    Raises:
+        ValueError: another ending than those of ``SUFFIXES``, a folder, no folder to write into, or ``fps``.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        bad_value("the video", f"a file that ends in {', '.join(SUFFIXES)}", path.name)
+    if os.path.isdir(path):
+        bad_value("the video", "a file", f"the folder {path}", "Name a file inside of it.")
+    if not os.path.isdir(path.parent):
+        bad_value("the video", "in an existing folder", path, f"Make the folder {path.parent} first.")
+    check_number(fps, "fps", 0.1, 120)
 
 
 def write_depth_video(path: str | os.PathLike[str], frames: Sequence[Image.Image], fps: float = 10.0) -> None:
-    """Write frames as a video, of the kind that the file's name ends in.
+    """Write frames as a video, of the kind that the file's name ends in; whole or not at all.
 
     Args:
         path: ends in .mp4 (OpenCV writes it), .webp or .gif.
@@ -95,25 +115,23 @@ def write_depth_video(path: str | os.PathLike[str], frames: Sequence[Image.Image
         fps: frames a second, in [0.1, 120].
 
     Raises:
-        ValueError: another ending, no frames, or MP4 without OpenCV.
+        ValueError: as ``check_video``; no frames.
         OSError: the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        bad_value("the video", f"a file that ends in {', '.join(SUFFIXES)}", path.name)
-    if not os.path.isdir(path.parent):
-        bad_value("the video", "in an existing folder", path, f"Make the folder {path.parent} first.")
+    check_video(path, fps)
     if not frames:
         bad_value("frames", "at least one picture", "none")
-    check_number(fps, "fps", 0.1, 120)
-    if path.suffix.lower() == ".mp4":
-        _write_mp4(path, frames, fps)
-        return
-    more: dict[str, Any] = {"quality": 85} if path.suffix.lower() == ".webp" else {}
+    kind = path.suffix.lower()
     try:
-        frames[0].save(
-            path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, **more
-        )
+        with atomic_path(path) as temporary:
+            if kind == ".mp4":
+                _write_mp4(temporary, frames, fps)
+                return
+            more: dict[str, Any] = {"quality": 85} if kind == ".webp" else {}
+            more |= {"duration": round(1000 / fps), "loop": 0}
+            with open(temporary, "wb") as file:  # Pillow leaves its own open file behind after a Ctrl-C
+                frames[0].save(file, kind[1:], save_all=True, append_images=frames[1:], **more)
     except OSError as error:
         reason = error.strerror or error
         raise InputFileError(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geodiff_plugin._camera_checks import LONG_BASELINE_M
+from geodiff_plugin._camera_checks import FAR_SCENE_M, LONG_BASELINE_M
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
@@ -210,7 +210,7 @@ def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
     if not SUSPECT_BASELINE_M <= baseline <= LONG_BASELINE_M or ahead.sum() < 20:
         return None
     depth_m = float(np.median(1.0 / inverse_depth[ahead]))
-    if depth_m < 200.0 or depth_m / baseline > 200.0:
+    if depth_m < FAR_SCENE_M or depth_m / baseline > 200.0:
         return None
     return (
         f"With a baseline of {baseline:.4g} m the matches lie {depth_m:.0f} m away in the median. "

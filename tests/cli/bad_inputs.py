@@ -256,6 +256,7 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "points-of-pixels": _points("u,v,depth\n10,20,3\n"),
     "points-with-words": _points("1 2 3\n1 2 car\n"),
     "points-with-too-few-cells": _points("id,x,y,z\n0,1,2,3\n1,2\n"),
+    "points-colmap": _points("1 0.1 -0.2 2.5 90 80 70 0.4 1 4 2 7\n", "points3D.txt"),
     "points-pcd": _points("VERSION 0.7\nFIELDS x y z\nDATA ascii\n1 2 3\n", "points.pcd"),
     "points-missing": _with("--points", "nothing.npy"),
     "points-empty": _points(b""),

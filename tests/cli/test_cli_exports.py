@@ -15,6 +15,7 @@ from PIL import Image
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
+from geodiff_plugin.plotting.video import write_depth_video
 
 
 @pytest.fixture
@@ -245,6 +246,62 @@ def test_video_as_mp4(geodiff, maps):
     video = cv2.VideoCapture("depth.mp4")
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3 and video.get(cv2.CAP_PROP_FPS) == 10
     assert video.read()[0]
+
+
+def first_frame(name: str) -> np.ndarray:
+    with Image.open(name) as video:
+        return np.asarray(video.convert("RGB")).astype(int)
+
+
+def test_video_of_results_without_a_unit(geodiff, maps):
+    """The legend says what the reports say; a video of both kinds would show one of them wrongly."""
+    for number, unit in enumerate(("m", None)):
+        folder = maps[0].parent / f"result-{number}"
+        folder.mkdir()
+        shutil.copy(maps[0], folder / "depth.npy")
+        (folder / "report.json").write_text(json.dumps({"unit": unit}))
+    for name in ("result-0", "result-1", "result-1/depth.npy", maps[0]):
+        assert geodiff("video", name, "--out", f"{str(name).replace('/', '-')[-18:]}.gif").code == 0
+    metres, without = first_frame("result-0.gif"), first_frame("result-1.gif")
+    changed = (np.abs(metres - without).sum(axis=2) > 300).any(axis=1)  # beyond what the palettes change
+    assert changed.any() and not changed[len(changed) // 8 :].any()  # the heading of the legend alone
+    assert np.array_equal(first_frame("result-1-depth.npy.gif"), without)
+    answer = geodiff("video", "result-0", "result-1")
+    assert answer.code == 2 and "all in metres, or all without a unit; got result-0 with" in answer.err
+
+
+class Interrupted:
+    """A frame at which the user presses Ctrl-C."""
+
+    def __getattr__(self, name: str):
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("name", ["depth.webp", "depth.gif", "depth.mp4"])
+def test_video_is_whole_or_as_it_was(tmp_path, name):
+    (tmp_path / name).write_bytes(b"older")
+    frames = [Image.new("RGB", (64, 48), shade) for shade in ("red", "green")]
+    with pytest.raises(KeyboardInterrupt):
+        write_depth_video(tmp_path / name, [*frames, Interrupted()])
+    assert (tmp_path / name).read_bytes() == b"older" and len(list(tmp_path.iterdir())) == 1
+    write_depth_video(tmp_path / name, frames)
+    assert (tmp_path / name).stat().st_size > 100 and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--out", "depth.avi"], "ends in .mp4, .webp, .gif"),
+        (["--out", "no/depth.gif"], "Make the folder no first."),
+        (["--out", "folder.gif"], "got the folder folder.gif"),
+        (["--fps", "0"], "fps must be between"),
+    ],
+)
+def test_video_is_checked_before_frames_are_drawn(geodiff, maps, monkeypatch, words, said):
+    (maps[0].parent / "folder.gif").mkdir()
+    monkeypatch.setattr("geodiff_plugin.cli.video.depth_frames", never)
+    answer = geodiff("video", *maps, *words)
+    assert answer.code == 2 and said in answer.err
 
 
 def test_video_of_results_with_photographs(geodiff, quick, pair_files):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import threading
 from pathlib import Path
 
@@ -269,6 +270,10 @@ def test_a_stop_ends_a_job_between_steps(priors, asked):
         ({"prior": "/etc"}, "prior must be one of"),
         ({"preset": "best"}, "preset must be one of"),
         ({"near": 1.0}, "near and far must be both given"),
+        ({"near": 3.0, "far": 2.0}, "the nearest depth must be below the farthest, 2 m; got 3"),
+        ({"near": math.nan, "far": 5.0}, "the nearest depth must be a number of metres above 0; got nan"),
+        ({"near": 1.0, "far": math.nan}, "the farthest depth must be a number of metres above 0; got nan"),
+        ({"near": 1.0, "far": math.inf}, "the farthest depth must be a number of metres above 0; got inf"),
         ({"steps": 1000}, "steps must be between"),
         ({"resolution": 10_000}, "resolution must be between"),
         ({"resolution": 33}, "resolution must be a multiple of 8"),

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.eval.app import eval_app
 from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
 from geodiff_plugin.evaluation.datasets import DATASETS
@@ -54,6 +55,13 @@ def test_pairs_writes_every_table_and_prints_it(data, tmp_path):
     lines = [json.loads(line) for line in (out / "samples.jsonl").read_text().splitlines()]
     assert [line["sample"] for line in lines] == ["one", "two"]
     assert all(line["all_pixels"]["raw"]["abs_rel"] < 0.05 for line in lines)
+
+
+@pytest.mark.parametrize("command", ["pairs", "strength", "sequence", "trust", "poses"])
+def test_out_that_can_be_no_folder_is_told_at_once(tmp_path, command):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="--out must be a folder; got the file"):
+        invoke(command, "--out", tmp_path / "file")
 
 
 def test_pairs_selects_scenes(data, tmp_path):

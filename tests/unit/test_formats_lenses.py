@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from functools import partial
 
 import cv2
@@ -36,6 +37,21 @@ def opencv(left, right) -> str:
     rows = [("M1", 3, 3, K), ("D1", 1, len(left), left), ("M2", 3, 3, K), ("D2", 1, len(right), right)]
     rows += [("R", 3, 3, R), ("T", 3, 1, [-0.12, 0.0, 0.0]), ("image_size", 1, 2, [640, 480])]
     return "%YAML:1.0\n---\n" + "".join(MATRIX.format(*row) for row in rows)
+
+
+def without(text: str, name: str) -> str:
+    """A calibration of OpenCV that lacks one matrix."""
+    return "".join(part for part in re.split(r"(?m)^(?=\w)", text) if not part.startswith(f"{name}:"))
+
+
+@pytest.mark.parametrize(("missing", "there", "side"), [("D2", "D1", "right"), ("D1", "D2", "left")])
+def test_distortion_of_one_camera_alone_is_told(reading, missing, there, side) -> None:
+    said = f"has the lens distortion {there} and no {missing}: the {side} image .* Add {missing} to the file"
+    with pytest.warns(UserWarning, match=said):
+        rig = reading(without(opencv(LEFT, RIGHT), missing))
+    assert [lens is None for lens in rig.distortion] == [missing == "D1", missing == "D2"]
+    zeros = [0.0] * 5
+    assert reading(without(opencv(zeros, zeros), missing)).distortion == (None, None)
 
 
 def kalibr(left=LEFT, right=RIGHT, model="radtan") -> str:

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
@@ -191,6 +192,16 @@ def test_a_rendered_pair_right_and_wrong(run, scene):
     assert "shifted copy" in said(run(right=np.roll(left, -6, axis=1)))
     with pytest.raises(InputError, match="Do not trust this depth"):
         run(right=np.ascontiguousarray(right[:, ::-1]), strict=True)
+
+
+@pytest.mark.filterwarnings("ignore:.* is a 16-bit image that is nearly black")
+def test_nearly_black_views_are_not_one_picture(run, scene):
+    """8 bits in a TIFF of 32 and views that are all black differ by less than rounding does elsewhere."""
+    left, right = (Image.fromarray(np.asarray(view[..., 0], np.int32)) for view in scene[:2])
+    black = np.zeros_like(scene[0])
+    assert not run(left=left, right=right).judgements[0].signs.same
+    assert not run(left=black, right=black).judgements[0].signs.same
+    assert run(left=left, right=left).judgements[0].signs.same
 
 
 def test_units_of_the_baseline(run, scene):

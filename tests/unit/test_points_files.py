@@ -189,6 +189,39 @@ def test_units_by_name_and_by_number(tmp_path):
             read_points(tmp_path / "points.npy", scale=scale)
 
 
+def test_millimetres_that_look_like_metres(tmp_path):
+    (tmp_path / "points.txt").write_text("0 0 1800\n100 0 2500\n0 0 -1\n")
+    np.save(tmp_path / "map.npy", 1000 * MAP)
+    for name, nearest in (("points.txt", 1800), ("map.npy", 1250)):
+        said = f"{name} has no known depth nearer than {nearest} m. .*millimetres, give --points-scale 1000"
+        with pytest.warns(UserWarning, match=said):
+            read_points(tmp_path / name)
+        for scale in (1, 1000):
+            read_points(tmp_path / name, scale=scale)
+    (tmp_path / "points.txt").write_text("0 0 1800\n0 0 180\n")  # a mountain behind a house
+    read_points(tmp_path / "points.txt")
+    (tmp_path / "points.txt").write_text("0 0 -1800\n")  # another mistake, which is told elsewhere
+    read_points(tmp_path / "points.txt")
+
+
+def test_the_points_of_a_colmap_model_are_named(tmp_path):
+    """Of equal length they would pass for a map, and of several for a broken list."""
+    line = "{} 0.1 -0.2 2.5 90 80 70 0.4 1 {} 2 7"
+    head = "# 3D point list with one line of data per point:\n"
+    lines = [line.format(number, number + 3) for number in range(1, 5)]
+    for name, text in (
+        ("points3D.txt", "\n".join(lines)),
+        ("renamed.txt", head + "\n".join(lines)),
+        ("points3D.txt", head + "\n".join([*lines, lines[0] + " 3 9"])),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ValueError, match=f"--points must be .*{name}, the points of a COLMAP model"):
+            read_points(tmp_path / name, "--points")
+        (tmp_path / name).unlink()
+    (tmp_path / "points3D.txt").write_text("0.1 -0.2 2.0\n0.4 0.3 5.5\n")
+    np.testing.assert_allclose(read_points(tmp_path / "points3D.txt"), POINTS)
+
+
 def test_integers_are_refused_without_a_unit(tmp_path):
     np.save(tmp_path / "points.npy", (POINTS * 1000).astype(np.int32))
     with pytest.raises(

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from geodiff_plugin.cli.eval.options import Device, names
+from geodiff_plugin.cli.eval.options import Device, Out, names
 
 __all__ = ["add_sequence"]
 
@@ -29,9 +29,7 @@ def sequence(
     prior: Annotated[str, typer.Option(help="'bundled', a hub id or a folder.")] = "bundled",
     seed: Annotated[int, typer.Option(help="Of the noise, the same for every frame.")] = 0,
     device: Device = "auto",
-    out: Annotated[Path, typer.Option(help="Folder of the records; a run goes on where it stopped.")] = Path(
-        "geodiff-eval"
-    ),
+    out: Out = Path("geodiff-eval"),
     results: Annotated[Path | None, typer.Option(help="Write the Markdown page here as well.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:

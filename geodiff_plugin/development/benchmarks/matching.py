@@ -7,11 +7,11 @@ Paper: none.
 from __future__ import annotations
 
 import argparse
-import importlib
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -146,7 +146,7 @@ def disparities_of(volume: CostVolume, width: int) -> int:
     return 16 * math.ceil(min(near, width / 2) / 16) if math.isfinite(near) else 128
 
 
-def sgbm_call(pair: Pair, disparities: int) -> Callable[[], object] | None:
+def sgbm_call(pair: Pair, disparities: int) -> Callable[[], object]:
     """OpenCV's ``StereoSGBM`` with eight paths on the same images, as many threads as torch has.
 
     Args:
@@ -154,12 +154,8 @@ def sgbm_call(pair: Pair, disparities: int) -> Callable[[], object] | None:
         disparities: a multiple of 16, as ``disparities_of`` gives it.
 
     Returns:
-        What does the work when it is called; ``None`` without OpenCV.
+        What does the work when it is called.
     """
-    try:
-        cv2 = importlib.import_module("cv2")
-    except ImportError:
-        return None
     size = pair[0].shape[-2:]
     # It needs images of one size; what they show does not change its time.
     images = [F.interpolate(image[None], size)[0].mul(255).byte() for image in (pair[0], pair[1][0])]
@@ -197,18 +193,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, pair in pairs:
         seconds, volume = measure(pair, options.device, options.repeats)
         disparities = options.disparities or disparities_of(volume, pair[0].shape[-1])
-        peer = sgbm_call(pair, disparities)
-        sgbm = None if peer is None else least_seconds(peer, "cpu", options.repeats)[0]
+        sgbm = least_seconds(sgbm_call(pair, disparities), "cpu", options.repeats)[0]
         if table is None:
             title = f"seconds on {options.device}, threads: {options.threads}"
             table = Table("pair", "size", "planes", *seconds, "SGBM", "evidence / SGBM", title=title)
         size = f"{pair[0].shape[-1]}x{pair[0].shape[-2]}"
-        shown = (
-            ["-", "-"]
-            if sgbm is None
-            else [f"{sgbm:.2f} ({disparities})", f"{seconds['evidence'] / sgbm:.2f}"]
-        )
-        ratios += [] if sgbm is None else [seconds["evidence"] / sgbm]
+        ratios.append(seconds["evidence"] / sgbm)
+        shown = [f"{sgbm:.2f} ({disparities})", f"{ratios[-1]:.2f}"]
         table.add_row(name, size, f"{len(volume.levels)}", *(f"{s:.3f}" for s in seconds.values()), *shown)
     console = Console(width=None if table is None else max(Console().width, 170))
     console.print(table)
