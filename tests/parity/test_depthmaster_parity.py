@@ -28,7 +28,7 @@ def theirs():
 
 @pytest.fixture
 def pipe(tokenizer, monkeypatch):
-    monkeypatch.setattr(depthmaster, "text_embedding", lambda tokenizer, text_encoder: prompt())
+    monkeypatch.setattr(depthmaster, "text_embedding", lambda *_: prompt())
     unet, vae = fill(FourierUNet(**UNET), "unet."), fill(AutoencoderKL(**VAE), "vae.")
     pipe = DepthMasterPipeline(unet.eval(), vae.eval(), make_text_encoder(), tokenizer)
     pipe.set_progress_bar_config(disable=True)
