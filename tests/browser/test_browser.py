@@ -16,14 +16,6 @@ RUN_MS = 600_000
 NUMBER = r"(\d+\.\d+)"
 
 
-def upload(page, paths) -> None:
-    for name, path in zip(("left", "right", "calibration"), paths, strict=False):
-        page.locator(f"#{name} input[type=file]").first.set_input_files(str(path))
-        page.wait_for_selector(
-            f"#{name} img" if name != "calibration" else f"#{name} >> text={Path(path).name}"
-        )
-
-
 def run(page) -> None:
     page.click("#run")
     page.wait_for_selector("#status .figures", timeout=RUN_MS)
@@ -40,6 +32,18 @@ def appears(page, selector: str, within_ms: int = 60_000) -> bool:
     except pytest.importorskip("playwright.sync_api").TimeoutError:
         return False
     return True
+
+
+def upload(page, paths) -> None:
+    """Give the files, each again where the busy page has lost it, as a person would."""
+    for name, path in zip(("left", "right", "calibration"), paths, strict=False):
+        there = f"#{name} img" if name != "calibration" else f"#{name} >> text={Path(path).name}"
+        for _ in range(3):
+            page.locator(f"#{name} input[type=file]").first.set_input_files(str(path))
+            if appears(page, there):
+                break
+        else:
+            pytest.fail(f"{path} does not appear on the page")
 
 
 def download(page, name: str, folder: Path) -> Path:
