@@ -190,9 +190,10 @@ def _quality(judgement: dict[str, Any]) -> str:
     return ("" if judgement["trusted"] else "DO NOT TRUST THIS, ") + (", ".join(said) or "not judged")
 
 
-def _length(value: float, unit: str) -> str:
+def _length(value: float, unit: str | None) -> str:
     """Two decimals, or two digits of what is too small for them."""
-    return f"{value:.2f} {unit}" if value >= 0.1 else f"{value:.2g} {unit}"
+    number = f"{value:.2f}" if value >= 0.1 else f"{value:.2g}"
+    return number if unit is None else f"{number} {unit}"
 
 
 def summary_line(report: dict[str, Any], where: str) -> str:
@@ -202,9 +203,10 @@ def summary_line(report: dict[str, Any], where: str) -> str:
         return f"no valid depth; {seconds:.1f} s -> {where}"
     own = report.get("own_scale")
     said = "" if own is None else f"; prior's own metres x {own[0][0]:.2f}"
-    lengths = "the calibration's lengths" if report.get("estimated_pose") is None else "baselines"
-    unit = report.get("unit", "m") or f"{lengths} (no unit)"
+    unit, lengths = report.get("unit", "m"), ""
+    if unit is None:
+        of = "the calibration's lengths" if report.get("estimated_pose") is None else "baselines"
+        lengths = f", in {of} (no unit)"
     near, far, median = (_length(depth[name], unit) for name in ("min_m", "max_m", "median_m"))
-    return (
-        f"{near} to {far}, median {median}; {_quality(report['judgement'])}{said}; {seconds:.1f} s -> {where}"
-    )
+    quality = _quality(report["judgement"])
+    return f"{near} to {far}, median {median}{lengths}; {quality}{said}; {seconds:.1f} s -> {where}"
