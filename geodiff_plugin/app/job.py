@@ -19,6 +19,7 @@ import torch
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
 from geodiff_plugin.app.priors import Priors
+from geodiff_plugin.cli.checks import LARGEST_SEED, check_resolution
 from geodiff_plugin.cli.messages import collected_warnings
 from geodiff_plugin.cli.report import used_poses
 from geodiff_plugin.formats import read_image
@@ -30,7 +31,6 @@ __all__ = ["PRESETS", "Request", "Result", "Stopped", "run_job"]
 
 PRESETS = {"default": DEFAULT, "paper": PAPER}
 MOST_STEPS, MOST_MEMBERS, LARGEST_RESOLUTION = 100, 20, 4096
-LARGEST_SEED = 2**63 - 1
 Report = Callable[[float, str], None]
 
 
@@ -145,9 +145,7 @@ def _call_options(request: Request) -> dict[str, Any]:
     """Keywords of the call that a guided and a plain one share."""
     check_number(request.steps, "steps", 0, MOST_STEPS, integer=True)
     check_number(request.members, "members", 1, MOST_MEMBERS, integer=True)
-    check_number(request.resolution, "resolution", 0, LARGEST_RESOLUTION, integer=True)
-    if request.resolution % 8 or 0 < request.resolution < 32:
-        bad_value("resolution", "a multiple of 8 from 32 on, or 0 for the prior's own", request.resolution)
+    check_resolution(request.resolution, "resolution", LARGEST_RESOLUTION, "the prior's own")
     check_number(request.seed, "seed", 0, LARGEST_SEED, integer=True)
     return {
         "num_inference_steps": request.steps or None,

@@ -12,7 +12,16 @@ import re
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin.cli.arguments import DepthArguments
 
-__all__ = ["DTYPES", "PRESETS", "SPACES", "camera_pair", "check_arguments", "check_positive"]
+__all__ = [
+    "DTYPES",
+    "LARGEST_SEED",
+    "PRESETS",
+    "SPACES",
+    "camera_pair",
+    "check_arguments",
+    "check_positive",
+    "check_resolution",
+]
 
 DTYPES = ("float32", "float16", "bfloat16")
 #: Keys of ``scale.space.SPACES``, which cannot be imported without torch; a test keeps them the same.
@@ -52,19 +61,24 @@ def _check_depth_range(near: float | None, far: float | None) -> None:
         bad_value("--near", "less than --far", f"{near:g} and {far:g}", "Both are metres from the camera.")
 
 
+def check_resolution(value: int, name: str, largest: int, meaning_of_0: str) -> None:
+    """Refuse a processing resolution, in pixels, that no latent has.
+
+    Raises:
+        ValueError: out of range, or neither 0 nor a multiple of 8 from 32 on.
+    """
+    check_number(value, name, 0, largest, integer=True)
+    if value % 8 or 0 < value < 32:
+        cure = f"Try {max(32, round(value / 8) * 8)}."
+        bad_value(name, f"a multiple of 8 from 32 on, or 0 for {meaning_of_0}", value, cure)
+
+
 def _check_numbers(arguments: DepthArguments) -> None:
     if arguments.steps is not None:
         check_number(arguments.steps, "--steps", 1, MOST_STEPS, integer=True)
     check_number(arguments.ensemble, "--ensemble", 1, MOST_MEMBERS, integer=True)
     if arguments.resolution is not None:
-        check_number(arguments.resolution, "--resolution", 0, LARGEST_RESOLUTION, integer=True)
-        if arguments.resolution % 8 or 0 < arguments.resolution < 32:
-            bad_value(
-                "--resolution",
-                "a multiple of 8 from 32 on, or 0 for the image's own size",
-                arguments.resolution,
-                f"Try {max(32, round(arguments.resolution / 8) * 8)}.",
-            )
+        check_resolution(arguments.resolution, "--resolution", LARGEST_RESOLUTION, "the image's own size")
     check_number(arguments.seed, "--seed", 0, LARGEST_SEED, integer=True)
     check_number(arguments.min_confidence, "--min-confidence", 0.0, 1.0)
     if arguments.points_scale is not None:

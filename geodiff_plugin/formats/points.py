@@ -11,6 +11,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -52,10 +53,12 @@ def _rows(path: Path, name: str) -> np.ndarray:
     ``#`` and ``//`` start a remark, anywhere in a line.
     """
     text = read_text(path, name, KINDS).replace('"', "")
-    _refuse_colmap(text, path, name)
     lines = [re.split(r"#|//", line)[0].strip(" \t,;") for line in text.splitlines()]
     refuse_decimal_commas(lines, path, name)
     rows = [re.split(r"[\s,;]+", line) for line in lines if line]
+    named = path.stem.lower() == COLMAP_STEM and rows and len(rows[0]) >= COLMAP_COLUMNS
+    if named or COLMAP_MARK in text:
+        _refuse_colmap(path, name)
     heading = rows.pop(0) if rows and not _is_number(rows[0][0]) else []
     columns = _columns(heading, len(rows[0]), path, name) if rows else None
     try:
@@ -68,21 +71,18 @@ def _rows(path: Path, name: str) -> np.ndarray:
     return np.array(values)
 
 
-def _refuse_colmap(text: str, path: Path, name: str) -> None:
+def _refuse_colmap(path: Path, name: str) -> NoReturn:
     """Refuse the points of a COLMAP model, whose first three numbers are no x, y and z.
 
     They cannot be read: they are in the frame and unit of the model, and the file tells neither.
     """
-    named = path.stem.lower() == COLMAP_STEM
-    rows = (line.split() for line in text.splitlines() if not line.startswith("#"))
-    if COLMAP_MARK in text or (named and len(next(rows, [])) >= COLMAP_COLUMNS):
-        bad_value(
-            name,
-            "points in metres in the left camera's frame, one a line",
-            f"{path}, the points of a COLMAP model, in its frame and unit",
-            "Transform their X, Y and Z by the pose of the left image in images.txt, multiply them by the "
-            "metres in a unit of the model, and save them alone.",
-        )
+    bad_value(
+        name,
+        "points in metres in the left camera's frame, one a line",
+        f"{path}, the points of a COLMAP model, in its frame and unit",
+        "Transform their X, Y and Z by the pose of the left image in images.txt, multiply them by the "
+        "metres in a unit of the model, and save them alone.",
+    )
 
 
 def _of(row: list[str], columns: list[int]) -> list[str]:

@@ -246,7 +246,12 @@ class GeometryGuidance:
         views = zip((None, *photographs[1:]), found.Ks, (np.eye(4), *found.Es), strict=True)
         points = points if found.scale.unit else None
         guidance = cls.from_views(
-            list(views), points=points, left_size=found.size_left, cropped=cropped, **knobs
+            list(views),
+            points=points,
+            left_size=found.size_left,
+            cropped=cropped,
+            unit=found.scale.unit,
+            **knobs,
         )
         guidance.estimated = found
         return guidance
@@ -309,7 +314,7 @@ class GeometryGuidance:
     @property
     def unit(self) -> str | None:
         """``"m"``, or ``None`` where no length is known."""
-        return self._unit if self.estimated is None else self.estimated.scale.unit
+        return self._unit
 
     @property
     def config(self) -> GuidanceConfig:
