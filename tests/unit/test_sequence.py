@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -140,8 +139,10 @@ def test_metres_of_a_prior_become_baselines_again(pipe, textured_plane):
     plain = plan_warm_start(pipe, prior, guidance, told, (48, 64))
     first.rescaled, first.global_scale = 4.0, 4.0 * first.global_scale
     in_metres = plan_warm_start(pipe, prior, guidance, told, (48, 64))
-    guidance.estimated = SimpleNamespace(scale=SimpleNamespace(unit=None))
-    in_baselines = plan_warm_start(pipe, prior, guidance, told, (48, 64))
+    no_unit = GeometryGuidance(
+        textured_plane.right, textured_plane.K, textured_plane.E, previous=first, unit=None
+    )
+    in_baselines = plan_warm_start(pipe, prior, no_unit, told, (48, 64))
     torch.testing.assert_close(in_metres.near_m, 4.0 * plain.near_m)
     torch.testing.assert_close(in_baselines.near_m, plain.near_m)
     torch.testing.assert_close(in_baselines.far_m, plain.far_m)
