@@ -35,15 +35,11 @@ def appears(page, selector: str, within_ms: int = 60_000) -> bool:
 
 
 def upload(page, paths) -> None:
-    """Give the files, each again where the busy page has lost it, as a person would."""
+    """Give the files and wait until the page shows each: a picture, or a file's row."""
     for name, path in zip(("left", "right", "calibration"), paths, strict=False):
-        there = f"#{name} img" if name != "calibration" else f"#{name} >> text={Path(path).name}"
-        for _ in range(3):
-            page.locator(f"#{name} input[type=file]").first.set_input_files(str(path))
-            if appears(page, there):
-                break
-        else:
-            pytest.fail(f"{path} does not appear on the page")
+        page.locator(f"#{name} input[type=file]").first.set_input_files(str(path))
+        shown = "img" if name != "calibration" else f'[aria-label="{Path(path).name}"]'
+        page.wait_for_selector(f"#{name} {shown}")
 
 
 def download(page, name: str, folder: Path) -> Path:
