@@ -45,6 +45,7 @@ class EvidenceInputs:
         points: as ``points_to_matches`` takes them, or ``None``.
         config: says how large the grids are, what the sweep spans, and whether the search needs it.
         needs_matches: aggregate the volume and check it against each view.
+        unit: of the lengths, ``"m"`` or ``None``.
     """
 
     left_01: Tensor
@@ -53,6 +54,7 @@ class EvidenceInputs:
     points: Tensor | None
     config: GuidanceConfig
     needs_matches: bool
+    unit: str | None = "m"
 
 
 @dataclass(frozen=True)

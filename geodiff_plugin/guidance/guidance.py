@@ -99,7 +99,7 @@ class GeometryGuidance:
             )
         self._config, self._unit = config.changed(**knobs), unit
         check_names(self._config)
-        self._inputs = read_inputs(right, K, E, points, cropped=cropped)
+        self._inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
         self.evidence_store: EvidenceStore | None = None
         self.points_measured = True  # False where they are depth of another view, as in guide_both_views
         self.previous = previous
@@ -377,7 +377,9 @@ class GeometryGuidance:
                 check_intrinsics_fit(*fit)
                 warn_of_other_size(*fit)
             views, K_left, points = one.on(lefts_01.device)
-            given = EvidenceInputs(lefts_01[i], views, K_left, points, self.config, self._needs_matches)
+            given = EvidenceInputs(
+                lefts_01[i], views, K_left, points, self.config, self._needs_matches, self.unit
+            )
             with WithinCores():  # here too, for who asks outside of a guided call
                 evidence.append(make(given))
         return evidence

@@ -61,7 +61,9 @@ class ImageInputs:
         return views, moved(self.K_left), None if self.points is None else moved(self.points)
 
 
-def read_inputs(right: Any, K: Any, E: Any, points: Any, *, cropped: bool = False) -> list[ImageInputs]:
+def read_inputs(
+    right: Any, K: Any, E: Any, points: Any, *, cropped: bool = False, unit: str | None = "m"
+) -> list[ImageInputs]:
     """Sort out the forms that ``GeometryGuidance`` takes, and check every entry.
 
     Args:
@@ -70,6 +72,7 @@ def read_inputs(right: Any, K: Any, E: Any, points: Any, *, cropped: bool = Fals
         E: likewise.
         points: likewise.
         cropped: likewise.
+        unit: likewise.
 
     Returns:
         One entry per left image.
@@ -85,7 +88,7 @@ def read_inputs(right: Any, K: Any, E: Any, points: Any, *, cropped: bool = Fals
         K, E = _as_tuple(K), _as_tuple(E)
     if count == 0:
         bad_value("right", "an image or a list with one image per left image", "an empty list")
-    found = [_read_one(right, K, E, points, i, count, cropped) for i in range(count)]
+    found = [_read_one(right, K, E, points, i, count, cropped, unit) for i in range(count)]
     for name, given in (
         ("right", [bool(one.rights) for one in found]),
         ("points", [one.points is not None for one in found]),
@@ -95,7 +98,9 @@ def read_inputs(right: Any, K: Any, E: Any, points: Any, *, cropped: bool = Fals
     return found
 
 
-def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int, cropped: bool) -> ImageInputs:
+def _read_one(
+    right: Any, K: Any, E: Any, points: Any, i: int, count: int, cropped: bool, unit: str | None
+) -> ImageInputs:
     """The entry of left image ``i`` of ``count``."""
 
     def label(name: str) -> str:
@@ -109,7 +114,7 @@ def _read_one(right: Any, K: Any, E: Any, points: Any, i: int, count: int, cropp
     images = tuple(as_image_01(image, name) for image, name in zip(views, names, strict=True))
     own_K = _entry(K, "K", i, count)
     K_left, K_rights = _intrinsics(own_K, label("K"), len(images))
-    poses = _poses(_entry(E, "E", i, count), label("E"), len(images))
+    poses = _poses(_entry(E, "E", i, count), label("E"), len(images), unit)
     for v, (K_right, image) in enumerate(zip(K_rights, images, strict=True)):
         if cropped:
             break
@@ -164,7 +169,7 @@ def _intrinsics(K: Any, name: str, views: int) -> tuple[np.ndarray, list[np.ndar
     return check_intrinsics(K[0], f"{name}[left]"), rights
 
 
-def _poses(E: Any, name: str, views: int) -> list[np.ndarray]:
+def _poses(E: Any, name: str, views: int, unit: str | None) -> list[np.ndarray]:
     """Pose of every right camera in the left camera's frame."""
     if views == 0:
         if E is not None:
@@ -186,7 +191,8 @@ def _poses(E: Any, name: str, views: int) -> list[np.ndarray]:
     for v, pose in enumerate(poses):
         named = name if views == 1 else f"{name}[{_view(v, views)}]"
         check_baseline(pose, named)
-        warn_of_long_baseline(pose, named)
+        if unit == "m":
+            warn_of_long_baseline(pose, named)
     return poses
 
 

@@ -48,7 +48,11 @@ def cleaned_views(
 
 
 def pose_views(
-    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, config: GuidanceConfig = DEFAULT
+    left_01: Tensor,
+    rights: Sequence[CameraView],
+    K_left: Tensor,
+    config: GuidanceConfig = DEFAULT,
+    unit: str | None = "m",
 ) -> RefinedViews:
     """The right views with the poses of the knob ``pose``.
 
@@ -57,10 +61,13 @@ def pose_views(
         rights: as the user gave them.
         K_left: ``(3, 3)`` pixels of ``left_01``.
         config: whether they are refined, and the coarse sweep that this starts from.
+        unit: of the poses' lengths, ``"m"`` or ``None``.
     """
     if config.pose == "given":
         return untouched(rights)
-    return refine_views(left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left, config))
+    return refine_views(
+        left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left, config), unit
+    )
 
 
 def coarse_depth(

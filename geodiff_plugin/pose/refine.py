@@ -70,7 +70,11 @@ def untouched(rights: Sequence[CameraView], status: str = "given") -> RefinedVie
 
 
 def refine_views(
-    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, first_depth: FirstDepth
+    left_01: Tensor,
+    rights: Sequence[CameraView],
+    K_left: Tensor,
+    first_depth: FirstDepth,
+    unit: str | None = "m",
 ) -> RefinedViews:
     """Check the poses against the images, and refine them together where they do not fit.
 
@@ -79,6 +83,7 @@ def refine_views(
         rights: as they were given, one or several.
         K_left: ``(3, 3)`` pixels of ``left_01``.
         first_depth: a rough depth by poses that fit roughly; asked only where refinement is due.
+        unit: of the poses' lengths; those in metres are asked about where they seem to be in millimetres.
 
     Returns:
         ``RefinedViews``; its ``rights`` are the very ones that were given where the poses fit, where there
@@ -95,7 +100,7 @@ def refine_views(
     fits_px = FITS_PX if rig else POSED_FITS_PX
     misfit = bool((before > fits_px).any())
     near = nearby_poses(sparse, given, before) if misfit else given
-    units = _units(sparse, given)
+    units = _units(sparse, given) if unit == "m" else ()
     mistakes = _mistakes(sparse, given, near)
     if mistakes:
         return RefinedViews(tuple(rights), found.changed(status="mistaken", warnings=mistakes))

@@ -86,7 +86,7 @@ def _refined_rig(guidance: GeometryGuidance, left: Any) -> Rig:
     """
     rights, K_left, _ = guidance.inputs[0].on(torch.device("cpu"))
     left_01, rights = cleaned_views(as_image_01(left, "left"), rights, guidance.config)
-    found = pose_views(left_01, rights, K_left, guidance.config)
+    found = pose_views(left_01, rights, K_left, guidance.config, guidance.unit)
     return replace(guidance.rigs[0], E=found.report.E[0])
 
 

@@ -338,6 +338,9 @@ def test_marigold_dc_preset_is_the_published_one():
 def test_millimetres_are_suspected():
     with pytest.warns(UserWarning, match="millimetres"):
         GeometryGuidance.from_baseline(RIGHT, K, 120.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        GeometryGuidance.from_baseline(RIGHT, K, 120.0, unit=None)
 
 
 def test_paper_preset_is_the_paper():

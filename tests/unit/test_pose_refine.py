@@ -347,6 +347,14 @@ def test_images_bring_a_perturbed_pose_back(pair) -> None:
     assert np.allclose(report.E_given[0], wrong, atol=1e-6)
 
 
+def test_lengths_without_a_unit_are_not_taken_for_millimetres(pair) -> None:
+    far = pair.E.numpy().copy()
+    far[:3, 3] *= 10.0 / np.linalg.norm(far[:3, 3])
+    (question,) = pose_views(*posed(pair, far)).report.warnings
+    assert "If the translation is in centimetres" in question
+    assert pose_views(*posed(pair, far), unit=None).report.warnings == ()
+
+
 def test_a_better_pose_that_is_too_far_is_not_said_to_be_used(pair) -> None:
     wrong = pair.E.numpy() @ pose((0, 0, 10), (0, 0, 0))
     left, rights, K_left = posed(pair, wrong)
