@@ -36,10 +36,13 @@ _FLOOR_PX, _LEAST_FAULT_PX = 0.05, 0.03
 # A rectified pair has a share and a narrow prior of its own: its cameras are bolted together, turn by tenths
 # of a degree and hardly shift, and a pan that fits the rows better is more often a fault of the lenses.
 _RIG_MOVED_SHARE, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = 0.4, np.radians(0.3), 0.01
-# Robust scale of the first fit, whose noise is not known yet, pixels of the right view. That of the last fit
+# Robust scale of the first fit, whose noise is not known yet, pixels of the right view. That of the next one
 # is so many times the residual that the first one leaves, but not below a tenth of a pixel; and its residuals
 # count half, because blocks of the image do not show all that neighbours have in common.
 SCALE_PX, _SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 0.7, 2.0, 0.1, 0.5
+# Where the given pose was wrong, little but the matches holds the new one, and what most of them agree on is
+# nearer the truth than what all of them are least far from: narrower fits follow.
+_NARROWER_BY = (1.0, 0.5)
 # A prior as wide as this leaves a pose free, but for the length of its baseline.
 FREE_PX = 1e3
 # The user is warned if the pose that fits best changes log depth by more than this, in the median.
@@ -109,14 +112,18 @@ def settle_poses(
     share = np.full_like(times, _RIG_MOVED_SHARE) if rig else np.clip(times**4, *_MOVED_SHARE)
     moved = np.maximum(np.nan_to_num(share * explained), _FLOOR_PX)
     shares = [part.independent_share for part in parts if part is not None]
-    settled = solve_poses(
-        tracks,
-        given,
-        Prior(moved, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE) if rig else Prior(moved),
-        start=fitted,
-        scale_px=max(_SCALE_BY * float(np.nanmean(left)), _LEAST_SCALE_PX),
-        trust=_COUNTS * float(np.mean(shares)),
-    )
+    held = Prior(moved, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE) if rig else Prior(moved)
+    wrong = not rig and bool((times > 1.0).any())
+    settled = fitted
+    for by in (_SCALE_BY, *(_NARROWER_BY if wrong else ())):
+        settled = solve_poses(
+            tracks,
+            given,
+            held,
+            start=settled,
+            scale_px=max(by * float(np.nanmean(left)), _LEAST_SCALE_PX),
+            trust=_COUNTS * float(np.mean(shares)),
+        )
     return settled, fitted
 
 
