@@ -159,6 +159,8 @@ def pretended(pipe: Any, guidance: Any, monkeypatch: Any) -> Any:
         waits.counts = True
 
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no such device
+    monkeypatch.setattr(torch, "is_autocast_enabled", lambda *_: False)
+    monkeypatch.setattr(torch, "get_autocast_dtype", lambda *_: torch.float32)
     monkeypatch.setattr(guidance, "prepare", lambda lefts: [put_there(e) for e in prepare(lefts.here)])
     monkeypatch.setattr(type(pipe), "decode_prediction", over)
     handle = pipe.unet.register_forward_pre_hook(start)

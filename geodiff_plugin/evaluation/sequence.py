@@ -16,17 +16,17 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from geodiff_plugin import __version__
 from geodiff_plugin._checks import check_choice, check_number
+from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.records import append_record, read_records
+from geodiff_plugin.evaluation.records import append_record, clean_records, read_records
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.guided_call import native_images
 from geodiff_plugin.runtime.machine import pick_device
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.synthetic.sequences import SyntheticSequence, render_sequence
 
 __all__ = ["WAYS", "SequenceOptions", "Way", "flicker", "run_sequence", "sequence_table"]
@@ -141,20 +141,24 @@ def run_sequence(options: SequenceOptions) -> Page:
     """Measure every way on every sequence, and write the page.
 
     Raises:
-        InputError: bad options.
+        InputError: bad options, or a prior that cannot be loaded.
         OSError: missing or unreadable files.
     """
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "sequence.jsonl"
+    clean_records(path)
     found = {record["key"]: record for record in read_records(path)}
-    keys = [(seed, way, _key(seed, way, options)) for seed in range(options.scenes) for way in options.ways]
-    pipe, sequence, store = None, None, EvidenceStore(options.frames)
+    settings, priors = Settings(options.prior, device=str(pick_device(options.device))), PriorCache()
+    pipe, prior = priors.get(settings), priors.fingerprint(settings)
+    keys = [
+        (seed, way, _key(seed, way, options, settings.device, prior))
+        for seed in range(options.scenes)
+        for way in options.ways
+    ]
+    sequence, store = None, EvidenceStore(options.frames)
     for seed, way, key in tqdm(keys, disable=options.quiet, desc="sequences"):
         if key in found:
             continue
-        if pipe is None:
-            pipe = enable_geometry_guidance(load_prior(options.prior, device=pick_device(options.device)))
-            pipe.set_progress_bar_config(disable=True)
         if sequence is None or sequence.seed != seed:
             sequence = render_sequence(seed, options.frames, size=options.size)
         found[key] = {"key": key, "seed": seed, "kind": sequence.kind, "way": way}
@@ -170,9 +174,9 @@ def run_sequence(options: SequenceOptions) -> Page:
     return page
 
 
-def _key(seed: int, way: str, options: SequenceOptions) -> str:
-    how = (options.frames, *options.size, options.steps, options.prior, options.seed)
-    return "|".join(map(str, (seed, way, *how)))
+def _key(seed: int, way: str, options: SequenceOptions, device: str, prior: str) -> str:
+    how = (options.frames, *options.size, options.steps, options.seed, device)
+    return "|".join(map(str, (seed, way, *how, options.prior, prior, __version__)))
 
 
 def _measure(

@@ -103,8 +103,9 @@ def _confidence(output: MetricDepthOutput) -> Tensor:
 
 
 def _confident_points(output: MetricDepthOutput, rig: Rig, min_confidence: float) -> Tensor:
-    """Points ``(N, 3)`` of a view's depth in the other view's frame, metres; only the confident ones."""
-    confidence, depth_m = _confidence(output), cast(Tensor, output.prediction).float()
+    """Points ``(N, 3)`` of a view's depth in the other view's frame, in E's lengths; the confident ones."""
+    # A metric prior may have turned it into metres: T is in the lengths of the guidance.
+    confidence, depth_m = _confidence(output), cast(Tensor, output.prediction).float() / output.rescaled
     K = torch.as_tensor(rig.K_left, dtype=torch.float32, device=depth_m.device)[None]
     T = torch.as_tensor(rig.T_right_from_left, dtype=torch.float32, device=K.device)[None]
     points = transform(unproject(depth_m, K), T)  # (1, H, W, 3)

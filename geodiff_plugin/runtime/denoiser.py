@@ -72,9 +72,12 @@ class DenoiserTap:
         """The tapped call: same result, detached; the graph is kept until ``release``."""
         model_input = model_input.detach()
         wide = torch.promote_types(model_input.dtype, torch.float32)
+        kind = model_input.device.type
+        mixed, precision = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
 
         def at(z_t: Tensor) -> Any:
-            with torch.enable_grad():
+            # Guided steps leave the user's autocast, under which the other arguments were made.
+            with torch.enable_grad(), torch.autocast(kind, precision, enabled=mixed):
                 joined = put_channels(model_input, self._channels, z_t.to(model_input.dtype))
                 return forward(joined, *args, **kwargs)
 

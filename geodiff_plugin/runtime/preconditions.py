@@ -38,7 +38,8 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
     Raises:
         TypeError, ValueError: another output type than ``"np"`` and ``"pt"``; a number of steps, a
             resolution, a batch or ensemble size that is no whole number or too small; a way of resampling
-            that does not exist; no generator, or a list of another number than that of all members.
+            that does not exist; no generator, or a list of another number than that of all members; latents
+            that are not finite.
     """
     missing = [name for name in STOCK_ARGUMENTS if name not in call]
     if missing:
@@ -64,6 +65,9 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
             f"one torch.Generator, or a list of {members}: one for every image and member of its ensemble"
         )
         bad_value("generator", expected, f"a list of {len(given)}")
+    latents = call["latents"]
+    if isinstance(latents, torch.Tensor) and not latents.isfinite().all():
+        bad_value("latents", "finite", "NaN or infinity in it")
 
 
 def check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) -> None:

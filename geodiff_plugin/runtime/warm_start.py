@@ -66,10 +66,11 @@ def plan_warm_start(
     if previous is None:
         return None
     assert previous.latent is not None and previous.scale is not None  # as GeometryGuidance saw to
-    device, samples = pipe._execution_device, previous.scale.numel()
-    wanted = call["ensemble_size"] * len(guidance.inputs)
-    if samples != wanted:
-        bad_value("previous", f"the output of {wanted} images or members", f"one of {samples}")
+    device = pipe._execution_device
+    # Not their product alone: three members of one image are no start for three images.
+    given, wanted = tuple(previous.scale.shape), (len(guidance.inputs), call["ensemble_size"])
+    if given != wanted:
+        bad_value("previous", f"the output of {_counted(*wanted)}", f"one of {_counted(*given)}")
     # Its lengths may have become a metric prior's metres, where those of this call are in baselines.
     metres = 1.0 if guidance.unit else previous.rescaled
     near, far = (end.to(device) / metres for end in _ends(previous, prior.space))
@@ -100,6 +101,11 @@ def plan_warm_start(
     level = noise_level(scheduler, timesteps[skipped])
     latents = level.alpha.to(device) * z0.float() + level.sigma.to(device) * noise.to(device).float()
     return WarmStart(near, far, skipped, latents.to(pipe.dtype))
+
+
+def _counted(images: int, members: int) -> str:
+    """How many samples, in words: ``"2 images of 1 member"``."""
+    return f"{images} image{'s' * (images != 1)} of {members} member{'s' * (members != 1)}"
 
 
 def _ends(previous: MetricDepthOutput, space: str) -> tuple[Tensor, Tensor]:

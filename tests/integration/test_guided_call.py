@@ -519,6 +519,29 @@ def test_autocast_leaves_geometry_alone(make_pipeline, textured_plane, left):
     assert mixed.prediction.dtype == np.float32
 
 
+def test_autocast_holds_for_every_call_of_the_network(make_pipeline, textured_plane, left, monkeypatch):
+    """The second update calls the network again, from within the guided step, which leaves autocast."""
+    pipe = enable_geometry_guidance(make_pipeline())
+    monkeypatch.setattr(pipe.unet, "forward", own := Recorded(pipe.unet.forward))
+    guidance = guidance_for(textured_plane, gradient="full", inner_steps=2)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        out = pipe(left, guidance=guidance, generator=seeded(), num_inference_steps=1)
+    assert own.precisions == [torch.bfloat16] * 2
+    assert np.isfinite(out.prediction).all()
+
+
+class Recorded:
+    """A network's forward that notes under which autocast it runs; ``None`` under none."""
+
+    def __init__(self, forward):
+        self.forward, self.precisions = forward, []
+
+    def __call__(self, *args, **kwargs):
+        enabled = torch.is_autocast_enabled("cpu")
+        self.precisions.append(torch.get_autocast_dtype("cpu") if enabled else None)
+        return self.forward(*args, **kwargs)
+
+
 class FakeAlign:
     offload = True
 

@@ -156,6 +156,7 @@ def test_12_bits_in_16_are_told_once_of_either_image(make_pipeline, textured_pla
         ({"resample_method_input": None}, "resample_method_input must be one of area, .*; got None"),
         ({"resample_method_output": "cubic"}, "resample_method_output must be one of .* got 'cubic'"),
         ({"callback_on_step_end": 3}, "callback_on_step_end must be a function; got int"),
+        ({"latents": torch.full((1, 4, 8, 8), torch.nan)}, "latents must be finite; got NaN or infinity"),
     ],
 )
 def test_other_arguments_are_checked_first_too(call, monkeypatch, arguments, message):

@@ -26,6 +26,7 @@ class FakePipeline:
     """Answers with the exact depth of a plane, and says of which part it is not sure."""
 
     def __init__(self) -> None:
+        self.rescaled = 1.0  # metres of a metric prior over the lengths of E
         poses = {"left": np.eye(4), "right": E}
         self.images, self.depth_m, self.calls = {}, {}, []
         for name, size in SIZES.items():
@@ -38,8 +39,9 @@ class FakePipeline:
         confidence = torch.full_like(self.depth_m[name], 0.9)
         confidence[(..., *UNSURE[name])] = 0.5
         again = [call for call, _, _ in self.calls].count(name) > 1
+        depth_m = self.rescaled * (self.depth_m[name] + 10.0 * again)
         return MetricDepthOutput(
-            prediction=self.depth_m[name] + 10.0 * again, confidence=confidence, warnings=[name]
+            prediction=depth_m, confidence=confidence, warnings=[name], rescaled=self.rescaled
         )
 
 
@@ -70,8 +72,11 @@ def test_four_calls_with_the_other_view_and_its_camera(pipe):
     assert [guidance.points_measured for _, guidance, _ in pipe.calls] == [True, True, False, False]
 
 
-def test_only_what_is_sure_there_and_not_here_is_told_at_its_true_place(pipe):
-    guide(pipe)
+@pytest.mark.parametrize("rescaled", [1.0, 4.0])
+def test_only_what_is_sure_there_and_not_here_is_told_at_its_true_place(pipe, rescaled):
+    """In the lengths of E, also where the prior alone knows the metres."""
+    pipe.rescaled = rescaled
+    guide(pipe, knobs={"unit": None} if rescaled != 1.0 else None)
     assert all(own.points is None for _, guidance, _ in pipe.calls[:2] for own in guidance.inputs)
     for name, guidance, _ in pipe.calls[2:]:
         points = guidance.inputs[0].points.double().numpy()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from diffusers import DDIMScheduler, LCMScheduler
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError, InputTypeError
+from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.sequence import SequenceOptions, flicker, run_sequence
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.warm_start import plan_warm_start
@@ -64,8 +67,22 @@ def test_the_command_measures_and_goes_on(tmp_path, monkeypatch):
     assert [row[0] for row in page.tables[0].rows] == ["each frame alone", "warm start, a quarter left out"]
     records = [json.loads(line) for line in (tmp_path / "sequence.jsonl").read_text().splitlines()]
     assert all(0 < record["abs_rel"] < 2 and record["seconds"] > 0 for record in records)
-    monkeypatch.setattr("geodiff_plugin.evaluation.sequence.load_prior", pytest.fail)  # nothing left to do
-    assert run_sequence(options).tables == page.tables
+    measured = []
+
+    def measure(pipe, sequence, way, *_):
+        measured.append(way.title)
+        return dict.fromkeys(("abs_rel", "worst", "flicker", "breath", "seconds"), 0.5)
+
+    rendered = SimpleNamespace(seed=0, kind="room")
+    monkeypatch.setattr("geodiff_plugin.evaluation.sequence.render_sequence", lambda *_, **__: rendered)
+    monkeypatch.setattr("geodiff_plugin.evaluation.sequence._measure", measure)
+    assert run_sequence(options).tables == page.tables and not measured  # nothing left to do
+    path = tmp_path / "sequence.jsonl"
+    path.write_bytes(path.read_bytes()[:-20])  # killed while it wrote
+    assert run_sequence(options).tables != page.tables and measured == ["warm start, a quarter left out"]
+    assert run_sequence(options) and len(measured) == 1
+    monkeypatch.setattr(PriorCache, "fingerprint", lambda self, settings: "trained further")
+    assert run_sequence(options) and len(measured) == 3
 
 
 # Calls that go on
@@ -161,8 +178,16 @@ def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane):
         call(pipe, textured_plane, previous=first.prediction)
     with pytest.raises(InputError, match="output_latent=True"):
         call(pipe, textured_plane, previous=MetricDepthOutput(first.prediction))
-    with pytest.raises(InputError, match="previous must be the output of 2 images or members"):
+    with pytest.raises(InputError, match="output of 1 image of 2 members; got one of 1 image of 1 member"):
         call(pipe, textured_plane, previous=first, size=2)
+    members = copy.copy(first)
+    members.latent = first.latent.repeat(2, 1, 1, 1)
+    members.scale, members.shift, members.global_scale = (
+        value.repeat(1, 2) for value in (first.scale, first.shift, first.global_scale)
+    )
+    two = GeometryGuidance([textured_plane.right] * 2, textured_plane.K, textured_plane.E, previous=members)
+    with pytest.raises(InputError, match="previous must be the output of 2 images of 1 member"):
+        pipe([textured_plane.left] * 2, guidance=two)
     small = MetricDepthOutput(first.prediction, latent=first.latent[..., :-1], scale=first.scale)
     small.shift, small.global_scale = first.shift, first.global_scale
     with pytest.raises(InputError, match="a sequence of its own"):
