@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,16 +19,20 @@ from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
+from geodiff_plugin.evaluation.records import record_key
 from geodiff_plugin.formats import CALIBRATION_FORMATS, read_calibration
 from geodiff_plugin.guidance import presets
 from geodiff_plugin.matching import points_to_matches
 from geodiff_plugin.priors import PRIORS
+from geodiff_plugin.priors.layout import Layout
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from geodiff_plugin.scale.points import fit_to_points
 from geodiff_plugin.scale.space import SPACES, MetricMap
 from tests.conftest import make_vae
 
 (PAGE,) = (Path(__file__).resolve().parents[1] / "docs").rglob("extending.md")
+#: Tables of the blocks that a reader takes alone, with all that they import.
+ALONE = ("TERMS", "SPACES", "RULES", "CALIBRATION_FORMATS", "DATASETS", "METHODS")
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
@@ -52,6 +56,21 @@ def test_a_prior_takes_less_than_40_lines():
     assert max(map(len, prior.splitlines())) <= 120
 
 
+@pytest.mark.parametrize("table", ALONE)
+def test_a_block_runs_in_a_file_of_its_own(page, table):
+    (block,) = [block for block in BLOCKS if f"\n{table}[" in block]
+    names: dict = {}
+    exec(compile(block, PAGE.name, "exec"), names)
+    missing = {
+        name
+        for value in names.values()
+        if isinstance(value, FunctionType) and value.__code__.co_filename == PAGE.name
+        for name in value.__code__.co_names
+        if name in ("np", "torch", "dataclass") and name not in names
+    }
+    assert not missing
+
+
 def test_what_the_page_adds_works(page, textured_plane, tmp_path):
     torch.manual_seed(0)
     unet = UNet2DModel(
@@ -64,6 +83,8 @@ def test_what_the_page_adds_works(page, textured_plane, tmp_path):
     )
     tiny = page["InkPipeline"](unet, make_vae(), DirectScheduler(), default_processing_resolution=64)
     tiny.save_pretrained(tmp_path)
+    own = page["OwnNetworkPrior"].load(Layout(tmp_path, "own"), torch.float32, None)
+    assert isinstance(own, page["InkPipeline"]) and isinstance(own.unet, UNet2DModel)
     pipe = enable_geometry_guidance(load_prior(tmp_path))
     pipe.set_progress_bar_config(disable=True)
     assert isinstance(pipe, page["InkPipeline"])
@@ -112,12 +133,16 @@ def test_a_format_a_data_set_and_a_method(page, textured_plane, tmp_path):
     pair, folder = textured_plane, tmp_path / "one.ink"
     folder.mkdir()
     for name in ("left", "right"):
-        Image.fromarray(getattr(pair, name)).save(folder / f"{name}.png")
+        Image.fromarray(getattr(pair, name)).save(folder / f"ink_{name}.png")
     np.save(folder / "depth.npy", pair.depth_m.astype(np.float32))
     K, E = pair.K, pair.E
     (folder / "cameras").write_text(f"ink 1\n{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]} {E[0, 3]}\n")
     np.testing.assert_allclose(read_calibration(folder / "cameras").E, E)
-    (ref,) = find_pairs(tmp_path, ["ink"])
+    (ref,) = find_pairs(tmp_path)
+    key = record_key(ref, "flat", {}, "", "1")
+    np.save(folder / "depth.npy", 2 * pair.depth_m.astype(np.float32))
+    assert record_key(ref, "flat", {}, "", "1") != key
+    np.save(folder / "depth.npy", pair.depth_m.astype(np.float32))
     sample = load(ref)
     assert sample.label == "ink/one" and sample.depth_m.shape == pair.depth_m.shape
     prediction = find_method("flat").run(sample, Settings(), PriorCache())

@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from typing import Any
 
 from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_priors, with_seeds
-from geodiff_plugin.evaluation.cells import label_of
+from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
 from geodiff_plugin.evaluation.datasets.perturbed import perturbed_ref
 from geodiff_plugin.evaluation.datasets.sample import SampleRef
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
@@ -73,7 +73,7 @@ def remarks_on(records: Sequence[dict[str, Any]], options: PairsOptions) -> list
         if record["status"] == "not applicable":
             key = (find_method(record["method"]).title, record["reason"])
             reasons[key] = reasons.get(key, 0) + 1
-    remarks += [f"{title}: '-' for {n} pairs, {reason}." for (title, reason), n in reasons.items()]
+    remarks += [f"{title}: '-' for {count_of_pairs(n)}, {reason}." for (title, reason), n in reasons.items()]
     broken: dict[tuple[str, str], list[str]] = {}
     for record in records:
         if record["status"] == "broken":

@@ -21,13 +21,15 @@ from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.runner import processes, run
+from geodiff_plugin.priors import PRIORS, find_prior
+from geodiff_plugin.priors.base import OwnPipelinePrior
 
 __all__ = ["COST_METHODS", "PLAIN", "cost_table", "run_cost"]
 
 PLAIN = "prior-aligned"
 """The stock pipeline, which everything is compared with; its alignment costs nothing beside it."""
 COST_METHODS = (PLAIN, "search-only", "guided", "guided:gradient=full", "paper")
-#: Denoising steps when none are asked for: the same for all, and what the default guidance takes.
+#: Denoising steps when none are asked for: what the default guidance takes of a prior that takes any number.
 STEPS = 4
 
 
@@ -64,11 +66,19 @@ def cost_table(records: Sequence[dict[str, Any]]) -> Table:
     header = ("method", "pairs", "seconds", "time × plain", "peak MB", "memory × plain")
     pairs = count_of_pairs(len({label_of(record) for record in records}))
     note = (
-        "Median seconds and greatest peak over the pairs, each method in a process of its own, all with the "
-        "same number of denoising steps. On CUDA the peak is what was allocated, weights included, reset for "
-        "each pair; on the CPU it is the increase of resident memory over the start, sampled every 50 ms."
+        "Median seconds and greatest peak over the pairs, each method in a process of its own, all of one "
+        "prior with the same number of denoising steps. On CUDA the peak is what was allocated, weights "
+        "included, reset for each pair; on the CPU it is the increase of resident memory over the start, "
+        "sampled every 50 ms."
     )
     return Table(f"Cost on {pairs}", header, tuple(rows), note)
+
+
+def _steps_of(prior: str) -> int | None:
+    """``STEPS``, or ``None`` for a prior that was trained for fewer: its own number then."""
+    adapter = PRIORS[find_prior(prior).key]
+    kind = adapter.pipeline_class if issubclass(adapter, OwnPipelinePrior) else adapter
+    return STEPS if kind.max_steps is None or kind.max_steps >= STEPS else None
 
 
 def run_cost(options: PairsOptions) -> Page:
@@ -84,9 +94,12 @@ def run_cost(options: PairsOptions) -> Page:
     if processes(options.settings).num_processes > 1:
         bad_value("the number of processes", "1 for cost", processes(options.settings).num_processes)
     refs = select(all_refs(options), options)
-    settings = replace(options.settings, steps=options.settings.steps or STEPS)
-    records = []
+    records, taken = [], {}
     for method in with_priors(tuple(dict.fromkeys((*COST_METHODS, *options.methods))), options.priors):
+        prior = find_method(method).own_settings(options.settings).prior
+        if prior not in taken:
+            taken[prior] = options.settings.steps or _steps_of(prior)
+        settings = replace(options.settings, steps=taken[prior])
         # What one method frees stays with the allocator, where the next would find it at no cost.
         with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
             job = fresh_process.submit(
@@ -102,7 +115,8 @@ def run_cost(options: PairsOptions) -> Page:
             )
             records += job.result()
     facts = run_facts(command_line(options, ("eval", "cost", "--data", str(options.data)), ()))
-    remarks = [*remarks_on(records, options), f"Denoising steps of each: {settings.steps}."]
+    each = [f"{steps or 'its own number'} with {prior}" for prior, steps in taken.items()]
+    remarks = [*remarks_on(records, options), f"Denoising steps of each: {', '.join(each)}."]
     page = Page("Cost", facts, (cost_table(records),), tuple(remarks))
     write_page(page, options.out, "cost")
     return page

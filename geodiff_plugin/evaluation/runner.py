@@ -30,6 +30,7 @@ from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_npy
+from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.runtime.machine import PeakMemory
 
 __all__ = ["RECORDS_NAME", "headline", "processes", "run"]
@@ -113,8 +114,10 @@ def _depth_path(depth_folder: Path, ref: SampleRef, method: Method) -> Path:
 
 
 def _lacks_map(record: dict[str, Any], path: Path) -> bool:
-    """Whether a finished record is of a metric map that an earlier run has not saved."""
-    return record["status"] == "ok" and record["all_pixels"]["raw"] is not None and not path.is_file()
+    """Whether a finished record is of a metric map that is not saved, or in whose place another run's is."""
+    if record["status"] != "ok" or record["all_pixels"]["raw"] is None:
+        return False
+    return not path.is_file() or record.get("map") != file_digest(path)
 
 
 def _finish(
@@ -139,6 +142,7 @@ def _finish(
         target = _depth_path(depth_folder, ref, method)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_depth_npy(target, prediction.depth_m)
+        body["map"] = file_digest(target)
     return {"rectified": sample.rectified} | body, sample
 
 
@@ -186,7 +190,8 @@ def run(
         crop: region of the image that is scored, one of ``crops.CROPS``.
         skip_broken: go on after a sample that cannot be read or measured; its record says why.
         save_depth: write each metric depth map to ``out/depth/<method>/<dataset>_<sample>.npy``, where the
-            method ``files:out/depth/<method>`` finds it; what is finished but has no map is run again.
+            method ``files:out/depth/<method>`` finds it; what is finished but has no map, or that of other
+            settings, is run again.
         progress: show a bar with each method's running AbsRel.
 
     Returns:

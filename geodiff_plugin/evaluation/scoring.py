@@ -7,6 +7,7 @@ Paper: S5.1 (metrics, raw and aligned).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -55,14 +56,15 @@ def out_of_view(sample: StereoSample) -> np.ndarray:
 def matched(sample: StereoSample) -> np.ndarray | None:
     """``(H, W)`` bool: pixels where our plane sweep of the two views finds a match that it is sure of.
 
-    No method, prior or truth has a part in it. It is kept until another sample object comes, so that one
-    sweep serves all methods, and made on the CPU, so that no two runs differ.
+    No method, prior or truth has a part in it, and poses are the true ones, however they are given. It is
+    kept until another sample object comes, so that one sweep serves all methods, and made on the CPU, so that
+    no two runs differ.
 
     Returns:
         ``None`` where the views cannot be swept: no overlap, no baseline, or an image that is too small.
     """
     try:
-        volume = sweep(sample, "cpu")
+        volume = sweep(replace(sample, E=sample.E_scored), "cpu")
     except ValueError:
         return None
     matches = find_matches(volume.left_01, volume.rights, volume.K, volume=volume)

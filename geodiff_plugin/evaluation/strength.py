@@ -23,7 +23,7 @@ from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.emulated import DENSE, SPACES, STRENGTHS, EmulatedPrior, EmulatedPriors
 from geodiff_plugin.evaluation.figures.strength import draw_strength, shaded
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.records import append_record, read_records, record_key
+from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.strength_tables import strength_tables
 from geodiff_plugin.evaluation.surfaces import DenseTruth
@@ -106,6 +106,7 @@ def run_strength(options: StrengthOptions) -> Page:
     refs = [ref for root in options.data for ref in find_pairs(root)[: options.limit]]
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "strength.jsonl"
+    clean_records(path)
     found = {record["key"]: record for record in read_records(path)}
     prior = EmulatedPrior(options.space, options.follow)
     cache, records = EmulatedPriors(prior), []

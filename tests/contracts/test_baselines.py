@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings
+from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.baselines._fill import fill_background
 from geodiff_plugin.evaluation.baselines.sgbm import sgbm_shift
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from tests.contracts.tiny_transformers import make_transformers
 
 NAN = np.nan
 
@@ -84,6 +85,13 @@ def test_configuration_is_json_and_names_what_matters(name):
     assert "bundled" not in plain  # the prior has its own place in the key
 
 
+@pytest.mark.parametrize("name", [*(key for key in METHODS if key != "sgbm"), "hf:somewhere/model"])
+def test_seconds_of_another_device_are_another_result(name):
+    """All but SGBM, which OpenCV runs on the CPU."""
+    method = find_method(name)
+    assert method.configuration(Settings(device="cuda")) != method.configuration(Settings())
+
+
 def test_same_seed_gives_the_same_depth(priors, textured_plane):
     sample = make_sample(textured_plane)
     first, second = (METHODS["guided"].run(sample, Settings(steps=1), priors) for _ in range(2))
@@ -97,16 +105,34 @@ def test_ensemble_brings_uncertainty(priors, textured_plane):
 
 
 def test_fingerprint_tells_priors_apart(make_pipeline, monkeypatch):
-    pipes = [make_pipeline(), make_pipeline(), make_pipeline()]
+    pipes = [make_pipeline(), make_pipeline(), make_pipeline(), make_pipeline()]
     next(pipes[2].unet.parameters()).data += 1
+    pipes[3].register_to_config(prediction_type="disparity")
 
     def fingerprint(pipe):
         cache = PriorCache()
         monkeypatch.setattr(cache, "get", lambda settings: pipe)
         return cache.fingerprint(Settings())
 
-    same, again, other = (fingerprint(pipe) for pipe in pipes)
-    assert same == again != other
+    same, again, trained, other_space = (fingerprint(pipe) for pipe in pipes)
+    assert same == again and len({same, trained, other_space}) == 3
+
+
+def test_a_decoder_in_a_folder_counts_by_its_files(tmp_path):
+    method = find_method(f"guided:decoder={tmp_path}")
+    before = method.configuration(Settings())
+    (tmp_path / "diffusion_pytorch_model.safetensors").write_bytes(b"trained further")
+    assert method.configuration(Settings()) != before
+    plain = METHODS["guided"].configuration(Settings())
+    assert plain["guidance"]["decoder"] == "full" and "decoder_files" not in plain
+
+
+@pytest.mark.parametrize("name", ["paper", "guided:gradient=full"])
+def test_no_gradient_goes_through_a_network_that_does_not_see_z_t(name, textured_plane, monkeypatch):
+    cache, pipe = PriorCache(), enable_geometry_guidance(make_transformers("glpn"))
+    monkeypatch.setattr(cache, "get", lambda settings: pipe)
+    with pytest.raises(NotApplicable, match="does not see"):
+        find_method(name).run(make_sample(textured_plane), Settings(), cache)
 
 
 @pytest.mark.parametrize("doffs", [0.0, 3.5])

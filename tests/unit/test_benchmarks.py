@@ -63,6 +63,16 @@ def test_tables_stand_between_the_marks():
         cost.with_tables("no marks", "new")
 
 
+def test_axes_that_are_not_measured_keep_their_tables(monkeypatch):
+    monkeypatch.setattr(cost, "_extrapolated", lambda size: ["counted", ""])
+    first, second = cost.AXES[:2]
+    old, new = ([(seconds, 10_000_000)] * 3 for seconds in (1.25, 2.5))
+    both = cost.tables({first.name: old, second.name: old}, operations.Size())
+    page = cost.with_tables(f"{cost.BEGIN}\n{cost.END}\n", both)
+    made = cost.tables({second.name: new}, operations.Size(), page)
+    assert made == cost.tables({first.name: old, second.name: new}, operations.Size())
+
+
 def test_deviation_is_relative():
     mean, most = deviation(np.array([2.2, 4.0]), np.array([2.0, 4.0]))
     assert (mean, most) == (pytest.approx(0.05), pytest.approx(0.1))

@@ -87,6 +87,12 @@ def test_pairs_names_bad_options(data, tmp_path):
         invoke("pairs", data, "--methods", "sgbm", "--limit", 0, "-o", tmp_path / "out")
 
 
+def test_limit_counts_all_sets_together_and_says_so(tmp_path):
+    """In a table of the paper each column is a set, which is limited by itself."""
+    words = " ".join(invoke("pairs", "--help").stdout.replace("│", " ").split())
+    assert "The first N samples alone; in a table of the paper, of each set." in words
+
+
 def test_pairs_draws_a_seeded_sample(data, tmp_path):
     words = ("pairs", data, "--methods", "sgbm", "-o", tmp_path / "out", "--sample")
     picked = ["middlebury2014/two" in invoke(*words, 1, "--seed", seed).stdout for seed in (0, 1, 2, 3, 4, 0)]

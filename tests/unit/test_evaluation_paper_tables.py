@@ -25,6 +25,7 @@ from geodiff_plugin.evaluation.layout import Table, latex_escape
 from geodiff_plugin.evaluation.paper_tables import FoundColumn, layout_table
 from geodiff_plugin.evaluation.published import LAYOUTS
 from geodiff_plugin.formats import write_pfm
+from tests.contracts.tiny_transformers import make_transformers
 
 
 def make_record(method, sample, raw, aligned, dataset="kitti2015", **rest):
@@ -313,10 +314,16 @@ def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, 
     monkeypatch.setattr(cost, "ProcessPoolExecutor", Inline)
     answer = invoke("cost", "--data", scene, "-o", tmp_path / "out", "--save-depth")
     assert jobs == [[name] for name in cost.COST_METHODS]
-    assert re.search("plain pipeline +1 ", answer.stdout) and "Denoising steps of each: 4." in answer.stdout
+    assert re.search("plain pipeline +1 ", answer.stdout)
+    assert "Denoising steps of each: 4 with bundled." in answer.stdout
     assert (tmp_path / "out" / "cost" / "samples.jsonl").is_file()
     assert (tmp_path / "out" / "cost.tex").is_file()
     assert (tmp_path / "out" / "cost" / "depth" / "guided" / "middlebury2014_one.npy").is_file()
+
+
+def test_cost_asks_no_prior_for_more_steps_than_it_was_trained_for(tmp_path):
+    make_transformers("glpn").save_pretrained(tmp_path)
+    assert cost._steps_of("bundled") == cost.STEPS and cost._steps_of(str(tmp_path)) is None
 
 
 def test_every_built_in_row_is_a_method():

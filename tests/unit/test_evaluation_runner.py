@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geodiff_plugin.evaluation import runner
+from geodiff_plugin.evaluation import runner, scoring
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, Settings
 from geodiff_plugin.evaluation.datasets.perturbed import with_perturbed_poses
@@ -16,7 +16,7 @@ from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 from geodiff_plugin.evaluation.detail_tables import disparity_table, regions_table, uncertainty_table
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
 from geodiff_plugin.evaluation.runner import headline, run
-from geodiff_plugin.evaluation.scoring import out_of_view, regions, score
+from geodiff_plugin.evaluation.scoring import matched, out_of_view, regions, score
 from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
 from geodiff_plugin.evaluation.tables import pairs_tables, per_pair_table
 
@@ -117,6 +117,19 @@ def test_poses_given_wrongly_change_no_mask_and_no_true_disparity():
     assert score(wrong, double, None)["disparity"] == score(sample, double, None)["disparity"]
 
 
+def test_matched_pixels_go_by_the_true_poses(monkeypatch):
+    swept = []
+
+    def seen(sample, device):
+        swept.append(sample.E)
+        raise ValueError("no overlap")
+
+    monkeypatch.setattr(scoring, "sweep", seen)
+    sample = make_sample()
+    assert matched(with_perturbed_poses(sample, (20.0, 0.5), "a")) is None
+    np.testing.assert_array_equal(swept[0], sample.E)
+
+
 def test_score_refuses_a_map_of_another_shape_and_a_sample_without_truth():
     with pytest.raises(ValueError, match="prediction.depth_m must be of the left image's shape"):
         score(make_sample(), Prediction(depth_m=np.ones((3, 3))), None)
@@ -206,6 +219,25 @@ def test_depth_maps_are_saved_on_request(bench):
     again = find_method(f"files:{path.parent / 'depth' / 'double'}").run(samples["a"], Settings(), None)
     np.testing.assert_array_equal(again.depth_m, saved)
     assert not (path.parent / "depth" / "double" / "middlebury2014_c.npy").exists()
+
+
+def test_a_saved_map_is_that_of_the_record(bench):
+    """Another configuration leaves its map in the same place."""
+    go, calls, methods, _, path = bench
+    one = methods["exact"]
+    two = make_method(
+        "exact", lambda s: Prediction(depth_m=3.0 * s.depth_m), calls, configuration={"knob": 1}
+    )
+    target = path.parent / "depth" / "exact" / "middlebury2014_a.npy"
+    maps = []
+    for method in (one, two, one):
+        methods["exact"] = method
+        go(save_depth=True)
+        maps.append(np.load(target))
+    assert calls.count(("exact", "a")) == 1 and maps[1][0, 0] == 15.0
+    np.testing.assert_array_equal(maps[0], maps[2])
+    go(save_depth=True)
+    assert ("exact", "a") not in calls
 
 
 def test_a_finished_run_that_saved_no_maps_saves_them_when_asked(bench):

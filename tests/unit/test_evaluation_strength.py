@@ -94,6 +94,11 @@ def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkey
     monkeypatch.setattr("geodiff_plugin.evaluation.strength._measure", measured_again)
     run_strength(StrengthOptions(**{**vars(options), "figure": None}))
     assert (tmp_path / "strength.jsonl").read_text() == written
+    monkeypatch.setattr("geodiff_plugin.evaluation.strength._measure", lambda *_: [])
+    (tmp_path / "strength.jsonl").write_text(written[:-20])  # killed while it wrote
+    run_strength(StrengthOptions(**{**vars(options), "figure": None}))
+    whole = "".join(written.splitlines(keepends=True)[:-1])
+    assert (tmp_path / "strength.jsonl").read_text() == whole  # the next record begins a line of its own
 
 
 def test_a_result_is_that_of_its_pair_and_its_seed(tmp_path):

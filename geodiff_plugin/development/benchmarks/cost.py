@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import takewhile
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -126,9 +127,13 @@ def exponent(values: Sequence[float], found: Sequence[float]) -> float:
     return float(np.polyfit(x, y, 1)[0])
 
 
+def _head_of(axis: Axis) -> str:
+    return f"| {axis.name} | " + " | ".join(map(str, axis.values)) + " | exponent |"
+
+
 def _axis_table(axis: Axis, found: Sequence[tuple[float, int]]) -> list[str]:
     seconds, peaks = ([one[i] for one in found] for i in (0, 1))
-    lines = [f"| {axis.name} | " + " | ".join(map(str, axis.values)) + " | exponent |"]
+    lines = [_head_of(axis)]
     lines.append("| --- |" + " ---: |" * (len(axis.values) + 1))
     cells = " | ".join(f"{s:.2f}" for s in seconds)
     lines.append(f"| CPU seconds | {cells} | {exponent(axis.values, seconds):.2f} |")
@@ -137,17 +142,20 @@ def _axis_table(axis: Axis, found: Sequence[tuple[float, int]]) -> list[str]:
     return [*lines, ""]
 
 
-def tables(measured: dict[str, list[tuple[float, int]]], size: Size) -> str:
+def tables(measured: dict[str, list[tuple[float, int]]], size: Size, page: str = "") -> str:
     """The page's tables as Markdown.
 
     Args:
         measured: name of an axis -> CPU seconds and bytes of each of its values.
         size: of the prior that the extrapolation counts.
+        page: where axes that are not measured keep the table that they have.
     """
-    lines = ["### Measured: bundled prior, one CPU thread", ""]
+    lines, kept = ["### Measured: bundled prior, one CPU thread", ""], page.splitlines()
     for axis in AXES:
         if axis.name in measured:
             lines += _axis_table(axis, measured[axis.name])
+        elif _head_of(axis) in kept:
+            lines += [*takewhile(bool, kept[kept.index(_head_of(axis)) :]), ""]
     return "\n".join([*lines, *_extrapolated(size)])
 
 
@@ -204,10 +212,11 @@ def with_tables(page: str, made: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print the tables, and write them into a page; ``--help`` lists the options."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--write", type=Path, help="a page with marks, whose tables are made anew")
+    parser.add_argument("--write", type=Path, help="a page with marks; tables of axes left out stay")
     parser.add_argument("--axes", nargs="*", type=int, help="numbers of AXES, from 0; all by default")
     typed = parser.parse_args(arguments)
     diffusers_logging.set_verbosity_error()
+    page = "" if typed.write is None else typed.write.read_text(encoding="utf-8")
     chosen = range(len(AXES)) if typed.axes is None else typed.axes
     measured: dict[str, list[tuple[float, int]]] = {}
     for axis in (AXES[i] for i in chosen):
@@ -215,10 +224,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
                 found = fresh_process.submit(measure, **axis.call(value)).result()
             measured.setdefault(axis.name, []).append(found)
-    made = tables(measured, Size())
+    made = tables(measured, Size(), page)
     print(made)
     if typed.write is not None:
-        typed.write.write_text(with_tables(typed.write.read_text(encoding="utf-8"), made), encoding="utf-8")
+        typed.write.write_text(with_tables(page, made), encoding="utf-8")
 
 
 if __name__ == "__main__":

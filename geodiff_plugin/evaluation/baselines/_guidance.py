@@ -9,16 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
-from geodiff_plugin.evaluation.baselines.base import Method, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.baselines._folder import folder_fingerprint
+from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
+from geodiff_plugin.runtime.preconditions import needs_network
 
 __all__ = [
     "Preset",
@@ -90,12 +93,17 @@ def guided_prediction(
 
 
 def guided_configuration(preset: Preset, settings: Settings) -> dict[str, Any]:
-    """Every hyperparameter of a preset and every setting but the prior, as JSON values."""
+    """Every hyperparameter of a preset and every setting but the prior, as JSON values.
+
+    A decoder in a folder counts by its files as well: one that was trained further keeps its name.
+    """
     any_camera = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]])
     to_the_right = np.eye(4)
     to_the_right[0, 3] = 0.1
     guidance = preset(np.zeros((32, 32, 3), np.uint8), any_camera, to_the_right)
     chosen = {key: value for key, value in asdict(settings).items() if key != "prior"}
+    if decoder := folder_fingerprint(Path(guidance.config.decoder)):
+        chosen["decoder_files"] = decoder
     return chosen | {"guidance": guidance.as_run().to_dict()}
 
 
@@ -123,12 +131,15 @@ def guided_method(name: str, title: str, summary: str, preset: Preset) -> Method
         preset: ``(right, K, E)`` -> guidance.
 
     Returns:
-        The method; its configuration is ``guided_configuration``.
+        The method; its configuration is ``guided_configuration``. It does not apply where it takes gradients
+        through a network that does not see z_t.
     """
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-        guidance = preset(*posed_views(sample, settings.views))
+        guidance, pipe = preset(*posed_views(sample, settings.views)), priors.get(settings)
         guidance.evidence_store = priors.evidence
-        return guided_prediction(priors.get(settings), sample, guidance, call_arguments(settings))
+        if needs_network(guidance) and find_adapter(pipe)(pipe).network_input is None:
+            raise NotApplicable("no gradient to z_t, which this prior's network does not see")
+        return guided_prediction(pipe, sample, guidance, call_arguments(settings))
 
     return Method(name, title, summary, run, partial(guided_configuration, preset), uses_prior=True)

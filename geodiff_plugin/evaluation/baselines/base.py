@@ -154,8 +154,8 @@ class PriorCache:
         key = _which(settings)
         if key not in self._fingerprints:
             pipe, digest = self.get(settings), hashlib.sha256()
-            for name in sorted(pipe.components):
-                module = pipe.components[name]
+            # The pipeline's own options are the space of its map, its size, how images are prepared.
+            for name, module in [("", pipe), *sorted(pipe.components.items())]:
                 config = getattr(module, "config", None)
                 # Names that start with an underscore say where it was loaded from and by which version.
                 values = (

@@ -45,7 +45,8 @@ def hf_method(name: str) -> Method:
         return Prediction(depth_m, relative=values, space=found.space)
 
     def configuration(settings: Settings) -> dict[str, Any]:
-        return {"dtype": settings.dtype, "files": folder_fingerprint(Path(name))}
+        files = folder_fingerprint(Path(name))
+        return {"device": settings.device, "dtype": settings.dtype, "files": files}
 
     title = Path(name).name
     return Method(f"hf:{name}", title, f"{title} by transformers", run, configuration, uses_prior=False)

@@ -28,7 +28,8 @@ def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Predic
 
 
 def _configuration(settings: Settings) -> dict[str, Any]:
-    return {"cost": "census", "winner": "take all", "views": settings.views}
+    choices = {"cost": "census", "winner": "take all"}
+    return choices | {"views": settings.views, "device": settings.device}
 
 
 PLANE_SWEEP = Method(

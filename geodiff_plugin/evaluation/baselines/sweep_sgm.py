@@ -32,7 +32,8 @@ def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Predic
 
 
 def _configuration(settings: Settings) -> dict[str, Any]:
-    return {"cost": "census", "aggregation": "semi-global", "fill": "background", "views": settings.views}
+    choices = {"cost": "census", "aggregation": "semi-global", "fill": "background"}
+    return choices | {"views": settings.views, "device": settings.device}
 
 
 SWEEP_SGM = Method(
