@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -33,6 +35,19 @@ def _map(path: Path) -> np.ndarray:
     if depth_m.ndim != 2 or depth_m.dtype.kind != "f" or not depth_m.size:
         bad_value("FRAME", expected, f"{file}")
     return depth_m
+
+
+class _Maps(Sequence[np.ndarray]):
+    """The maps of all frames, read whenever they are asked for: those of a long video exceed the memory."""
+
+    def __init__(self, frames: list[Path]) -> None:
+        self._frames = frames
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, number: Any) -> Any:
+        return _map(self._frames[number])
 
 
 def _has_unit(path: Path) -> bool:
@@ -92,14 +107,14 @@ def run_video(
         photographs: show the left images beside the depth.
     """
     check_video(out, fps)
-    depths_m = [_map(path) for path in frames]
-    for path, depth_m in zip(frames, depths_m, strict=True):
-        if depth_m.shape != depths_m[0].shape:
-            (height, width), (first_height, first_width) = depth_m.shape, depths_m[0].shape
+    depths_m = _Maps(frames)
+    shapes = [depth_m.shape for depth_m in depths_m]
+    for path, shape in zip(frames, shapes, strict=True):
+        if shape != shapes[0]:
+            (height, width), (first_height, first_width) = shape, shapes[0]
             expected = f"all of one shape, {first_width}x{first_height} pixels as {frames[0]}"
             bad_value("FRAME", expected, f"{path} of {width}x{height}", "Make a video of each size.")
     unit = _unit(frames)
-    lefts = [_photograph(path) for path in frames] if photographs else None
-    pictures = depth_frames(depths_m, lefts, near, far, unit)
-    write_depth_video(out, pictures, fps)
-    print(f"{len(pictures)} frames, {len(pictures) / fps:.1f} s -> {out}")
+    lefts = map(_photograph, frames) if photographs else None
+    write_depth_video(out, depth_frames(depths_m, lefts, near, far, unit), fps)
+    print(f"{len(frames)} frames, {len(frames) / fps:.1f} s -> {out}")

@@ -7,6 +7,7 @@ Paper: S5.1 (Tanks and Temples).
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from geodiff_plugin.formats.rigs import intrinsics, pose_from_world_to_camera
 from geodiff_plugin.formats.structured import array_of
 from geodiff_plugin.types import Rig
 
-__all__ = ["COLMAP", "matches", "read"]
+__all__ = ["COLMAP", "image_list", "matches", "read"]
 
 #: Of a model: how many focal lengths stand before cx cy, OpenCV's name of its lens, how many of its
 #: coefficients stand behind. Where OpenCV has more, those that are not there are zero.
@@ -40,7 +41,32 @@ FOREIGN = ("FOV", "THIN_PRISM_FISHEYE")
 CAMERA = re.compile(r"^(\d+) ([A-Z_]+) (\d+) (\d+) (.+)$", re.MULTILINE)
 IMAGE = re.compile(r"^(\d+)((?: [-+.\deE]+){7}) (\d+) (\S.*)$", re.MULTILINE)
 CAMERAS_MARK, IMAGES_MARK = "# Camera list with", "# Image list with"
+LONGEST_HEAD = 200
 UNDISTORT = "Undistort the images first (colmap image_undistorter) and give the model that it writes."
+
+
+def image_list(path: Path) -> str | None:
+    """The text of an ``images.txt`` without its points, which of many photographs are hundreds of megabytes.
+
+    A file that did not change since it was read last is not read again: every pair of a run asks for it.
+
+    Args:
+        path: an existing file.
+
+    Returns:
+        Comments and a line an image; ``None`` for a file without COLMAP's head.
+    """
+    found = path.stat()
+    return _image_list(path.absolute(), found.st_size, found.st_mtime_ns)
+
+
+@lru_cache(maxsize=2)
+def _image_list(path: Path, size: int, changed_ns: int) -> str | None:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        head = file.readline(LONGEST_HEAD)
+        if not head.startswith(IMAGES_MARK):
+            return None
+        return head + "".join(line for line in file if line.startswith("#") or IMAGE.match(line))
 
 
 def matches(text: str, path: Path) -> bool:

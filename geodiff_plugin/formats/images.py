@@ -70,10 +70,20 @@ def _check_floats(values: np.ndarray, name: str) -> np.ndarray:
     return values.astype(np.float32, copy=False).clip(0.0, 1.0)
 
 
+def _has_16_bits(image: Image.Image | np.ndarray) -> bool:
+    """Whether an image has 16 bits; of a coloured one Pillow loads the upper 8, and tells only before."""
+    if isinstance(image, np.ndarray):
+        return image.dtype == np.uint16
+    raw_modes = (str(tile[3]) for tile in getattr(image, "tile", ()))
+    return image.mode.startswith("I") or any(";16" in mode for mode in raw_modes)
+
+
 def _dark_notes(image: Image.Image | np.ndarray, name: str) -> list[str]:
-    """A sentence if an image has 16 bits of which a camera of 10 or 12 filled the lowest; else nothing."""
-    deep = image.mode.startswith("I") if isinstance(image, Image.Image) else image.dtype == np.uint16
-    if not deep or (most := int(np.asarray(image).max())) >= DARK_16_BITS:
+    """A sentence if a camera of 10 or 12 bits filled the lowest of an image's 16; else nothing."""
+    if isinstance(image, Image.Image):
+        image = np.asarray(image if image.mode.startswith("I") else image.convert("RGB"))
+    most = int(image.max()) * (257 if image.dtype == np.uint8 else 1)
+    if most >= DARK_16_BITS:
         return []
     return [
         f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
@@ -111,6 +121,7 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
     found = check_file(path, name, "an image file")
     try:
         with Image.open(found) as image:
+            deep = _has_16_bits(image)
             image.load()
             turn = TURNS.get(image.getexif().get(EXIF_ORIENTATION, UPRIGHT))
             upright = ImageOps.exif_transpose(image)
@@ -131,7 +142,7 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
         )
     _check_sides(upright.height, upright.width, name)
     notes = [ALPHA_DROPPED.format(name=name)] if alpha else []
-    notes += _dark_notes(upright, name)
+    notes += _dark_notes(upright, name) if deep else []
     if turn is not None:
         notes.append(
             f"{name} was {turn} to {upright.width}x{upright.height}, as its EXIF orientation says; "
@@ -228,6 +239,7 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         ValueError: wrong rank or channels, NaN or infinity, floats outside [0, 1], a side under 32 pixels.
     """
     raw = _raw(value, name)
+    deep = _has_16_bits(raw)
     if isinstance(raw, Image.Image):
         if raw.getexif().get(EXIF_ORIENTATION) in TURNS:
             warnings.warn(
@@ -243,7 +255,7 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
             warnings.warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
             raw = raw[..., :3]
         hwc = _scaled(raw, name)
-    for note in _dark_notes(raw, name):
+    for note in _dark_notes(raw, name) if deep else ():
         warnings.warn(note, stacklevel=3)
     hwc = np.repeat(hwc, 3, axis=-1) if hwc.shape[-1] == 1 else hwc
     return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))

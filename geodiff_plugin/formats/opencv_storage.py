@@ -6,7 +6,9 @@ Paper: none.
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,12 +19,16 @@ from geodiff_plugin.formats.structured import parse_json
 
 __all__ = ["is_storage", "parse_storage"]
 
+#: A matrix has rows and columns; from OpenCV 5 on one of Python's ``(5,)`` is "nd", with its sizes in a list.
+KINDS = ("opencv-matrix", "opencv-nd-matrix")
 MATRIX = re.compile(
-    r"^[ \t]*([\w.]+)[ \t]*:[ \t]*!!opencv-matrix\s+"
-    r"rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\S+\s+data:\s*\[([^\]]*)\]",
+    r"^[ \t]*([\w.]+)[ \t]*:[ \t]*!!opencv-(?:nd-)?matrix\s+"
+    r"(?:rows:\s*(\d+)\s+cols:\s*(\d+)|sizes:\s*\[([\d,\s]*)\])\s+dt:\s*(\S+)\s+data:\s*\[([^\]]*)\]",
     re.MULTILINE,
 )
 JSON_MARK = '"opencv-matrix"'
+#: The channels of an entry stand before the letter of its type, as in "2f" of a list of points.
+CHANNELS = re.compile(r'^"?(\d{1,3})')
 #: Older versions write 1. and .Nan into JSON, which has no such numbers.
 BARE_POINT = re.compile(r"(?<=\d)\.(?=[\s,\]}eE])")
 NOT_FINITE = re.compile(r"(-?)\.(Nan|Inf)")
@@ -44,12 +50,13 @@ def _numbers(text: str) -> np.ndarray | None:
         return None
 
 
-def _matrix(key: str, rows: str, cols: str, data: str, path: Path) -> np.ndarray:
-    values = _numbers(data)
-    if values is None or values.size != int(rows) * int(cols):
+def _matrix(key: str, sizes: Sequence[str], kind: str, data: str, path: Path) -> np.ndarray:
+    values, channels = _numbers(data), CHANNELS.search(kind)
+    shape = [int(size[:12]) for size in (*sizes, *([channels[1]] if channels else []))]
+    if values is None or values.size != math.prod(shape):
         got = "other than numbers" if values is None else f"{values.size} numbers"
-        bad_value(f"{key} in {path}", f"{rows}x{cols} numbers", got, "Is the file cut off?")
-    return values.reshape(int(rows), int(cols))
+        bad_value(f"{key} in {path}", f"{'x'.join(map(str, shape))} numbers", got, "Is the file cut off?")
+    return values.reshape(shape)
 
 
 def _parse_yaml(text: str, path: Path) -> dict[str, np.ndarray]:
@@ -59,14 +66,17 @@ def _parse_yaml(text: str, path: Path) -> dict[str, np.ndarray]:
         if values is not None:
             entries[key.lower()] = values
     found = MATRIX.findall(text)
-    if len(found) != text.count("!!opencv-matrix"):
+    count = sum(text.count(f"!!{kind}") for kind in KINDS)
+    if len(found) != count:
         bad_value(
             f"{path}",
-            f"an OpenCV file with {text.count('!!opencv-matrix')} whole matrices",
+            f"an OpenCV file with {count} whole matrices",
             f"{len(found)} with rows, cols, dt and data up to its ]",
             "Is the file cut off?",
         )
-    entries.update({key.lower(): _matrix(key, rows, cols, data, path) for key, rows, cols, data in found})
+    for key, rows, cols, sizes, kind, data in found:
+        shape = (rows, cols) if rows else sizes.replace(",", " ").split()
+        entries[key.lower()] = _matrix(key, shape, kind, data, path)
     return entries
 
 
@@ -81,16 +91,19 @@ def _parse_xml(text: str, path: Path) -> dict[str, np.ndarray]:
         bad_value(f"{path}", "well-formed XML", str(error), "Is the file cut off?")
     entries = {}
     for node in root:
-        if node.get("type_id") == "opencv-matrix":
-            rows, cols, data = (node.findtext(tag, default="").strip() for tag in ("rows", "cols", "data"))
-            if not (rows.isdigit() and cols.isdigit()):
+        if node.get("type_id") in KINDS:
+            rows, cols, sizes, kind, data = (
+                node.findtext(tag, default="").strip() for tag in ("rows", "cols", "sizes", "dt", "data")
+            )
+            shape = sizes.split() or (rows, cols)
+            if not all(size.isdecimal() for size in shape):
                 bad_value(
                     f"{node.tag} in {path}",
                     "a matrix with rows, cols and data",
                     "none",
                     "Is the file cut off?",
                 )
-            entries[node.tag.lower()] = _matrix(node.tag, rows, cols, data, path)
+            entries[node.tag.lower()] = _matrix(node.tag, shape, kind, data, path)
         elif len(node) == 0 and node.text:
             values = _numbers(node.text)
             if values is not None:
@@ -104,11 +117,14 @@ def _parse_json(text: str, path: Path) -> dict[str, np.ndarray]:
     content = parse_json(text, path)
     entries = {}
     for key, value in content.items() if isinstance(content, dict) else ():
-        if isinstance(value, dict) and value.get("type_id") == "opencv-matrix":
-            rows, cols, data = str(value.get("rows", "")), str(value.get("cols", "")), value.get("data")
-            if not (rows.isdecimal() and cols.isdecimal() and isinstance(data, list)):
+        if isinstance(value, dict) and value.get("type_id") in KINDS:
+            sizes, data = value.get("sizes", [value.get("rows"), value.get("cols")]), value.get("data")
+            shape = [str(size) for size in sizes] if isinstance(sizes, list) else [""]
+            if not (all(size.isdecimal() for size in shape) and isinstance(data, list)):
                 bad_value(f"{key} in {path}", "a matrix with rows, cols and data", "none")
-            entries[key.lower()] = _matrix(key, rows, cols, " ".join(map(str, data)), path)
+            entries[key.lower()] = _matrix(
+                key, shape, str(value.get("dt", "")), " ".join(map(str, data)), path
+            )
         elif isinstance(value, (int, float, list)) and not isinstance(value, bool):
             numbers = _numbers(str(value).strip("[]"))
             if numbers is not None:
@@ -124,7 +140,8 @@ def parse_storage(text: str, path: Path) -> dict[str, np.ndarray]:
         path: the file, for messages.
 
     Returns:
-        Float64 arrays by key in small letters; matrices are 2-D, the rest 1-D. Strings are left out.
+        Float64 arrays by key in small letters; matrices have the axes that they were written with, and one
+        for their channels, the rest has one. Strings are left out.
 
     Raises:
         ValueError: cut off or malformed.

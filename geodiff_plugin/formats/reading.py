@@ -19,9 +19,9 @@ import numpy as np
 from geodiff_plugin._checks import FolderError, bad_type, bad_value, check_number
 from geodiff_plugin.formats.booster import BOOSTER
 from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.colmap import COLMAP
+from geodiff_plugin.formats.colmap import COLMAP, image_list
 from geodiff_plugin.formats.euroc import EUROC
-from geodiff_plugin.formats.files import read_text
+from geodiff_plugin.formats.files import check_file, read_text
 from geodiff_plugin.formats.foundation_stereo import FOUNDATION_STEREO
 from geodiff_plugin.formats.kalibr import KALIBR
 from geodiff_plugin.formats.kitti_cam_to_cam import KITTI_CAM_TO_CAM
@@ -69,7 +69,13 @@ def _files(path: PathLike | Sequence[PathLike]) -> tuple[CalibrationFile, ...]:
     paths = _paths(path)
     if len(paths) == 2 and paths[0] == paths[1]:
         paths = paths[:1]
-    return tuple(CalibrationFile(p, read_text(p, "calibration", "a calibration file")) for p in paths)
+    return tuple(CalibrationFile(p, _text(p)) for p in paths)
+
+
+def _text(path: Path) -> str:
+    name, what = "calibration", "a calibration file"
+    images = image_list(check_file(path, name, what))
+    return read_text(path, name, what) if images is None else images
 
 
 def _paths(path: PathLike | Sequence[PathLike]) -> tuple[Path, ...]:

@@ -1,13 +1,15 @@
 """Video of a sequence of depth maps, in one range of colours with a legend.
 
-Data flow: depth maps in metres -> frames -> GIF, WebP or MP4.
+Data flow: depth maps in metres -> frames, one at a time -> GIF, WebP or MP4.
 Paper: none.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from geodiff_plugin._checks import InputFileError, bad_value, check_number
+from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_number
 from geodiff_plugin.formats.atomic import atomic_path
 from geodiff_plugin.plotting.figures import depth_figure, depth_range
 
@@ -24,41 +26,40 @@ __all__ = ["SUFFIXES", "check_video", "depth_frames", "write_depth_video"]
 SUFFIXES = (".mp4", ".webp", ".gif")
 #: Of a frame with its photograph, pixels.
 MOST_WIDTH = 960
+#: The range of colours is taken from so many pixels of all maps.
+MOST_FOR_RANGE = 1 << 24
 
 
 def depth_frames(
     depths_m: Sequence[np.ndarray],
-    photographs: Sequence[Image.Image] | None = None,
+    photographs: Iterable[Image.Image] | None = None,
     near: float | None = None,
     far: float | None = None,
     unit: str | None = "m",
-) -> list[Image.Image]:
-    """One picture a depth map, all of one size and in the same colours.
+) -> Iterator[Image.Image]:
+    """One picture a depth map, all of one size and in the same colours; each is drawn when it is asked for.
 
     Args:
         depths_m: ``(H, W)`` metres each, of one shape.
-        photographs: one a map, shown on its left.
+        photographs: one a map, shown on its left; each is taken when its picture is drawn.
         near: depth of the last colour, metres; ``None`` takes the 2nd percentile over all maps.
         far: depth of the first colour, metres; ``None`` takes the 98th.
         unit: of all maps, ``"m"``, or ``None`` for depths without one, as the legend then says.
 
     Raises:
-        ValueError: no maps, maps of several shapes, or another number of photographs.
+        ValueError: no maps, or maps of several shapes; at the last picture: another number of photographs.
     """
     shapes = sorted({depth_m.shape for depth_m in depths_m})
     if len(shapes) != 1:
         bad_value("depths_m", "at least one map, all of one shape", shapes or "none")
-    if photographs is not None and len(photographs) != len(depths_m):
-        bad_value("photographs", f"one for each of {len(depths_m)} maps", len(photographs))
-    stack = np.concatenate([np.asarray(depth_m).reshape(1, -1) for depth_m in depths_m])
-    near, far = depth_range(stack, near=near, far=far)
-    figures = [depth_figure(depth_m, near=near, far=far, unit=unit) for depth_m in depths_m]
+    every = max(1, math.ceil(len(depths_m) * math.prod(shapes[0]) / MOST_FOR_RANGE))
+    sample = np.concatenate([np.asarray(depth_m).reshape(-1)[::every].copy() for depth_m in depths_m])
+    near, far = depth_range(sample[None], near=near, far=far)
+    figures = (depth_figure(depth_m, near=near, far=far, unit=unit) for depth_m in depths_m)
     if photographs is None:
         return figures
-    shape = shapes[0]
-    return [
-        _beside(photograph, figure, shape) for photograph, figure in zip(photographs, figures, strict=True)
-    ]
+    pairs = zip(photographs, figures, strict=True)
+    return (_beside(photograph, figure, shapes[0]) for photograph, figure in pairs)
 
 
 def _beside(photograph: Image.Image, figure: Image.Image, shape: tuple[int, ...]) -> Image.Image:
@@ -73,12 +74,12 @@ def _beside(photograph: Image.Image, figure: Image.Image, shape: tuple[int, ...]
     )
 
 
-def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
+def _write_mp4(path: Path, size: tuple[int, int], frames: Iterable[Image.Image], fps: float) -> None:
     # H.264 and its like want even sides.
-    width, height = (side // 2 * 2 for side in frames[0].size)
+    width, height = (side // 2 * 2 for side in size)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
     if not writer.isOpened():
-        raise InputFileError("OpenCV cannot open it")  # the caller names the file
+        raise OSError("OpenCV cannot open it")  # the caller names the file
     try:
         for frame in frames:
             writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))
@@ -106,8 +107,10 @@ def check_video(path: str | os.PathLike[str], fps: float) -> None:
     check_number(fps, "fps", 0.1, 120)
 
 
-def write_depth_video(path: str | os.PathLike[str], frames: Sequence[Image.Image], fps: float = 10.0) -> None:
+def write_depth_video(path: str | os.PathLike[str], frames: Iterable[Image.Image], fps: float = 10.0) -> None:
     """Write frames as a video, of the kind that the file's name ends in; whole or not at all.
+
+    An MP4 is written frame by frame; all frames of the others are in memory, as Pillow wants them.
 
     Args:
         path: ends in .mp4 (OpenCV writes it), .webp or .gif.
@@ -120,18 +123,22 @@ def write_depth_video(path: str | os.PathLike[str], frames: Sequence[Image.Image
     """
     path = Path(path)
     check_video(path, fps)
-    if not frames:
+    rest = iter(frames)
+    first = next(rest, None)
+    if first is None:
         bad_value("frames", "at least one picture", "none")
     kind = path.suffix.lower()
     try:
         with atomic_path(path) as temporary:
             if kind == ".mp4":
-                _write_mp4(temporary, frames, fps)
+                _write_mp4(temporary, first.size, itertools.chain([first], rest), fps)
                 return
             more: dict[str, Any] = {"quality": 85} if kind == ".webp" else {}
             more |= {"duration": round(1000 / fps), "loop": 0}
             with open(temporary, "wb") as file:  # Pillow leaves its own open file behind after a Ctrl-C
-                frames[0].save(file, kind[1:], save_all=True, append_images=frames[1:], **more)
+                first.save(file, kind[1:], save_all=True, append_images=rest, **more)
+    except InputError:  # of a photograph
+        raise
     except OSError as error:
         reason = error.strerror or error
         raise InputFileError(

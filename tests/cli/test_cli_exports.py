@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 import types
+import weakref
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from PIL import Image
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
+from geodiff_plugin.formats.npy import read_npy
 from geodiff_plugin.plotting.video import write_depth_video
 
 
@@ -268,6 +270,30 @@ def test_video_of_results_without_a_unit(geodiff, maps):
     assert np.array_equal(first_frame("result-1-depth.npy.gif"), without)
     answer = geodiff("video", "result-0", "result-1")
     assert answer.code == 2 and "all in metres, or all without a unit; got result-0 with" in answer.err
+
+
+def test_a_long_video_is_never_in_memory_as_a_whole(geodiff, maps, tmp_path, monkeypatch):
+    most, alive = [], []
+
+    def counted(path, *rest):
+        depth_m = read_npy(path, *rest)
+        alive.append(weakref.ref(depth_m))
+        most.append(sum(ref() is not None for ref in alive))
+        return depth_m
+
+    def pictures():
+        for shade in range(12):
+            picture = Image.new("RGB", (64, 48), (shade, 0, 0))
+            drawn.append(weakref.ref(picture))
+            most_drawn.append(sum(ref() is not None for ref in drawn))
+            yield picture
+
+    monkeypatch.setattr("geodiff_plugin.cli.video.read_npy", counted)
+    assert geodiff("video", *maps * 4, "--out", "depth.mp4").code == 0
+    assert len(most) >= 12 and max(most) <= 3
+    drawn, most_drawn = [], []
+    write_depth_video(tmp_path / "x.mp4", pictures())
+    assert len(most_drawn) == 12 and max(most_drawn) <= 3
 
 
 class Interrupted:

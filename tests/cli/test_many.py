@@ -415,6 +415,48 @@ def test_a_broken_pair_is_reported_and_the_rest_go_on(geodiff, folders):
     assert not (root / "out" / "b").exists()
 
 
+@pytest.mark.parametrize("fault", ["calibration", "size", "cut off"])
+def test_what_fails_all_pairs_is_said_once_before_the_prior_is_loaded(geodiff, folders, monkeypatch, fault):
+    root, command = folders
+    monkeypatch.setattr("geodiff_plugin.cli.many.run.load_guided_prior", never)
+    calib = root / "calib.txt"
+    if fault == "calibration":
+        calib.write_text("no calibration")
+    elif fault == "size":
+        calib.write_text(calib.read_text().replace("width=", "width=9"))
+    else:
+        for path in (root / "right").iterdir():
+            path.write_bytes(path.read_bytes()[:200])
+    answer = geodiff(*command)
+    assert answer.code == 2 and answer.err.count("geodiff: ") == 1, answer.err
+    assert "The same holds for all 3 pairs; nothing was computed." in answer.err
+    assert not (root / "out").exists() and not list(root.glob(".out*"))
+
+
+def test_pairs_that_fail_for_several_reasons_are_reported_each(geodiff, folders):
+    root, command = folders
+    (root / "left" / "a.png").write_bytes(b"no image")
+    for name in "bc":
+        (root / "right" / f"{name}.png").write_bytes(b"no image")
+    answer = geodiff(*command)
+    assert answer.code == 4 and answer.err.count("geodiff: ") == 3, answer.err
+    assert [row["result"] for row in rows_of(root / "out")] == ["failed"] * 3
+
+
+def test_reports_are_not_kept_in_memory(geodiff, folders, monkeypatch):
+    from geodiff_plugin.cli.many import run
+
+    jobs, work = [], run._run
+
+    def kept(arguments, settings, own, *rest):
+        jobs.extend(own)
+        return work(arguments, settings, own, *rest)
+
+    monkeypatch.setattr(run, "_run", kept)
+    assert geodiff(*folders[1], "-q").code == 0
+    assert len(jobs) == 3 and all(job.report is None and job.inputs is None for job in jobs)
+
+
 def test_a_defect_in_one_pair_keeps_its_traceback(geodiff, folders, monkeypatch):
     from geodiff_plugin.cli.many import job
 

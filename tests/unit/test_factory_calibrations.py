@@ -323,6 +323,22 @@ def test_colmap_folder(tmp_path):
     assert read_calibration(tmp_path, **factory.COLMAP_CHOICE).E[0, 3] == pytest.approx(0.12)
 
 
+def test_colmap_model_of_many_images_with_all_their_points(tmp_path, monkeypatch):
+    """The points of a hundred images exceed what any other calibration has, and no pair needs them."""
+    monkeypatch.setattr("geodiff_plugin.formats.files.LARGEST_TEXT_BYTES", 20_000)
+    points = " ".join(["512.25 40.5 7", "3 200 -1"] * 3000)
+    (tmp_path / "cameras.txt").write_text(factory.COLMAP_CAMERAS)
+    (tmp_path / "images.txt").write_text(factory.COLMAP_IMAGES.replace("320.5 240.25 17", points))
+    assert read_calibration(tmp_path, **factory.COLMAP_CHOICE).E[0, 3] == pytest.approx(0.12)
+    moved = (tmp_path / "images.txt").read_text().replace("rig/right.jpg", "rig/renamed.jpg")
+    (tmp_path / "images.txt").write_text(moved)  # what is remembered is that of the old file
+    with pytest.raises(ValueError, match="one of the 3 in"):
+        read_calibration(tmp_path, **factory.COLMAP_CHOICE)
+    (tmp_path / "images.txt").write_text(points)
+    with pytest.raises(ValueError, match="calibration must be a calibration file; got .* bytes"):
+        read_calibration(tmp_path, **factory.COLMAP_CHOICE)
+
+
 # The doors
 
 

@@ -361,6 +361,24 @@ def test_projections_by_other_names_and_with_points_as_in_orb_slam(tmp_path):
         assert rig.size_left == (None if path.name == "b.yml" else (640, 480))
 
 
+@pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+def test_opencv_arrays_of_one_axis_and_of_several_channels(tmp_path, suffix):
+    """OpenCV 5 writes an array of shape (5,) as another kind of matrix; lists of points have two channels."""
+    cv2 = pytest.importorskip("cv2")
+    K, T = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]), np.array([-0.12, 0.02, 0.04])
+    D1, D2 = np.array([-0.25, 0.125, 0.001, 0.0, 0.0]), np.array([-0.1, 0.2, 0.0, 0.0])
+    points = np.arange(8.0).reshape(4, 1, 2)
+    path = tmp_path / f"s.{suffix}"
+    storage(cv2, path, points=points, M1=K, D1=D1, M2=K, D2=D2, R=np.eye(3), T=T)
+    rig = read_calibration(path, distorted=True)
+    np.testing.assert_allclose(rig.E[:3, 3], -T, atol=1e-12)
+    for lens, coefficients in zip(rig.distortion, (D1, D2), strict=True):
+        np.testing.assert_array_equal(lens.coefficients, coefficients)
+    path.write_text(path.read_text().replace("-0.25,", "").replace("-0.25 ", ""))
+    with pytest.raises(ValueError, match=r"D1 in .* must be .* numbers; got 4 numbers\. Is the file cut off"):
+        read_calibration(path, distorted=True)
+
+
 def test_lens_distortion_by_an_unknown_name_is_no_pinhole(tmp_path):
     cv2 = pytest.importorskip("cv2")
     path = stereo(cv2, tmp_path / "s.yml", "K1 dist_of_left K2 dist_of_right R T".split())

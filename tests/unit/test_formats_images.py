@@ -78,6 +78,24 @@ def test_12_bits_in_16_are_told(tmp_path):
     assert f"its values reach {grey.max()} of 65535" in notes[0] and "multiply them by 16" in notes[0]
 
 
+@pytest.mark.parametrize("channels", [3, 4])
+def test_12_bits_in_16_of_a_coloured_file_are_told(tmp_path, channels):
+    """Pillow keeps the upper 8 bits of these, which leaves 16 levels and no mode that tells."""
+    cv2 = pytest.importorskip("cv2")
+    deep = np.full((H, W, channels), 65535, np.uint16)
+    deep[..., :3] = ramp()[..., ::-1]
+    for times, told in ((16, True), (257, False)):
+        path = tmp_path / f"{times}.png"
+        values = np.concatenate([deep[..., :3] * np.uint16(times), deep[..., 3:]], axis=-1)
+        assert cv2.imwrite(str(path), values)
+        notes = [note for note in read_image(path)[1] if "alpha" not in note]
+        assert len(notes) == told and all("is a 16-bit image that is nearly black" in note for note in notes)
+        with warnings.catch_warnings(record=True) as said, Image.open(path) as image:
+            warnings.simplefilter("always")
+            as_image_01(image, "left")
+        assert [str(w.message) for w in said if "alpha" not in str(w.message)] == notes
+
+
 @pytest.mark.parametrize("mode", ["L", "1", "P", "CMYK"])
 def test_other_modes_become_rgb(tmp_path, mode):
     name = "x.tif" if mode == "CMYK" else "x.png"

@@ -34,7 +34,9 @@ Methods = Annotated[
 ]
 Datasets = Annotated[str | None, typer.Option(help="Comma-separated; all that the folder has by default.")]
 Scenes = Annotated[str | None, typer.Option(help="Comma-separated parts of sample names to keep.")]
-Limit = Annotated[int | None, typer.Option(help="At most this many samples of each data set.")]
+Limit = Annotated[
+    int | None, typer.Option(help="The first N samples alone; in a table of the paper, of each set.")
+]
 Sample = Annotated[int | None, typer.Option(help="Draw this many samples at random, by --seed.")]
 ViewPairs = Annotated[
     str, typer.Option("--pairs", help="Of a group of posed views: default (the first two) or all.")

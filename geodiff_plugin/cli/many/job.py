@@ -37,7 +37,7 @@ from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.runtime.guided_call import native_images
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["Job", "Stages", "ThreadWarnings"]
+__all__ = ["Job", "Reader", "Stages", "ThreadWarnings"]
 
 
 @dataclass(eq=False)
@@ -85,7 +85,7 @@ class Job:
     def let_go(self) -> None:
         """Give the folder and the memory back."""
         self._held.close()
-        self.inputs = self.output = None
+        self.inputs = self.output = self.report = None
 
 
 class ThreadWarnings:
@@ -106,36 +106,26 @@ class ThreadWarnings:
         self._own.__dict__.setdefault("sentences", []).append(sentence)
 
 
-class Stages:
-    """The four stages of every job.
+class Reader:
+    """The first stage of every job, which needs no prior.
 
     Args:
-        pipe: of ``load_guided_prior``.
         settings: what was understood of the options.
         warned: where the warnings of a thread go.
-        warm_start: go on from the pair before, where it has the same size.
-        side_by_side: matching and guiding, which compute, run at the same time: they share the cores.
     """
 
-    def __init__(
-        self,
-        pipe: Any,
-        settings: Settings,
-        warned: ThreadWarnings,
-        warm_start: bool,
-        side_by_side: bool = True,
-    ) -> None:
-        self._pipe, self._settings, self._warned, self._warm_start = pipe, settings, warned, warm_start
-        self._among = 2 if side_by_side else 1
+    def __init__(self, settings: Settings, warned: ThreadWarnings) -> None:
+        self._settings, self._warned = settings, warned
         self._rigs, self._videos, self._held = RigStore(), dict[Path, VideoReader](), ExitStack()
-        self._before: tuple[Job, tuple[int, ...], MetricDepthOutput] | None = None
 
     def close(self) -> None:
         """Close the videos; to be called when the threads are done."""
         self._held.close()
 
     def read(self, job: Job) -> None:
-        """Look at the files, take the folder, decode the views."""
+        """Look at the files, take the folder, decode the views; nothing, if that was done before."""
+        if job.inputs is not None:
+            return
         self._warned.use(job.warnings)
         with job.watch.stage("calibration"):
             check_arguments(_checkable(job))
@@ -143,12 +133,13 @@ class Stages:
             job.hold()
             job.digests = file_digests(job.arguments)  # before: what changes later is another version
             if job.arguments.estimate_pose:
-                job.inputs = read_photographs(job.arguments, self._settings)
+                inputs = read_photographs(job.arguments, self._settings)
             else:
                 views = None if job.ref.frame is None else self._frames(job.ref, job.ref.frame)
                 rig_of = partial(self._rigs.read, sentences=job.warnings)
-                job.inputs = read_inputs(job.arguments, self._settings, views, rig_of)
-            check_image_names(job.arguments, job.inputs)
+                inputs = read_inputs(job.arguments, self._settings, views, rig_of)
+            check_image_names(job.arguments, inputs)
+        job.inputs = inputs
 
     def _frames(self, ref: PairRef, frame: int) -> Any:
         views = [self._video(path).read(frame) for path in (ref.left, ref.right) if path is not None]
@@ -158,6 +149,41 @@ class Stages:
         if path not in self._videos:
             self._videos[path] = self._held.enter_context(VideoReader(path))
         return self._videos[path]
+
+
+class Stages:
+    """The four stages of every job.
+
+    Args:
+        pipe: of ``load_guided_prior``.
+        settings: what was understood of the options.
+        warned: where the warnings of a thread go.
+        warm_start: go on from the pair before, where it has the same size.
+        side_by_side: matching and guiding, which compute, run at the same time: they share the cores.
+        reader: of pairs that are read before the prior is loaded; by default one of its own.
+    """
+
+    def __init__(
+        self,
+        pipe: Any,
+        settings: Settings,
+        warned: ThreadWarnings,
+        warm_start: bool,
+        side_by_side: bool = True,
+        reader: Reader | None = None,
+    ) -> None:
+        self._pipe, self._settings, self._warned, self._warm_start = pipe, settings, warned, warm_start
+        self._among = 2 if side_by_side else 1
+        self._reader = Reader(settings, warned) if reader is None else reader
+        self._before: tuple[Job, tuple[int, ...], MetricDepthOutput] | None = None
+
+    def close(self) -> None:
+        """Close the videos; to be called when the threads are done."""
+        self._reader.close()
+
+    def read(self, job: Job) -> None:
+        """As ``Reader.read``."""
+        self._reader.read(job)
 
     def evidence(self, job: Job) -> None:
         """What the views say by themselves, into a store of the pair's own, where the call finds it."""

@@ -24,7 +24,7 @@ from geodiff_plugin.cli.estimate import load_guided_prior
 from geodiff_plugin.cli.exports import check_exports
 from geodiff_plugin.cli.many.conveyor import Conveyor
 from geodiff_plugin.cli.many.finished import distrust, finished_report
-from geodiff_plugin.cli.many.job import Job, Stages, ThreadWarnings
+from geodiff_plugin.cli.many.job import Job, Reader, Stages, ThreadWarnings
 from geodiff_plugin.cli.many.pairs import PairRef, assumption
 from geodiff_plugin.cli.many.processes import Processes, join_processes
 from geodiff_plugin.cli.many.summary import COLUMNS, SUMMARY, Row, write_summary
@@ -92,28 +92,70 @@ def _work(
         else:
             yield number, _row(ref.name, "there", report)
     if jobs:
-        yield from _run(arguments, settings, jobs, processes)
+        is_whole = len(jobs) == len(refs)
+        yield from _run(arguments, settings, jobs, processes, is_whole)
+
+
+def _refuse_if_all_fail(jobs: Sequence[Job], reader: Reader, quiet: bool) -> None:
+    """Read pairs until one can be read, so that what is wrong with all of them is said once, and early.
+
+    Args:
+        jobs: all pairs of a run. The one that could be read keeps its views.
+        reader: of the pairs.
+        quiet: no progress bar.
+
+    Raises:
+        ValueError: no pair can be read, and for all it is the same reason, but for their names.
+    """
+    first = None
+    for job in tqdm(jobs, "reading", unit="pair", file=sys.stderr, disable=quiet, leave=False, delay=1.0):
+        try:
+            reader.read(job)
+            return
+        except InputError as error:
+            job.let_go()
+            reason = str(error)
+        except Exception:  # a defect: told with its traceback when its turn comes
+            job.let_go()
+            return
+        arguments, cause = job.arguments, reason
+        for path in (arguments.left, arguments.right, arguments.out):
+            cause = cause if path is None else cause.replace(str(path), "")
+        first = first or (reason, cause)
+        if cause != first[1]:
+            return
+    if first is not None:
+        raise InputError(f"{first[0]} The same holds for all {len(jobs)} pairs; nothing was computed.")
 
 
 def _run(
-    arguments: DepthArguments, settings: Settings, jobs: list[Job], processes: Processes
+    arguments: DepthArguments,
+    settings: Settings,
+    jobs: list[Job],
+    processes: Processes,
+    is_whole: bool,
 ) -> Iterator[tuple[int, Row]]:
-    pipe = load_guided_prior(replace(arguments, quiet=arguments.quiet or processes.index > 0), settings)
-    warned = ThreadWarnings()
-    stages = Stages(pipe, settings, warned, arguments.warm_start)
-
-    def failed(job: Job, error: Exception) -> None:
-        job.error = _say_failed(job, error)
-
-    conveyor = Conveyor([stages.read, stages.evidence, stages.guide, stages.write], failed, MOST_ON_THE_WAY)
-    bar = tqdm(total=len(jobs), desc="pairs", unit="pair", file=sys.stderr, disable=arguments.quiet)
-    bar.set_description("pairs" if processes.count == 1 else f"pairs of process {processes.index + 1}")
+    warned, tell = ThreadWarnings(), _once()
     with ExitStack() as held:
-        held.enter_context(bar)
-        held.enter_context(collected_warnings(warned, _once()))
         for job in jobs:  # those on the way when the run is stopped
             held.callback(job.let_go)
-        held.enter_context(closing(stages))
+        reader = held.enter_context(closing(Reader(settings, warned)))
+        if is_whole and len(jobs) > 1:  # the pairs that are left over, or those of one process, are no rule
+            with collected_warnings(warned, tell):
+                _refuse_if_all_fail(jobs, reader, arguments.quiet)
+        pipe = load_guided_prior(replace(arguments, quiet=arguments.quiet or processes.index > 0), settings)
+        stages = Stages(pipe, settings, warned, arguments.warm_start, reader=reader)
+
+        def failed(job: Job, error: Exception) -> None:
+            job.error = _say_failed(job, error)
+
+        conveyor = Conveyor(
+            [stages.read, stages.evidence, stages.guide, stages.write], failed, MOST_ON_THE_WAY
+        )
+        bar = tqdm(total=len(jobs), desc="pairs", unit="pair", file=sys.stderr, disable=arguments.quiet)
+        bar.set_description("pairs" if processes.count == 1 else f"pairs of process {processes.index + 1}")
+        held.enter_context(bar)
+        held.enter_context(collected_warnings(warned, tell))
         for job in held.enter_context(closing(conveyor.run(jobs))):
             elsewhere = None if job.out is None else job.out.elsewhere
             if job.error is None and elsewhere is not None:
