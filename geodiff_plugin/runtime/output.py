@@ -108,6 +108,7 @@ def assemble_output(
         prediction=out(depth_m),
         uncertainty=out(uncertainty),
         relative=out(relative),
+        space=run.prior.space,
         scale=members("scale"),
         shift=members("shift"),
         global_scale=members("g_s"),

@@ -59,8 +59,8 @@ def plan_warm_start(
         size: ``(H, W)`` of the padded processing grid.
 
     Raises:
-        TypeError, ValueError: an output of another number of images or members, or of another size;
-            ``latents`` of another shape than the output's, or no tensor.
+        TypeError, ValueError: an output of another number of images or members, of a prior of another space,
+            or of another size; ``latents`` of another shape than the output's, or no tensor.
     """
     previous = guidance.previous
     if previous is None:
@@ -71,6 +71,9 @@ def plan_warm_start(
     given, wanted = tuple(previous.scale.shape), (len(guidance.inputs), call["ensemble_size"])
     if given != wanted:
         bad_value("previous", f"the output of {_counted(*wanted)}", f"one of {_counted(*given)}")
+    if previous.space != prior.space:
+        expected = f"the output of a prior whose map is affine in {prior.space}"
+        bad_value("previous", expected, f"one in {previous.space}", "Use one prior for a whole sequence.")
     # Its lengths may have become a metric prior's metres, where those of this call are in baselines.
     metres = 1.0 if guidance.unit else previous.rescaled
     near, far = (end.to(device) / metres for end in _ends(previous, prior.space))

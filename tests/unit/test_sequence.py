@@ -188,8 +188,12 @@ def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane):
     two = GeometryGuidance([textured_plane.right] * 2, textured_plane.K, textured_plane.E, previous=members)
     with pytest.raises(InputError, match="previous must be the output of 2 images of 1 member"):
         pipe([textured_plane.left] * 2, guidance=two)
-    small = MetricDepthOutput(first.prediction, latent=first.latent[..., :-1], scale=first.scale)
-    small.shift, small.global_scale = first.shift, first.global_scale
+    other = copy.copy(first)
+    other.space = "disparity"
+    with pytest.raises(InputError, match="a prior whose map is affine in depth; got one in disparity"):
+        call(pipe, textured_plane, previous=other)
+    small = copy.copy(first)
+    small.latent = first.latent[..., :-1]
     with pytest.raises(InputError, match="a sequence of its own"):
         call(pipe, textured_plane, previous=small)
     for latents in (first.latent[..., :-1], first.latent[:, :1]):  # the latter would be spread silently
