@@ -74,12 +74,18 @@ def _beside(photograph: Image.Image, figure: Image.Image, shape: tuple[int, ...]
     )
 
 
-def _write_mp4(path: Path, size: tuple[int, int], frames: Iterable[Image.Image], fps: float) -> None:
+def _unwritable(path: Path, reason: object) -> InputFileError:
+    return InputFileError(f"the video must be a file that can be written; got {path} ({reason}).")
+
+
+def _write_mp4(
+    path: Path, target: Path, size: tuple[int, int], frames: Iterable[Image.Image], fps: float
+) -> None:
     # H.264 and its like want even sides.
     width, height = (side // 2 * 2 for side in size)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
     if not writer.isOpened():
-        raise OSError("OpenCV cannot open it")  # the caller names the file
+        raise _unwritable(target, "OpenCV cannot open it")
     try:
         for frame in frames:
             writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))
@@ -131,16 +137,13 @@ def write_depth_video(path: str | os.PathLike[str], frames: Iterable[Image.Image
     try:
         with atomic_path(path) as temporary:
             if kind == ".mp4":
-                _write_mp4(temporary, first.size, itertools.chain([first], rest), fps)
+                _write_mp4(temporary, path, first.size, itertools.chain([first], rest), fps)
                 return
             more: dict[str, Any] = {"quality": 85} if kind == ".webp" else {}
             more |= {"duration": round(1000 / fps), "loop": 0}
             with open(temporary, "wb") as file:  # Pillow leaves its own open file behind after a Ctrl-C
                 first.save(file, kind[1:], save_all=True, append_images=rest, **more)
-    except InputError:  # of a photograph
+    except InputError:  # of a photograph, or of the file, which it names
         raise
     except OSError as error:
-        reason = error.strerror or error
-        raise InputFileError(
-            f"the video must be a file that can be written; got {path} ({reason})."
-        ) from error
+        raise _unwritable(path, error.strerror or error) from error
