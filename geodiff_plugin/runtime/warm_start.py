@@ -71,7 +71,7 @@ def plan_warm_start(
     given, wanted = tuple(previous.scale.shape), (len(guidance.inputs), call["ensemble_size"])
     if given != wanted:
         bad_value("previous", f"the output of {_counted(*wanted)}", f"one of {_counted(*given)}")
-    if previous.space != prior.space:
+    if previous.space not in (None, prior.space):  # None of one that was put together by hand
         expected = f"the output of a prior whose map is affine in {prior.space}"
         bad_value("previous", expected, f"one in {previous.space}", "Use one prior for a whole sequence.")
     # Its lengths may have become a metric prior's metres, where those of this call are in baselines.

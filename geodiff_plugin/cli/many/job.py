@@ -241,5 +241,6 @@ def _checkable(job: Job) -> DepthArguments:
 
 def _small(output: MetricDepthOutput) -> MetricDepthOutput:
     """What the next call needs of an output, without its maps."""
-    kept = {name: getattr(output, name) for name in ("latent", "scale", "shift", "global_scale")}
+    needed = ("latent", "space", "scale", "shift", "global_scale", "rescaled")
+    kept = {name: getattr(output, name) for name in needed}
     return MetricDepthOutput(prediction=output.prediction[:0], **kept)
