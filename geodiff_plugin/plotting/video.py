@@ -49,17 +49,20 @@ def depth_frames(
     Raises:
         ValueError: no maps, or maps of several shapes; at the last picture: another number of photographs.
     """
-    shapes = sorted({depth_m.shape for depth_m in depths_m})
+    shapes, samples = set(), []
+    for depth_m in depths_m:  # one pass: a map may be read from its file whenever it is asked for
+        every = max(1, math.ceil(len(depths_m) * depth_m.size / MOST_FOR_RANGE))
+        shapes.add(depth_m.shape)
+        samples.append(np.asarray(depth_m).reshape(-1)[::every].copy())
     if len(shapes) != 1:
-        bad_value("depths_m", "at least one map, all of one shape", shapes or "none")
-    every = max(1, math.ceil(len(depths_m) * math.prod(shapes[0]) / MOST_FOR_RANGE))
-    sample = np.concatenate([np.asarray(depth_m).reshape(-1)[::every].copy() for depth_m in depths_m])
-    near, far = depth_range(sample[None], near=near, far=far)
+        bad_value("depths_m", "at least one map, all of one shape", sorted(shapes) or "none")
+    near, far = depth_range(np.concatenate(samples)[None], near=near, far=far)
     figures = (depth_figure(depth_m, near=near, far=far, unit=unit) for depth_m in depths_m)
     if photographs is None:
         return figures
     pairs = zip(photographs, figures, strict=True)
-    return (_beside(photograph, figure, shapes[0]) for photograph, figure in pairs)
+    (shape,) = shapes
+    return (_beside(photograph, figure, shape) for photograph, figure in pairs)
 
 
 def _beside(photograph: Image.Image, figure: Image.Image, shape: tuple[int, ...]) -> Image.Image:
