@@ -1,0 +1,37 @@
+"""Results that no change of the structure may move (``make.py`` freezes them anew)."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.golden.cases import CASES, DATA, NEEDS_DATA
+from tests.golden.make import STORED, machine, summary
+
+FROZEN = json.loads(STORED.read_text())
+#: Relative difference of a quantile that another processor may make, and the same of flags and small numbers.
+TOLERANCE, NEAR_ZERO = 0.02, 0.02
+NEEDS_POSELIB = {"estimated_pose"}
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("name", CASES)
+def test_result_is_the_frozen_one(name: str) -> None:
+    if name in NEEDS_DATA and not DATA.is_dir():
+        pytest.skip("the real pairs are not here")
+    if name in NEEDS_POSELIB:
+        pytest.importorskip("poselib")
+    results, frozen = CASES[name](), FROZEN["cases"][name]
+    assert set(results) == set(frozen)
+    exact = FROZEN["machine"] == machine()
+    for key, value in results.items():
+        now, then = summary(value), frozen[key]
+        if exact or isinstance(value, str):
+            assert now == then, f"{name}.{key} moved"
+            continue
+        assert now["shape"] == then["shape"]
+        np.testing.assert_allclose(
+            now["numbers"], then["numbers"], rtol=TOLERANCE, atol=NEAR_ZERO, err_msg=f"{name}.{key}"
+        )
