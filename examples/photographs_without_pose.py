@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from PIL import Image, ImageOps
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior, render_pair
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
+from tests.scenes import render_pair
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -14,7 +14,8 @@ import argparse
 import numpy as np
 import torch
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior, render_pair
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
+from tests.scenes import render_pair
 
 
 def world_poses(E: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,7 @@ import torch
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
 from geodiff_plugin.formats.video import VideoReader, count_frames
 from geodiff_plugin.plotting.video import depth_frames, write_depth_video
-from geodiff_plugin.synthetic.sequences import render_sequence
+from tests.scenes.sequences import render_sequence
 
 
 def read_frames(left: Path, right: Path, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time names are i
         disable_geometry_guidance,
         enable_geometry_guidance,
     )
-    from geodiff_plugin.synthetic import render_pair
     from geodiff_plugin.types import MetricDepthOutput, Rig
 
 __version__ = "0.1.0"
@@ -46,7 +45,6 @@ __all__ = [
     "load_bundled_prior",
     "load_prior",
     "read_calibration",
-    "render_pair",
 ]
 
 #: Public name -> module, imported on first use so that ``import geodiff_plugin`` stays quick.
@@ -64,7 +62,6 @@ _MODULE_OF = {
     "load_bundled_prior": "geodiff_plugin.bundled",
     "load_prior": "geodiff_plugin.priors",
     "read_calibration": "geodiff_plugin.formats.reading",
-    "render_pair": "geodiff_plugin.synthetic",
 }
 
 

@@ -14,6 +14,8 @@ from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, Model
 from diffusers.configuration_utils import ConfigMixin, register_to_config
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
+import tests.scenes.dataset  # noqa: F401  registers the data set synthetic:N
+
 # Networks and images are tiny here: a second thread costs more than it brings, above all where several
 # processes share the cores. Processes that a test starts read the variable.
 if "OMP_NUM_THREADS" not in os.environ:

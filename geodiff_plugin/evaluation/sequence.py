@@ -27,10 +27,11 @@ from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.guided_call import native_images
 from geodiff_plugin.runtime.machine import pick_device
-from geodiff_plugin.synthetic.sequences import SyntheticSequence, render_sequence
 
-__all__ = ["WAYS", "SequenceOptions", "Way", "flicker", "run_sequence", "sequence_table"]
+__all__ = ["SEQUENCES", "WAYS", "SequenceOptions", "Way", "flicker", "run_sequence", "sequence_table"]
 
+#: What renders a sequence, by name; a checkout registers its renderer (tests/scenes/dataset.py).
+SEQUENCES: dict[str, Any] = {}
 #: A point is the same in the next frame where the depth there is its own within this share.
 SAME_SURFACE = 0.01
 
@@ -99,7 +100,7 @@ class SequenceOptions:
         check_number(self.scenes, "scenes", 1, 10_000, integer=True)
 
 
-def flicker(errors: Sequence[np.ndarray], sequence: SyntheticSequence) -> tuple[float, float]:
+def flicker(errors: Sequence[np.ndarray], sequence: Any) -> tuple[float, float]:
     """Change of log depth of the same surface points from frame to frame, beyond that of the truth.
 
     Args:
@@ -120,7 +121,7 @@ def flicker(errors: Sequence[np.ndarray], sequence: SyntheticSequence) -> tuple[
     return float(np.mean(points)), float(np.mean(breath))
 
 
-def _same_points(sequence: SyntheticSequence, i: int) -> tuple[np.ndarray, ...]:
+def _same_points(sequence: Any, i: int) -> tuple[np.ndarray, ...]:
     """Rows and columns in frame ``i``, and in frame ``i + 1`` those of the same surface points."""
     K = sequence.K.numpy()
     depth, following = (sequence.lefts[j].depth_m[0].numpy().astype(np.float64) for j in (i, i + 1))
@@ -160,7 +161,7 @@ def run_sequence(options: SequenceOptions) -> Page:
         if key in found:
             continue
         if sequence is None or sequence.seed != seed:
-            sequence = render_sequence(seed, options.frames, size=options.size)
+            sequence = SEQUENCES["synthetic"](seed, options.frames, size=options.size)
         found[key] = {"key": key, "seed": seed, "kind": sequence.kind, "way": way}
         found[key] |= _measure(pipe, sequence, WAYS[way], options, store)
         append_record(path, found[key])
@@ -180,7 +181,7 @@ def _key(seed: int, way: str, options: SequenceOptions, device: str, prior: str)
 
 
 def _measure(
-    pipe: Any, sequence: SyntheticSequence, way: Way, options: SequenceOptions, store: EvidenceStore
+    pipe: Any, sequence: Any, way: Way, options: SequenceOptions, store: EvidenceStore
 ) -> dict[str, float]:
     """AbsRel, flicker and seconds a frame of one way of going through a sequence."""
     steps = max(1, round(options.steps * way.share))

@@ -13,10 +13,10 @@ from diffusers import AutoencoderKL, UNet2DConditionModel
 
 from geodiff_plugin.bundled.demo_pair import DemoPair
 from geodiff_plugin.cli.bench import BUNDLED, Cost, measure, run_bench
-from geodiff_plugin.development.benchmarks import full_size, operations
-from geodiff_plugin.development.full_sizes import UNET, VAE
 from geodiff_plugin.runtime.machine import PeakMemory
 from geodiff_plugin.types import Rig
+from tests.benchmarks import full_size, operations
+from tests.benchmarks.full_sizes import UNET, VAE
 
 
 def test_peak_memory_sees_what_is_freed_again():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin.synthetic import render_pair
+from tests.scenes import render_pair
 
 pytest.importorskip("poselib")
 

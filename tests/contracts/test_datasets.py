@@ -20,11 +20,11 @@ from geodiff_plugin.evaluation.datasets.mvsnet import find_mvsnet
 from geodiff_plugin.evaluation.datasets.perturbed import perturbed_ref
 from geodiff_plugin.evaluation.datasets.robustmvd import KEY_VIEWS, find_robustmvd
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
-from geodiff_plugin.evaluation.datasets.synthetic import is_reflective
 from geodiff_plugin.evaluation.records import record_key
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm_png, write_pfm
 from tests.contracts import factory_calibrations as factory
+from tests.scenes.dataset import is_reflective
 
 HEIGHT, WIDTH, F, CX, CY, BASELINE = 40, 64, 50.0, 31.0, 19.5, 0.2
 FAR_HOLE = (slice(0, 5), slice(0, 7))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.synthetic import KINDS, Camera, Material, render_views, sample_scene
-from geodiff_plugin.synthetic.cameras import intrinsics
-from geodiff_plugin.synthetic.layouts import LAYOUTS
-from geodiff_plugin.synthetic.scene import Shape
+from tests.scenes import KINDS, Camera, Material, render_views, sample_scene
+from tests.scenes.cameras import intrinsics
+from tests.scenes.layouts import LAYOUTS
+from tests.scenes.scene import Shape
 
 SIZE = (48, 64)
 SEEDS = range(3)

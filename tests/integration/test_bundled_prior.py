@@ -9,8 +9,8 @@ import pytest
 import torch
 from diffusers import MarigoldDepthPipeline
 
+from examples.training.train import parse, run
 from geodiff_plugin.bundled import PRIOR_FOLDER, load_bundled_prior
-from geodiff_plugin.development.training.train import parse, run
 
 
 def test_folder_is_small_and_holds_no_pickle():
@@ -79,7 +79,7 @@ def test_ground_is_nearer_below():
 
 @pytest.mark.slow
 def test_a_short_training_learns_and_resumes(tmp_path, monkeypatch):
-    from geodiff_plugin.development.training import data
+    from examples.training import data
 
     monkeypatch.setattr(data, "SHAPES", ((64, 96),))
     cache = tmp_path / "cache"

@@ -7,8 +7,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior, render_pair
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
 from geodiff_plugin.guidance.posing import pose_views
+from tests.scenes import render_pair
 
 
 def drifted(seed: int, size: tuple[int, int]):

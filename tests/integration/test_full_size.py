@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.development.random_marigold import random_marigold
+from tests.benchmarks.random_marigold import random_marigold
 from tests.conftest import plane_pair
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geodiff_plugin import enable_geometry_guidance, guide_both_views, load_bundled_prior, render_pair
+from geodiff_plugin import enable_geometry_guidance, guide_both_views, load_bundled_prior
+from tests.scenes import render_pair
 
 CALL = {"processing_resolution": 64, "num_inference_steps": 2}
 

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, guide_both_views
 from geodiff_plugin.guidance.posing import pose_views
-from geodiff_plugin.synthetic import render_pair
 from geodiff_plugin.types import CameraView
 from tests.conftest import plane_pair
 from tests.contracts.tiny_priors import TINY
+from tests.scenes import render_pair
 
 PAPER = {
     "search": "one-number",

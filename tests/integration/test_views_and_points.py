@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
-from geodiff_plugin.synthetic import Camera, render_views, sample_scene
-from geodiff_plugin.synthetic.cameras import intrinsics
+from tests.scenes import Camera, render_views, sample_scene
+from tests.scenes.cameras import intrinsics
 
 SIZE = (72, 96)
 FAST = {"inner_steps": 4, "min_steps": 1, "loss_resolution": 96}

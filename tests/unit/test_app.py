@@ -338,6 +338,7 @@ def test_without_gradio_it_says_what_to_install(monkeypatch):
 
 def test_a_port_that_another_program_has_is_a_sentence(monkeypatch):
     pytest.importorskip("gradio", reason="gradio is in the extra app")
+
     def taken(*_args, **_options):
         raise OSError("Cannot find empty port in range: 8000-8000.")
 

@@ -8,10 +8,10 @@ import torch
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
-from geodiff_plugin.development.benchmarks import calls, cost, large, many, operations
-from geodiff_plugin.development.benchmarks.matrix import deviation
-from geodiff_plugin.development.full_sizes import UNET, VAE
-from geodiff_plugin.development.random_marigold import narrowed
+from tests.benchmarks import calls, cost, large, many, operations
+from tests.benchmarks.full_sizes import UNET, VAE
+from tests.benchmarks.matrix import deviation
+from tests.benchmarks.random_marigold import narrowed
 
 
 def test_calls_of_every_way():

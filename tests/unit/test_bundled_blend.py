@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from examples.training.blend import blend, main
+from examples.training.models import save_prior
 from geodiff_plugin.bundled import PRIOR_FOLDER
 from geodiff_plugin.bundled.loading import open_pipeline
-from geodiff_plugin.development.training.blend import blend, main
-from geodiff_plugin.development.training.models import save_prior
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from geodiff_plugin.development.training import data
-from geodiff_plugin.development.training.latents import resize_scenes
+from examples.training import data
+from examples.training.latents import resize_scenes
 
 
 def test_target_spans_the_quantiles_of_inverse_depth_and_puts_the_sky_farthest():

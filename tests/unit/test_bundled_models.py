@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from examples.training import models, schedule
+from examples.training.state import Average, Progress, restore, store
 from geodiff_plugin.bundled.loading import open_pipeline
-from geodiff_plugin.development.training import models, schedule
-from geodiff_plugin.development.training.state import Average, Progress, restore, store
 
 
 def test_parts_fit_into_sixteen_megabytes_of_float16():

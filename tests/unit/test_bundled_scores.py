@@ -7,9 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.development.benchmarks.bundled_prior import seconds_per_call
-from geodiff_plugin.development.training import validate
-from geodiff_plugin.development.training.evaluate import best_constant, best_plane
+from examples.training import validate
+from examples.training.evaluate import best_constant, best_plane
+from tests.benchmarks.bundled_prior import seconds_per_call
 
 
 def _ramp(seed: int = 0, size: tuple[int, int] = (12, 18)) -> np.ndarray:

@@ -17,8 +17,8 @@ from geodiff_plugin.guidance.evidence_store import make_evidence
 from geodiff_plugin.matching import clean, find_matches
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.cleaning import find_flaws
-from geodiff_plugin.synthetic import SyntheticPair, render_pair
 from geodiff_plugin.types import CameraView
+from tests.scenes import SyntheticPair, render_pair
 
 GRID = 210_000
 

@@ -7,10 +7,10 @@ import torch
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.algorithm.evidence import EvidenceInputs
-from geodiff_plugin.development.benchmarks.matching import textured_pair
 from geodiff_plugin.guidance import evidence_store
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
+from tests.benchmarks.matching import textured_pair
 
 SETTINGS = (GuidanceConfig(), True)
 

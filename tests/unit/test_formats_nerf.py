@@ -16,8 +16,8 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.many.rigs import RigStore
-from geodiff_plugin.synthetic import render_pair
 from tests.contracts import factory_calibrations as factory
+from tests.scenes import render_pair
 
 NAMES = ("images/left.jpg", "images/right.jpg")
 

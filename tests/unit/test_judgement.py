@@ -18,8 +18,8 @@ from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.runtime.judgement import agreement_of_points, judge
 from geodiff_plugin.runtime.signs import Signs, read_signs
 from geodiff_plugin.scale.order import order_agreement
-from geodiff_plugin.synthetic import render_pair
 from geodiff_plugin.types import PoseReport
+from tests.scenes import render_pair
 
 GOOD = Signs(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0)
 

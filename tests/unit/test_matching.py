@@ -10,14 +10,14 @@ import torch
 
 from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
-from geodiff_plugin.development.benchmarks.matching import main as benchmark_main
-from geodiff_plugin.development.benchmarks.matching import textured_pair
 from geodiff_plugin.guidance.config import MatchingConfig, SweepConfig
 from geodiff_plugin.matching.aggregation import NEVER, Room
 from geodiff_plugin.matching.alignment import align_view
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.census import COST_LEVELS, VOTE_LEVELS, census, census_cost, grey_levels
 from geodiff_plugin.matching.sweep import UNSEEN_COST, UNSEEN_LEVEL, inverse_depth_at_shift, median_shift
+from tests.benchmarks.matching import main as benchmark_main
+from tests.benchmarks.matching import textured_pair
 
 SIZE = (96, 144)
 

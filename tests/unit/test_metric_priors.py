@@ -15,9 +15,9 @@ from geodiff_plugin.cli.report import summary_line
 from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.runtime.prompting import PROMPT_LONG_EDGE, prompt_of
-from geodiff_plugin.synthetic import render_pair
 from geodiff_plugin.types import CameraView
 from tests.contracts.tiny_transformers import make_transformers
+from tests.scenes import render_pair
 
 FAST = {"inner_steps": 1, "min_steps": 1, "loss_resolution": 64}
 

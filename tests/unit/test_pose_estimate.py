@@ -16,7 +16,7 @@ from geodiff_plugin.guidance.photographs import estimate_rig
 from geodiff_plugin.pose.estimate import estimate_pose
 from geodiff_plugin.pose.scale import find_scale
 from geodiff_plugin.pose.tracks import Tracks
-from geodiff_plugin.synthetic import render_pair
+from tests.scenes import render_pair
 from tests.unit.test_pose_refine import TRUE, K, angle_deg, make_tracks, pose
 
 pytest.importorskip("poselib")

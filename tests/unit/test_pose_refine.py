@@ -18,8 +18,8 @@ from geodiff_plugin.pose.settle import is_rig, median_residuals, settle_poses, u
 from geodiff_plugin.pose.solve import Prior, solve_poses
 from geodiff_plugin.pose.straighten import fit_displacement, straightened
 from geodiff_plugin.pose.tracks import Tracks, merge_tracks, residuals_px, solve_inverse_depth
-from geodiff_plugin.synthetic import render_pair
 from geodiff_plugin.types import CameraView
+from tests.scenes import render_pair
 
 K = np.array([[500.0, 0, 255.5], [0, 500.0, 191.5], [0, 0, 1]])
 SIZE = (384, 512)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.development.full_sizes import FULL_SIZES
-from geodiff_plugin.development.memory import _LiveBytes, count_memory
 from geodiff_plugin.priors import PRIORS
+from tests.benchmarks.full_sizes import FULL_SIZES
+from tests.benchmarks.memory import _LiveBytes, count_memory
 from tests.contracts.tiny_priors import TINY
 
 

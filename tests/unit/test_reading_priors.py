@@ -12,10 +12,10 @@ import torch
 from diffusers import MarigoldDepthPipeline
 from safetensors.torch import load_file, save_file
 
+from examples.training.models import save_prior
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 from geodiff_plugin.bundled import PRIOR_FOLDER
 from geodiff_plugin.bundled.loading import open_pipeline
-from geodiff_plugin.development.training.models import save_prior
 from geodiff_plugin.priors.hf_depth import HFDepthModel
 
 QUICK = {"num_inference_steps": 1, "processing_resolution": 64}

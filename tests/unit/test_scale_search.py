@@ -11,9 +11,9 @@ import torch
 
 from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
-from geodiff_plugin.development.benchmarks.matching import textured_pair
 from geodiff_plugin.scale.points import refine_to_matches
 from geodiff_plugin.scale.volume_search import argmin_over, search_scale
+from tests.benchmarks.matching import textured_pair
 
 SPACES = {
     "depth": lambda z: z,

@@ -17,9 +17,9 @@ from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.sequence import SequenceOptions, flicker, run_sequence
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.warm_start import plan_warm_start
-from geodiff_plugin.synthetic import render_sequence
 from geodiff_plugin.types import MetricDepthOutput
 from tests.contracts.tiny_geowizard import make_geowizard
+from tests.scenes import render_sequence
 
 FAST = {"inner_steps": 0, "loss_resolution": 64, "corrections": 4}
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from geodiff_plugin.geometry.warping import warp_right_to_left
-from geodiff_plugin.synthetic import CameraEffects, Material, render_mono, render_pair
-from geodiff_plugin.synthetic.cameras import intrinsics
+from tests.scenes import CameraEffects, Material, render_mono, render_pair
+from tests.scenes.cameras import intrinsics
 
 SIZE = (72, 96)
 

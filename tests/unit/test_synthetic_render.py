@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.development.benchmarks.rendering import main, measure
-from geodiff_plugin.synthetic import Camera, CameraEffects, Material, render_views, sample_scene
-from geodiff_plugin.synthetic.builder import Builder, Look
-from geodiff_plugin.synthetic.cameras import intrinsics, tile, untile
-from geodiff_plugin.synthetic.effects import apply_effects, sample_effects
-from geodiff_plugin.synthetic.layouts.ground import crossing, drives, parcels, repairs
-from geodiff_plugin.synthetic.layouts.plants import thicket
-from geodiff_plugin.synthetic.layouts.spot import Spot, camera_pose
-from geodiff_plugin.synthetic.patterns import LAYERS, TEXELS, bake_layer
-from geodiff_plugin.synthetic.photographs import PHOTOGRAPHS, cover_with_photographs
-from geodiff_plugin.synthetic.render import expose, render_linear, soften
-from geodiff_plugin.synthetic.scene import Scene, Shape
-from geodiff_plugin.synthetic.textures import atlas, sample_atlas
+from tests.benchmarks.rendering import main, measure
+from tests.scenes import Camera, CameraEffects, Material, render_views, sample_scene
+from tests.scenes.builder import Builder, Look
+from tests.scenes.cameras import intrinsics, tile, untile
+from tests.scenes.effects import apply_effects, sample_effects
+from tests.scenes.layouts.ground import crossing, drives, parcels, repairs
+from tests.scenes.layouts.plants import thicket
+from tests.scenes.layouts.spot import Spot, camera_pose
+from tests.scenes.patterns import LAYERS, TEXELS, bake_layer
+from tests.scenes.photographs import PHOTOGRAPHS, cover_with_photographs
+from tests.scenes.render import expose, render_linear, soften
+from tests.scenes.scene import Scene, Shape
+from tests.scenes.textures import atlas, sample_atlas
 
 GREY = Look("plain", np.full((3, 3), 0.5), macro=0.0)
 SIZE = (40, 56)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.synthetic.builder import Builder, Look, rotation
-from geodiff_plugin.synthetic.cameras import camera_rays, intrinsics
-from geodiff_plugin.synthetic.layouts import sample_scene
-from geodiff_plugin.synthetic.occlusion import openness
-from geodiff_plugin.synthetic.primitives import INTERSECT, surface
-from geodiff_plugin.synthetic.scene import Camera, Shape
-from geodiff_plugin.synthetic.tracing import Bundles, blocked, nearest
-from geodiff_plugin.synthetic.world import World
+from tests.scenes.builder import Builder, Look, rotation
+from tests.scenes.cameras import camera_rays, intrinsics
+from tests.scenes.layouts import sample_scene
+from tests.scenes.occlusion import openness
+from tests.scenes.primitives import INTERSECT, surface
+from tests.scenes.scene import Camera, Shape
+from tests.scenes.tracing import Bundles, blocked, nearest
+from tests.scenes.world import World
 
 INF = float("inf")
 

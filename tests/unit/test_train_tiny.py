@@ -5,10 +5,8 @@ import torch
 from diffusers import AutoencoderTiny
 from safetensors.torch import save_file
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
-from geodiff_plugin.bundled.loading import open_pipeline
-from geodiff_plugin.development.training import train_tiny as module
-from geodiff_plugin.development.training.train_tiny import (
+from examples.training import train_tiny as module
+from examples.training.train_tiny import (
     build_tiny,
     distillation_loss,
     draw_maps,
@@ -16,6 +14,8 @@ from geodiff_plugin.development.training.train_tiny import (
     perturbed,
     train_tiny,
 )
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
+from geodiff_plugin.bundled.loading import open_pipeline
 from geodiff_plugin.priors.finding import BUNDLED_FOLDER
 
 

@@ -21,7 +21,6 @@ from geodiff_plugin.evaluation.datasets.mvsnet import MVSNET
 from geodiff_plugin.evaluation.datasets.perturbed import with_drifted_rig, with_perturbed_poses
 from geodiff_plugin.evaluation.datasets.robustmvd import ROBUSTMVD
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
-from geodiff_plugin.evaluation.datasets.synthetic import SYNTHETIC
 
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load", "load_pairs"]
 
@@ -37,7 +36,6 @@ DATASETS: dict[str, Dataset] = {
         MVSNET,
         ROBUSTMVD,
         FOLDER,
-        SYNTHETIC,
     )
 }
 """Every data set by name, in the order in which results are listed."""
@@ -60,7 +58,7 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
     """References to every metric pair below ``root``, in the table's order.
 
     Args:
-        root: folder that holds one or several data sets in their official layouts, or ``synthetic:N``.
+        root: folder that holds one or several data sets in their official layouts.
         datasets: names to look for; all by default.
         **options: for the data sets that know them: ``pairs`` and ``pixel_centre`` (mvsnet, robustmvd);
             ``None`` for the set's own default.
@@ -80,7 +78,7 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
         given = {key: options[key] for key in dataset.options if options.get(key) is not None}
         refs += dataset.find(root, **given)
     if not refs and not os.path.isdir(root):
-        bad_value("root", "an existing folder or synthetic:N", str(root))
+        bad_value("root", "an existing folder", str(root))
     return refs
 
 

@@ -1,0 +1,5 @@
+"""Benchmarks: each module prints one table, run as ``python -m tests.benchmarks.NAME``.
+
+Data flow: this machine -> seconds.
+Paper: none.
+"""

@@ -1,0 +1,142 @@
+"""What ``geodiff depth`` on many pairs gains by stages side by side: the same pairs, one after the other.
+
+Data flow: rendered pairs in two folders -> the stages of the command, overlapped and not -> a table
+    (``python -m tests.benchmarks.many``).
+Paper: none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import torch
+from PIL import Image
+
+from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.estimate import load_guided_prior
+from geodiff_plugin.cli.many.conveyor import Conveyor
+from geodiff_plugin.cli.many.job import Job, Stages, ThreadWarnings
+from geodiff_plugin.cli.many.pairs import find_pairs
+from geodiff_plugin.cli.many.run import MOST_ON_THE_WAY
+from geodiff_plugin.cli.settings import read_settings
+from geodiff_plugin.cli.start import start_many
+from geodiff_plugin.cli.terminal import new_table, show
+from tests.scenes import render_pair
+
+__all__ = ["WAYS", "ManyPairs", "main"]
+
+#: Name -> pairs that may be on the way at a time, and whether matching and guiding share the cores.
+WAYS = {
+    "one after the other": (1, False),
+    "overlapped, all threads each": (MOST_ON_THE_WAY, False),
+    "overlapped": (MOST_ON_THE_WAY, True),
+}
+KIND, BASELINE_M = "street", 0.54
+
+
+def write_pairs(folder: Path, count: int, size: tuple[int, int]) -> DepthArguments:
+    """Write rendered pairs of one rig, and give the options that ``geodiff depth`` takes for them.
+
+    Args:
+        folder: for ``left``, ``right`` and ``out``.
+        count: pairs.
+        size: ``(H, W)`` pixels.
+    """
+    height, width = size
+    K = np.array([[0.6 * width, 0, (width - 1) / 2], [0, 0.6 * width, (height - 1) / 2], [0, 0, 1]])
+    for seed in range(count):
+        pair = render_pair(seed, KIND, size, BASELINE_M, K_left=K)
+        for side in ("left", "right"):
+            (folder / side).mkdir(exist_ok=True)
+            pixels = (getattr(pair, side).image_01 * 255).round().byte().permute(1, 2, 0).numpy()
+            Image.fromarray(pixels).save(folder / side / f"{seed:06}.png")
+    return DepthArguments(
+        left=folder / "left",
+        right=folder / "right",
+        fx=K[0, 0],
+        fy=K[1, 1],
+        cx=K[0, 2],
+        cy=K[1, 2],
+        baseline=BASELINE_M,
+        out=folder / "out",
+        overwrite=True,
+        quiet=True,
+    )
+
+
+class ManyPairs:
+    """The work of a run on many pairs, to be done as often as wanted with the same prior.
+
+    Args:
+        arguments: of the run.
+    """
+
+    def __init__(self, arguments: DepthArguments) -> None:
+        start_many(arguments)
+        self._arguments, self._settings = arguments, read_settings(arguments)
+        self._pipe = load_guided_prior(arguments, self._settings)
+
+    def seconds(self, most: int, shared: bool) -> tuple[float, float]:
+        """Seconds of a clock and of all cores for all pairs.
+
+        Args:
+            most: pairs that may be on the way at a time.
+            shared: matching and guiding share the cores, as in the command.
+
+        Raises:
+            Exception: what a stage raised.
+        """
+        jobs = [Job.of(ref, self._arguments) for ref in find_pairs(self._arguments)]
+        stages, broken = Stages(self._pipe, self._settings, ThreadWarnings(), False, shared), []
+        steps = [stages.read, stages.evidence, stages.guide, stages.write]
+        conveyor = Conveyor(steps, lambda job, error: broken.append(error), most)
+        clock, cores = time.perf_counter(), time.process_time()
+        with closing(stages), closing(conveyor.run(jobs)) as finished:
+            for job in finished:
+                job.let_go()
+        taken = time.perf_counter() - clock, time.process_time() - cores
+        if broken:
+            raise broken[0]
+        return taken
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table; ``--help`` lists the options."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--size", type=int, nargs=2, default=(375, 1242), metavar=("H", "W"))
+    parser.add_argument("--pairs", type=int, default=6)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--prior", default="bundled")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="rows for each")
+    parser.add_argument("--repeats", type=int, default=3, help="the ways in turn; the median counts")
+    options = parser.parse_args(arguments)
+    table = new_table(("threads", *WAYS, "ratio"), "seconds of a clock (of all cores) a pair")
+    before = torch.get_num_threads()
+    with tempfile.TemporaryDirectory() as folder:
+        typed = write_pairs(Path(folder), options.pairs, tuple(options.size))
+        many = ManyPairs(replace(typed, device=options.device, prior=options.prior))
+        many.seconds(1, False)  # warms up
+        for threads in options.threads:
+            torch.set_num_threads(threads)
+            taken = {way: [] for way in WAYS}
+            for _ in range(options.repeats):
+                for way, how in WAYS.items():
+                    taken[way].append([value / options.pairs for value in many.seconds(*how)])
+            clock, cores = ({way: median(t[i] for t in taken[way]) for way in WAYS} for i in (0, 1))
+            ratio = clock["overlapped"] / clock["one after the other"]
+            shown = [f"{clock[way]:.2f} ({cores[way]:.2f})" for way in WAYS]
+            table.add_row(f"{threads}", *shown, f"{ratio:.2f}")
+    torch.set_num_threads(before)
+    show(table)
+
+
+if __name__ == "__main__":
+    main()
