@@ -27,6 +27,7 @@ LAYER = {
     "matching": 3,
     "formats": 3,
     "plotting": 3,
+    "runner": 4,
     "scale": 4,
     "algorithm": 5,
     "guidance": 6,

@@ -1,0 +1,218 @@
+"""Jobs that are resumed, shared, killed and that fail."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, fingerprint
+
+CHILD = """
+import sys, time
+from pathlib import Path
+from geodiff_plugin.runner import Item, Journal, Runner
+
+out, pause, stages = Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
+
+def work(item):
+    with open(out / "begun", "a") as file:
+        file.write(f"{item.key}\\n")
+    time.sleep(pause)
+    return {"square": item.payload**2}
+
+items = [Item(f"item{n}", n) for n in range(8)]
+further = [lambda record: record] * (stages - 1)
+runner = Runner(items, Journal(out / "job.jsonl"), progress=False, in_order=stages > 1)
+print(len(runner.run(work, *further)))
+"""
+
+
+def items_of(count, **given):
+    return [Item(f"item{n}", n, **given) for n in range(count)]
+
+
+def go(folder, work, count=4, stages=1, said=None, **keywords):
+    """The records of a run of ``work`` in one stage, or behind others that hand an item on."""
+    say = (lambda sentence: None) if said is None else said.append
+    runner = Runner(items_of(count), Journal(folder / "job.jsonl"), progress=False, say=say, **keywords)
+    return runner.run(*[lambda item: item] * (stages - 1), work)
+
+
+@pytest.mark.parametrize("stages", [1, 3])
+def test_a_second_run_does_what_is_missing(tmp_path, stages):
+    calls = []
+
+    def work(item):
+        calls.append(item.payload)
+        return {"square": item.payload**2}
+
+    assert [r["square"] for r in go(tmp_path, work, 3, stages)] == [0, 1, 4]
+    assert [r["square"] for r in go(tmp_path, work, 5, stages)] == [0, 1, 4, 9, 16]
+    assert calls == [0, 1, 2, 3, 4]
+    assert [path.name for path in tmp_path.iterdir()] == ["job.jsonl"]
+
+
+@given(
+    cut=st.integers(0, 200), extra=st.sampled_from([b"", b'{"key": "item', b"\xff\xfe", b"[1]\n", b"\n\n"])
+)
+def test_a_torn_end_costs_its_line_only(tmp_path_factory, cut, extra):
+    folder, calls = tmp_path_factory.mktemp("torn"), []
+
+    def work(item):
+        calls.append(item.key)
+        return {"text": f"line {item.payload}\n"}
+
+    first = go(folder, work)
+    path = folder / "job.jsonl"
+    content = path.read_bytes()[: max(0, path.stat().st_size - cut)]
+    path.write_bytes(content + extra)
+    calls.clear()
+    assert go(folder, work) == first
+    assert len(calls) <= 4 - content.count(b"\n") and go(folder, work) == first
+
+
+def test_changed_inputs_and_lost_files_are_made_again(tmp_path):
+    picture, journal = tmp_path / "left.png", tmp_path / "job.jsonl"
+    calls = []
+
+    def run(whole=None):
+        item = Item("pair", inputs=fingerprint({"picture": picture}, "0.1.0"))
+        record = Runner([item], Journal(journal), progress=False, whole=whole).run(
+            lambda i: calls.append(i) or {}
+        )
+        return record[0]["inputs"]
+
+    picture.write_text("old")
+    first = run()
+    picture.touch()
+    assert run() == first and len(calls) == 1
+    picture.write_text("another")
+    assert run() != first and len(calls) == 2
+    picture.write_text("old")
+    assert run() == first and len(calls) == 2
+    run(whole=lambda item, record: False)
+    assert len(calls) == 3
+
+
+def test_a_fingerprint_is_of_contents(tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    for path in (here, there):
+        path.write_text("same")
+    assert fingerprint({"file": here, "n": (1, 2)}) == fingerprint({"n": [1, 2], "file": there})
+    assert fingerprint({"file": tmp_path}) == fingerprint({}) != fingerprint({"file": None})
+    there.write_text("other")
+    assert fingerprint(here) != fingerprint(there)
+
+
+def test_a_failure_ends_the_run_unless_it_is_survived(tmp_path):
+    said, fixed = [], False
+
+    def work(item):
+        if item.payload in (1, 2) and not fixed:
+            raise FileNotFoundError(f"{item.key} is missing")
+        return {"status": "ok"}
+
+    with pytest.raises(FileNotFoundError, match="item1 is missing"):
+        go(tmp_path, work)
+    records = go(tmp_path, work, said=said, survives=(OSError,))
+    assert [r["status"] for r in records] == ["ok", BROKEN, BROKEN, "ok"]
+    assert records[1]["error"] == "item1 is missing"
+    assert said == [
+        "geodiff: item1: item1 is missing",
+        "geodiff: 2 of 4 items failed for one reason: item1, item2.",
+    ]
+    fixed = True
+    assert [r["status"] for r in go(tmp_path, work)] == ["ok"] * 4
+
+
+def test_what_fails_every_item_is_said_once(tmp_path):
+    said = []
+
+    def work(item):
+        raise ValueError(f"{item.key} has no camera")
+
+    with pytest.raises(ValueError, match=r"item0 has no camera The same holds for all 4 items"):
+        go(tmp_path, work, said=said, survives=(ValueError,), stages=2)
+    assert said == []
+
+
+def test_a_defect_keeps_its_traceback(tmp_path):
+    said = []
+    records = go(tmp_path, lambda item: {"n": 1 // (item.payload % 2)}, said=said, survives=(Exception,))
+    assert records[0]["error"].startswith("ZeroDivisionError: ") and records[1]["n"] == 1
+    assert [sentence.startswith("Traceback") for sentence in said] == [True, False, False]
+
+
+def test_stages_work_side_by_side_and_let_go_of_every_item(tmp_path):
+    released, threads = [], set()
+
+    def stage(value):
+        threads.add(threading.get_ident())
+        return value
+
+    def last(item):
+        threads.add(threading.get_ident())
+        if item.payload == 2:
+            raise KeyError("defect")
+        return {}
+
+    runner = Runner(items_of(6), Journal(tmp_path / "job.jsonl"), progress=False)
+    with pytest.raises(KeyError):
+        runner.run(stage, last, release=lambda item: released.append(item.payload))
+    assert len(threads) == 2 and {0, 1, 2} <= set(released) and len(released) == len(set(released))
+    assert not list(tmp_path.glob(".*"))
+    assert len((tmp_path / "job.jsonl").read_bytes().splitlines()) == 2
+
+
+def test_refusals(tmp_path):
+    with pytest.raises(ValueError, match="items must be of different keys"):
+        Runner([Item("a"), Item("a")], Journal(tmp_path / "job.jsonl"))
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="--out must be a folder that can be written to"):
+        Journal(tmp_path / "file" / "job.jsonl")
+
+
+def start(folder, pause=0.05, stages=1, **environment):
+    words = [sys.executable, "-c", CHILD, str(folder), str(pause), str(stages)]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, env=os.environ | environment, text=True)
+
+
+def begun(folder):
+    return Counter((folder / "begun").read_text().split()) if (folder / "begun").exists() else Counter()
+
+
+@pytest.mark.parametrize("stages", [1, 2])
+@pytest.mark.parametrize("launched", [True, False])
+def test_processes_share_a_job(tmp_path, stages, launched):
+    both = [{"RANK": str(i), "WORLD_SIZE": "2"} if launched else {} for i in range(2)]
+    processes = [start(tmp_path, stages=stages, **environment) for environment in both]
+    counts = [int(process.communicate(timeout=60)[0]) for process in processes]
+    assert counts[0] == 8 and (launched or counts[1] == 8)
+    assert begun(tmp_path) == Counter(f"item{n}" for n in range(8))
+    assert [path.name for path in tmp_path.glob(".*")] == []
+
+
+def test_what_a_killed_process_had_begun_is_taken_over(tmp_path):
+    victim = start(tmp_path, pause=60, RANK="1", WORLD_SIZE="2")
+    while not begun(tmp_path):
+        time.sleep(0.05)
+    first = start(tmp_path, RANK="0", WORLD_SIZE="2")
+    while sum(begun(tmp_path).values()) < 8:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    assert first.poll() is None  # it waits for the item that the other one has
+    victim.send_signal(signal.SIGKILL)
+    victim.communicate()
+    assert first.communicate(timeout=60)[0] == "8\n"
+    assert begun(tmp_path) == Counter(f"item{n}" for n in range(8)) + Counter(["item4"])
+    records = [json.loads(line) for line in Path(tmp_path / "job.jsonl").read_text().splitlines()]
+    assert sorted(record["square"] for record in records) == [n**2 for n in range(8)]
