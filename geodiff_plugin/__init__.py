@@ -5,7 +5,7 @@
 >>> depth_m = out.prediction  # (1, H, W, 1), metres
 
 The method follows GeoDiff (arXiv 2510.18291). Read the code along the path of one image: ``types``,
-``geometry``, ``guidance.config``, ``matching``, ``scale``, ``algorithm``, ``guidance``, ``priors``,
+``geometry``, ``config``, ``matching``, ``scale``, ``algorithm``, ``guidance``, ``priors``,
 ``runtime``.
 """
 
@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see; at run time names are imported on first use
     from geodiff_plugin._checks import InputError
     from geodiff_plugin.bundled import load_bundled_prior
+    from geodiff_plugin.config import GuidanceConfig
     from geodiff_plugin.formats.reading import read_calibration
-    from geodiff_plugin.guidance.config import GuidanceConfig
     from geodiff_plugin.guidance.guidance import GeometryGuidance
     from geodiff_plugin.priors import PRIORS, load_prior
-    from geodiff_plugin.runtime.both_views import guide_both_views
     from geodiff_plugin.runtime.pipeline import (
         GuidedMarigoldDepthPipeline,
         disable_geometry_guidance,
@@ -41,7 +40,6 @@ __all__ = [
     "Rig",
     "disable_geometry_guidance",
     "enable_geometry_guidance",
-    "guide_both_views",
     "load_bundled_prior",
     "load_prior",
     "read_calibration",
@@ -50,7 +48,7 @@ __all__ = [
 #: Public name -> module, imported on first use so that ``import geodiff_plugin`` stays quick.
 _MODULE_OF = {
     "GeometryGuidance": "geodiff_plugin.guidance.guidance",
-    "GuidanceConfig": "geodiff_plugin.guidance.config",
+    "GuidanceConfig": "geodiff_plugin.config",
     "GuidedMarigoldDepthPipeline": "geodiff_plugin.runtime.pipeline",
     "InputError": "geodiff_plugin._checks",
     "MetricDepthOutput": "geodiff_plugin.types",
@@ -58,7 +56,6 @@ _MODULE_OF = {
     "Rig": "geodiff_plugin.types",
     "disable_geometry_guidance": "geodiff_plugin.runtime.pipeline",
     "enable_geometry_guidance": "geodiff_plugin.runtime.pipeline",
-    "guide_both_views": "geodiff_plugin.runtime.both_views",
     "load_bundled_prior": "geodiff_plugin.bundled",
     "load_prior": "geodiff_plugin.priors",
     "read_calibration": "geodiff_plugin.formats.reading",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import FunctionType, SimpleNamespace
+from types import FunctionType
 
 import numpy as np
 import pytest
@@ -13,7 +13,6 @@ from diffusers import UNet2DModel
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
-from geodiff_plugin.algorithm.objective import Objective
 from geodiff_plugin.algorithm.rules import RULES
 from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.evaluation.alignment import align
@@ -21,7 +20,6 @@ from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings, f
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
 from geodiff_plugin.evaluation.records import record_key
 from geodiff_plugin.formats import CALIBRATION_FORMATS, read_calibration
-from geodiff_plugin.guidance import presets
 from geodiff_plugin.matching import points_to_matches
 from geodiff_plugin.priors import PRIORS
 from geodiff_plugin.priors.layout import Layout
@@ -94,7 +92,6 @@ def test_what_the_page_adds_works(page, textured_plane, tmp_path):
         textured_plane.E,
         rule="sign",
         weights={"photometric": 1.0, "far_pull": 0.1},
-        options={"far_pull.power": 2.0},
         inner_steps=2,
         min_steps=2,
         loss_resolution=64,
@@ -102,17 +99,6 @@ def test_what_the_page_adds_works(page, textured_plane, tmp_path):
     out = pipe(Image.fromarray(textured_plane.left), guidance=guidance)
     assert (out.prediction > 0).all() and np.isfinite(out.prediction).all()
     assert "far_pull" in out.history[0].terms and len(out.history) == 2
-
-
-def test_a_term_takes_its_option(page, textured_plane):
-    estimate = SimpleNamespace(depth_m=torch.full((1, 1, 4, 4), 0.5))
-    for options, value in (({}, 2.0), ({"far_pull.power": 3.0}, 8.0)):
-        settings = presets.DEFAULT.changed(options=options).terms
-        objective = Objective(None, MetricMap(), {"far_pull": 1.0}, settings)
-        assert float(TERMS["far_pull"].function(estimate, **objective.options_of("far_pull"))) == value
-    pair = textured_plane
-    with pytest.raises(ValueError, match="option of options"):
-        GeometryGuidance(pair.right, pair.K, pair.E, options={"far_pull.colour": 1.0})
 
 
 def test_a_space_is_known_to_map_fit_and_alignment(page):

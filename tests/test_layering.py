@@ -16,13 +16,7 @@ LAYER = {
     "_threads": 0,
     "types": 0,
     "geometry": 1,
-    "guidance.fields": 2,
-    "guidance.scale_stages": 2,
-    "guidance.correction_stages": 2,
-    "guidance.loss_stages": 2,
-    "guidance.config": 2,
-    "guidance.presets": 2,
-    "guidance.knobs": 2,
+    "config": 1,
     "pose": 2,
     "matching": 3,
     "formats": 3,
@@ -58,7 +52,7 @@ KNOWN = {_module_name(path) for path in FILES}
 
 
 def _part(module: str) -> str:
-    """``geodiff_plugin.algorithm.terms.base`` -> ``algorithm``; ``guidance.config`` has its own entry."""
+    """``geodiff_plugin.algorithm.terms.base`` -> ``algorithm``; a module may have an entry of its own."""
     parts = module.split(".")[1:]
     own = ".".join(parts[:2])
     return own if own in LAYER else parts[0]

@@ -15,18 +15,40 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.solver import solve_robust
 from geodiff_plugin.algorithm.terms.base import MatchTarget
+from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.geometry.cameras import image_size
-from geodiff_plugin.guidance.config import CorrectionConfig
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.scale.points import weighted_quantile
 
 __all__ = ["Refined", "off_edges", "prior_error", "refine_depth"]
 
-#: Longer side in pixels of the grid that ``smoothness``, ``image_edge`` and ``depth_edge`` are numbers of; on
+#: Longer side in pixels of the grid that ``smoothness``, ``IMAGE_EDGE`` and ``DEPTH_EDGE`` are numbers of; on
 #: another one they are scaled, so that a correction reaches the same share of the image.
 REFERENCE_SIDE = 512.0
-#: Error of the prior at which ``smoothness`` and ``inertia`` are as the configuration says.
-REFERENCE_ERROR = 0.05
+#: Error of the prior at which ``smoothness`` and ``INERTIA`` hold, and the power of it that both fall with.
+REFERENCE_ERROR, STIFFNESS_POWER = 0.05, 4.0
+#: Bounds of the smoothness, however wrong or right the prior is.
+LOOSEST, STIFFEST = 0.03, 100.0
+#: Weight of the correction itself, so that what is far from every match keeps its depth, and its bounds.
+INERTIA, LEAST_INERTIA, MOST_INERTIA = 0.015, 5e-4, 0.03
+#: Passes of a fit, in even ratios from this smoothness to the prior's own, and the least inertia of the
+#: first: it corrects whole regions, with the pixels far from every match.
+PASSES, BROAD_SMOOTHNESS, BROAD_INERTIA = 3, 50.0, 1e-4
+#: Smoothness, and inertia as a share of it, of the fit that measures the prior and finds outliers.
+STIFF_SMOOTHNESS, STIFF_INERTIA = 400.0, 1.3e-3
+#: Robustly reweighted solves, and conjugate-gradient steps of each on every level of its pyramid.
+REWEIGHTINGS, SOLVER_STEPS = 3, 12
+#: Residual, in standard deviations of a match, from which it counts for less.
+CAUCHY = 2.5
+#: Side of the blocks of matches left out to measure the prior, in image sides, and bounds of the error that
+#: is assumed of it, in log depth.
+BLOCK, LEAST_ERROR, MOST_ERROR = 0.08, 0.01, 0.5
+#: Steps in brightness and in log depth across which a correction does not spread, and the share of the
+#: smoothness that remains across any edge.
+IMAGE_EDGE, DEPTH_EDGE, LEAST_LINK = 0.1, 0.1, 1e-3
+#: Matches this close to a depth edge have less weight, a share of the longer side; half of it beside this
+#: step in log depth, which grows with the third power of an error of the prior above the last number: such a
+#: prior does not know where edges are.
+EDGE_REACH, EDGE_STEP, EDGE_ERROR = 0.006, 0.3, 0.11
 #: Share of the right matches' residuals by which the prior is measured, and the normal distribution's
 #: quantile of their size there: the median would not see that a fifth of the scene is on a wrong surface.
 SHARE, DEVIATIONS = 0.8, 1.2816
@@ -68,7 +90,7 @@ class _Observations:
 
 
 def _observations(
-    depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: CorrectionConfig
+    depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: GuidanceConfig
 ) -> _Observations:
     size = image_size(target.inverse_depth)
     guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
@@ -79,7 +101,7 @@ def _observations(
     residual = torch.where(weight > 0, known.log() + log_depth, torch.zeros_like(known))
     right = (weight * target.confidence.clamp_max(1.0)).flatten(1).sum(1, keepdim=True)
     right_share = right / weight.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
-    across, down = (_links(guide, log_depth, axis, config) for axis in (-1, -2))
+    across, down = (_links(guide, log_depth, axis) for axis in (-1, -2))
     return _Observations(residual, noise, weight, right_share, (across, down))
 
 
@@ -87,12 +109,12 @@ def _log_depth(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(depth_m.float().log(), size, mode="bilinear", align_corners=False)
 
 
-def _links(guide: Tensor, log_depth: Tensor, axis: int, config: CorrectionConfig) -> Tensor:
+def _links(guide: Tensor, log_depth: Tensor, axis: int) -> Tensor:
     """Strength with which neighbours along an axis share a correction, ``(B, 1, h, w)`` less one there."""
     scale = max(guide.shape[-2:]) / REFERENCE_SIDE
-    step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / config.image_edge
-    jump = log_depth.diff(dim=axis).abs() / config.depth_edge
-    return scale**2 * torch.exp(-scale * (step + jump)).clamp_min(config.least_link)
+    step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / IMAGE_EDGE
+    jump = log_depth.diff(dim=axis).abs() / DEPTH_EDGE
+    return scale**2 * torch.exp(-scale * (step + jump)).clamp_min(LEAST_LINK)
 
 
 def _times(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Tensor]:
@@ -101,9 +123,7 @@ def _times(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Te
 
 
 @torch.no_grad()
-def off_edges(
-    target: MatchTarget, depth_m: Tensor, error: Tensor, config: CorrectionConfig = DEFAULT.correction
-) -> MatchTarget:
+def off_edges(target: MatchTarget, depth_m: Tensor, error: Tensor) -> MatchTarget:
     """Matches with less confidence near the depth edges of a map, as far as the map knows where they are.
 
     A window of the matching that lies across an edge takes the nearer surface's depth for both.
@@ -111,15 +131,14 @@ def off_edges(
     Args:
         target: matches, not known points: those are measured on their own ray.
         depth_m: ``(B, 1, H, W)`` metres, at any resolution.
-        error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it; one above ``edge_error`` has its
+        error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it; one above ``EDGE_ERROR`` has its
             edges elsewhere than the scene.
-        config: the fit's numbers.
     """
     size = image_size(target.confidence)
     log_depth = _log_depth(depth_m, size)
-    reach = max(1, round(config.edge_reach * max(size)))
+    reach = max(1, round(EDGE_REACH * max(size)))
     span = _highest(log_depth, reach) + _highest(-log_depth, reach)
-    width = config.edge_step * (error / config.edge_error).clamp_min(1.0) ** 3
+    width = EDGE_STEP * (error / EDGE_ERROR).clamp_min(1.0) ** 3
     return replace(target, confidence=target.confidence / (1.0 + (span / width) ** 2))
 
 
@@ -127,19 +146,19 @@ def _highest(values: Tensor, reach: int) -> Tensor:
     return F.max_pool2d(F.pad(values, (reach,) * 4, mode="replicate"), 2 * reach + 1, 1)
 
 
-def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: CorrectionConfig) -> Tensor:
+def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
     """Cauchy weight of residuals that a prior of this error leaves beside the noise of a match."""
     return 1.0 / (1.0 + residual**2 / (config.outlier_width**2 * (noise**2 + error**2)))
 
 
-def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: CorrectionConfig) -> Tensor:
+def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
     """The field ``(B, 1, h, w)`` that only says what matches say over wide regions."""
-    stiff = torch.full_like(error, config.stiff_smoothness)
+    stiff = torch.full_like(error, STIFF_SMOOTHNESS)
 
     def robust(left_over: Tensor) -> Tensor:
         return trusted * _robust(left_over, observed.noise, error, config)
 
-    rounds, inertia = config.reweightings + 1, config.stiff_inertia * stiff
+    rounds, inertia = REWEIGHTINGS + 1, STIFF_INERTIA * stiff
     return solve_robust(
         _times(observed.links, stiff),
         observed.residual,
@@ -147,7 +166,7 @@ def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: Corr
         trusted,
         robust,
         rounds,
-        config.solver_steps,
+        SOLVER_STEPS,
     )[0]
 
 
@@ -165,7 +184,7 @@ def _spread(residual: Tensor, observed: _Observations) -> Tensor:
 
 @torch.no_grad()
 def prior_error(
-    depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: CorrectionConfig = DEFAULT.correction
+    depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: GuidanceConfig = DEFAULT
 ) -> Tensor:
     """How far a prior is wrong, in log depth, as far as its matches can tell.
 
@@ -180,22 +199,22 @@ def prior_error(
 
     Returns:
         ``(B, 1, 1, 1)``, the robust standard deviation of what is predicted wrongly, beyond the noise of
-        matches; within ``least_error`` and ``most_error``, the latter for a sample without matches.
+        matches; within ``LEAST_ERROR`` and ``MOST_ERROR``, the latter for a sample without matches.
     """
     observed = _observations(depth_m, target, left_01, config)
     height, width = observed.residual.shape[-2:]
-    side = max(1, round(config.block * max(height, width)))
+    side = max(1, round(BLOCK * max(height, width)))
     rows, columns = (torch.arange(n, device=depth_m.device) // side for n in (height, width))
     black = ((rows[:, None] + columns[None]) % 2).to(observed.residual.dtype)
-    first = _bounded(_spread(observed.residual, observed), config)
+    first = _bounded(_spread(observed.residual, observed))
     predicted = [_stiff(observed, observed.weight * colour, first, config) for colour in (black, 1.0 - black)]
     error = _spread(torch.where(black > 0, predicted[1], predicted[0]) - observed.residual, observed)
     matched = observed.weight.flatten(1).amax(1).view(-1, 1, 1, 1) > 0
-    return torch.where(matched, _bounded(error, config), torch.full_like(error, config.most_error))
+    return torch.where(matched, _bounded(error), torch.full_like(error, MOST_ERROR))
 
 
-def _bounded(error: Tensor, config: CorrectionConfig) -> Tensor:
-    return error.clamp(config.least_error, config.most_error)
+def _bounded(error: Tensor) -> Tensor:
+    return error.clamp(LEAST_ERROR, MOST_ERROR)
 
 
 @torch.no_grad()
@@ -204,7 +223,7 @@ def refine_depth(
     target: MatchTarget,
     left_01: Tensor,
     error: Tensor,
-    config: CorrectionConfig = DEFAULT.correction,
+    config: GuidanceConfig = DEFAULT,
 ) -> Refined:
     """Least-squares correction of log depth that follows matches and stops at edges.
 
@@ -228,7 +247,7 @@ def refine_depth(
     trusted = observed.weight * _robust(broad - observed.residual, observed.noise, error, config)
 
     def robust(left_over: Tensor) -> Tensor:
-        return trusted / (1.0 + (left_over / (config.correction_cauchy * observed.noise)) ** 2)
+        return trusted / (1.0 + (left_over / (CAUCHY * observed.noise)) ** 2)
 
     found, weights = torch.zeros_like(observed.residual), trusted
     decided = torch.zeros_like(found)
@@ -238,9 +257,7 @@ def refine_depth(
         if k == len(levels) - 1:  # a second right-hand side of ones shows where the correction is decided
             data = torch.cat([data, torch.ones_like(data)], 1)
         links = _times(observed.links, smoothness)
-        part, weights = solve_robust(
-            links, data, inertia, weights, robust, config.reweightings, config.solver_steps
-        )
+        part, weights = solve_robust(links, data, inertia, weights, robust, REWEIGHTINGS, SOLVER_STEPS)
         found, decided = found + part[:, :1], part[:, 1:]
     size = tuple(depth_m.shape[-2:])
     change, support = (
@@ -253,15 +270,15 @@ def refine_depth(
     return Refined(refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), found)
 
 
-def _levels(error: Tensor, config: CorrectionConfig) -> list[tuple[Tensor, Tensor]]:
+def _levels(error: Tensor, config: GuidanceConfig) -> list[tuple[Tensor, Tensor]]:
     """Smoothness and inertia ``(B, 1, 1, 1)`` of every pass, from broad to the prior's own."""
     ratio = REFERENCE_ERROR / error
-    own = (config.smoothness * ratio**config.stiffness_power).clamp(config.loosest, config.stiffest)
-    broad = own.clamp_min(config.broad_smoothness)
-    inertia = (config.inertia * ratio**4).clamp_max(config.most_inertia)
+    own = (config.smoothness * ratio**STIFFNESS_POWER).clamp(LOOSEST, STIFFEST)
+    broad = own.clamp_min(BROAD_SMOOTHNESS)
+    inertia = (INERTIA * ratio**4).clamp_max(MOST_INERTIA)
     levels = []
-    for k in range(config.passes):
-        share = k / (config.passes - 1) if config.passes > 1 else 1.0
-        least = config.broad_inertia ** (1.0 - share) * config.least_inertia**share
+    for k in range(PASSES):
+        share = k / (PASSES - 1) if PASSES > 1 else 1.0
+        least = BROAD_INERTIA ** (1.0 - share) * LEAST_INERTIA**share
         levels.append((broad ** (1.0 - share) * own**share, inertia.clamp_min(least)))
     return levels

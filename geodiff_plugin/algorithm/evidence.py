@@ -15,9 +15,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.objective import FurtherView, Views
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.geometry.projection import plane_rays
-from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.matching import (
     CostVolume,
     Matches,
@@ -128,21 +128,13 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
     size, size_loss = image_size(left_01), image_size(left)
     volume, found, matches, known, sweep_known = None, None, None, None, None
     warnings: list[str] = [] if pose is None else list(pose.warnings)
-    if views and (config.search.search == "volume" or needs_matches):
+    if views and (config.search == "volume" or needs_matches):
         # The sweep chooses its own grid, finer than that of the losses for wide images.
-        sweep = config.sweep
-        volume = build_cost_volume(
-            left_01,
-            views,
-            K_left,
-            depth_range=config.depth_range,
-            config=sweep,
-            matching=config.matching,
-        )
+        volume = build_cost_volume(left_01, views, K_left, depth_range=config.depth_range, config=config)
         if needs_matches:
-            found = find_matches(left_01, views, K_left, volume=volume, matching=config.matching)
+            found = find_matches(left_01, views, K_left, volume=volume)
             matches = _on_grid(found, left, K_loss)
-        check = mirrored_pose_preferred(left_01, views, K_left, found, sweep, config.matching)
+        check = mirrored_pose_preferred(left_01, views, K_left, found)
         if check.preferred:
             warnings.append(INVERSE)
     if points is not None:
@@ -151,7 +143,7 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
         sweep_known, _ = points_to_matches(points, K_left, size, K_grid, size_grid)
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
-    sure = None if matches is None else sure_matches(matches, config.fit)
+    sure = None if matches is None else sure_matches(matches)
     _read_back_once(volume, [one for one in (matches, known, sure) if one is not None])
     return Evidence(
         left,

@@ -19,8 +19,8 @@ from torch import Tensor
 from geodiff_plugin.algorithm.correction import Refined, off_edges, prior_error, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.terms.base import MatchTarget
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry.cameras import image_size
-from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.matching import Matches, reject_reflections, with_points
 
 __all__ = ["Known", "stacked"]
@@ -73,15 +73,6 @@ class Known:
         target = self.matches or self.points
         return None if target is None else (target.confidence.shape[-2], target.confidence.shape[-1])
 
-    def coarser(self, share: float) -> Self:
-        """On a grid whose sides are that share of this one's; of every cell the surest match or point.
-
-        A mean of two inverse depths across an edge is the depth of neither surface.
-        """
-        if share >= 1.0:
-            return self
-        return replace(self, matches=_pooled(self.matches, share), points=_pooled(self.points, share))
-
     def judged(self, depth_m: Tensor, left_01: Tensor) -> Self:
         """With ``kept`` and ``error`` by the prior's first estimate; later ones change nothing.
 
@@ -91,13 +82,15 @@ class Known:
         """
         if self.error is not None or (self.matches is None and self.points is None):
             return self
-        kept, stage = self.kept, self.config.reflections
+        kept, config = self.kept, self.config
         if self.matches is not None and kept is None:
-            rejects = stage.reject_reflections
-            kept = reject_reflections(self.matches, depth_m, stage) if rejects else torch.ones_like(depth_m)
-        known, fit = replace(self, kept=kept), self.config.correction
-        target = known.target(depth_m) if fit.correct or fit.refine else None
-        return known if target is None else replace(known, error=prior_error(depth_m, target, left_01, fit))
+            rejects = config.reject_reflections
+            kept = reject_reflections(self.matches, depth_m) if rejects else torch.ones_like(depth_m)
+        known = replace(self, kept=kept)
+        target = known.target(depth_m) if config.correct or config.refine else None
+        return (
+            known if target is None else replace(known, error=prior_error(depth_m, target, left_01, config))
+        )
 
     def of_sample(self, index: int) -> tuple[Tensor | None, Tensor | None]:
         """``kept (1, h, w)`` and ``error (1, 1, 1)`` of one sample."""
@@ -118,7 +111,7 @@ class Known:
         """What an estimate is refined by: usable matches, and points; ``None`` without either."""
         matches = self.usable_matches
         if matches is not None and self.error is not None:
-            matches = off_edges(matches, depth_m, self.error, self.config.correction)
+            matches = off_edges(matches, depth_m, self.error)
         return matches if self.points is None else with_points(matches, self.points)
 
     def refine(self, depth_m: Tensor, left_01: Tensor) -> Refined | None:
@@ -131,16 +124,7 @@ class Known:
         target = self.target(depth_m)
         if target is None or self.error is None:
             return None
-        return refine_depth(depth_m, target, left_01, self.error, self.config.correction)
-
-
-def _pooled(target: MatchTarget | None, share: float) -> MatchTarget | None:
-    if target is None:
-        return None
-    size = [max(1, round(share * side)) for side in target.confidence.shape[-2:]]
-    confidence, at = F.adaptive_max_pool2d(target.confidence, size, return_indices=True)
-    inverse_depth = target.inverse_depth.flatten(2).gather(2, at.flatten(2)).view_as(confidence)
-    return replace(target, inverse_depth=inverse_depth, confidence=confidence)
+        return refine_depth(depth_m, target, left_01, self.error, self.config)
 
 
 def _resized(values: Tensor, size: tuple[int, int]) -> Tensor:

@@ -6,19 +6,17 @@ Paper: Eq. 14 (eq:geo-loss) with Eq. 16 and 17.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.terms import TERMS, Estimate, MatchTarget
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.geometry.projection import PlaneRays
 from geodiff_plugin.geometry.warping import hidden_in_right, warp_right_to_left
-from geodiff_plugin.guidance.config import TermsConfig
 from geodiff_plugin.scale.space import AffineState, MetricMap
 
 __all__ = ["Loss", "Objective", "FurtherView", "Views"]
@@ -85,16 +83,14 @@ class Objective:
     Attributes:
         views: what the cameras saw.
         metric: the prior's metric parametrisation.
-        weights: weight by name of ``TERMS``; a term of weight 0 is not computed.
-        settings: what the terms ask for by name, and ``min_visible``, the share in view below which a
-            sample's photometric term is switched off: a depth that pushes the scene out of the right image
-            leaves nothing to compare and would win.
+        config: weights by name of ``TERMS``, a term of weight 0 is not computed; what the terms ask for by
+            name; and ``min_visible``, the share in view below which a sample's photometric term is switched
+            off: a depth that pushes the scene out of the right image leaves nothing to compare and would win.
     """
 
     views: Views
     metric: MetricMap
-    weights: Mapping[str, float]
-    settings: TermsConfig
+    config: GuidanceConfig
 
     def metric_depth(self, x: Tensor, affine: AffineState) -> Tensor:
         """``x (B, 1, h, w)`` upsampled to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""
@@ -133,7 +129,7 @@ class Objective:
         }
         active = {
             name: weight
-            for name, weight in self.weights.items()
+            for name, weight in self.config.weights.items()
             if weight and not any(absent and getattr(TERMS[name], need) for need, absent in lacking.items())
         }
         depth_m = self.metric_depth(x, affine)
@@ -150,20 +146,14 @@ class Objective:
         values = {}
         for name, weight in active.items():
             term = TERMS[name]
-            value = term.function(estimate, **self.options_of(name))
+            value = term.function(
+                estimate, **{option: getattr(self.config, option) for option in term.options}
+            )
             if term.needs_warp:
-                value = value * (visible_fraction >= self.settings.min_visible)
+                value = value * (visible_fraction >= self.config.min_visible)
             values[name] = value
             total = total + weight * value
         return Loss(total, values, visible_fraction)
-
-    def options_of(self, name: str) -> dict[str, Any]:
-        """The options of a term: leaves of the configuration, else its own entries; else its defaults."""
-        leaves = {o: getattr(self.settings, o) for o in TERMS[name].options if hasattr(self.settings, o)}
-        own = {o: f"{name}.{o}" for o in TERMS[name].options if o not in leaves}
-        return leaves | {
-            o: self.settings.options[key] for o, key in own.items() if key in self.settings.options
-        }
 
     def hidden(self, x: Tensor, affine: AffineState) -> Tensor:
         """``(B, V, 1, H, W)`` bool: what another part of this estimate hides from each right view."""

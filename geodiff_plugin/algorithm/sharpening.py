@@ -18,8 +18,6 @@ from torch import Tensor
 
 from geodiff_plugin.formats.strips import row_strips
 from geodiff_plugin.geometry.cameras import image_size
-from geodiff_plugin.guidance.config import CorrectionConfig
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.scale.points import weighted_quantile
 
 __all__ = ["sharpen_edges"]
@@ -27,6 +25,13 @@ __all__ = ["sharpen_edges"]
 #: Samples of the window of the median to each side of its centre; where the surfaces beside a ramp are looked
 #: for. Both in pixels of the prior's grid.
 HALF, BESIDE = 2, 3
+#: Least relative step in inverse depth from a pixel on a ramp to each of two opposite neighbours, and how
+#: many times steeper than the surfaces on both sides the slope must be there.
+STEP, STEEPER = 0.02, 2.0
+#: Where a neighbour's weight in the median falls: to a half at this slope in log depth over one of the
+#: prior's pixels, to a third at this difference in brightness, and with a Gaussian of this standard deviation
+#: in pixels of the prior's grid.
+SLOPE, BRIGHTNESS, REACH = 0.04, 0.12, 1.5
 #: Two opposite neighbours: across, down, and both diagonals.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 #: Pixels whose windows are in memory at once.
@@ -34,9 +39,7 @@ CHUNK = 1 << 16
 
 
 @torch.no_grad()
-def sharpen_edges(
-    depth_m: Tensor, left_01: Tensor, spacing: int = 1, config: CorrectionConfig = DEFAULT.correction
-) -> Tensor:
+def sharpen_edges(depth_m: Tensor, left_01: Tensor, spacing: int = 1) -> Tensor:
     """Give every pixel on the ramp between two surfaces the depth of one of them.
 
     A pixel is on a ramp if its inverse depth lies between those of two opposite neighbours, with a step to
@@ -48,7 +51,6 @@ def sharpen_edges(
         depth_m: ``(B, 1, H, W)`` metres, > 0.
         left_01: ``(B, 3, H, W)`` in [0, 1], the left images on the same grid.
         spacing: pixels of this grid to one of the grid that the map was decoded on, >= 1.
-        config: thresholds and weights.
 
     Returns:
         ``(B, 1, H, W)`` metres: on a ramp the depth of a pixel in the window, elsewhere what was given, bit
@@ -65,7 +67,7 @@ def sharpen_edges(
                 F.pad(whole[index : index + 1, :, part].float(), missing, mode="replicate")[0]
                 for whole in (depth_m, left_01)
             )
-            strip = _Strip(depth[0], image, spacing, config)
+            strip = _Strip(depth[0], image, spacing)
             v, u = strip.on_ramp().nonzero(as_tuple=True)
             target = out[index, 0, rows]
             for at in zip(v.split(CHUNK), u.split(CHUNK), strict=True):
@@ -80,11 +82,10 @@ class _Strip:
         depth_m: ``(h + 2 halo, w + 2 halo)`` metres.
         image_01: ``(3, h + 2 halo, w + 2 halo)``.
         spacing: as ``sharpen_edges``.
-        config: likewise.
     """
 
-    def __init__(self, depth_m: Tensor, image_01: Tensor, spacing: int, config: CorrectionConfig) -> None:
-        self.depth_m, self.image, self.spacing, self.config = depth_m, image_01, spacing, config
+    def __init__(self, depth_m: Tensor, image_01: Tensor, spacing: int) -> None:
+        self.depth_m, self.image, self.spacing = depth_m, image_01, spacing
         self.inverse = 1.0 / depth_m
         self.halo = (BESIDE + 1) * spacing
 
@@ -100,23 +101,23 @@ class _Strip:
         found = torch.zeros_like(centre, dtype=torch.bool)
         for way in DIRECTIONS:
             ahead, behind = self._along(way, 1) - centre, centre - self._along(way, -1)
-            stepped = torch.minimum(ahead.abs(), behind.abs()) > self.config.ramp_step * centre
+            stepped = torch.minimum(ahead.abs(), behind.abs()) > STEP * centre
             ends = [(self._along(way, k + 1) - self._along(way, k - 1)).abs() for k in (-BESIDE, BESIDE)]
-            steep = (ahead + behind).abs() > self.config.ramp_contrast * torch.maximum(*ends)
+            steep = (ahead + behind).abs() > STEEPER * torch.maximum(*ends)
             found |= (ahead * behind > 0) & stepped & steep
         return found
 
     def median(self, v: Tensor, u: Tensor) -> Tensor:
         """``(n,)`` metres, the weighted median in the windows of the pixels ``(v, u)``, ``(n,)`` each."""
-        width, config = self.depth_m.shape[1], self.config
+        width = self.depth_m.shape[1]
         steps = torch.arange(-HALF, HALF + 1, device=v.device)
         down, right = (each.flatten() for each in torch.meshgrid(steps, steps, indexing="ij"))
         centre = (v + self.halo) * width + u + self.halo
         window = centre[:, None] + self.spacing * (down * width + right)  # (n, samples), into flat maps
         image = self.image.flatten(1)
-        unlike = (image[:, window] - image[:, centre, None]).abs().mean(0) / config.sharpen_colour
-        away = (down**2 + right**2).float() / (2.0 * config.sharpen_reach**2)
-        flat = 1.0 / (1.0 + (self._slope.flatten()[window] / config.ramp_slope) ** 2)
+        unlike = (image[:, window] - image[:, centre, None]).abs().mean(0) / BRIGHTNESS
+        away = (down**2 + right**2).float() / (2.0 * REACH**2)
+        flat = 1.0 / (1.0 + (self._slope.flatten()[window] / SLOPE) ** 2)
         return weighted_quantile(self.depth_m.flatten()[window], flat * torch.exp(-unlike - away), 0.5)
 
     @cached_property

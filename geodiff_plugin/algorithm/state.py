@@ -7,7 +7,6 @@ Paper: Algorithm 1, S7.3.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +18,7 @@ from geodiff_plugin.algorithm.known import Known
 from geodiff_plugin.algorithm.objective import Loss, Objective
 from geodiff_plugin.algorithm.rules import RULES
 from geodiff_plugin.algorithm.terms import MatchTarget
-from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.scale.order import order_agreement
 from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refine_to_matches
 from geodiff_plugin.scale.space import AffineState, MetricMap, smooth_floor
@@ -70,15 +69,13 @@ class Trajectory:
         start_range: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         self.config, self.evidence, self.owners = config, evidence, list(owners)
-        self.metric = MetricMap(space, config.search.positive)
-        self.objective = Objective(chunk_views(evidence, owners), self.metric, config.weights, config.terms)
-        known = Known.of([evidence[i] for i in owners], config, "loss")
-        self.known, self._on_losses = known.coarser(config.correction.correction_scale), known
-        updates = config.updates
+        self.metric = MetricMap(space, config.positive)
+        self.objective = Objective(chunk_views(evidence, owners), self.metric, config)
+        self.known = Known.of([evidence[i] for i in owners], config, "loss")
         self.plan = config.plan_updates(points_given=self.known.points is not None)
-        self.latent_rule = RULES[updates.rule](self.plan.step_latents)
-        self.scale_rule = RULES[updates.affine_rule](updates.step_affine)
-        self.shift_rule = RULES[updates.affine_rule](updates.step_affine)
+        self.latent_rule = RULES[config.rule](self.plan.step_latents)
+        self.scale_rule = RULES[config.rule](config.step_affine)
+        self.shift_rule = RULES[config.rule](config.step_affine)
         # Of a disparity, x = 1 is the nearest end.
         self.own_range: tuple[Tensor, Tensor] | None = None
         if own_range is not None:
@@ -116,7 +113,7 @@ class Trajectory:
 
     def is_active(self, fraction: float) -> bool:
         """Whether steps at this fraction of the schedule, [0, 1), are updated."""
-        return self.config.updates.start <= fraction < self.config.updates.stop
+        return self.config.start <= fraction < self.config.stop
 
     def settle_scale(self, x: Tensor) -> None:
         """Find g_s and the start of scale and shift for a relative map (S7.3), or better ones than before.
@@ -128,14 +125,14 @@ class Trajectory:
             self.own_depth = self.metric(x, self.metric.from_range(*self.own_range))
         if self.order is None:
             self.order = self._order(x)
-        search = self.config.search.search
+        search = self.config.search
         if search not in ONCE:
             self._search_volume(x)
         elif self._affine is None:
             (self._search_one_number if search == "one-number" else self._span_points)(x)
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         self.known = self.known.judged(self._on_known(depth_m), self.objective.views.left_01)
-        self.matches = replace(self._on_losses, kept=self.known.kept).usable_matches
+        self.matches = self.known.usable_matches
 
     def _on_known(self, depth_m: Tensor) -> Tensor:
         """A metric map on the grid of the corrections."""
@@ -155,15 +152,15 @@ class Trajectory:
 
     def _search_one_number(self, x: Tensor) -> None:
         zero = x.new_zeros(x.shape[0])
-        low, high = self.config.search.g_s_range
-        count = self.config.search.g_s_candidates
+        low, high = self.config.g_s_range
+        count = self.config.g_s_candidates
         candidates = torch.linspace(low, high, count, dtype=torch.float32, device=x.device)
 
         def cost(g_s: Tensor) -> Tensor:
             affine = AffineState(zero, zero, g_s.expand_as(zero))
             loss = self.objective(x, affine, affine, zero.view(-1, 1), zero.view(-1, 1), None)
             # What no right camera sees costs nothing, and must not win for that.
-            shown = (loss.visible_fraction > 0) & (loss.visible_fraction >= self.config.terms.min_visible)
+            shown = (loss.visible_fraction > 0) & (loss.visible_fraction >= self.config.min_visible)
             return loss.terms["photometric"].where(shown, torch.inf)
 
         best, self.on_edge = argmin_over(candidates, cost)
@@ -208,7 +205,7 @@ class Trajectory:
         space, floored = self.metric.space, smooth_floor(x)
         if evidence.volume is None:
             assert evidence.points is not None  # without views there are points
-            near_far = fit_to_points(x, evidence.points, self.metric, current, self.config.fit)
+            near_far = fit_to_points(x, evidence.points, self.metric, current)
             on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
         elif current is not None and evidence.sure is not None and self.on_edge is not None:
             # Later steps start from what the first found; sure matches tell whether its basin still holds.
@@ -220,17 +217,16 @@ class Trajectory:
                 space,
                 depth_range=self.config.depth_range,
                 current=current,
-                config=self.config.search,
             )
             near_far, on_edge = (found.near_m, found.far_m), found.on_edge
-        fit, sure = self.config.fit, evidence.sure
+        sure = evidence.sure
         if sure is not None and evidence.matches is not None:
             # A poor prior's true basin is shallow in raw costs; matches tell basins apart at a prior's error.
-            near_far = refine_to_matches(floored, evidence.matches, *near_far, space, fit)
-            near_far = fit_to_points(x, sure, self.metric, near_far, fit)
+            near_far = refine_to_matches(floored, evidence.matches, *near_far, space)
+            near_far = fit_to_points(x, sure, self.metric, near_far)
         for known in (evidence.matches, evidence.points):
             if known is not None:
-                near_far = refine_to_matches(floored, known, *near_far, space, fit)
+                near_far = refine_to_matches(floored, known, *near_far, space)
         if self.config.depth_range is not None:
             low, high = self.config.depth_range
             near_far = ordered(*(v.clamp(low, high) for v in near_far))
@@ -243,7 +239,7 @@ class Trajectory:
             x: ``(B, 1, h, w)`` float32 relative map that the updates start from, its scale settled.
         """
         compared = self.config.weights.get("photometric") and self.objective.views.further
-        if self.config.terms.z_test and compared:
+        if self.config.z_test and compared:
             self.hidden = self.objective.hidden(x, self.affine)
 
     @torch.no_grad()
@@ -268,7 +264,7 @@ class Trajectory:
         """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""
         assert self._start is not None  # as in ``affine``
         return self.objective(
-            x, affine, self._start, z0, anchor, self.matches, self._on_losses.points, self.hidden
+            x, affine, self._start, z0, anchor, self.matches, self.known.points, self.hidden
         )
 
     def report(self, step: int, timestep: float, loss: Loss) -> None:

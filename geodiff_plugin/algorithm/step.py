@@ -15,7 +15,7 @@ from torch import Tensor
 from geodiff_plugin.algorithm.gradient import pull_back
 from geodiff_plugin.algorithm.objective import Loss
 from geodiff_plugin.algorithm.state import Trajectory
-from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.config import GuidanceConfig
 
 __all__ = ["StepContext", "corrected_rounds", "guided_step"]
 
@@ -31,11 +31,10 @@ def corrected_rounds(config: GuidanceConfig, count: int) -> set[int]:
         config: says which rounds are active, and how many of them correct.
         count: rounds of the whole schedule.
     """
-    updates = config.updates
-    active = [i for i in range(count) if updates.start <= i / count < updates.stop]
-    if not config.correction.correct or not updates.optimize_latents or not active:
+    active = [i for i in range(count) if config.start <= i / count < config.stop]
+    if not config.correct or not config.optimize_latents or not active:
         return set()
-    wanted = min(config.correction.corrections, len(active))
+    wanted = min(config.corrections, len(active))
     first = min(len(active) // 2, len(active) - wanted)
     step = (len(active) - 1 - first) / max(wanted - 1, 1)
     return {active[len(active) - 1 - round(k * step)] for k in range(wanted)}
@@ -108,7 +107,7 @@ def _plan(state: Trajectory, at: StepContext) -> list[tuple[int, bool]]:
     brought to the same matches, which only follows their noise.
     """
     config, state.result = state.config, None
-    corrects = config.correction.correct and config.updates.optimize_latents and at.encode is not None
+    corrects = config.correct and config.optimize_latents and at.encode is not None
     chosen = corrected_rounds(config, at.count) if corrects else set()
     active = [i for i in at.rounds if state.is_active(i / at.count)]
     rounds: list[tuple[int, bool]] = []
@@ -140,7 +139,7 @@ def _corrected(
         state.watch.note("the network's clean latent", at.step, z0)
         state.watch.note("the decoded map", at.step, x0)
         state.settle_scale(x0)
-        refined_later = ends and state.config.correction.refine
+        refined_later = ends and state.config.refine
         corrected = x0 if refined_later and unread is not None else state.corrected(x0)
         state.result = x0 if refined_later else corrected
         if corrected is x0 or unread is not None:
@@ -163,7 +162,7 @@ def _update(
         further rounds are anchored to as well; the loss before the first update.
     """
     watch = state.watch
-    moves = state.config.updates.optimize_latents and updates > 0
+    moves = state.config.optimize_latents and updates > 0
     for k in range(max(updates, 1)):
         with torch.set_grad_enabled(updates > 0):
             if moves and not z.requires_grad:

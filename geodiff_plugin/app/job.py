@@ -22,9 +22,9 @@ from geodiff_plugin.app.priors import Priors
 from geodiff_plugin.cli.checks import LARGEST_SEED, check_resolution
 from geodiff_plugin.cli.messages import collected_warnings
 from geodiff_plugin.cli.report import used_poses
+from geodiff_plugin.config import DEFAULT, PAPER
 from geodiff_plugin.formats import read_image
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.presets import DEFAULT, PAPER
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["PRESETS", "Request", "Result", "Stopped", "run_job"]

@@ -87,7 +87,7 @@ def info(
 ) -> None:
     """Print versions, devices, priors and what is cached."""
     if knobs:
-        from geodiff_plugin.guidance.knobs import knob_lines
+        from geodiff_plugin.config import knob_lines
 
         typer.echo("\n".join(knob_lines()))
         return

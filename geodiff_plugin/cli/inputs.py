@@ -26,11 +26,11 @@ from geodiff_plugin.cli.checks import check_positive
 from geodiff_plugin.cli.lenses import Lenses, lenses_of, pinhole
 from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.cli.start import PARAMETERS, calibration_way
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.formats.distortion import undistorted_points
 from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.formats.rigs import intrinsics
-from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Distortion, Rig
 

@@ -12,9 +12,9 @@ import torch
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 from geodiff_plugin.formats.rigs import is_distorted
-from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.posing import cleaned
 from geodiff_plugin.types import Distortion, Rig
 

@@ -13,9 +13,7 @@ import torch
 from geodiff_plugin._checks import refuse
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.checks import camera_pair
-from geodiff_plugin.guidance.config import GuidanceConfig
-from geodiff_plugin.guidance.knobs import config_from_text
-from geodiff_plugin.guidance.presets import PRESETS
+from geodiff_plugin.config import PRESETS, GuidanceConfig, config_from_text
 from geodiff_plugin.runtime.machine import pick_device
 
 __all__ = ["Settings", "read_settings"]
@@ -52,7 +50,7 @@ def _configuration(
     # The paper's search is over one number, between the same two depths.
     if preset != "paper":
         return config.changed(depth_range=depth_range)
-    given = config.search.g_s_range != base.search.g_s_range
+    given = config.g_s_range != base.g_s_range
     return config if given else config.changed(g_s_range=depth_range)
 
 

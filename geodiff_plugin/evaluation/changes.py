@@ -10,12 +10,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from geodiff_plugin.algorithm.rules import RULES
+from geodiff_plugin.config import DEFAULT, value_of
 from geodiff_plugin.evaluation.cells import by_method, cell, count_of_pairs, interval_cell, label_of
 from geodiff_plugin.evaluation.layout import Table
 from geodiff_plugin.evaluation.paper_tables import metric_values
 from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
-from geodiff_plugin.guidance.knobs import value_of
-from geodiff_plugin.guidance.presets import DEFAULT
 
 __all__ = ["CHANGES", "NUMBERS", "changes_table", "flatness_methods", "flatness_table"]
 
@@ -36,7 +35,7 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         # One number that is searched within a thousandth of 1 is 1.
         ("g_s = 1", "paper:g_s_range=[0.999,1.001]"),
         ("gradient to the clean latent (denoised)", "paper:gradient=denoised"),
-        *((f"rule {name}", f"paper:rule={name}+affine_rule={name}") for name in RULES if name != "plain"),
+        *((f"rule {name}", f"paper:rule={name}") for name in RULES if name != "plain"),
     ),
     "parts": (
         ("as it is", "guided"),
@@ -47,7 +46,6 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("without correction in the loop", "guided:correct=false"),
         ("with a correction in every step", "guided:corrections=1000"),
         ("with gradient updates", "guided:inner_steps=5"),
-        ("with gradient updates at every step", "guided:inner_steps=5+updates_from=0"),
         ("without refinement of the result", "guided:refine=false"),
         ("without sharpening of depth edges", "guided:sharpen=false"),
         ("without rejection of reflections", "guided:reject_reflections=false"),
@@ -65,14 +63,10 @@ has known points, so their term has none); ``parts`` is what the default has bey
 _NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
 
 NUMBERS = (
-    *("min_steps", "corrections", "outlier_width", "broad_smoothness", "passes", "stiffness_power"),
+    *("min_steps", "corrections", "outlier_width", "match_noise", "smoothness"),
     *("weights.photometric", "weights.matches", "weights.anchor", "loss_resolution"),
-    *("match_noise", "correction_cauchy", "smoothness", "stiffest", "inertia", "most_inertia"),
-    *("image_edge", "depth_edge", "edge_step"),
-    *("ramp_step", "ramp_contrast", "ramp_slope", "sharpen_colour", "sharpen_reach"),
-    *("reflection_region", "reflection_spreads", "reflection_floor", "basin_cauchy", "fit_cauchy"),
 )
-"""The numbers that decide the default's result, by leaf."""
+"""The numbers that decide the default's result, by knob."""
 
 
 def changes_table(records: Sequence[dict[str, Any]], name: str) -> Table:

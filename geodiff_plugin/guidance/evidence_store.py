@@ -30,10 +30,10 @@ def make_evidence(given: EvidenceInputs) -> Evidence:
 
 def _settings(given: EvidenceInputs) -> tuple[Any, ...]:
     """What of a configuration evidence depends on."""
-    config, swept = given.config, given.config.search.search == "volume"
+    config, swept = given.config, given.config.search == "volume"
     return (
         *(config.pose, config.clean_photographs, config.loss_resolution, config.depth_range),
-        *(config.sweep, config.matching, config.fit),
+        *(config.planes, config.sweep_pixels),
         *(swept, given.needs_matches, given.unit),
     )
 

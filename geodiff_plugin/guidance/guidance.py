@@ -7,7 +7,6 @@ Paper: S3.3, S4.2, S5.1; ``GeometryGuidance.paper`` is Algorithm 1 with its prin
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,14 +17,13 @@ from geodiff_plugin._camera_checks import check_calibrated_size, check_intrinsic
 from geodiff_plugin._checks import bad_type, bad_value, check_number, check_size
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs
+from geodiff_plugin.config import GuidanceConfig, UpdatePlan, preset_named
 from geodiff_plugin.formats import picture_size, read_calibration
 from geodiff_plugin.geometry.cameras import image_size
-from geodiff_plugin.guidance.config import GuidanceConfig, UpdatePlan
 from geodiff_plugin.guidance.evidence_store import EvidenceStore, make_evidence
 from geodiff_plugin.guidance.inputs import ImageInputs, read_inputs, split_views
 from geodiff_plugin.guidance.photographs import EstimatedRig, estimate_rig
 from geodiff_plugin.guidance.preconditions import check_fed, check_names
-from geodiff_plugin.guidance.presets import DEFAULT, MARIGOLD_DC, PAPER, SEARCH_ONLY
 from geodiff_plugin.types import MetricDepthOutput, Rig
 
 __all__ = ["GeometryGuidance"]
@@ -55,8 +53,10 @@ class GeometryGuidance:
             The output then says so, and a metric prior gives the metres.
         previous: the output of the previous frame, called with ``output_latent=True``. The call then starts
             in the middle of the schedule, from that latent, and the scale search starts at that scale.
-        config: the hyperparameters; the default preset, or another one of ``guidance.presets``.
-        **knobs: hyperparameters to change in ``config``, such as ``inner_steps=10``;
+        preset: hyperparameters by name: ``"default"``, ``"paper"``, ``"marigold-dc"``, ``"search-only"`` or
+            ``"prior-fit"``.
+        config: hyperparameters in place of a preset.
+        **knobs: hyperparameters to change in them, such as ``inner_steps=10``;
             docs/reference/knobs.md and ``geodiff info --knobs`` list them.
 
     Attributes:
@@ -88,9 +88,14 @@ class GeometryGuidance:
         cropped: bool = False,
         unit: str | None = "m",
         previous: MetricDepthOutput | None = None,
-        config: GuidanceConfig = DEFAULT,
+        preset: str | None = None,
+        config: GuidanceConfig | None = None,
         **knobs: Any,
     ) -> None:
+        if config is None:
+            config = preset_named(preset or "default")
+        elif preset is not None:
+            bad_value("preset", "None beside config", repr(preset))
         if not isinstance(config, GuidanceConfig):
             bad_type("config", "a GuidanceConfig", config, "GuidanceConfig.load reads a saved one.")
         if unit not in ("m", None):
@@ -101,7 +106,6 @@ class GeometryGuidance:
         check_names(self._config)
         self._inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
         self.evidence_store: EvidenceStore | None = None
-        self.points_measured = True  # False where they are depth of another view, as in guide_both_views
         self.previous = previous
         self._cropped, self._left_size = cropped, check_size(left_size, "left_size")
         check_fed(
@@ -270,7 +274,7 @@ class GeometryGuidance:
 
         Source: Viola et al. 2024, Algorithm 1; prs-eth/Marigold-DC, in parity (tests/parity).
         """
-        return cls.from_points(points, K, config=MARIGOLD_DC, **knobs)
+        return cls.from_points(points, K, preset="marigold-dc", **knobs)
 
     @classmethod
     def paper(cls, right: Any, K: Any, E: Any, **knobs: Any) -> Self:
@@ -284,7 +288,7 @@ class GeometryGuidance:
 
         Source: Algorithm 1, S5.1, S7.3, S9; docs/reference/paper-map.md settles what the paper leaves open.
         """
-        return cls(right, K, E, config=PAPER, **knobs)
+        return cls(right, K, E, preset="paper", **knobs)
 
     @classmethod
     def search_only(cls, right: Any, K: Any, E: Any, **knobs: Any) -> Self:
@@ -296,7 +300,7 @@ class GeometryGuidance:
             E: as in the constructor.
             **knobs: hyperparameters to change.
         """
-        return cls(right, K, E, config=SEARCH_ONLY, **knobs)
+        return cls(right, K, E, preset="search-only", **knobs)
 
     @property
     def previous(self) -> MetricDepthOutput | None:
@@ -328,7 +332,9 @@ class GeometryGuidance:
 
     def as_run(self) -> GuidanceConfig:
         """The configuration with all automatic choices resolved, for reports."""
-        return self.config.changed(**asdict(self.updates))
+        return self.config.changed(
+            inner_steps=self.updates.inner_steps, step_latents=self.updates.step_latents
+        )
 
     @property
     def inputs(self) -> list[ImageInputs]:
@@ -386,6 +392,5 @@ class GeometryGuidance:
 
     @property
     def _needs_matches(self) -> bool:
-        stage = self.config.correction
-        used = self.updates.inner_steps > 0 or stage.correct or stage.refine
+        used = self.updates.inner_steps > 0 or self.config.correct or self.config.refine
         return used and bool(self.config.weights.get("matches"))

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit
 from geodiff_plugin._checks import bad_type, bad_value, check_number
+from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
 from geodiff_plugin.guidance.inputs import as_points
 from geodiff_plugin.guidance.posing import cleaned, coarse_depth
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.pose.estimate import EstimatedPose, estimate_pose
 from geodiff_plugin.pose.matchers import Matcher, find_matcher
 from geodiff_plugin.pose.refine import polished

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.guidance.config import GuidanceConfig
-from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.matching import clean
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
@@ -29,7 +28,7 @@ _FARTHEST = 1e-3
 
 def cleaned(image_01: Tensor, config: GuidanceConfig) -> Tensor:
     """A photograph ``(3, H, W)`` in [0, 1] of native size, as the knob ``clean_photographs`` says."""
-    return clean(image_01, config.sweep.sweep_pixels) if config.clean_photographs else image_01
+    return clean(image_01, config.sweep_pixels) if config.clean_photographs else image_01
 
 
 def cleaned_views(
@@ -60,28 +59,23 @@ def pose_views(
         left_01: ``(3, H, W)`` float32 in [0, 1], native size.
         rights: as the user gave them.
         K_left: ``(3, 3)`` pixels of ``left_01``.
-        config: whether they are refined, and the coarse sweep that this starts from.
+        config: whether they are refined.
         unit: of the poses' lengths, ``"m"`` or ``None``.
     """
     if config.pose == "given":
         return untouched(rights)
-    return refine_views(
-        left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left, config), unit
-    )
+    return refine_views(left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left), unit)
 
 
-def coarse_depth(
-    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, config: GuidanceConfig = DEFAULT
-) -> Tensor:
+def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> Tensor:
     """A rough, smooth depth without holes, ``(1, 1, h, w)`` metres: a coarse sweep, its sure matches spread.
 
     Args:
         left_01: ``(3, H, W)`` float32 in [0, 1].
         rights: with poses that fit roughly.
         K_left: ``(3, 3)`` pixels of ``left_01``.
-        config: of the sweep and its matches.
     """
-    matches = match_volume(pilot_volume(left_01, rights, K_left, config.sweep), config.matching)
+    matches = match_volume(pilot_volume(left_01, rights, K_left))
     weight = matches.confidence[None] ** 2 + 1e-9
     values = matches.inverse_depth[None] * weight
     above, below = values.clone(), weight.clone()

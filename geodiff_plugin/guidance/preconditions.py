@@ -9,25 +9,20 @@ from __future__ import annotations
 from geodiff_plugin._checks import bad_value, check_choice, refuse
 from geodiff_plugin.algorithm.rules import RULES
 from geodiff_plugin.algorithm.terms import TERMS
-from geodiff_plugin.guidance.config import GuidanceConfig, UpdatePlan
+from geodiff_plugin.config import GuidanceConfig, UpdatePlan
 
 __all__ = ["check_fed", "check_names"]
 
 
 def check_names(config: GuidanceConfig) -> None:
-    """Refuse names of rules, terms and their options that do not exist.
+    """Refuse names of rules and terms that do not exist.
 
     Raises:
         InputError: naming what does.
     """
-    check_choice(config.updates.rule, "rule", RULES)
-    check_choice(config.updates.affine_rule, "affine_rule", RULES)
+    check_choice(config.rule, "rule", RULES)
     for name in config.weights:
         check_choice(name, "a key of weights", TERMS)
-    for name in config.terms.options:
-        term, _, option = name.partition(".")
-        check_choice(term, f"the term of options[{name!r}]", TERMS)
-        check_choice(option, f"the option of options[{name!r}]", TERMS[term].options)
 
 
 def check_fed(config: GuidanceConfig, updates: UpdatePlan, *, views: bool, points: bool) -> None:
@@ -42,7 +37,7 @@ def check_fed(config: GuidanceConfig, updates: UpdatePlan, *, views: bool, point
     Raises:
         InputError: the search, or every weighted term, lacks what it works on.
     """
-    search = config.search.search
+    search = config.search
     if search == "one-number" and not (views and config.weights.get("photometric")):
         refuse("search='one-number' needs a right view and a photometric weight; search='volume' does not.")
     if search == "points-range" and not points:
@@ -54,7 +49,7 @@ def check_fed(config: GuidanceConfig, updates: UpdatePlan, *, views: bool, point
         for name in weighted
         if any(absent and getattr(TERMS[name], need) for need, absent in lacking.items())
     ]
-    makes_updates = updates.inner_steps or config.updates.inner_steps is None
+    makes_updates = updates.inner_steps or config.inner_steps is None
     if makes_updates and len(idle) == len(weighted):
         cure = "photometric and matches need a right view, points needs points; inner_steps=0 needs none."
         bad_value("weights", "above 0 for a term that can work on what is given", dict(config.weights), cure)

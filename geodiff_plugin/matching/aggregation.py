@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import torch
 
-from geodiff_plugin.guidance.config import MatchingConfig
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching.census import COST_LEVELS
 
 __all__ = ["NEVER", "PATHS", "Room", "aggregate", "cells"]
+
+#: Cost of a step of one plane between neighbouring pixels, in units of the largest matching cost, and of any
+#: larger step where the image is flat; the difference in brightness that halves the latter.
+STEP_PENALTY, JUMP_PENALTY, JUMP_CONTRAST = 0.15, 1.2, 0.1
 
 PATHS = 4
 """Up, down, left and right."""
@@ -73,32 +75,25 @@ def _scan_rows(cost: torch.Tensor, p1: int, p2: torch.Tensor, total: torch.Tenso
             total[:, row] += path[i]
 
 
-def _limits(grey: torch.Tensor, config: MatchingConfig) -> tuple[torch.Tensor, torch.Tensor]:
+def _limits(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Edge-adaptive P2 for vertical ``(H, W)`` and horizontal ``(W, H)`` paths: cheap jumps at edges."""
     limits = []
     for image in (grey, grey.T):
         difference = torch.zeros_like(image)
         difference[1:] = (image[1:] - image[:-1]).abs()
-        limit = config.jump_penalty / (1.0 + difference / config.jump_contrast)
-        limit = limit.clamp_min(2.0 * config.step_penalty)
+        limit = JUMP_PENALTY / (1.0 + difference / JUMP_CONTRAST)
+        limit = limit.clamp_min(2.0 * STEP_PENALTY)
         limits.append((COST_LEVELS * limit).round().to(torch.int16))
     return limits[0], limits[1]
 
 
 @torch.no_grad()
-def aggregate(
-    levels: torch.Tensor,
-    grey: torch.Tensor,
-    config: MatchingConfig = DEFAULT.matching,
-    *,
-    room: Room | None = None,
-) -> torch.Tensor:
+def aggregate(levels: torch.Tensor, grey: torch.Tensor, *, room: Room | None = None) -> torch.Tensor:
     """Semi-global aggregation along four paths.
 
     Args:
         levels: ``(D, H, W)`` uint8, costs of 0 to ``COST_LEVELS``.
         grey: ``(H, W)`` of the same view in [0, 1]: a brightness edge makes a jump in depth cheaper there.
-        config: penalties of steps between neighbouring pixels.
         room: memory to work in, which holds the result until its next use; its own by default.
 
     Returns:
@@ -106,8 +101,8 @@ def aggregate(
 
     Source: Hirschmueller 2008, Eq. 13 with paths up, down, left, right.
     """
-    vertical, horizontal = _limits(grey, config)
-    step = round(COST_LEVELS * config.step_penalty)
+    vertical, horizontal = _limits(grey)
+    step = round(COST_LEVELS * STEP_PENALTY)
     planes, height, width = levels.shape
     room, paths = room or Room(), levels.new_empty(0, dtype=torch.int16)
     turned = room.cells("turned", planes, (width, height), levels)

@@ -13,9 +13,8 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.geometry import image_size, plane_rays, resize_intrinsics
-from geodiff_plugin.guidance.config import MatchingConfig, SweepConfig
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -31,6 +30,20 @@ __all__ = ["build_cost_volume", "find_matches", "pilot_volume"]
 
 # Fewer planes than this make no parabola worth the name.
 _FEWEST_PLANES = 24
+#: How far the median pixel moves from one plane to the next, px: below a pixel, for positions between planes.
+PLANE_STEP_PX = 0.75
+#: Upper bound on the longer side of the sweep's grid, px; wide images would exceed it within
+#: ``sweep_pixels``.
+SWEEP_SIDE = 828
+# The coarse sweep that finds how near the planes must reach: pixels, planes, and the median step of one, px.
+PILOT_PIXELS, PILOT_PLANES, PILOT_STEP_PX = 20_000, 160, 1.0
+# Shift of the nearest depth that it looks at, in image widths.
+PILOT_SHIFT = 0.4
+# Its matches above this confidence count; this quantile of their inverse depths is taken for the nearest,
+# unless they are less than this share of the pixels: then the planes reach as near as the sweep looked.
+PILOT_CONFIDENCE, PILOT_QUANTILE, PILOT_LEAST_SHARE = 0.8, 0.995, 0.03
+# The planes reach this factor nearer than that, and at least to the depth of this shift, in image widths.
+HEADROOM, LEAST_SHIFT = 1.25, 0.03
 
 
 def _shrink(
@@ -84,15 +97,15 @@ def pilot_volume(
     left_01: torch.Tensor,
     rights: Sequence[CameraView],
     K_left: torch.Tensor,
-    config: SweepConfig = DEFAULT.sweep,
+    pixels: int = PILOT_PIXELS,
 ) -> CostVolume:
-    """A coarse sweep of all depths from infinity to the shift ``pilot_shift``, 40 % of the width.
+    """A coarse sweep of all depths from infinity to a shift of 40 % of the width.
 
     Args:
         left_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1].
         rights: as for ``build_cost_volume``.
         K_left: ``(3, 3)`` pixels of ``left_01``.
-        config: how large its grid is and how far it looks.
+        pixels: upper bound on those of its grid.
 
     Returns:
         ``CostVolume``.
@@ -101,12 +114,11 @@ def pilot_volume(
         ValueError: the views do not overlap, or both cameras stand at one place.
     """
     views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
-    pixels = config.pilot_pixels
     left, small, K = _to_grid(grey(left_01), views, K_left.float(), pixels, pixels)
     size = image_size(left)
-    limit = _at_shift(small, K, size, config.pilot_shift)
-    span, step_px = (torch.zeros_like(limit), limit), config.pilot_step_px
-    planes = _even_planes(span, size, small, K, step_px, config.pilot_planes)
+    limit = _at_shift(small, K, size, PILOT_SHIFT)
+    span = (torch.zeros_like(limit), limit)
+    planes = _even_planes(span, size, small, K, PILOT_STEP_PX, PILOT_PLANES)
     return sweep_planes(left, small, K, planes)
 
 
@@ -122,15 +134,15 @@ def _at_shift(
     return torch.stack(found).amin()
 
 
-def _nearest_inverse_depth(pilot: CostVolume, config: SweepConfig, matching: MatchingConfig) -> torch.Tensor:
+def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
     """The inverse depth that a coarse sweep says nothing is nearer than."""
-    matches = match_volume(pilot, matching)
-    sure, limit = matches.confidence > config.pilot_sure, pilot.inverse_depth[-1]
-    inverse_depth = torch.where(sure, matches.inverse_depth, torch.nan)
-    least = _at_shift(pilot.rights, pilot.K, pilot.size, config.least_shift)
-    nearest = (config.headroom * torch.nanquantile(inverse_depth, config.pilot_quantile)).clamp(least, limit)
+    matches = match_volume(pilot)
+    reliable, limit = matches.confidence > PILOT_CONFIDENCE, pilot.inverse_depth[-1]
+    inverse_depth = torch.where(reliable, matches.inverse_depth, torch.nan)
+    least = _at_shift(pilot.rights, pilot.K, pilot.size, LEAST_SHIFT)
+    nearest = (HEADROOM * torch.nanquantile(inverse_depth, PILOT_QUANTILE)).clamp(least, limit)
     # With little to go by, the search must see everything.
-    return torch.where(sure.float().mean() < config.pilot_least_sure, limit, nearest)
+    return torch.where(reliable.float().mean() < PILOT_LEAST_SHARE, limit, nearest)
 
 
 @torch.no_grad()
@@ -140,8 +152,7 @@ def build_cost_volume(
     K_left: torch.Tensor,
     *,
     depth_range: tuple[float, float] | None = None,
-    config: SweepConfig = DEFAULT.sweep,
-    matching: MatchingConfig = DEFAULT.matching,
+    config: GuidanceConfig = DEFAULT,
 ) -> CostVolume:
     """Sweep planes through the left view and compare it with the right views.
 
@@ -154,8 +165,7 @@ def build_cost_volume(
             infinity to somewhat nearer than anything that a coarse sweep is sure of, so that a street gets
             finer planes than a table top.
         config: bounds of the grid, to which larger images are shrunk, right ones to as many pixels per
-            radian; how many planes; the coarse sweep.
-        matching: how the coarse sweep is read.
+            radian, and of the number of planes.
 
     Returns:
         ``CostVolume``; not differentiable.
@@ -167,14 +177,13 @@ def build_cost_volume(
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
     views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
-    bounds = config.sweep_side, config.sweep_pixels
-    left, small, K = _to_grid(grey(left_01), views, K_left.float(), *bounds)
+    left, small, K = _to_grid(grey(left_01), views, K_left.float(), SWEEP_SIDE, config.sweep_pixels)
     if depth_range is None:
-        nearest = _nearest_inverse_depth(pilot_volume(left, small, K, config), config, matching)
+        nearest = _nearest_inverse_depth(pilot_volume(left, small, K))
         span = (torch.zeros_like(nearest), nearest)
     else:
         span = (K.new_tensor(1.0 / depth_range[1]), K.new_tensor(1.0 / depth_range[0]))
-    planes = _even_planes(span, image_size(left), small, K, config.plane_step_px, config.planes)
+    planes = _even_planes(span, image_size(left), small, K, PLANE_STEP_PX, config.planes)
     return sweep_planes(left, small, K, planes)
 
 
@@ -185,8 +194,7 @@ def find_matches(
     *,
     volume: CostVolume | None = None,
     depth_range: tuple[float, float] | None = None,
-    config: SweepConfig = DEFAULT.sweep,
-    matching: MatchingConfig = DEFAULT.matching,
+    config: GuidanceConfig = DEFAULT,
 ) -> Matches:
     """What the views alone say about depth.
 
@@ -197,7 +205,6 @@ def find_matches(
         volume: what ``build_cost_volume`` gave for the same views, if it was called already.
         depth_range: as for ``build_cost_volume``.
         config: likewise.
-        matching: penalties of the aggregation, and how far the views may differ.
 
     Returns:
         ``Matches`` on the volume's grid.
@@ -206,7 +213,5 @@ def find_matches(
         ValueError: as ``build_cost_volume``.
     """
     if volume is None:
-        volume = build_cost_volume(
-            left_01, rights, K_left, depth_range=depth_range, config=config, matching=matching
-        )
-    return match_volume(volume, matching)
+        volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range, config=config)
+    return match_volume(volume)

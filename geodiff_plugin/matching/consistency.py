@@ -12,8 +12,6 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 
-from geodiff_plugin.guidance.config import MatchingConfig
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching.aggregation import NEVER, PATHS, Room, aggregate
 from geodiff_plugin.matching.alignment import AlignedView
 from geodiff_plugin.matching.census import COST_LEVELS
@@ -36,6 +34,11 @@ RIGHT_WITHIN_PLANES = 3.0
 LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
 #: Which sign each of them may have; 0 for any.
 SIGNS = (0, 1, -1, -1)
+#: Planes by which the matches of the two views may differ.
+AGREEMENT_PLANES = 1.5
+#: Half the window, px, over which a match's plane must be better than the mean plane, and by how much, as a
+#: share of the largest cost, for full confidence. Else aggregation would carry matches across blank walls.
+CONTRAST_REACH, LEAST_CONTRAST = 15, 0.03
 # The right view is matched in every such row only.
 _EVERY_ROW = 2
 # A sum over the paths and its plane in one integer, so that one minimum finds both.
@@ -67,7 +70,7 @@ def _winner(total: torch.Tensor) -> _Winner:
     return _Winner(index, position, around, best)
 
 
-def _right_winners(volume: CostVolume, view: AlignedView, config: MatchingConfig, room: Room) -> torch.Tensor:
+def _right_winners(volume: CostVolume, view: AlignedView, room: Room) -> torch.Tensor:
     """The position between planes that a right view takes for the best, ``(ceil(h / 2), w)`` of its canvas.
 
     Its costs are those of the same sweep, looked up along its own pixels, and aggregated along its own edges:
@@ -82,7 +85,7 @@ def _right_winners(volume: CostVolume, view: AlignedView, config: MatchingConfig
     for k, own in enumerate(volume.levels):
         plane[:height, :width] = own
         levels[k] = plane.index_select(0, rows[k]).index_select(1, columns[k])
-    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], config, room=room)).position
+    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], room=room)).position
 
 
 def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
@@ -148,39 +151,35 @@ class _Candidates:
     differences: Iterator[torch.Tensor]
 
 
-def _find_candidates(volume: CostVolume, views: Sequence[AlignedView], config: MatchingConfig) -> _Candidates:
+def _find_candidates(volume: CostVolume, views: Sequence[AlignedView]) -> _Candidates:
     """Aggregate, take the winner, and compare it with the matches of right views."""
     room = Room()
-    total = aggregate(volume.levels, volume.left_01[0], config, room=room)
+    total = aggregate(volume.levels, volume.left_01[0], room=room)
     winner = _winner(total)
     second = total.scatter_(0, winner.around, NEVER).amin(dim=0)
     unit = 1.0 / (PATHS * COST_LEVELS)
     margin, cost = (second - winner.best) * unit, winner.best * unit
-    differences = (
-        _disagreement(view, _right_winners(volume, view, config, room), winner.position) for view in views
-    )
-    contrast = _contrast(volume, winner.index, config.contrast_reach)
+    differences = (_disagreement(view, _right_winners(volume, view, room), winner.position) for view in views)
+    contrast = _contrast(volume, winner.index, CONTRAST_REACH)
     return _Candidates(winner.position, margin, cost, contrast, differences)
 
 
-def _evidence(
-    found: _Candidates, difference: torch.Tensor, config: MatchingConfig
-) -> tuple[torch.Tensor, ...]:
+def _evidence(found: _Candidates, difference: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """1, log of the margin (0.03 + second best cost - best cost), best cost, left-right difference."""
     margin = found.margin.clamp(0.0, 0.5)
     ones = torch.ones_like(margin)
-    differs = difference.clamp_max(config.agreement_planes)
+    differs = difference.clamp_max(AGREEMENT_PLANES)
     return ones, (margin + 0.03).log(), found.cost.clamp(0.0, 0.8), differs
 
 
-def _confidence(found: _Candidates, difference: torch.Tensor, config: MatchingConfig) -> torch.Tensor:
+def _confidence(found: _Candidates, difference: torch.Tensor) -> torch.Tensor:
     """Probability ``(H, W)`` that the winner is right, given the left-right difference in planes."""
     odds = torch.zeros_like(difference)
-    for weight, x in zip(LOG_ODDS, _evidence(found, difference, config), strict=True):
+    for weight, x in zip(LOG_ODDS, _evidence(found, difference), strict=True):
         odds = odds + weight * x
     probability = torch.sigmoid(odds)
-    probability = probability * (found.contrast / config.least_contrast).clamp_max(1.0)
-    return torch.where(difference <= config.agreement_planes, probability, torch.zeros_like(probability))
+    probability = probability * (found.contrast / LEAST_CONTRAST).clamp_max(1.0)
+    return torch.where(difference <= AGREEMENT_PLANES, probability, torch.zeros_like(probability))
 
 
 @dataclass(frozen=True)
@@ -199,30 +198,29 @@ class CheckedMatches:
 
 
 @torch.no_grad()
-def checked_matches(volume: CostVolume, config: MatchingConfig = DEFAULT.matching) -> CheckedMatches:
+def checked_matches(volume: CostVolume) -> CheckedMatches:
     """Matches of a cost volume and their evidence, by its first right view."""
-    found = _find_candidates(volume, volume.aligned[:1], config)
+    found = _find_candidates(volume, volume.aligned[:1])
     (difference,) = found.differences
-    checked = (difference <= config.agreement_planes) & (found.contrast >= config.least_contrast)
+    checked = (difference <= AGREEMENT_PLANES) & (found.contrast >= LEAST_CONTRAST)
     inverse_depth = volume.inverse_depth[0] + found.position * volume.plane_step
-    return CheckedMatches(inverse_depth, torch.stack(_evidence(found, difference, config)), checked)
+    return CheckedMatches(inverse_depth, torch.stack(_evidence(found, difference)), checked)
 
 
 @torch.no_grad()
-def match_volume(volume: CostVolume, config: MatchingConfig = DEFAULT.matching) -> Matches:
+def match_volume(volume: CostVolume) -> Matches:
     """Matches of a cost volume: aggregate, take the winner, and check it against every right view.
 
     Args:
         volume: of any number of right views.
-        config: penalties of the aggregation, and how far the views may differ.
 
     Returns:
         ``Matches``; zero confidence where no right view agrees, else about the probability that the match is
         within ``RIGHT_WITHIN_PLANES`` of the truth (that of the right view most sure of it).
     """
-    found = _find_candidates(volume, volume.aligned, config)
+    found = _find_candidates(volume, volume.aligned)
     confidence = torch.zeros_like(found.cost)
     for difference in found.differences:
-        confidence = torch.maximum(confidence, _confidence(found, difference, config))
+        confidence = torch.maximum(confidence, _confidence(found, difference))
     inverse_depth = volume.inverse_depth[0] + found.position * volume.plane_step
     return Matches(inverse_depth[None], confidence[None], volume.plane_step, volume.K, volume.size)

@@ -7,13 +7,11 @@ Paper: none; a check of the user's input.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
 from geodiff_plugin.geometry import invert_rigid
-from geodiff_plugin.guidance.config import MatchingConfig, SweepConfig
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -50,8 +48,6 @@ def mirrored_pose_preferred(
     rights: Sequence[CameraView],
     K_left: torch.Tensor,
     matches: Matches | None = None,
-    config: SweepConfig = DEFAULT.sweep,
-    matching: MatchingConfig = DEFAULT.matching,
 ) -> PoseCheck:
     """Compare the pose as given with its inverse.
 
@@ -63,8 +59,6 @@ def mirrored_pose_preferred(
         rights: as for ``build_cost_volume``.
         K_left: ``(3, 3)`` pixels of ``left_01``.
         matches: what ``find_matches`` gave for the pose as given, if it was called already.
-        config: of the coarse sweeps, but for their size.
-        matching: how they are read.
 
     Returns:
         ``PoseCheck``; two coarse sweeps, or none where the matches leave no doubt.
@@ -72,10 +66,8 @@ def mirrored_pose_preferred(
     if matches is not None and (found := float(matches.confidence.mean())) > _PLAINLY:
         return PoseCheck(False, found, None)
 
-    small = replace(config, pilot_pixels=_PIXELS)
-
     def confidence(views: Sequence[CameraView]) -> float:
-        return float(match_volume(pilot_volume(left_01, views, K_left, small), matching).confidence.mean())
+        return float(match_volume(pilot_volume(left_01, views, K_left, _PIXELS)).confidence.mean())
 
     given = confidence(rights)
     try:

@@ -145,7 +145,7 @@ class GuidedCall(_Stock):
         with torch.autocast(device.type, enabled=False):
             evidence = guidance.prepare(lefts_01)
             if prior.takes_prompt and call.get("prompt_depth") is None:
-                call["prompt_depth"] = prompt_of(evidence, guidance.config.correction)
+                call["prompt_depth"] = prompt_of(evidence, guidance.config)
         warm = plan_warm_start(self, prior, guidance, call, grid.size)
         if warm is not None and warm.latents is not None:
             call |= {"latents": warm.latents, "generator": None}  # the latents hold the noise already

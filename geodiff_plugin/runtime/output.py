@@ -67,7 +67,7 @@ def assemble_output(
     )
     K = resize_intrinsics(K_lefts, size, grid)
     seen = [
-        reprojection(own.native, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1], run.config.terms)
+        reprojection(own.native, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1])
         for i, own in enumerate(run.evidence)
         if own.native
     ]
@@ -196,7 +196,6 @@ def _judged(
         on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in own),
         range_given=run.config.depth_range is not None,
         own_ratio=own_ratio,
-        points_measured=guidance.points_measured,
         has_unit=guidance.unit is not None,
     )
     return judge(signs)

@@ -94,7 +94,7 @@ def needs_network(guidance: GeometryGuidance) -> bool:
 
 
 def _moves_latents(guidance: GeometryGuidance) -> bool:
-    return guidance.config.updates.optimize_latents and guidance.updates.inner_steps > 0
+    return guidance.config.optimize_latents and guidance.updates.inner_steps > 0
 
 
 def check_network_input(prior: DepthPrior) -> None:

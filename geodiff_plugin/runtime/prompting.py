@@ -15,7 +15,7 @@ from torch import Tensor
 from geodiff_plugin.algorithm.correction import prior_error, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.known import stacked
-from geodiff_plugin.guidance.config import CorrectionConfig
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.matching import with_points
 
 __all__ = ["PROMPT_LONG_EDGE", "prompt_of"]
@@ -24,7 +24,7 @@ __all__ = ["PROMPT_LONG_EDGE", "prompt_of"]
 PROMPT_LONG_EDGE = 256
 
 
-def prompt_of(evidence: Sequence[Evidence], config: CorrectionConfig) -> Tensor | None:
+def prompt_of(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
     """Matches that are sure and points, spread along surfaces.
 
     Args:
@@ -39,7 +39,7 @@ def prompt_of(evidence: Sequence[Evidence], config: CorrectionConfig) -> Tensor 
     return torch.cat(maps) if len(maps) == len(evidence) else None
 
 
-def _dense(evidence: Evidence, config: CorrectionConfig) -> Tensor | None:
+def _dense(evidence: Evidence, config: GuidanceConfig) -> Tensor | None:
     """``(1, 1, h, w)`` metres: a flat map brought to what is known, as a prior's own would be."""
     sure, points = stacked([evidence.sure]), stacked([evidence.points])
     known = sure if points is None else with_points(sure, points)

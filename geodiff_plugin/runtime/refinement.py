@@ -39,7 +39,7 @@ def refine_result(
         ``(N, 1, H, W)`` metres, and support in [0, 1]; the depth as it was given and ``None`` where the
         result is not to be refined, or nothing is known of some image.
     """
-    if not run.config.correction.refine:
+    if not run.config.refine:
         return depth_m, None
     images = zip(known_of, depth_m.split(1), lefts_01.split(1), lefts.split(1), strict=True)
     fits = [fit for own, *maps in images if (fit := _refined(run, own, *maps)) is not None]
@@ -83,7 +83,7 @@ def _refined(run: GuidedRun, known: Known, depth_m: Tensor, left_01: Tensor, lef
     Edges first: a fit that finds them steep does not carry the depth of one surface over to the other, and
     the fit takes back what a poor prior's edges get wrong.
     """
-    if run.config.correction.sharpen and known.size is not None:
+    if run.config.sharpen and known.size is not None:
         spacing = max(1, round(max(image_size(depth_m)) / max(run.grid.content)))
-        depth_m = sharpen_edges(depth_m, left, spacing, run.config.correction)
+        depth_m = sharpen_edges(depth_m, left, spacing)
     return known.refine(depth_m, left_01)

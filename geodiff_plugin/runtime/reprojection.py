@@ -15,14 +15,13 @@ from geodiff_plugin.algorithm.evidence import as_fine_as
 from geodiff_plugin.algorithm.terms.exposure import match_exposure
 from geodiff_plugin.formats.strips import row_strips
 from geodiff_plugin.geometry.warping import warp_right_to_left
-from geodiff_plugin.guidance.config import TermsConfig
 from geodiff_plugin.types import CameraView
 
 __all__ = ["reprojection"]
 
 
 def reprojection(
-    views: Sequence[CameraView], depth_m: Tensor, left_01: Tensor, K_left: Tensor, config: TermsConfig
+    views: Sequence[CameraView], depth_m: Tensor, left_01: Tensor, K_left: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Where any right view sees the pixel, and the least mean absolute error to the re-rendered left image.
 
@@ -33,7 +32,6 @@ def reprojection(
         depth_m: ``(1, 1, H, W)`` metres.
         left_01: ``(1, 3, H, W)`` in [0, 1].
         K_left: ``(1, 3, 3)`` pixels of that grid.
-        config: how exposure is matched.
 
     Returns:
         ``(1, 1, H, W)`` bool and float in [0, 1], 0 where no view sees the pixel.
@@ -45,14 +43,7 @@ def reprojection(
         error = torch.zeros_like(depth_m)
         for channel in range(left_01.shape[1]):  # one by one: at this size a copy of all three counts
             own = slice(channel, channel + 1)
-            matched = match_exposure(
-                warped[:, own],
-                left_01[:, own],
-                seen,
-                gain_range=config.exposure_gain,
-                cells=(config.exposure_rows, config.exposure_columns),
-                prior=config.exposure_prior,
-            )
+            matched = match_exposure(warped[:, own], left_01[:, own], seen)
             error += matched.sub_(left_01[:, own]).abs_()
         error /= left_01.shape[1]
         best = torch.where(seen, torch.minimum(best, error), best)

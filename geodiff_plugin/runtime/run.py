@@ -260,7 +260,7 @@ class GuidedRun:
         if codec.has_tiny and decode_result is None:
             trajectory.result = None  # its map is a tiny decoder's
         active = any(trajectory.is_active(i / count) for i in rounds)
-        if move is None or not self.config.updates.optimize_latents or not active:
+        if move is None or not self.config.optimize_latents or not active:
             result: StepResult = output, z_t, None  # bit for bit the pipeline's own step
         elif tap is not None:
             result = self._moved_noisy(tap, output, z_t, leaf, move)
@@ -284,7 +284,7 @@ class GuidedRun:
             # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
             moved = (leaf + move).detach()
             return tap.output_at(moved).detach(), put_channels(z_t, depth, moved.to(z_t.dtype)), None
-        if self.config.updates.step_from == "updated":
+        if self.config.step_from == "updated":
             moved = (leaf + move).detach().to(z_t.dtype)
             return output, put_channels(z_t, depth, moved), None
         wide = torch.promote_types(z_t.dtype, torch.float32)

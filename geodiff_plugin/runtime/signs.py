@@ -148,7 +148,6 @@ def read_signs(
     on_edge: bool,
     range_given: bool = False,
     own_ratio: float = math.nan,
-    points_measured: bool = True,
     has_unit: bool = True,
 ) -> Signs:
     """The signs of one image.
@@ -163,14 +162,12 @@ def read_signs(
         on_edge: whether the search for the scale ended on the edge of its range.
         range_given: whether that range was given by the user.
         own_ratio: of the depth over a metric prior's own, NaN for a relative prior.
-        points_measured: whether points tell anything of the calibration; those that another view's depth
-            gives, where this view's matches are unsure, do not.
         has_unit: whether lengths are in metres, so that the length of a baseline says something.
     """
     matches, points = evidence.sweep_matches, evidence.sweep_points
     planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
     found: dict[str, Any] = {} if matches is None else {**_of_matches(matches, planes)}
-    if matches is not None and points is not None and points_measured:
+    if matches is not None and points is not None:
         found["points_ratio"] = _points_against(matches, points)
     known = evidence.points
     found |= {} if evidence.pose is None else _of_pose(evidence.pose)

@@ -15,8 +15,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.guidance.config import FitConfig
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.points import UNIT
 from geodiff_plugin.scale.space import SPACES, MetricMap, Space
@@ -30,8 +28,23 @@ __all__ = [
     "weighted_quantile",
 ]
 
+#: Matches above this confidence are reliable; as few of them make a basin or a quantile.
+RELIABLE, FEWEST_RELIABLE = 0.5, 50
+#: Values of near, and of far, that are tried against reliable matches or points, how far beyond the points'
+#: own range they reach, as a factor, and the points that tell basins apart.
+BASIN_CANDIDATES, BASIN_REACH, BASIN_SAMPLES = 48, 4.0, 1500
+#: Width of their Cauchy cost in units of the points, about a prior's own error; a current state within this
+#: factor of the best cost stays.
+BASIN_CAUCHY, BASIN_KEEP = 32.0, 1.05
+#: Reweighted Gauss-Newton steps on near and far, and matches that the fit looks at.
+FIT_ITERATIONS, FIT_SAMPLES = 12, 20_000
+#: Standard deviation of a match of confidence .96, planes; the least one in log depth, for what a map leaves
+#: over; width of the Cauchy weight, in standard deviations of both.
+FIT_NOISE, FIT_FLOOR, FIT_CAUCHY = 0.5, 4e-3, 2.0
+#: How far near and far may move, as log factors.
+NEAR_REACH, FAR_REACH = 1.4, 0.7
 # What a match leaves to doubt, ``1 - confidence``, tells its variance as well: on pairs with truth the error
-# of matches, in planes, grows with its root. At the first ``fit_noise`` holds; it falls to a share of it.
+# of matches, in planes, grows with its root. At the first ``FIT_NOISE`` holds; it falls to a share of it.
 _REFERENCE_DOUBT, _LEAST_DOUBT = 0.04, 0.16
 
 
@@ -41,10 +54,10 @@ def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
     return 1.0 / known.amax(), 1.0 / known.amin()
 
 
-def sure_matches(matches: Matches, config: FitConfig = DEFAULT.fit) -> Matches | None:
+def sure_matches(matches: Matches) -> Matches | None:
     """The matches that are more likely right than wrong, as if they were points; ``None`` for too few."""
-    sure = (matches.confidence > config.sure_confidence) & (matches.inverse_depth > matches.plane_step)
-    if int(sure.sum()) < config.min_sure:
+    sure = (matches.confidence > RELIABLE) & (matches.inverse_depth > matches.plane_step)
+    if int(sure.sum()) < FEWEST_RELIABLE:
         return None
     unit = UNIT * matches.inverse_depth[sure].median()
     return replace(matches, confidence=sure.float(), plane_step=unit)
@@ -56,7 +69,6 @@ def fit_to_points(
     points: Matches,
     metric: MetricMap,
     current: tuple[Tensor, Tensor] | None = None,
-    config: FitConfig = DEFAULT.fit,
 ) -> tuple[Tensor, Tensor]:
     """Depths of the two ends of a relative map that explain the points best.
 
@@ -65,19 +77,18 @@ def fit_to_points(
         points: of that image.
         metric: the prior's metric parametrisation.
         current: ``(near_m, far_m)``, ``(B,)`` each, in use; they stay unless a better basin shows up.
-        config: the fit's numbers.
 
     Returns:
-        ``near_m, far_m``, ``(B,)``: the best of 1128 (by default) log-spaced pairs in mean Cauchy cost of
+        ``near_m, far_m``, ``(B,)``: the best of 1128 log-spaced pairs in mean Cauchy cost of
         inverse depth, so that some points may be wrong. Coarse: ``refine_to_matches`` does the rest.
     """
     at = points.above(0.0)
-    at = at[:: max(1, -(-len(at) // config.basin_samples))]
+    at = at[:: max(1, -(-len(at) // BASIN_SAMPLES))]
     target = points.inverse_depth.flatten()[at]
     values = F.interpolate(x.float(), points.size, mode="bilinear", align_corners=False).flatten(1)[:, at]
     nearest, farthest = depth_span(points)
-    low, high = (nearest / config.basin_reach).log(), (farthest * config.basin_reach).log()
-    steps = torch.linspace(0, 1, config.basin_candidates, dtype=low.dtype, device=x.device)
+    low, high = (nearest / BASIN_REACH).log(), (farthest * BASIN_REACH).log()
+    steps = torch.linspace(0, 1, BASIN_CANDIDATES, dtype=low.dtype, device=x.device)
     grid = torch.exp(low + (high - low) * steps)
     i, j = torch.triu_indices(len(grid), len(grid), 1, device=x.device)
     found = []
@@ -86,11 +97,11 @@ def fit_to_points(
         if current is not None:
             near, far = torch.cat([current[0][b : b + 1], near]), torch.cat([current[1][b : b + 1], far])
         depth_m = metric(row.expand(len(near), 1, 1, -1), metric.from_range(near, far))[:, 0, 0]
-        e = (1.0 / depth_m - target) / (config.basin_cauchy * points.plane_step)
+        e = (1.0 / depth_m - target) / (BASIN_CAUCHY * points.plane_step)
         cost = torch.log1p(e * e).mean(1)
         best = cost.argmin(keepdim=True)  # a 0-d index would be read back
         if current is not None:
-            best = torch.where(cost[:1] <= config.basin_keep * cost[best], torch.zeros_like(best), best)
+            best = torch.where(cost[:1] <= BASIN_KEEP * cost[best], torch.zeros_like(best), best)
         found.append(torch.cat([near[best], far[best]]))
     nearest, farthest = torch.stack(found).unbind(1)
     return nearest, farthest
@@ -98,12 +109,7 @@ def fit_to_points(
 
 @torch.no_grad()
 def refine_to_matches(
-    x: Tensor,
-    matches: Matches,
-    near_m: Tensor,
-    far_m: Tensor,
-    space: str,
-    config: FitConfig = DEFAULT.fit,
+    x: Tensor, matches: Matches, near_m: Tensor, far_m: Tensor, space: str
 ) -> tuple[Tensor, Tensor]:
     """Robust fit of the two ends of a relative map to matches, started from the search's result.
 
@@ -113,7 +119,6 @@ def refine_to_matches(
         near_m: ``(B,)`` metres, start.
         far_m: ``(B,)`` metres, start.
         space: as in ``search_scale``.
-        config: the fit's numbers.
 
     Returns:
         ``near_m, far_m``, far within a factor of 2 of the start: matches alone have outliers, so they
@@ -127,20 +132,20 @@ def refine_to_matches(
     at = matches.above(0.0)  # known points are few: not one may be missed
     if not len(at):
         return near_m, far_m
-    at = at[:: max(1, len(at) // config.fit_samples)]
+    at = at[:: max(1, len(at) // FIT_SAMPLES)]
     inverse = matches.inverse_depth.flatten()[at].clamp_min(0.0)
     confidence = matches.confidence.flatten()[at]
     doubt = ((1.0 - confidence) / _REFERENCE_DOUBT).clamp_min(_LEAST_DOUBT)
-    fitted = _Fitted(inverse, confidence, doubt.sqrt(), config.fit_noise * matches.plane_step)
+    fitted = _Fitted(inverse, confidence, doubt.sqrt(), FIT_NOISE * matches.plane_step)
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
     form = SPACES[space]
     start = _ends(form, near_m, far_m)
-    reach = _ends(form, near_m / math.exp(config.fit_near_reach), far_m / math.exp(config.fit_far_reach))
-    other = _ends(form, near_m * math.exp(config.fit_near_reach), far_m * math.exp(config.fit_far_reach))
+    reach = _ends(form, near_m / math.exp(NEAR_REACH), far_m / math.exp(FAR_REACH))
+    other = _ends(form, near_m * math.exp(NEAR_REACH), far_m * math.exp(FAR_REACH))
     low, high = torch.minimum(reach, other), torch.maximum(reach, other)
     ends = start
-    for _ in range(config.fit_iterations):
-        ends = _refine_once(form, ends, values, fitted, (low, high), config)
+    for _ in range(FIT_ITERATIONS):
+        ends = _refine_once(form, ends, values, fitted, (low, high))
     at_zero, at_one = (form.forward(end, torch.ones_like(end)) for end in ends.unbind(1))
     return ordered(*form.ends(at_zero, at_one))
 
@@ -177,7 +182,6 @@ def _refine_once(
     values: Tensor,
     fitted: _Fitted,
     bounds: tuple[Tensor, Tensor],
-    config: FitConfig,
 ) -> Tensor:
     """One reweighted Gauss-Newton step on ``ends (B, 2)``, kept within ``bounds``."""
 
@@ -194,9 +198,9 @@ def _refine_once(
     residual = ((fitted.inverse + fitted.noise) / above).log().clamp(-1.0, 1.0)
     slope = mapped / above * (log_depth(v + h) - log_depth(v - h)) / (2.0 * h)
     left_over = 1.4826 * weighted_quantile(residual.abs(), fitted.trusted.expand_as(residual), 0.5)
-    floor = left_over.clamp_min(config.fit_floor)[:, None]
+    floor = left_over.clamp_min(FIT_FLOOR)[:, None]
     variance = (fitted.doubt * fitted.noise / above) ** 2 + floor**2
-    weight = fitted.trusted / (variance * (1.0 + residual**2 / (config.fit_cauchy**2 * variance)))
+    weight = fitted.trusted / (variance * (1.0 + residual**2 / (FIT_CAUCHY**2 * variance)))
     J = slope[..., None] * shares
     normal = torch.einsum("bpi,bp,bpj->bij", J, weight, J)
     gradient = torch.einsum("bpi,bp,bp->bi", J, weight, residual)

@@ -17,12 +17,22 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.guidance.config import SearchConfig
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.matching import CostVolume
 from geodiff_plugin.scale.space import SPACES
 
 __all__ = ["ScaleSearch", "argmin_over", "search_scale"]
+
+#: Cost beyond which a pixel is an outlier: occluded, mirrored, mistaken by the prior.
+COST_CLAMP = 0.35
+#: Pixels that the search looks at; of these, those that tell basins apart in the coarse grid.
+SAMPLES, COARSE_SAMPLES = 6000, 1500
+#: Values of near, and of far, in the coarse grid, and in each of the two finer ones.
+COARSE_GRID, FINE_GRID = 48, 13
+#: A current state this close to the best cost stays: a new one restarts the updates of scale and shift.
+KEEP_MARGIN = 2e-3
+#: Least share of the pixels that must stay in view of a rectified pair, and of any other pose: at the true
+#: depth some pairs of the latter share only .3 of them.
+IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.6, 0.25
 
 
 @dataclass(frozen=True)
@@ -32,7 +42,7 @@ class ScaleSearch:
     Attributes:
         near_m: metres, depth of the nearest end of the relative map.
         far_m: metres, depth of its farthest end.
-        cost: mean clamped census cost there, [0, ``cost_clamp``].
+        cost: mean clamped census cost there, [0, ``COST_CLAMP``].
         on_edge: the best pair touches the far end of the range, or the near end of a given range.
     """
 
@@ -79,7 +89,6 @@ def search_scale(
     *,
     depth_range: tuple[float, float] | None = None,
     current: tuple[Tensor, Tensor] | None = None,
-    config: SearchConfig = DEFAULT.search,
 ) -> ScaleSearch:
     """Depths of the two ends of a relative map that the two views agree on best.
 
@@ -90,20 +99,19 @@ def search_scale(
         depth_range: ``(near, far)`` metres, bounds of the search; by default from the volume's nearest
             plane to where the shift is 0.3 px.
         current: nearest and farthest depth in use, ``(B,)`` each, to be kept unless a better basin shows up.
-        config: the search's numbers.
 
     Returns:
-        ``ScaleSearch``. 1128 pairs (near, far) by default, log-spaced, then two finer grids around the best.
+        ``ScaleSearch``. 1128 pairs (near, far), log-spaced, then two finer grids around the best.
 
     Source: S7.3. Deviation: two numbers instead of one, clamped census cost instead of L_geo.
     """
     low, high = volume.reach_m if depth_range is None else depth_range
     height, width = volume.size
-    at = _sample_positions(height, width, config.search_samples, x.device)
+    at = _sample_positions(height, width, SAMPLES, x.device)
     cost, in_view = volume.at_pixels(at)
-    least = config.min_in_view_rectified if volume.rectified else config.min_in_view_posed
+    least = IN_VIEW_RECTIFIED if volume.rectified else IN_VIEW_POSED
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
-    coarse, fine = config.coarse_grid, config.fine_grid
+    coarse, fine = COARSE_GRID, FINE_GRID
     grid = torch.linspace(0, 1, coarse, dtype=values.dtype, device=x.device)
     log_low, log_span = math.log(low), math.log(high / low)
     i, j = torch.triu_indices(coarse, coarse, 1, device=x.device)
@@ -116,7 +124,7 @@ def search_scale(
         ) -> tuple[Tensor, Tensor, Tensor]:
             depth = SPACES[space].depth_at(row[None, ::every], near[:, None], far[:, None])
             mean, share = _lookup(
-                cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth, config.cost_clamp
+                cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth, COST_CLAMP
             )
             mean = mean + (share < least) * 1.0  # only if no pair keeps enough in view does one of these win
             k = mean.argmin(keepdim=True)  # a 0-d index would be read back
@@ -125,9 +133,7 @@ def search_scale(
         def to_m(u: Tensor) -> Tensor:
             return torch.exp(log_low + log_span * u)
 
-        near, far, mean = best_of(
-            to_m(grid[i]), to_m(grid[j]), every=max(1, len(at) // config.coarse_samples)
-        )
+        near, far, mean = best_of(to_m(grid[i]), to_m(grid[j]), every=max(1, len(at) // COARSE_SAMPLES))
         reach = log_span / (coarse - 1)
         for _ in range(2):
             n = near.log() + reach * offsets.repeat_interleave(fine)
@@ -138,7 +144,7 @@ def search_scale(
         if current is not None:
             a, c = (v[b : b + 1] for v in current)
             now = best_of(torch.minimum(a, c), torch.maximum(a, c))
-            kept = now[2] <= mean + config.keep_margin
+            kept = now[2] <= mean + KEEP_MARGIN
             near, far, mean = (
                 torch.where(kept, old, new) for old, new in zip(now, (near, far, mean), strict=True)
             )

@@ -31,6 +31,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
 from geodiff_plugin.geometry import resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.matching import build
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.machine import PeakMemory
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
@@ -67,7 +68,7 @@ AXES = (
     Axis(
         "planes of the sweep, at most",
         (32, 64, 128),
-        lambda n: {"knobs": {"planes": n, "plane_step_px": 0.05}},
+        lambda n: {"knobs": {"planes": n}},
     ),
     Axis("further views", (1, 2, 4), lambda n: {"views": n}),
     Axis("denoising steps", (4, 8, 16), lambda n: {"options": {"num_inference_steps": n}}),
@@ -108,7 +109,11 @@ def measure(
     torch.set_num_threads(1)
     pair = read_demo_pair()
     left, right, (K_left, K_right) = _resized(pair, side)
-    grids = {"loss_resolution": side, "sweep_side": side, "sweep_pixels": side * side}
+    # The grids and the number of planes follow the bounds that are measured, and nothing else.
+    build.SWEEP_SIDE = side
+    if "planes" in (knobs or {}):
+        build.PLANE_STEP_PX = 0.05
+    grids = {"loss_resolution": side, "sweep_pixels": side * side}
     K = K_left, *[K_right] * views
     E = np.eye(4), *[pair.rig.E] * views
     guidance = GeometryGuidance((right,) * views, K, E, pose="given", **grids | (knobs or {}))

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.cli.many.pairs import is_many
+from geodiff_plugin.config import KNOBS
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
 from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.formats.out_place import check_out
-from geodiff_plugin.guidance.config import GuidanceConfig
 from tests.fuzz.strategies import (
     CALIBRATIONS,
     EXAMPLES,
@@ -107,7 +107,7 @@ def test_matrices(tmp_path, size):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_arguments_of_the_guidance(size):
-    knobs = [name for name in GuidanceConfig().leaves() if name != "weights"]
+    knobs = [name for name in KNOBS if name != "weights"]
 
     @size
     @given(

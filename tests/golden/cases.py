@@ -133,7 +133,7 @@ def preset_search_only() -> Result:
 @case
 def gradient_updates() -> Result:
     left, right, K, E, _ = small()
-    knobs = {"inner_steps": 3, "updates_from": 0.0, "step_latents": 0.03}
+    knobs = {"inner_steps": 3, "step_latents": 0.03}
     return maps_of(call(bundled_prior(), left, GeometryGuidance(right, K, E, **knobs)))
 
 

@@ -8,13 +8,13 @@ import torch
 from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.objective import FurtherView, Objective, Views
 from geodiff_plugin.algorithm.terms import MatchTarget
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry.projection import plane_rays
-from geodiff_plugin.guidance.config import TermsConfig
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.scale.space import AffineState, MetricMap
 
-SETTINGS = TermsConfig(pyramid_levels=2, pull_to="zero", min_visible=0.0)
 WEIGHTS = {"photometric": 1.0, "matches": 0.3, "points": 0.1, "prior_pull": 0.01, "anchor": 0.2}
+CONFIG = GuidanceConfig(weights=WEIGHTS, pyramid_levels=2, pull_to="zero", min_visible=0.0)
 
 
 def double(x):
@@ -38,7 +38,7 @@ def test_whole_chain_against_finite_differences(make_pipeline, textured_plane, s
     pipe = make_pipeline().to(torch.float64)
     prior = MarigoldPrior(pipe)
     views, points = views_of(textured_plane)
-    objective = Objective(views, MetricMap(space), WEIGHTS, SETTINGS)
+    objective = Objective(views, MetricMap(space), CONFIG)
     generator = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
     condition, z_t = draw(1, 4, 24, 32), draw(1, 4, 24, 32)

@@ -149,8 +149,6 @@ def test_outside_start_and_stop_nothing_is_updated(make_pipeline, textured_plane
     "knobs, updates",
     [
         ({}, [0, 0, 0, 2]),  # matches are encoded at every step, photographs refine them at the last
-        ({"updates_from": 0.5}, [0, 0, 2, 2]),
-        ({"updates_from": 1.0}, [0, 0, 0, 0]),
         ({"stop": 0.5}, [0, 2, 0, 0]),
         ({"correct": False}, [2, 2, 2, 2]),
         ({"weights": {"photometric": 1.0}}, [2, 2, 2, 2]),

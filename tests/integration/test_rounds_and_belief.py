@@ -10,8 +10,10 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.algorithm import correction
 from geodiff_plugin.algorithm.rules import RULES
 from geodiff_plugin.algorithm.terms import TERMS, Term
+from geodiff_plugin.config import GuidanceConfig, UpdatePlan
 from tests.conftest import render_plane
 from tests.contracts.tiny_priors import make_e2e_ft
 
@@ -39,12 +41,12 @@ def test_later_rounds_are_anchored_to_the_network_and_all_corrections(textured_p
 
     monkeypatch.setitem(TERMS, "spy", Term(spy))
     monkeypatch.setitem(RULES, "constant", Constant)
+    monkeypatch.setattr(GuidanceConfig, "plan_updates", lambda *_args, **_kw: UpdatePlan(1, 0.0, 0.03))
     pair, pipe = textured_plane, enable_geometry_guidance(make_e2e_ft())
     guidance = GeometryGuidance(
         *(pair.right, pair.K, pair.E),
         rule="constant",
         inner_steps=1,
-        updates_from=0.0,
         min_steps=3,
         weights={"matches": 1.0, "spy": 1.0},
         loss_resolution=64,
@@ -53,13 +55,13 @@ def test_later_rounds_are_anchored_to_the_network_and_all_corrections(textured_p
     assert len(seen) == 3
     torch.testing.assert_close(seen[0][0], seen[0][1])  # the first round starts from the anchor
     for (z, anchor), (next_z, next_anchor) in zip(seen, seen[1:], strict=False):
-        correction = next_z - (z + STEP)
-        assert correction.abs().max() > 1e-3
-        torch.testing.assert_close(next_anchor - anchor, correction, atol=1e-5, rtol=0)
+        moved = next_z - (z + STEP)
+        assert moved.abs().max() > 1e-3
+        torch.testing.assert_close(next_anchor - anchor, moved, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("rejects", [True, False])
-def test_the_result_believes_no_match_behind_the_prior(make_oracle, rejects):
+def test_the_result_believes_no_match_behind_the_prior(make_oracle, monkeypatch, rejects):
     """A prior that sees a near surface in the far part of a plane, as it sees a mirror."""
     K = np.array([[90.0, 0, 47.5], [0, 90.0, 35.5], [0, 0, 1]])
     E, normal = np.eye(4), np.array([0.5, -0.7, 1.0])
@@ -71,10 +73,10 @@ def test_the_result_believes_no_match_behind_the_prior(make_oracle, rejects):
     seen_m[block] = 1.1 * truth_m.min()
     pipe = enable_geometry_guidance(make_oracle((seen_m - seen_m.min()) / (seen_m.max() - seen_m.min())))
     # Nothing else that doubts a match: it is the rejection that is looked at.
-    open_fit = {"outlier_width": 1e3, "stiffest": 0.7, "most_inertia": 0.003}
-    guidance = GeometryGuidance(
-        right, K, E, inner_steps=0, correct=False, reject_reflections=rejects, **open_fit
-    )
+    monkeypatch.setattr(correction, "STIFFEST", 0.7)
+    monkeypatch.setattr(correction, "MOST_INERTIA", 0.003)
+    knobs = {"inner_steps": 0, "correct": False, "reject_reflections": rejects, "outlier_width": 1e3}
+    guidance = GeometryGuidance(right, K, E, **knobs)
     out = pipe(Image.fromarray(left), guidance=guidance, num_inference_steps=1)
     inner = np.zeros_like(block)
     inner[45:61, 25:41] = True

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, guide_both_views
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.guidance.posing import pose_views
 from geodiff_plugin.types import CameraView
 from tests.conftest import plane_pair
@@ -68,20 +68,6 @@ def test_no_warm_start_does(default, textured_plane):
     expected = _depth_m(pipe, textured_plane, previous=first)
     with _default(default):
         assert np.array_equal(_depth_m(pipe, textured_plane, previous=first), expected)
-
-
-@pytest.mark.parametrize("default", ["meta", torch.float64, torch.bfloat16], ids=str)
-def test_no_pair_of_views_does(default, textured_plane):
-    pipe = enable_geometry_guidance(TINY["marigold"]())
-    views = textured_plane.left, textured_plane.right, textured_plane.K, textured_plane.E
-
-    def both():
-        outputs = guide_both_views(pipe, *views, generator=torch.Generator("cpu").manual_seed(0))
-        return np.stack([output.prediction for output in outputs])
-
-    expected = both()
-    with _default(default):
-        assert np.array_equal(both(), expected)
 
 
 @pytest.mark.parametrize("default", ["meta", torch.float64, torch.bfloat16], ids=str)

@@ -13,7 +13,7 @@ from tests.pretended_device import Reached, pretended
 ALLOWED = 0
 KNOBS = {
     "default": {},
-    "updates": {"inner_steps": 2, "updates_from": 0.0},
+    "updates": {"inner_steps": 2},
     "full": {"gradient": "full", "inner_steps": 1},
 }
 STEPS = 3

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from geodiff_plugin.algorithm.terms import TERMS, Term
 from geodiff_plugin.cli.eval.app import eval_app
+from geodiff_plugin.config import DEFAULT_WEIGHTS
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings
 from geodiff_plugin.evaluation.baselines._guidance import call_arguments
 from geodiff_plugin.evaluation.datasets import find_pairs, load
@@ -26,7 +27,6 @@ from geodiff_plugin.evaluation.figures.clouds import SHRINK, orbit, render_cloud
 from geodiff_plugin.evaluation.figures.gs_sweep import sweep_g_s
 from geodiff_plugin.evaluation.figures.terms import term_by_term
 from geodiff_plugin.formats import write_depth_npy
-from geodiff_plugin.guidance.config import DEFAULT_WEIGHTS
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 
 

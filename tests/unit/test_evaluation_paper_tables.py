@@ -128,20 +128,18 @@ def test_changes_are_configurations_of_the_guidance(name):
 def test_flatness_tries_every_number_at_half_and_at_twice():
     names = flatness_methods()
     assert len(names) == 1 + 2 * len(NUMBERS) == len(set(names))
-    assert "guided:outlier_width=6" in names and "guided:correction_cauchy=5" in names
-    records = [
-        make_record(name, "0", 0.2 if name.endswith("correction_cauchy=5") else 0.1, 1.0) for name in names
-    ]
+    assert "guided:outlier_width=6" in names and "guided:smoothness=80" in names
+    records = [make_record(name, "0", 0.2 if name.endswith("smoothness=80") else 0.1, 1.0) for name in names]
     rows = {row[0]: row for row in flatness_table(records).rows}
-    assert rows["`correction_cauchy`"][1:] == ("2.5", "0.1000", "0.2000", f"0.100 ({label_of(records[0])})")
-    assert rows["`inertia`"][-1] == "0.000"
+    assert rows["`smoothness`"][1:] == ("40", "0.1000", "0.2000", f"0.100 ({label_of(records[0])})")
+    assert rows["`min_steps`"][-1] == "0.000"
 
 
-def test_a_variant_changes_its_leaf_and_no_other():
+def test_a_variant_changes_its_knob_and_no_other():
     preset = find_method("guided").configuration(Settings())["guidance"]
-    changed = find_method("guided:correction_cauchy=4").configuration(Settings())["guidance"]
-    assert changed["correction"].pop("correction_cauchy") == 4.0
-    assert preset["correction"].pop("correction_cauchy") == 2.5
+    changed = find_method("guided:smoothness=4").configuration(Settings())["guidance"]
+    assert changed.pop("smoothness") == 4.0
+    assert preset.pop("smoothness") == 40.0
     assert changed == preset
 
 
@@ -285,7 +283,7 @@ def test_parts_and_flatness_take_any_data(free_methods, scene, tmp_path):
     further = answer.stdout.partition("Further methods and priors, 1 pair")[2]
     assert re.search("sweep-sgm +1 +1.000", further) and not re.search("guided +1 ", further)
     answer = invoke("flatness", "--data", scene, "-o", tmp_path / "flat")
-    assert re.search("`inertia` +0.015 ", answer.stdout) and (tmp_path / "flat" / "flatness.md").is_file()
+    assert re.search("`smoothness` +40 ", answer.stdout) and (tmp_path / "flat" / "flatness.md").is_file()
 
 
 def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, tmp_path, monkeypatch):

@@ -7,8 +7,8 @@ import torch
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.algorithm.evidence import EvidenceInputs
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.guidance import evidence_store
-from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from tests.benchmarks.matching import textured_pair
 
@@ -61,7 +61,7 @@ def test_any_other_value_is_made_anew(made):
         store.get(EvidenceInputs(*given, *SETTINGS))
     assert len(made) == 1 + len(others)
     store.get(EvidenceInputs(left, rights, K, None, GuidanceConfig().changed(loss_resolution=320), True))
-    store.get(EvidenceInputs(left, rights, K, None, GuidanceConfig().changed(step_penalty=0.3), True))
+    store.get(EvidenceInputs(left, rights, K, None, GuidanceConfig().changed(planes=80), True))
     # What happens after evidence is made says nothing of it.
     store.get(EvidenceInputs(left, rights, K, None, GuidanceConfig().changed(inner_steps=0), True))
     assert len(made) == 3 + len(others)

@@ -14,7 +14,7 @@ import pytest
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.lenses import lenses_of, pinhole
-from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.config import GuidanceConfig
 from tests.contracts import factory_calibrations as factory
 from tests.contracts import test_formats_table as table
 

@@ -9,8 +9,7 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.guidance import presets
-from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.config import DEFAULT, PAPER, PRESETS, GuidanceConfig
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
 E = np.eye(4)
@@ -19,10 +18,12 @@ RIGHT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
 changed_K = np.array([[60.0, 0, 900.0], [0, 60.0, 23.5], [0, 0, 1]])
 
 
-def test_knobs_are_leaves_of_the_configuration(tmp_path):
+def test_knobs_are_fields_of_the_configuration(tmp_path):
     guidance = GeometryGuidance(RIGHT, K, E, inner_steps=10, smoothness=5.0)
-    assert guidance.config == presets.DEFAULT.changed(inner_steps=10, smoothness=5.0)
-    assert GeometryGuidance(RIGHT, K, E, config=presets.PAPER).config == presets.PAPER
+    assert guidance.config == DEFAULT.changed(inner_steps=10, smoothness=5.0)
+    assert GeometryGuidance(RIGHT, K, E, config=PAPER).config == PAPER
+    for name in ("default", "paper", "search-only", "prior-fit"):
+        assert GeometryGuidance(RIGHT, K, E, preset=name).config == PRESETS[name]
     guidance.config.save(tmp_path / "guidance.json")
     again = GeometryGuidance(RIGHT, K, E, config=GuidanceConfig.load(tmp_path / "guidance.json"), eta=0.5)
     assert again.config == guidance.config.changed(eta=0.5)
@@ -31,8 +32,8 @@ def test_knobs_are_leaves_of_the_configuration(tmp_path):
 def test_what_is_left_open_is_settled_for_what_is_given():
     points = np.array([[0.0, 0.0, 2.0]])
     guidance = GeometryGuidance(RIGHT, K, E)
-    assert guidance.config.updates.inner_steps is None and guidance.updates.inner_steps == 0
-    assert guidance.as_run().updates.inner_steps == 0
+    assert guidance.config.inner_steps is None and guidance.updates.inner_steps == 0
+    assert guidance.as_run().inner_steps == 0
     only_points = {"weights": {"points": 1.0, "photometric": 1.0}}
     assert GeometryGuidance(RIGHT, K, E, **only_points).updates.inner_steps == 40
     assert GeometryGuidance(RIGHT, K, E, points=points, **only_points).updates.inner_steps == 0
@@ -43,8 +44,10 @@ def test_names_of_tables_above_the_configuration_are_checked():
         GeometryGuidance(RIGHT, K, E, smoothnes=1.0)
     with pytest.raises(InputError, match="config must be a GuidanceConfig"):
         GeometryGuidance(RIGHT, K, E, config={"gradient": "full"})
-    with pytest.raises(InputError, match="the option of options"):
-        GeometryGuidance(RIGHT, K, E, options={"matches.colour": 1.0})
+    with pytest.raises(InputError, match="preset must be one of default"):
+        GeometryGuidance(RIGHT, K, E, preset="fast")
+    with pytest.raises(InputError, match="preset must be None beside config"):
+        GeometryGuidance(RIGHT, K, E, preset="paper", config=PAPER)
 
 
 @pytest.mark.parametrize(
@@ -208,7 +211,6 @@ def changed(matrix, index, value):
         (bad(rule="sgd"), ValueError, "rule"),
         (bad(inner_steps=1.5), TypeError, "inner_steps"),
         (bad(inner_steps=-1), ValueError, "inner_steps"),
-        (bad(updates_from=1.5), ValueError, "updates_from"),
         (bad(start=0.8, stop=0.2), ValueError, "start"),
         (bad(depth_range=(3.0, 1.0)), ValueError, "depth_range"),
         (bad(weights=["photometric"]), TypeError, "weights must be a dict"),
@@ -239,7 +241,7 @@ def test_views_in_any_world_frame():
     K_third[0, 2] += 5
     views = [(RIGHT, K, world), (RIGHT, K, world @ E), (RIGHT, K_third, world @ up)]
     guidance = GeometryGuidance.from_views(views, inner_steps=3)
-    assert guidance.config.updates.inner_steps == 3 and len(guidance.rights) == 2
+    assert guidance.config.inner_steps == 3 and len(guidance.rights) == 2
     np.testing.assert_allclose([rig.E for rig in guidance.rigs], [E, up], atol=1e-12)
     assert guidance.rigs[1].K_right[0, 2] == 36.5 and guidance.rigs[1].K_left[0, 2] == 31.5
     with pytest.raises(ValueError, match="image must be of 64x48 pixels, as the left view; got 32x24"):
@@ -319,19 +321,10 @@ def test_what_is_given_must_feed_what_is_asked():
 
 def test_marigold_dc_preset_is_the_published_one():
     config = GeometryGuidance.marigold_dc(np.array([[0.0, 0.0, 2.0]]), K).config
-    updates = config.updates
-    assert (config.gradient, updates.rule, updates.step_latents, updates.step_affine) == (
-        "full",
-        "adam-norm",
-        0.05,
-        0.005,
-    )
-    assert (config.search.positive, config.terms.points_loss, config.min_steps, updates.inner_steps) == (
-        "square",
-        "l1l2",
-        50,
-        1,
-    )
+    assert (config.gradient, config.rule) == ("full", "adam-norm")
+    assert (config.step_latents, config.step_affine) == (0.05, 0.005)
+    assert (config.positive, config.points_loss, config.min_steps) == ("square", "l1l2", 50)
+    assert config.inner_steps == 1
     assert config.weights == {"points": 1.0}
 
 
@@ -345,12 +338,11 @@ def test_millimetres_are_suspected():
 
 def test_paper_preset_is_the_paper():
     config = GeometryGuidance.paper(RIGHT, K, E).config
-    terms, updates, search = config.terms, config.updates, config.search
-    assert (config.gradient, updates.rule, updates.affine_rule) == ("full", "plain", "plain")
-    assert updates.step_latents == updates.step_affine == 1e-2
+    assert (config.gradient, config.rule) == ("full", "plain")
+    assert config.step_latents == config.step_affine == 1e-2
     assert config.weights == {"photometric": 1.0, "prior_pull": 1e-2}
-    assert (terms.eta, updates.inner_steps, terms.pull_to) == (0.85, 1, "zero")
-    assert (search.search, search.g_s_range) == ("one-number", (1.0, 80.0))
+    assert (config.eta, config.inner_steps, config.pull_to) == (0.85, 1, "zero")
+    assert (config.search, config.g_s_range) == ("one-number", (1.0, 80.0))
 
 
 def test_from_calibration_picks_the_cameras(tmp_path):

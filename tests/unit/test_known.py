@@ -7,7 +7,7 @@ import torch
 
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.known import Known
-from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching import Matches
 
 K, FINE, COARSE = torch.eye(3), (24, 32), (12, 16)

@@ -8,8 +8,8 @@ import torch
 
 from geodiff_plugin.algorithm.evidence import EvidenceInputs, chunk_views, prepare_evidence
 from geodiff_plugin.algorithm.objective import Objective
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry import warp_right_to_left
-from geodiff_plugin.guidance.config import GuidanceConfig, TermsConfig
 from geodiff_plugin.scale.space import MetricMap
 from geodiff_plugin.types import CameraView
 from tests.conftest import render_plane
@@ -64,8 +64,10 @@ def test_below_min_visible_the_photographs_have_no_say(min_visible):
     """At this depth the plane shows some 60 % of the left image to a right camera that far away."""
     views = chunk_views([wide_pair((120, 800), 600.0, at_m=0.6)], [0])
     metric = MetricMap("depth")
-    settings = TermsConfig(eta=0.85, pyramid_levels=1, exposure=False, min_visible=min_visible)
-    objective = Objective(views, metric, {"photometric": 1.0}, settings)
+    config = GuidanceConfig(
+        weights={"photometric": 1.0}, pyramid_levels=1, exposure=False, min_visible=min_visible
+    )
+    objective = Objective(views, metric, config)
     affine = metric.from_range(torch.tensor([1.0]), torch.tensor([1.4]))
     x = torch.full((1, 1, 96, 640), 0.3, requires_grad=True)
     loss = objective(x, affine, affine, x, x, None)

@@ -10,7 +10,6 @@ from PIL import Image
 from geodiff_plugin.formats import flying_points, make_cloud, strips, write_depth_mm_png, write_ply
 from geodiff_plugin.formats.ply import read_ply_points
 from geodiff_plugin.formats.strips import row_strips
-from geodiff_plugin.guidance.config import TermsConfig
 from geodiff_plugin.plotting.figures import colour_depth, depth_range
 from geodiff_plugin.plotting.overview import overview, share_figure
 from geodiff_plugin.runtime.confidence import depth_confidence
@@ -69,7 +68,7 @@ def test_rerendering_and_confidence_in_strips(textured_plane, monkeypatch):
 
     def told():
         view = CameraView(0.8 * right + 0.1, K, T)  # another exposure, which is taken out
-        visible, error = reprojection([view], depth_m, left[None], K[None], TermsConfig())
+        visible, error = reprojection([view], depth_m, left[None], K[None])
         support = torch.linspace(0, 1, depth_m.numel()).view_as(depth_m)
         return visible, error, depth_confidence(support, error, visible, None)
 

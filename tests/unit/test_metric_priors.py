@@ -12,8 +12,7 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.algorithm.evidence import EvidenceInputs, prepare_evidence
 from geodiff_plugin.cli.report import summary_line
-from geodiff_plugin.guidance.config import GuidanceConfig
-from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.runtime.prompting import PROMPT_LONG_EDGE, prompt_of
 from geodiff_plugin.types import CameraView
 from tests.contracts.tiny_transformers import make_transformers
@@ -122,7 +121,7 @@ def evidence_of(pair, points=None, rights=True):
 
 
 def test_matches_become_a_dense_prompt(textured_plane):
-    prompt = prompt_of([evidence_of(textured_plane)], DEFAULT.correction)
+    prompt = prompt_of([evidence_of(textured_plane)], DEFAULT)
     assert prompt.shape[:2] == (1, 1) and max(prompt.shape[-2:]) <= PROMPT_LONG_EDGE
     truth = torch.from_numpy(textured_plane.depth_m)[None, None]
     truth = torch.nn.functional.interpolate(truth, prompt.shape[-2:], mode="bilinear", antialias=True)
@@ -132,11 +131,11 @@ def test_matches_become_a_dense_prompt(textured_plane):
 def test_points_alone_become_a_prompt_and_nothing_becomes_none(textured_plane):
     points = torch.zeros(textured_plane.depth_m.shape)
     points[::8, ::8] = torch.from_numpy(textured_plane.depth_m)[::8, ::8]
-    prompt = prompt_of([evidence_of(textured_plane, points, rights=False)], DEFAULT.correction)
+    prompt = prompt_of([evidence_of(textured_plane, points, rights=False)], DEFAULT)
     middle = float(np.median(textured_plane.depth_m))
     assert prompt.isfinite().all() and float(prompt.median()) == pytest.approx(middle, rel=0.01)
     bare = evidence_of(textured_plane, points, rights=False)
-    assert prompt_of([bare, replace(bare, points=None, sweep_points=None)], DEFAULT.correction) is None
+    assert prompt_of([bare, replace(bare, points=None, sweep_points=None)], DEFAULT) is None
 
 
 def test_prompt_depth_anything_is_given_what_is_known(textured_plane):

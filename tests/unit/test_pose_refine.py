@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.guidance.config import GuidanceConfig
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.guidance.posing import coarse_depth, pose_views
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.noise import split_residuals

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm import sharpening
 from geodiff_plugin.algorithm.sharpening import sharpen_edges
-from geodiff_plugin.guidance.presets import DEFAULT
 
 NEAR, FAR = 2.0, 6.0
 
@@ -97,11 +96,10 @@ def test_strips_chunks_and_batches_change_nothing(monkeypatch):
     assert torch.equal(sharpen_edges(soft, left, 2), whole)
 
 
-def test_thresholds_are_knobs():
+@pytest.mark.parametrize(("name", "value"), [("SLOPE", 1e3), ("REACH", 0.3), ("BRIGHTNESS", 1e3)])
+def test_every_weight_of_the_median_counts(monkeypatch, name, value):
     truth = box()
     soft, left = blurred(truth), picture(truth)
-    off = DEFAULT.changed(ramp_step=10.0).correction
-    assert torch.equal(sharpen_edges(soft, left, config=off), soft)
     usual = sharpen_edges(soft, left)
-    for knob in ({"ramp_slope": 1e3}, {"sharpen_reach": 0.3}, {"sharpen_colour": 1e3}):
-        assert not torch.equal(sharpen_edges(soft, left, config=DEFAULT.changed(**knob).correction), usual)
+    monkeypatch.setattr(sharpening, name, value)
+    assert not torch.equal(sharpen_edges(soft, left), usual)

@@ -18,10 +18,10 @@ import geodiff_plugin
 from geodiff_plugin import GeometryGuidance, geometry
 from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit, warn_of_other_size
 from geodiff_plugin.algorithm.evidence import EvidenceInputs, as_fine_as, prepare_evidence, resize_long_edge
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.figures.clouds import render_cloud
 from geodiff_plugin.formats.pointcloud import write_ply
-from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.matching import build_cost_volume, find_matches, points_to_matches
 from geodiff_plugin.matching.alignment import align_view
 from geodiff_plugin.matching.build import pilot_volume
@@ -50,7 +50,6 @@ HAND_ON = {
     "matching.mirrored.mirrored_pose_preferred",
     "matching.build.find_matches",
     "matching.build.pilot_volume",
-    "runtime.both_views.guide_both_views",
     "runtime.reprojection.reprojection",  # to warp_right_to_left
     "cli.lenses.pinhole",  # to OpenCV
     "cli.inputs.read_known",

@@ -5,8 +5,11 @@ import pytest
 import torch
 
 from geodiff_plugin.algorithm.terms import TERMS, Estimate, MatchTarget, masked_mean
+from geodiff_plugin.algorithm.terms.anchor import FLOOR
+from geodiff_plugin.algorithm.terms.matches import CAUCHY as MATCHES_CAUCHY
 from geodiff_plugin.algorithm.terms.photometric import photometric, photometric_map, ssim
-from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.algorithm.terms.points import CAUCHY as POINTS_CAUCHY
+from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.scale.space import AffineState
 
 
@@ -35,7 +38,7 @@ def estimate(**changes):
 @pytest.mark.parametrize("name", [n for n in TERMS if n != "prior_pull"])
 def test_a_perfect_estimate_costs_nothing(name):
     term = TERMS[name]
-    value = term.function(estimate(), **{key: getattr(DEFAULT.terms, key) for key in term.options})
+    value = term.function(estimate(), **{key: getattr(DEFAULT, key) for key in term.options})
     torch.testing.assert_close(value, torch.zeros(2), atol=1e-5, rtol=0)
 
 
@@ -71,7 +74,7 @@ def test_points_robust_and_in_metres():
     known[:, :, 3, 4] = known[:, :, 20, 30] = 1.0
     target = MatchTarget(torch.full((2, 1, 32, 40), 0.5) * known, known, torch.tensor([0.005, 0.005]))
     off = estimate(depth_m=torch.full((2, 1, 32, 40), 2.5), points=target)
-    c2 = DEFAULT.terms.points_cauchy**2
+    c2 = POINTS_CAUCHY**2
     expected = torch.full((2,), c2 / 2 * float(torch.log1p(torch.tensor(20.0**2 / c2))))
     torch.testing.assert_close(points(off), expected)
     torch.testing.assert_close(points(off, points_loss="l1l2"), torch.full((2,), 0.5 + 0.25))
@@ -124,7 +127,7 @@ def test_photometric_gradient_in_float64():
 
 def test_matches_in_planes():
     near = estimate(depth_m=torch.full((2, 1, 32, 40), 1 / 0.53))
-    c2 = DEFAULT.terms.matches_cauchy**2
+    c2 = MATCHES_CAUCHY**2
     expected = c2 / 2 * torch.log(1 + torch.tensor([3.0, 1.5]) ** 2 / c2)
     torch.testing.assert_close(TERMS["matches"].function(near), expected, rtol=1e-4, atol=0)
 
@@ -160,7 +163,7 @@ def test_anchor_holds_what_no_match_holds():
     half[..., :20] = 0.0
     half = MatchTarget(target.inverse_depth, half, target.plane_step)
     value = TERMS["anchor"].function(estimate(z0=moved, matches=half))
-    torch.testing.assert_close(value, torch.full((2,), 9.0 * (1.0 + DEFAULT.terms.anchor_floor) / 2.0))
+    torch.testing.assert_close(value, torch.full((2,), 9.0 * (1.0 + FLOOR) / 2.0))
 
 
 def test_masked_mean():

@@ -3,10 +3,9 @@
 Data flow: ``Estimate`` -> ``{name: (B,)}``.
 Paper: Eq. 14 (eq:geo-loss), Eq. 17; the terms beyond the paper say so.
 
-A new term is a new file and one line in ``TERMS``. ``options`` are the keywords that it takes: leaves of
-``TermsConfig``, or for a term beyond the package entries ``TERM.OPTION`` of its ``options``. ``needs_warp``
-says whether it reads ``Estimate.warped_01``, ``needs_matches`` and ``needs_points`` whether it reads those; a
-term whose input a call lacks is left out.
+A new term is a new file and one line in ``TERMS``. ``options`` are the keywords that it takes, knobs of
+``GuidanceConfig``. ``needs_warp`` says whether it reads ``Estimate.warped_01``, ``needs_matches`` and
+``needs_points`` whether it reads those; a term whose input a call lacks is left out.
 """
 
 from __future__ import annotations
@@ -37,20 +36,10 @@ class Term:
     needs_points: bool = False
 
 
-PHOTOMETRIC_OPTIONS = (
-    "eta",
-    "pyramid_levels",
-    "exposure",
-    "exposure_gain",
-    "exposure_rows",
-    "exposure_columns",
-    "exposure_prior",
-)
-
 TERMS: dict[str, Term] = {
-    "photometric": Term(photometric, PHOTOMETRIC_OPTIONS, needs_warp=True),
-    "matches": Term(matches, ("matches_cauchy",), needs_matches=True),
-    "points": Term(points, ("points_loss", "points_cauchy"), needs_points=True),
+    "photometric": Term(photometric, ("eta", "pyramid_levels", "exposure"), needs_warp=True),
+    "matches": Term(matches, needs_matches=True),
+    "points": Term(points, ("points_loss",), needs_points=True),
     "prior_pull": Term(prior_pull, ("pull_to",)),
-    "anchor": Term(anchor, ("anchor_floor",)),
+    "anchor": Term(anchor),
 }

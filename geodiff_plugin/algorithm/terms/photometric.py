@@ -14,7 +14,7 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.terms.base import Estimate, masked_mean
 from geodiff_plugin.algorithm.terms.exposure import match_exposure
-from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.config import DEFAULT
 
 __all__ = ["photometric", "photometric_map", "ssim"]
 
@@ -72,13 +72,9 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 def photometric(
     estimate: Estimate,
     *,
-    eta: float = DEFAULT.terms.eta,
-    pyramid_levels: int = DEFAULT.terms.pyramid_levels,
-    exposure: bool = DEFAULT.terms.exposure,
-    exposure_gain: tuple[float, float] = DEFAULT.terms.exposure_gain,
-    exposure_rows: int = DEFAULT.terms.exposure_rows,
-    exposure_columns: int = DEFAULT.terms.exposure_columns,
-    exposure_prior: float = DEFAULT.terms.exposure_prior,
+    eta: float = DEFAULT.eta,
+    pyramid_levels: int = DEFAULT.pyramid_levels,
+    exposure: bool = DEFAULT.exposure,
 ) -> Tensor:
     """Mean photometric error over the visible pixels, averaged over an image pyramid.
 
@@ -90,10 +86,6 @@ def photometric(
         eta: weight of SSIM against L1.
         pyramid_levels: 1 is the paper's; coarser levels widen the basin of attraction.
         exposure: compare in the left image's exposure (``exposure.match_exposure``).
-        exposure_gain: as ``gain_range`` there.
-        exposure_rows: of its cells.
-        exposure_columns: of its cells.
-        exposure_prior: as ``prior`` there.
 
     Returns:
         ``(B,)`` float; differentiable in the depth through ``warped_01`` (bilinear, so the gradient is
@@ -108,10 +100,7 @@ def photometric(
     warped = estimate.warped_01.flatten(0, 1)
     mask = estimate.visible.flatten(0, 1).to(left.dtype)
     if exposure:
-        cells = (exposure_rows, exposure_columns)
-        warped = match_exposure(
-            warped, left, mask, gain_range=exposure_gain, cells=cells, prior=exposure_prior
-        )
+        warped = match_exposure(warped, left, mask)
     total, levels = left.new_zeros(()), 0
     for level in range(pyramid_levels):
         if level:

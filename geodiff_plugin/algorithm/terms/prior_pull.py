@@ -9,12 +9,12 @@ from __future__ import annotations
 from torch import Tensor
 
 from geodiff_plugin.algorithm.terms.base import Estimate
-from geodiff_plugin.guidance.presets import DEFAULT
+from geodiff_plugin.config import DEFAULT
 
 __all__ = ["prior_pull"]
 
 
-def prior_pull(estimate: Estimate, *, pull_to: str = DEFAULT.terms.pull_to) -> Tensor:
+def prior_pull(estimate: Estimate, *, pull_to: str = DEFAULT.pull_to) -> Tensor:
     """Squared distance of the raw scale and shift from their anchor.
 
     Args:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.presets import DEFAULT
 
 __all__ = ["PHOTOMETRIC_ONLY"]
 

@@ -6,9 +6,9 @@ Paper: none; what the loop of guided steps has to beat.
 
 from __future__ import annotations
 
+from geodiff_plugin.config import PRIOR_FIT
 from geodiff_plugin.evaluation.baselines._guidance import guided_method
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.presets import PRIOR_FIT
 
 __all__ = ["PRIOR_FIT_METHOD"]
 

@@ -13,12 +13,12 @@ from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImage
 from PIL import Image
 from torch import Tensor
 
+from geodiff_plugin.config import PAPER
 from geodiff_plugin.evaluation.baselines._constant import Start, constant_method
 from geodiff_plugin.evaluation.baselines._guidance import call_arguments
 from geodiff_plugin.evaluation.baselines.base import Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.presets import PAPER
 
 __all__ = ["REPROJECTION_ONLY"]
 

@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from geodiff_plugin.config import DEFAULT, PAPER, GuidanceConfig, config_from_text
 from geodiff_plugin.evaluation.baselines._guidance import (
     call_arguments,
     guided_configuration,
@@ -18,10 +19,7 @@ from geodiff_plugin.evaluation.baselines._guidance import (
 )
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.guidance.config import GuidanceConfig
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.knobs import config_from_text
-from geodiff_plugin.guidance.presets import DEFAULT, PAPER
 
 __all__ = ["default_variant", "paper_variant"]
 

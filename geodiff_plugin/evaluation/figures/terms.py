@@ -18,6 +18,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.algorithm.state import Trajectory
+from geodiff_plugin.algorithm.terms.matches import CAUCHY
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines._guidance import call_arguments, posed_views, prior_space
 from geodiff_plugin.evaluation.datasets import StereoSample
@@ -39,7 +40,6 @@ from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import hidden_in_right, warp_right_to_left
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.presets import DEFAULT
 from geodiff_plugin.plotting.figures import depth_range
 from geodiff_plugin.scale.space import AffineState
 from geodiff_plugin.types import StepReport
@@ -178,7 +178,7 @@ def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[st
     shown = show_values(lower[1], parts.difference, title, "inferno", 0.0, WORST_DIFFERENCE)
     mark(lower[1], parts.hidden, HIDDEN_COLOUR)
     value_bar(figure, shown, lower[1], "mean absolute difference", "max")
-    title, most = "refined against matches\n(red: nearer)", DEFAULT.terms.matches_cauchy
+    title, most = "refined against matches\n(red: nearer)", CAUCHY
     shown = show_values(lower[2], parts.residual, title, "RdBu_r", -most, most)
     value_bar(figure, shown, lower[2], "planes of the sweep", "both")
     shown = show_values(lower[3], parts.match_weight, "weight of the matches", "viridis", 0.0, 1.0)

@@ -1,0 +1,678 @@
+"""Every number and switch of the guidance: one flat, frozen configuration, and its presets.
+
+S5.1 and Algorithm 1 name some of them. The tables of docs/reference/knobs.md are made from this module:
+
+    python -m geodiff_plugin.config docs/reference/knobs.md
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import Field, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_flag, check_number, check_range
+
+__all__ = ["DEFAULT", "DEFAULT_WEIGHTS", "KNOBS", "MARIGOLD_DC", "PAPER", "PRESETS", "PRIOR_FIT"]
+__all__ += ["SEARCH_ONLY", "GuidanceConfig", "Knob", "UpdatePlan", "close_names", "config_from_text"]
+__all__ += ["knob_lines", "knob_tables", "preset_named", "value_of", "with_tables"]
+
+#: Weights of the default preset.
+DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
+#: The least value where 0 is not allowed.
+TINY = 1e-9
+
+
+class Knob(NamedTuple):
+    """What is known about one field of the configuration.
+
+    Attributes:
+        doc: what it does, with its source where it has one.
+        values: its range in words.
+        check: value and name -> the value as it is kept; raises ``InputError``.
+        paper: what the paper says of it; ``"{}"`` stands for the value of the ``PAPER`` preset.
+        unset: what ``None`` becomes when the guidance is used, in words; empty where ``None`` is not allowed.
+    """
+
+    doc: str
+    values: str
+    check: Callable[[Any, str], Any]
+    paper: str = "{}"
+    unset: str = ""
+
+    @classmethod
+    def of(cls, described: Field[Any]) -> Knob:
+        """The description of a field."""
+        return described.metadata["knob"]
+
+
+class _FrozenDict(dict[str, Any]):
+    """A dict that cannot be changed, so that a configuration can hold it; equal to a dict of its items."""
+
+    def _refuse(self, *_: Any, **__: Any) -> Any:
+        raise TypeError("a configuration does not change; make another one with changed(...)")
+
+    __setitem__ = __delitem__ = __ior__ = clear = pop = popitem = setdefault = update = _refuse
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(frozenset(self.items()))
+
+    def __reduce__(self) -> tuple[type[_FrozenDict], tuple[dict[str, Any]]]:
+        return _FrozenDict, (dict(self),)
+
+
+def _knob(default: Any, *described: Any, **more: str) -> Any:
+    knob = Knob(*described, **more)
+    if knob.unset:
+        check = knob.check
+        knob = knob._replace(
+            values=f"{knob.values}, or `None`",
+            check=lambda value, name: None if value is None else check(value, name),
+        )
+    return field(default=default, metadata={"knob": knob})
+
+
+def _number(default: float | None, low: float, high: float, doc: str, **more: str) -> Any:
+    """A finite number in ``[low, high]``."""
+    values = f"[{low:g}, {high:g}]"
+    return _knob(default, doc, values, lambda v, name: float(check_number(v, name, low, high)), **more)
+
+
+def _integer(default: int | None, low: int, high: int, doc: str, **more: str) -> Any:
+    """A whole number in ``[low, high]``."""
+
+    def check(value: Any, name: str) -> int:
+        return int(check_number(value, name, low, high, integer=True))
+
+    return _knob(default, doc, f"integer, [{low:g}, {high:g}]", check, **more)
+
+
+def _flag(default: bool, doc: str, **more: str) -> Any:
+    """``True`` or ``False``, nothing else."""
+    return _knob(default, doc, "bool", check_flag, **more)
+
+
+def _choice(default: str, choices: tuple[str, ...], doc: str, **more: str) -> Any:
+    """One of some names."""
+    values = ", ".join(f"`{name}`" for name in choices)
+    return _knob(default, doc, values, lambda v, name: check_choice(v, name, choices), **more)
+
+
+def _text(default: str, values: str, doc: str, **more: str) -> Any:
+    """A text that is not empty; only the code that uses it can say whether the text is valid."""
+
+    def check(value: Any, name: str) -> str:
+        if isinstance(value, Path):
+            value = str(value)
+        return value if isinstance(value, str) and value else bad_type(name, f"a text ({values})", value)
+
+    return _knob(default, doc, values, check, **more)
+
+
+def _pair(default: tuple[float, float] | None, doc: str, **more: str) -> Any:
+    """Two numbers in metres, ``0 < low < high``; a list is taken for a tuple."""
+
+    def check(value: Any, name: str) -> tuple[float, float]:
+        return check_range(value, name) or bad_type(name, "a pair of numbers (low, high)", value)
+
+    return _knob(default, doc, "pair with 0 < low < high, m", check, **more)
+
+
+def _weights(default: Mapping[str, float], doc: str) -> Any:
+    """A dict of weights >= 0 by the name of a term."""
+
+    def check(value: Any, name: str) -> _FrozenDict:
+        if not isinstance(value, Mapping):
+            bad_type(name, "a dict, term -> >= 0", value)
+        for key in value:
+            if not isinstance(key, str):
+                bad_value(f"a key of {name}", "a text", repr(key))
+        return _FrozenDict(
+            {k: float(check_number(v, f"{name}[{k!r}]", 0.0, float("inf"))) for k, v in value.items()}
+        )
+
+    return _knob(_FrozenDict(default), doc, "term -> >= 0", check)
+
+
+class UpdatePlan(NamedTuple):
+    """Number, start and size of the gradient updates of a call, with automatic choices resolved.
+
+    Attributes:
+        inner_steps: updates in each denoising step that makes any.
+        updates_from: fraction of the schedule; steps that end by it make no updates.
+        step_latents: step size of the rule.
+    """
+
+    inner_steps: int
+    updates_from: float
+    step_latents: float
+
+
+@dataclass(frozen=True)
+class GuidanceConfig:
+    """How strongly, and by what, a second view steers the diffusion; with no argument the default preset.
+
+    Raises:
+        InputError: a value of the wrong type or out of range, naming the knob.
+    """
+
+    gradient: str = _choice(
+        "denoised",
+        ("denoised", "full"),
+        "`full` goes through the U-Net to z_t; `denoised` stops at the clean latent and moves that: no U-Net "
+        "backward",
+    )
+    weights: Mapping[str, float] = _weights(
+        DEFAULT_WEIGHTS,
+        "the terms of the loss; a term of weight 0, or of none, costs nothing (gamma of Eq. 17 is "
+        "`prior_pull`)",
+    )
+    min_steps: int = _integer(
+        4,
+        1,
+        1000,
+        "denoising steps when the call names none and the pipeline's own default is lower; a one-step prior "
+        "does the rounds of all of them in its one step",
+        paper="{} (not given)",
+    )
+    respace: bool = _flag(True, "a leading DDIM schedule runs as trailing while guided")
+    warm_start: float = _number(
+        0.25,
+        0.0,
+        0.99,
+        "share of the schedule that a call with `previous`, the output of the previous frame, skips; with 0 "
+        "it takes over the scale alone ([sequences](../how-to/sequences.md))",
+        paper="-",
+    )
+    loss_resolution: int = _integer(
+        640,
+        32,
+        1 << 16,
+        "upper bound on the longer side of the grid that losses are computed on, px",
+        paper="{} (S9, without saying for what)",
+    )
+    depth_range: tuple[float, float] | None = _pair(
+        None,
+        "bounds of the sweep and of the nearest and farthest depth of the search",
+        paper="-",
+        unset="from the nearest plane to a shift of 0.3 px",
+    )
+    pose: str = _choice(
+        "refine",
+        ("refine", "given"),
+        "poses that leave matches more than 0.3 px off their epipolar lines (0.45 px if they are rectified) "
+        "are refined, all views together, and the right image is straightened ([poses](../how-to/poses.md))",
+    )
+    clean_photographs: bool = _flag(
+        True,
+        "blocks of JPEG compression and strong sensor noise are removed before photographs are compared; the "
+        "prior sees the image as it is, except with `--distortion`, which undistorts cleaned photographs",
+    )
+    decoder: str = _text(
+        "full",
+        "`full`, `tiny`, a folder or a hub id",
+        "what decodes and encodes between the steps: the prior's own autoencoder, the tiny one that is "
+        "published for its latent, or another `AutoencoderTiny`; the result is always decoded by the "
+        "prior's own ([priors](../reference/priors.md#a-tiny-decoder))",
+        paper="-",
+    )
+    eta: float = _number(
+        0.85, 0, 1, "SSIM against L1 in the photometric term (Eq. 14)", paper="{} (not given)"
+    )
+    pyramid_levels: int = _integer(3, 1, 10, "levels of the image pyramid of the photometric term")
+    exposure: bool = _flag(
+        True,
+        "photographs are compared in the left one's exposure: gain and bias per channel and a slow field, in "
+        "closed form",
+    )
+    z_test: bool = _flag(
+        True,
+        "pixels that the estimate itself occludes in a right camera take no part in the photometric term of "
+        "updates, as the right image shows something else there",
+    )
+    min_visible: float = _number(0.1, 0, 1, "share in view below which the photometric term is off")
+    pull_to: str = _choice(
+        "start",
+        ("start", "zero"),
+        "what `prior_pull` pulls s_hat, t_hat towards (Eq. 17): the search's result, or 0",
+    )
+    points_loss: str = _choice(
+        "robust",
+        ("robust", "l1l2"),
+        "error at points: Cauchy in inverse depth, in units of 1 % of the points' median inverse depth, or "
+        "L1 + L2 in metres (Marigold-DC, Eq. 4)",
+        paper="-",
+    )
+    planes: int = _integer(160, 24, 4096, "upper bound on the number of planes of the sweep", paper="-")
+    sweep_pixels: int = _integer(
+        210_000,
+        1024,
+        1 << 32,
+        "upper bound on the number of pixels of the sweep's grid: 828 x 250 for KITTI, 530 x 397 for 4:3",
+        paper="-",
+    )
+    search: str = _choice(
+        "volume",
+        ("volume", "one-number", "points-range"),
+        "joint (near, far) in a plane-sweep volume, then the basin that reliable matches prefer (a robust "
+        "fit to the points where there is no right view); the argmin over g_s (S7.3); or the nearest and the "
+        "farthest point (Marigold-DC)",
+    )
+    positive: str = _choice(
+        "softplus",
+        ("softplus", "square"),
+        "how raw scale and shift become positive (Eq. 13); `square` also clips the relative map to [0, 1] "
+        "(Marigold-DC, Eq. 2)",
+    )
+    g_s_range: tuple[float, float] = _pair(
+        (1.0, 80.0), "candidates of the one-number search", paper='{} (a "predefined range")'
+    )
+    g_s_candidates: int = _integer(
+        80, 2, 100_000, "how many of them; the paper's figures step through 1..80", paper="{} (not given)"
+    )
+    reject_reflections: bool = _flag(
+        True,
+        "matches that lie behind the prior's first estimate, over a region and by more than the image's "
+        "matches scatter around it, lose their weight: they are reflections in mirrors and glass",
+    )
+    correct: bool = _flag(
+        True,
+        "in `corrections` of the steps the decoded map is fitted to its matches and points and the change "
+        'is encoded, before the updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek '
+        "and Nalpantidis 2024)",
+    )
+    corrections: int = _integer(
+        2,
+        1,
+        10_000,
+        "upper bound on the number of steps (or rounds of a prior with fewer steps) that are corrected: the "
+        "last, and the others spread over the second half of the schedule, or over more of it if they do not "
+        "fit there; a step with neither correction nor updates is left to the prior, and is not decoded",
+        paper="-",
+    )
+    refine: bool = _flag(True, "the result is fitted to its matches and points once more, at full resolution")
+    sharpen: bool = _flag(
+        True,
+        "before the result is refined, pixels that hang in the air between a near and a far surface get the "
+        "depth of one of them, the weighted median of their neighbours (after Ma et al. 2013)",
+        paper="-",
+    )
+    smoothness: float = _number(
+        40.0,
+        TINY,
+        1e6,
+        "weight of the correction's slope against a match of full confidence, on a grid 512 pixels long, for "
+        "a prior that is wrong by 5 %; it falls with the fourth power of that error",
+        paper="-",
+    )
+    match_noise: float = _number(
+        0.02,
+        TINY,
+        1e3,
+        "relative error of a perfect match: below it one match is as good as another",
+        paper="-",
+    )
+    outlier_width: float = _number(
+        3.0,
+        TINY,
+        1e6,
+        "a match that differs from those of a wide region by more than this many standard deviations, of its "
+        "noise and of the prior's error, counts for less",
+        paper="-",
+    )
+    rule: str = _text(
+        "adam",
+        "key of `RULES`",
+        "how a gradient moves the latent, scale and shift: `plain`; `adam`; `norm` scales it to a share of "
+        "the predicted noise; `adam-norm` scales it to the noise's norm before an Adam with the usual decays "
+        "(Marigold-DC)",
+    )
+    step_latents: float | None = _number(
+        None, 0, 1e6, "step size of `rule` on the latent", unset="0.03 after a correction, else 0.1"
+    )
+    step_affine: float = _number(0.01, 0, 1e6, "step size of `rule` on raw s_hat, t_hat")
+    inner_steps: int | None = _integer(
+        None,
+        0,
+        10_000,
+        "updates in each denoising step that makes any; with 0 only the search and the correction remain; "
+        "after a correction only the last quarter of the schedule makes any",
+        unset="0 after a correction, else 40",
+    )
+    optimize_latents: bool = _flag(True, "`False` is Table 4's ablation: scale and shift only (S5.3)")
+    start: float = _number(0.0, 0, 1, "fraction of the schedule before which nothing is updated")
+    stop: float = _number(1.0, 0, 1, "fraction after which nothing is updated")
+    step_from: str = _choice(
+        "given",
+        ("given", "updated"),
+        'with `gradient="full"`: add the update after the scheduler\'s step (Algorithm 1), or let the step '
+        "start from the updated z_t (Marigold-DC)",
+    )
+
+    def __post_init__(self) -> None:
+        for described in fields(self):
+            value = Knob.of(described).check(getattr(self, described.name), described.name)
+            object.__setattr__(self, described.name, value)
+        check_number(self.start, "start", 0.0, self.stop)
+
+    def plan_updates(self, points_given: bool) -> UpdatePlan:
+        """The updates of a call; what is left open depends on the rest of the configuration.
+
+        Args:
+            points_given: whether points come with the guidance.
+        """
+        # Matches and points that can be encoded bring the latent close; else the gradient has the whole way.
+        encoded = self.weights.get("matches") or (self.weights.get("points") and points_given)
+        near = self.correct and encoded and self.optimize_latents and self.gradient == "denoised"
+        # Early estimates are left to the matches; late ones are refined by the photographs.
+        steps, start, size = (0, 0.75 * self.stop, 0.03) if near else (40, 0.0, 0.1)
+        return UpdatePlan(
+            steps if self.inner_steps is None else self.inner_steps,
+            start,
+            size if self.step_latents is None else self.step_latents,
+        )
+
+    def changed(self, **knobs: Any) -> Self:
+        """This configuration with some knobs set otherwise.
+
+        Raises:
+            InputError: no such knob, or a value that it cannot have.
+        """
+        for name in knobs:
+            if name not in KNOBS:
+                bad_value("a knob", "one that exists", repr(name), close_names(name, KNOBS))
+        return replace(self, **knobs)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values by knob; inverse of ``from_dict``."""
+        return {name: _plain(getattr(self, name)) for name in KNOBS}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """What ``to_dict`` gave, or the nested form of former versions; what is missing is as in the default.
+
+        Raises:
+            InputError: a name that does not exist, or a value that it cannot have.
+
+        Warns:
+            UserWarning: names of former versions whose values differ from the constants that replaced them.
+        """
+        flat: dict[str, Any] = {}
+        for name, value in _mapping(values, "the configuration").items():
+            if name in FORMER_STAGES and not (name in KNOBS and isinstance(value, str)):
+                flat |= _mapping(value, name)
+            else:
+                flat[name] = value
+        for name in flat:
+            if name not in KNOBS and name not in FORMER:
+                bad_value("a name in the configuration", "a knob", repr(name), close_names(name, KNOBS))
+        config = cls().changed(**{name: value for name, value in flat.items() if name in KNOBS})
+        plans = [config.plan_updates(given).updates_from for given in (False, True)]
+        same = {"affine_rule": [config.rule], "updates_from": [None, *plans]}
+        dropped = [
+            f"{name}={value}"
+            for name, value in flat.items()
+            if name in FORMER and _plain(value) not in same.get(name, [_plain(FORMER[name])])
+        ]
+        if dropped:
+            said = (
+                f"The configuration sets numbers that are fixed now, and are left out: {', '.join(dropped)}."
+            )
+            warnings.warn(said, stacklevel=2)
+        return config
+
+    def save(self, path: str | Path) -> None:
+        """Write a JSON file."""
+        Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what ``save`` wrote, also that of former versions.
+
+        Raises:
+            OSError, InputError: no such file, no JSON, or as ``from_dict``.
+        """
+        try:
+            values = json.loads(Path(path).read_text(encoding="utf-8"))
+        except ValueError as error:
+            bad_value(f"the configuration {path}", "a JSON file that GuidanceConfig.save wrote", str(error))
+        return cls.from_dict(values)
+
+
+#: All knobs, in the order of the tables.
+KNOBS = tuple(described.name for described in fields(GuidanceConfig))
+#: Stages of the nested configurations of former versions.
+FORMER_STAGES = ("terms", "sweep", "matching", "search", "fit", "reflections", "correction", "updates")
+#: Numbers that were knobs in former versions, with the values that they are fixed at now.
+FORMER: dict[str, Any] = {
+    **{"exposure_gain": (0.2, 5.0), "exposure_rows": 4, "exposure_columns": 5, "exposure_prior": 0.2},
+    **{"matches_cauchy": 5.0, "points_cauchy": 5.0, "anchor_floor": 0.05, "options": {}},
+    **{"plane_step_px": 0.75, "sweep_side": 828, "pilot_pixels": 20_000, "pilot_planes": 160},
+    **{"pilot_step_px": 1.0, "pilot_shift": 0.4, "pilot_sure": 0.8, "pilot_quantile": 0.995},
+    **{"pilot_least_sure": 0.03, "headroom": 1.25, "least_shift": 0.03},
+    **{"step_penalty": 0.15, "jump_penalty": 1.2, "jump_contrast": 0.1, "agreement_planes": 1.5},
+    **{"contrast_reach": 15, "least_contrast": 0.03},
+    **{"cost_clamp": 0.35, "search_samples": 6000, "coarse_samples": 1500, "coarse_grid": 48},
+    **{"fine_grid": 13, "keep_margin": 2e-3, "min_in_view_rectified": 0.6, "min_in_view_posed": 0.25},
+    **{"basin_candidates": 48, "basin_reach": 4.0, "basin_samples": 1500, "basin_cauchy": 32.0},
+    **{"basin_keep": 1.05, "sure_confidence": 0.5, "min_sure": 50, "fit_iterations": 12},
+    **{"fit_samples": 20_000, "fit_noise": 0.5, "fit_floor": 4e-3, "fit_cauchy": 2.0},
+    **{"fit_near_reach": 1.4, "fit_far_reach": 0.7},
+    **{"reflection_region": 0.08, "reflection_spreads": 2.0, "reflection_floor": 0.2},
+    **{"reflection_least_spread": 0.05, "reflection_gone": 1.6, "reflection_limit": 1.5},
+    **{"reflection_sure": 0.3},
+    **{"correction_scale": 1.0, "ramp_step": 0.02, "ramp_contrast": 2.0, "ramp_slope": 0.04},
+    **{"sharpen_colour": 0.12, "sharpen_reach": 1.5, "correction_cauchy": 2.5, "stiffness_power": 4.0},
+    **{"loosest": 0.03, "stiffest": 100.0, "inertia": 0.015, "least_inertia": 5e-4, "most_inertia": 0.03},
+    **{"broad_smoothness": 50.0, "broad_inertia": 1e-4, "passes": 3, "stiff_smoothness": 400.0},
+    **{"stiff_inertia": 1.3e-3, "block": 0.08, "least_error": 0.01, "most_error": 0.5},
+    **{"image_edge": 0.1, "depth_edge": 0.1, "edge_reach": 0.006, "edge_step": 0.3, "edge_error": 0.11},
+    **{"least_link": 1e-3, "reweightings": 3, "solver_steps": 12},
+    **{"affine_rule": "adam", "updates_from": None},
+}
+
+DEFAULT = GuidanceConfig()
+
+#: Algorithm 1 with its printed numbers; docs/reference/paper-map.md settles what the paper leaves open.
+PAPER = DEFAULT.changed(
+    gradient="full",
+    rule="plain",
+    step_latents=1e-2,
+    step_affine=1e-2,
+    inner_steps=1,
+    min_steps=10,
+    weights={"photometric": 1.0, "prior_pull": 0.01},
+    eta=0.85,
+    pyramid_levels=1,
+    exposure=False,
+    z_test=False,
+    min_visible=0.0,
+    pull_to="zero",
+    search="one-number",
+    loss_resolution=768,
+    pose="given",
+    clean_photographs=False,
+    correct=False,
+    reject_reflections=False,
+    refine=False,
+)
+
+#: Scale and shift of the search alone.
+SEARCH_ONLY = DEFAULT.changed(inner_steps=0, weights={"photometric": 1.0}, correct=False, refine=False)
+
+#: A plain call that is fitted to the matches and refined once: the default without its loop.
+PRIOR_FIT = DEFAULT.changed(inner_steps=0, correct=False)
+
+#: Marigold-DC (Viola et al. 2024, "Marigold-DC: zero-shot monocular depth completion with guided diffusion")
+#: with the numbers of its code, whose loss is taken at the image's own resolution: no bound on it.
+MARIGOLD_DC = DEFAULT.changed(
+    gradient="full",
+    rule="adam-norm",
+    step_latents=0.05,
+    step_affine=0.005,
+    inner_steps=1,
+    min_steps=50,
+    weights={"points": 1.0},
+    points_loss="l1l2",
+    positive="square",
+    search="points-range",
+    step_from="updated",
+    loss_resolution=1 << 16,
+    correct=False,
+    refine=False,
+)
+
+#: All presets by name; ``geodiff depth --preset`` takes the first two.
+PRESETS = {
+    "default": DEFAULT,
+    "paper": PAPER,
+    "marigold-dc": MARIGOLD_DC,
+    "search-only": SEARCH_ONLY,
+    "prior-fit": PRIOR_FIT,
+}
+
+
+def preset_named(name: str) -> GuidanceConfig:
+    """A preset by its name.
+
+    Raises:
+        InputError: no such preset.
+    """
+    return PRESETS[check_choice(name, "preset", PRESETS)]
+
+
+def close_names(name: str, names: Iterable[str]) -> str:
+    """Names that exist, those that look like ``name`` first, as a sentence."""
+    names = list(names)
+    near = difflib.get_close_matches(name, names, 3, 0.6)
+    hint = f"Did you mean {' or '.join(near)}? " if near else ""
+    return f"{hint}There are: {', '.join(names)}."
+
+
+def _mapping(value: Any, name: str) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else bad_type(name, "a dict of values by name", value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return dict(value)
+    return list(value) if isinstance(value, tuple) else value
+
+
+def config_from_text(entries: Iterable[str], base: GuidanceConfig, name: str) -> GuidanceConfig:
+    """A configuration with knobs set otherwise, as they are written on a command line.
+
+    Args:
+        entries: ``KNOB=VALUE`` each; ``weights.TERM=VALUE`` changes one weight.
+        base: what they change.
+        name: the option, for messages.
+
+    Returns:
+        The configuration; a value is JSON, or text where it is none.
+
+    Raises:
+        InputError: another form, a knob that does not exist, a value that it cannot have.
+    """
+    changes: dict[str, Any] = {}
+    for entry in entries:
+        written, equals, text = entry.partition("=")
+        knob, _, term = written.partition(".")
+        if not equals or knob not in KNOBS or (knob == "weights") != bool(term):
+            cure = close_names(written, [*(n for n in KNOBS if n != "weights"), "weights.NAME"])
+            bad_value(name, "KNOB=VALUE with a knob of GeometryGuidance", repr(entry), cure)
+        try:
+            value = json.loads(text)
+        except (ValueError, RecursionError):
+            value = text
+        changes[knob] = changes.get(knob, base.weights) | {term: value} if term else value
+    return base.changed(**changes)
+
+
+def value_of(name: str, config: GuidanceConfig) -> Any:
+    """A knob's value, or that of ``weights.TERM``; automatic choices as they are settled with matches.
+
+    Raises:
+        InputError: no such knob.
+        KeyError: no such term.
+    """
+    knob, _, term = name.partition(".")
+    if knob not in KNOBS:
+        bad_value("a knob", "one that exists", repr(name), close_names(name, KNOBS))
+    value = getattr(config, knob)
+    if term:
+        return value[term]
+    return getattr(config.plan_updates(points_given=False), knob, None) if value is None else value
+
+
+#: Sections of the tables, each with the first of its knobs.
+SECTIONS = {
+    "gradient": "The call",
+    "eta": "Terms of the loss",
+    "planes": "Plane sweep and search of the scale (S7.3)",
+    "reject_reflections": "Correction by matches and points",
+    "rule": "Gradient updates of latent, scale and shift (Algorithm 1)",
+}
+BEGIN, END = "<!-- made by geodiff_plugin.config -->", "<!-- end -->"
+
+
+def _rows() -> Iterator[tuple[str, str, Knob, str]]:
+    """Name, section that starts with it or nothing, description and default of every knob."""
+    for described in fields(GuidanceConfig):
+        name, knob, value = described.name, Knob.of(described), getattr(DEFAULT, described.name)
+        yield name, SECTIONS.get(name, ""), knob, knob.unset if value is None else _shown(value)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"({', '.join(_shown(v) for v in value)})"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_shown(v)}" for name, v in value.items()) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def knob_tables() -> str:
+    """Markdown tables of every knob: name, default, paper, range, what it does."""
+    lines: list[str] = []
+    for name, section, knob, shown in _rows():
+        if section:
+            lines += ["", f"### {section}", "", "| knob | default | paper | range | what it does |"]
+            lines += ["| --- | --- | --- | --- | --- |"]
+        default = f"`None`: {shown}" if getattr(DEFAULT, name) is None else shown
+        paper = knob.paper.format(_shown(value_of(name, PAPER)))
+        lines.append(f"| {' | '.join((f'`{name}`', default, paper, knob.values, knob.doc))} |")
+    return "\n".join([*lines[1:], ""])
+
+
+def knob_lines() -> list[str]:
+    """The same for a terminal: one line a knob, with its default."""
+    lines: list[str] = []
+    for name, section, knob, shown in _rows():
+        if section:
+            lines += ["", section]
+        doc = re.sub(r" \(\[[^]]*\]\([^)]*\)\)", "", knob.doc)  # a terminal has no use for links
+        lines.append(f"  {name} = {shown}  [{knob.values}]  {doc}".replace("`", ""))
+    return lines[1:]
+
+
+def with_tables(page: str) -> str:
+    """A page with the tables between its marks made anew.
+
+    Raises:
+        InputError: a page without the marks.
+    """
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        bad_value("the page", f"one with the marks {BEGIN} and {END}", "one without")
+    return f"{before}{BEGIN}\n\n{knob_tables()}\n{END}{after}"
+
+
+if __name__ == "__main__":
+    target = Path(sys.argv[1])
+    target.write_text(with_tables(target.read_text(encoding="utf-8")), encoding="utf-8")
