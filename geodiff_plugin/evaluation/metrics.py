@@ -10,7 +10,15 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["FLOOR_M", "ause", "confidence_deciles", "counted", "evaluate_depth", "evaluate_disparity"]
+__all__ = [
+    "FLOOR_M",
+    "ause",
+    "ause_of_random",
+    "confidence_deciles",
+    "counted",
+    "evaluate_depth",
+    "evaluate_disparity",
+]
 
 FLOOR_M = 1e-5
 """Nearest truth that counts and nearest value of a prediction, metres (Marigold's evaluation of KITTI)."""
@@ -103,7 +111,7 @@ def evaluate_disparity(
 
     Returns:
         ``epe`` (mean of |p - t|), ``bad1`` .. ``bad3`` (share with an error above 1, 2, 3 px; ``None`` where
-        the truth's step is not finer than the threshold), ``d1`` (KITTI: error above 3 px and above 5 % of
+        the truth's step is coarser than the threshold), ``d1`` (KITTI: error above 3 px and above 5 % of
         the truth), over the pixels with both truth and prediction; NaN where there is none.
 
     Raises:
@@ -123,8 +131,8 @@ def evaluate_disparity(
 
     scores: dict[str, float | None] = {"epe": share(error)}
     for k in (1, 2, 3):
-        scores[f"bad{k}"] = share(error > k) if step_px < k else None
-    scores["d1"] = share((error > 3) & (error > 0.05 * np.abs(truth))) if step_px < 3 else None
+        scores[f"bad{k}"] = share(error > k) if step_px <= k else None
+    scores["d1"] = share((error > 3) & (error > 0.05 * np.abs(truth))) if step_px <= 3 else None
     return scores
 
 
@@ -156,19 +164,32 @@ def ause(
     kept = valid & np.isfinite(pred_m) & (pred_m > 0) & np.isfinite(uncertainty)
     if not kept.any():
         bad_value("uncertainty", "finite for at least one pixel with truth", "none")
-    truth = np.asarray(truth_m, np.float64)[kept]
-    error = np.abs(np.asarray(pred_m, np.float64)[kept] - truth) / truth
-    cut = (np.arange(steps) * error.size) // steps
-
-    def remaining(order: np.ndarray) -> np.ndarray:
-        """Mean error without the first ``cut`` pixels of the order."""
-        tail_sum = np.cumsum(error[order][::-1])[::-1]
-        return tail_sum[cut] / (error.size - cut)
-
+    error = _relative_errors(pred_m, truth_m, kept)
     # Stable sorts: pixels of equal uncertainty keep the image's order on every machine.
     by_uncertainty = np.argsort(-np.asarray(uncertainty, np.float64)[kept], kind="stable")
     by_error = np.argsort(-error, kind="stable")
-    return float(np.mean(remaining(by_uncertainty) - remaining(by_error)))
+    return float(np.mean(_remaining(error, by_uncertainty, steps) - _remaining(error, by_error, steps)))
+
+
+def ause_of_random(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, steps: int = 100) -> float:
+    """What ``ause`` is in the mean over random uncertainties; arguments and errors as there."""
+    _check_maps(pred_m=pred_m, truth_m=truth_m, valid=valid)
+    kept = valid & np.isfinite(pred_m) & (pred_m > 0)
+    if not kept.any():
+        bad_value("pred_m", "known for at least one pixel with truth", "none")
+    error = _relative_errors(pred_m, truth_m, kept)
+    return float(error.mean() - _remaining(error, np.argsort(-error, kind="stable"), steps).mean())
+
+
+def _relative_errors(pred_m: np.ndarray, truth_m: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    truth = np.asarray(truth_m, np.float64)[kept]
+    return np.abs(np.asarray(pred_m, np.float64)[kept] - truth) / truth
+
+
+def _remaining(error: np.ndarray, order: np.ndarray, steps: int) -> np.ndarray:
+    """Mean error without the first ``k / steps`` of the pixels of an order, for every k."""
+    cut = (np.arange(steps) * error.size) // steps
+    return np.cumsum(error[order][::-1])[::-1][cut] / (error.size - cut)
 
 
 def confidence_deciles(

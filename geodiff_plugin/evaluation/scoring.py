@@ -19,8 +19,15 @@ from geodiff_plugin.evaluation.alignment import align, to_space
 from geodiff_plugin.evaluation.baselines._sweep import sweep
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
+from geodiff_plugin.evaluation.edges import (
+    boundary_errors,
+    boundary_f1,
+    hidden_by_truth,
+    near_disparity_steps,
+)
 from geodiff_plugin.evaluation.metrics import (
     ause,
+    ause_of_random,
     confidence_deciles,
     counted,
     evaluate_depth,
@@ -29,10 +36,22 @@ from geodiff_plugin.evaluation.metrics import (
 from geodiff_plugin.matching import find_matches
 from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
-__all__ = ["SURE_MATCH", "TOM_CLASSES", "matched", "out_of_view", "regions", "score"]
+__all__ = [
+    "DENSE",
+    "SURE_MATCH",
+    "TOM_CLASSES",
+    "disparity_masks",
+    "disparity_scores",
+    "matched",
+    "out_of_view",
+    "regions",
+    "score",
+]
 
 TOM_CLASSES = (2, 3)
 """Material classes that Booster's authors call transparent or mirror when they score depth."""
+DENSE = 0.5
+"""Share of pixels with truth from which on its edges are there to be measured."""
 SURE_MATCH = 0.5
 """Confidence from which on a match of our plane sweep counts as one."""
 
@@ -127,13 +146,46 @@ def _both(
     }
 
 
-def _disparity(sample: StereoSample, depth_m: np.ndarray) -> dict[str, float | None]:
-    """Disparity errors of a rectified sample."""
+def _true_disparity(sample: StereoSample) -> np.ndarray:
     cameras = (sample.K_left, sample.K_right, sample.E_scored)
-    true_px = depth_to_disparity(np.where(sample.valid, sample.depth_m, 1.0), *cameras)
+    return depth_to_disparity(np.where(sample.valid, sample.depth_m, 1.0), *cameras)
+
+
+def disparity_masks(sample: StereoSample) -> dict[str, np.ndarray]:
+    """Masks by which the disparity errors of a rectified sample are split.
+
+    Returns:
+        ``visible``: neither hidden in the right view nor outside of it, by the set's mask or by dense truth;
+        ``edge`` and ``flat``: near a step of the true disparity, and the rest. ``(H, W)`` bool, within
+        ``sample.valid``; ``visible`` is left out where nothing says what is hidden.
+    """
+    true_px = _true_disparity(sample)
+    edge = near_disparity_steps(true_px, sample.valid)
+    masks = {"edge": edge, "flat": sample.valid & ~edge}
+    hidden = sample.occluded
+    if hidden is None and sample.valid.mean() > DENSE:
+        hidden = hidden_by_truth(true_px, sample.valid)
+    if hidden is not None:
+        masks = {"visible": sample.valid & ~hidden & ~out_of_view(sample)} | masks
+    return masks
+
+
+def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, dict[str, float | None]]:
+    """EPE, bad-1 to bad-3 and D1 of a rectified sample, ``all`` pixels with truth and by ``disparity_masks``.
+
+    Args:
+        sample: rectified, with truth.
+        depth_m: ``(H, W)`` metres; holes do not count.
+    """
+    true_px, cameras = _true_disparity(sample), (sample.K_left, sample.K_right, sample.E_scored)
     pred_px = depth_to_disparity(_positive(depth_m), *cameras)
     step_px = float(sample.notes.get("disparity_step_px", 0.0))
-    return _plain(evaluate_disparity(pred_px, true_px, sample.valid, step_px))
+    masks = {"all": sample.valid} | disparity_masks(sample)
+    return {
+        name: _plain(evaluate_disparity(pred_px, true_px, mask, step_px))
+        for name, mask in masks.items()
+        if mask.any()
+    }
 
 
 def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> dict[str, Any]:
@@ -148,7 +200,8 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
         ``all_pixels``: ``raw`` and ``aligned`` errors over every pixel with truth, without a cap; ``capped``:
         the same two under the cap; ``disparity``: for rectified pairs, not aligned; ``regions``: AbsRel by
         region under the cap, not aligned (aligned for a method without metres); ``ause`` of the uncertainty;
-        ``confidence`` by decile.
+        ``confidence`` by decile, and ``ause_confidence``: its AUSE, and that of a random order;
+        ``boundaries`` of dense truth: ``f1``, ``dbe_acc``, ``dbe_comp``. ``disparity`` has ``regions`` too.
         ``None`` where it does not apply.
 
     Raises:
@@ -171,14 +224,26 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
     if cap_m is not None:
         capped = _both(sample, depth_m, values, prediction.space, cap_m)
     record |= {"capped": capped, "disparity": None, "ause": None, "confidence": None}
+    record["ause_confidence"] = None
     kept = counted(truth, valid, cap_m)
     shown_m = align(values, truth, kept, prediction.space) if depth_m is None else depth_m
     if depth_m is not None and sample.rectified:
-        record["disparity"] = _disparity(sample, depth_m)
+        by_mask = disparity_scores(sample, depth_m)
+        record["disparity"] = by_mask.pop("all") | {"regions": by_mask}
     if depth_m is not None and prediction.uncertainty is not None:
         record["ause"] = _plain({"ause": ause(depth_m, truth, kept, prediction.uncertainty)})["ause"]
     if depth_m is not None and prediction.confidence is not None:
-        found = confidence_deciles(depth_m, truth, kept, prediction.confidence, RIGHT_WITHIN)
-        record["confidence"] = [_plain(decile) for decile in found]
+        deciles = confidence_deciles(depth_m, truth, kept, prediction.confidence, RIGHT_WITHIN)
+        record["confidence"] = [_plain(decile) for decile in deciles]
+        record["ause_confidence"] = _plain(
+            {
+                "ause": ause(depth_m, truth, kept, -prediction.confidence),
+                "random": ause_of_random(depth_m, truth, kept),
+            }
+        )
     record["regions"] = _split(shown_m, sample, cap_m)
+    record["boundaries"] = None
+    if depth_m is not None and valid.mean() > DENSE:
+        found = {"f1": boundary_f1(depth_m, truth, valid)} | boundary_errors(depth_m, truth, valid)
+        record["boundaries"] = _plain(found)
     return record

@@ -20,13 +20,13 @@ from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.evaluation.edges import edge_error, surface_error
 from geodiff_plugin.evaluation.emulated import DENSE, SPACES, STRENGTHS, EmulatedPrior, EmulatedPriors
 from geodiff_plugin.evaluation.figures.strength import draw_strength, shaded
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.strength_tables import strength_tables
-from geodiff_plugin.evaluation.surfaces import DenseTruth
 
 __all__ = ["METHODS", "StrengthOptions", "run_strength"]
 
@@ -173,7 +173,7 @@ def _measure(
     options: StrengthOptions,
 ) -> list[dict[str, Any]]:
     """A record of every method and strength that has none yet."""
-    truth, records = DenseTruth(sample.depth_m, sample.valid), []
+    truth, records = (sample.depth_m, sample.valid), []
     for (strength, method), key in keys.items():
         if key in found:
             continue
@@ -189,8 +189,8 @@ def _measure(
                 "method": method,
                 "abs_rel": scores["abs_rel"],
                 "delta1": scores["delta1"],
-                "edges": truth.edge_error(depth_m),
-                "surfaces": truth.surface_error(depth_m),
+                "edges": edge_error(depth_m, *truth),
+                "surfaces": surface_error(depth_m, *truth),
             }
         )
     return records

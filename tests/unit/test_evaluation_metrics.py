@@ -83,7 +83,7 @@ def test_disparity_metrics_match_their_formulas():
 
 
 def test_coarse_truth_gives_no_fine_scores():
-    scores = evaluate_disparity(row(1.0, 2.0), row(1.0, 2.0), ALL, step_px=1.0)
+    scores = evaluate_disparity(row(1.0, 2.0), row(1.0, 2.0), ALL, step_px=1.5)
     assert scores["bad1"] is None
     assert (scores["bad2"], scores["bad3"], scores["d1"]) == (0, 0, 0)
 

@@ -12,7 +12,6 @@ from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, find_met
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.emulated import SPACES, STRENGTHS, EmulatedPrior, relative_map
 from geodiff_plugin.evaluation.strength import StrengthOptions, run_strength
-from geodiff_plugin.evaluation.surfaces import DenseTruth
 
 SMALL = "synthetic:1+4@128x96"
 
@@ -53,19 +52,6 @@ def test_its_answer_follows_its_input_as_far_as_asked(sample, follow):
     v = prior.pipe.unet(torch.cat([image, moved + a * 0.5], 1), second)[0]
     z0 = scheduler.step(v, second, moved + a * 0.5).pred_original_sample
     torch.testing.assert_close(z0 - own, torch.full_like(own, follow * 0.5), atol=2e-3, rtol=0)
-
-
-def test_edges_and_surfaces_of_a_dense_truth():
-    truth = np.full((40, 60), 2.0)
-    truth[:, 30:] = 4.0
-    dense = DenseTruth(truth, np.ones_like(truth, bool))
-    assert dense.edge_error(truth) == 0.0 and dense.surface_error(truth) == 0.0
-    shifted = np.full((40, 60), 2.0)
-    shifted[:, 32:] = 4.0
-    assert dense.edge_error(shifted) > 0.1 and dense.surface_error(shifted) == 0.0
-    rough = truth * np.exp(0.01 * np.random.default_rng(0).normal(size=truth.shape))
-    assert dense.surface_error(rough) > 5.0
-    assert np.isnan(DenseTruth(np.full((9, 9), 2.0), np.ones((9, 9), bool)).edge_error(np.ones((9, 9))))
 
 
 def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkeypatch):

@@ -30,7 +30,7 @@ from geodiff_plugin.evaluation.baselines.prior_fit import PRIOR_FIT_METHOD
 from geodiff_plugin.evaluation.baselines.reprojection_only import REPROJECTION_ONLY
 from geodiff_plugin.evaluation.baselines.scale_shift_only import SCALE_SHIFT_ONLY
 from geodiff_plugin.evaluation.baselines.search_only import SEARCH_ONLY
-from geodiff_plugin.evaluation.baselines.sgbm import SGBM
+from geodiff_plugin.evaluation.baselines.sgbm import SGBM, SGBM_WLS
 from geodiff_plugin.evaluation.baselines.sweep_sgm import SWEEP_SGM
 from geodiff_plugin.evaluation.baselines.variants import default_variant, paper_variant
 
@@ -63,6 +63,7 @@ METHODS: dict[str, Method] = {
         REPROJECTION_ONLY,
         NO_DIFFUSION,
         SGBM,
+        SGBM_WLS,
         PLANE_SWEEP,
         SWEEP_SGM,
     )

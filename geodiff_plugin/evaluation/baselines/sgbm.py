@@ -6,6 +6,8 @@ Paper: leaves this peer out; fill as KITTI's development kit does it for sparse 
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -15,13 +17,15 @@ from geodiff_plugin.evaluation.baselines._fill import fill_background
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 
-__all__ = ["SGBM", "sgbm_shift"]
+__all__ = ["SGBM", "SGBM_WLS", "sgbm_shift"]
 
 #: Largest shift that is tried, as a share of the image width.
 MAX_SHIFT = 0.25
 #: Matches with a smaller shift than this, in pixels, are taken for mistakes and filled: one such match in the
 #: sky's neighbourhood costs more AbsRel than a hundred good ones gain.
 MIN_SHIFT_PX = 1.0
+#: As OpenCV's own example sets the filter.
+WLS_LAMBDA, WLS_SIGMA = 8000.0, 1.5
 PARAMETERS = {
     "blockSize": 5,
     "uniquenessRatio": 10,
@@ -31,11 +35,12 @@ PARAMETERS = {
 }
 
 
-def sgbm_shift(sample: StereoSample) -> np.ndarray:
+def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
     """Shift of a rectified pair, ``f b / z``, with holes.
 
     Args:
         sample: a rectified sample.
+        wls: smooth it, with that of the right view, by OpenCV's weighted least squares: no holes are left.
 
     Returns:
         ``(H, W)`` float32, pixels, disparity plus Middlebury's doffs; NaN where the match was rejected.
@@ -57,37 +62,56 @@ def sgbm_shift(sample: StereoSample) -> np.ndarray:
     left, right = (
         np.pad(image, ((0, 0), (pad, 0), (0, 0)), mode="edge") for image in (sample.left, sample.right)
     )
-    raw = matcher.compute(np.ascontiguousarray(left), np.ascontiguousarray(right))[:, pad:]
+    left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
+    raw = matcher.compute(left, right)
+    if wls:
+        smoother = cv2.ximgproc.createDisparityWLSFilter(matcher)
+        smoother.setLambda(WLS_LAMBDA)
+        smoother.setSigmaColor(WLS_SIGMA)
+        opposite = cv2.ximgproc.createRightMatcher(matcher).compute(right, left)
+        raw = smoother.filter(raw, left, disparity_map_right=opposite)
+    raw = raw[:, pad:]
     shift = raw.astype(np.float32) / 16.0 + np.float32(sample.K_right[0, 2] - sample.K_left[0, 2])
     shift[(raw <= 16 * (lowest - 1)) | (shift < MIN_SHIFT_PX)] = np.nan
     return shift
 
 
-def _run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+def _run(wls: bool, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     if not sample.rectified:
         raise NotApplicable("not rectified")
     if sample.left.shape != sample.right.shape:
         raise NotApplicable("views of different sizes")
-    with_holes = sgbm_shift(sample)
+    if wls and not hasattr(cv2, "ximgproc"):
+        raise NotApplicable("cv2.ximgproc, of opencv-contrib-python, is not installed")
+    with_holes = sgbm_shift(sample, wls)
     depth_m = sample.K_left[0, 0] * sample.E[0, 3] / fill_background(with_holes)
     notes = {"density": float(np.isfinite(with_holes).mean())}
     return Prediction(depth_m=depth_m, space="disparity", notes=notes)
 
 
-def _configuration(settings: Settings) -> dict[str, Any]:
+def _configuration(wls: bool, settings: Settings) -> dict[str, Any]:
+    smoother = {"wls": [WLS_LAMBDA, WLS_SIGMA]} if wls else {}
     return {
         "max_shift": MAX_SHIFT,
         "min_shift_px": MIN_SHIFT_PX,
         "mode": "3way",
         "fill": "background",
-    } | PARAMETERS
+    } | (PARAMETERS | smoother)
 
 
 SGBM = Method(
     name="sgbm",
     title="SGBM + fill",
     summary="OpenCV StereoSGBM (3-way) with background fill; rectified pairs only",
-    run=_run,
-    configuration=_configuration,
+    run=partial(_run, False),
+    configuration=partial(_configuration, False),
     uses_prior=False,
+)
+SGBM_WLS = replace(
+    SGBM,
+    name="sgbm-wls",
+    title="SGBM + WLS",
+    summary="the same, smoothed by OpenCV's WLS filter (opencv-contrib)",
+    run=partial(_run, True),
+    configuration=partial(_configuration, True),
 )
