@@ -20,7 +20,7 @@ from geodiff_plugin.cli.tiny_marigold_v2 import tiny_marigold_v2
 from geodiff_plugin.evaluation.fitted_lora import FittedLora, complete_by_lora
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior
-from geodiff_plugin.priors.pipelines.marigold_v2 import MarigoldV2Pipeline
+from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from diffusers import AutoencoderKLQwenImage, FlowMatchEulerDiscreteScheduler, QwenImageTransformer2DModel
 
-from geodiff_plugin.priors.pipelines.marigold_v2 import MarigoldV2Pipeline
+from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
 
 __all__ = ["tiny_marigold_v2"]

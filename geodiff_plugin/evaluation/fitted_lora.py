@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.priors.pipelines.marigold_v2 import MarigoldV2Pipeline
+from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 
 __all__ = ["FittedLora", "complete_by_lora"]
 

@@ -1,6 +1,5 @@
 """Adapters of diffusion depth priors, one a file, and how a prior is found by name.
 
-Data flow: name or folder -> ``FoundPrior`` -> pipeline -> ``DepthPrior``.
 Paper: S4 (any diffusion-based depth model with iterative updates).
 
 A new prior is a new file and one line in ``PRIORS``.
@@ -20,14 +19,20 @@ from geodiff_plugin.priors.base import DepthPrior, OwnPipelinePrior
 from geodiff_plugin.priors.depthfm import DepthFMPrior
 from geodiff_plugin.priors.depthmaster import DepthMasterPrior
 from geodiff_plugin.priors.e2e_ft import E2EFTPrior
-from geodiff_plugin.priors.finding import BUNDLED_FOLDER, REFUSED, fetch_small_files, fetch_weights, refuse
+from geodiff_plugin.priors.folders import (
+    BUNDLED_FOLDER,
+    REFUSED,
+    Layout,
+    fetch_small_files,
+    fetch_weights,
+    refuse,
+)
 from geodiff_plugin.priors.geowizard import GeoWizardPrior
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.loading import check_device
 from geodiff_plugin.priors.lotus import LotusPrior
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Prior
 from geodiff_plugin.priors.ppd import PPDPrior
-from geodiff_plugin.priors.reading import check_device
 from geodiff_plugin.priors.transformers_depth import TransformersDepthPrior
 from geodiff_plugin.scale.space import SPACES
 

@@ -1,6 +1,5 @@
 """Interface of a prior's adapter: decoding, space, network call; it never sees a camera.
 
-Data flow: folder -> pipeline -> ``DepthPrior`` -> network, decode, space.
 Paper: S4 ("can be integrated with any DB-MDE framework following a similar schema").
 """
 
@@ -11,7 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.loading import build_pipeline
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 

@@ -1,23 +1,247 @@
-"""GeoWizard v1 and v2.
-
-Data flow: authors' folder or ours -> ``GeoWizardPipeline`` -> contract.
-Paper: S4 (any diffusion-based depth model).
-"""
+"""GeoWizard v1 and v2: depth and normals from one noise (Fu et al., ECCV 2024)."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import torch
-from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
+import torch.nn.functional as F
+from diffusers import AutoencoderKL, DDIMScheduler, SchedulerMixin, UNet2DConditionModel
+from diffusers.models.attention_processor import Attention, AttnProcessor2_0
+from diffusers.utils.torch_utils import randn_tensor
+from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
+from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
+from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.loading import LIBRARIES, build_pipeline, load_component
-from geodiff_plugin.priors.pipelines.geowizard import IMAGE_EMBEDDING, TEXT_PROMPT, GeoWizardPipeline
+from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipelines.prompts import text_embedding
 
-__all__ = ["GeoWizardPrior"]
+__all__ = ["DOMAINS", "GeoWizardPipeline", "GeoWizardPrior", "PairAttention"]
+
+DOMAINS = ("indoor", "outdoor", "object")
+#: Width of the class embedding -> further condition of the U-Net: the image in v1, the domain as text in v2.
+IMAGE_EMBEDDING, TEXT_PROMPT = 10, 4
+#: Added to the length of a decoded normal before dividing by it.
+EPS_LENGTH = 1e-5
+
+
+class PairAttention(AttnProcessor2_0):
+    """Self-attention over both members of a pair: every token sees those of its depth and of its normals."""
+
+    def __call__(self, attn: Attention, hidden_states: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        """Tokens ``(2B, n, c)``, all depth before all normals, attended to as ``(B, 2n, c)``."""
+        pair = torch.cat(hidden_states.chunk(2), dim=1)
+        return torch.cat(super().__call__(attn, pair, *args, **kwargs).chunk(2, dim=1))
+
+
+class GeoWizardPipeline(DepthDiffusionPipeline):
+    """GeoWizard v1 (conditioned on the image through CLIP) and v2 (on the domain as text).
+
+    Args:
+        unet: 8 channels in, 4 out, class embedding of 10 (v1) or 4 (v2) numbers.
+        vae: of Stable Diffusion 2.
+        scheduler: theirs is a DDIM with v-prediction.
+        image_encoder: v1 only.
+        text_encoder: v2 only.
+        tokenizer: v2 only.
+        prediction_type: what the map is affine in.
+        default_denoising_steps: when a call names none.
+        default_processing_resolution: longer side, pixels, when a call names none.
+        default_domain: one of ``DOMAINS``, when a call names none.
+        clip_statistics: ``{"mean": [3], "std": [3]}`` of the image encoder's input, CLIP's own for ``None``.
+
+    Raises:
+        ValueError: the U-Net is of neither version, or the parts of its version are not all given.
+
+    Convention:
+        Normals are unit vectors of the left camera's frame (x right, y down, z forward) on the side of the
+        surface that the camera sees: a wall that faces the camera has ``(0, 0, -1)``. GeoWizard's own files
+        hold the opposite vectors. They are resized by taking the nearest one, which keeps their length.
+    """
+
+    depth_channels = slice(0, 4)
+    normal_channels = slice(4, 8)
+    model_cpu_offload_seq = "image_encoder->text_encoder->unet->vae"
+    _optional_components = ["image_encoder", "text_encoder", "tokenizer"]
+
+    def __init__(
+        self,
+        unet: UNet2DConditionModel,
+        vae: AutoencoderKL,
+        scheduler: SchedulerMixin,
+        image_encoder: CLIPVisionModelWithProjection | None = None,
+        text_encoder: CLIPTextModel | None = None,
+        tokenizer: CLIPTokenizer | None = None,
+        prediction_type: str = "depth",
+        default_denoising_steps: int = 10,
+        default_processing_resolution: int = 768,
+        default_domain: str = "indoor",
+        clip_statistics: dict[str, list[float]] | None = None,
+    ) -> None:
+        super().__init__()
+        width = unet.config.projection_class_embeddings_input_dim
+        complete = {
+            IMAGE_EMBEDDING: image_encoder is not None,
+            TEXT_PROMPT: text_encoder is not None and tokenizer is not None,
+        }
+        if width not in complete:
+            bad_value("the U-Net's class embedding", "10 (GeoWizard v1) or 4 (v2) numbers wide", width)
+        if not complete[width]:
+            expected = "image_encoder" if width == IMAGE_EMBEDDING else "text_encoder and tokenizer"
+            bad_value("components", f"with {expected} for this U-Net", "None")
+        couple_pairs(unet)
+        self.register_prior(
+            {
+                "unet": unet,
+                "vae": vae,
+                "scheduler": scheduler,
+                "image_encoder": image_encoder,
+                "text_encoder": text_encoder,
+                "tokenizer": tokenizer,
+            },
+            prediction_type,
+            default_denoising_steps,
+            default_processing_resolution,
+            default_domain=check_choice(default_domain, "default_domain", DOMAINS),
+            clip_statistics=clip_statistics or {"mean": list(OPENAI_CLIP_MEAN), "std": list(OPENAI_CLIP_STD)},
+        )
+
+    def prepare_condition(
+        self,
+        image: Tensor,
+        ensemble_size: int,
+        batch_size: int,
+        generator: Generators,
+        domain: str | None = None,
+    ) -> Condition:
+        """Image latent, prompt and class embedding of every member.
+
+        Args:
+            image: ``(N, 3, H, W)`` in [-1, 1].
+            ensemble_size: members E per image.
+            batch_size: images per forward.
+            generator: unused, nothing is drawn here.
+            domain: ``"indoor"``, ``"outdoor"`` or ``"object"`` (an object without background);
+                ``default_domain`` for ``None``.
+
+        Returns:
+            ``image_latent (N * E, 4, h, w)``, ``prompt (N * E, tokens, width)``,
+            ``class_labels (N * E, 2, 10 or 4)`` for depth and normals.
+
+        Raises:
+            ValueError: an unknown domain; a U-Net whose attention between depth and normals was replaced.
+        """
+        domain = check_choice(domain or self.config.default_domain, "domain", DOMAINS)
+        check_coupled(self.unet)
+        of_image = self.unet.config.projection_class_embeddings_input_dim == IMAGE_EMBEDDING
+        if of_image:
+            prompt = self._image_prompt(image)
+        else:
+            words = text_embedding(self.tokenizer, self.text_encoder, image.device, f"{domain} geometry")
+            prompt = words.to(image.dtype).expand(len(image), -1, -1)
+        labels = class_embedding(domain if of_image else None).to(image)
+        return {
+            "image_latent": self.image_latents(image, ensemble_size, batch_size),
+            "prompt": prompt.repeat_interleave(ensemble_size, dim=0),
+            "class_labels": labels.expand(len(image) * ensemble_size, -1, -1),
+        }
+
+    def _image_prompt(self, image: Tensor) -> Tensor:
+        """CLIP's embedding of the whole image squeezed into its square, ``(N, 1, width)``."""
+        side = self.image_encoder.config.image_size
+        statistics = self.config.clip_statistics
+        mean, std = (image.new_tensor(statistics[k], dtype=torch.float32) for k in ("mean", "std"))
+        small = F.interpolate(
+            (image.float() + 1.0) / 2.0, (side, side), mode="bicubic", align_corners=False, antialias=True
+        )
+        small = (small - mean[:, None, None]) / std[:, None, None]
+        return self.image_encoder(small.to(image.dtype)).image_embeds[:, None].to(image.dtype)
+
+    def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
+        """One Gaussian for depth and normals, ``(N * E, 8, h, w)``."""
+        like = condition["image_latent"]
+        noise = randn_tensor(like.shape, generator=generator, device=like.device, dtype=like.dtype)
+        return noise.repeat(1, 2, 1, 1)
+
+    def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
+        """The U-Net's answer for both halves, ``(B, 8, h, w)``."""
+        geometry = torch.cat([latents[:, self.depth_channels], latents[:, self.normal_channels]])
+        output = self.unet(
+            torch.cat([condition["image_latent"].repeat(2, 1, 1, 1), geometry], dim=1),
+            timestep,
+            encoder_hidden_states=condition["prompt"].repeat(2, 1, 1),
+            class_labels=torch.cat(condition["class_labels"].unbind(dim=1)),
+            return_dict=False,
+        )[0]  # (2B, 4, h, w)
+        return torch.cat(output.chunk(2), dim=1)
+
+    def decode_relative(self, z0: Tensor) -> Tensor:
+        """Mean of the decoded channels from [-1, 1] to [0, 1], not clipped."""
+        return (self.decode_latents(z0).mean(dim=1, keepdim=True) + 1.0) / 2.0
+
+    def decode_prediction(self, latents: Tensor) -> Tensor:
+        """Their ending: clipped, then stretched so that every map has a 0 and a 1."""
+        maps = super().decode_prediction(latents)
+        low, high = maps.amin((1, 2, 3), keepdim=True), maps.amax((1, 2, 3), keepdim=True)
+        return (maps - low) / (high - low).clamp_min(torch.finfo(maps.dtype).tiny)
+
+    def decode_extras(self, latents: Tensor, ensemble_size: int) -> dict[str, Tensor]:
+        """Normals of every image: those of the member that lies closest to the mean of all.
+
+        Returns:
+            ``{"normals": (N, 3, H, W)}``, unit vectors; frame and sign as the class says.
+        """
+        halves = latents[:, self.normal_channels].split(1)
+        normals = torch.cat([self.decode_latents(half) for half in halves])
+        normals = normals / (normals.norm(dim=1, keepdim=True) + EPS_LENGTH)
+        return {"normals": torch.cat([closest_to_mean(m) for m in normals.split(ensemble_size)])}
+
+
+def class_embedding(domain: str | None) -> Tensor:
+    """Sines and cosines of one-hot codes, ``(2, 10)``, ``(2, 4)`` without a domain; depth, then normals."""
+    here: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
+    codes = [torch.tensor([[0.0, 1.0], [1.0, 0.0]], **here)]
+    if domain is not None:
+        codes.append(torch.eye(len(DOMAINS), **here)[[DOMAINS.index(domain)] * 2])
+    return torch.cat([f(code) for code in codes for f in (torch.sin, torch.cos)], dim=1)
+
+
+def closest_to_mean(normals: Tensor) -> Tensor:
+    """The member of ``(E, 3, H, W)`` unit vectors that turns least from their mean, ``(1, 3, H, W)``."""
+    mean = F.normalize(normals.mean(dim=0, keepdim=True), dim=1)
+    angle = torch.acos((normals * mean).sum(dim=1).clamp(-1.0, 1.0)).sum(dim=(1, 2))  # (E,)
+    return normals[angle.argmin()][None]
+
+
+def _self_attention(unet: UNet2DConditionModel) -> dict[str, Any]:
+    return {name: p for name, p in unet.attn_processors.items() if name.endswith("attn1.processor")}
+
+
+def couple_pairs(unet: UNet2DConditionModel) -> None:
+    """Let every self-attention of the transformer blocks see the pair; it has no weights of its own."""
+    coupled = dict.fromkeys(_self_attention(unet), PairAttention())
+    unet.set_attn_processor(unet.attn_processors | coupled)
+
+
+def check_coupled(unet: UNet2DConditionModel) -> None:
+    """Refuse a U-Net that would treat depth and normals as strangers.
+
+    Raises:
+        ValueError: some processor was replaced after the pipeline was made.
+    """
+    strangers = {type(p).__name__ for p in _self_attention(unet).values() if not isinstance(p, PairAttention)}
+    if strangers:
+        bad_value(
+            "pipe.unet",
+            "with PairAttention, through which depth and normals see each other",
+            ", ".join(sorted(strangers)),
+            "Do not set attention processors (xformers, slicing, ...) on this pipeline.",
+        )
+
 
 #: What the authors' scripts load from a folder whose index names classes of their own, or that has no index.
 CLASSES = {

@@ -1,23 +1,165 @@
-"""Lotus: depth and disparity, generative (G) and discriminative (D).
-
-Data flow: folder in diffusers' layout, and its name -> ``LotusPipeline``.
-Paper: none (He et al., Lotus, ICLR 2025).
-"""
+"""Lotus G and D: one step of an x0-predicting SD-2 U-Net with a task embedding (He et al., ICLR 2025)."""
 
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import torch
+from diffusers import AutoencoderKL, UNet2DConditionModel
+from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
+from torch import Tensor
+from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.loading import build_pipeline
+from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
-from geodiff_plugin.priors.pipelines.lotus import TIMESTEP, LotusPipeline
+from geodiff_plugin.priors.pipelines.prompts import text_embedding
 
-__all__ = ["LotusPrior", "space_of_name"]
+__all__ = ["LotusPipeline", "LotusPrior", "space_of_name"]
+
+#: The only timestep that Lotus was trained at.
+TIMESTEP = 999
+#: One-hot of the task: [1, 0] predicts depth, [0, 1] repeats the image (used in training only).
+DEPTH_TASK = (1.0, 0.0)
+
+
+class LotusImageProcessor(MarigoldImageProcessor):
+    """Preprocessing as the authors' ``resize_max_res``: no padding, and their rounding of the sides."""
+
+    def __init__(self) -> None:
+        super().__init__(vae_scale_factor=1)
+
+    @staticmethod
+    def resize_to_max_edge(image: Tensor, max_edge_sz: int, mode: str) -> Tensor:
+        """Resize ``(N, 3, H, W)`` so that its longer side is ``max_edge_sz``, sometimes a pixel less.
+
+        A float product cut to an integer: at 768 a width of 1242 becomes 768, one of 1226 becomes 767.
+        """
+        height, width = image.shape[-2:]
+        factor = min(max_edge_sz / width, max_edge_sz / height)
+        size = (int(height * factor), int(width * factor))
+        if 0 in size:
+            bad_value("image", "of a moderate aspect ratio", f"{width} x {height}")
+        return MarigoldImageProcessor.resize_antialias(image, size, mode, is_aa=True)
+
+
+class LotusPipeline(DepthDiffusionPipeline):
+    """Lotus-G (8 input channels: image and noise) or Lotus-D (4: image alone), as the U-Net says.
+
+    Not deterministic even as D: the image latent is drawn from the VAE's posterior.
+
+    Args:
+        unet: ``UNet2DConditionModel`` with 4-d projected class embeddings.
+        vae: SD's ``AutoencoderKL``.
+        text_encoder: for the empty prompt.
+        tokenizer: of it.
+        scheduler: any; replaced by ``DirectScheduler``: a schedule of noise prediction (SD-2's own, which
+            such a folder may carry) is not what the network was trained on.
+        prediction_type: ``"depth"`` or ``"disparity"``; the repository's name is the only place that says.
+        default_denoising_steps: 1.
+        default_processing_resolution: longer side, pixels.
+
+    Raises:
+        ValueError: an unknown prediction type; a U-Net of other channels or without task embedding.
+    """
+
+    model_cpu_offload_seq = "text_encoder->unet->vae"
+    max_steps = 1
+    output_resampling = "nearest-exact"
+
+    def __init__(
+        self,
+        unet: UNet2DConditionModel,
+        vae: AutoencoderKL,
+        text_encoder: CLIPTextModel,
+        tokenizer: CLIPTokenizer,
+        scheduler: Any,
+        prediction_type: str | None = None,
+        default_denoising_steps: int = 1,
+        default_processing_resolution: int = 768,
+    ) -> None:
+        super().__init__()
+        if prediction_type not in ("depth", "disparity"):
+            cure = "No config of Lotus says; the disparity versions are those with disparity in their name."
+            bad_value("prediction_type", "'depth' or 'disparity'", repr(prediction_type), cure)
+        channels = unet.config.in_channels
+        if channels not in (4, 8) or unet.config.projection_class_embeddings_input_dim != 4:
+            bad_value(
+                "unet",
+                "one of Lotus (4 or 8 input channels, 4-d class embedding)",
+                f"{channels} channels, {unet.config.projection_class_embeddings_input_dim}-d class embedding",
+            )
+        self.sees_latents = channels == 8
+        if not isinstance(scheduler, DirectScheduler):
+            scheduler = DirectScheduler(timestep=TIMESTEP)
+        modules = {
+            "unet": unet,
+            "vae": vae,
+            "text_encoder": text_encoder,
+            "tokenizer": tokenizer,
+            "scheduler": scheduler,
+        }
+        self.register_prior(
+            modules,
+            prediction_type,
+            default_denoising_steps,
+            default_processing_resolution,
+            LotusImageProcessor(),
+        )
+
+    def prepare_condition(
+        self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
+    ) -> Condition:
+        """Image latents (a draw each), embedded task and empty prompt, ``N * E`` of each."""
+        latents = self.image_latents(image, ensemble_size, batch_size, generator, sample=True)
+        task = torch.tensor(DEPTH_TASK, dtype=torch.float32, device="cpu")
+        task = torch.cat([task.sin(), task.cos()]).to(latents)  # (4,)
+        prompt = text_embedding(self.tokenizer, self.text_encoder, latents.device)
+        return {
+            "image_latent": latents,  # (N * E, 4, h, w)
+            "task": task.expand(len(latents), -1),
+            "prompt": prompt.to(latents).expand(len(latents), -1, -1),  # (N * E, 2, C)
+        }
+
+    def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
+        """The clean latent ``(B, 4, h, w)``; D does not look at ``latents``."""
+        sample = condition["image_latent"]
+        if self.sees_latents:
+            sample = torch.cat([sample, latents], dim=1)
+        return self.unet(
+            sample,
+            timestep,
+            encoder_hidden_states=condition["prompt"],
+            class_labels=condition["task"],
+            return_dict=False,
+        )[0]
+
+    def decode_relative(self, z0: Tensor) -> Tensor:
+        """Channel mean in [0, 1], not clipped, pixel to pixel with the processed image.
+
+        The latent covers whole cells of 8 pixels only; a guided call repeats the last row and column beyond
+        them. (The authors stretch instead, which moves the map by up to 7 pixels.)
+        """
+        return self._decode(z0)  # (B, 1, 8 h, 8 w)
+
+    def encode_relative(self, x: Tensor) -> Tensor:
+        """As the base class, of whole cells only."""
+        cell = 2 ** (len(self.vae.config.block_out_channels) - 1)
+        height, width = (side // cell * cell for side in x.shape[-2:])
+        return super().encode_relative(x[..., :height, :width])
+
+    def decode_prediction(self, latents: Tensor) -> Tensor:
+        """As the authors end: clipped to [0, 1], whole cells only; the caller's resizing stretches it."""
+        return self._decode(latents, clip=True)
+
+    def _decode(self, z0: Tensor, clip: bool = False) -> Tensor:
+        """Mean of the decoded channels, ``(B, 1, 8 h, 8 w)``; the authors clip every channel before it."""
+        decoded = self.decode_latents(z0) / 2 + 0.5
+        return (decoded.clamp(0.0, 1.0) if clip else decoded).mean(dim=1, keepdim=True)
 
 
 def space_of_name(name: str) -> str:

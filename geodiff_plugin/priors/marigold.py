@@ -1,6 +1,5 @@
 """Marigold v1-0, v1-1 and LCM, and every fine-tune that keeps ``MarigoldDepthPipeline``.
 
-Data flow: clean latent -> VAE decoder, not clipped -> relative map.
 Paper: S3.1, S5.1 (built upon Marigold).
 """
 
@@ -11,9 +10,9 @@ from diffusers import MarigoldDepthPipeline
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.hooks import encode_map
+from geodiff_plugin.priors.pipelines.base import encode_map
 from geodiff_plugin.scale.space import SPACES
 
 __all__ = ["MarigoldPrior"]

@@ -1,9 +1,4 @@
-"""Tiny autoencoders for the decoding and encoding between the denoising steps.
-
-Data flow: ``decoder`` of the configuration + prior -> ``AutoencoderTiny`` of the same latent.
-Paper: none; TAESD and its relatives (O. Boer Bohan, github.com/madebyollin/taesd) are distilled from the
-autoencoders that they stand for.
-"""
+"""Tiny autoencoders for the decoding and encoding between the denoising steps."""
 
 from __future__ import annotations
 

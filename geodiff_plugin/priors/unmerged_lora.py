@@ -1,8 +1,6 @@
 """A LoRA kept apart from its base, since a base in 4 bits cannot be merged with it.
 
-Data flow: ``transformer/``, ``lora/`` of a folder -> the base as it is or in NF4
-    -> the same with the LoRA on it.
-Paper: none (LoRA, arXiv 2106.09685; NF4, arXiv 2305.14314).
+Source: LoRA, arXiv 2106.09685; NF4, arXiv 2305.14314.
 
 ``peft`` puts it on, ``bitsandbytes`` holds 4-bit weights; both are extras of the package.
 """
@@ -17,7 +15,7 @@ from diffusers import BitsAndBytesConfig, QwenImageTransformer2DModel
 from safetensors.torch import load_file
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.loading import check_weights, load_component
 
 __all__ = [

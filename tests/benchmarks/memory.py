@@ -30,7 +30,7 @@ except ImportError:  # transformers 4
     from transformers.modeling_utils import no_init_weights
 
 from geodiff_plugin.priors import PRIORS
-from geodiff_plugin.priors.pipelines.marigold_v2 import MarigoldV2Pipeline
+from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 from geodiff_plugin.priors.unmerged_lora import SKIPPED
 from tests.benchmarks.full_sizes import FULL_SIZES
 

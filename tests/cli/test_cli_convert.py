@@ -13,9 +13,8 @@ from safetensors.torch import load_file
 
 from geodiff_plugin.cli.converters.depthfm import diffusers_name, unet_config
 from geodiff_plugin.priors.depthfm import DepthFMPrior
-from geodiff_plugin.priors.depthmaster import DepthMasterPrior
-from geodiff_plugin.priors.layout import Layout
-from geodiff_plugin.priors.pipelines.depthmaster import DepthMasterPipeline
+from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, DepthMasterPrior
+from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.pipelines.fourier_unet import FourierUNet
 from tests.conftest import make_text_encoder, make_vae
 from tests.parity.depthfm_reference import HPARAMS, VAE

@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from geodiff_plugin.cli.converters import shards
 from geodiff_plugin.cli.converters.marigold_v2 import Trainables, read_prompt
 from geodiff_plugin.priors import find_prior, load_prior, unmerged_lora
-from geodiff_plugin.priors.pipelines.marigold_v2 import MarigoldV2Pipeline
+from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 from tests.parity import marigold_v2_reference as reference
 
 IMAGE = np.random.default_rng(0).random((32, 48, 3), np.float32)

@@ -15,7 +15,7 @@ from transformers import (
     CLIPVisionModelWithProjection,
 )
 
-from geodiff_plugin.priors.pipelines.geowizard import IMAGE_EMBEDDING, TEXT_PROMPT, GeoWizardPipeline
+from geodiff_plugin.priors.geowizard import IMAGE_EMBEDDING, TEXT_PROMPT, GeoWizardPipeline
 from tests.parity import geowizard_reference as reference
 
 

@@ -7,7 +7,7 @@ from diffusers import FlowMatchEulerDiscreteScheduler
 from transformers import Dinov2Config, Dinov2Model
 
 from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
-from geodiff_plugin.priors.pipelines.ppd import PPDPipeline
+from geodiff_plugin.priors.ppd import PPDPipeline
 
 
 def make_ppd(seed: int = 0) -> PPDPipeline:

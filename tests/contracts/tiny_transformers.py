@@ -27,7 +27,7 @@ from transformers import (
 )
 
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
-from geodiff_plugin.priors.pipelines.transformers_depth import TransformersDepthPipeline
+from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline
 
 IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 STAGES = {"out_features": [f"stage{i}" for i in range(1, 5)], "reshape_hidden_states": False}

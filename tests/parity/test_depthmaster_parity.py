@@ -10,8 +10,8 @@ import torch
 from diffusers import AutoencoderKL
 from PIL import Image
 
-from geodiff_plugin.priors.pipelines import depthmaster
-from geodiff_plugin.priors.pipelines.depthmaster import DepthMasterPipeline
+from geodiff_plugin.priors import depthmaster
+from geodiff_plugin.priors.depthmaster import DepthMasterPipeline
 from geodiff_plugin.priors.pipelines.fourier_unet import FourierUNet
 from tests.conftest import make_text_encoder
 from tests.parity.depthmaster_reference import UNET, VAE, image_u8, prompt

@@ -10,8 +10,7 @@ from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 from PIL import Image
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
-from geodiff_plugin.priors.e2e_ft import E2EFTPrior
-from geodiff_plugin.priors.pipelines.e2e_ft import E2EFTPipeline
+from geodiff_plugin.priors.e2e_ft import E2EFTPipeline, E2EFTPrior
 from tests.parity.e2e_ft_reference import SCHEDULER, TEXT, UNET, VAE, image_u8, write_tokenizer
 from tests.parity.named_weights import fill
 

@@ -16,7 +16,7 @@ from transformers import (
     CLIPVisionModelWithProjection,
 )
 
-from geodiff_plugin.priors.pipelines.geowizard import GeoWizardPipeline
+from geodiff_plugin.priors.geowizard import GeoWizardPipeline
 from tests.parity import geowizard_reference as reference
 from tests.parity.named_weights import fill
 

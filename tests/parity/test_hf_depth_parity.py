@@ -15,8 +15,7 @@ from transformers.models.prompt_depth_anything.image_processing_pil_prompt_depth
 )
 from transformers.models.zoedepth.image_processing_pil_zoedepth import ZoeDepthImageProcessorPil
 
-from geodiff_plugin.priors.hf_depth import HFDepthModel
-from geodiff_plugin.priors.hf_preparation import Preparation
+from geodiff_plugin.priors.hf_model import HFDepthModel, Preparation
 from tests.contracts.tiny_transformers import MODELS, spread
 
 PATCH_OF_14 = {"keep_aspect_ratio": True, "ensure_multiple_of": 14}

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from geodiff_plugin.algorithm.denoising import z0_from
-from geodiff_plugin.priors.pipelines.depthfm import SIDE, cosine_alpha_bar
+from geodiff_plugin.priors.depthfm import SIDE, cosine_alpha_bar
 from geodiff_plugin.priors.pipelines.sides import SidesOf
 from geodiff_plugin.runtime.noise_levels import noise_level
 from tests.contracts.tiny_depthfm import make_depthfm

@@ -10,7 +10,7 @@ import torch
 from diffusers import UNet2DConditionModel
 
 from geodiff_plugin.priors.depthmaster import DepthMasterPrior
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.pipelines.fourier_unet import FourierBlock
 from tests.contracts.tiny_depthmaster import make_depthmaster
 

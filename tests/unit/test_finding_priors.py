@@ -9,8 +9,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from geodiff_plugin.priors import PRIORS, REFUSED, find_prior, load_prior
-from geodiff_plugin.priors.finding import refuse
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.folders import Layout, refuse
 
 UNET = {"in_channels": 8, "out_channels": 4}
 V1_0 = {"timestep_spacing": "leading", "steps_offset": 1}

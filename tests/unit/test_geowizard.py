@@ -11,9 +11,13 @@ from diffusers.models.attention_processor import AttnProcessor
 from safetensors.torch import load_file, save_file
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.priors.geowizard import GeoWizardPrior
-from geodiff_plugin.priors.layout import Layout
-from geodiff_plugin.priors.pipelines.geowizard import GeoWizardPipeline, class_embedding, closest_to_mean
+from geodiff_plugin.priors.folders import Layout
+from geodiff_plugin.priors.geowizard import (
+    GeoWizardPipeline,
+    GeoWizardPrior,
+    class_embedding,
+    closest_to_mean,
+)
 from tests.contracts.tiny_geowizard import make_geowizard
 
 IMAGE = np.random.default_rng(0).random((48, 64, 3)).astype(np.float32)

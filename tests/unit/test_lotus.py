@@ -11,9 +11,8 @@ from diffusers import PNDMScheduler
 from safetensors.torch import load_file, save_file
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.priors.layout import Layout
-from geodiff_plugin.priors.lotus import LotusPrior, space_of_name
-from geodiff_plugin.priors.pipelines.lotus import LotusImageProcessor, LotusPipeline
+from geodiff_plugin.priors.folders import Layout
+from geodiff_plugin.priors.lotus import LotusImageProcessor, LotusPipeline, LotusPrior, space_of_name
 from tests.conftest import make_unet
 from tests.contracts.tiny_lotus import make_lotus
 

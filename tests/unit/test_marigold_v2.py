@@ -13,9 +13,8 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.cli.tiny_marigold_v2 import tiny_marigold_v2
 from geodiff_plugin.priors import find_adapter
-from geodiff_plugin.priors.pipelines.marigold_v2 import MarigoldV2Pipeline
+from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline, frame_of, latents_of, pack, unpack
 from geodiff_plugin.priors.pipelines.sides import SidesOf
-from geodiff_plugin.priors.pipelines.video_latents import frame_of, latents_of, pack, unpack
 
 FAST = {"min_steps": 1, "loss_resolution": 64}
 

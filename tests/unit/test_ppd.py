@@ -5,10 +5,9 @@ import torch
 from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
 from geodiff_plugin.cli.convert import run_convert
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
-from geodiff_plugin.priors.pipelines.ppd import AreaImageProcessor, area_resize
-from geodiff_plugin.priors.ppd import PPDPrior
+from geodiff_plugin.priors.ppd import AreaImageProcessor, PPDPrior, area_resize
 from tests.contracts.tiny_ppd import make_ppd
 
 

@@ -16,7 +16,7 @@ from examples.training.models import save_prior
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 from geodiff_plugin.bundled import PRIOR_FOLDER
 from geodiff_plugin.bundled.loading import open_pipeline
-from geodiff_plugin.priors.hf_depth import HFDepthModel
+from geodiff_plugin.priors.hf_model import HFDepthModel
 
 QUICK = {"num_inference_steps": 1, "processing_resolution": 64}
 

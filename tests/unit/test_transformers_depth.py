@@ -10,11 +10,9 @@ from safetensors.torch import load_file, save_file
 from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES
 
 from geodiff_plugin.priors import PRIORS, find_adapter
-from geodiff_plugin.priors.hf_depth import NO_DEPTH, DepthMap, HFDepthModel, output_of
-from geodiff_plugin.priors.hf_preparation import Preparation
-from geodiff_plugin.priors.layout import Layout
-from geodiff_plugin.priors.pipelines.transformers_depth import unit_range
-from geodiff_plugin.priors.transformers_depth import TransformersDepthPrior
+from geodiff_plugin.priors.folders import Layout
+from geodiff_plugin.priors.hf_model import NO_DEPTH, DepthMap, HFDepthModel, Preparation, output_of
+from geodiff_plugin.priors.transformers_depth import TransformersDepthPrior, unit_range
 from tests.contracts.tiny_transformers import MODELS, depth_anything, make_transformers
 
 OUTPUTS = {
@@ -116,6 +114,21 @@ def test_canopy_height_is_refused_with_the_reason(space):
     preparation = Preparation.from_config({"image_processor_type": "GLPNImageProcessor"})
     with pytest.raises(ValueError, match="height of trees"):
         HFDepthModel(CHMv2ForDepthEstimation(), preparation, space)
+
+
+def test_a_folder_of_canopy_height_is_refused_before_its_image_processor(tmp_path):
+    (tmp_path / "config.json").write_text(
+        '{"architectures": ["CHMv2ForDepthEstimation"], "model_type": "dpt"}'
+    )
+    (tmp_path / "preprocessor_config.json").write_text('{"image_processor_type": "CHMv2ImageProcessor"}')
+    with pytest.raises(ValueError, match="height of trees"):
+        HFDepthModel.from_pretrained(tmp_path)
+
+
+def test_depth_pro_without_its_field_of_view_is_relative():
+    model = MODELS["depth_pro"]()[0]
+    model.config.use_fov_model = False
+    assert output_of(model) == ("disparity", False)
 
 
 def test_metric_depth_anything_and_dinov2s_dpt_give_metres():

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.cli.converters.kinds import Converter, write_card
+from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.loading import check_weights
-from geodiff_plugin.priors.pipelines.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
 
 __all__ = ["DEPTHFM", "diffusers_name", "unet_config"]

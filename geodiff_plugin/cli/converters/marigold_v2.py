@@ -26,7 +26,7 @@ from geodiff_plugin.cli.converters.kinds import write_card
 from geodiff_plugin.cli.converters.reading import read_tensor
 from geodiff_plugin.cli.converters.shards import rewrite_shards, shapes_of, weight_files
 from geodiff_plugin.priors.loading import check_weights
-from geodiff_plugin.priors.pipelines.marigold_v2 import SPACE_OF_CHECKPOINT, MarigoldV2Pipeline
+from geodiff_plugin.priors.marigold_v2 import SPACE_OF_CHECKPOINT, MarigoldV2Pipeline
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
 from geodiff_plugin.priors.unmerged_lora import LORA_FILE, LORA_FOLDER, LORAS
 from geodiff_plugin.scale.space import SPACES

@@ -22,10 +22,10 @@ from transformers import Dinov2Config, Dinov2Model
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.converters.kinds import Converter, write_card
 from geodiff_plugin.cli.converters.reading import read_checkpoint
-from geodiff_plugin.priors.layout import Layout
+from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.loading import check_weights, load_component
 from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
-from geodiff_plugin.priors.pipelines.ppd import PPDPipeline
+from geodiff_plugin.priors.ppd import PPDPipeline
 
 __all__ = ["PPD", "encoder_name"]
 

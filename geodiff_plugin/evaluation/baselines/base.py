@@ -20,7 +20,7 @@ from geodiff_plugin.bundled.loading import no_bars
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.priors import load_prior
-from geodiff_plugin.priors.hf_depth import HFDepthModel
+from geodiff_plugin.priors.hf_model import HFDepthModel
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 __all__ = ["Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]

@@ -1,8 +1,4 @@
-"""A schedule of one step for networks whose output is the clean latent itself.
-
-Data flow: ``model_output`` -> ``prev_sample``, unchanged.
-Paper: none (its priors all take several steps).
-"""
+"""A schedule of one step for networks whose output is the clean latent itself."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """DepthMaster's U-Net: that of Stable Diffusion 2 with a block after the middle that works on frequencies.
 
-Data flow: image latent -> clean depth latent.
-Paper: none (DepthMaster, arXiv 2501.02576, the Fourier Enhancement module).
+Source: DepthMaster, arXiv 2501.02576, the Fourier Enhancement module.
 """
 
 from __future__ import annotations

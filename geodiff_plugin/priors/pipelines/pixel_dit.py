@@ -1,8 +1,4 @@
-"""Network of Pixel-Perfect Depth: a diffusion transformer on pixels, with semantic tokens half way.
-
-Data flow: ``cat[x_t, image - 0.5] (B, 4, H, W)``, tokens ``(B, n, C)``, time -> velocity ``(B, 1, H, W)``.
-Paper: none; Pixel-Perfect Depth (arXiv 2510.07316), whose weights load by name.
-"""
+"""Network of Pixel-Perfect Depth: a diffusion transformer on pixels, with semantic tokens half way."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Prompt embeddings for U-Nets with cross-attention: encoded, or saved with the weights.
-
-Data flow: prompt -> ``(1, n, C)`` text embedding.
-Paper: none (Marigold's empty prompt).
-"""
+"""Prompt embeddings for U-Nets with cross-attention: encoded, or saved with the weights."""
 
 from __future__ import annotations
 

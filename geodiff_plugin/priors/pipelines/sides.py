@@ -1,8 +1,4 @@
-"""Image processors for networks whose input sides must be multiples of a number.
-
-Data flow: image of any size -> ``(N, 3, H, W)`` in [-1, 1], each side brought there with a factor of its own.
-Paper: none.
-"""
+"""Image processors for networks whose input sides must be multiples of a number."""
 
 from __future__ import annotations
 
