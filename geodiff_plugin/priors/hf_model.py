@@ -177,7 +177,8 @@ def output_of(model: PreTrainedModel) -> tuple[str, bool]:
     Returns:
         Depth Anything as its ``depth_estimation_type`` says; DPT relative disparity, but metres with the
         projection that only DINOv2's depth heads have; ZoeDepth, GLPN and TIPSv2 metres; DepthPro inverse
-        metres, relative without the head for its field of view; Prompt Depth Anything relative depth, until it is given a prompt.
+        metres, relative without the head for its field of view; Prompt Depth Anything relative depth, until
+        it is given a prompt.
 
     Raises:
         ValueError: a class of which this is not known.
