@@ -1,18 +1,16 @@
 """Every number and switch of the guidance: one flat, frozen configuration, and its presets.
 
-S5.1 and Algorithm 1 name some of them. The tables of docs/reference/knobs.md are made from this module:
-
-    python -m geodiff_plugin.config docs/reference/knobs.md
+S5.1 and Algorithm 1 name some of them; docs/reference/knobs.md, which is made from this module, says which.
 """
 
 from __future__ import annotations
 
 import difflib
+import inspect
 import json
 import re
-import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -21,7 +19,7 @@ from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_flag
 
 __all__ = ["DEFAULT", "DEFAULT_WEIGHTS", "KNOBS", "MARIGOLD_DC", "PAPER", "PRESETS", "PRIOR_FIT"]
 __all__ += ["SEARCH_ONLY", "GuidanceConfig", "Knob", "UpdatePlan", "close_names", "config_from_text"]
-__all__ += ["knob_lines", "knob_tables", "preset_named", "value_of", "with_tables"]
+__all__ += ["knob_lines", "sentences", "shown", "value_of"]
 
 #: Weights of the default preset.
 DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
@@ -30,17 +28,15 @@ TINY = 1e-9
 
 
 class Knob(NamedTuple):
-    """What is known about one field of the configuration.
+    """What is known about one field of the configuration, beside the sentence on what it does.
 
     Attributes:
-        doc: what it does, with its source where it has one.
         values: its range in words.
         check: value and name -> the value as it is kept; raises ``InputError``.
         paper: what the paper says of it; ``"{}"`` stands for the value of the ``PAPER`` preset.
         unset: what ``None`` becomes when the guidance is used, in words; empty where ``None`` is not allowed.
     """
 
-    doc: str
     values: str
     check: Callable[[Any, str], Any]
     paper: str = "{}"
@@ -67,64 +63,63 @@ class _FrozenDict(dict[str, Any]):
         return _FrozenDict, (dict(self),)
 
 
-def _knob(default: Any, *described: Any, **more: str) -> Any:
-    knob = Knob(*described, **more)
+def _knob(default: Any, values: str, check: Callable[[Any, str], Any], **more: str) -> Any:
+    knob = Knob(values, check, **more)
     if knob.unset:
-        check = knob.check
         knob = knob._replace(
-            values=f"{knob.values}, or `None`",
+            values=f"{values}, or `None`",
             check=lambda value, name: None if value is None else check(value, name),
         )
     return field(default=default, metadata={"knob": knob})
 
 
-def _number(default: float | None, low: float, high: float, doc: str, **more: str) -> Any:
+def _number(default: float | None, low: float, high: float, **more: str) -> Any:
     """A finite number in ``[low, high]``."""
-    values = f"[{low:g}, {high:g}]"
-    return _knob(default, doc, values, lambda v, name: float(check_number(v, name, low, high)), **more)
+    return _knob(
+        default, f"[{low:g}, {high:g}]", lambda v, name: float(check_number(v, name, low, high)), **more
+    )
 
 
-def _integer(default: int | None, low: int, high: int, doc: str, **more: str) -> Any:
+def _integer(default: int | None, low: int, high: int, **more: str) -> Any:
     """A whole number in ``[low, high]``."""
 
     def check(value: Any, name: str) -> int:
         return int(check_number(value, name, low, high, integer=True))
 
-    return _knob(default, doc, f"integer, [{low:g}, {high:g}]", check, **more)
+    return _knob(default, f"integer, [{low:g}, {high:g}]", check, **more)
 
 
-def _flag(default: bool, doc: str, **more: str) -> Any:
+def _flag(default: bool, **more: str) -> Any:
     """``True`` or ``False``, nothing else."""
-    return _knob(default, doc, "bool", check_flag, **more)
+    return _knob(default, "bool", check_flag, **more)
 
 
-def _choice(default: str, choices: tuple[str, ...], doc: str, **more: str) -> Any:
-    """One of some names."""
+def _choice(*choices: str, **more: str) -> Any:
+    """One of some names, the default first."""
     values = ", ".join(f"`{name}`" for name in choices)
-    return _knob(default, doc, values, lambda v, name: check_choice(v, name, choices), **more)
+    return _knob(choices[0], values, lambda v, name: check_choice(v, name, choices), **more)
 
 
-def _text(default: str, values: str, doc: str, **more: str) -> Any:
+def _text(default: str, values: str, **more: str) -> Any:
     """A text that is not empty; only the code that uses it can say whether the text is valid."""
 
     def check(value: Any, name: str) -> str:
-        if isinstance(value, Path):
-            value = str(value)
-        return value if isinstance(value, str) and value else bad_type(name, f"a text ({values})", value)
+        text = str(value) if isinstance(value, Path) else value
+        return text if isinstance(text, str) and text else bad_type(name, f"a text ({values})", value)
 
-    return _knob(default, doc, values, check, **more)
+    return _knob(default, values, check, **more)
 
 
-def _pair(default: tuple[float, float] | None, doc: str, **more: str) -> Any:
+def _pair(default: tuple[float, float] | None, **more: str) -> Any:
     """Two numbers in metres, ``0 < low < high``; a list is taken for a tuple."""
 
     def check(value: Any, name: str) -> tuple[float, float]:
         return check_range(value, name) or bad_type(name, "a pair of numbers (low, high)", value)
 
-    return _knob(default, doc, "pair with 0 < low < high, m", check, **more)
+    return _knob(default, "pair with 0 < low < high, m", check, **more)
 
 
-def _weights(default: Mapping[str, float], doc: str) -> Any:
+def _weights(default: Mapping[str, float]) -> Any:
     """A dict of weights >= 0 by the name of a term."""
 
     def check(value: Any, name: str) -> _FrozenDict:
@@ -137,7 +132,7 @@ def _weights(default: Mapping[str, float], doc: str) -> Any:
             {k: float(check_number(v, f"{name}[{k!r}]", 0.0, float("inf"))) for k, v in value.items()}
         )
 
-    return _knob(_FrozenDict(default), doc, "term -> >= 0", check)
+    return _knob(_FrozenDict(default), "term -> >= 0", check)
 
 
 class UpdatePlan(NamedTuple):
@@ -158,202 +153,125 @@ class UpdatePlan(NamedTuple):
 class GuidanceConfig:
     """How strongly, and by what, a second view steers the diffusion; with no argument the default preset.
 
+    The tables of knobs take their sentences from here.
+
+    Attributes:
+        gradient: `full` goes through the U-Net to z_t; `denoised` stops at the clean latent and moves that:
+            no U-Net backward.
+        weights: the terms of the loss; a term of weight 0, or of none, costs nothing (gamma of Eq. 17 is
+            `prior_pull`).
+        min_steps: denoising steps when the call names none and the pipeline's own default is lower; a
+            one-step prior does the rounds of all of them in its one step.
+        respace: a leading DDIM schedule runs as trailing while guided.
+        warm_start: share of the schedule that a call with `previous`, the output of the previous frame,
+            skips; with 0 it takes over the scale alone ([sequences](../how-to/sequences.md)).
+        loss_resolution: upper bound on the longer side of the grid that losses are computed on, px.
+        depth_range: bounds of the sweep and of the nearest and farthest depth of the search.
+        pose: poses that leave matches more than 0.3 px off their epipolar lines (0.45 px if they are
+            rectified) are refined, all views together, and the right image is straightened
+            ([poses](../how-to/poses.md)).
+        clean_photographs: blocks of JPEG compression and strong sensor noise are removed before photographs
+            are compared; the prior sees the image as it is, except with `--distortion`, which undistorts
+            cleaned photographs.
+        decoder: what decodes and encodes between the steps: the prior's own autoencoder, the tiny one that is
+            published for its latent, or another `AutoencoderTiny`; the result is always decoded by the
+            prior's own ([priors](../reference/priors.md#a-tiny-decoder)).
+        eta: SSIM against L1 in the photometric term (Eq. 14).
+        pyramid_levels: levels of the image pyramid of the photometric term.
+        exposure: photographs are compared in the left one's exposure: gain and bias per channel and a slow
+            field, in closed form.
+        z_test: pixels that the estimate itself occludes in a right camera take no part in the photometric
+            term of updates, as the right image shows something else there.
+        min_visible: share in view below which the photometric term is off.
+        pull_to: what `prior_pull` pulls s_hat, t_hat towards (Eq. 17): the search's result, or 0.
+        points_loss: error at points: Cauchy in inverse depth, in units of 1 % of the points' median inverse
+            depth, or L1 + L2 in metres (Marigold-DC, Eq. 4).
+        planes: upper bound on the number of planes of the sweep.
+        sweep_pixels: upper bound on the number of pixels of the sweep's grid: 828 x 250 for KITTI, 530 x 397
+            for 4:3.
+        search: joint (near, far) in a plane-sweep volume, then the basin that reliable matches prefer (a
+            robust fit to the points where there is no right view); the argmin over g_s (S7.3); or the nearest
+            and the farthest point (Marigold-DC).
+        positive: how raw scale and shift become positive (Eq. 13); `square` also clips the relative map to
+            [0, 1] (Marigold-DC, Eq. 2).
+        g_s_range: candidates of the one-number search.
+        g_s_candidates: how many of them; the paper's figures step through 1..80.
+        reject_reflections: matches that lie behind the prior's first estimate, over a region and by more than
+            the image's matches scatter around it, lose their weight: they are reflections in mirrors and
+            glass.
+        correct: in `corrections` of the steps the decoded map is fitted to its matches and points and the
+            change is encoded, before the updates; with `gradient="denoised"` only (after SteeredMarigold,
+            Gregorek and Nalpantidis 2024).
+        corrections: upper bound on the number of steps (or rounds of a prior with fewer steps) that are
+            corrected: the last, and the others spread over the second half of the schedule, or over more of
+            it if they do not fit there; a step with neither correction nor updates is left to the prior, and
+            is not decoded.
+        refine: the result is fitted to its matches and points once more, at full resolution.
+        sharpen: before the result is refined, pixels that hang in the air between a near and a far surface
+            get the depth of one of them, the weighted median of their neighbours (after Ma et al. 2013).
+        smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
+            long, for a prior that is wrong by 5 %; it falls with the fourth power of that error.
+        match_noise: relative error of a perfect match: below it one match is as good as another.
+        outlier_width: a match that differs from those of a wide region by more than this many standard
+            deviations, of its noise and of the prior's error, counts for less.
+        rule: how a gradient moves the latent, scale and shift: `plain`; `adam`; `norm` scales it to a share
+            of the predicted noise; `adam-norm` scales it to the noise's norm before an Adam with the usual
+            decays (Marigold-DC).
+        step_latents: step size of `rule` on the latent.
+        step_affine: step size of `rule` on raw s_hat, t_hat.
+        inner_steps: updates in each denoising step that makes any; with 0 only the search and the correction
+            remain; after a correction only the last quarter of the schedule makes any.
+        optimize_latents: `False` is Table 4's ablation: scale and shift only (S5.3).
+        start: fraction of the schedule before which nothing is updated.
+        stop: fraction after which nothing is updated.
+        step_from: with `gradient="full"`: add the update after the scheduler's step (Algorithm 1), or let the
+            step start from the updated z_t (Marigold-DC).
+
     Raises:
         InputError: a value of the wrong type or out of range, naming the knob.
     """
 
-    gradient: str = _choice(
-        "denoised",
-        ("denoised", "full"),
-        "`full` goes through the U-Net to z_t; `denoised` stops at the clean latent and moves that: no U-Net "
-        "backward",
-    )
-    weights: Mapping[str, float] = _weights(
-        DEFAULT_WEIGHTS,
-        "the terms of the loss; a term of weight 0, or of none, costs nothing (gamma of Eq. 17 is "
-        "`prior_pull`)",
-    )
-    min_steps: int = _integer(
-        4,
-        1,
-        1000,
-        "denoising steps when the call names none and the pipeline's own default is lower; a one-step prior "
-        "does the rounds of all of them in its one step",
-        paper="{} (not given)",
-    )
-    respace: bool = _flag(True, "a leading DDIM schedule runs as trailing while guided")
-    warm_start: float = _number(
-        0.25,
-        0.0,
-        0.99,
-        "share of the schedule that a call with `previous`, the output of the previous frame, skips; with 0 "
-        "it takes over the scale alone ([sequences](../how-to/sequences.md))",
-        paper="-",
-    )
-    loss_resolution: int = _integer(
-        640,
-        32,
-        1 << 16,
-        "upper bound on the longer side of the grid that losses are computed on, px",
-        paper="{} (S9, without saying for what)",
-    )
+    gradient: str = _choice("denoised", "full")
+    weights: Mapping[str, float] = _weights(DEFAULT_WEIGHTS)
+    min_steps: int = _integer(4, 1, 1000, paper="{} (not given)")
+    respace: bool = _flag(True)
+    warm_start: float = _number(0.25, 0.0, 0.99, paper="-")
+    loss_resolution: int = _integer(640, 32, 1 << 16, paper="{} (S9, without saying for what)")
     depth_range: tuple[float, float] | None = _pair(
-        None,
-        "bounds of the sweep and of the nearest and farthest depth of the search",
-        paper="-",
-        unset="from the nearest plane to a shift of 0.3 px",
+        None, paper="-", unset="from the nearest plane to a shift of 0.3 px"
     )
-    pose: str = _choice(
-        "refine",
-        ("refine", "given"),
-        "poses that leave matches more than 0.3 px off their epipolar lines (0.45 px if they are rectified) "
-        "are refined, all views together, and the right image is straightened ([poses](../how-to/poses.md))",
-    )
-    clean_photographs: bool = _flag(
-        True,
-        "blocks of JPEG compression and strong sensor noise are removed before photographs are compared; the "
-        "prior sees the image as it is, except with `--distortion`, which undistorts cleaned photographs",
-    )
-    decoder: str = _text(
-        "full",
-        "`full`, `tiny`, a folder or a hub id",
-        "what decodes and encodes between the steps: the prior's own autoencoder, the tiny one that is "
-        "published for its latent, or another `AutoencoderTiny`; the result is always decoded by the "
-        "prior's own ([priors](../reference/priors.md#a-tiny-decoder))",
-        paper="-",
-    )
-    eta: float = _number(
-        0.85, 0, 1, "SSIM against L1 in the photometric term (Eq. 14)", paper="{} (not given)"
-    )
-    pyramid_levels: int = _integer(3, 1, 10, "levels of the image pyramid of the photometric term")
-    exposure: bool = _flag(
-        True,
-        "photographs are compared in the left one's exposure: gain and bias per channel and a slow field, in "
-        "closed form",
-    )
-    z_test: bool = _flag(
-        True,
-        "pixels that the estimate itself occludes in a right camera take no part in the photometric term of "
-        "updates, as the right image shows something else there",
-    )
-    min_visible: float = _number(0.1, 0, 1, "share in view below which the photometric term is off")
-    pull_to: str = _choice(
-        "start",
-        ("start", "zero"),
-        "what `prior_pull` pulls s_hat, t_hat towards (Eq. 17): the search's result, or 0",
-    )
-    points_loss: str = _choice(
-        "robust",
-        ("robust", "l1l2"),
-        "error at points: Cauchy in inverse depth, in units of 1 % of the points' median inverse depth, or "
-        "L1 + L2 in metres (Marigold-DC, Eq. 4)",
-        paper="-",
-    )
-    planes: int = _integer(160, 24, 4096, "upper bound on the number of planes of the sweep", paper="-")
-    sweep_pixels: int = _integer(
-        210_000,
-        1024,
-        1 << 32,
-        "upper bound on the number of pixels of the sweep's grid: 828 x 250 for KITTI, 530 x 397 for 4:3",
-        paper="-",
-    )
-    search: str = _choice(
-        "volume",
-        ("volume", "one-number", "points-range"),
-        "joint (near, far) in a plane-sweep volume, then the basin that reliable matches prefer (a robust "
-        "fit to the points where there is no right view); the argmin over g_s (S7.3); or the nearest and the "
-        "farthest point (Marigold-DC)",
-    )
-    positive: str = _choice(
-        "softplus",
-        ("softplus", "square"),
-        "how raw scale and shift become positive (Eq. 13); `square` also clips the relative map to [0, 1] "
-        "(Marigold-DC, Eq. 2)",
-    )
-    g_s_range: tuple[float, float] = _pair(
-        (1.0, 80.0), "candidates of the one-number search", paper='{} (a "predefined range")'
-    )
-    g_s_candidates: int = _integer(
-        80, 2, 100_000, "how many of them; the paper's figures step through 1..80", paper="{} (not given)"
-    )
-    reject_reflections: bool = _flag(
-        True,
-        "matches that lie behind the prior's first estimate, over a region and by more than the image's "
-        "matches scatter around it, lose their weight: they are reflections in mirrors and glass",
-    )
-    correct: bool = _flag(
-        True,
-        "in `corrections` of the steps the decoded map is fitted to its matches and points and the change "
-        'is encoded, before the updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek '
-        "and Nalpantidis 2024)",
-    )
-    corrections: int = _integer(
-        2,
-        1,
-        10_000,
-        "upper bound on the number of steps (or rounds of a prior with fewer steps) that are corrected: the "
-        "last, and the others spread over the second half of the schedule, or over more of it if they do not "
-        "fit there; a step with neither correction nor updates is left to the prior, and is not decoded",
-        paper="-",
-    )
-    refine: bool = _flag(True, "the result is fitted to its matches and points once more, at full resolution")
-    sharpen: bool = _flag(
-        True,
-        "before the result is refined, pixels that hang in the air between a near and a far surface get the "
-        "depth of one of them, the weighted median of their neighbours (after Ma et al. 2013)",
-        paper="-",
-    )
-    smoothness: float = _number(
-        40.0,
-        TINY,
-        1e6,
-        "weight of the correction's slope against a match of full confidence, on a grid 512 pixels long, for "
-        "a prior that is wrong by 5 %; it falls with the fourth power of that error",
-        paper="-",
-    )
-    match_noise: float = _number(
-        0.02,
-        TINY,
-        1e3,
-        "relative error of a perfect match: below it one match is as good as another",
-        paper="-",
-    )
-    outlier_width: float = _number(
-        3.0,
-        TINY,
-        1e6,
-        "a match that differs from those of a wide region by more than this many standard deviations, of its "
-        "noise and of the prior's error, counts for less",
-        paper="-",
-    )
-    rule: str = _text(
-        "adam",
-        "key of `RULES`",
-        "how a gradient moves the latent, scale and shift: `plain`; `adam`; `norm` scales it to a share of "
-        "the predicted noise; `adam-norm` scales it to the noise's norm before an Adam with the usual decays "
-        "(Marigold-DC)",
-    )
-    step_latents: float | None = _number(
-        None, 0, 1e6, "step size of `rule` on the latent", unset="0.03 after a correction, else 0.1"
-    )
-    step_affine: float = _number(0.01, 0, 1e6, "step size of `rule` on raw s_hat, t_hat")
-    inner_steps: int | None = _integer(
-        None,
-        0,
-        10_000,
-        "updates in each denoising step that makes any; with 0 only the search and the correction remain; "
-        "after a correction only the last quarter of the schedule makes any",
-        unset="0 after a correction, else 40",
-    )
-    optimize_latents: bool = _flag(True, "`False` is Table 4's ablation: scale and shift only (S5.3)")
-    start: float = _number(0.0, 0, 1, "fraction of the schedule before which nothing is updated")
-    stop: float = _number(1.0, 0, 1, "fraction after which nothing is updated")
-    step_from: str = _choice(
-        "given",
-        ("given", "updated"),
-        'with `gradient="full"`: add the update after the scheduler\'s step (Algorithm 1), or let the step '
-        "start from the updated z_t (Marigold-DC)",
-    )
+    pose: str = _choice("refine", "given")
+    clean_photographs: bool = _flag(True)
+    decoder: str = _text("full", "`full`, `tiny`, a folder or a hub id", paper="-")
+    eta: float = _number(0.85, 0, 1, paper="{} (not given)")
+    pyramid_levels: int = _integer(3, 1, 10)
+    exposure: bool = _flag(True)
+    z_test: bool = _flag(True)
+    min_visible: float = _number(0.1, 0, 1)
+    pull_to: str = _choice("start", "zero")
+    points_loss: str = _choice("robust", "l1l2", paper="-")
+    planes: int = _integer(160, 24, 4096, paper="-")
+    sweep_pixels: int = _integer(210_000, 1024, 1 << 32, paper="-")
+    search: str = _choice("volume", "one-number", "points-range")
+    positive: str = _choice("softplus", "square")
+    g_s_range: tuple[float, float] = _pair((1.0, 80.0), paper='{} (a "predefined range")')
+    g_s_candidates: int = _integer(80, 2, 100_000, paper="{} (not given)")
+    reject_reflections: bool = _flag(True)
+    correct: bool = _flag(True)
+    corrections: int = _integer(2, 1, 10_000, paper="-")
+    refine: bool = _flag(True)
+    sharpen: bool = _flag(True, paper="-")
+    smoothness: float = _number(40.0, TINY, 1e6, paper="-")
+    match_noise: float = _number(0.02, TINY, 1e3, paper="-")
+    outlier_width: float = _number(3.0, TINY, 1e6, paper="-")
+    rule: str = _text("adam", "key of `RULES`")
+    step_latents: float | None = _number(None, 0, 1e6, unset="0.03 after a correction, else 0.1")
+    step_affine: float = _number(0.01, 0, 1e6)
+    inner_steps: int | None = _integer(None, 0, 10_000, unset="0 after a correction, else 40")
+    optimize_latents: bool = _flag(True)
+    start: float = _number(0.0, 0, 1)
+    stop: float = _number(1.0, 0, 1)
+    step_from: str = _choice("given", "updated")
 
     def __post_init__(self) -> None:
         for described in fields(self):
@@ -538,15 +456,6 @@ PRESETS = {
 }
 
 
-def preset_named(name: str) -> GuidanceConfig:
-    """A preset by its name.
-
-    Raises:
-        InputError: no such preset.
-    """
-    return PRESETS[check_choice(name, "preset", PRESETS)]
-
-
 def close_names(name: str, names: Iterable[str]) -> str:
     """Names that exist, those that look like ``name`` first, as a sentence."""
     names = list(names)
@@ -610,7 +519,7 @@ def value_of(name: str, config: GuidanceConfig) -> Any:
     return getattr(config.plan_updates(points_given=False), knob, None) if value is None else value
 
 
-#: Sections of the tables, each with the first of its knobs.
+#: Sections of the tables of knobs, by the first knob of each.
 SECTIONS = {
     "gradient": "The call",
     "eta": "Terms of the loss",
@@ -618,61 +527,32 @@ SECTIONS = {
     "reject_reflections": "Correction by matches and points",
     "rule": "Gradient updates of latent, scale and shift (Algorithm 1)",
 }
-BEGIN, END = "<!-- made by geodiff_plugin.config -->", "<!-- end -->"
 
 
-def _rows() -> Iterator[tuple[str, str, Knob, str]]:
-    """Name, section that starts with it or nothing, description and default of every knob."""
-    for described in fields(GuidanceConfig):
-        name, knob, value = described.name, Knob.of(described), getattr(DEFAULT, described.name)
-        yield name, SECTIONS.get(name, ""), knob, knob.unset if value is None else _shown(value)
+def sentences() -> dict[str, str]:
+    """What every knob does, from the docstring of ``GuidanceConfig``."""
+    lines = inspect.cleandoc(GuidanceConfig.__doc__ or "").partition("Attributes:\n")[2]
+    found = re.findall(r"^    (\w+): (.*(?:\n     +.*)*)", lines, re.MULTILINE)
+    return {name: " ".join(text.split()).rstrip(".") for name, text in found}
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A value of a knob as the tables show it."""
     if isinstance(value, tuple):
-        return f"({', '.join(_shown(v) for v in value)})"
+        return f"({', '.join(map(shown, value))})"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_shown(v)}" for name, v in value.items()) or "none"
+        return ", ".join(f"{name} {shown(v)}" for name, v in value.items()) or "none"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def knob_tables() -> str:
-    """Markdown tables of every knob: name, default, paper, range, what it does."""
-    lines: list[str] = []
-    for name, section, knob, shown in _rows():
-        if section:
-            lines += ["", f"### {section}", "", "| knob | default | paper | range | what it does |"]
-            lines += ["| --- | --- | --- | --- | --- |"]
-        default = f"`None`: {shown}" if getattr(DEFAULT, name) is None else shown
-        paper = knob.paper.format(_shown(value_of(name, PAPER)))
-        lines.append(f"| {' | '.join((f'`{name}`', default, paper, knob.values, knob.doc))} |")
-    return "\n".join([*lines[1:], ""])
-
-
 def knob_lines() -> list[str]:
-    """The same for a terminal: one line a knob, with its default."""
+    """For a terminal: the sections, and of every knob a line with its default, range and what it does."""
     lines: list[str] = []
-    for name, section, knob, shown in _rows():
-        if section:
-            lines += ["", section]
-        doc = re.sub(r" \(\[[^]]*\]\([^)]*\)\)", "", knob.doc)  # a terminal has no use for links
-        lines.append(f"  {name} = {shown}  [{knob.values}]  {doc}".replace("`", ""))
+    for described in fields(GuidanceConfig):
+        name, knob, value = described.name, Knob.of(described), getattr(DEFAULT, described.name)
+        lines += ["", SECTIONS[name]] if name in SECTIONS else []
+        # A terminal has no use for links and marks.
+        sentence = re.sub(r" \(\[[^]]*\]\([^)]*\)\)", "", sentences().get(name, ""))
+        default = knob.unset if value is None else shown(value)
+        lines.append(f"  {name} = {default}  [{knob.values}]  {sentence}".replace("`", ""))
     return lines[1:]
-
-
-def with_tables(page: str) -> str:
-    """A page with the tables between its marks made anew.
-
-    Raises:
-        InputError: a page without the marks.
-    """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
-        bad_value("the page", f"one with the marks {BEGIN} and {END}", "one without")
-    return f"{before}{BEGIN}\n\n{knob_tables()}\n{END}{after}"
-
-
-if __name__ == "__main__":
-    target = Path(sys.argv[1])
-    target.write_text(with_tables(target.read_text(encoding="utf-8")), encoding="utf-8")

@@ -14,10 +14,10 @@ import numpy as np
 from torch import Tensor
 
 from geodiff_plugin._camera_checks import check_calibrated_size, check_intrinsics_fit, warn_of_other_size
-from geodiff_plugin._checks import bad_type, bad_value, check_number, check_size
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, check_size
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs
-from geodiff_plugin.config import GuidanceConfig, UpdatePlan, preset_named
+from geodiff_plugin.config import PRESETS, GuidanceConfig, UpdatePlan
 from geodiff_plugin.formats import picture_size, read_calibration
 from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.guidance.evidence_store import EvidenceStore, make_evidence
@@ -93,7 +93,7 @@ class GeometryGuidance:
         **knobs: Any,
     ) -> None:
         if config is None:
-            config = preset_named(preset or "default")
+            config = PRESETS[check_choice(preset or "default", "preset", PRESETS)]
         elif preset is not None:
             bad_value("preset", "None beside config", repr(preset))
         if not isinstance(config, GuidanceConfig):

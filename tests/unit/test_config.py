@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
+import os
 import pickle
 from pathlib import Path
 
@@ -25,17 +26,18 @@ from geodiff_plugin.config import (
     Knob,
     config_from_text,
     knob_lines,
+    sentences,
+    shown,
     value_of,
-    with_tables,
 )
 
 (PAGE,) = (Path(__file__).resolve().parents[2] / "docs").rglob("knobs.md")
 
 
 @pytest.mark.parametrize("described", dataclasses.fields(GuidanceConfig), ids=lambda field: field.name)
-def test_every_knob_is_described_and_its_default_is_legal(described):
+def test_the_default_of_every_knob_is_legal(described):
     knob = Knob.of(described)
-    assert knob.doc and knob.doc[-1] != "." and "|" not in knob.doc + knob.values
+    assert "|" not in knob.values
     assert knob.check(described.default, described.name) == described.default
     assert bool(knob.unset) == (described.default is None)
 
@@ -167,14 +169,33 @@ def test_a_value_by_name():
         value_of("smoothnes", DEFAULT)
 
 
+def tables():
+    """Markdown tables of every knob, a section each."""
+    lines, said = [], sentences()
+    for described in dataclasses.fields(GuidanceConfig):
+        name, knob = described.name, Knob.of(described)
+        if name in SECTIONS:
+            lines += ["", f"### {SECTIONS[name]}", "", "| knob | default | paper | range | what it does |"]
+            lines += ["| --- | --- | --- | --- | --- |"]
+        default = f"`None`: {knob.unset}" if knob.unset else shown(described.default)
+        paper = knob.paper.format(shown(value_of(name, PAPER)))
+        lines.append(f"| `{name}` | {default} | {paper} | {knob.values} | {said[name]} |")
+    return "\n".join([*lines, ""])
+
+
 def test_the_page_of_knobs_is_up_to_date():
-    """Else: ``python -m geodiff_plugin.config`` with the page."""
+    """``GEODIFF_WRITE=1 pytest tests/unit/test_config.py`` makes its tables anew."""
     page = PAGE.read_text(encoding="utf-8")
-    assert with_tables(page) == page
-    with pytest.raises(InputError, match="the page must be one with the marks"):
-        with_tables("# Knobs")
+    before, begin, rest = page.partition("<!-- tables of tests/unit/test_config.py -->\n")
+    _, end, after = rest.partition("\n<!-- end -->")
+    assert begin and end
+    made = f"{before}{begin}{tables()}{end}{after}"
+    if os.environ.get("GEODIFF_WRITE"):
+        PAGE.write_text(made, encoding="utf-8")
+    assert PAGE.read_text(encoding="utf-8") == made
 
 
 def test_every_knob_has_a_line_for_the_terminal():
-    told = "\n".join(knob_lines())
-    assert all(f"  {name} = " in told for name in KNOBS) and "](" not in told
+    told = [line for line in knob_lines() if line.startswith("  ")]
+    assert [line.split()[0] for line in told] == list(KNOBS)
+    assert all(len(line.partition("]  ")[2]) > 20 and "](" not in line for line in told)
