@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.formats.strips import row_strips
+from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.scale.points import weighted_quantile
 

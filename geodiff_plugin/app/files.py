@@ -19,7 +19,7 @@ from geodiff_plugin.formats import (
     atomic_path,
     flying_points,
     make_cloud,
-    write_depth_mm_png,
+    write_depth_mm,
     write_depth_npy,
     write_glb,
     write_ply,
@@ -100,7 +100,7 @@ def write_files(folder: Path, result: Result, least_confidence: float = 0.0) -> 
     """
     names = ("depth_mm.png", "depth.npy", "depth.png", "cloud.ply", "cloud.glb", "report.json")
     millimetres, array, picture, ply, glb, report = paths = [folder / name for name in names]
-    write_depth_mm_png(millimetres, result.depth_m)
+    write_depth_mm(millimetres, result.depth_m)
     write_depth_npy(array, result.depth_m)
     depth_figure(result.depth_m).save(picture)
     keep = _kept(result, least_confidence)

@@ -6,7 +6,6 @@ Paper: S5.1 (AbsRel, delta1, RMSE).
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import atomic_path
-from geodiff_plugin.formats.out_folder import EXIT_ELSEWHERE, OutFolder
+from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.plotting.figures import colour_depth, depth_range
 from geodiff_plugin.plotting.sheets import grid
 
@@ -64,5 +63,3 @@ def run_demo(arguments: DepthArguments, out: OutFolder) -> None:
     except OSError as error:  # the result itself is safe
         say(f"geodiff: comparison.png could not be written ({error.strerror or error}).")
     print(summary_line(run.report, f"{out.path}/"))
-    if out.elsewhere is not None:
-        sys.exit(EXIT_ELSEWHERE)

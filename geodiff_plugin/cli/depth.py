@@ -6,7 +6,6 @@ Paper: Algorithm 1.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from geodiff_plugin.cli.outputs import write_maps, write_report, write_undistort
 from geodiff_plugin.cli.photographs import read_photographs
 from geodiff_plugin.cli.report import build_report, summary_line
 from geodiff_plugin.cli.settings import Settings, read_settings
-from geodiff_plugin.formats.out_folder import EXIT_ELSEWHERE, OutFolder
+from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["DepthRun", "estimate_and_write", "run_depth", "write_result"]
@@ -83,8 +82,6 @@ def estimate_and_write(arguments: DepthArguments, out: OutFolder) -> DepthRun:
                 say(f"warning: {sentence}")
         report = build_report(inputs, output, pipe, arguments, settings, warnings)
         report_text = write_result(arguments, out, inputs, output, report, watch)
-    if out.elsewhere is not None:
-        say(f"geodiff: {out.elsewhere}")
     return DepthRun(inputs, output, pipe, settings, report, report_text)
 
 
@@ -143,5 +140,3 @@ def run_depth(arguments: DepthArguments, out: OutFolder) -> None:
     viewer = check_exports((), arguments.show)
     if viewer is not None:
         show_scene(viewer, _scene(run.output, run.inputs, arguments))
-    if out.elsewhere is not None:
-        sys.exit(EXIT_ELSEWHERE)

@@ -22,7 +22,7 @@ from geodiff_plugin.cli.messages import say
 from geodiff_plugin.cli.outputs import write_undistorted
 from geodiff_plugin.cli.report import single_map, used_poses
 from geodiff_plugin.formats import Cloud, flying_points, make_cloud, write_colmap, write_glb
-from geodiff_plugin.formats.colmap_export import check_colmap_names
+from geodiff_plugin.formats.colmap import check_colmap_names
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = [

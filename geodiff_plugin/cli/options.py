@@ -24,7 +24,7 @@ def option(help_text: str, panel: str, *names: str) -> Any:
 
 def out_folder(typed: Path | None, default: str, overwrite: bool) -> Path:
     """The folder that was named, else the default, with a number where it is taken."""
-    from geodiff_plugin.formats.out_place import free_folder
+    from geodiff_plugin.formats.out import free_folder
 
     if typed is not None:
         return typed

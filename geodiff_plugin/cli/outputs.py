@@ -15,7 +15,7 @@ from PIL import Image
 
 from geodiff_plugin.cli.arguments import undistorted_name
 from geodiff_plugin.cli.report import single_map
-from geodiff_plugin.formats import flying_points, write_depth_mm_png, write_depth_npy, write_ply
+from geodiff_plugin.formats import flying_points, write_depth_mm, write_depth_npy, write_ply
 from geodiff_plugin.plotting.figures import depth_figure
 from geodiff_plugin.plotting.overview import overview, share_figure
 from geodiff_plugin.types import MetricDepthOutput
@@ -39,7 +39,7 @@ def write_maps(
     """
     depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
     write_depth_npy(folder / "depth.npy", depth_m)
-    zeros = write_depth_mm_png(folder / "depth_mm.png", depth_m)
+    zeros = write_depth_mm(folder / "depth_mm.png", depth_m)
     depth_figure(depth_m, unit=output.unit).save(folder / "depth.png")
     error = None
     if output.visible is not None:

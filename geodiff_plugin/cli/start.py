@@ -21,8 +21,7 @@ from geodiff_plugin.cli.checks import check_arguments
 from geodiff_plugin.cli.many.pairs import PairRef, arguments_of, find_pairs
 from geodiff_plugin.cli.many.summary import check_summary
 from geodiff_plugin.formats.files import check_file
-from geodiff_plugin.formats.out_folder import OutFolder
-from geodiff_plugin.formats.out_place import check_out
+from geodiff_plugin.formats.out import OutFolder, check_out
 
 __all__ = [
     "CALIBRATION_WAYS",

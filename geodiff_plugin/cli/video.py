@@ -17,7 +17,7 @@ from PIL import Image
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import check_file, read_image
-from geodiff_plugin.formats.npy import read_npy
+from geodiff_plugin.formats.files import read_npy
 from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.plotting.video import check_video, depth_frames, write_depth_video
 

@@ -19,7 +19,7 @@ from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.runner import processes, run
 from geodiff_plugin.evaluation.seed_tables import without_copies
 from geodiff_plugin.evaluation.tables import pairs_tables
-from geodiff_plugin.formats.out_folder import OutFolder
+from geodiff_plugin.formats.out import OutFolder
 
 __all__ = ["measure", "remarks_on", "run_pairs"]
 

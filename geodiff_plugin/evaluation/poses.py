@@ -23,7 +23,7 @@ from geodiff_plugin.evaluation.options import first_pairs, settings_words
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.runner import headline, run
 from geodiff_plugin.evaluation.statistics import mean_with_interval
-from geodiff_plugin.formats.out_folder import OutFolder
+from geodiff_plugin.formats.out import OutFolder
 
 __all__ = ["Column", "PosesOptions", "poses_table", "run_poses"]
 

@@ -35,7 +35,7 @@ from geodiff_plugin.evaluation.options import first_pairs, settings_words
 from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, Case, case_kinds, cases_of
-from geodiff_plugin.formats.out_folder import OutFolder
+from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.judgement import judge
 from geodiff_plugin.runtime.signs import Signs

@@ -1,8 +1,4 @@
-"""File formats: calibrations, images, depth maps, point clouds.
-
-Data flow: what lies on disk -> ``Rig``, arrays; arrays -> what lies on disk, whole or not at all.
-Paper: S5.1 (the layouts of the data sets).
-"""
+"""File formats: calibrations, images, depth maps, point clouds (S5.1, the layouts of the data sets)."""
 
 from __future__ import annotations
 
@@ -12,29 +8,29 @@ from typing import Any
 #: Name -> module, imported on first use: some of them need torch, and a file can be looked at without.
 _MODULE_OF = {
     "CALIBRATION_FORMATS": "reading",
-    "Cloud": "pointcloud",
+    "Cloud": "clouds",
     "MIN_SIDE": "images",
     "as_image_01": "images",
-    "atomic_path": "atomic",
+    "atomic_path": "out",
     "check_file": "files",
-    "flying_points": "pointcloud",
-    "make_cloud": "pointcloud",
+    "flying_points": "clouds",
+    "make_cloud": "clouds",
     "picture_size": "images",
     "read_calibration": "reading",
     "read_depth_mm_png": "depth",
     "read_disparity_kitti_png": "depth",
     "read_image": "images",
-    "read_matrix": "matrices",
+    "read_matrix": "files",
     "read_pfm": "depth",
     "read_points": "points",
     "read_text": "files",
     "rig_from_parameters": "rigs",
-    "write_colmap": "colmap_export",
-    "write_depth_mm_png": "depth",
+    "write_colmap": "colmap",
+    "write_depth_mm": "depth",
     "write_depth_npy": "depth",
-    "write_glb": "glb",
+    "write_glb": "clouds",
     "write_pfm": "depth",
-    "write_ply": "pointcloud",
+    "write_ply": "clouds",
 }
 
 __all__ = sorted(_MODULE_OF)  # noqa: PLE0605

@@ -1,28 +1,27 @@
-"""Depth and disparity maps: PFM, npy, 16-bit PNG in millimetres or KITTI's 1/256.
-
-Data flow: file <-> float32 map and boolean mask.
-Paper: S5.1 (ground truth of the data sets).
-"""
+"""Depth and disparity maps: PFM, npy, 16-bit PNG in millimetres or KITTI's 1/256; strips of large maps."""
 
 from __future__ import annotations
 
 import os
 import zlib
+from collections.abc import Iterator
 
 import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.atomic import atomic_path
 from geodiff_plugin.formats.files import check_file
-from geodiff_plugin.formats.strips import row_strips
+from geodiff_plugin.formats.out import atomic_path
 
 __all__ = [
+    "STRIP_PIXELS",
     "read_depth_mm_png",
     "read_depth_png",
     "read_disparity_kitti_png",
     "read_pfm",
-    "write_depth_mm_png",
+    "row_strips",
+    "write_depth_mm",
+    "write_depth_mm",
     "write_depth_npy",
     "write_pfm",
 ]
@@ -30,6 +29,18 @@ __all__ = [
 PathLike = str | os.PathLike[str]
 KITTI_STEP = 256.0
 LARGEST_MM = 65535
+#: Pixels of a strip: a map of float64 of so many is 8 MB.
+STRIP_PIXELS = 1 << 20
+
+
+def row_strips(height: int, width: int) -> Iterator[slice]:
+    """Slices that cover all rows in order, each of at most ``STRIP_PIXELS`` pixels or of one row.
+
+    They keep the temporary arrays of a large map small.
+    """
+    rows = max(1, STRIP_PIXELS // max(1, width))
+    for top in range(0, height, rows):
+        yield slice(top, min(top + rows, height))
 
 
 def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
@@ -112,20 +123,18 @@ def write_depth_npy(path: PathLike, depth_m: np.ndarray) -> None:
         np.save(file, depth_m, allow_pickle=False)
 
 
-def write_depth_mm_png(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None = None) -> int:
-    """Write depth as a 16-bit PNG in whole millimetres, whole or not at all.
+def depth_mm(depth_m: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
+    """Depth as whole millimetres of 16 bits, as ROS' ``16UC1`` images and RGB-D data sets have it.
 
     Args:
-        path: the file.
         depth_m: ``(H, W)`` metres.
         valid: ``(H, W)`` boolean; ``None`` means everywhere.
 
     Returns:
-        How many pixels are 0 in the file: not valid, not finite, under half a millimetre or beyond 65.535 m.
+        ``(H, W)`` uint16; 0 where not valid, not finite, under half a millimetre or beyond 65.535 m.
 
     Raises:
         ValueError: another shape.
-        OSError: the folder does not exist or is not writable.
     """
     depth_m = _check_map(depth_m)
     keep = np.isfinite(depth_m) if valid is None else np.isfinite(depth_m) & np.asarray(valid, dtype=bool)
@@ -134,6 +143,25 @@ def write_depth_mm_png(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | 
         millimetres = np.rint(np.where(keep[rows], depth_m[rows], 0.0).astype(np.float64) * 1000.0)
         millimetres[(millimetres < 0) | (millimetres > LARGEST_MM)] = 0
         whole[rows] = millimetres
+    return whole
+
+
+def write_depth_mm(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None = None) -> int:
+    """Write depth as a 16-bit PNG in whole millimetres (``16UC1``), whole or not at all.
+
+    Args:
+        path: the file.
+        depth_m: as in ``depth_mm``.
+        valid: likewise.
+
+    Returns:
+        How many pixels are 0 in the file.
+
+    Raises:
+        ValueError: another shape.
+        OSError: the folder does not exist or is not writable.
+    """
+    whole = depth_mm(depth_m, valid)
     with atomic_path(path) as temporary:
         Image.fromarray(whole).save(temporary, format="PNG")
     return int((whole == 0).sum())

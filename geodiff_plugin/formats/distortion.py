@@ -1,8 +1,4 @@
-"""Undistorts photographs and what is known of their pixels, with OpenCV's model or its fisheye model.
-
-Data flow: image, pixels or map of depths, K, coefficients -> those of a pinhole camera with the same K.
-Paper: none; every formula of the package is of a pinhole camera.
-"""
+"""Undistorts photographs and what is known of their pixels, with OpenCV's model or its fisheye model."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import cv2
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.lenses import COUNTS
+from geodiff_plugin.formats.rigs import COEFFICIENT_COUNTS
 from geodiff_plugin.types import Distortion
 
 __all__ = ["distortion_from_text", "undistorted", "undistorted_pixels", "undistorted_points"]
@@ -35,7 +31,7 @@ def distortion_from_text(text: str, name: str = "--distortion") -> Distortion:
         coefficients = np.array([float(part) for part in numbers.split(",")])
     except ValueError:
         coefficients = np.zeros(0)
-    if model not in COUNTS or len(coefficients) not in COUNTS[model] or not np.isfinite(coefficients).all():
+    if len(coefficients) not in COEFFICIENT_COUNTS.get(model, ()) or not np.isfinite(coefficients).all():
         cure = "The order is OpenCV's: k1,k2,p1,p2,k3."
         bad_value(name, "k1,k2,p1,p2[,k3[,...]] or fisheye:k1,k2,k3,k4", repr(text), cure)
     return Distortion(model, coefficients)

@@ -1,8 +1,4 @@
-"""Camera matrices from EXIF data, or from a field of view.
-
-Data flow: EXIF of an image, or degrees -> K in pixels of the upright image.
-Paper: none.
-"""
+"""Camera matrices from EXIF data, or from a field of view."""
 
 from __future__ import annotations
 

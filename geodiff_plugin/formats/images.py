@@ -1,8 +1,4 @@
-"""Images from files and from memory as float tensors in [0, 1].
-
-Data flow: a file, PIL image, numpy or torch array -> floats in [0, 1].
-Paper: S3.3 (the two views).
-"""
+"""Images from files and from memory as floats in [0, 1] (S3.3, the two views)."""
 
 from __future__ import annotations
 

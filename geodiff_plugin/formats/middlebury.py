@@ -1,102 +1,115 @@
-"""Middlebury ``calib.txt``, version 2014; MiddEval3 and ETH3D two-view share it.
-
-Data flow: ``cam0=[...]``, ``cam1=[...]``, ``doffs`` (px), ``baseline`` (mm) -> ``Rig``.
-Paper: S5.1 (Middlebury); Z = baseline * f / (d + doffs).
-"""
+"""Rectified pairs as Middlebury, Booster (S5.1), FoundationStereo and stereodemo describe them."""
 
 from __future__ import annotations
 
 import re
-import warnings
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.rigs import make_rig, pose_to_the_right, positive, whole_pixels
-from geodiff_plugin.types import Rig
+from geodiff_plugin.formats.rigs import (
+    CalibrationFormat,
+    Camera,
+    CameraChoice,
+    RawRig,
+    array_of,
+    intrinsics,
+    number,
+    size_of,
+)
+from geodiff_plugin.formats.structured import is_storage, parse_json, parse_storage
 
-__all__ = ["MIDDLEBURY", "matches", "read"]
+__all__ = ["BOOSTER", "FOUNDATION_STEREO", "MIDDLEBURY", "STEREODEMO"]
 
-MARK = re.compile(r"^\s*cam0\s*=\s*\[", re.MULTILINE)
+MM_PER_METRE = 1000.0
+CAM0 = re.compile(r"^\s*cam0\s*=\s*\[", re.MULTILINE)
 ENTRY = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE)
 #: Files are printed with three decimals, so an honest cam1 agrees with doffs better than this.
 DOFFS_TOLERANCE_PX = 0.05
+#: Marks of other programs' JSON that has an "fx" too.
+OTHER_JSON = ("opencv-matrix", '"ppx"', '"transform_matrix"')
 
 
-def matches(text: str, path: Path) -> bool:
-    """Whether a line starts with ``cam0=[``."""
-    return MARK.search(text) is not None
-
-
-def _camera(entries: dict[str, str], key: str, path: Path) -> np.ndarray:
+def _matrix(entries: dict[str, str], key: str) -> np.ndarray:
     value = entries[key]
-    try:
-        matrix = np.array([[float(v) for v in row.split()] for row in value.strip("[]").split(";")])
-    except ValueError:
-        matrix = np.empty(0)
-    if matrix.shape != (3, 3) or not value.endswith("]"):
-        bad_value(f"{key} in {path}", "[f 0 cx; 0 f cy; 0 0 1]", repr(value), "Is the file cut off?")
-    return matrix
+    if not value.endswith("]"):
+        bad_value(key, "[f 0 cx; 0 f cy; 0 0 1]", repr(value), "Is the file cut off?")
+    return array_of([row.split() for row in value.strip("[]").split(";")], (3, 3), key)
 
 
-def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
-    """The rig of one ``calib.txt``.
-
-    ``doffs`` is what the ground truth was made with, so the right principal point is ``cx0 + doffs`` where
-    ``cam1`` disagrees or is missing (with a warning).
-
-    Raises:
-        ValueError: an entry is missing or malformed.
+def _read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+    """``doffs`` is what the ground truth was made with, so ``cx0 + doffs`` goes before ``cam1``.
 
     Convention:
-        ``doffs = cx1 - cx0``: 52.3 px of it move cx of ``K_right`` 52.3 px to the right.
+        ``doffs = cx1 - cx0``, so that Z = baseline * f / (disparity + doffs); the baseline is in millimetres.
     """
-    path = files[0].path
-    entries = dict(ENTRY.findall(files[0].text))
-    if "baseline" not in entries:
-        bad_value(
-            f"{path}", "a Middlebury calib.txt with a line baseline=<mm>", "none", "Is the file cut off?"
-        )
-    K_left = _camera(entries, "cam0", path)
-    if "doffs" in entries:
-        doffs = _number(entries["doffs"], f"doffs in {path}")
-        K_right = _camera(entries, "cam1", path) if "cam1" in entries else K_left.copy()
-        expected = K_left[0, 2] + doffs
-        if "cam1" not in entries or abs(K_right[0, 2] - expected) > DOFFS_TOLERANCE_PX:
-            said = f"says cx = {K_right[0, 2]:g}" if "cam1" in entries else "is missing"
-            warnings.warn(
-                f"{path}: cam1 {said}; using cx0 + doffs = {expected:g} px for the right image.", stacklevel=2
-            )
+    entries = dict(ENTRY.findall(texts[0]))
+    K_left = _matrix(entries, "cam0")
+    K_right, notes = _matrix(entries, "cam1") if "cam1" in entries else None, []
+    if K_right is None or "doffs" in entries:
+        expected = K_left[0, 2] + number(entries["doffs"], "doffs")
+        if K_right is None or abs(K_right[0, 2] - expected) > DOFFS_TOLERANCE_PX:
+            said = "is missing" if K_right is None else f"says cx = {K_right[0, 2]:g}"
+            notes.append(f"cam1 {said}; using cx0 + doffs = {expected:g} px for the right image.")
+            K_right = K_left.copy() if K_right is None else K_right
             K_right[0, 2] = expected
-    elif "cam1" in entries:
-        K_right = _camera(entries, "cam1", path)
-    else:
-        bad_value(
-            f"{path}",
-            "a Middlebury calib.txt with cam1=[...] or doffs=<px>",
-            "neither",
-            "Is the file cut off?",
-        )
-    baseline_m = positive(entries["baseline"], f"baseline in {path}") / 1000.0
-    return make_rig(
-        K_left, K_right, pose_to_the_right(baseline_m), path, size=_size(entries, path), rectified=True
-    )
+    size = size_of(entries) if {"width", "height"} <= entries.keys() else None
+    baseline_m = number(entries["baseline"], "baseline") / MM_PER_METRE
+    return RawRig(Camera(K_left, size), Camera(K_right, size), baseline_m, True, tuple(notes))
 
 
-def _number(value: str, name: str) -> float:
+def _read_booster(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+    """For the images at full resolution, which are rectified."""
+    entries = parse_storage(texts[0])
+    left, right = (Camera(entries[key][:, :3]) for key in ("proj_matl", "proj_matr"))
+    return RawRig(left, right, float(entries["baselinelr"][0]) / MM_PER_METRE, rectified=True)
+
+
+def _numbers(text: str) -> list[float] | None:
     try:
-        return float(value)
+        return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
-        bad_value(name, "a number", repr(value), "Is the file cut off?")
-
-
-def _size(entries: dict[str, str], path: Path) -> tuple[int, int] | None:
-    if "width" not in entries or "height" not in entries:
         return None
-    width, height = (whole_pixels(entries[key], f"{key} in {path}") for key in ("width", "height"))
-    return width, height
 
 
-MIDDLEBURY = CalibrationFormat("Middlebury, MiddEval3 or ETH3D calib.txt (cam0=[...])", matches, read)
+def _read_foundation_stereo(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+    values = _numbers(texts[0]) or []
+    if len(values) != 10:
+        cure = "Add the baseline as a second line; a file that holds only K or E goes to K and E (--K, --E)."
+        bad_value("the file", "9 numbers of K and the baseline in metres", f"{len(values)} numbers", cure)
+    K = np.reshape(values[:9], (3, 3))
+    return RawRig(Camera(K), Camera(K.copy()), values[9])
+
+
+def _read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+    data: dict[str, Any] = parse_json(texts[0])
+    if "cx" in data:  # older files: one principal point for both images
+        data = {"cx0": data["cx"], "cx1": data["cx"], **data}
+    size = size_of(data) if {"width", "height"} <= data.keys() else None
+    left, right = (
+        Camera(intrinsics(data["fx"], data["fy"], data[cx], data["cy"]), size) for cx in ("cx0", "cx1")
+    )
+    return RawRig(left, right, number(data["baseline_meters"], "baseline_meters"))
+
+
+MIDDLEBURY = CalibrationFormat(
+    "Middlebury, MiddEval3 or ETH3D calib.txt (cam0=[...])",
+    lambda text: CAM0.search(text) is not None,
+    _read_middlebury,
+)
+BOOSTER = CalibrationFormat(
+    "Booster xml (proj_matL, proj_matR, baselineLR)",
+    lambda text: is_storage(text) and "proj_matL" in text,
+    _read_booster,
+)
+FOUNDATION_STEREO = CalibrationFormat(
+    "K.txt of FoundationStereo (9 numbers, baseline in metres)",
+    lambda text: _numbers(text) is not None,
+    _read_foundation_stereo,
+)
+STEREODEMO = CalibrationFormat(
+    "stereodemo JSON (fx, fy, cx0, cx1, cy, baseline_meters)",
+    lambda text: text.lstrip().startswith("{") and '"fx"' in text and not any(m in text for m in OTHER_JSON),
+    _read_stereodemo,
+)

@@ -1,30 +1,31 @@
-"""``transforms.json`` of nerfstudio, instant-ngp and NeRF's scenes, and the names of two images in it.
-
-Data flow: the frames of two images, with what the file says of all frames -> ``Rig``, in the file's unit.
-Paper: none.
-"""
+"""``transforms.json`` of nerfstudio, instant-ngp and NeRF's scenes: cameras and poses of frames."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.image_names import names_of_pair
-from geodiff_plugin.formats.lenses import NO_MODEL, FactoryCamera, lens_of, rig_of_cameras
-from geodiff_plugin.formats.rigs import check_rigid, finite, intrinsics, positive, whole_pixels
-from geodiff_plugin.formats.structured import array_of, entry, parse_json
+from geodiff_plugin.formats.rigs import (
+    CalibrationFormat,
+    Camera,
+    CameraChoice,
+    RawRig,
+    array_of,
+    intrinsics,
+    names_of_pair,
+    number,
+    rigid,
+    size_of,
+)
+from geodiff_plugin.formats.structured import parse_json
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
-from geodiff_plugin.types import Distortion, Rig
 
-__all__ = ["MARK", "NERF", "matches", "read"]
+__all__ = ["NERF", "nerf_camera", "nerf_frames", "nerf_pose"]
 
-MARK = '"transform_matrix"'
-#: OpenCV's names of the lenses of ``camera_model``.
+#: What ``Camera.model`` calls the lenses of ``camera_model``.
 MODELS = {
     "OPENCV": "opencv",
     "PINHOLE": "opencv",
@@ -41,122 +42,124 @@ LENSES = {
 #: The order of nerfstudio's ``distortion_params``.
 PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
-Size = tuple[int, int]
+Frame = dict[str, Any]
 
 
-def matches(text: str, path: Path) -> bool:
-    """Whether the text is a JSON object with ``"frames"`` and ``"transform_matrix"`` in it."""
-    return text.lstrip().startswith("{") and '"frames"' in text and MARK in text
+def nerf_frames(text: str) -> dict[str, Frame]:
+    """Frames by ``file_path``, each with the entries of the whole file that it does not have itself.
 
-
-def _frames(data: Any, path: Path) -> dict[str, dict[str, Any]]:
-    """Frames by ``file_path``, each with the entries of the whole file that it does not have itself."""
-    frames = entry(data, "frames", f"{path}")
+    Raises:
+        ValueError: not JSON, frames without a name, or Mitsuba's axes.
+    """
+    data = parse_json(text)
+    if data.get("from_mitsuba"):
+        cure = "Its cameras have other axes: export camera-to-world matrices with y up and z backward."
+        bad_value("from_mitsuba", "false or left out", "true", cure)
+    frames = data["frames"]
     if not isinstance(frames, list):
-        bad_value(f"frames in {path}", "a list", type(frames).__name__)
+        bad_value("frames", "a list", type(frames).__name__)
     shared = {key: value for key, value in data.items() if key not in ("frames", "transform_matrix")}
     named = {}
-    for number, frame in enumerate(frames):
-        name = entry(frame, "file_path", f"frame {number} in {path}")
-        if not isinstance(name, str):
-            bad_value(f"file_path of frame {number} in {path}", "a name", repr(name)[:80])
-        named[name] = shared | frame
+    for position, frame in enumerate(frames):
+        if not isinstance(frame.get("file_path"), str):
+            bad_value(f"file_path of frame {position}", "a name", repr(frame.get("file_path"))[:80])
+        named[frame["file_path"]] = shared | frame
     return named
 
 
-def _lens(frame: dict[str, Any], where: str) -> Distortion | None:
+def _lens(frame: Frame) -> tuple[str, list[float]]:
     model = frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV")
     model = next((key for key in FOREIGN if key in frame), model)
     if model not in MODELS:
-        bad_value(f"camera_model of {where}", f"one of {', '.join(MODELS)}", repr(model), NO_MODEL)
-    kind = MODELS[model]
+        return str(model), []
     if "distortion_params" in frame:
-        params = array_of(frame["distortion_params"], (len(PARAMS),), f"distortion_params of {where}")
+        params = array_of(frame["distortion_params"], (len(PARAMS),), "distortion_params")
         frame = frame | dict(zip(PARAMS, params.tolist(), strict=True))
-    numbers = {key: finite(frame.get(key, 0.0), f"{key} of {where}") for key in PARAMS}
-    coefficients, others = LENSES[kind]
+    numbers = {key: number(frame.get(key, 0.0), key) for key in PARAMS}
+    coefficients, others = LENSES[MODELS[model]]
     for key in others:
         if numbers[key] != 0:
-            bad_value(f"{key} of {where}", f"zero for {model}", numbers[key], NO_MODEL)
-    return lens_of(np.array([numbers[key] for key in coefficients]), f"the lens of {where}", kind)
+            cure = "OpenCV does not have this model: undistort or rectify both images first."
+            bad_value(key, f"zero for {model}", numbers[key], cure)
+    return MODELS[model], [numbers[key] for key in coefficients]
 
 
-def _focal_px(frame: dict[str, Any], axis: str, side: int, where: str) -> float | None:
+def _focal_px(frame: Frame, axis: str, side: float) -> float | None:
     """The focal length of one axis, or ``None`` where the file leaves it to the other one."""
     if f"fl_{axis}" in frame:
-        return positive(frame[f"fl_{axis}"], f"fl_{axis} of {where}")
+        return number(frame[f"fl_{axis}"], f"fl_{axis}")
     key = f"camera_angle_{axis}"
     if key not in frame:
         return None
-    angle = finite(frame[key], f"{key} of {where}")
+    angle = number(frame[key], key)
     if not 0 < angle < math.pi:
-        bad_value(f"{key} of {where}", "an angle in radians, between 0 and pi", angle, "Is it in degrees?")
+        bad_value(key, "an angle in radians, between 0 and pi", angle, "Is it in degrees?")
     return 0.5 * side / math.tan(0.5 * angle)
 
 
-def _camera(frame: dict[str, Any], image_size: Size | None, where: str) -> FactoryCamera:
-    size: Size | None = image_size
-    if "w" in frame and "h" in frame:
-        width, height = (whole_pixels(frame[key], f"{key} of {where}") for key in "wh")
-        size = (width, height)
-    if size is None:
-        bad_value(where, "entries 'w' and 'h'", "none", "Give image_size, the (width, height) of the images.")
-    focals = [_focal_px(frame, axis, side, where) for axis, side in zip("xy", size, strict=True)]
-    known = [focal for focal in focals if focal is not None]
-    if not known:
-        bad_value(where, "an entry 'fl_x' or 'camera_angle_x'", "none", "Is this the right file?")
-    # As COLMAP, both programs put the centre of the first pixel at (0.5, 0.5).
-    cx, cy = (
-        finite(frame.get(key, side / 2), f"{key} of {where}") - 0.5
-        for key, side in zip(("cx", "cy"), size, strict=True)
-    )
-    return FactoryCamera(intrinsics(known[0], known[-1], cx, cy), size, _lens(frame, where))
+def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Camera:
+    """The camera of a frame, with K as this package has it (first pixel's centre at 0).
 
-
-def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
-    """Camera-to-world in OpenCV's axes."""
-    name = f"transform_matrix of {where}"
-    numbers = array_of(entry(frame, "transform_matrix", where), (-1,), name)
-    if numbers.size == 12:  # instant-ngp never reads the last row
-        numbers = np.append(numbers, (0, 0, 0, 1))
-    return check_rigid(array_of(numbers, (4, 4), name), name) @ OPENGL_FROM_OPENCV
-
-
-def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
-    """The rig of the two images of ``choice.image_names``; a frame's own entries go before the file's.
-
-    Lengths keep the unit that the poses had before nerfstudio's ``applied_scale``. ``applied_transform``
-    turns the world and changes no relative pose. Without ``w`` and ``h`` both images are of
-    ``choice.image_size``; without ``cx`` and ``cy`` the principal point is the middle of the image.
+    Args:
+        frame: of ``nerf_frames``.
+        image_size: ``(width, height)`` of its image, for files without ``w`` and ``h``.
 
     Raises:
-        ValueError: no such images, no names, an entry that is missing or malformed, a ``camera_model`` that
-            OpenCV does not have, Mitsuba's axes.
+        ValueError: no size, no focal length, or a lens with coefficients that OpenCV's model has not.
+    """
+    size = size_of(frame, "w", "h") or image_size
+    if size is None:
+        cure = "Give image_size, the (width, height) of the images."
+        bad_value("the file", "one with entries 'w' and 'h'", "none", cure)
+    sides = [number(side, key) for side, key in zip(size, "wh", strict=True)]
+    focals = [_focal_px(frame, axis, side) for axis, side in zip("xy", sides, strict=True)]
+    given = [focal for focal in focals if focal is not None]
+    if not given:
+        expected = "one with an entry 'fl_x' or 'camera_angle_x'"
+        bad_value("the file", expected, "none", "Is this the right file?")
+    # As COLMAP, both programs put the centre of the first pixel at (0.5, 0.5).
+    cx, cy = (
+        number(frame.get(key, side / 2), key) - 0.5 for key, side in zip(("cx", "cy"), sides, strict=True)
+    )
+    model, coefficients = _lens(frame)
+    return Camera(intrinsics(given[0], given[-1], cx, cy), size, coefficients, model)
+
+
+def nerf_pose(frame: Frame) -> np.ndarray:
+    """``(4, 4)`` camera-to-world in OpenCV's axes, lengths as before nerfstudio's ``applied_scale``.
+
+    Raises:
+        ValueError: no rigid ``transform_matrix`` of 12 or 16 numbers, or an ``applied_scale`` that is none.
+    """
+    pose = rigid(frame["transform_matrix"], "transform_matrix") @ OPENGL_FROM_OPENCV
+    scale = number(frame.get("applied_scale", 1.0), "applied_scale")
+    if scale <= 0:
+        bad_value("applied_scale", "above 0", scale)
+    pose[:3, 3] /= scale
+    return pose
+
+
+def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+    """The two images of ``choice.image_names``; a frame's entries go before the file's.
+
+    Lengths keep the unit of the poses; ``applied_transform`` turns the world and changes no relative pose.
+    Without ``w`` and ``h`` both images are of ``choice.image_size``; without ``cx`` and ``cy`` the principal
+    point is the middle of the image.
 
     Source: data conventions of nerfstudio's documentation, its ``colmap_utils.py`` (intrinsics are written as
         COLMAP has them) and ``cameras.py`` (rays through pixel + 0.5); ``nerf_loader.cu`` of instant-ngp.
     """
-    path = files[0].path
-    data = parse_json(files[0].text, path)
-    frames = _frames(data, path)
-    if data.get("from_mitsuba"):
-        cure = "Its cameras have other axes: export camera-to-world matrices with y up and z backward."
-        bad_value(f"from_mitsuba in {path}", "false or left out", "true", cure)
-    names = names_of_pair(frames, choice, path, "a transforms.json")
-    places = [f"{name} in {path}" for name in names]
-    left, right = (
-        _camera(frames[name], choice.image_size, where) for name, where in zip(names, places, strict=True)
-    )
-    E_left, E_right = (_pose(frames[name], where) for name, where in zip(names, places, strict=True))
-    E = np.linalg.inv(E_left) @ E_right
-    E[:3, 3] /= positive(data.get("applied_scale", 1.0), f"applied_scale in {path}")
-    return rig_of_cameras(left, right, E, str(path))
+    frames = nerf_frames(texts[0])
+    pair = [frames[name] for name in names_of_pair(frames, choice)]
+    left, right = (nerf_camera(frame, choice.image_size) for frame in pair)
+    E_left, E_right = (nerf_pose(frame) for frame in pair)
+    return RawRig(left, right, np.linalg.inv(E_left) @ E_right)
 
 
 NERF = CalibrationFormat(
     "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
-    matches,
-    read,
+    lambda text: text.lstrip().startswith("{") and '"frames"' in text and '"transform_matrix"' in text,
+    _read,
     has_unit=False,
     by_image=True,
 )

@@ -1,7 +1,4 @@
-"""Reading of calibration files whose format is recognised from their content.
-
-Data flow: a path or a pair of paths -> ``CALIBRATION_FORMATS`` -> ``Rig``.
-Paper: S3.3 (known cameras).
+"""Reading of calibration files, whose format is recognised from their content (S3.3).
 
 A new format is a new file and one line in the table (docs/reference/calibration.md).
 """
@@ -16,26 +13,20 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import FolderError, bad_type, bad_value, check_number
-from geodiff_plugin.formats.booster import BOOSTER
-from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.colmap import COLMAP, image_list
-from geodiff_plugin.formats.euroc import EUROC
+from geodiff_plugin._checks import FolderError, InputError, bad_type, bad_value, check_number, refuse
+from geodiff_plugin.formats.colmap import COLMAP, model_files, model_text
 from geodiff_plugin.formats.files import check_file, read_text
-from geodiff_plugin.formats.foundation_stereo import FOUNDATION_STEREO
-from geodiff_plugin.formats.kalibr import KALIBR
-from geodiff_plugin.formats.kitti_cam_to_cam import KITTI_CAM_TO_CAM
-from geodiff_plugin.formats.kitti_projections import KITTI_PROJECTIONS
-from geodiff_plugin.formats.middlebury import MIDDLEBURY
+from geodiff_plugin.formats.kalibr import EUROC, KALIBR
+from geodiff_plugin.formats.kitti import KITTI_CAM_TO_CAM, KITTI_PROJECTIONS
+from geodiff_plugin.formats.middlebury import BOOSTER, FOUNDATION_STEREO, MIDDLEBURY, STEREODEMO
 from geodiff_plugin.formats.mvsnet import MVSNET
 from geodiff_plugin.formats.nerf import NERF
 from geodiff_plugin.formats.oak import OAK
 from geodiff_plugin.formats.opencv import OPENCV
 from geodiff_plugin.formats.orb_slam import ORB_SLAM
 from geodiff_plugin.formats.realsense import REALSENSE
-from geodiff_plugin.formats.rigs import check_no_distortion
+from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, check_no_distortion, make_rig
 from geodiff_plugin.formats.ros import ROS
-from geodiff_plugin.formats.stereodemo import STEREODEMO
 from geodiff_plugin.formats.zed import ZED
 from geodiff_plugin.types import Rig
 
@@ -65,55 +56,62 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
 PathLike = str | os.PathLike[str]
 
 
-def _files(path: PathLike | Sequence[PathLike]) -> tuple[CalibrationFile, ...]:
-    paths = _paths(path)
-    if len(paths) == 2 and paths[0] == paths[1]:
-        paths = paths[:1]
-    return tuple(CalibrationFile(p, _text(p)) for p in paths)
+#: What a reader that takes a whole file for granted raises on one that is not.
+UNFINISHED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError)
 
 
-def _text(path: Path) -> str:
-    name, what = "calibration", "a calibration file"
-    images = image_list(check_file(path, name, what))
-    return read_text(path, name, what) if images is None else images
-
-
-def _paths(path: PathLike | Sequence[PathLike]) -> tuple[Path, ...]:
+def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
+    """The text of each file; of a COLMAP model, the one calibration that may be a folder, of two."""
     paths = (path,) if isinstance(path, (str, os.PathLike)) else path
     if not isinstance(paths, (tuple, list)) or not all(isinstance(p, (str, os.PathLike)) for p in paths):
         bad_type("calibration", "a path, or a pair of paths (left, right)", path)
     if len(paths) not in (1, 2):
         bad_value("calibration", "one file, or a pair (left, right)", f"{len(paths)} files")
     if len(paths) == 1 and os.path.isdir(paths[0]):
-        return _model_files(Path(paths[0]))
-    return tuple(Path(p) for p in paths)
+        files = model_files(Path(paths[0]))
+        if files is None:
+            raise FolderError(
+                "calibration must be a calibration file, or the folder of a COLMAP model with its cameras "
+                f"and images (.txt or .bin); got the folder {paths[0]}. Name the file inside it."
+            )
+        paths = files
+    return {Path(p): _text(Path(p)) for p in paths}
 
 
-def _model_files(folder: Path) -> tuple[Path, ...]:
-    """The two text files of a COLMAP model, the one kind of calibration that is a folder."""
-    files = (folder / "cameras.txt", folder / "images.txt")
-    if not all(file.exists() for file in files):
-        cure = "Name the file inside it."
-        if (folder / "images.bin").exists():
-            cure = "Write it as text first: colmap model_converter --output_type TXT."
-        raise FolderError(
-            "calibration must be a calibration file, or the folder of a COLMAP model with cameras.txt and "
-            f"images.txt; got the folder {folder}. {cure}"
+def _text(path: Path) -> str:
+    text = model_text(check_file(path, "calibration", "a calibration file"))
+    return read_text(path, "calibration", "a calibration file") if text is None else text
+
+
+def _source(texts: dict[Path, str]) -> str:
+    return " and ".join(map(str, texts))
+
+
+def _recognise(text: str, path: Path) -> str:
+    name = next((name for name, entry in CALIBRATION_FORMATS.items() if entry.matches(text)), None)
+    if name is None:
+        formats = "; ".join(entry.summary for entry in CALIBRATION_FORMATS.values())
+        cure = "Is this the right file? Otherwise give fx, fy, cx, cy and baseline, or K and E."
+        bad_value("calibration", f"in a known format ({formats})", f"{path}, which is none of them", cure)
+    return name
+
+
+def _read(texts: dict[Path, str], name: str, choice: CameraChoice) -> Rig:
+    """The rig of files of one format; whatever is wrong in them becomes a sentence with their names."""
+    source, calibration = _source(texts), CALIBRATION_FORMATS[name]
+    try:
+        raw = calibration.read(tuple(texts.values()), choice)
+        rig = make_rig(raw, source)
+    except InputError as error:
+        refuse(f"{source}: {error}")
+    except UNFINISHED as error:
+        got = (
+            f"no {error}" if isinstance(error, KeyError) else str(error).partition("\n")[0] or "other entries"
         )
-    return files
-
-
-def _recognise(file: CalibrationFile) -> str:
-    found = [name for name, known in CALIBRATION_FORMATS.items() if known.matches(file.text, file.path)]
-    if not found:
-        known = "; ".join(entry.summary for entry in CALIBRATION_FORMATS.values())
-        bad_value(
-            "calibration",
-            f"in a known format ({known})",
-            f"{file.path}, which is none of them",
-            "Is this the right file? Otherwise give fx, fy, cx, cy and baseline, or K and E.",
-        )
-    return found[0]
+        bad_value(source, f"a whole {calibration.summary}", got, "Is the file cut off?")
+    for note in raw.notes:
+        warnings.warn(f"{source}: {note}", stacklevel=3)
+    return rig
 
 
 def _check_cameras(cameras: tuple[int, int] | None, name: str) -> None:
@@ -186,8 +184,8 @@ def read_calibration(
     Convention:
         A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
     """
-    files = _files(path)
-    name = _one_format(files)
+    texts = _texts(path)
+    name = _one_format(texts)
     _check_cameras(cameras, name)
     choice = CameraChoice(
         (cameras[0], cameras[1]) if cameras else None,
@@ -195,7 +193,7 @@ def read_calibration(
         None if image_names is None else (str(image_names[0]), str(image_names[1])),
         None if image_size is None else (int(image_size[0]), int(image_size[1])),
     )
-    rig = CALIBRATION_FORMATS[name].read(files, choice)
+    rig = _read(texts, name, choice)
     if not distorted:
         for side, lens in zip(("left", "right"), rig.distortion, strict=True):
             check_no_distortion(lens, f"Lens distortion of the {side} camera in {rig.source}")
@@ -211,23 +209,18 @@ def has_pose_per_image(path: PathLike | Sequence[PathLike]) -> bool:
     Raises:
         OSError, TypeError, ValueError: as ``read_calibration``, where no format is recognised.
     """
-    return CALIBRATION_FORMATS[_one_format(_files(path))].by_image
+    return CALIBRATION_FORMATS[_one_format(_texts(path))].by_image
 
 
-def _one_format(files: tuple[CalibrationFile, ...]) -> str:
+def _one_format(texts: dict[Path, str]) -> str:
     """The name of the format that all files have, as many as it needs."""
-    names = [_recognise(file) for file in files]
+    names = [_recognise(text, path) for path, text in texts.items()]
     if len(set(names)) > 1:
         bad_value("calibration", "two files of one format", " and ".join(names))
-    known = CALIBRATION_FORMATS[names[0]]
-    if len(files) not in known.file_counts:
-        one = len(files) == 1
-        bad_value(
-            "calibration",
-            f"{'two files' if one else 'one file'} ({known.summary})",
-            " and ".join(str(file.path) for file in files),
-            "Give --calib twice, for the left and the right view."
-            if one
-            else "It describes both cameras; give it once.",
-        )
+    calibration = CALIBRATION_FORMATS[names[0]]
+    if len(texts) not in calibration.file_counts:
+        count, cure = "one file", "It describes both cameras; give it once."
+        if len(texts) == 1:
+            count, cure = "two files", "Give --calib twice, for the left and the right view."
+        bad_value("calibration", f"{count} ({calibration.summary})", _source(texts), cure)
     return names[0]

@@ -1,26 +1,28 @@
-"""Intel RealSense: what ``rs-enumerate-devices -c`` prints, or rs2's structures as JSON.
-
-Data flow: intrinsics of both infrared cameras and the extrinsics between them -> ``Rig``.
-Paper: none.
-"""
+"""Intel RealSense: what ``rs-enumerate-devices -c`` prints, or rs2's structures as JSON."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.calibration import CalibrationFile, CalibrationFormat, CameraChoice
-from geodiff_plugin.formats.lenses import NO_MODEL, FactoryCamera, lens_of, rig_of_cameras
-from geodiff_plugin.formats.rigs import check_rigid, intrinsics, is_distorted, positive, whole_pixels
-from geodiff_plugin.formats.structured import array_of, entry, parse_json
-from geodiff_plugin.types import Distortion, Rig
+from geodiff_plugin.formats.rigs import (
+    CalibrationFormat,
+    Camera,
+    CameraChoice,
+    RawRig,
+    array_of,
+    intrinsics,
+    is_distorted,
+    rigid,
+)
+from geodiff_plugin.formats.structured import parse_json
+from geodiff_plugin.types import Distortion
 
-__all__ = ["REALSENSE", "matches", "read"]
+__all__ = ["REALSENSE"]
 
 PRINTED = re.compile(r'^\s*Intrinsic of "', re.MULTILINE)
 INTRINSIC = re.compile(
@@ -30,93 +32,63 @@ EXTRINSIC = re.compile(
     r'^\s*Extrinsic from "Infrared 1"\s+To\s+"Infrared 2"[^\n]*\n(.*?)(?=\n\s*Extrinsic|\Z)', re.M | re.S
 )
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
-LINES = {
-    "Fx": "fx",
-    "Fy": "fy",
-    "PPX": "ppx",
-    "PPY": "ppy",
-    "Width": "width",
-    "Height": "height",
-    "Distortion": "model",
-}
 #: rs2_distortion by its number.
 MODELS = (
-    "none",
-    "modified brown conrady",
-    "inverse brown conrady",
-    "ftheta",
-    "brown conrady",
-    "kannala brandt4",
+    *("none", "modified brown conrady", "inverse brown conrady"),
+    *("ftheta", "brown conrady", "kannala brandt4"),
 )
 
 
-def matches(text: str, path: Path) -> bool:
-    """Whether it is JSON with ``"ppx"`` in it, or has a line ``Intrinsic of "..."``."""
-    return (text.lstrip().startswith(("{", "[")) and '"ppx"' in text) or PRINTED.search(text) is not None
-
-
-def _lens(values: dict[str, Any], where: str) -> Distortion | None:
-    coefficients = array_of(values.get("coeffs", ()), (-1,), f"coeffs of {where}")
+def _camera(values: dict[str, Any]) -> Camera:
+    """A camera of rs2's entries; a lens of coefficients 0 is none, whatever its model."""
+    K = intrinsics(*(values[key] for key in ("fx", "fy", "ppx", "ppy")))
+    coefficients = array_of(values.get("coeffs", ()), (-1,), "coeffs")
     said = values.get("model", "none")
-    known = isinstance(said, int) and 0 <= said < len(MODELS)
-    text = re.sub(r"[\s_]+", " ", str(MODELS[said] if known else said).lower()).strip()
+    said = MODELS[said] if isinstance(said, int) and 0 <= said < len(MODELS) else said
+    text = re.sub(r"[\s_]+", " ", str(said).lower()).strip()
     model = text.removeprefix("distortion.").removeprefix("rs2 distortion ")
     if model == "kannala brandt4":
-        return lens_of(coefficients[:4], f"coeffs of {where}", "fisheye")
-    if model != "brown conrady" and is_distorted(Distortion("opencv", coefficients)):
-        bad_value(
-            f"the distortion model of {where}",
-            "brown conrady or kannala brandt4, unless its coefficients are zero",
-            repr(model),
-            NO_MODEL,
-        )
-    return lens_of(coefficients, f"coeffs of {where}")
+        model, coefficients = "fisheye", coefficients[:4]
+    elif model == "brown conrady" or not is_distorted(Distortion("opencv", coefficients)):
+        model = "opencv"
+    return Camera(K, (values["width"], values["height"]), coefficients, model)
 
 
-def _camera(values: dict[str, Any], where: str) -> FactoryCamera:
-    fx, fy = (positive(entry(values, key, where), f"{key} of {where}") for key in ("fx", "fy"))
-    cx, cy = array_of([entry(values, key, where) for key in ("ppx", "ppy")], (2,), f"ppx, ppy of {where}")
-    width, height = (
-        whole_pixels(entry(values, key, where), f"{key} of {where}") for key in ("width", "height")
-    )
-    return FactoryCamera(intrinsics(fx, fy, cx, cy), (width, height), _lens(values, where))
-
-
-def _of_size(cameras: list[FactoryCamera], choice: CameraChoice, path: Path) -> FactoryCamera:
-    sizes = sorted({camera.size for camera in cameras if camera.size is not None})
-    if choice.image_size is None and len(sizes) == 1:
+def _of_size(cameras: list[Camera], choice: CameraChoice) -> Camera:
+    by_size = {tuple(map(int, camera.size)): camera for camera in reversed(cameras)}
+    if choice.image_size is None and len(by_size) == 1:
         return cameras[0]
-    fitting = [camera for camera in cameras if camera.size == choice.image_size]
-    if not fitting:
-        there = ", ".join("{}x{}".format(*size) for size in sizes)
+    if choice.image_size not in by_size:
+        there = ", ".join("{}x{}".format(*size) for size in sorted(by_size))
         got = "no image" if choice.image_size is None else "{}x{}".format(*choice.image_size)
-        bad_value("the left image", f"of one of the sizes in {path} ({there})", got)
-    return fitting[0]
+        bad_value("the left image", f"of one of the file's sizes ({there})", got)
+    return by_size[choice.image_size]
 
 
-def _printed(file: CalibrationFile, choice: CameraChoice) -> tuple[FactoryCamera, FactoryCamera, np.ndarray]:
-    cameras: dict[str, list[FactoryCamera]] = {"1": [], "2": []}
-    for number, width, height, block in INTRINSIC.findall(file.text):
-        where = f'Intrinsic of "Infrared {number}" / {width}x{height} in {file.path}'
+def _printed(text: str, choice: CameraChoice) -> tuple[Camera, Camera, np.ndarray]:
+    cameras: dict[str, list[Camera]] = {"1": [], "2": []}
+    for side, _, _, block in INTRINSIC.findall(text):
         pairs = (line.partition(":") for line in block.splitlines())
-        values = {LINES[key.strip()]: value for key, _, value in pairs if key.strip() in LINES}
-        lens = next((line for line in block.splitlines() if line.strip().startswith("Coeffs")), "")
-        cameras[number].append(_camera(values | {"coeffs": NUMBER.findall(lens)}, where))
-    between = EXTRINSIC.search(file.text)
+        values: dict[str, Any] = {key.strip().lower(): value.strip() for key, _, value in pairs}
+        values |= {
+            "coeffs": NUMBER.findall(values.get("coeffs", "")),
+            "model": values.get("distortion", "none"),
+        }
+        cameras[side].append(_camera(values))
+    between = EXTRINSIC.search(text)
     if not (cameras["1"] and cameras["2"] and between):
-        bad_value(
-            f"{file.path}",
-            'rs-enumerate-devices -c with "Infrared 1", "Infrared 2" and the extrinsics from 1 to 2',
-            "less",
-            "Is the file cut off?",
-        )
-    rotation, _, translation = between.group(1).partition("Translation")
-    where = f'Extrinsic from "Infrared 1" To "Infrared 2" in {file.path}'
+        expected = 'what rs-enumerate-devices -c prints, with "Infrared 1", "Infrared 2" and the extrinsics'
+        bad_value("the file", expected, "less", "Is the file cut off?")
+    rotation, _, translation = between[1].partition("Translation")
+    left, right = (_of_size(cameras[side], choice) for side in "12")
+    return left, right, _pose(NUMBER.findall(rotation)[:9], NUMBER.findall(translation)[:3], "C")
+
+
+def _pose(rotation: Any, translation: Any, order: Any) -> np.ndarray:
     T = np.eye(4)
-    T[:3, :3] = array_of(NUMBER.findall(rotation)[:9], (3, 3), where)
-    T[:3, 3] = array_of(NUMBER.findall(translation)[:3], (3,), where)
-    left, right = (_of_size(cameras[number], choice, file.path) for number in "12")
-    return left, right, check_rigid(T, where)
+    T[:3, :3] = array_of(rotation, (9,), "rotation").reshape(3, 3, order=order)
+    T[:3, 3] = array_of(translation, (3,), "translation")
+    return rigid(T, "the extrinsics")
 
 
 def _objects(value: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
@@ -130,52 +102,42 @@ def _objects(value: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]
             yield from _objects(inner, name)
 
 
-def _json(file: CalibrationFile, choice: CameraChoice) -> tuple[FactoryCamera, FactoryCamera, np.ndarray]:
-    found = list(_objects(parse_json(file.text, file.path)))
-    views = [(name, values) for name, values in found if "ppx" in values]
+def _json(text: str, choice: CameraChoice) -> tuple[Camera, Camera, np.ndarray]:
+    objects = list(_objects(parse_json(text)))
+    views = [(name, values) for name, values in objects if "ppx" in values]
     # A file of the whole device has colour and depth too; the pair is the two infrared ones.
     infrared = [view for view in views if re.search(r"infra|left|right|\bir", view[0])]
     views = infrared if len(infrared) >= 2 else views
     between = [
-        (name, values)
-        for name, values in found
+        values
+        for name, values in objects
         if "translation" in values and not re.search(r"color|depth|imu|gyro|accel", name)
     ]
     if len(views) != 2 or len(between) != 1:
-        bad_value(
-            f"{file.path}",
-            "two rs2 intrinsics (fx, fy, ppx, ppy) of the infrared pair and their extrinsics",
-            f"{len(views)} and {len(between)}",
-            "Is the file cut off?",
-        )
-    (where, extrinsics), pose = between[0], np.eye(4)
-    where = f"{where.strip('/') or 'extrinsics'} in {file.path}"
-    rotation = array_of(entry(extrinsics, "rotation", where), (9,), f"rotation of {where}")
-    pose[:3, :3] = rotation.reshape(3, 3).T  # rs2 keeps it column by column
-    pose[:3, 3] = array_of(extrinsics["translation"], (3,), f"translation of {where}")
-    T = check_rigid(pose, where)
+        expected = "two rs2 intrinsics (fx, fy, ppx, ppy) of the infrared pair and their extrinsics"
+        bad_value("the file", expected, f"{len(views)} and {len(between)}", "Is the file cut off?")
+    # rs2 keeps a rotation column by column.
+    T = _pose(between[0]["rotation"], between[0]["translation"], "F")
     # From the left to the right one x becomes smaller; a file that says it the other way round is inverted.
-    T = T if T[0, 3] <= 0 else np.linalg.inv(T)
-    left, right = (_camera(values, f"{name.strip('/')} in {file.path}") for name, values in views)
-    return left, right, T
+    return _camera(views[0][1]), _camera(views[1][1]), T if T[0, 3] <= 0 else np.linalg.inv(T)
 
 
-def read(files: tuple[CalibrationFile, ...], choice: CameraChoice) -> Rig:
-    """The rig of the infrared pair, whose images the camera rectifies itself, or of the T265's fisheyes.
+def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+    """The infrared pair, whose images the camera rectifies itself, or the T265's fisheyes.
 
     The printed text holds every resolution: ``choice.image_size`` chooses. JSON holds ``rs2_intrinsics`` of
     the left camera, then of the right one, and ``rs2_extrinsics`` between them, under any names.
-
-    Raises:
-        ValueError: an entry is missing or malformed, no such resolution, a lens that OpenCV has no model of.
     """
-    printed = PRINTED.search(files[0].text) is not None
-    left, right, T_right_from_left = (_printed if printed else _json)(files[0], choice)
-    rectified = left.lens is None and right.lens is None
-    E = np.linalg.inv(T_right_from_left)
-    return rig_of_cameras(left, right, E, str(files[0].path), rectified=rectified)
+    printed = PRINTED.search(texts[0]) is not None
+    left, right, T_right_from_left = (_printed if printed else _json)(texts[0], choice)
+    lenses = [Distortion(camera.model, np.asarray(camera.coefficients)) for camera in (left, right)]
+    return RawRig(left, right, np.linalg.inv(T_right_from_left), not any(map(is_distorted, lenses)))
 
 
 REALSENSE = CalibrationFormat(
-    "RealSense intrinsics and extrinsics (rs-enumerate-devices -c, or rs2 as JSON)", matches, read
+    "RealSense intrinsics and extrinsics (rs-enumerate-devices -c, or rs2 as JSON)",
+    lambda text: (
+        (text.lstrip().startswith(("{", "[")) and '"ppx"' in text) or PRINTED.search(text) is not None
+    ),
+    _read,
 )

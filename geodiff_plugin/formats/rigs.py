@@ -1,12 +1,10 @@
-"""Checked ``Rig`` records from the numbers of a calibration file.
-
-Data flow: camera matrices, projections, world-to-camera transforms, baselines -> ``Rig``.
-Paper: S3.3; E as in docs/reference/calibration.md.
-"""
+"""What the readers of calibrations share: raw numbers of two cameras, and ``make_rig``, which checks them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,88 +17,174 @@ from geodiff_plugin.geometry import nearest_rotation
 from geodiff_plugin.types import Distortion, Rig
 
 __all__ = [
+    "COEFFICIENT_COUNTS",
+    "CalibrationFormat",
+    "Camera",
+    "CameraChoice",
+    "RawRig",
+    "array_of",
     "check_no_distortion",
-    "finite",
-    "check_rigid",
     "intrinsics",
     "is_distorted",
     "make_rig",
-    "pose_from_projections",
-    "pose_from_world_to_camera",
-    "pose_to_the_right",
-    "positive",
+    "names_of_pair",
+    "number",
+    "projected",
     "rig_from_parameters",
-    "whole_pixels",
+    "rigid",
+    "size_of",
+    "two_cameras",
 ]
+
+Size = tuple[int, int]
 
 #: Coefficients below this move no pixel of a 12 megapixel image by a tenth of a pixel.
 DISTORTION_TOLERANCE = 1e-6
 #: How far a file's rotation may be from orthogonal; what is left is rounding in print.
 ROTATION_TOLERANCE = 1e-2
+#: How many coefficients OpenCV's functions take, by the model's name in ``Distortion``.
+COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
+CHECK_FILE = "Check the calibration file."
 
 
-def intrinsics(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """The ``(3, 3)`` float64 camera matrix of four numbers in pixels."""
+@dataclass(frozen=True)
+class CameraChoice:
+    """Which two cameras of a file with more than two, and at which resolution.
+
+    Attributes:
+        cameras: numbers of the left and the right camera, or ``None`` to choose by the folder or the file.
+        image_folder_hint: name or path of the left image's folder (or of the image), or ``None``.
+        image_names: names or paths of the left and the right image, or ``None``.
+        image_size: ``(width, height)`` of the left image, or ``None``; chooses among a file's resolutions.
+    """
+
+    cameras: tuple[int, int] | None = None
+    image_folder_hint: str | None = None
+    image_names: tuple[str, str] | None = None
+    image_size: Size | None = None
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera as a file describes it; nothing is checked yet.
+
+    Attributes:
+        K: ``(3, 3)`` pixels, the centre of the first pixel at (0, 0).
+        size: ``(width, height)`` that ``K`` is for, or ``None``.
+        coefficients: of the lens, in OpenCV's order; empty for none.
+        model: ``"opencv"``, ``"fisheye"``, or the file's name of a model that OpenCV does not have.
+    """
+
+    K: np.ndarray
+    size: Any = None
+    coefficients: Any = ()
+    model: str = "opencv"
+
+
+@dataclass(frozen=True)
+class RawRig:
+    """Two cameras as a file describes them.
+
+    Attributes:
+        left: the left camera.
+        right: the right camera.
+        pose: ``(4, 4)`` metres, the right camera's pose in the left camera's frame; or the baseline in
+            metres of a right camera that stands to the right.
+        rectified: whether the file says that its images are rectified.
+        notes: sentences about what was assumed, for a warning each.
+    """
+
+    left: Camera
+    right: Camera
+    pose: Any
+    rectified: bool = False
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class CalibrationFormat:
+    """One entry of ``CALIBRATION_FORMATS``.
+
+    Attributes:
+        summary: the format and its mark, for messages.
+        matches: whether a text is of this format; looks at nothing else.
+        read: ``(texts, choice) -> RawRig``. It may raise whatever a missing entry raises, which
+            ``read_calibration`` turns into a sentence with the file's name.
+        file_counts: how many files may describe one pair.
+        uses_cameras: whether a file may hold more than two cameras, so that ``cameras`` has a meaning.
+        has_unit: whether its lengths have a known unit (or are taken as metres); a warning says where not.
+        by_image: whether it has a pose for each of many images, which are found by their names.
+    """
+
+    summary: str
+    matches: Callable[[str], bool]
+    read: Callable[[tuple[str, ...], CameraChoice], RawRig]
+    file_counts: tuple[int, ...] = (1,)
+    uses_cameras: bool = False
+    has_unit: bool = True
+    by_image: bool = False
+
+
+def number(value: Any, name: str) -> float:
+    """A finite number, as float; text of one is taken, a truth value is not.
+
+    Raises:
+        ValueError: it is not.
+    """
+    try:
+        result = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):  # a whole number of any length is JSON
+        result = math.nan
+    if not math.isfinite(result):
+        bad_value(name, "a finite number", "none" if value is None else repr(value)[:80], CHECK_FILE)
+    return result
+
+
+def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Finite numbers as a float64 array; flat lists are brought to ``shape``, ``(-1,)`` takes any count.
+
+    Raises:
+        ValueError: other things than finite numbers, or another count of them.
+    """
+    count = math.prod(shape)
+    expected = "numbers" if count < 0 else f"{count} numbers"
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.array(np.nan)
+    if not np.isfinite(numbers).all():
+        bad_value(name, f"{expected}, all finite", repr(value)[:80], CHECK_FILE)
+    if count >= 0 and numbers.size != count:
+        bad_value(name, expected, f"{numbers.size}", "Is the file cut off?")
+    return numbers.reshape(shape)
+
+
+def intrinsics(fx: Any, fy: Any, cx: Any, cy: Any) -> np.ndarray:
+    """The ``(3, 3)`` float64 camera matrix of four numbers in pixels.
+
+    Raises:
+        ValueError: one of them is no finite number.
+    """
+    fx, fy, cx, cy = (number(value, name) for value, name in ((fx, "fx"), (fy, "fy"), (cx, "cx"), (cy, "cy")))
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
 
-def positive(value: Any, name: str) -> float:
-    """A finite number above 0, as float.
-
-    Raises:
-        ValueError: it is not.
-    """
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):  # a whole number of any length is JSON
-        bad_value(name, "a number above 0", repr(value))
-    if not (np.isfinite(number) and number > 0):
-        bad_value(name, "a finite number above 0", number, "Check the calibration file.")
-    return number
+def size_of(entries: Any, width: str = "width", height: str = "height") -> tuple[Any, Any] | None:
+    """The raw ``(width, height)`` of a mapping; ``None`` where it has neither."""
+    pair = entries.get(width), entries.get(height)
+    return None if pair == (None, None) else pair
 
 
-def whole_pixels(value: Any, name: str) -> int:
-    """A side of an image, as int; ``640.0`` is one too.
-
-    Raises:
-        ValueError: it is not a whole number above 0.
-    """
-    try:
-        number = 0.0 if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = 0.0
-    if not number >= 1 or number % 1 != 0:  # infinity % 1 is NaN
-        cure = "The images are checked against it; leave out both sides where they are not known."
-        bad_value(name, "a whole number of pixels above 0", "none" if value is None else repr(value), cure)
-    return int(number)
-
-
-def finite(value: Any, name: str) -> float:
-    """A finite number, as float; text is none.
-
-    Raises:
-        ValueError: it is not.
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        bad_value(name, "a number", repr(value))
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        bad_value(name, "a finite number", repr(value), "Check the calibration file.")
-    return number
-
-
-def check_rigid(T: np.ndarray, name: str) -> np.ndarray:
-    """A ``(4, 4)`` float64 transform with its rotation projected to the nearest one.
+def rigid(matrix: Any, name: str) -> np.ndarray:
+    """A ``(4, 4)`` float64 transform of 12 or 16 numbers, its rotation projected to the nearest one.
 
     Raises:
         ValueError: not finite, last row not (0, 0, 0, 1), mirrored, or not orthogonal within 1e-2.
     """
-    T = np.asarray(T, dtype=np.float64)
-    if not np.isfinite(T).all():
-        bad_value(name, "finite", "NaN or infinity in it", "Check the calibration file.")
+    numbers = array_of(matrix, (-1,), name)
+    if numbers.size == 12:
+        numbers = np.append(numbers, (0.0, 0.0, 0.0, 1.0))
+    T = array_of(numbers, (4, 4), name).copy()
     if not np.allclose(T[3], (0, 0, 0, 1), atol=1e-6):
         bad_value(
             name, "a rigid transform with last row 0 0 0 1", f"last row {T[3].tolist()}", "Is it transposed?"
@@ -114,9 +198,30 @@ def check_rigid(T: np.ndarray, name: str) -> np.ndarray:
             f"determinant {np.linalg.det(R):.4f}, |R R^T - I| up to {off:.4f}",
             "Check that rows and columns are not swapped and that no scale is multiplied in.",
         )
-    T = T.copy()
     T[:3, :3] = nearest_rotation(torch.from_numpy(R.copy())).numpy()
     return T
+
+
+def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> RawRig:
+    """The rig of two rectified ``(3, 4)`` projections ``K [I | t]`` that share one frame.
+
+    A camera with ``K [I | t]`` has its centre at ``-t``, so the pose's translation is ``t_left - t_right``.
+    """
+    P = [array_of(values, (3, 4), f"the {side} projection") for side, values in _sides(P_left, P_right)]
+    t_left, t_right = (
+        np.linalg.solve(check_intrinsics(matrix[:, :3], f"K of the {side} camera"), matrix[:, 3])
+        for side, matrix in _sides(*P)
+    )
+    E = np.eye(4)
+    E[:3, 3] = t_left - t_right
+    left, right = (
+        Camera(matrix[:, :3], size) for matrix, size in zip(P, (size_left, size_right), strict=True)
+    )
+    return RawRig(left, right, E, rectified=True)
+
+
+def _sides(left: Any, right: Any) -> tuple[tuple[str, Any], tuple[str, Any]]:
+    return ("left", left), ("right", right)
 
 
 def is_distorted(lens: Distortion | None) -> bool:
@@ -144,72 +249,69 @@ def check_no_distortion(lens: Distortion | None, name: str) -> None:
     )
 
 
-def pose_to_the_right(baseline_m: float) -> np.ndarray:
-    """E of a right camera ``baseline_m`` metres to the right: ``E[0, 3] == +baseline_m``."""
-    E = np.eye(4)
-    E[0, 3] = baseline_m
-    return E
+def _lens(camera: Camera, side: str) -> Distortion | None:
+    """The lens, or ``None`` where it moves no pixel."""
+    if camera.model not in COEFFICIENT_COUNTS:
+        cure = "OpenCV does not have this model: undistort or rectify both images to a pinhole first."
+        expected = f"one of {', '.join(COEFFICIENT_COUNTS)}"
+        bad_value(f"the lens model of the {side} camera", expected, repr(camera.model), cure)
+    name = f"Lens distortion of the {side} camera"
+    lens = Distortion(camera.model, array_of(camera.coefficients, (-1,), name))
+    if not is_distorted(lens):
+        return None
+    counts = COEFFICIENT_COUNTS[camera.model]
+    if lens.coefficients.size not in counts:
+        expected = f"{', '.join(map(str, counts))} coefficients in OpenCV's order ({camera.model})"
+        got = np.array2string(lens.coefficients, precision=4, separator=", ")
+        bad_value(name, expected, f"{lens.coefficients.size}: {got}", CHECK_FILE)
+    return lens
 
 
-def pose_from_projections(P_left: np.ndarray, P_right: np.ndarray, source: str | Path) -> np.ndarray:
-    """E of two rectified ``(3, 4)`` projections ``K [I | t]`` that share one frame.
-
-    A camera with ``K [I | t]`` has its centre at ``-t``, so E's translation is ``t_left - t_right``.
-
-    Raises:
-        ValueError: a left 3x3 part that is no camera matrix, naming the file ``source``.
-    """
-    t_left, t_right = (
-        np.linalg.solve(check_intrinsics(P[:, :3], f"K of the {side} camera in {source}"), P[:, 3])
-        for side, P in (("left", P_left), ("right", P_right))
-    )
-    E = np.eye(4)
-    E[:3, 3] = t_left - t_right
-    return E
-
-
-def pose_from_world_to_camera(T_left_from_world: np.ndarray, T_right_from_world: np.ndarray) -> np.ndarray:
-    """E of two world-to-camera transforms: ``T_left_from_right``."""
-    return T_left_from_world @ np.linalg.inv(T_right_from_world)
+def _pixels(size: Any, side: str) -> Size | None:
+    if size is None:
+        return None
+    cure = "The images are checked against it; leave out both sides where they are not known."
+    pair = []
+    for name, value in zip(("width", "height"), size, strict=True):
+        name = f"the {name} of the {side} image"
+        if value is None:
+            bad_value(name, "a whole number of pixels above 0", "none", cure)
+        pixels = number(value, name)
+        if pixels < 1 or pixels % 1:
+            bad_value(name, "a whole number of pixels above 0", repr(value), cure)
+        pair.append(int(pixels))
+    return pair[0], pair[1]
 
 
-def make_rig(
-    K_left: np.ndarray,
-    K_right: np.ndarray,
-    E: np.ndarray,
-    source: str | Path,
-    *,
-    size: tuple[int, int] | None = None,
-    size_right: tuple[int, int] | None = None,
-    distortion: tuple[Distortion | None, Distortion | None] = (None, None),
-    rectified: bool = False,
-) -> Rig:
-    """A ``Rig`` whose numbers are finite and whose matrices have the right form.
+def make_rig(raw: RawRig, source: str | Path) -> Rig:
+    """A ``Rig`` of raw numbers: finite, in the right form, with whole pixels and lenses that OpenCV has.
 
     Args:
-        K_left: ``(3, 3)`` pixels.
-        K_right: ``(3, 3)`` pixels.
-        E: ``(4, 4)`` metres, pose of the right camera in the left camera's frame.
-        source: the file.
-        size: ``(width, height)`` of the left image, and of the right one unless ``size_right`` is given.
-        size_right: ``(width, height)`` of the right image.
-        distortion: of both lenses.
-        rectified: whether the file says that its images are rectified.
+        raw: as a reader found it.
+        source: the file, for later messages.
 
     Raises:
-        ValueError: a matrix that is none, naming the file.
+        ValueError: what is wrong with which camera, or with the pose.
     """
-    if not np.isfinite(E).all():
-        bad_value(f"the pose in {source}", "finite", "NaN or infinity in it", "Check the calibration file.")
+    pose = raw.pose
+    if np.ndim(pose) == 0:
+        pose, baseline_m = np.eye(4), number(pose, "the baseline")
+        if baseline_m <= 0:
+            bad_value("the baseline", "above 0", baseline_m, CHECK_FILE)
+        pose[0, 3] = baseline_m
+    cameras = _sides(raw.left, raw.right)
+    K_left, K_right = (check_intrinsics(camera.K, f"K of the {side} camera") for side, camera in cameras)
+    size_left, size_right = (_pixels(camera.size, side) for side, camera in cameras)
+    lens_left, lens_right = (_lens(camera, side) for side, camera in cameras)
     return Rig(
-        K_left=check_intrinsics(K_left, f"K of the left camera in {source}"),
-        K_right=check_intrinsics(K_right, f"K of the right camera in {source}"),
-        E=np.asarray(E, dtype=np.float64),
-        size_left=size,
-        size_right=size if size_right is None else size_right,
+        K_left=K_left,
+        K_right=K_right,
+        E=array_of(pose, (4, 4), "the pose"),
+        size_left=size_left,
+        size_right=size_right,
         source=str(source),
-        distortion=distortion,
-        rectified=rectified,
+        distortion=(lens_left, lens_right),
+        rectified=raw.rectified,
     )
 
 
@@ -221,7 +323,7 @@ def rig_from_parameters(
     baseline_m: float,
     *,
     cx_right: float | None = None,
-    size: tuple[int, int] | None = None,
+    size: Size | None = None,
 ) -> Rig:
     """A rectified rig from the numbers that a data sheet gives.
 
@@ -238,10 +340,78 @@ def rig_from_parameters(
         TypeError, ValueError: not finite numbers, or not above 0 where they must be.
     """
     tiny = float(np.finfo(np.float64).tiny)
+    cx_right = cx if cx_right is None else cx_right
     for name, value in (("fx", fx), ("fy", fy), ("baseline", baseline_m)):
         check_number(value, name, tiny, np.finfo(np.float64).max)
-    for name, value in (("cx", cx), ("cy", cy), ("cx_right", cx if cx_right is None else cx_right)):
+    for name, value in (("cx", cx), ("cy", cy), ("cx_right", cx_right)):
         check_number(value, name, -1e9, 1e9)
-    K_left = intrinsics(fx, fy, cx, cy)
-    K_right = intrinsics(fx, fy, cx if cx_right is None else cx_right, cy)
-    return make_rig(K_left, K_right, pose_to_the_right(float(baseline_m)), "arguments", size=size)
+    left, right = (Camera(intrinsics(fx, fy, x, cy), size) for x in (cx, cx_right))
+    return make_rig(RawRig(left, right, float(baseline_m)), "arguments")
+
+
+def two_cameras(choice: CameraChoice, available: Collection[int]) -> tuple[int, int]:
+    """``choice.cameras``, which must be given, as two different ones of those that a file has.
+
+    Raises:
+        ValueError: they are not.
+    """
+    have = ", ".join(map(str, sorted(available))) or "none"
+    left, right = choice.cameras or (0, 0)
+    if left == right or not {left, right} <= set(available):
+        bad_value("cameras", f"two different cameras of the file ({have})", f"{left},{right}")
+    return left, right
+
+
+def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, str]:
+    """The names in a file of ``choice.image_names``.
+
+    A path fits a name that it ends with, or that ends with it; of several the one with the most folders in
+    common is taken.
+
+    Args:
+        names: of all images in the file; they may hold folders, and may lack the suffix.
+        choice: its ``image_names`` are names or paths.
+
+    Raises:
+        ValueError: no names, no such image, several that fit as well, or one image for both.
+    """
+    if choice.image_names is None:
+        expected = "given for a calibration of many images, as ('left.jpg', 'right.jpg')"
+        bad_value("image_names", expected, "none")
+    left, right = (_named(names, wanted) for wanted in choice.image_names)
+    if left == right:
+        bad_value("the images", "two of those in the file", f"{left} for both", "Check their names.")
+    return left, right
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    # Files of Windows programs have backslashes; a step upwards says nothing about the name.
+    return tuple(part for part in Path(name.replace("\\", "/")).parts if part != "..")
+
+
+def _agreeing(name: str, wanted: str) -> int:
+    """How many parts both paths have in common, if one of them ends the other; else 0."""
+    ours, theirs = _parts(name), _parts(wanted)
+    if ours and theirs and ours[-1] == Path(theirs[-1]).stem:  # NeRF's names have no suffix
+        theirs = (*theirs[:-1], ours[-1])
+    count = min(len(ours), len(theirs))
+    return count if count and ours[-count:] == theirs[-count:] else 0
+
+
+def _named(names: Collection[str], wanted: str) -> str:
+    agreeing = {name: _agreeing(name, wanted) for name in names}
+    most = max(agreeing.values(), default=0)
+    fitting = sorted(name for name, count in agreeing.items() if count == most)
+    if most == 0:
+        some = ", ".join(sorted(names)[:3])
+        bad_value(
+            "the image", f"one of the {len(names)} in the file ({some}, ...)", wanted, "Check its name."
+        )
+    if len(fitting) > 1:
+        bad_value(
+            "the image",
+            "one image of the file",
+            f"{wanted}, which may be {' and '.join(fitting[:2])}",
+            "Add its folder.",
+        )
+    return fitting[0]

@@ -1,29 +1,45 @@
-"""Numbers from the JSON and YAML of calibration files.
+"""JSON, YAML and OpenCV's FileStorage of calibration files as dicts, lists and arrays.
 
-Data flow: text -> nested dicts and lists -> checked float64 arrays.
-Paper: none.
+OpenCV's own reader is not used: a damaged file can corrupt its memory, and calibrations come from strangers.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
-from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import yaml
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["array_of", "entry", "parse_json", "parse_yaml"]
+__all__ = ["is_storage", "parse_json", "parse_storage", "parse_yaml"]
 
 CUT_OFF = "Is the file cut off?"
 #: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
 OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")
+#: A matrix has rows and columns; from OpenCV 5 on one of Python's ``(5,)`` is "nd", with its sizes in a list.
+KINDS = ("opencv-matrix", "opencv-nd-matrix")
+#: The channels of an entry stand before the letter of its type, as in "2f" of a list of points.
+CHANNELS = re.compile(r"^(\d{1,3})")
+#: How deep maps may lie in maps.
+DEEPEST = 4
 
 
-def parse_json(text: str, path: Path) -> Any:
+class _Loader(yaml.SafeLoader):
+    """YAML as OpenCV writes it: its matrices are mappings like others."""
+
+
+for _kind in KINDS:
+    _Loader.add_constructor(
+        f"tag:yaml.org,2002:{_kind}", lambda loader, node: loader.construct_mapping(node, deep=True)
+    )
+
+
+def parse_json(text: str) -> Any:
     """What a JSON text holds.
 
     Raises:
@@ -32,59 +48,110 @@ def parse_json(text: str, path: Path) -> Any:
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
-        bad_value(f"{path}", "JSON", f"{error.msg} in line {error.lineno}", CUT_OFF)
+        bad_value("the file", "JSON", f"{error.msg} in line {error.lineno}", CUT_OFF)
     except RecursionError:
-        bad_value(f"{path}", "a JSON object of numbers", "lists within lists without end")
+        bad_value("the file", "a JSON object of numbers", "lists within lists without end")
     except ValueError:
-        bad_value(f"{path}", "a JSON object of numbers", "a whole number of thousands of digits")
+        bad_value("the file", "a JSON object of numbers", "a whole number of thousands of digits")
 
 
-def parse_yaml(text: str, path: Path) -> dict[str, Any]:
+def parse_yaml(text: str) -> dict[str, Any]:
     """The mapping that the first YAML document holds; later documents (``rostopic echo``) are left out.
 
     Raises:
         ValueError: not YAML, or no mapping.
     """
     try:
-        content = next(yaml.safe_load_all(OPENCV_HEAD.sub("", text)), None)
+        content = next(yaml.load_all(OPENCV_HEAD.sub("", text), _Loader), None)  # noqa: S506  (a safe one)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f" in line {mark.line + 1}"
-        bad_value(f"{path}", "YAML", f"{getattr(error, 'problem', None) or 'something else'}{where}", CUT_OFF)
+        bad_value(
+            "the file", "YAML", f"{getattr(error, 'problem', None) or 'something else'}{where}", CUT_OFF
+        )
+    except (RecursionError, ValueError):  # a date that is none, a number of thousands of digits
+        bad_value("the file", "a YAML file of numbers", "something else", CUT_OFF)
     if not isinstance(content, dict):
-        bad_value(f"{path}", "a YAML file of named entries", type(content).__name__, CUT_OFF)
+        bad_value("the file", "a YAML file of named entries", type(content).__name__, CUT_OFF)
     return content
 
 
-def entry(mapping: Any, key: Any, where: str) -> Any:
-    """``mapping[key]``, or one sentence about what is missing.
+def is_storage(text: str) -> bool:
+    """Whether the text is written as OpenCV's FileStorage does it, in YAML, XML or JSON."""
+    return any(mark in text for mark in ("!!opencv-matrix", "<opencv_storage", '"opencv-matrix"'))
+
+
+def parse_storage(text: str) -> dict[str, Any]:
+    """Every entry of an OpenCV file in YAML, XML or JSON, those of nested maps beside the others.
+
+    Returns:
+        By key in small letters: matrices as float64 arrays with the axes that they were written with and one
+        for their channels, numbers and lists of numbers as float64 arrays of one axis, and strings.
 
     Raises:
-        ValueError: no mapping, or no such key.
+        ValueError: cut off or malformed.
     """
-    if not isinstance(mapping, dict) or key not in mapping:
-        bad_value(where, f"an entry {key!r}", "none", CUT_OFF)
-    return mapping[key]
+    # JSON is YAML; older versions of OpenCV write 1. and .Nan into it, which JSON itself does not know.
+    content = _parse_xml(text) if "<opencv_storage" in text else parse_yaml(text)
+    return _flat(content, DEEPEST)
 
 
-def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Finite numbers as a float64 array; flat lists are brought to ``shape``.
-
-    Args:
-        value: numbers in (nested) lists.
-        shape: of the result; ``(-1,)`` takes any count.
-        name: for the message.
-
-    Raises:
-        ValueError: other things than finite numbers, or another count of them.
-    """
+def _parse_xml(text: str) -> dict[str, Any]:
+    if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        cure = "OpenCV writes none; remove it."
+        bad_value("the file", "an OpenCV XML file", "a document type with entities", cure)
     try:
-        numbers = np.asarray(value, dtype=np.float64)
+        return {node.tag: _of_element(node, DEEPEST) for node in ElementTree.fromstring(text.strip())}
+    except ElementTree.ParseError as error:
+        bad_value("the file", "well-formed XML", str(error), CUT_OFF)
+
+
+def _of_element(node: ElementTree.Element, deepest: int) -> Any:
+    if len(node) and deepest:
+        return {child.tag: _of_element(child, deepest - 1) for child in node}
+    words = (node.text or "").split()
+    return words[0] if len(words) == 1 and node.tag not in ("data", "sizes") else words
+
+
+def _flat(content: dict[str, Any], deepest: int) -> dict[str, Any]:
+    entries: dict[str, Any] = {}
+    for key, value in content.items():
+        key = str(key).lower()
+        if isinstance(value, dict) and "data" in value and "dt" in value:
+            entries[key] = _matrix(value, key)
+        elif isinstance(value, dict):
+            entries = (_flat(value, deepest - 1) if deepest else {}) | entries
+        else:
+            numbers = _numbers(value)
+            entries[key] = value if numbers is None else numbers
+    return entries
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """A number or a flat list of numbers, some of which may be text; ``None`` for other things."""
+    words = value if isinstance(value, list) else [value]
+    try:
+        return np.array([_number(word) for word in words], np.float64)
     except (TypeError, ValueError, OverflowError):
-        numbers = None
-    expected = "numbers" if shape == (-1,) else f"{int(np.prod(shape))} numbers"
-    if numbers is None or not np.isfinite(numbers).all():
-        bad_value(name, f"{expected}, all finite", repr(value)[:80], CUT_OFF)
-    if shape != (-1,) and numbers.size != int(np.prod(shape)):
-        bad_value(name, expected, f"{numbers.size}", CUT_OFF)
-    return numbers.reshape(shape)
+        return None
+
+
+def _number(word: Any) -> float:
+    if isinstance(word, bool):
+        raise TypeError
+    # OpenCV writes .Nan and .Inf, which Python reads without the dot.
+    return float(
+        word.lower().replace(".nan", "nan").replace(".inf", "inf") if isinstance(word, str) else word
+    )
+
+
+def _matrix(value: dict[str, Any], key: str) -> np.ndarray:
+    sizes = value["sizes"] if "sizes" in value else [value.get("rows"), value.get("cols")]
+    shape, numbers = _numbers(sizes), _numbers(value["data"])
+    channels = CHANNELS.search(str(value["dt"]).strip('"'))
+    if shape is None or numbers is None or not ((shape >= 0) & (shape < 1e9) & (shape % 1 == 0)).all():
+        bad_value(key, "a matrix with rows, cols and data of numbers", "something else", CUT_OFF)
+    axes = [int(side) for side in (*shape, *(channels.groups() if channels else ()))]
+    if numbers.size != math.prod(axes):
+        bad_value(key, f"{'x'.join(map(str, axes))} numbers", f"{numbers.size} numbers", CUT_OFF)
+    return numbers.reshape(axes)

@@ -1,8 +1,4 @@
-"""Frames of a video as images in [0, 1], read by OpenCV.
-
-Data flow: a video file -> ``(H, W, 3)`` floats, one frame after the other.
-Paper: none.
-"""
+"""Frames of a video as images in [0, 1], read by OpenCV."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.strips import row_strips
+from geodiff_plugin.formats.depth import row_strips
 
 __all__ = ["WHITE", "colour_depth", "depth_figure", "depth_range", "text_font", "ticks", "write_centred"]
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from PIL import Image, ImageDraw
 
-from geodiff_plugin.formats.strips import row_strips
+from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.plotting.figures import (
     BLACK,
     FIGURE_MIN_HEIGHT,

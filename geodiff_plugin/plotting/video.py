@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_number
-from geodiff_plugin.formats.atomic import atomic_path
+from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.plotting.figures import depth_figure, depth_range
 
 __all__ = ["SUFFIXES", "check_video", "depth_frames", "write_depth_video"]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from geodiff_plugin.formats.strips import row_strips
+from geodiff_plugin.formats.depth import row_strips
 
 __all__ = ["BY_EVIDENCE", "RIGHT_WITHIN", "SIGNS", "depth_confidence", "depth_evidence"]
 

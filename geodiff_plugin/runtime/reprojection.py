@@ -13,7 +13,7 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.evidence import as_fine_as
 from geodiff_plugin.algorithm.terms.exposure import match_exposure
-from geodiff_plugin.formats.strips import row_strips
+from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.types import CameraView
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.formats import out_folder
-from geodiff_plugin.formats.out_folder import OutFolder
-from geodiff_plugin.formats.out_place import LOCK, PARTIAL, free_folder
+from geodiff_plugin._checks import InputError, InputFileError
+from geodiff_plugin.formats import out as out_module
+from geodiff_plugin.formats.out import LOCK, PARTIAL, OutFolder, free_folder
 
 
 def fill(folder: Path) -> str:
@@ -36,7 +37,7 @@ def test_a_new_folder_appears_whole(tmp_path):
         return fill(folder)
 
     with OutFolder(out) as held:
-        assert held.write(watched) == "filled" and held.path == out and held.elsewhere is None
+        assert held.write(watched) == "filled" and held.path == out
     assert [path.name for path in sorted(tmp_path.rglob("*"))] == [
         "deep",
         "er",
@@ -99,22 +100,6 @@ def test_a_report_of_something_else_deletes_nothing(tmp_path, report):
     assert names(tmp_path) == ["b", "out"] and names(out) == ["1", "cloud.ply", "depth.npy", "report.json"]
 
 
-def test_the_report_goes_last(tmp_path, monkeypatch):
-    """Cut off before, the folder still says what is its own; cut off after, nothing is left to delete."""
-    (tmp_path / "cloud.ply").write_text("old")
-    (tmp_path / "report.json").write_text(report_of("cloud.ply"))
-    moved, real = [], out_folder._move
-
-    def move(source, target):
-        moved.append((target.name, (tmp_path / "cloud.ply").exists()))
-        real(source, target)
-
-    monkeypatch.setattr(out_folder, "_move", move)
-    with OutFolder(tmp_path, overwrite=True) as held:
-        held.write(fill)
-    assert moved == [("depth.npy", True), ("report.json", False)]
-
-
 def test_input_is_neither_replaced_nor_deleted(tmp_path):
     out, link = tmp_path / "out", tmp_path / "link.npy"
     out.mkdir()
@@ -152,25 +137,6 @@ def test_the_unfinished_files_lie_inside_a_folder_that_exists(tmp_path):
     assert names(disk) == ["depth.npy", "report.json"] and link.is_symlink()
 
 
-def test_a_border_of_file_systems_is_crossed_by_a_copy(tmp_path, monkeypatch):
-    real = os.replace
-
-    def replace(source, target):
-        if PARTIAL in str(Path(source).parent):
-            raise OSError(errno.EXDEV, "Invalid cross-device link")
-        real(source, target)
-
-    monkeypatch.setattr(os, "replace", replace)
-    with OutFolder(tmp_path) as held:
-        held.write(fill)
-    assert names(tmp_path) == ["depth.npy", "report.json"]
-    out = tmp_path / "new"
-    monkeypatch.setattr(os, "rename", lambda *_: replace(f"{PARTIAL}/x", None))
-    with OutFolder(out) as held:
-        held.write(fill)
-    assert names(out) == ["depth.npy", "report.json"]
-
-
 def refused(path: Path, **options) -> str:
     with pytest.raises(ValueError, match="--out must be") as caught, OutFolder(path, **options):
         pass
@@ -199,7 +165,7 @@ def test_a_folder_that_takes_no_file_is_refused_before_the_work(tmp_path, monkey
     def no_file(*_, **__):
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr(out_folder, "open", no_file, raising=False)
+    monkeypatch.setattr(out_module, "open", no_file, raising=False)
     assert os.strerror(code) in refused(tmp_path / "out")
     assert names(tmp_path) == []
 
@@ -233,7 +199,7 @@ def test_what_a_killed_run_left_is_recognised_and_cleared(tmp_path, exists, caps
     if exists:
         out.mkdir()
     code = (
-        "import os, sys\nfrom pathlib import Path\nfrom geodiff_plugin.formats.out_folder import OutFolder\n"
+        "import os, sys\nfrom pathlib import Path\nfrom geodiff_plugin.formats.out import OutFolder\n"
         "def fill(folder):\n"
         "    (folder / 'depth.npy').write_text('half')\n"
         f"    os.kill(os.getpid(), {int(signal.SIGKILL)})\n"
@@ -250,83 +216,50 @@ def test_what_a_killed_run_left_is_recognised_and_cleared(tmp_path, exists, caps
     assert names(tmp_path) == ["out"] and names(out) == ["depth.npy", "report.json"]
 
 
-def test_a_result_that_does_not_fit_is_written_elsewhere(tmp_path, monkeypatch):
-    elsewhere, out = tmp_path / "elsewhere", tmp_path / "disk" / "out"
-    elsewhere.mkdir()
-    monkeypatch.chdir(elsewhere)
+def test_the_report_goes_last(tmp_path, monkeypatch):
+    """Cut off before, the folder still says what is its own; cut off after, nothing is left to delete."""
+    (tmp_path / "cloud.ply").write_text("old")
+    (tmp_path / "report.json").write_text(report_of("cloud.ply"))
+    moved, real = [], os.replace
+
+    def move(source, target):
+        moved.append((Path(target).name, (tmp_path / "cloud.ply").exists()))
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", move)
+    with OutFolder(tmp_path, overwrite=True) as held:
+        held.write(fill)
+    assert moved == [("depth.npy", True), ("report.json", False)]
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_disk_that_fills_up_loses_nothing_and_strews_nothing(tmp_path, monkeypatch, exists):
+    here, out = tmp_path / "here", tmp_path / "disk" / "out"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    if exists:
+        out.mkdir(parents=True)
+        (out / "depth.npy").write_text("finished")
+        (out / "report.json").write_text(report_of("depth.npy"))
 
     def full(folder):
         (folder / "depth.npy").write_text("half")
-        if folder.is_relative_to(tmp_path / "disk"):
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return fill(folder)
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    with OutFolder(out) as held:
-        assert held.write(full) == "filled"
-    assert "No space left" in held.elsewhere and str(held.path) in held.elsewhere
-    assert held.path.parent == elsewhere and names(held.path) == ["depth.npy", "report.json"]
-    assert not (tmp_path / "disk").exists()
-
-
-def test_a_folder_that_vanishes_meanwhile_is_made_again_or_replaced(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with OutFolder(tmp_path / "deep" / "out") as held:
-        for path in (tmp_path / "deep").iterdir():
-            path.unlink()
-        (tmp_path / "deep").rmdir()
-        held.write(fill)
-    assert names(held.path) == ["depth.npy", "report.json"]
-
-
-def test_a_result_that_fits_nowhere(tmp_path, monkeypatch, capsys):
-    """On a terminal it is kept until there is room; else one sentence, since nobody is there to make any."""
-    tries = []
-
-    def full(folder):
-        tries.append(folder)
-        if len(tries) < 5:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return fill(folder)
-
-    with (
-        pytest.raises(OSError, match="out could not be written .No space left"),
-        OutFolder(tmp_path / "out") as held,
-    ):
+    said = "out could not be written .No space left on device.. Free disk space"
+    with pytest.raises(InputFileError, match=said), OutFolder(out, overwrite=exists) as held:
         held.write(full)
+    assert names(here) == []
+    if exists:
+        assert (out / "depth.npy").read_text() == "finished" and names(out) == ["depth.npy", "report.json"]
+    else:
+        assert names(tmp_path) == ["here"]
+
+
+def test_a_full_disk_is_refused_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
+    assert os.strerror(errno.ENOSPC) in refused(tmp_path / "new" / "out")
     assert names(tmp_path) == []
-    tries.clear()
-    monkeypatch.setattr(out_folder, "RETRY_S", 0.0)
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with OutFolder(tmp_path / "out") as held:
-        held.write(full)
-    assert "Trying again" in capsys.readouterr().err
-    assert names(tmp_path / "out") == ["depth.npy", "report.json"]
-
-
-def test_a_result_is_kept_where_nothing_knows_a_folder(tmp_path, monkeypatch):
-    """Of a full disk there is no folder for temporary files, of a container's user none at home."""
-    tries = []
-
-    def unknown(error):
-        def raises(*_args):
-            raise error
-
-        return raises
-
-    def full(folder):
-        tries.append(folder)
-        if len(tries) < 3:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return fill(folder)
-
-    monkeypatch.setattr(out_folder.Path, "cwd", unknown(FileNotFoundError("the working folder is gone")))
-    monkeypatch.setattr(out_folder.tempfile, "gettempdir", unknown(FileNotFoundError("none usable")))
-    monkeypatch.setattr(out_folder.Path, "home", unknown(RuntimeError("no home")))
-    monkeypatch.setattr(out_folder, "RETRY_S", 0.0)
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with OutFolder(tmp_path / "out") as held:
-        held.write(full)
-    assert len(tries) == 3 and names(tmp_path / "out") == ["depth.npy", "report.json"]
 
 
 def test_a_working_folder_that_was_removed_is_a_sentence(tmp_path, monkeypatch):

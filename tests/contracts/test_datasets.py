@@ -22,7 +22,7 @@ from geodiff_plugin.evaluation.datasets.robustmvd import KEY_VIEWS, find_robustm
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.records import record_key
 from geodiff_plugin.evaluation.scoring import score
-from geodiff_plugin.formats import write_depth_mm_png, write_pfm
+from geodiff_plugin.formats import write_depth_mm, write_pfm
 from tests.contracts import factory_calibrations as factory
 from tests.scenes.dataset import is_reflective
 
@@ -457,7 +457,7 @@ def test_folder_takes_depth_in_three_formats(tmp_path):
     write_pfm(tmp_path / "mine" / "depth.pfm", np.where(expected > 0, expected, np.inf))
     np.testing.assert_array_equal(one(tmp_path, "folder").depth_m, expected)
     (tmp_path / "mine" / "depth.pfm").unlink()
-    write_depth_mm_png(tmp_path / "mine" / "depth.png", expected)
+    write_depth_mm(tmp_path / "mine" / "depth.png", expected)
     np.testing.assert_allclose(one(tmp_path, "folder").depth_m, expected, atol=5.1e-4)
 
 

@@ -15,7 +15,7 @@ from geodiff_plugin.cli.many.pairs import is_many
 from geodiff_plugin.config import KNOBS
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
 from geodiff_plugin.formats.exif import warn_of_other_lens
-from geodiff_plugin.formats.out_place import check_out
+from geodiff_plugin.formats.out import check_out
 from tests.fuzz.strategies import (
     CALIBRATIONS,
     EXAMPLES,

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
-from geodiff_plugin.formats import write_depth_mm_png
+from geodiff_plugin.formats import write_depth_mm
 from tests.scenes import SyntheticPair, render_pair
 
 __all__ = ["make_pair"]
@@ -55,7 +55,7 @@ def make_pair(folder: Path) -> None:
     _write_image(folder / "left.png", pair.left.image_01)
     _write_image(folder / "right.png", pair.right.image_01)
     middle = slice(RAYS_PER_SIDE // 2, None, RAYS_PER_SIDE)
-    write_depth_mm_png(folder / "depth_mm.png", pair.left.depth_m[0, middle, middle].numpy())
+    write_depth_mm(folder / "depth_mm.png", pair.left.depth_m[0, middle, middle].numpy())
     K = _intrinsics(1)
     camera = f"[{K[0, 0]:g} 0 {K[0, 2]:g}; 0 {K[1, 1]:g} {K[1, 2]:g}; 0 0 1]"
     lines = (

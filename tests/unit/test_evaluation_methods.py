@@ -28,7 +28,7 @@ from geodiff_plugin.evaluation.baselines.files import map_name
 from geodiff_plugin.evaluation.datasets.folder import find_folder, load_folder
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
-from geodiff_plugin.formats import write_depth_mm_png, write_pfm
+from geodiff_plugin.formats import write_depth_mm, write_pfm
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.scale.space import SPACES
@@ -72,7 +72,7 @@ def png16(path, values):
     [
         ("depth", lambda f, s: np.save(f / "folder_mine.npy", with_hole(s.depth_m, np.nan)), 1e-6),
         ("depth", lambda f, s: write_pfm(f / "folder_mine.pfm", with_hole(s.depth_m, 0)), 1e-6),
-        ("depth", lambda f, s: write_depth_mm_png(f / "folder_mine.png", with_hole(s.depth_m, 0)), 1e-3),
+        ("depth", lambda f, s: write_depth_mm(f / "folder_mine.png", with_hole(s.depth_m, 0)), 1e-3),
         ("disparity", lambda f, s: np.save(f / "folder_mine.npy", with_hole(disparity_of(s), np.inf)), 1e-5),
         (
             "disparity",

@@ -31,23 +31,12 @@ def test_zed_takes_the_section_of_the_image(reading, size, focal):
     assert rig.K_left[0, 0] == focal and rig.size_left == size
 
 
-@pytest.mark.parametrize("choice", [{}, {"image_size": (2560, 720)}])
-def test_zed_without_a_fitting_image_lists_its_resolutions(reading, choice):
-    with pytest.raises(ValueError, match="2208x1242, 1280x720"):
-        reading(factory.ZED, **choice)
-
-
 def test_zed_rotation_and_offsets_point_from_left_to_right(reading):
     text = factory.ZED.replace("TY=0", "TY=0.5").replace("TZ=0", "TZ=-2").replace("CV_HD=0", "CV_HD=0.01")
     rig = reading(text, image_size=(1280, 720))
     R = Rotation.from_rotvec([0, 0.01, 0]).as_matrix()
     np.testing.assert_allclose(rig.E[:3, :3], R.T, atol=1e-12)
     np.testing.assert_allclose(rig.E[:3, 3], R.T @ [0.12, 0.0005, -0.002], atol=1e-12)
-
-
-def test_zed_lens_is_named_by_side(reading):
-    with pytest.raises(ValueError, match="Lens distortion of the left camera .* Undistort"):
-        reading(factory.ZED.replace("k1=0", "k1=-0.17", 3), image_size=(1280, 720))
 
 
 # RealSense
@@ -76,13 +65,6 @@ def test_realsense_json_the_other_way_round_is_inverted(reading):
     assert reading(json.dumps(data)).E[0, 3] == pytest.approx(0.12)
 
 
-def test_realsense_json_without_extrinsics(reading):
-    data = json.loads(factory.REALSENSE_JSON)
-    del data["extrinsics"]
-    with pytest.raises(ValueError, match="their extrinsics; got 2 and 0"):
-        reading(json.dumps(data))
-
-
 # OAK-D
 
 
@@ -101,13 +83,6 @@ def test_oak_rectified_images_have_the_right_cameras_intrinsics(reading):
     assert rig.K_left[0, 0] == rig.K_right[0, 0] == 712.5
 
 
-def test_oak_without_rectification_needs_images_without_a_lens(reading):
-    data = copy.deepcopy(factory.OAK_DATA)
-    data["stereoRectificationData"]["rectifiedRotationLeft"] = []
-    with pytest.raises(ValueError, match="Lens distortion of the left camera"):
-        reading(json.dumps(data))
-
-
 def test_oak_other_sockets_go_along_the_links(reading):
     data = copy.deepcopy(factory.OAK_DATA)
     for _, camera in data["cameraData"]:
@@ -122,13 +97,6 @@ def test_oak_other_sockets_go_along_the_links(reading):
 # ROS, Kalibr
 
 
-def test_ros_needs_both_files_and_a_baseline(reading):
-    with pytest.raises(ValueError, match="two files"):
-        reading(factory.ROS_RIGHT)
-    with pytest.raises(ValueError, match="single cameras"):
-        reading(factory.ROS_LEFT, factory.ROS_LEFT)
-
-
 def test_ros_swapped_files_put_the_camera_on_the_other_side(reading):
     assert reading(factory.ROS_RIGHT, factory.ROS_LEFT).E[0, 3] == pytest.approx(-0.12)
 
@@ -141,12 +109,12 @@ def test_ros_sizes_are_whole_numbers(reading):
 
     assert sized("640.0").size_left == sized("640.").size_right == (640, 480)
     for width in ("640.5", "0", "-640", ".nan", ".inf", "true", "", "[640]"):
-        with pytest.raises(ValueError, match=r"image_width in .* must be a whole number of pixels above 0"):
+        with pytest.raises(ValueError, match="the width of the left image must be a .* number"):
             sized(width)
     echoed = (factory.ROS_ECHO_LEFT, factory.ROS_ECHO_RIGHT)
     without = [text.replace("width: 640\n", "").replace("height: 480\n", "") for text in echoed]
     assert reading(*without).size_left is None
-    with pytest.raises(ValueError, match="image_height in .* got none"):
+    with pytest.raises(ValueError, match="the height of the .* got none"):
         reading(*(text.replace("height: 480\n", "") for text in echoed))
 
 
@@ -154,22 +122,6 @@ def test_kalibr_chain_of_three(reading):
     third = factory.KALIBR[factory.KALIBR.index("cam1:") :].replace("cam1:", "cam2:")
     rig = reading(factory.KALIBR + third.replace("-0.12", "-0.3"), cameras=(0, 2))
     assert rig.E[0, 3] == pytest.approx(0.42)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("distortion_coeffs: [0.0", "distortion_coeffs: [-0.28", "Lens distortion of the left camera"),
-        ("camera_model: pinhole", "camera_model: omni", "camera_model of cam0.*pinhole.*omni"),
-        ("cam1:", "cam3:", "'cam1'"),
-        ("distortion_model: radtan", "distortion_model: fov", "distortion_model of cam0.*'fov'.*undistort"),
-        ("distortion_coeffs: [0.0, ", "distortion_coeffs: [", "distortion_coeffs of cam0.*4 numbers; got 3"),
-        ("intrinsics: [700.0", "intrinsics: [.nan", "intrinsics of cam0"),
-    ],
-)
-def test_kalibr_bad_entries_are_named(reading, old, new, said):
-    with pytest.raises(ValueError, match=said):
-        reading(factory.KALIBR.replace(old, new))
 
 
 # EuRoC
@@ -188,26 +140,6 @@ def test_euroc_pose_is_between_the_cameras_whatever_the_body(reading):
     np.testing.assert_allclose(reading(factory.EUROC_LEFT, marked).E, turned, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("distortion_coefficients: [0.0", "distortion_coefficients: [-0.28", "Lens distortion of the left"),
-        ("camera_model: pinhole", "camera_model: omni", "camera_model of .*pinhole.*omni"),
-        ("radial-tangential", "fov", "distortion_model of .*'fov'.*undistort"),
-        ("resolution: [640", "resolution: [640.5", "resolution of .*whole number of pixels"),
-        ("  data: [0.0, 0.0, 1.0, 0.3,", "  data: [0.0, 0.0, 1.0,", "T_BS in .*16 numbers; got 15"),
-    ],
-)
-def test_euroc_bad_entries_are_named(reading, old, new, said):
-    with pytest.raises(ValueError, match=said):
-        reading(factory.EUROC_LEFT.replace(old, new), factory.EUROC_RIGHT)
-
-
-def test_euroc_needs_both_files(reading):
-    with pytest.raises(ValueError, match="two files.*--calib twice"):
-        reading(factory.EUROC_LEFT)
-
-
 # ORB-SLAM
 
 
@@ -216,7 +148,7 @@ def test_orb_slam_lenses_are_those_of_its_camera_type(reading):
     left, right = reading(text, distorted=True).distortion
     assert left.model == "opencv" and left.coefficients.tolist() == [-0.28, 0, 0, 0] and right is None
     fish = text.replace("PinHole", "KannalaBrandt8").replace(".p1:", ".k3:").replace(".p2:", ".k4:")
-    with pytest.raises(ValueError, match="Camera2.k1 in .*finite number; got none"):
+    with pytest.raises(ValueError, match="Camera2.k1.*finite number; got none"):
         reading(fish, distorted=True)
     fish += "".join(f"Camera2.k{n}: 0.00{n}\n" for n in range(1, 5))
     left, right = reading(fish, distorted=True).distortion
@@ -241,38 +173,6 @@ def test_orb_slam_baseline_of_rectified_images(reading):
     new = reading(re.sub(r"Camera\.([fc][xy])", r"Camera1.\1", new))
     np.testing.assert_allclose(new.E, old.E)
     np.testing.assert_array_equal(new.K_right, old.K_left)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("ThDepth: 35", "DepthMapFactor: 5000", "stereo camera.*got .* with a depth sensor"),
-        ("Camera.bf: 84.0", "", "with Stereo.T_c1_c2, or Camera.bf of rectified images"),
-        ("Camera.bf: 84.0", "Camera.bf: -84.0", "Camera.bf in .*above 0"),
-        ("Camera.k1: 0.0", "Camera.k1: 0.2", "Lens distortion of Camera .*zero"),
-        ("Camera.cx: 300.0", "", "Camera.cx in .*finite number; got none"),
-        ("Camera.height: 480", "", "Camera.height in .*finite number; got none"),
-        ("Camera.width: 640", "Camera.width: 640.5", "Camera.width in .*whole number of pixels"),
-        ("%YAML:1.0", '%YAML:1.0\nCamera.type: "KannalaBrandt8"', "of type KannalaBrandt8"),
-    ],
-)
-def test_orb_slam_bad_entries_are_named(reading, old, new, said):
-    with pytest.raises(ValueError, match=said):
-        reading(factory.ORB_SLAM_RECTIFIED.replace(old, new))
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("PinHole", "Rectified", "Camera.type in .*PinHole or KannalaBrandt8 beside Stereo.T_c1_c2"),
-        ("Camera2.fx: 700.0\n", "", "Camera2.fx in .*finite number; got none"),
-        ("  rows: 4\n  cols: 4", "  rows: 2\n  cols: 8", r"Stereo.T_c1_c2 in .*shape \(4, 4\)"),
-        ("0.0, 0.0, 1.0, 0.0,\n", "0.0, 0.0, 3.0, 0.0,\n", "Stereo.T_c1_c2 in .*rotation"),
-    ],
-)
-def test_orb_slam_bad_pairs_are_named(reading, old, new, said):
-    with pytest.raises(ValueError, match=said):
-        reading(factory.ORB_SLAM.replace(old, new))
 
 
 # COLMAP
@@ -304,19 +204,9 @@ def test_colmap_rotation_is_world_to_camera(reading):
     )
 
 
-def test_colmap_unknown_image_and_lens(reading):
-    with pytest.raises(ValueError, match=r"one of the 3 in .*rig/left.jpg.*elsewhere.jpg"):
-        reading(factory.COLMAP_CAMERAS, factory.COLMAP_IMAGES, image_names=("elsewhere.jpg", "rig/right.jpg"))
-    radial = factory.COLMAP_CAMERAS.replace(
-        "PINHOLE 640 480 700 700 300.5 200.5", "SIMPLE_RADIAL 640 480 700 300.5 200.5 -0.1"
-    )
-    with pytest.raises(ValueError, match="Lens distortion"):
-        reading(radial, factory.COLMAP_IMAGES, **factory.COLMAP_CHOICE)
-
-
 def test_colmap_folder(tmp_path):
     (tmp_path / "images.bin").write_bytes(b"\0")
-    with pytest.raises(IsADirectoryError, match="model_converter"):
+    with pytest.raises(IsADirectoryError, match="a COLMAP model with its cameras and images"):
         read_calibration(tmp_path)
     (tmp_path / "cameras.txt").write_text(factory.COLMAP_CAMERAS)
     (tmp_path / "images.txt").write_text(factory.COLMAP_IMAGES)

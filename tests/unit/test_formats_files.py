@@ -12,7 +12,7 @@ from geodiff_plugin.formats import (
     read_depth_mm_png,
     read_disparity_kitti_png,
     read_pfm,
-    write_depth_mm_png,
+    write_depth_mm,
     write_depth_npy,
     write_pfm,
     write_ply,
@@ -107,14 +107,14 @@ def test_depth_mm_png_round_trip_and_zero_count(tmp_path):
     depth = np.array([[0.0004, 1.2344, 65.535], [65.536, np.nan, 2.0], [np.inf, -1.0, 0.001]])
     valid = np.ones((3, 3), dtype=bool)
     valid[1, 2] = False
-    zeros = write_depth_mm_png(tmp_path / "d.png", depth, valid)
+    zeros = write_depth_mm(tmp_path / "d.png", depth, valid)
     read, known = read_depth_mm_png(tmp_path / "d.png")
     np.testing.assert_allclose(read, [[0, 1.234, 65.535], [0, 0, 0], [0, 0, 0.001]], atol=1e-6)
     np.testing.assert_array_equal(known, read > 0)
     assert zeros == 6 == int((~known).sum())
     with Image.open(tmp_path / "d.png") as image:
         assert image.mode.startswith("I;16")
-    assert write_depth_mm_png(tmp_path / "e.png", np.full((2, 2), 3.0)) == 0
+    assert write_depth_mm(tmp_path / "e.png", np.full((2, 2), 3.0)) == 0
 
 
 def test_kitti_disparity_png(tmp_path):

@@ -120,7 +120,7 @@ def test_realsense_models(reading) -> None:
     assert reading(printed).distortion[0].coefficients.tolist() == [0.1, 0.2, 0, 0, 0]
     for model in ("distortion.inverse_brown_conrady", 2, "Inverse Brown Conrady"):
         assert reading(realsense(model, [0.0] * 5)).rectified, "zeros are no lens"
-        with pytest.raises(InputError, match=r"infra1 in .*inverse brown conrady.*rectify"):
+        with pytest.raises(InputError, match=r"lens model of the left .*inverse brown conrady.*rectify"):
             reading(realsense(model, five))
 
 
@@ -137,7 +137,7 @@ def test_oak_as_taken_has_its_lenses(reading) -> None:
     assert lens.model == "fisheye" and lens.coefficients.tolist() == LEFT
     for _, camera in data["cameraData"]:
         camera["cameraType"] = 3
-    with pytest.raises(InputError, match=r"cameraType .* 0 \(perspective\) or 1 \(fisheye\); got 3"):
+    with pytest.raises(InputError, match="got 'cameraType 3'"):
         reading(json.dumps(data))
 
 
@@ -160,27 +160,6 @@ def test_colmap_models(reading, camera, model, coefficients) -> None:
         assert lens.model == model and lens.coefficients.tolist() == coefficients
 
 
-@pytest.mark.parametrize(
-    ("camera", "said"),
-    [
-        ("FOV 640 480 700 700 300.5 200.5 0.9", "the model of camera 1 .* got FOV. Undistort"),
-        ("OPENCV 640 480 700 700 300.5 200.5 1 2", "parameters of camera 1 .* 8 numbers; got 6"),
-    ],
-)
-def test_colmap_models_that_are_none_of_opencvs(reading, camera, said) -> None:
-    cameras = factory.COLMAP_CAMERAS.replace("PINHOLE 640 480 700 700 300.5 200.5", camera)
-    with pytest.raises(InputError, match=said):
-        reading(cameras, factory.COLMAP_IMAGES, **factory.COLMAP_CHOICE)
-
-
-@pytest.mark.parametrize("numbers", [[-0.3, 0.1, 0, 0, 0, 0.1], [".Nan", 0.1, 0, 0, 0], [0.1]])
-def test_an_opencv_lens_with_a_count_or_numbers_that_are_none(reading, numbers) -> None:
-    text = opencv(LEFT, numbers).replace("'", "")
-    said = rf"right camera in .* 4, 5, 8, 12 or 14 finite coefficients .* got {len(numbers)}: "
-    with pytest.raises(InputError, match=said):
-        reading(text)
-
-
 @pytest.mark.parametrize("sample", ["middlebury", "kitti_cam_to_cam", "kitti_projections", "opencv_yaml"])
 def test_files_of_rectified_images_say_so(reading, sample) -> None:
     assert reading(*table.SAMPLES[sample][1]).rectified
@@ -188,14 +167,6 @@ def test_files_of_rectified_images_say_so(reading, sample) -> None:
 
 
 # What else users write into such files
-
-
-def test_ros_of_rectified_images_and_of_no_calibration(reading) -> None:
-    assert reading(factory.ROS_LEFT, factory.ROS_RIGHT).rectified
-    zeros = factory.ROS_LEFT.replace("700., 0., 300.", "0., 0., 0.").replace("0., 700., 200.", "0., 0., 0.")
-    zeros = zeros.replace("0., 0., 1., 0.]", "0., 0., 0., 0.]")
-    with pytest.raises(InputError, match=r"file0 is of a camera that is not calibrated: .* all zeros\."):
-        reading(zeros, zeros.replace("/left", "/right"))
 
 
 @pytest.mark.parametrize("head", ["%YAML:1.0\n", "%YAML:1.0\n---\n", "%YAML 1.1\n---\n"])
@@ -208,10 +179,3 @@ def test_the_head_of_opencvs_yaml_is_read_over(reading, head) -> None:
 def test_kalibr_keys_may_have_comments(reading, end) -> None:
     text = factory.KALIBR.replace("cam0:", "cam0:  # left").replace("cam1:", "cam1: # right")
     assert reading(text.replace("\n", end)).E[0, 3] == pytest.approx(0.12)
-
-
-def test_kalibr_cameras_that_are_not_there(reading) -> None:
-    for cameras in ((0, 2), (1, 1)):
-        said = rf"cameras must be two different cameras of .* \(0, 1\); got {cameras[0]},{cameras[1]}"
-        with pytest.raises(InputError, match=said):
-            reading(factory.KALIBR, cameras=cameras)

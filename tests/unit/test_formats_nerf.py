@@ -99,7 +99,7 @@ def test_without_a_measured_distance_it_warns_and_keeps_the_unit_before_nerfstud
         assert reading(data, baseline_m=None).E[0, 3] == pytest.approx(0.5)
     with pytest.warns(UserWarning, match="has no unit"):
         assert reading(data | {"applied_scale": 0.25}, baseline_m=None).E[0, 3] == pytest.approx(2.0)
-    with pytest.raises(InputError, match="applied_scale in .* above 0"):
+    with pytest.raises(InputError, match="applied_scale.* above 0"):
         reading(data | {"applied_scale": 0})
 
 
@@ -125,9 +125,7 @@ def test_angles_of_nerfs_rendered_scenes(reading, data):
     np.testing.assert_allclose(np.diag(rig.K_left), [700, 600, 1])
     with pytest.raises(InputError, match=r"entries 'w' and 'h'; got none\. Give image_size"):
         reading(bare)
-    with pytest.raises(
-        InputError, match=r"camera_angle_x of .*left.jpg in .* in radians.*got 50\.0\. Is it in deg"
-    ):
+    with pytest.raises(InputError, match=r"camera_angle_x .* in radians.*got 50\.0\. Is it in deg"):
         reading(bare | {"camera_angle_x": 50.0}, image_size=(640, 480))
 
 
@@ -174,32 +172,10 @@ def test_fisheyes(reading, data, said):
         reading(given, distorted=False)
 
 
-def test_axes_of_mitsuba_are_refused(reading, data):
-    with pytest.raises(InputError, match="from_mitsuba in .* y up and z backward"):
-        reading(data | {"from_mitsuba": True})
-
-
 @pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", None])
 def test_models_of_a_pinhole(reading, data, model):
     given = without(data, "camera_model") | ({} if model is None else {"camera_model": model})
     assert reading(given, distorted=False).distortion == (None, None)
-
-
-@pytest.mark.parametrize(
-    ("entries", "said"),
-    [
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model of .*left.jpg .* OPENCV_FISHEYE; got 'EQUIRECT"),
-        ({"camera_model": None}, "camera_model of .* got None"),
-        ({"ftheta_p0": 0.1}, "got 'ftheta_p0'. OpenCV does not have this model"),
-        ({"k4": 0.1}, r"k4 of .* zero for OPENCV; got 0\.1"),
-        ({"camera_model": "OPENCV_FISHEYE", "p2": 0.1}, "p2 of .* zero for OPENCV_FISHEYE"),
-        ({"k1": "little"}, "k1 of .*left.jpg in .* a number; got 'little'"),
-        ({"distortion_params": [0.1]}, "distortion_params of .* 6 numbers; got 1"),
-    ],
-)
-def test_lenses_that_are_none_of_opencvs(reading, data, entries, said):
-    with pytest.raises(InputError, match=said):
-        reading(data | entries)
 
 
 # Names
@@ -228,21 +204,6 @@ def test_images_are_found_by_the_ends_of_their_paths(reading, data, in_file, ask
     assert rig.E[0, 3] == pytest.approx(0.12) and rig.E[0, 0] == pytest.approx(1)
 
 
-@pytest.mark.parametrize(
-    ("in_file", "asked", "said"),
-    [
-        (("a.png", "b.png", "c.png"), ("a.png", "d.png"), r"one of the 3 in .*a\.png, b\.png.*got d\.png"),
-        (("a.png", "b.png", "c.png"), ("a.png", "c.jpg"), r"one of the 3 in .*got c\.jpg"),
-        (("one/a.png", "b.png", "two/a.png"), ("a.png", "b.png"), "may be one/a.png and two/a.png. Add its"),
-        (("a.png", "b.png", "c.png"), ("left/a.png", "right/a.png"), "two of those in .* got a.png for both"),
-        (("a.png", "b.png", "c.png"), None, r"image_names must be given for a transforms\.json"),
-    ],
-)
-def test_images_that_are_not_there(reading, data, in_file, asked, said):
-    with pytest.raises(InputError, match=said):
-        reading(named(data, *in_file), image_names=asked)
-
-
 # Matrices and other entries
 
 
@@ -250,44 +211,6 @@ def test_a_matrix_may_lack_its_last_row(reading, data):
     for frame in data["frames"]:
         del frame["transform_matrix"][3]
     assert reading(data).E[0, 3] == pytest.approx(0.12)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (
-            lambda m: np.array(m).T.tolist(),
-            "transform_matrix of .*right.jpg in .* last row .* Is it transposed",
-        ),
-        (lambda m: (np.diag([2, 2, 2, 1]) @ m).tolist(), "rigid transform.*determinant 8.*no scale"),
-        (lambda m: (np.array(m) @ np.diag([-1, 1, 1, 1])).tolist(), "rigid transform.*determinant -1"),
-        (lambda m: m[:2], "transform_matrix of .*right.jpg in .* 16 numbers; got 8"),
-        (lambda m: "identity", "transform_matrix of .* all finite; got 'identity'"),
-        (lambda m: [[math.nan] * 4] * 4, "transform_matrix of .* all finite"),
-    ],
-)
-def test_a_matrix_that_is_no_pose(reading, data, change, said):
-    frame = data["frames"][2]
-    frame["transform_matrix"] = change(frame["transform_matrix"])
-    with pytest.raises(InputError, match=said):
-        reading(data)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda d: d | {"frames": {"0": d["frames"][0]}}, "frames in .* a list; got dict"),
-        (lambda d: named(d, "a.png", "b.png", 3), "file_path of frame 2 in .* a name; got 3"),
-        (lambda d: d | {"frames": [*d["frames"], {"transform_matrix": 0}]}, "frame 3 in .* 'file_path'"),
-        (lambda d: d | {"frames": [*d["frames"][:2], without(d["frames"][2], "transform_matrix")]},
-         "right.jpg in .* an entry 'transform_matrix'; got none"),
-        (lambda d: d | {"fl_x": -700}, "fl_x of .*left.jpg in .* above 0; got -700"),
-        (lambda d: d | {"cx": [1]}, "cx of .*left.jpg in .* a number"),
-    ],
-)  # fmt: skip
-def test_entries_that_are_missing_or_wrong_are_named(reading, data, change, said):
-    with pytest.raises(InputError, match=said):
-        reading(change(data))
 
 
 # The doors

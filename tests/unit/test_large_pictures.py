@@ -7,9 +7,10 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.formats import flying_points, make_cloud, strips, write_depth_mm_png, write_ply
-from geodiff_plugin.formats.ply import read_ply_points
-from geodiff_plugin.formats.strips import row_strips
+from geodiff_plugin.formats import depth as strips
+from geodiff_plugin.formats import flying_points, make_cloud, write_depth_mm, write_ply
+from geodiff_plugin.formats.depth import row_strips
+from geodiff_plugin.formats.points import read_ply_points
 from geodiff_plugin.plotting.figures import colour_depth, depth_range
 from geodiff_plugin.plotting.overview import overview, share_figure
 from geodiff_plugin.runtime.confidence import depth_confidence
@@ -39,7 +40,7 @@ def written(folder, scene):
     depth_m, image, K = scene
     folder.mkdir()
     valid = ~flying_points(depth_m)
-    zeros = write_depth_mm_png(folder / "mm.png", depth_m)
+    zeros = write_depth_mm(folder / "mm.png", depth_m)
     count = write_ply(folder / "cloud.ply", depth_m, image, K, valid=valid)
     cloud = make_cloud(depth_m, image, K, valid)
     counts = np.array([zeros, count, len(cloud.points_m)])

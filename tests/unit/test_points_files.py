@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.formats import read_points, write_depth_mm_png, write_pfm, write_ply
+from geodiff_plugin.formats import read_points, write_depth_mm, write_pfm, write_ply
 
 MAP = np.zeros((6, 8), np.float32)
 MAP[1, 2], MAP[4, 5] = 1.25, 3.5
@@ -14,7 +14,7 @@ POINTS = np.array([[0.1, -0.2, 2.0], [0.4, 0.3, 5.5]], np.float32)
 
 
 def test_maps_of_every_kind_are_the_same(tmp_path):
-    write_depth_mm_png(tmp_path / "map.png", MAP)
+    write_depth_mm(tmp_path / "map.png", MAP)
     write_pfm(tmp_path / "map.pfm", np.where(MAP > 0, MAP, np.inf))
     np.save(tmp_path / "map.npy", np.where(MAP > 0, MAP, np.nan).astype(np.float64))
     for name in ("map.png", "map.pfm", "map.npy"):
@@ -176,7 +176,7 @@ def test_units_by_name_and_by_number(tmp_path):
     folder = tmp_path / "proj_depth" / "groundtruth"
     folder.mkdir(parents=True)
     for path in (tmp_path / "map.png", folder / "map.png"):
-        write_depth_mm_png(path, MAP * 0.256)  # the integers of KITTI's 1/256 m
+        write_depth_mm(path, MAP * 0.256)  # the integers of KITTI's 1/256 m
     np.testing.assert_allclose(read_points(tmp_path / "map.png", scale=256), MAP, atol=4e-3)
     with pytest.warns(UserWarning, match="KITTI's units of 1/256 m"):
         np.testing.assert_allclose(read_points(folder / "map.png"), MAP, atol=4e-3)

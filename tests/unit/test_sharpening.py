@@ -91,7 +91,7 @@ def test_strips_chunks_and_batches_change_nothing(monkeypatch):
     whole = sharpen_edges(soft, left, 2)
     alone = [sharpen_edges(*each, 2) for each in zip(soft.split(1), left.split(1), strict=True)]
     assert torch.equal(whole, torch.cat(alone))
-    monkeypatch.setattr("geodiff_plugin.formats.strips.STRIP_PIXELS", 5 * 64)
+    monkeypatch.setattr("geodiff_plugin.formats.depth.STRIP_PIXELS", 5 * 64)
     monkeypatch.setattr(sharpening, "CHUNK", 7)
     assert torch.equal(sharpen_edges(soft, left, 2), whole)
 

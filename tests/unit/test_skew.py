@@ -21,7 +21,7 @@ from geodiff_plugin.algorithm.evidence import EvidenceInputs, as_fine_as, prepar
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.figures.clouds import render_cloud
-from geodiff_plugin.formats.pointcloud import write_ply
+from geodiff_plugin.formats.clouds import write_ply
 from geodiff_plugin.matching import build_cost_volume, find_matches, points_to_matches
 from geodiff_plugin.matching.alignment import align_view
 from geodiff_plugin.matching.build import pilot_volume
@@ -58,7 +58,7 @@ HAND_ON = {
     "formats.distortion.undistorted",
     "formats.distortion.undistorted_pixels",
     "formats.distortion.undistorted_points",
-    "formats.pointcloud.make_cloud",
+    "formats.clouds.make_cloud",
     "guidance.photographs.estimate_rig",
     "guidance.posing.coarse_depth",
     "guidance.posing.pose_views",

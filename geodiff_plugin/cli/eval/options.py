@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geodiff_plugin.formats.out_place import check_out
+from geodiff_plugin.formats.out import check_out
 
 if TYPE_CHECKING:
     from geodiff_plugin.evaluation.options import PairsOptions

@@ -31,7 +31,7 @@ from geodiff_plugin.cli.photographs import read_photographs
 from geodiff_plugin.cli.report import build_report
 from geodiff_plugin.cli.settings import Settings
 from geodiff_plugin.cli.start import check_files, out_folder_of
-from geodiff_plugin.formats.out_folder import OutFolder
+from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.runtime.guided_call import native_images

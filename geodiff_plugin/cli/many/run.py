@@ -31,7 +31,7 @@ from geodiff_plugin.cli.many.summary import COLUMNS, SUMMARY, Row, write_summary
 from geodiff_plugin.cli.messages import collected_warnings, in_options, say
 from geodiff_plugin.cli.settings import Settings, read_settings
 from geodiff_plugin.cli.terminal import new_table, show
-from geodiff_plugin.formats.out_place import reason_of
+from geodiff_plugin.formats.out import reason_of
 
 __all__ = ["EXIT_SOME_FAILED", "run_many"]
 
@@ -157,10 +157,6 @@ def _run(
         held.enter_context(bar)
         held.enter_context(collected_warnings(warned, tell))
         for job in held.enter_context(closing(conveyor.run(jobs))):
-            elsewhere = None if job.out is None else job.out.elsewhere
-            if job.error is None and elsewhere is not None:
-                job.error = elsewhere
-                say(f"geodiff: {job.ref.name}: {elsewhere}")
             row = _row(job.ref.name, "failed" if job.error else "done", job.report, job.error)
             job.let_go()
             bar.update()

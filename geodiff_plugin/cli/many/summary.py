@@ -16,8 +16,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.atomic import atomic_path
-from geodiff_plugin.formats.out_place import reason_of
+from geodiff_plugin.formats.out import atomic_path, reason_of
 
 __all__ = ["COLUMNS", "SUMMARY", "Row", "check_summary", "write_summary"]
 

@@ -15,7 +15,7 @@ import torch
 
 from geodiff_plugin._checks import bad_value, check_metres
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
-from geodiff_plugin.formats import check_file, npy, read_depth_mm_png, read_image, read_pfm
+from geodiff_plugin.formats import check_file, files, read_depth_mm_png, read_image, read_pfm
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.types import Rig
 
@@ -38,7 +38,7 @@ def read_rgb(path: Path, name: str) -> np.ndarray:
 
 def read_npy(path: Path, name: str) -> np.ndarray:
     """``(H, W)`` array of an npy file; ``ValueError`` naming it where it is damaged or of another rank."""
-    values = npy.read_npy(check_file(path, name, "an npy file"), name, "a map of shape (H, W)")
+    values = files.read_npy(check_file(path, name, "an npy file"), name, "a map of shape (H, W)")
     if values.ndim != 2:
         bad_value(name, "a map of shape (H, W)", f"{path} of shape {values.shape}")
     return values

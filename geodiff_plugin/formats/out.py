@@ -1,0 +1,326 @@
+"""Output: a file or a folder appears whole or not at all, and what cannot be written is said before the work.
+
+Nothing here imports torch: what is wrong with a folder is said at once.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import secrets
+import shutil
+import sys
+from collections.abc import Callable, Collection, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self, TypeVar
+
+from tqdm import tqdm
+
+from geodiff_plugin._checks import FolderError, InputFileError, MissingFileError, bad_value
+
+try:
+    import fcntl
+except ImportError:  # where there is no flock, two runs with one folder are not detected
+    CAN_LOCK = False
+else:
+    CAN_LOCK = True
+
+__all__ = ["LOCK", "PARTIAL", "OutFolder", "atomic_path", "check_out", "free_folder", "reason_of"]
+
+LOCK, PARTIAL = ".geodiff-lock", ".geodiff-partial"
+#: Lists what a run wrote, and is written last.
+REPORT = "report.json"
+MOST_NUMBERED = 10_000
+#: A disk with less room takes no result, however small its picture.
+LEAST_FREE_BYTES = 8 << 20
+
+Result = TypeVar("Result")
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path to write to; rename it to ``path`` when the block ends well.
+
+    The temporary file lies in the same folder (a rename across file systems is a copy) and keeps the
+    suffix, from which writers guess the format. On any error, Ctrl-C included, it is removed and an older
+    file at ``path`` stays as it was.
+
+    Args:
+        path: the file to appear.
+
+    Yields:
+        The path to write to.
+
+    Raises:
+        FileNotFoundError: the folder does not exist.
+        IsADirectoryError: ``path`` is a folder.
+    """
+    target = Path(path)
+    if os.path.isdir(target):
+        raise FolderError(f"The output must be a file; got the folder {target}. Name a file inside of it.")
+    if not os.path.isdir(target.parent):
+        raise MissingFileError(
+            f"The output must be in an existing folder; got {target}. Make the folder {target.parent} first."
+        )
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def reason_of(error: OSError) -> str:
+    """The system's words for what went wrong, without the path."""
+    return error.strerror or str(error)
+
+
+def _hidden(target: Path, kind: str) -> Path:
+    """Where the lock or the unfinished files of a folder lie: inside it, or beside it until it is there.
+
+    A folder that exists may be a disk of its own, below one that nobody may write to.
+    """
+    return target / kind if target.is_dir() else target.with_name(f".{target.name}{kind}")
+
+
+def _absolute(path: Path, name: str) -> Path:
+    try:
+        return path.absolute()
+    except FileNotFoundError:
+        cure = "Change to one that is there."
+        bad_value(name, "below a working folder that exists", f"{path}, and that folder was removed", cure)
+
+
+def check_out(path: Path, name: str = "--out") -> Path:
+    """The place that an output folder has or will have, links followed.
+
+    Args:
+        path: as typed.
+        name: the option, for messages.
+
+    Raises:
+        ValueError: a file, a link to nothing, below a file, or a name that the file system refuses.
+    """
+    try:
+        if path.is_symlink() and not path.exists():
+            cure = "Make that folder, or remove the link."
+            bad_value(name, "a folder", f"{path}, a link to {os.readlink(path)}, which does not exist", cure)
+        target = _absolute(path, name) if not path.exists() else path.resolve()
+        if target.exists() and not target.is_dir():
+            bad_value(name, "a folder", f"the file {path}", "Name a folder.")
+        if not target.name:
+            bad_value(name, "a folder below the root", str(path), "Name a folder.")
+        os.stat(target.with_name(f".{target.name}{PARTIAL}"))  # the longest name that will be needed
+    except FileNotFoundError:
+        pass
+    except NotADirectoryError:
+        bad_value(name, "a folder that can be made", f"{path}, which lies below a file")
+    except OSError as error:
+        bad_value(name, "a folder that can be made", f"{path} ({reason_of(error)})", "Name another.")
+    return target
+
+
+def _holds_files(target: Path) -> bool:
+    """Whether a folder is there and has more in it than a lock and what an unfinished run left."""
+    return target.is_dir() and any(path.name not in (LOCK, PARTIAL) for path in target.iterdir())
+
+
+def free_folder(default: Path) -> Path:
+    """A folder for a run that named none: ``default``, or ``default-2`` and so on where that is taken."""
+    for number in range(1, MOST_NUMBERED):
+        path = default if number == 1 else default.with_name(f"{default.name}-{number}")
+        taken = os.path.lexists(path) and (not path.is_dir() or _holds_files(path))
+        if not taken and not _held(_hidden(_absolute(path, "--out"), LOCK)):
+            return path
+    bad_value("--out", "given, as a new folder", f"{MOST_NUMBERED} folders {default}-N that hold files")
+
+
+def _take_lock(file: IO[bytes]) -> bool:
+    """Lock an open file until it is closed; ``False`` where another process has it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _held(lock: Path) -> bool:
+    """Whether a process that writes to the folder of this lock is alive."""
+    if not (CAN_LOCK and lock.is_file()):
+        return False
+    with open(lock, "rb") as file:
+        try:
+            return not _take_lock(file)
+        except OSError:  # a file system that knows no locks
+            return True
+
+
+def _files_of_report(folder: Path) -> set[str]:
+    """Names of the files that an earlier run wrote there, as its report lists them."""
+    try:
+        names = json.loads((folder / REPORT).read_text(encoding="utf-8"))["files"]["names"]
+        return {name for name in names if Path(name).name == name} if isinstance(names, list) else set()
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # none, or of something else
+        return set()
+
+
+class OutFolder:
+    """A folder that this process alone writes to, from before the work until the result is in it.
+
+    Args:
+        path: as typed; it need not exist.
+        names: every file that the run may write.
+        inputs: files that the run reads, none of which it may replace or delete.
+        overwrite: take a folder that holds files. Those that its report lists as an earlier run's go where
+            the new run does not write them; all others stay.
+        resume: the folder is written to directly, file by file, and may hold an earlier part of the same.
+        option: what ``path`` was given as, for messages.
+
+    Raises:
+        ValueError: on entry: what ``check_out`` refuses; files in it, or an input that the run would replace
+            or delete; it cannot be written to, or its disk is full; another run has it.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        names: Collection[str] = (),
+        *,
+        inputs: Collection[Path] = (),
+        overwrite: bool = False,
+        resume: bool = False,
+        option: str = "--out",
+    ) -> None:
+        self.path = Path(path)
+        self._names, self._inputs = set(names), inputs
+        self._overwrite, self._resume, self._option = overwrite, resume, option
+        self._earlier: set[str] = set()
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        self._target = check_out(self.path, self._option)
+        if _holds_files(self._target) and not (self._overwrite or self._resume):
+            cure = "Name another, or add --overwrite."
+            bad_value(self._option, "a new or empty folder", f"{self.path}, which holds files", cure)
+        if self._overwrite:
+            self._earlier = _files_of_report(self._target)
+            self._refuse_inputs()
+        with ExitStack() as stack:
+            try:
+                self._make(self._target if self._resume else self._target.parent, stack)
+                self._lock(stack)
+                self._staging = _hidden(self._target, PARTIAL)
+                self._clear_leftovers()
+                if shutil.disk_usage(self._staging.parent).free < LEAST_FREE_BYTES:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            except OSError as error:
+                cure = "Name another with --out, or free disk space and check its permissions."
+                got = f"{self.path} ({reason_of(error)})"
+                bad_value(self._option, "a folder that can be written to", got, cure)
+            stack.callback(shutil.rmtree, self._staging, ignore_errors=True)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def _refuse_inputs(self) -> None:
+        """Refuse a folder with an input of this run among the files that it replaces or deletes."""
+        written = [self._target / name for name in sorted(self._names | self._earlier)]
+        written = [path for path in written if path.exists()]
+        for path in self._inputs:
+            if any(path.exists() and path.samefile(other) for other in written):
+                got = f"{self.path}, where the run would replace or delete {path}, which it reads"
+                bad_value(self._option, "a folder that holds no input of the run", got, "Name another.")
+
+    def _make(self, folder: Path, stack: ExitStack) -> None:
+        """Make a folder and those above it; new ones go in the end if they are still empty."""
+        for path in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
+            path.mkdir(exist_ok=True)
+            stack.callback(_remove_empty, path)
+
+    def _lock(self, stack: ExitStack) -> None:
+        """Take the folder's lock; the kernel gives it back when the process ends, however it ends."""
+        beside = self._target.with_name(f".{self._target.name}{LOCK}")
+        lock = _hidden(self._target, LOCK)
+        if lock != beside and _held(beside):  # a run that began before the folder was there
+            self._refuse_held(beside)
+        while True:
+            file = stack.enter_context(open(lock, "a+b", buffering=0))
+            if not CAN_LOCK:
+                break
+            if not _take_lock(file):
+                self._refuse_held(lock)
+            # A run that ended meanwhile has taken the file away: what we hold is then nobody's lock.
+            if lock.exists() and os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+                break
+        stack.callback(lock.unlink, missing_ok=True)
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n".encode())  # says who, and finds out whether the disk takes a byte
+
+    def _refuse_held(self, lock: Path) -> None:
+        process = lock.read_text(encoding="ascii", errors="replace").strip() or "unknown"
+        got = f"{self.path}, which process {process} is writing to"
+        bad_value(self._option, "a folder that no other run has", got, "Wait for it, or name another.")
+
+    def _clear_leftovers(self) -> None:
+        if self._staging.exists():  # we have the lock, so whoever made it is gone
+            shutil.rmtree(self._staging)
+            line = f"geodiff: removed what a run that was killed had left in {self._staging}"
+            tqdm.write(line, file=sys.stderr)  # above a progress bar, if there is one
+
+    def write(self, fill: Callable[[Path], Result]) -> Result:
+        """Let ``fill`` write into an empty folder beside the place, whose files are then moved.
+
+        A new folder appears by one rename. In one that exists each file is replaced by one rename, then what
+        only an earlier run wrote goes, and the report is replaced last.
+
+        Args:
+            fill: writes all files into the folder that it is given.
+
+        Returns:
+            What ``fill`` returned.
+
+        Raises:
+            OSError: it could not be written; what was there before is as it was.
+        """
+        try:
+            self._staging.mkdir(parents=True)
+            result = fill(self._staging)
+            self._move()
+        except InputFileError:  # of a file that it names
+            raise
+        except OSError as error:
+            cure = "Free disk space or check its permissions, and run it again."
+            raise InputFileError(f"{self.path} could not be written ({reason_of(error)}). {cure}") from error
+        finally:
+            shutil.rmtree(self._staging, ignore_errors=True)
+        return result
+
+    def _move(self) -> None:
+        if not self._target.is_dir():
+            try:
+                os.rename(self._staging, self._target)
+                return
+            except OSError:
+                if not self._target.is_dir():  # else somebody made it meanwhile
+                    raise
+        written = {path.name for path in self._staging.iterdir()}
+        for name in sorted(written - {REPORT}):
+            os.replace(self._staging / name, self._target / name)
+        for path in (self._target / name for name in self._earlier - written):
+            if path.is_file():
+                path.unlink()
+        if REPORT in written:  # last: until then the old one lists what is still to go
+            os.replace(self._staging / REPORT, self._target / REPORT)
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):  # not empty: the result is in it
+        folder.rmdir()
