@@ -63,7 +63,7 @@ def _read_booster(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     """For the images at full resolution, which are rectified."""
     entries = parse_storage(texts[0])
     left, right = (Camera(entries[key][:, :3]) for key in ("proj_matl", "proj_matr"))
-    return RawRig(left, right, float(entries["baselinelr"][0]) / MM_PER_METRE, rectified=True)
+    return RawRig(left, right, float(entries["baselinelr"].ravel()[0]) / MM_PER_METRE, rectified=True)
 
 
 def _numbers(text: str) -> list[float] | None:
