@@ -44,6 +44,8 @@ class Rig:
         distortion: of the left and the right lens; ``None`` for none.
         rectified: whether the source says that its images are rectified, free of lens distortion.
         unit: ``"m"``, or ``None`` where the source does not say what its lengths are in.
+        measured: whether the distance between the cameras is calibrated or measured, so that a refined pose
+            keeps it; ``False`` for poses of a tracker, of SLAM or of structure from motion.
 
     Convention:
         A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
@@ -58,6 +60,7 @@ class Rig:
     distortion: tuple[Distortion | None, Distortion | None] = (None, None)
     rectified: bool = False
     unit: str | None = "m"
+    measured: bool = True
 
     @property
     def T_right_from_left(self) -> np.ndarray:
@@ -82,6 +85,8 @@ class PoseReport:
         residual_px: the same with the poses, and images, as used.
         matches: number of matches, one per right view.
         straightened_px: root mean square displacement applied to the right images; 0 for none.
+        scale_spread: relative standard deviation of the scale of refined poses, and with it of the depth;
+            ``None`` where the length of the baseline is measured, and where the poses are used as given.
         warnings: sentences for the user.
     """
 
@@ -92,6 +97,7 @@ class PoseReport:
     residual_px: tuple[float, ...] = ()
     matches: tuple[float, ...] = ()
     straightened_px: tuple[float, ...] = ()
+    scale_spread: float | None = None
     warnings: tuple[str, ...] = ()
 
     def changed(self, **fields: Any) -> Self:

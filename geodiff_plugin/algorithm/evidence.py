@@ -46,6 +46,7 @@ class EvidenceInputs:
         config: says how large the grids are, what the sweep spans, and whether the search needs it.
         needs_matches: aggregate the volume and check it against each view.
         unit: of the lengths, ``"m"`` or ``None``.
+        measured: whether the lengths of the baselines are measured; see ``Rig``.
     """
 
     left_01: Tensor
@@ -55,6 +56,7 @@ class EvidenceInputs:
     config: GuidanceConfig
     needs_matches: bool
     unit: str | None = "m"
+    measured: bool = False
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,8 @@ def _rig_from_matrices(arguments: DepthArguments, alone: bool) -> Rig:
     K_right = K
     if arguments.k_right is not None:
         K_right = check_intrinsics(read_matrix(arguments.k_right, "--K-right"), "--K-right")
-    return Rig(K, K_right, check_pose(read_matrix(arguments.e, "--E"), "--E"), source=str(arguments.k))
+    E = check_pose(read_matrix(arguments.e, "--E"), "--E")
+    return Rig(K, K_right, E, source=str(arguments.k), measured=False)
 
 
 def read_rig(
@@ -225,7 +226,8 @@ def _make_guidance(
         return GeometryGuidance(None, rig.K_left, points=points, cropped=cropped, config=config)
     further = _read_further_views(arguments, rig.K_left, lenses[2:], config)
     posed = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E), *further]
-    return GeometryGuidance.from_views(posed, points=points, cropped=cropped, unit=rig.unit, config=config)
+    lengths = {"unit": rig.unit, "measured_baseline": rig.measured}
+    return GeometryGuidance.from_views(posed, points=points, cropped=cropped, **lengths, config=config)
 
 
 def _compare_with_exif(arguments: DepthArguments, rig: Rig) -> None:

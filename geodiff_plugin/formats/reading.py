@@ -136,7 +136,7 @@ def _in_metres(rig: Rig, baseline_m: float | None, name: str) -> Rig:
                 "distance of the two cameras as baseline_m (--baseline) to get metres.",
                 stacklevel=3,
             )
-            return replace(rig, unit=None)
+            return replace(rig, unit=None, measured=False)
         return rig
     check_number(baseline_m, "baseline_m", float(np.finfo(np.float64).tiny), 1e9)
     length = float(np.linalg.norm(rig.E[:3, 3]))

@@ -24,7 +24,7 @@ def make_evidence(given: EvidenceInputs) -> Evidence:
     if not given.views:
         return prepare_evidence(given)
     left_01, views = cleaned_views(given.left_01, given.views, given.config)
-    posed = pose_views(left_01, views, given.K_left, given.config, given.unit)
+    posed = pose_views(left_01, views, given.K_left, given.config, given.unit, given.measured)
     return prepare_evidence(replace(given, left_01=left_01, views=posed.rights), posed.report)
 
 
@@ -34,7 +34,7 @@ def _settings(given: EvidenceInputs) -> tuple[Any, ...]:
     return (
         *(config.pose, config.clean_photographs, config.loss_resolution, config.depth_range),
         *(config.planes, config.sweep_pixels),
-        *(swept, given.needs_matches, given.unit),
+        *(swept, given.needs_matches, given.unit, given.measured),
     )
 
 

@@ -51,6 +51,9 @@ class GeometryGuidance:
         cropped: the images are crops, so the principal point may lie outside of the image.
         unit: ``"m"``, or ``None`` where the lengths of ``E`` are in no known unit, as in a model of COLMAP.
             The output then says so, and a metric prior gives the metres.
+        measured_baseline: whether the distance between the cameras is measured or calibrated, and not a
+            tracker's. Where the poses have to be refined, a measured distance stays as it is; otherwise it is
+            weighed against the depth of the scene under the given poses. A rectified rig's is measured.
         previous: the output of the previous frame, called with ``output_latent=True``. The call then starts
             in the middle of the schedule, from that latent, and the scale search starts at that scale.
         preset: hyperparameters by name: ``"default"``, ``"paper"``, ``"marigold-dc"``, ``"search-only"`` or
@@ -63,6 +66,7 @@ class GeometryGuidance:
         evidence_store: cache of cost volumes and matches for further calls with the same images, cameras and
             settings; ``None``, the default, for no cache.
         previous: as the argument; it may be set before every call.
+        measured_baseline: likewise.
 
     Raises:
         InputError: an argument of the wrong type, rank, size or range, or a pose that is not rigid. It is a
@@ -87,6 +91,7 @@ class GeometryGuidance:
         left_size: tuple[int, int] | None = None,
         cropped: bool = False,
         unit: str | None = "m",
+        measured_baseline: bool = False,
         previous: MetricDepthOutput | None = None,
         preset: str | None = None,
         config: GuidanceConfig | None = None,
@@ -105,6 +110,7 @@ class GeometryGuidance:
         self._config, self._unit = config.changed(**knobs), unit
         check_names(self._config)
         self._inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
+        self.measured_baseline = measured_baseline
         self.evidence_store: EvidenceStore | None = None
         self.previous = previous
         self._cropped, self._left_size = cropped, check_size(left_size, "left_size")
@@ -126,7 +132,7 @@ class GeometryGuidance:
         check_number(baseline_m, "baseline_m", -1e6, 1e6)
         E = np.eye(4)
         E[0, 3] = baseline_m
-        return cls(right, K if K_right is None else (K, K_right), E, **knobs)
+        return cls(right, K if K_right is None else (K, K_right), E, **{"measured_baseline": True} | knobs)
 
     @classmethod
     def from_calibration(
@@ -157,9 +163,8 @@ class GeometryGuidance:
         if size is None and right is not None and not isinstance(right, (list, tuple)):
             size = picture_size(right, "right")  # the two cameras of a rig have one resolution
         rig = read_calibration(path, cameras, image_names=image_names, image_size=size, baseline_m=baseline_m)
-        guidance = cls(
-            right, (rig.K_left, rig.K_right), rig.E, **{"left_size": rig.size_left, "unit": rig.unit} | knobs
-        )
+        of_rig = {"left_size": rig.size_left, "unit": rig.unit, "measured_baseline": rig.measured}
+        guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **of_rig | knobs)
         for image in guidance.rights:
             size = (image.shape[-1], image.shape[-2])
             cure = "Scale K with the images, or use these."
@@ -255,6 +260,7 @@ class GeometryGuidance:
             left_size=found.size_left,
             cropped=cropped,
             unit=found.scale.unit,
+            measured_baseline=True,
             **knobs,
         )
         guidance.estimated = found
@@ -384,7 +390,14 @@ class GeometryGuidance:
                 warn_of_other_size(*fit)
             views, K_left, points = one.on(lefts_01.device)
             given = EvidenceInputs(
-                lefts_01[i], views, K_left, points, self.config, self._needs_matches, self.unit
+                lefts_01[i],
+                views,
+                K_left,
+                points,
+                self.config,
+                self._needs_matches,
+                self.unit,
+                self.measured_baseline,
             )
             with WithinCores():  # here too, for who asks outside of a guided call
                 evidence.append(make(given))

@@ -52,6 +52,7 @@ def pose_views(
     K_left: Tensor,
     config: GuidanceConfig = DEFAULT,
     unit: str | None = "m",
+    measured: bool = False,
 ) -> RefinedViews:
     """The right views with the poses of the knob ``pose``.
 
@@ -61,10 +62,13 @@ def pose_views(
         K_left: ``(3, 3)`` pixels of ``left_01``.
         config: whether they are refined.
         unit: of the poses' lengths, ``"m"`` or ``None``.
+        measured: whether the lengths of the baselines are measured; see ``Rig``.
     """
     if config.pose == "given":
         return untouched(rights)
-    return refine_views(left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left), unit)
+    return refine_views(
+        left_01, rights, K_left, lambda posed: coarse_depth(left_01, posed, K_left), unit, measured
+    )
 
 
 def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> Tensor:

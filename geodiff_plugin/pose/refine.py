@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit, pose_change
+from geodiff_plugin.pose.scale import MOST_SCALE_SPREAD, refined_scale
 from geodiff_plugin.pose.settle import (
     FEWEST,
     FREE_PX,
@@ -26,7 +27,7 @@ from geodiff_plugin.pose.settle import (
 )
 from geodiff_plugin.pose.solve import Prior, solve_poses
 from geodiff_plugin.pose.straighten import Displacement, fit_displacement, straightened
-from geodiff_plugin.pose.tracks import Tracks, merge_tracks
+from geodiff_plugin.pose.tracks import Tracks, merge_tracks, project_tracks, solve_inverse_depth
 from geodiff_plugin.pose.views import FirstDepth, dense_tracks, grey_views, sparse_tracks
 from geodiff_plugin.types import CameraView, PoseReport
 
@@ -75,6 +76,7 @@ def refine_views(
     K_left: Tensor,
     first_depth: FirstDepth,
     unit: str | None = "m",
+    measured: bool = False,
 ) -> RefinedViews:
     """Check the poses against the images, and refine them together where they do not fit.
 
@@ -84,6 +86,8 @@ def refine_views(
         K_left: ``(3, 3)`` pixels of ``left_01``.
         first_depth: a rough depth by poses that fit roughly; asked only where refinement is due.
         unit: of the poses' lengths; those in metres are asked about where they seem to be in millimetres.
+        measured: whether the lengths of the baselines are measured. Refined poses then keep them, as those of
+            a rectified rig do; otherwise they are weighed against the scene's depth under the given poses.
 
     Returns:
         ``RefinedViews``; its ``rights`` are the very ones that were given where the poses fit, where there
@@ -124,13 +128,18 @@ def refine_views(
     if far.any():
         warnings = _too_far(before, after, far, turned_deg, shifts) + units
         return RefinedViews(tuple(rights), found.changed(status="kept", warnings=warnings))
+    doubts, spread = undecided(tracks, Ts, free), None
+    if not (rig or measured):
+        Ts, spread, uncertain = _rescaled(tracks, given, Ts, before)
+        doubts += uncertain
     bends = [
         None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views.rights[v].shape)
         for v, T in enumerate(Ts)
     ]
     found = found.changed(
         status="refined",
-        warnings=_improved(before, after) + undecided(tracks, Ts, free) + units,
+        warnings=_improved(before, after) + doubts + units,
+        scale_spread=spread,
         E=_as_E(Ts),
         residual_px=_numbers(_straight_medians(tracks, Ts, bends)),
         straightened_px=tuple(0.0 if bend is None else bend.rms_px for bend in bends),
@@ -168,6 +177,35 @@ def polished(
     length = np.linalg.norm(Ts[0, :3, 3]) / np.linalg.norm(solved[0, :3, 3])
     solved[:, :3, 3] *= length
     return solved, tracks
+
+
+def _rescaled(
+    tracks: Tracks, given: np.ndarray, Ts: np.ndarray, before: np.ndarray
+) -> tuple[np.ndarray, float, tuple[str, ...]]:
+    """Refined poses of a tracker at the scale that baselines and scene agree on, its spread, and a warning."""
+    refined, shifts = solve_inverse_depth(tracks, Ts), []
+    for v, (K, T) in enumerate(zip(tracks.K_rights, Ts, strict=True)):
+        rays, w = tracks.rays[tracks.seen[v]], refined[tracks.seen[v]]
+        moved = project_tracks(rays, w, K, T).px - project_tracks(rays, np.zeros_like(w), K, T).px
+        shifts.append(np.linalg.norm(moved, axis=1))
+    misfit = float(np.nanmean(before) / max(np.median(np.concatenate(shifts)), 1e-6))
+    factor, spread = refined_scale(refined, solve_inverse_depth(tracks, given), misfit)
+    if not np.isfinite(factor):
+        return Ts, float("inf"), ()
+    Ts = Ts.copy()
+    Ts[:, :3, 3] *= factor
+    if spread <= MOST_SCALE_SPREAD:
+        return Ts, spread, ()
+    return (
+        Ts,
+        spread,
+        (
+            f"The scale of the refined pose is uncertain by {100 * spread:.0f} % (one standard deviation): "
+            "the given baseline and the depth of the scene under the given pose disagree. If the distance "
+            "between the cameras is measured, say so (measured_baseline=True, --baseline); otherwise give "
+            "known points, or views from further apart.",
+        ),
+    )
 
 
 def _mistakes(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.guidance.posing import coarse_depth, pose_views
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.noise import split_residuals
+from geodiff_plugin.pose.scale import refined_scale
 from geodiff_plugin.pose.settle import is_rig, median_residuals, settle_poses, undecided
 from geodiff_plugin.pose.solve import Prior, solve_poses
 from geodiff_plugin.pose.straighten import fit_displacement, straightened
@@ -137,6 +138,20 @@ def test_what_most_matches_agree_on_counts_where_the_pose_was_wrong(monkeypatch)
     narrower = np.mean([error(seed) for seed in range(8)])
     monkeypatch.setattr("geodiff_plugin.pose.settle._NARROWER_BY", ())
     assert narrower < 0.9 * np.mean([error(seed) for seed in range(8)])
+
+
+def test_scale_of_a_refined_pose_is_weighed_between_baseline_and_scene() -> None:
+    """By hand: equal spreads of 0.1 meet half-way; a misfit of 0.1 sqrt(3) quarters what the scene counts."""
+    refined = np.array([0.1, 0.2, 0.4, -1.0, 0.3])
+    given = np.array([0.08, 0.16, 0.32, 0.1, -0.2])
+    assert refined_scale(refined, refined, 0.0) == pytest.approx((1.0, 0.1 / 2**0.5))
+    factor, spread = refined_scale(refined, given, 0.0)
+    assert factor == pytest.approx(1.25**0.5)
+    assert spread == pytest.approx((0.005 + np.log(1.25) ** 2 / 4) ** 0.5)
+    assert refined_scale(refined, given, 0.1 * 3**0.5)[0] == pytest.approx(1.25**0.2)
+    assert refined_scale(refined, given, 0.0, length_spread=1e6)[0] == pytest.approx(1.25)
+    assert refined_scale(refined, given, 0.0, length_spread=0.0)[0] == 1.0
+    assert np.isnan(refined_scale(np.array([-1.0]), np.array([1.0]), 0.0)).all()
 
 
 def test_matches_that_leave_the_pose_open_are_told() -> None:
@@ -363,6 +378,25 @@ def test_images_bring_a_perturbed_pose_back(pair) -> None:
     assert angle_deg(report.E[0][:3, :3].T @ E[:3, :3]) < 0.2
     assert np.allclose(np.linalg.inv(found.rights[0][2].numpy()), report.E[0], atol=1e-5)
     assert np.allclose(report.E_given[0], wrong, atol=1e-6)
+
+
+def test_a_tracker_keeps_the_scene_and_a_measured_baseline_its_length(pair) -> None:
+    """The camera has turned about a point of the scene: its depth is right, the baseline is not."""
+    E = pair.E.numpy().astype(float)
+    about = np.eye(4)
+    about[2, 3] = float(pair.left.depth_m.median())
+    wrong = about @ pose((1.0, 1.2, 0.4), (0, 0, 0)) @ np.linalg.inv(about) @ E
+    length, given_length = (np.linalg.norm(P[:3, 3]) for P in (E, wrong))
+    assert abs(np.log(given_length / length)) > 0.1, "else nothing is tested"
+    kept = pose_views(*posed(pair, wrong), measured=True).report
+    assert kept.status == "refined" and kept.scale_spread is None
+    assert np.linalg.norm(kept.E[0][:3, 3]) == pytest.approx(given_length, rel=0.02)
+    report = pose_views(*posed(pair, wrong)).report
+    moved = np.log(np.linalg.norm(report.E[0][:3, 3]) / given_length)
+    assert 0.2 < moved / np.log(length / given_length) < 0.8
+    assert 0.05 < report.scale_spread < 0.3
+    uncertain = [s for s in report.warnings if "scale of the refined pose is uncertain" in s]
+    assert bool(uncertain) == (report.scale_spread > 0.1)
 
 
 def test_lengths_without_a_unit_are_not_taken_for_millimetres(pair) -> None:

@@ -138,6 +138,7 @@ def guided_method(name: str, title: str, summary: str, preset: Preset) -> Method
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
         guidance, pipe = preset(*posed_views(sample, settings.views)), priors.get(settings)
         guidance.evidence_store = priors.evidence
+        guidance.measured_baseline = guidance.measured_baseline or sample.measured_baseline
         if needs_network(guidance) and find_adapter(pipe)(pipe).network_input is None:
             raise NotApplicable("no gradient to z_t, which this prior's network does not see")
         return guided_prediction(pipe, sample, guidance, call_arguments(settings))

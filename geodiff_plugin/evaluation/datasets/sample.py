@@ -72,6 +72,11 @@ class StereoSample:
         return f"{self.dataset}/{self.name}"
 
     @property
+    def measured_baseline(self) -> bool:
+        """Whether the length of the baseline is said to be true: a pose given wrongly on purpose keeps it."""
+        return self.E_true is not None
+
+    @property
     def E_scored(self) -> np.ndarray:
         """``(4, 4)`` the pose that truth and scores go by, whatever the methods are given."""
         return self.E if self.E_true is None else self.E_true
