@@ -24,8 +24,8 @@ def make_evidence(given: EvidenceInputs) -> Evidence:
     if not given.views:
         return prepare_evidence(given)
     left_01, views = cleaned_views(given.left_01, given.views, given.config)
-    posed = pose_views(left_01, views, given.K_left, given.config, given.unit, given.measured)
-    return prepare_evidence(replace(given, left_01=left_01, views=posed.rights), posed.report)
+    views, report = pose_views(left_01, views, given.K_left, given.config, given.unit, given.measured)
+    return prepare_evidence(replace(given, left_01=left_01, views=views), report)
 
 
 def _settings(given: EvidenceInputs) -> tuple[Any, ...]:

@@ -23,12 +23,11 @@ from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
 from geodiff_plugin.guidance.inputs import as_points
 from geodiff_plugin.guidance.posing import cleaned, coarse_depth
 from geodiff_plugin.pose.estimate import EstimatedPose, estimate_pose
-from geodiff_plugin.pose.matchers import Matcher, find_matcher
+from geodiff_plugin.pose.matches import GreyViews, Matcher, find_matcher, grey_views
 from geodiff_plugin.pose.refine import polished
 from geodiff_plugin.pose.scale import Scale, find_scale
-from geodiff_plugin.pose.spread import depth_spread, open_pose
+from geodiff_plugin.pose.solve import depth_spread, open_pose
 from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
-from geodiff_plugin.pose.views import GreyViews, grey_views
 from geodiff_plugin.types import CameraView
 
 __all__ = ["EstimatedRig", "estimate_rig"]
@@ -165,7 +164,7 @@ def estimate_rig(
         baseline_m: distance of the first right camera from the left one.
         known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left photograph and their distance.
         points: ``(N, 3)`` metres in the left camera's frame, or a sparse depth map ``(H, W)`` of it.
-        matcher: of distinct points, see ``pose.matchers.find_matcher``.
+        matcher: of distinct points, see ``pose.matches.find_matcher``.
         cropped: the photographs are crops, so the principal point of a given K may lie outside of them.
 
     Raises:

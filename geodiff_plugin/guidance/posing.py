@@ -16,8 +16,8 @@ from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.matching import clean
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
-from geodiff_plugin.pose.refine import RefinedViews, refine_views, untouched
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.pose.refine import refine_views, untouched
+from geodiff_plugin.types import CameraView, PoseReport
 
 __all__ = ["cleaned", "cleaned_views", "coarse_depth", "pose_views"]
 
@@ -53,8 +53,8 @@ def pose_views(
     config: GuidanceConfig = DEFAULT,
     unit: str | None = "m",
     measured: bool = False,
-) -> RefinedViews:
-    """The right views with the poses of the knob ``pose``.
+) -> tuple[tuple[CameraView, ...], PoseReport]:
+    """The right views with the poses of the knob ``pose``, and the report on them.
 
     Args:
         left_01: ``(3, H, W)`` float32 in [0, 1], native size.

@@ -1,9 +1,4 @@
-"""The pose of a second photograph from matches alone, up to the length of its baseline.
-
-Data flow: tracks + K's -> rotation and direction of the baseline, or a sentence on why there is none to be
-had.
-Paper: none. Robust five-point estimation by PoseLib (Larsson).
-"""
+"""Rotation and direction of the baseline of two photographs, by PoseLib (Larsson), or why there is none."""
 
 from __future__ import annotations
 
@@ -30,7 +25,7 @@ NO_PARALLAX_DEG, LITTLE_PARALLAX_DEG = 0.3, 0.6
 RECTIFIED_PX = 0.45
 #: A simpler motion that explains this share of the inliers is the motion.
 SIMPLER = 0.9
-#: Matches this far from their lines are no noise of the pose found; a second motion that explains this share
+#: Matches this far from their lines are no noise of the pose; a second motion that explains this share
 #: of all matches, and of those, is one of the scene. Above the last, as a share of the first motion's
 #: matches, nobody can tell which of the two the camera made.
 APART_PX, SECOND_SHARE, SECOND_OF_REST, RIVAL = 6.0, 0.1, 0.5, 0.45
@@ -88,8 +83,8 @@ def parallax_deg(tracks: Tracks, R: np.ndarray) -> np.ndarray:
         tracks: of one right view.
         R: ``(3, 3)`` of ``T_right_from_left``.
     """
-    one, other = tracks.rays @ R.T, _right_rays(tracks)
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), (one * other).sum(1)))
+    left, right = tracks.rays @ R.T, _right_rays(tracks)
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(left, right), axis=1), (left * right).sum(1)))
 
 
 def estimate_pose(
@@ -142,7 +137,7 @@ def estimate_pose(
 
 def _five_points(tracks: Tracks) -> np.ndarray:
     """``T_right_from_left`` that explains the most tracks, its baseline of length 1."""
-    found, _ = _poselib().estimate_relative_pose(
+    pose, _ = _poselib().estimate_relative_pose(
         _unskewed(tracks.left_px, tracks.K_left),
         _unskewed(tracks.right_px[0], tracks.K_rights[0]),
         _camera(tracks.K_left),
@@ -151,7 +146,7 @@ def _five_points(tracks: Tracks) -> np.ndarray:
         {},
     )
     T = np.eye(4)
-    T[:3] = found.Rt
+    T[:3] = pose.Rt
     T[:3, 3] /= max(float(np.linalg.norm(T[:3, 3])), 1e-12)
     return T
 
@@ -185,12 +180,12 @@ def _of_second_motion(tracks: Tracks, T: np.ndarray, inliers: np.ndarray, name: 
 
 def _rectified(tracks: Tracks, near: np.ndarray) -> np.ndarray | None:
     """The pose of a rectified pair, where that explains the inliers of a free one as well."""
-    own = tracks.kept(near)
+    inliers = tracks.kept(near)
     for way in (-1.0, 1.0):
         T = np.eye(4)
         T[0, 3] = way
-        if len(own) >= FEWEST_INLIERS and np.median(residuals_px(own, T[None])) < RECTIFIED_PX:
-            if (solve_inverse_depth(own, T[None]) > 0).mean() > SIMPLER:
+        if len(inliers) >= FEWEST_INLIERS and np.median(residuals_px(inliers, T[None])) < RECTIFIED_PX:
+            if (solve_inverse_depth(inliers, T[None]) > 0).mean() > SIMPLER:
                 return T
     return None
 
@@ -219,13 +214,13 @@ def _check_parallax(tracks: Tracks, near: np.ndarray, parallax: float, name: str
 
 def _rotation_residuals(tracks: Tracks) -> np.ndarray:
     """Distance ``(N,)`` px from where a rotation alone, fitted robustly, puts the tracks."""
-    one, other = (
+    left, right = (
         rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (tracks.rays, _right_rays(tracks))
     )
-    weights, off = np.ones(len(one)), np.zeros(len(one))
+    weights, off = np.ones(len(left)), np.zeros(len(left))
     for _ in range(10):
-        R = Rotation.align_vectors(other, one, weights=weights)[0].as_matrix()
-        p = one @ (tracks.K_rights[0] @ R).T
+        R = Rotation.align_vectors(right, left, weights=weights)[0].as_matrix()
+        p = left @ (tracks.K_rights[0] @ R).T
         off = np.linalg.norm(p[:, :2] / np.maximum(p[:, 2:], 1e-6) - tracks.right_px[0], axis=1)
         weights = 1.0 / (1.0 + (off / INLIER_PX) ** 2)
     return off
@@ -233,6 +228,6 @@ def _rotation_residuals(tracks: Tracks) -> np.ndarray:
 
 def _homography_share(tracks: Tracks, near: np.ndarray) -> float:
     """Share of the inliers that one homography explains."""
-    one, other = (px[near].astype(np.float32) for px in (tracks.left_px, tracks.right_px[0]))
-    _, mask = cv2.findHomography(one, other, cv2.RANSAC, INLIER_PX)
+    left, right = (px[near].astype(np.float32) for px in (tracks.left_px, tracks.right_px[0]))
+    _, mask = cv2.findHomography(left, right, cv2.RANSAC, INLIER_PX)
     return 0.0 if mask is None else float(mask.mean())

@@ -1,15 +1,13 @@
-"""The usual mistakes of a given pose, recognised by which of them would make it fit.
+"""Names the usual mistakes of a given pose or K by which of them would make it fit; nothing is repaired.
 
-Data flow: matches + cameras as given -> the name of a mistake, or nothing.
-Paper: none. A mistake is named, never repaired: what the user meant only the user knows.
-
-What epipolar lines do not show is not told here: the unit of a translation, and for a rectified pair K.
+What only the user knows is what was meant. Epipolar lines do not show the unit of a translation, nor K of a
+rectified pair.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -70,17 +68,8 @@ _ALIKE = 0.95
 SUSPECT_BASELINE_M = 5.0
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """How well a pose explains the matches.
-
-    Attributes:
-        shares: of the matches that speak for it, [0, 1], coarsely and finely (``_NEAR_PX``).
-        median_px: distance of the matches from their epipolar lines.
-    """
-
-    shares: tuple[float, ...]
-    median_px: float
+_Fit = tuple[tuple[float, ...], float]
+"""Shares of the matches that speak for a pose, coarsely and finely, and their median residual, pixels."""
 
 
 def _fit(tracks: Tracks, T: np.ndarray) -> _Fit:
@@ -88,19 +77,15 @@ def _fit(tracks: Tracks, T: np.ndarray) -> _Fit:
     ahead = (inverse_depth > 0) & ((tracks.rays @ T[2, :3] + inverse_depth * T[2, 3]) > 0)
     off_px = residuals_px(tracks, T[None])[0]
     shares = tuple(float((ahead & (off_px < near_px)).mean()) for near_px in _NEAR_PX)
-    return _Fit(shares, float(np.median(off_px)))
+    return shares, float(np.median(off_px))
 
 
-def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
+def _scaled(K: np.ndarray, factor: float, centred: bool) -> np.ndarray:
+    """``K`` of an image of another size, its principal point scaled with it or not."""
     K = K.copy()
     K[..., :2, :2] *= factor
-    K[..., :2, 2] = (K[..., :2, 2] + 0.5) * factor - 0.5
-    return K
-
-
-def _refocused(K: np.ndarray, factor: float) -> np.ndarray:
-    K = K.copy()
-    K[..., :2, :2] *= factor
+    if not centred:
+        K[..., :2, 2] = (K[..., :2, 2] + 0.5) * factor - 0.5
     return K
 
 
@@ -117,10 +102,9 @@ def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np
     if not np.allclose(tracks.K_left, tracks.K_rights[0], rtol=0.02):
         yield _K_SWAPPED, replace(tracks, K_left=tracks.K_rights[0], K_rights=tracks.K_left[None]), T
     for factor, size in _FACTORS.items():
-        for sentence, change in ((_K_SCALED, _scaled), (_FOCAL_SCALED, _refocused)):
-            other = replace(
-                tracks, K_left=change(tracks.K_left, factor), K_rights=change(tracks.K_rights, factor)
-            )
+        for sentence, centred in ((_K_SCALED, False), (_FOCAL_SCALED, True)):
+            K_left, K_rights = (_scaled(K, factor, centred) for K in (tracks.K_left, tracks.K_rights))
+            other = replace(tracks, K_left=K_left, K_rights=K_rights)
             yield sentence.format(factor=factor, size=size), other, T
 
 
@@ -140,36 +124,20 @@ def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.degrees(np.arccos(np.clip(cosines, -1, 1))), shifts
 
 
-@dataclass(frozen=True)
-class _Found:
-    """One candidate.
+def _likeliest(tracks: Tracks, T: np.ndarray) -> tuple[str, _Fit, bool]:
+    """The mistake with the largest share of matches; of several alike the one that also fits more finely.
 
-    Attributes:
-        sentence: names it.
-        fit: of its pose and K.
-        far: whether the given pose is too far from it to be an inexact one.
+    With its fit, and whether the given pose is too far from it to be an inexact one.
     """
-
-    sentence: str
-    fit: _Fit
-    far: bool
-
-
-def _found(tracks: Tracks, T: np.ndarray) -> list[_Found]:
-    found = []
-    for sentence, own, pose in _candidates(tracks, T):
+    candidates = []
+    for sentence, changed, pose in _candidates(tracks, T):
         (turned_deg,), (shift,) = pose_change(T[None], pose[None])
-        far = own is not tracks or turned_deg >= _FAR_DEG or shift >= _FAR_SHIFT
-        found.append(_Found(sentence, _fit(own, pose), bool(far)))
-    return found
-
-
-def _likeliest(found: list[_Found]) -> _Found:
-    """The candidate with the largest share; of several alike the one that also fits more finely."""
+        far = changed is not tracks or turned_deg >= _FAR_DEG or shift >= _FAR_SHIFT
+        candidates.append((sentence, _fit(changed, pose), bool(far)))
     for level in range(len(_NEAR_PX)):
-        largest = max(one.fit.shares[level] for one in found)
-        found = [one for one in found if one.fit.shares[level] >= _ALIKE * largest]
-    return min(found, key=lambda one: one.fit.median_px)
+        largest = max(fit[0][level] for _, fit, _ in candidates)
+        candidates = [each for each in candidates if each[1][0][level] >= _ALIKE * largest]
+    return min(candidates, key=lambda each: each[1][1])
 
 
 def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
@@ -180,17 +148,16 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
         T: ``(4, 4)``, ``T_right_from_left`` as given.
         near: ``(4, 4)``, the pose near it that fits best: where only that fits, the pose is inexact.
     """
-    given, nearby = _fit(tracks, T), _fit(tracks, near)
-    likeliest = _likeliest(_found(tracks, T))
-    fit = likeliest.fit
-    if any(own <= _NEARLY * other for own, other in zip(fit.shares, nearby.shares, strict=True)):
+    given, nearby = _fit(tracks, T)[0], _fit(tracks, near)
+    sentence, (shares, median_px), far = _likeliest(tracks, T)
+    if any(share <= _NEARLY * other for share, other in zip(shares, nearby[0], strict=True)):
         return None
     coarsely, finely = (
-        own > max(_AT_LEAST, _CLEARLY * other) for own, other in zip(fit.shares, given.shares, strict=True)
+        share > max(_AT_LEAST, _CLEARLY * other) for share, other in zip(shares, given, strict=True)
     )
-    exactly = fit.median_px <= _AS_EXACT * nearby.median_px
-    clear = (exactly or likeliest.far) if coarsely else (finely and exactly and likeliest.far)
-    return likeliest.sentence if clear else None
+    exactly = median_px <= _AS_EXACT * nearby[1]
+    clear = (exactly or far) if coarsely else (finely and exactly and far)
+    return sentence if clear else None
 
 
 def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:

@@ -1,48 +1,71 @@
-"""Poses as given -> poses that fit the images, or the same ones bit for bit where they fit already.
+"""Checks given poses against the images, and refines them where they do not fit.
 
-Data flow: images, K's, T's -> matches -> residual; where it is large, refined poses and straightened images.
-Paper: none; it takes exact poses for granted (S3.3).
+A pose that fits already is used bit for bit. What no pose explains (rolling shutter, lens distortion, errors
+of K) is taken out of the right image afterwards, by a smooth displacement across the epipolar lines.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from geodiff_plugin.pose.matches import FirstDepth, dense_tracks, grey_views, sparse_tracks
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit, pose_change
 from geodiff_plugin.pose.scale import MOST_SCALE_SPREAD, refined_scale
-from geodiff_plugin.pose.settle import (
-    FEWEST,
+from geodiff_plugin.pose.solve import (
     FREE_PX,
     SCALE_PX,
+    Prior,
     is_rig,
-    median_residuals,
     nearby_poses,
     settle_poses,
-    undecided,
+    solve_poses,
 )
-from geodiff_plugin.pose.solve import Prior, solve_poses
-from geodiff_plugin.pose.straighten import Displacement, fit_displacement, straightened
-from geodiff_plugin.pose.tracks import Tracks, merge_tracks, project_tracks, solve_inverse_depth
-from geodiff_plugin.pose.views import FirstDepth, dense_tracks, grey_views, sparse_tracks
+from geodiff_plugin.pose.tracks import (
+    FEWEST,
+    Tracks,
+    across_lines,
+    median_residuals,
+    merge_tracks,
+    project_tracks,
+    solve_inverse_depth,
+)
 from geodiff_plugin.types import CameraView, PoseReport
 
-__all__ = ["FITS_PX", "POSED_FITS_PX", "WARNS_PX", "RefinedViews", "polished", "refine_views", "untouched"]
+__all__ = [
+    "FITS_PX",
+    "POSED_FITS_PX",
+    "WARNS_PX",
+    "Displacement",
+    "fit_displacement",
+    "polished",
+    "refine_views",
+    "straightened",
+    "undecided",
+    "untouched",
+]
 
 #: A pose whose matches lie nearer than this to their epipolar lines, in the median, is left as it is: that of
 #: a rectified rig, whose lenses leave as much, and any other, of which a shift may hide most of a wrong turn.
 FITS_PX, POSED_FITS_PX = 0.45, 0.3
 #: Above this, as given, the user is told.
 WARNS_PX = 1.0
-# Robust scales of an estimated pose after the first, pixels. Nothing but the matches holds it, and what most
-# of them agree on to a tenth of a pixel is nearer the truth than what all of them are least far from.
-_NARROWER_PX = (0.3, 0.15, 0.08)
 # A refinement must gain this share of the residual, and may turn and shift a camera so far.
 _LEAST_GAIN, _MOST_TURN_DEG, _MOST_SHIFT = 0.1, 8.0, 0.8
+# Robust scales of an estimated pose after the first, pixels. Nothing but the matches holds it, and what most
+# of them agree on is nearer the truth than what all of them are least far from.
+_NARROWER_PX = (0.3, 0.15, 0.08)
+# The user is warned if the pose that fits best changes log depth by more than this, in the median.
+_MOST_SPREAD = 0.13
+# Straightening: residual from which on a match counts for less, pixels; pull of the 20 coefficients towards
+# 0, in matches; fewest matches; side of the blocks that are left out in turn, in shares of the image's width;
+# by which share left-out matches must come nearer to their lines.
+_BENT_PX, _RIDGE, _FEWEST_BENT, _BLOCK, _LEAST_BENT_GAIN = 0.5, 3.0, 80, 1.0 / 6.0, 0.05
 
 _CAUSES = (
     "Likely causes: poses of a tracker, of SLAM or of a rig that has drifted; things that moved between the "
@@ -50,24 +73,14 @@ _CAUSES = (
     "another order of the views, or world-to-camera poses for camera-to-world ones."
 )
 
-
-@dataclass(frozen=True, eq=False)
-class RefinedViews:
-    """What everything downstream works with.
-
-    Attributes:
-        rights: the right views as they were given, or with refined poses and straightened images.
-        report: what was found.
-    """
-
-    rights: tuple[CameraView, ...]
-    report: PoseReport
+_Refined = tuple[tuple[CameraView, ...], PoseReport]
+"""The right views that everything downstream works with, and the report."""
 
 
-def untouched(rights: Sequence[CameraView], status: str = "given") -> RefinedViews:
+def untouched(rights: Sequence[CameraView], status: str = "given") -> _Refined:
     """The views as they were given, and a report that says why."""
     poses = _as_E(_poses(rights))
-    return RefinedViews(tuple(rights), PoseReport(status, poses, poses))
+    return tuple(rights), PoseReport(status, poses, poses)
 
 
 def refine_views(
@@ -77,7 +90,7 @@ def refine_views(
     first_depth: FirstDepth,
     unit: str | None = "m",
     measured: bool = False,
-) -> RefinedViews:
+) -> _Refined:
     """Check the poses against the images, and refine them together where they do not fit.
 
     Args:
@@ -90,8 +103,8 @@ def refine_views(
             a rectified rig do; otherwise they are weighed against the scene's depth under the given poses.
 
     Returns:
-        ``RefinedViews``; its ``rights`` are the very ones that were given where the poses fit, where there
-        are too few matches, where a mistake explains the misfit, or where no better pose is near.
+        The right views and the report. The views are the very ones that were given where the poses fit, where
+        there are too few matches, where a mistake explains the misfit, or where no better pose is near.
     """
     views, given = grey_views(left_01, rights, K_left), _poses(rights)
     sparse = sparse_tracks(views)
@@ -99,35 +112,34 @@ def refine_views(
     if counts.max(initial=0) < FEWEST:
         return untouched(rights, "not checked")
     before, poses = median_residuals(sparse, given), _as_E(given)
-    found = PoseReport("fits", poses, poses, _numbers(before), _numbers(before), _numbers(counts))
+    report = PoseReport("fits", poses, poses, _numbers(before), _numbers(before), _numbers(counts))
     rig = is_rig(sparse, given)
     fits_px = FITS_PX if rig else POSED_FITS_PX
     misfit = bool((before > fits_px).any())
     near = nearby_poses(sparse, given, before) if misfit else given
-    units = _units(sparse, given) if unit == "m" else ()
-    mistakes = _mistakes(sparse, given, near)
-    if mistakes:
-        return RefinedViews(tuple(rights), found.changed(status="mistaken", warnings=mistakes))
+    units = _sentences(sparse, implausible_unit, given) if unit == "m" else ()
+    if mistakes := _sentences(sparse, find_mistake, given, near):
+        return tuple(rights), report.changed(status="mistaken", warnings=mistakes)
     if not misfit:
-        return RefinedViews(tuple(rights), found.changed(warnings=units))
+        return tuple(rights), report.changed(warnings=units)
     depth_m = _on_grid(first_depth(_applied(rights, near)), views.left.shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     before = median_residuals(tracks, given)
     Ts, free = settle_poses(tracks, given, near, before, rig)
     after = median_residuals(tracks, Ts)
-    found = found.changed(
+    report = report.changed(
         residual_px_given=_numbers(before),
         residual_px=_numbers(before),
         matches=_numbers(tracks.seen.sum(1)),
     )
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
         warnings = _unimproved(before) + undecided(tracks, Ts, free) + units
-        return RefinedViews(tuple(rights), found.changed(status="kept", warnings=warnings))
+        return tuple(rights), report.changed(status="kept", warnings=warnings)
     turned_deg, shifts = pose_change(given, Ts)
     far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
     if far.any():
         warnings = _too_far(before, after, far, turned_deg, shifts) + units
-        return RefinedViews(tuple(rights), found.changed(status="kept", warnings=warnings))
+        return tuple(rights), report.changed(status="kept", warnings=warnings)
     doubts, spread = undecided(tracks, Ts, free), None
     if not (rig or measured):
         Ts, spread, uncertain = _rescaled(tracks, given, Ts, before)
@@ -136,7 +148,7 @@ def refine_views(
         None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views.rights[v].shape)
         for v, T in enumerate(Ts)
     ]
-    found = found.changed(
+    report = report.changed(
         status="refined",
         warnings=_improved(before, after) + doubts + units,
         scale_spread=spread,
@@ -144,7 +156,7 @@ def refine_views(
         residual_px=_numbers(_straight_medians(tracks, Ts, bends)),
         straightened_px=tuple(0.0 if bend is None else bend.rms_px for bend in bends),
     )
-    return RefinedViews(_applied(rights, Ts, bends), found)
+    return _applied(rights, Ts, bends), report
 
 
 def polished(
@@ -182,7 +194,7 @@ def polished(
 def _rescaled(
     tracks: Tracks, given: np.ndarray, Ts: np.ndarray, before: np.ndarray
 ) -> tuple[np.ndarray, float, tuple[str, ...]]:
-    """Refined poses of a tracker at the scale that baselines and scene agree on, its spread, and a warning."""
+    """Refined poses of a tracker, scaled by both baselines and scene; the spread of the scale; a warning."""
     refined, shifts = solve_inverse_depth(tracks, Ts), []
     for v, (K, T) in enumerate(zip(tracks.K_rights, Ts, strict=True)):
         rays, w = tracks.rays[tracks.seen[v]], refined[tracks.seen[v]]
@@ -196,30 +208,107 @@ def _rescaled(
     Ts[:, :3, 3] *= factor
     if spread <= MOST_SCALE_SPREAD:
         return Ts, spread, ()
-    return (
-        Ts,
-        spread,
-        (
-            f"The scale of the refined pose is uncertain by {100 * spread:.0f} % (one standard deviation): "
-            "the given baseline and the depth of the scene under the given pose disagree. If the distance "
-            "between the cameras is measured, say so (measured_baseline=True, --baseline); otherwise give "
-            "known points, or views from further apart.",
-        ),
+    warning = (
+        f"The scale of the refined pose is uncertain by {100 * spread:.0f} % (one standard deviation): "
+        "the given baseline and the depth of the scene under the given pose disagree. If the distance "
+        "between the cameras is measured, say so (measured_baseline=True, --baseline); otherwise give "
+        "known points, or views from further apart."
     )
+    return Ts, spread, (warning,)
 
 
-def _mistakes(tracks: Tracks, given: np.ndarray, near: np.ndarray) -> tuple[str, ...]:
-    """Sentences on the mistakes that explain the poses as given."""
-    views = [(tracks.view(v), *poses) for v, poses in enumerate(zip(given, near, strict=True))]
-    found = [find_mistake(own, T, T_near) for own, T, T_near in views if len(own) >= FEWEST]
-    return tuple(dict.fromkeys(sentence for sentence in found if sentence))
+@dataclass(frozen=True, eq=False)
+class Displacement:
+    """A cubic displacement of a right image.
+
+    Attributes:
+        coefficients: ``(10, 2)`` pixels of the image of ``size``.
+        size: ``(H, W)`` that it was fitted at.
+        most_px: no pixel moves further.
+        rms_px: of the displacement at the matches.
+    """
+
+    coefficients: np.ndarray
+    size: tuple[int, int]
+    most_px: float
+    rms_px: float
+
+    def at(self, px: np.ndarray) -> np.ndarray:
+        """``(N, 2)`` pixels that are to be added to ``(N, 2)`` pixels."""
+        moved = _cubic(px, self.size) @ self.coefficients
+        length = np.linalg.norm(moved, axis=1, keepdims=True)
+        return moved * np.minimum(1.0, self.most_px / np.maximum(length, 1e-9))
 
 
-def _units(tracks: Tracks, given: np.ndarray) -> tuple[str, ...]:
-    """Questions about the unit of the translations, which no residual answers."""
-    views = [(tracks.view(v), T) for v, T in enumerate(given)]
-    found = [implausible_unit(own, T) for own, T in views if len(own) >= FEWEST]
-    return tuple(dict.fromkeys(sentence for sentence in found if sentence))
+def _cubic(px: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """``(N, 10)``: all products of x and y up to the third degree, over [-1, 1] of the longer side."""
+    half = max(size) / 2.0
+    x, y = (px[:, 0] - (size[1] - 1) / 2) / half, (px[:, 1] - (size[0] - 1) / 2) / half
+    return np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)
+
+
+def _fit_cubic(basis: np.ndarray, normals: np.ndarray, off: np.ndarray) -> np.ndarray:
+    rows = (basis[:, :, None] * normals[:, None]).reshape(len(basis), -1)
+    solution = np.zeros(rows.shape[1])
+    for _ in range(15):
+        weights = 1.0 / (1.0 + ((rows @ solution - off) / _BENT_PX) ** 2)
+        weighted = rows * weights[:, None]
+        solution = np.linalg.solve(weighted.T @ rows + _RIDGE * np.eye(rows.shape[1]), weighted.T @ off)
+    return solution.reshape(10, 2)
+
+
+def fit_displacement(tracks: Tracks, T: np.ndarray, size: tuple[int, int]) -> Displacement | None:
+    """The displacement that brings matches to their epipolar lines, if left-out matches agree.
+
+    Only for a refined pose: a residual that depends on depth is a pose's, and bending the image for it ruins
+    it.
+
+    Args:
+        tracks: of one right view.
+        T: ``(4, 4)``, ``T_right_from_left``, refined.
+        size: ``(H, W)`` of the right image.
+
+    Returns:
+        ``None`` where there are few matches or nothing smooth is left.
+    """
+    if len(tracks) < _FEWEST_BENT:
+        return None
+    off, normals = across_lines(tracks, T)
+    basis = _cubic(tracks.right_px[0], size)
+    block = (tracks.left_px // (_BLOCK * max(size))).sum(1) % 2 == 0
+    told = np.empty(len(off))
+    for part in (block, ~block):
+        if part.sum() < _FEWEST_BENT // 4:
+            return None
+        fit = _fit_cubic(basis[part], normals[part], off[part])
+        told[~part] = ((basis[~part] @ fit) * normals[~part]).sum(1)
+    if np.median(np.abs(off - told)) > (1.0 - _LEAST_BENT_GAIN) * np.median(np.abs(off)):
+        return None
+    coefficients = _fit_cubic(basis, normals, off)
+    lengths = np.linalg.norm(basis @ coefficients, axis=1)
+    most_px, rms_px = float(np.quantile(lengths, 0.98)), float(np.sqrt((lengths**2).mean()))
+    return Displacement(coefficients, size, most_px, rms_px)
+
+
+def straightened(image_01: Tensor, displacement: Displacement) -> Tensor:
+    """The right image with every pixel moved as the displacement says.
+
+    Args:
+        image_01: ``(C, H, W)`` float in [0, 1], of any size.
+        displacement: fitted to the image at its own size.
+
+    Returns:
+        ``(C, H, W)``, its edge repeated where nothing is known; not differentiable.
+    """
+    height, width = image_01.shape[-2:]
+    scale = np.array([displacement.size[1] / width, displacement.size[0] / height])
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2).astype(np.float64)
+    moved = displacement.at((grid + 0.5) * scale - 0.5) / scale
+    source = (grid - moved).reshape(height, width, 2).astype(np.float32)
+    pixels = image_01.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()
+    bent = cv2.remap(pixels, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    bent = bent.reshape(height, width, -1).clip(0.0, 1.0)
+    return torch.from_numpy(np.ascontiguousarray(bent.transpose(2, 0, 1))).to(image_01)
 
 
 def _on_grid(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
@@ -257,28 +346,43 @@ def _applied(
     )
 
 
-def _given(before: np.ndarray, v: int) -> str:
-    return "The pose as given" if len(before) == 1 else f"The pose of right view {v + 1} as given"
+def _sentences(tracks: Tracks, ask: Callable[..., str | None], *poses: np.ndarray) -> tuple[str, ...]:
+    """What ``ask`` says about every view that has matches, each sentence once."""
+    views = [(tracks.view(v), own) for v, own in enumerate(zip(*poses, strict=True))]
+    said = [ask(view, *own) for view, own in views if len(view) >= FEWEST]
+    return tuple(dict.fromkeys(sentence for sentence in said if sentence))
+
+
+def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ...]:
+    """A sentence where the matches leave the pose, and with it the depth, open."""
+    used, other = (solve_inverse_depth(tracks, poses) for poses in (Ts, free))
+    ahead = (used > 0) & (other > 0)
+    spread = float(np.median(np.abs(np.log(used[ahead] / other[ahead])))) if ahead.any() else 0.0
+    if spread < _MOST_SPREAD:
+        return ()
+    return (
+        "The matches do not settle the pose: another one fits them as well, and its depths differ by "
+        f"{100 * np.expm1(spread):.0f} % in the median. Give a more exact pose, or views from further apart.",
+    )
+
+
+def _leaves(before: np.ndarray, v: int) -> str:
+    pose = "The pose as given" if len(before) == 1 else f"The pose of right view {v + 1} as given"
+    return f"{pose} leaves matches {before[v]:.1f} px off their epipolar lines in the median"
 
 
 def _improved(before: np.ndarray, after: np.ndarray) -> tuple[str, ...]:
     worst = int(np.argmax(np.nan_to_num(before)))
     if not before[worst] > WARNS_PX:
         return ()
-    return (
-        f"{_given(before, worst)} leaves matches {before[worst]:.1f} px off their epipolar lines in the "
-        f"median, a refined one {after[worst]:.1f} px. {_CAUSES}",
-    )
+    return (f"{_leaves(before, worst)}, a refined one {after[worst]:.1f} px. {_CAUSES}",)
 
 
 def _unimproved(before: np.ndarray) -> tuple[str, ...]:
     worst = int(np.argmax(np.nan_to_num(before)))
     if not before[worst] > WARNS_PX:
         return ()
-    return (
-        f"{_given(before, worst)} leaves matches {before[worst]:.1f} px off their epipolar lines in the "
-        f"median, and no pose near it leaves clearly less. {_CAUSES}",
-    )
+    return (f"{_leaves(before, worst)}, and no pose near it leaves clearly less. {_CAUSES}",)
 
 
 def _too_far(
@@ -288,7 +392,7 @@ def _too_far(
         return ()
     v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # of those too far, the worst
     return (
-        f"{_given(before, v)} leaves matches {before[v]:.1f} px off their epipolar lines in the median. "
-        f"A pose {turned_deg[v]:.0f} degrees and {100 * shifts[v]:.0f} % of the baseline away "
-        f"fits to {after[v]:.1f} px, but is too far from the given one and was not used. {_CAUSES}",
+        f"{_leaves(before, v)}. A pose {turned_deg[v]:.0f} degrees and {100 * shifts[v]:.0f} % of the "
+        f"baseline away fits to {after[v]:.1f} px, but is too far from the given one and was not used. "
+        f"{_CAUSES}",
     )

@@ -1,7 +1,6 @@
-"""Small robust least squares over the poses of right cameras, under a prior that holds the given ones.
+"""Robust least squares over the poses of right cameras, under a prior that holds the given ones.
 
-Data flow: tracks + poses as given -> poses that fit the tracks.
-Paper: none. Minimises, over 6 degrees of freedom a right view and one inverse depth a track,
+Minimises, over 6 degrees of freedom a right view and one inverse depth a track,
     trust * sum log(1 + (residual / scale)^2)
     + mean |moved|^2 / sd^2 + |turned|^2 / 1.5 deg^2 + |shifted|^2 / (.1 |t|)^2
     + (change of log |t|)^2 / .05^2.
@@ -13,13 +12,58 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin.pose.tracks import Projected, Tracks, project_tracks, solve_inverse_depth
+from geodiff_plugin.geometry import is_rectified
+from geodiff_plugin.pose.tracks import (
+    Projected,
+    Tracks,
+    blocks,
+    median_residuals,
+    project_tracks,
+    solve_inverse_depth,
+    split_residuals,
+)
 
-__all__ = ["Prior", "Whitened", "solve_poses", "whitened"]
+__all__ = [
+    "FREE_PX",
+    "MOST_SPREAD",
+    "SCALE_PX",
+    "Prior",
+    "Whitened",
+    "depth_spread",
+    "is_rig",
+    "nearby_poses",
+    "open_pose",
+    "settle_poses",
+    "solve_poses",
+    "whitened",
+]
 
+#: Robust scale of a fit whose noise is not known yet, pixels of the right view.
+SCALE_PX = 0.7
+#: A prior as wide as this leaves a pose free, but for the length of its baseline.
+FREE_PX = 1e3
+#: The user is warned if the depth that rests on an estimated pose is less certain than this.
+MOST_SPREAD = 0.06
 _STEPS = 12
+# How far a refined pose may move the points, along their lines as well: the residual that it explains, times
+# a share. The share is 1 where that residual is so many times the cameras' other faults (a rolling shutter,
+# lenses, K), which are what the residuals of neighbours have in common. It grows with the fourth power:
+# below, a free pose would hide those faults; above, the given pose was wrong.
+_FAULTS, _MOVED_SHARE = 5.6, (0.2, 40.0)
+_FLOOR_PX, _LEAST_FAULT_PX = 0.05, 0.03
+# A rectified pair has a share and a narrow prior of its own: its cameras are bolted together, turn by tenths
+# of a degree and hardly shift, and a pan that fits the rows better is more often a fault of the lenses.
+_RIG_MOVED_SHARE, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = 0.4, np.radians(0.3), 0.01
+# The robust scale after the first fit is so many times the residual that the first one leaves, but not below
+# a tenth of a pixel; and residuals count half, because blocks of the image do not show all that neighbours
+# have in common.
+_SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 2.0, 0.1, 0.5
+# Where the given pose was wrong, little but the matches holds the new one. What most
+# of them agree on is nearer the truth than what all of them are least far from: narrower fits follow.
+_NARROWER_BY = (1.0, 0.5)
 
 _Terms = tuple[float, np.ndarray, np.ndarray]
 """Cost, gradient ``(6V,)`` and normal matrix ``(6V, 6V)``."""
@@ -29,8 +73,8 @@ _Terms = tuple[float, np.ndarray, np.ndarray]
 class Prior:
     """How far the poses as given are believed.
 
-    What two views cannot tell, above all the length of the baseline and a turn that a shift makes up for,
-    stays where it was given: such a move costs here and gains nothing in the residuals.
+    What two views cannot determine, above all the length of the baseline and a turn that a shift compensates,
+    stays as given: such a move costs here and gains nothing in the residuals.
 
     Attributes:
         moved_px: ``(V,)``, standard deviation of where the tracks' points project to.
@@ -160,10 +204,10 @@ def _prior_terms(tracks: Tracks, Ts: np.ndarray, given: np.ndarray, w: np.ndarra
         pulls = slope * np.r_[turn, change[:3, 3]]
         longer = np.log(length / baseline) / prior.longer_share
         by_step = np.r_[np.zeros(3), T[:3, 3] / (length**2 * prior.longer_share)]
-        own = slice(6 * v, 6 * v + 6)
+        block = slice(6 * v, 6 * v + 6)
         cost += moved @ moved + pulls @ pulls + longer**2
-        gradient[own] += J.T @ moved + slope * pulls + by_step * longer
-        normal[own, own] += J.T @ J + np.diag(slope**2) + np.outer(by_step, by_step)
+        gradient[block] += J.T @ moved + slope * pulls + by_step * longer
+        normal[block, block] += J.T @ J + np.diag(slope**2) + np.outer(by_step, by_step)
     return cost, gradient, normal
 
 
@@ -184,7 +228,7 @@ def solve_poses(
         prior: how far they are believed.
         start: where to begin; ``None`` for ``given``.
         scale_px: residual from which on an observation counts for less, pixels of the right view.
-        trust: what the residuals count against the prior, (0, 1]; see ``noise.ResidualParts``.
+        trust: what the residuals count against the prior, (0, 1]; see ``tracks.split_residuals``.
 
     Returns:
         ``(V, 4, 4)``.
@@ -209,3 +253,99 @@ def solve_poses(
         if settled:
             break
     return Ts
+
+
+def is_rig(tracks: Tracks, given: np.ndarray) -> bool:
+    """Whether all poses as given ``(V, 4, 4)`` are those of a rectified rig."""
+    cameras = (torch.as_tensor(m, device="cpu") for m in (tracks.K_left, tracks.K_rights, given))
+    return bool(is_rectified(*cameras).all())
+
+
+def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Poses that fit the sparse matches, sought from far away first: then no match is an outlier yet."""
+    before = np.nan_to_num(before, nan=1.0)
+    prior, Ts = Prior(1.5 * before + _FLOOR_PX), given
+    for scale in (max(float(before.max()), 1.0), 1.0):
+        Ts = solve_poses(sparse, given, prior, start=Ts, scale_px=scale)
+    return Ts
+
+
+def settle_poses(
+    tracks: Tracks, given: np.ndarray, near: np.ndarray, before: np.ndarray, rig: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses that fit all matches, held as firmly as the given ones turn out to deserve.
+
+    Args:
+        tracks: all matches of V right views.
+        given: ``(V, 4, 4)``, ``T_right_from_left`` as given.
+        near: likewise, poses that fit roughly.
+        before: ``(V,)`` pixels, ``median_residuals`` of the poses as given.
+        rig: whether these are those of a rectified rig, see ``is_rig``.
+
+    Returns:
+        ``(V, 4, 4)``: free where they explain nearly all of the residual, near the given ones where the
+        cameras have faults that no pose explains, and where they are those of a rectified rig. And
+        ``(V, 4, 4)``: those that fit best, but for the lengths of the baselines.
+    """
+    free = Prior(np.full(len(given), FREE_PX), longer_share=0.02)
+    fitted = solve_poses(tracks, given, free, start=near, scale_px=SCALE_PX)
+    left = np.maximum(median_residuals(tracks, fitted), _FLOOR_PX)
+    explained = np.sqrt(np.clip(before**2 - left**2, 0.0, None))
+    views = [tracks.view(v) for v in range(len(given))]
+    parts = [split_residuals(view, T) if len(view) else None for view, T in zip(views, fitted, strict=True)]
+    faults = np.array([np.nan if part is None else part[1] for part in parts])
+    times = explained / (_FAULTS * np.maximum(faults, _LEAST_FAULT_PX))
+    share = np.full_like(times, _RIG_MOVED_SHARE) if rig else np.clip(times**4, *_MOVED_SHARE)
+    moved = np.maximum(np.nan_to_num(share * explained), _FLOOR_PX)
+    counting = float(np.mean([part[0] for part in parts if part is not None]))
+    held = Prior(moved, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE) if rig else Prior(moved)
+    wrong = not rig and bool((times > 1.0).any())
+    settled = fitted
+    for by in (_SCALE_BY, *(_NARROWER_BY if wrong else ())):
+        scale_px = max(by * float(np.nanmean(left)), _LEAST_SCALE_PX)
+        trust = _COUNTS * counting
+        settled = solve_poses(tracks, given, held, start=settled, scale_px=scale_px, trust=trust)
+    return settled, fitted
+
+
+def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
+    """The relative standard deviation of the depth of a track, in the median, caused by errors of free poses.
+
+    The covariance of the poses is the sandwich of robust statistics (Huber 1967; White 1982), with blocks of
+    the image as what is independent: residuals of neighbours are alike.
+
+    Args:
+        tracks: of V right views, those that the poses explain and some that they do not.
+        Ts: ``(V, 4, 4)``, ``T_right_from_left``, that fit them best; the unit of length is taken as known.
+
+    Returns:
+        0.05 for 5 %; ``inf`` where no track lies in front of the cameras.
+    """
+    at = whitened(tracks, Ts, SCALE_PX)
+    ahead = at.inverse_depth > 0
+    if not ahead.any():
+        return float("inf")
+    # Steps with translations in baselines, and without the one along all translations at once, which
+    # changes nothing but the unit.
+    unit = np.tile(np.repeat([1.0, np.linalg.norm(Ts[0, :3, 3])], 3), len(Ts))
+    longer = np.concatenate([np.r_[np.zeros(3), T[:3, 3]] for T in Ts]) / unit
+    free = unit[:, None] * np.linalg.svd(longer[None])[2][1:].T
+    J = at.left_by_pose @ free
+    of_track = blocks(tracks)
+    pulls = np.zeros((of_track.max() + 1, J.shape[-1]))
+    np.add.at(pulls, of_track, np.einsum("nkp,nk->np", J, at.residuals))
+    inverse = np.linalg.pinv(np.einsum("nkp,nkq->pq", J, J))
+    covariance = inverse @ (pulls.T @ pulls) @ inverse
+    by_step = (at.depth_by_pose @ free)[ahead] / (at.slopes * at.inverse_depth)[ahead, None]
+    return float(np.median(np.einsum("np,pq,nq->n", by_step, covariance, by_step)) ** 0.5)
+
+
+def open_pose(spread: float | None) -> tuple[str, ...]:
+    """A sentence where the matches leave an estimated pose, and so the depth, open; none for ``None``."""
+    if spread is None or spread <= MOST_SPREAD:
+        return ()
+    return (
+        f"The matches leave the estimated pose open: by it alone depths may be off by {100 * spread:.0f} % "
+        "(one standard deviation). Take photographs that show more texture or are further apart, or give "
+        "the pose.",
+    )

@@ -1,19 +1,32 @@
-"""Points of the left image with their places in the right ones, and how poses explain them.
-
-Data flow: left pixels, right pixels, K's, poses -> inverse depths -> residuals in pixels.
-Paper: S7.2 Eq. 25 (eq:forward-warp_supp), with inverse depth in place of depth.
-"""
+"""Points of the left image with their places in the right ones, and how well poses explain them (Eq. 25)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Tracks", "merge_tracks", "project_tracks", "residuals_px", "solve_inverse_depth"]
+__all__ = [
+    "FEWEST",
+    "Projected",
+    "Tracks",
+    "across_lines",
+    "blocks",
+    "median_residuals",
+    "merge_tracks",
+    "project_tracks",
+    "residuals_px",
+    "solve_inverse_depth",
+    "split_residuals",
+]
 
+#: Fewer matches than this say nothing about a pose.
+FEWEST = 40
+#: Blocks a row of the left image, for what neighbouring residuals have in common.
+_BLOCKS, _FEWEST_IN_BLOCK, _FEWEST_BLOCKS = 10, 5, 3
 _TINY = 1e-12
 
 
@@ -43,25 +56,20 @@ class Tracks:
         """``(N, 3)`` left rays with z = 1."""
         return np.linalg.solve(self.K_left, np.c_[self.left_px, np.ones(len(self))].T).T
 
-    def view(self, v: int) -> Tracks:
-        """The tracks that right view ``v`` sees, of that view alone."""
-        kept = self.seen[v]
-        return Tracks(
-            self.left_px[kept],
-            self.right_px[v : v + 1, kept],
-            self.seen[v : v + 1, kept],
-            self.K_left,
-            self.K_rights[v : v + 1],
-        )
-
-    def kept(self, mask: np.ndarray) -> Tracks:
+    def kept(self, mask: np.ndarray | slice) -> Tracks:
         """The tracks of a boolean mask or an index."""
         return replace(
-            self,
-            left_px=self.left_px[mask],
-            right_px=self.right_px[:, mask],
-            seen=self.seen[:, mask],
+            self, left_px=self.left_px[mask], right_px=self.right_px[:, mask], seen=self.seen[:, mask]
         )
+
+    def alone(self, v: int) -> Tracks:
+        """All tracks, with right view ``v`` alone."""
+        one = slice(v, v + 1)
+        return replace(self, right_px=self.right_px[one], seen=self.seen[one], K_rights=self.K_rights[one])
+
+    def view(self, v: int) -> Tracks:
+        """The tracks that right view ``v`` sees, of that view alone."""
+        return self.alone(v).kept(self.seen[v])
 
     def seen_anywhere(self) -> Tracks:
         """The tracks that one right view has at least."""
@@ -78,12 +86,11 @@ def merge_tracks(parts: Sequence[Tracks]) -> Tracks:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Projected:
-    """Tracks in one right view, at given inverse depths.
+class Projected(NamedTuple):
+    """Tracks in one right view, at given inverse depths: pixels and their derivatives.
 
     Attributes:
-        px: ``(N, 2)`` pixels.
+        px: ``(N, 2)``.
         scaled: ``(N, 3)``, the points in the right frame times their inverse left depth.
         by_point: ``(N, 2, 3)``, derivative of ``px`` by ``scaled``.
         by_inverse_depth: ``(N, 2)``, derivative of ``px`` by inverse depth.
@@ -130,7 +137,7 @@ def _linear_inverse_depth(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
 def solve_inverse_depth(
     tracks: Tracks, Ts: np.ndarray, weights: np.ndarray | None = None, steps: int = 3
 ) -> np.ndarray:
-    """The inverse depth of every track that its right pixels want most.
+    """The inverse depth of every track that fits its right pixels best.
 
     Args:
         tracks: of V right views.
@@ -157,7 +164,8 @@ def solve_inverse_depth(
 def residuals_px(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
     """How far every observation lies from where the poses can put it.
 
-    With one right view that is the distance from the epipolar line of the left pixel.
+    With one right view that is the distance from the epipolar line of the left pixel, as in kornia's
+    ``left_to_right_epipolar_distance``, which knows no point seen in several views.
 
     Args:
         tracks: of V right views.
@@ -174,3 +182,67 @@ def residuals_px(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
         ]
     )
     return np.where(tracks.seen, off, np.nan)
+
+
+def median_residuals(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
+    """Median distance from the epipolar lines, ``(V,)`` pixels, NaN for a view with too few matches."""
+    views = [tracks.view(v) for v in range(len(Ts))]
+    return np.array(
+        [
+            np.median(residuals_px(view, T[None])) if len(view) >= FEWEST else np.nan
+            for view, T in zip(views, Ts, strict=True)
+        ]
+    )
+
+
+def blocks(tracks: Tracks) -> np.ndarray:
+    """The block of the left image that every track lies in, ``(N,)``, numbered from 0 without gaps."""
+    width = max(2.0 * tracks.K_left[0, 2], 1.0)  # that of an image whose principal point is near its middle
+    column, row = (tracks.left_px // (width / _BLOCKS)).astype(int).T
+    return np.unique(row * 1000 + column, return_inverse=True)[1]
+
+
+def across_lines(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Signed residuals ``(N,)`` across the epipolar lines, and the lines' normals ``(N, 2)``.
+
+    Args:
+        tracks: of one right view.
+        T: ``(4, 4)``, ``T_right_from_left``.
+    """
+    at = project_tracks(tracks.rays, solve_inverse_depth(tracks, T[None]), tracks.K_rights[0], T)
+    along = at.by_inverse_depth / np.maximum(np.linalg.norm(at.by_inverse_depth, axis=1, keepdims=True), 1e-9)
+    normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    return ((at.px - tracks.right_px[0]) * normals).sum(1), normals
+
+
+def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
+    """Tell noise of single matches from what the residuals of neighbours have in common.
+
+    Residuals of neighbours are alike where a pose cannot explain them (a rolling shutter, lens distortion,
+    K), and then a thousand matches hold a pose no better than a few. Blocks of the image show it: the mean of
+    ``n`` independent residuals varies by ``1 / n`` of what a single residual does.
+
+    Args:
+        tracks: of one right view, at least one.
+        T: ``(4, 4)``, ``T_right_from_left``, that fits them.
+
+    Returns:
+        How much of a match counts, in (0, 1], 1 where residuals of neighbours have nothing in common; and
+        the standard deviation, pixels, of what they have in common: that of the means of blocks beyond what
+        noise of single matches leaves in them, or of all residuals if the matches lie in too few blocks.
+    """
+    off, _ = across_lines(tracks, T)
+    scale = max(1.4826 * float(np.median(np.abs(off))), 1e-3)
+    kept = np.abs(off) < 3.0 * scale
+    block = blocks(tracks.kept(kept))
+    count = np.bincount(block)
+    mean = np.bincount(block, off[kept]) / count
+    enough = count >= _FEWEST_IN_BLOCK
+    count, mean = count[enough], mean[enough]
+    total = float((off[kept] ** 2).mean())
+    inflated = (count * mean**2).mean() / total if len(count) else 1.0
+    common = total
+    if len(count) >= _FEWEST_BLOCKS:
+        between = (mean**2).mean()
+        common = between - max(total - between, 0.0) * (1.0 / count).mean()
+    return float(1.0 / max(inflated, 1.0)), float(max(common, 0.0) ** 0.5)

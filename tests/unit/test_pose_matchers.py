@@ -12,9 +12,8 @@ from transformers import SuperGlueForKeypointMatching as SuperGlue
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.guidance.photographs import estimate_rig
-from geodiff_plugin.pose import matchers
-from geodiff_plugin.pose.matchers import MATCHERS, find_matcher
-from geodiff_plugin.pose.views import GreyViews, sparse_tracks
+from geodiff_plugin.pose import matches as matchers
+from geodiff_plugin.pose.matches import MATCHERS, GreyViews, find_matcher, sparse_tracks
 
 K = np.array([[200.0, 0, 79.5], [0, 200.0, 59.5], [0, 0, 1]])
 

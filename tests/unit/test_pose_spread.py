@@ -9,9 +9,7 @@ import pytest
 
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.guidance.photographs import estimate_rig
-from geodiff_plugin.pose.settle import SCALE_PX
-from geodiff_plugin.pose.solve import Prior, solve_poses
-from geodiff_plugin.pose.spread import MOST_SPREAD, depth_spread, open_pose
+from geodiff_plugin.pose.solve import MOST_SPREAD, SCALE_PX, Prior, depth_spread, open_pose, solve_poses
 from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
 from tests.unit.test_pose_refine import TRUE, make_tracks, pose
 

@@ -65,7 +65,7 @@ HAND_ON = {
     "pose.refine.polished",
     "pose.refine.refine_views",
     "pose.tracks.project_tracks",
-    "pose.views.grey_views",
+    "pose.matches.grey_views",
     "runtime.signs.read_signs",
 }
 

@@ -16,8 +16,8 @@ from geodiff_plugin.evaluation.datasets.perturbed import perturbed_ref
 from geodiff_plugin.evaluation.figures.base import Drawing, FigureOptions, references
 from geodiff_plugin.evaluation.figures.canvas import new_figure, show_image
 from geodiff_plugin.guidance.posing import pose_views
+from geodiff_plugin.pose.matches import grey_views, sparse_tracks
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, residuals_px
-from geodiff_plugin.pose.views import grey_views, sparse_tracks
 from geodiff_plugin.types import CameraView
 
 __all__ = ["draw_epipolar"]
@@ -56,7 +56,7 @@ def draw_epipolar(options: FigureOptions) -> Drawing:
         torch.as_tensor(m).float() for m in (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
     )
     rights = [CameraView(right, K_right, T)]
-    report = pose_views(left, rights, K_left).report
+    _, report = pose_views(left, rights, K_left)
     views = grey_views(left, rights, K_left)
     tracks = sparse_tracks(views)
     Ts = {"as given": np.linalg.inv(report.E_given[0]), "as refined": np.linalg.inv(report.E[0])}
