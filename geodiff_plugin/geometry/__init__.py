@@ -1,17 +1,14 @@
-"""Two pinhole cameras: intrinsics, rigid transforms, projection, backward warping.
+"""Two pinhole cameras: intrinsics, projection, backward warping (S3.3, S7.2).
 
-Data flow: depth in metres on the left grid -> right-view pixels -> right image seen from the left.
-Paper: S3.3, S7.2.
+Rigid transforms are kornia's (``kornia.geometry.linalg``). Where kornia has something else of it as well, a
+comment says why ours is used.
 """
 
 from geodiff_plugin.geometry.cameras import (
     OPENGL_FROM_OPENCV,
     image_size,
-    invert_rigid,
     is_rectified,
     nearest_rotation,
-    pad_intrinsics,
-    relative_pose,
     resize_intrinsics,
 )
 from geodiff_plugin.geometry.projection import (
@@ -32,14 +29,11 @@ __all__ = [
     "Warped",
     "hidden_in_right",
     "image_size",
-    "invert_rigid",
     "is_rectified",
     "nearest_rotation",
-    "pad_intrinsics",
     "plane_rays",
     "project",
     "project_rays",
-    "relative_pose",
     "resize_intrinsics",
     "sample_at",
     "transform",

@@ -1,14 +1,11 @@
-"""From pixels with a depth to points and back, for one camera and across two.
-
-Data flow: depth map in metres + K -> points -> points of the other camera -> pixels of the other image.
-Paper: S3.3 Eq. 9 (eq:forward-warp), S7.2 Eq. 25 (eq:forward-warp_supp).
-"""
+"""From pixels with a depth to points and back, for one camera and across two (Eq. 9, Eq. 25)."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import torch
+from kornia.geometry.depth import unproject_meshgrid
 from kornia.geometry.linalg import transform_points
 
 from geodiff_plugin.geometry.cameras import image_size
@@ -65,12 +62,10 @@ def unproject(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
 
 
 def _rays(size: tuple[int, int], K: torch.Tensor) -> torch.Tensor:
-    """Points at z = 1 behind every pixel, ``(B, H, W, 3)``; kornia's know no skew."""
-    v, u = torch.meshgrid(*(torch.arange(n, device=K.device, dtype=K.dtype) for n in size), indexing="ij")
-    fx, skew, cx, fy, cy = (K[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
-    y = (v - cy) / fy
-    x = (u - cx - skew * y) / fx
-    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    """Points at z = 1 behind every pixel, ``(B, H, W, 3)``."""
+    rays = unproject_meshgrid(*size, K, device=K.device, dtype=K.dtype)
+    slant = (K[:, 0, 1] / K[:, 0, 0])[:, None, None]  # kornia's know no skew
+    return torch.cat([rays[..., :1] - (slant * rays[..., 1])[..., None], rays[..., 1:]], dim=-1)
 
 
 def transform(points: torch.Tensor, T: torch.Tensor) -> torch.Tensor:
@@ -92,6 +87,7 @@ def _in_front(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return in_front, torch.where(in_front, z, torch.ones_like(z))
 
 
+# kornia's ``project_points`` knows no skew, and mirrors points behind the camera into the image.
 def project(points: torch.Tensor, K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Pixels of points in a camera's frame.
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from kornia.geometry.linalg import inverse_transformation
 
-from geodiff_plugin.geometry import invert_rigid
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -71,7 +71,9 @@ def mirrored_pose_preferred(
 
     given = confidence(rights)
     try:
-        turned = confidence([CameraView(image, K_right, invert_rigid(T)) for image, K_right, T in rights])
+        turned = confidence(
+            [CameraView(image, K_right, inverse_transformation(T)) for image, K_right, T in rights]
+        )
     except ValueError:  # under the inverse pose the views do not overlap, so it is not the true one
         turned = 0.0
     return PoseCheck(turned > _CLEARLY * given, given, turned)

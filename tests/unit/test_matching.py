@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kornia.geometry.linalg import inverse_transformation, relative_transformation
 
 from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
@@ -30,7 +31,7 @@ def scene(turn=0.0, at=(0.3, 0.0, 0.0), size=SIZE, seed=0, focal=None):
     E[0, 0] = E[2, 2] = math.cos(turn)
     E[0, 2], E[2, 0] = math.sin(turn), -math.sin(turn)
     E[:3, 3] = torch.tensor(at)
-    T = g.relative_pose(torch.eye(4)[None], E[None])[0]
+    T = relative_transformation(E[None], torch.eye(4)[None])[0]
     warped = g.warp_right_to_left(texture[None], depth[None], K[None], K[None], T[None])
     return warped.image[0], (texture, K, T), K, depth, warped.visible[0]
 
@@ -385,7 +386,7 @@ def second_sweep(volume, inverse_depth):
     image, K_right, T = volume.rights[0]
     span = volume.inverse_depth[[0, -1]]
     planes = torch.linspace(float(span[0]), 1.3 * float(span[1]), 2 * len(volume.inverse_depth))
-    back = m.sweep_planes(image, [(volume.left_01, volume.K, g.invert_rigid(T))], K_right, planes)
+    back = m.sweep_planes(image, [(volume.left_01, volume.K, inverse_transformation(T))], K_right, planes)
     other = planes[m.aggregate(back.levels, image[0]).argmin(0)]
     depth = 1 / inverse_depth.clamp_min(1e-3 * volume.plane_step)[None]
     warped = g.warp_right_to_left(other[None, None], depth, volume.K[None], K_right[None], T[None])
@@ -427,7 +428,7 @@ def test_a_pose_that_matches_plainly_is_not_turned(rectified, monkeypatch):
 def test_swapped_views_and_inverted_poses_are_told(turn, at):
     left, (texture, K, T), _, _, _ = scene(turn, at)
     assert not m.mirrored_pose_preferred(left, [(texture, K, T)], K).preferred
-    inverse = g.invert_rigid(T)
+    inverse = inverse_transformation(T)
     assert m.mirrored_pose_preferred(left, [(texture, K, inverse)], K).preferred
     assert m.mirrored_pose_preferred(texture, [(left, K, T)], K).preferred
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from kornia.geometry.linalg import relative_transformation
 
 from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
@@ -94,7 +95,7 @@ def test_general_pose(turn):
     E[0, 0] = E[2, 2] = np.cos(turn)
     E[0, 2], E[2, 0] = np.sin(turn), -np.sin(turn)
     E[:3, 3] = torch.tensor([0.25, 0.1, 0.1])
-    T = g.relative_pose(torch.eye(4)[None], E[None])
+    T = relative_transformation(E[None], torch.eye(4)[None])
     left = g.warp_right_to_left(texture[None], depth[None], K[None], K[None], T).image[0]
     volume = m.build_cost_volume(left, [(texture, K, T[0])], K)
     x = relative(depth, "disparity")

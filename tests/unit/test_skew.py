@@ -142,10 +142,6 @@ def test_resizing_and_padding(size):
     scale = np.array([size[1] / SIZE[1], size[0] / SIZE[0]])[:, None, None]
     points = points_of(DEPTH, K)
     np.testing.assert_allclose(uv_of(points, moved), (pixels()[:2] + 0.5) * scale - 0.5, atol=1e-9)
-    padded = geometry.pad_intrinsics(tensor(K), left=4, top=7)[0].numpy()
-    np.testing.assert_allclose(
-        uv_of(points, padded), pixels()[:2] + np.array([4, 7])[:, None, None], atol=1e-9
-    )
 
 
 def test_shrinking_keeps_the_skew_of_the_image():
@@ -269,9 +265,9 @@ def test_no_function_that_takes_a_camera_matrix_is_left_out():
         f"{f.__module__.removeprefix('geodiff_plugin.')}.{f.__name__}"
         for f in (
             *(geometry.unproject, geometry.project, geometry.plane_rays, geometry.warp_right_to_left),
-            *(geometry.hidden_in_right, geometry.resize_intrinsics, geometry.pad_intrinsics),
+            *(geometry.hidden_in_right, geometry.resize_intrinsics),
             *(geometry.is_rectified, resize_long_edge, as_fine_as, build_cost_volume, sweep_planes),
-            *(align_view, points_to_matches, write_ply, render_cloud, render_pair, hidden_from_right),
+            *(align_view, points_to_matches, write_ply, render_cloud),
             *(disparity_to_depth, depth_to_disparity),
         )
     }
