@@ -30,7 +30,6 @@ from geodiff_plugin.matching.sweep import sweep_planes
 from geodiff_plugin.types import CameraView
 from tests.conftest import textured
 from tests.scenes import render_pair
-from tests.scenes.visibility import hidden_from_right
 
 SIZE = (48, 64)
 K = np.array([[60.0, 14.0, 28.5], [0.0, 55.0, 24.5], [0.0, 0.0, 1.0]])
