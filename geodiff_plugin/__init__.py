@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see; at run time names are imported on first use
     from geodiff_plugin._checks import InputError
     from geodiff_plugin.bundled import load_bundled_prior
+    from geodiff_plugin.capture.capture import Capture
     from geodiff_plugin.config import GuidanceConfig
     from geodiff_plugin.formats.reading import read_calibration
     from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -32,6 +33,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "PRIORS",
+    "Capture",
     "GeometryGuidance",
     "GuidanceConfig",
     "GuidedMarigoldDepthPipeline",
@@ -47,6 +49,7 @@ __all__ = [
 
 #: Public name -> module, imported on first use so that ``import geodiff_plugin`` stays quick.
 _MODULE_OF = {
+    "Capture": "geodiff_plugin.capture.capture",
     "GeometryGuidance": "geodiff_plugin.guidance.guidance",
     "GuidanceConfig": "geodiff_plugin.config",
     "GuidedMarigoldDepthPipeline": "geodiff_plugin.runtime.pipeline",

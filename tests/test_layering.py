@@ -28,16 +28,17 @@ LAYER = {
     "priors": 7,
     "runtime": 8,
     "bundled": 8,
-    "evaluation": 9,
-    "app": 10,
-    "cli": 10,
-    "__main__": 11,
+    "capture": 9,
+    "evaluation": 10,
+    "app": 11,
+    "cli": 11,
+    "__main__": 12,
 }
 """By part of the package, or by module where a folder lies in two layers: the configuration is below all
 that reads it, what takes images and cameras as a user gives them is above."""
 
 #: From here up diffusers may be imported whole, and the root of the package, which imports everything.
-DIFFUSERS_FROM, ROOT_FROM = LAYER["priors"], LAYER["evaluation"]
+DIFFUSERS_FROM, ROOT_FROM = LAYER["priors"], LAYER["capture"]
 #: Where diffusers may be imported below the priors, and what of it.
 DIFFUSERS_BELOW = {"types": {"BaseOutput"}}
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")

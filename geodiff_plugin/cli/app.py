@@ -15,6 +15,7 @@ from typing import Annotated
 
 import typer
 
+from geodiff_plugin.cli.capture import add_capture
 from geodiff_plugin.cli.depth_options import add_depth
 from geodiff_plugin.cli.eval.app import eval_app
 from geodiff_plugin.cli.messages import CommandGroup
@@ -52,6 +53,7 @@ def _root(
 
 
 add_depth(app)
+add_capture(app)
 
 
 @app.command()

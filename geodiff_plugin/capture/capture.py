@@ -1,0 +1,238 @@
+"""``Capture``: the frames of a walk with a camera, their poses solved together, depth of any of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from geodiff_plugin._checks import bad_value, check_choice, check_number
+from geodiff_plugin._threads import available_cores
+from geodiff_plugin.capture.neighbours import choose_neighbours
+from geodiff_plugin.formats.captures import CaptureFiles, CaptureFrame, read_capture
+from geodiff_plugin.formats.distortion import undistorted
+from geodiff_plugin.formats.images import read_image
+from geodiff_plugin.formats.video import VideoReader
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
+from geodiff_plugin.types import MetricDepthOutput
+
+__all__ = ["NEIGHBOURS", "Capture"]
+
+#: Neighbours of a frame by default.
+NEIGHBOURS = 4
+
+
+class Capture:
+    """Frames of one moving camera with their poses.
+
+    >>> capture = Capture.open("scan")
+    >>> out = capture.depth(pipe, "frame_0010")
+
+    Attributes:
+        files: what was read.
+        names: of the frames, in order.
+        unit: ``"m"``, or ``None`` where no length is known.
+    """
+
+    def __init__(self, files: CaptureFiles) -> None:
+        self.files = files
+        self.names = [frame.name for frame in files.frames]
+        self.unit = files.unit
+        self._number = {name: number for number, name in enumerate(self.names)}
+        self._solved: SolvedCapture | None = None
+
+    @classmethod
+    def open(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        K: np.ndarray | None = None,
+        fov: float | None = None,
+        trajectory: str | os.PathLike[str] | None = None,
+    ) -> Self:
+        """Read a capture; the layout is recognised (docs/how-to/captures.md lists them).
+
+        Args:
+            path: file or folder.
+            K: ``(3, 3)`` intrinsics in pixels, where the capture has none.
+            fov: horizontal field of view in degrees, likewise.
+            trajectory: of a video, in TUM's form.
+
+        Raises:
+            FileNotFoundError: nothing there.
+            InputError: nothing that is a capture, or fewer than two frames.
+        """
+        return cls(read_capture(path, K=K, fov=fov, trajectory=trajectory))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def frame(self, name: str) -> CaptureFrame:
+        """The frame of a name.
+
+        Raises:
+            InputError: no such frame.
+        """
+        if name not in self._number:
+            some = ", ".join(self.names[:3])
+            bad_value(
+                "a frame", f"a name of the capture, such as {some}", repr(name), "Names are file stems."
+            )
+        return self.files.frames[self._number[name]]
+
+    def choose(self, wanted: str | None) -> list[str]:
+        """Names of ``NAME,NAME`` or ``FIRST:LAST:STEP``; all for ``None``.
+
+        Raises:
+            InputError: names that do not exist, or other text.
+        """
+        if wanted is None:
+            return list(self.names)
+        if ":" in wanted:
+            try:
+                numbers = [int(part) if part else None for part in wanted.split(":")]
+                first, last, step = (*numbers, None, None)[:3]
+            except ValueError:
+                bad_value("--frames", "NAME,NAME or FIRST:LAST:STEP with numbers from 0", repr(wanted))
+            chosen = self.names[first : None if last is None else last + 1 : step]
+            if not chosen:
+                bad_value("--frames", f"numbers from 0 to {len(self) - 1}", repr(wanted))
+            return chosen
+        return [self.frame(name.strip()).name for name in wanted.split(",") if name.strip()]
+
+    @property
+    def poses(self) -> np.ndarray | None:
+        """``(N, 4, 4)`` camera-to-world as given, or ``None``."""
+        Es = [frame.E for frame in self.files.frames]
+        return None if any(E is None for E in Es) else np.stack([E for E in Es if E is not None])
+
+    def solve(self, poses: str = "refined", *, threads: int | None = None) -> SolvedCapture:
+        """Poses of all frames (extra ``capture``); made once and kept.
+
+        Args:
+            poses: ``"refined"``, or ``"given"`` to keep the given ones.
+            threads: for features, matching and adjustment; all cores by default.
+
+        Raises:
+            InputError: pycolmap is missing; frames without poses that cannot be connected.
+        """
+        check_choice(poses, "poses", ("refined", "given"))
+        if self._solved is None:
+            frames = self.files.frames
+            K = np.stack([frame.K for frame in frames])
+            sizes = [frame.size for frame in frames]
+            threads = threads or available_cores()
+            self._solved = solve_capture(self._greys(), K, self.poses, sizes, poses=poses, threads=threads)
+        return self._solved
+
+    def adopt(self, solved: SolvedCapture) -> None:
+        """Take poses that were solved before."""
+        self._solved = solved
+
+    def rescale(self, factor: float) -> None:
+        """Multiply all lengths, which then are metres.
+
+        Raises:
+            InputError: a factor that is not above 0.
+        """
+        check_number(factor, "metres per unit", 1e-12, 1e12)
+        frames = tuple(replace(f, E=None if f.E is None else _longer(f.E, factor)) for f in self.files.frames)
+        self.files = replace(self.files, frames=frames, unit="m")
+        self.unit = "m"
+        if self._solved is not None:
+            s = self._solved
+            given = None if s.E_given is None else _longer(s.E_given, factor)
+            self._solved = replace(s, E=_longer(s.E, factor), E_given=given, points=s.points * factor)
+
+    def image(self, name: str) -> np.ndarray:
+        """``(H, W, 3)`` float32 in [0, 1], upright, free of lens distortion.
+
+        Raises:
+            OSError, InputError: an image that cannot be read.
+        """
+        frame = self.frame(name)
+        if frame.index is not None:
+            with VideoReader(frame.image, f"the video {frame.image}") as video:
+                image = video.read(frame.index)
+        else:
+            image = read_image(frame.image, f"frame {name}")[0]
+        return image if frame.lens is None else undistorted(image, frame.K, frame.lens)
+
+    def _greys(self) -> Iterator[np.ndarray]:
+        for name in self.names:
+            grey = self.image(name) @ np.array([0.299, 0.587, 0.114], np.float32)
+            yield np.rint(grey * 255).astype(np.uint8)
+
+    def neighbours(self, name: str, count: int = NEIGHBOURS) -> list[str]:
+        """Frames that are right views of a frame, the best first.
+
+        Args:
+            name: of the frame.
+            count: how many at most, >= 1.
+        """
+        check_number(count, "neighbours", 1, 32, integer=True)
+        solved, number = self.solve(), self._number[self.frame(name).name]
+        return [self.names[i] for i in choose_neighbours(solved, number, count)]
+
+    def guidance(
+        self, name: str, neighbours: Sequence[str] | int = NEIGHBOURS, **knobs: Any
+    ) -> GeometryGuidance:
+        """The guidance of a frame: its neighbours as right views, with the solved poses.
+
+        Args:
+            name: of the frame.
+            neighbours: names, or how many are chosen.
+            **knobs: further arguments of ``GeometryGuidance``.
+
+        Raises:
+            InputError: no frame that sees the same; a frame without pose.
+        """
+        solved = self.solve()
+        names = self.neighbours(name, neighbours) if isinstance(neighbours, int) else list(neighbours)
+        if not names:
+            bad_value(f"frame {name}", "connected to others by shared points", "none shares any")
+        i, rights = self._number[name], [self._number[other] for other in names]
+        views = [
+            (self.image(other), solved.K[j], solved.pose(i, j))
+            for other, j in zip(names, rights, strict=True)
+        ]
+        first = (None, solved.K[i], np.eye(4))
+        settings = {"pose": "given"} if solved.status in ("solved", "estimated") else {}
+        return GeometryGuidance.from_views(
+            [first, *views], left_size=self.frame(name).size, unit=self.unit, **settings | knobs
+        )
+
+    def depth(
+        self,
+        pipe: Any,
+        name: str,
+        neighbours: Sequence[str] | int = NEIGHBOURS,
+        *,
+        seed: int = 0,
+        knobs: dict[str, Any] | None = None,
+        **call: Any,
+    ) -> MetricDepthOutput:
+        """Depth of a frame by a pipeline with guidance enabled.
+
+        Args:
+            pipe: of ``enable_geometry_guidance``.
+            name: of the frame.
+            neighbours: names, or how many are chosen.
+            seed: of the noise.
+            knobs: further arguments of ``GeometryGuidance``.
+            **call: further arguments of the pipeline's call.
+        """
+        guidance = self.guidance(name, neighbours, **knobs or {})
+        generator = torch.Generator("cpu").manual_seed(seed)
+        return pipe(self.image(name), guidance=guidance, generator=generator, **call)
+
+
+def _longer(E: np.ndarray, factor: float) -> np.ndarray:
+    E = E.copy()
+    E[..., :3, 3] *= factor
+    return E

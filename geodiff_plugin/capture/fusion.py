@@ -1,0 +1,189 @@
+"""One cloud of all frames with normals and colours, a mesh, and the maps in COLMAP's format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.capture.agreement import DepthFrame
+from geodiff_plugin.formats.clouds import Cloud, flying_points
+from geodiff_plugin.formats.colmap import write_colmap
+from geodiff_plugin.formats.out import atomic_path
+
+__all__ = ["fuse", "normals_of", "write_colmap_maps", "write_mesh", "write_normal_ply"]
+
+#: Points closer than this share of the median depth are one; points of lower confidence are left out.
+CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
+#: Points of one frame at most; more would not show in a cloud of many frames.
+MOST_POINTS = 200_000
+VERTEX = np.dtype(
+    [(n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")] + [(n, "u1") for n in ("red", "green", "blue")]
+)
+
+
+def normals_of(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """``(H, W, 3)`` unit normals of a depth map in its camera's frame, towards the camera."""
+    height, width = depth.shape
+    v, u = np.mgrid[:height, :width]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+    points = rays * depth[..., None]
+    along = [np.gradient(points, axis=axis) for axis in (0, 1)]
+    normals = np.cross(along[0], along[1])
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    away = (normals * rays).sum(-1, keepdims=True) > 0
+    return np.where(away, -normals, normals).astype(np.float32)
+
+
+def kept(frame: DepthFrame) -> np.ndarray:
+    """``(H, W)`` pixels that become points: sure or confirmed, never contradicted, not flying."""
+    good = (frame.confidence >= LEAST_CONFIDENCE) & ~flying_points(frame.depth)
+    if frame.confirmed is not None and frame.asked is not None:
+        good &= (frame.confirmed > 0) | (frame.asked == 0)
+    return good
+
+
+def fuse(frames: Sequence[DepthFrame], image: Callable[[str], np.ndarray]) -> tuple[Cloud, np.ndarray]:
+    """The cloud of all frames in the world's frame, one point a cell.
+
+    Args:
+        frames: agreed.
+        image: a frame's name -> ``(H, W, 3)`` in [0, 1].
+
+    Returns:
+        The cloud, and ``(N, 3)`` normals.
+    """
+    cell = CELL_SHARE * float(np.median([np.median(frame.depth) for frame in frames]))
+    parts = []
+    for frame in frames:
+        v, u = np.nonzero(kept(frame))
+        every = max(1, len(u) // MOST_POINTS)
+        v, u = v[::every], u[::every]
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame.K).T
+        R, t = frame.E[:3, :3], frame.E[:3, 3]
+        points = rays * frame.depth[v, u][:, None] @ R.T + t
+        colours = image(frame.name)[v, u] * 255
+        normals = normals_of(frame.depth, frame.K)[v, u] @ R.T
+        parts.append(_thinned(np.hstack([points, normals, colours]), cell))
+    every_point = _thinned(np.concatenate(parts), cell)
+    normals = every_point[:, 3:6]
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return Cloud(every_point[:, :3], np.rint(every_point[:, 6:]).astype(np.uint8)), normals
+
+
+def _thinned(rows: np.ndarray, cell: float) -> np.ndarray:
+    """The mean of the rows of every cell of a grid over their first three columns."""
+    if not len(rows):
+        return rows
+    keys = np.floor(rows[:, :3] / cell).astype(np.int64)
+    _, inverse, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.reshape(-1)
+    sums = [np.bincount(inverse, rows[:, column], len(counts)) for column in range(rows.shape[1])]
+    return np.stack(sums, -1) / counts[:, None]
+
+
+def write_normal_ply(path: Path, cloud: Cloud, normals: np.ndarray, unit: str | None) -> None:
+    """Write a cloud with normals as binary PLY."""
+    vertices = np.empty(len(cloud.points_m), VERTEX)
+    for names, values in (
+        (("x", "y", "z"), cloud.points_m),
+        (("nx", "ny", "nz"), normals),
+        (("red", "green", "blue"), cloud.colours),
+    ):
+        for column, name in enumerate(names):
+            vertices[name] = values[:, column]
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment world frame, {'metres' if unit else 'no unit'}",
+    ]
+    lines += [f"element vertex {len(vertices)}"]
+    lines += [f"property {kinds[VERTEX[name].str]} {name}" for name in VERTEX.names or ()]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + vertices.tobytes())
+
+
+def write_mesh(path: Path, frames: Sequence[DepthFrame], image: Callable[[str], np.ndarray]) -> None:
+    """Write a mesh of all frames by TSDF (extra ``mesh``).
+
+    Raises:
+        InputError: Open3D is not installed.
+    """
+    try:
+        import open3d
+    except ImportError:
+        bad_value("open3d", "installed for a mesh", "missing", "pip install 'geodiff-plugin[mesh]'")
+    middle = float(np.median([np.median(frame.depth) for frame in frames]))
+    volume = open3d.pipelines.integration.ScalableTSDFVolume(
+        voxel_length=middle / 250,
+        sdf_trunc=middle / 50,
+        color_type=open3d.pipelines.integration.TSDFVolumeColorType.RGB8,
+    )
+    for frame in frames:
+        depth = np.where(kept(frame), frame.depth, 0).astype(np.float32)
+        colour = np.ascontiguousarray(np.rint(image(frame.name) * 255).astype(np.uint8))
+        rgbd = open3d.geometry.RGBDImage.create_from_color_and_depth(
+            open3d.geometry.Image(colour),
+            open3d.geometry.Image(depth),
+            depth_scale=1.0,
+            depth_trunc=float(depth.max()) + 1.0,
+            convert_rgb_to_intensity=False,
+        )
+        height, width = depth.shape
+        camera = open3d.camera.PinholeCameraIntrinsic(
+            width, height, frame.K[0, 0], frame.K[1, 1], frame.K[0, 2], frame.K[1, 2]
+        )
+        volume.integrate(rgbd, camera, np.linalg.inv(frame.E))
+    mesh = volume.extract_triangle_mesh()
+    mesh.compute_vertex_normals()
+    with atomic_path(path) as temporary:
+        open3d.io.write_triangle_mesh(str(temporary), mesh)
+
+
+def write_colmap_maps(
+    folder: Path,
+    frames: Sequence[DepthFrame],
+    files: dict[str, str],
+    cloud: Cloud,
+    image: Callable[[str], Any],
+) -> None:
+    """Write a dense workspace of COLMAP: images, sparse model, depth and normal maps.
+
+    Args:
+        folder: to appear.
+        frames: agreed; maps have depth only where frames are kept.
+        files: file name of a frame's image by the frame's name.
+        cloud: points of the sparse model.
+        image: a frame's name -> ``(H, W, 3)`` in [0, 1].
+
+    Convention:
+        ``colmap stereo_fusion --workspace_path FOLDER --input_type geometric --output_path fused.ply``
+    """
+    from PIL import Image
+
+    for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    views = []
+    for frame in frames:
+        file, depth = files[frame.name], np.where(kept(frame), frame.depth, 0).astype(np.float32)
+        Image.fromarray(np.rint(image(frame.name) * 255).astype(np.uint8)).save(folder / "images" / file)
+        normals = normals_of(frame.depth, frame.K)
+        write_map(folder / "stereo/depth_maps" / f"{file}.geometric.bin", depth[..., None])
+        write_map(folder / "stereo/normal_maps" / f"{file}.geometric.bin", normals)
+        views.append((file, frame.K, frame.E, depth.shape[::-1]))
+    write_colmap(folder / "sparse", views, cloud)
+    names = "".join(f"{files[frame.name]}\n" for frame in frames)
+    (folder / "stereo" / "fusion.cfg").write_text(names, encoding="utf-8")
+    pairs = "".join(f"{files[frame.name]}\n__auto__, 20\n" for frame in frames)
+    (folder / "stereo" / "patch-match.cfg").write_text(pairs, encoding="utf-8")
+
+
+def write_map(path: Path, values: np.ndarray) -> None:
+    """Write ``(H, W, C)`` float32 as COLMAP does: a head ``W&H&C&``, then one channel after the other."""
+    height, width, channels = values.shape
+    data = np.ascontiguousarray(values.transpose(2, 0, 1), dtype="<f4").tobytes()
+    path.write_bytes(f"{width}&{height}&{channels}&".encode() + data)

@@ -1,0 +1,86 @@
+"""Which frames are right views of a frame: those that see its points under a good angle of the rays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geodiff_plugin.pose.capture import SolvedCapture
+
+__all__ = ["BEST_ANGLE_DEG", "choose_neighbours"]
+
+#: Angle of two rays that a match is worth most at, degrees, and how fast it is worth less below and above it.
+BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG = 6.0, 2.5, 10.0
+#: A point that a chosen neighbour sees already counts so much for the next one.
+SEEN_AGAIN = 0.5
+#: A neighbour must be worth this share of the best one.
+LEAST_SHARE = 0.15
+#: Shared points below which two frames are no neighbours.
+FEWEST_SHARED = 12
+
+
+def choose_neighbours(solved: SolvedCapture, frame: int, most: int) -> list[int]:
+    """Neighbours of a frame, the best first.
+
+    Every shared point counts by the angle of its two rays, as in COLMAP's and MVSNet's view selection, and
+    less where earlier neighbours see it: so the neighbours together see all of the frame.
+
+    Args:
+        solved: poses and points.
+        frame: number of the frame.
+        most: neighbours wanted, >= 1.
+
+    Returns:
+        At most ``most`` numbers; those nearest by position where the frame shares no points.
+
+    Source: Yao et al. 2018 (MVSNet), S5.1: the piecewise Gaussian of the angle.
+    """
+    values = _values(solved, frame)
+    chosen: list[int] = []
+    first = 0.0
+    left = np.ones(values.shape[1])
+    shared = (values > 0).sum(1)
+    while len(chosen) < most:
+        gains = values @ left
+        gains[chosen], gains[shared < FEWEST_SHARED] = -1.0, -1.0
+        best = int(np.argmax(gains))
+        if gains[best] <= LEAST_SHARE * first:
+            break
+        first = first or float(gains[best])
+        chosen.append(best)
+        left = left * np.where(values[best] > 0, SEEN_AGAIN, 1.0)
+    return chosen or _nearest(solved, frame, most)
+
+
+def _values(solved: SolvedCapture, frame: int) -> np.ndarray:
+    """``(N, P)`` worth of the frame's points to every other frame, 0 where it does not see them."""
+    own = solved.seen[frame].point
+    centres = (solved.E if np.isfinite(solved.E[frame]).all() else solved.E_given)[:, :3, 3]
+    xyz = solved.points[own]
+    row = np.full(len(solved.points), -1)
+    row[own] = np.arange(len(own))
+    to = xyz - centres[frame]
+    to /= np.linalg.norm(to, axis=1, keepdims=True)
+    values = np.zeros((len(solved.E), len(own)))
+    for other, seen in enumerate(solved.seen):
+        at = np.unique(row[seen.point])
+        at = at[at >= 0]
+        if other == frame or not len(at) or not np.isfinite(centres[other]).all():
+            continue
+        back = xyz[at] - centres[other]
+        back /= np.linalg.norm(back, axis=1, keepdims=True)
+        angle = np.degrees(np.arccos(np.clip((to[at] * back).sum(1), -1, 1)))
+        width = np.where(angle < BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG)
+        values[other, at] = np.exp(-0.5 * ((angle - BEST_ANGLE_DEG) / width) ** 2)
+    return values
+
+
+def _nearest(solved: SolvedCapture, frame: int, most: int) -> list[int]:
+    """Frames near a frame that look the same way, for one that shares no points."""
+    E = solved.E if solved.E_given is None else solved.E_given
+    if not np.isfinite(E[frame]).all():
+        return []
+    apart = np.linalg.norm(E[:, :3, 3] - E[frame, :3, 3], axis=1)
+    turned = np.degrees(np.arccos(np.clip(E[:, :3, 2] @ E[frame, :3, 2], -1, 1)))
+    fits = np.isfinite(apart) & (apart > 0) & (turned < 30)
+    order = [int(i) for i in np.argsort(np.abs(np.arange(len(E)) - frame)) if fits[i]]
+    return order[:most]
