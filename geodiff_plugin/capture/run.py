@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from diffusers.utils import logging as of_diffusers
+from transformers.utils import logging as of_transformers
 
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import InputError, bad_value, check_choice, check_number
@@ -169,7 +171,14 @@ def _positive(text: str, option: str, typed: str) -> float:
 
 
 def _pipe(options: CaptureOptions, device: torch.device) -> Any:
-    pipe = enable_geometry_guidance(load_prior(options.prior).to(device))
+    bars = [library for library in (of_diffusers, of_transformers) if library.is_progress_bar_enabled()]
+    for library in bars:
+        library.disable_progress_bar()
+    try:
+        pipe = enable_geometry_guidance(load_prior(options.prior).to(device))
+    finally:
+        for library in bars:
+            library.enable_progress_bar()
     pipe.set_progress_bar_config(disable=True)
     return pipe
 
