@@ -17,7 +17,7 @@ from PIL import Image, ImageOps
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
-from geodiff_plugin.plotting.figures import depth_figure
+from geodiff_plugin.plotting import depth_figure
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -21,8 +21,7 @@ from PIL import Image, ImageOps
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
-from geodiff_plugin.plotting.figures import colour_depth, depth_range
-from geodiff_plugin.plotting.sheets import grid
+from geodiff_plugin.plotting import colour_depth, depth_range, grid
 from geodiff_plugin.priors import find_prior
 
 

@@ -16,7 +16,7 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior, read_calibration
 from geodiff_plugin.formats import flying_points, make_cloud, rig_from_parameters, write_glb, write_ply
-from geodiff_plugin.plotting.figures import colour_depth
+from geodiff_plugin.plotting import colour_depth
 
 CATEGORY = "GeoDiff"
 #: The prior that was used last, with the device it is on: a graph is run again and again.

@@ -24,7 +24,7 @@ from geodiff_plugin.formats import (
     write_glb,
     write_ply,
 )
-from geodiff_plugin.plotting.figures import depth_figure
+from geodiff_plugin.plotting import depth_figure
 
 __all__ = ["cloud_of", "report_of", "write_files", "write_scene"]
 

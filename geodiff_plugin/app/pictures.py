@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from geodiff_plugin.app.measure import Reading, distance_m
-from geodiff_plugin.plotting.figures import colour_depth, depth_range, ticks
+from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
 
 __all__ = [
     "colour_relative",
@@ -25,8 +25,6 @@ __all__ = [
     "metres",
 ]
 
-#: Low to high, for shares: a dark violet over teal to yellow, light where it is high.
-SHARE_STOPS = np.array([[43, 10, 61], [52, 78, 120], [38, 130, 142], [95, 200, 120], [250, 230, 60]], float)
 MARKS = ("A", "B")
 LEGEND_STOPS = 24
 
@@ -56,14 +54,6 @@ def colour_relative(values: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
     return colour_depth(np.exp(share), near=1.0, far=math.e)  # exp: the colours go with the logarithm
 
 
-def colour_share(values: np.ndarray, most: float = 1.0) -> np.ndarray:
-    """``(H, W, 3)`` uint8 of a map in [0, most]."""
-    position = np.clip(values / most, 0, 1) * (len(SHARE_STOPS) - 1)
-    lower = np.minimum(position.astype(int), len(SHARE_STOPS) - 2)
-    part = (position - lower)[..., None]
-    return np.rint(SHARE_STOPS[lower] * (1 - part) + SHARE_STOPS[lower + 1] * part).astype(np.uint8)
-
-
 def _legend(colours: np.ndarray, marks: Sequence[tuple[float, str]], caption: str) -> str:
     stops = ", ".join(
         f"rgb({r},{g},{b}) {100 * i / (len(colours) - 1):.1f}%" for i, (r, g, b) in enumerate(colours)
@@ -87,7 +77,7 @@ def legend_of_depth(depth_m: np.ndarray) -> str:
 
 def legend_of_share(most: float, caption: str) -> str:
     """A bar from 0 to ``most`` with percentages under it, as HTML."""
-    colours = colour_share(np.linspace(0, 1, LEGEND_STOPS))
+    colours = colour_share(np.linspace(0, 1, LEGEND_STOPS)[None])[0]
     return _legend(colours, [(s, f"{100 * s * most:.0f} %") for s in (0, 0.25, 0.5, 0.75, 1)], caption)
 
 

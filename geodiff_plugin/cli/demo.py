@@ -21,8 +21,7 @@ from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
-from geodiff_plugin.plotting.figures import colour_depth, depth_range
-from geodiff_plugin.plotting.sheets import grid
+from geodiff_plugin.plotting import colour_depth, depth_range, grid
 
 __all__ = ["run_demo"]
 

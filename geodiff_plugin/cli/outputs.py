@@ -16,8 +16,7 @@ from PIL import Image
 from geodiff_plugin.cli.arguments import undistorted_name
 from geodiff_plugin.cli.report import single_map
 from geodiff_plugin.formats import flying_points, write_depth_mm, write_depth_npy, write_ply
-from geodiff_plugin.plotting.figures import depth_figure
-from geodiff_plugin.plotting.overview import overview, share_figure
+from geodiff_plugin.plotting import depth_figure, overview, share_figure
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["write_maps", "write_report", "write_undistorted"]

@@ -19,7 +19,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import check_file, read_image
 from geodiff_plugin.formats.files import read_npy
 from geodiff_plugin.formats.video import VideoReader, both_halves
-from geodiff_plugin.plotting.video import check_video, depth_frames, write_depth_video
+from geodiff_plugin.plotting import check_video, depth_frames, write_depth_video
 
 __all__ = ["run_video"]
 

@@ -17,7 +17,7 @@ from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 from geodiff_plugin.formats.files import read_npy
-from geodiff_plugin.plotting.video import write_depth_video
+from geodiff_plugin.plotting import write_depth_video
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ from geodiff_plugin.formats import depth as strips
 from geodiff_plugin.formats import flying_points, make_cloud, write_depth_mm, write_ply
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.formats.points import read_ply_points
-from geodiff_plugin.plotting.figures import colour_depth, depth_range
-from geodiff_plugin.plotting.overview import overview, share_figure
+from geodiff_plugin.plotting import colour_depth, depth_range, overview, share_figure
 from geodiff_plugin.runtime.confidence import depth_confidence
 from geodiff_plugin.runtime.reprojection import reprojection
 from geodiff_plugin.types import CameraView

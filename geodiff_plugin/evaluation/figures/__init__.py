@@ -54,7 +54,6 @@ def run_figure(name: str, options: FigureOptions) -> Path:
 
     Raises:
         ValueError: an unknown figure, no samples, bad options.
-        ImportError: matplotlib is not installed.
         OSError: missing or unreadable files.
     """
     drawing = FIGURES[check_choice(name, "the figure", FIGURES)].draw(options)

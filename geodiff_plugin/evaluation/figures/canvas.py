@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin.formats import atomic_path
-from geodiff_plugin.plotting.figures import ticks
+from geodiff_plugin.plotting import ticks
 
 __all__ = [
     "COLOURS",
@@ -42,21 +42,11 @@ _GREY = "#808080"
 
 
 def _matplotlib(part: str = "") -> Any:
-    try:
-        return importlib.import_module(f"matplotlib.{part}" if part else "matplotlib")
-    except ImportError as error:
-        raise ImportError(
-            "geodiff eval figure needs matplotlib, which is not installed. "
-            "Run: pip install 'geodiff-plugin[eval]'."
-        ) from error
+    return importlib.import_module(f"matplotlib.{part}" if part else "matplotlib")
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """An empty figure that lays itself out; it belongs to no global state.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-    """
+    """An empty figure that lays itself out; it belongs to no global state."""
     return _matplotlib("figure").Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 

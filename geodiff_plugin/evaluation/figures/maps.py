@@ -23,7 +23,7 @@ from geodiff_plugin.evaluation.figures.canvas import (
     show_image,
 )
 from geodiff_plugin.evaluation.figures.clouds import orbit, render_cloud
-from geodiff_plugin.plotting.figures import depth_range
+from geodiff_plugin.plotting import depth_range
 
 __all__ = ["ABLATION_METHODS", "QUALITATIVE_METHODS", "draw_ablation", "draw_qualitative"]
 

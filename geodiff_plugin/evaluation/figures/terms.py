@@ -40,7 +40,7 @@ from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import hidden_in_right, warp_right_to_left
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.plotting.figures import depth_range
+from geodiff_plugin.plotting import depth_range
 from geodiff_plugin.scale.space import AffineState
 from geodiff_plugin.types import StepReport
 

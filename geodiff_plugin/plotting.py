@@ -1,0 +1,455 @@
+"""Pictures of depth maps (the figures of S5): colours and legends, contact sheets, overviews and videos.
+
+matplotlib is imported when the first picture is drawn, and draws without any global state.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from PIL import Image
+
+from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_number
+from geodiff_plugin.formats.depth import row_strips
+from geodiff_plugin.formats.out import atomic_path
+
+__all__ = [
+    *("VIDEO_SUFFIXES", "check_video", "colour_depth", "colour_share", "depth_figure", "depth_frames"),
+    *("depth_range", "grid", "overview", "share_figure", "ticks", "write_depth_video"),
+]
+
+#: Lightness grows evenly in both, so equal steps look equal; neither has a colour near the grey of "unknown".
+DEPTH_COLOURS, SHARE_COLOURS = "plasma", "YlGnBu_r"
+GREY = 128
+#: Share of the pixels beyond either end of the colours, so that one outlier does not flatten the rest.
+TAIL_PERCENT = 2.0
+#: The ends of the colours are those of so many pixels of a larger map, or of all maps of a video.
+MOST_FOR_RANGE = 1 << 22
+#: Maps lower than this are enlarged in a figure, so that the legend can be read.
+FIGURE_MIN_HEIGHT = 256
+#: Of a picture in an overview; larger maps are thinned to no less than twice that.
+CELL_WIDTH = 480
+#: The colours of the photometric error end at its 98 % quantile, and not below this.
+LEAST_ERROR = 0.05
+VIDEO_SUFFIXES = (".mp4", ".webp", ".gif")
+#: Of a frame with its photograph, pixels.
+MOST_VIDEO_WIDTH = 960
+DPI = 100
+
+
+def _as_map(values: Any, name: str = "depth_m") -> np.ndarray:
+    """``(H, W)`` of a tensor or array whose other axes have length 1."""
+    array = np.asarray(values.detach().cpu() if isinstance(values, torch.Tensor) else values)
+    while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
+        array = array[0] if array.shape[0] == 1 else array[..., 0]
+    if array.ndim != 2:
+        bad_value(name, "one map of shape (H, W)", f"shape {array.shape}")
+    return array
+
+
+def _usable(depth_m: np.ndarray, valid: Any) -> np.ndarray:
+    use = np.isfinite(depth_m) & (depth_m > 0)
+    if valid is None:
+        return use
+    mask = _as_map(valid, "valid").astype(bool)
+    if mask.shape != depth_m.shape:
+        bad_value("valid", f"of shape {depth_m.shape} as depth_m", f"shape {mask.shape}")
+    return use & mask
+
+
+def depth_range(
+    depth_m: Any, valid: Any = None, near: float | None = None, far: float | None = None
+) -> tuple[float, float]:
+    """The depths at the two ends of the colours, ``0 < near < far`` in metres.
+
+    Args:
+        depth_m: ``(H, W)`` metres, numpy or torch.
+        valid: ``(H, W)`` boolean; pixels that are not finite or not above 0 never count.
+        near: nearest depth in metres, > 0; ``None`` takes the 2nd percentile.
+        far: farthest depth in metres; ``None`` takes the 98th percentile.
+
+    Raises:
+        ValueError: ``near`` or ``far`` not above 0 and finite, or ``near >= far`` when both are given.
+    """
+    for name, value in (("near", near), ("far", far)):
+        if value is not None and not (0 < value < math.inf):
+            bad_value(name, "a depth in metres above 0", value)
+    if near is not None and far is not None and near >= far:
+        bad_value("near, far", "near < far, in metres", f"{near}, {far}")
+    depth_m = _as_map(depth_m)
+    use = _usable(depth_m, valid)
+    every = math.isqrt(max(1, depth_m.size // MOST_FOR_RANGE))
+    if use[::every, ::every].any():
+        depth_m, use = depth_m[::every, ::every], use[::every, ::every]
+    used = depth_m[use].astype(np.float64)
+    low, high = np.percentile(used, (TAIL_PERCENT, 100 - TAIL_PERCENT)) if len(used) else (1.0, 2.0)
+    low, high = (low if near is None else near), (high if far is None else far)
+    if high <= low * (1 + 1e-6):  # a flat map, or a given end beyond the data: open the other end a little
+        low, high = (low, low * 1.01) if far is None else (high / 1.01, high)
+    return float(low), float(high)
+
+
+def ticks(near: float, far: float, most: int = 8) -> list[float]:
+    """At most ``most`` rising round depths in ``[near, far]`` for a logarithmic scale, ``0 < near < far``.
+
+    They are 1, 2, 5 (or denser) times powers of ten over wide ranges, equal steps over narrow ones.
+    """
+    if far / near >= 4:
+        powers = range(math.floor(math.log10(near)), math.ceil(math.log10(far)) + 1)
+        for digits in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7)):
+            inside = [d * 10.0**power for power in powers for d in digits if near <= d * 10.0**power <= far]
+            if len(inside) >= 4:
+                return inside[:: math.ceil(len(inside) / most)]
+    magnitude = 10.0 ** math.floor(math.log10((far - near) / most))
+    for step in (magnitude * factor for factor in (1, 2, 5, 10)):
+        inside = [i * step for i in range(math.ceil(near / step - 1e-9), math.floor(far / step + 1e-9) + 1)]
+        if len(inside) <= most:
+            return [float(f"{value:.6g}") for value in inside]
+    return [near, far]
+
+
+def _coloured(
+    values: np.ndarray, use: np.ndarray, share_of: Callable[[Any], Any], colours: str
+) -> np.ndarray:
+    """``(H, W, 3)`` uint8 of a map; ``share_of`` tells each value's place among the colours."""
+    import matplotlib
+
+    table = matplotlib.colormaps[colours].resampled(1024)
+    picture = np.full((*values.shape, 3), GREY, np.uint8)
+    for rows in row_strips(*values.shape):
+        shares = share_of(values[rows][use[rows]].astype(np.float64))
+        picture[rows][use[rows]] = table(np.clip(shares, 0.0, 1.0), bytes=True)[..., :3]
+    return picture
+
+
+def colour_depth(
+    depth_m: Any, valid: Any = None, near: float | None = None, far: float | None = None
+) -> np.ndarray:
+    """``(H, W, 3)`` uint8 RGB of a depth map: near is yellow, far is dark blue, unknown is grey.
+
+    The colours go with the logarithm of depth, so that a step of colour is a step of relative depth, as in
+    AbsRel. Arguments and errors as for ``depth_range``; axes of length 1 are dropped.
+    """
+    near, far = depth_range(depth_m, valid, near, far)
+    depth_m = _as_map(depth_m)
+    scale = math.log(far / near)
+    return _coloured(depth_m, _usable(depth_m, valid), lambda z: np.log(far / z) / scale, DEPTH_COLOURS)
+
+
+def colour_share(values: np.ndarray, top: float = 1.0) -> np.ndarray:
+    """``(H, W, 3)`` uint8 RGB of ``(H, W)`` values from 0 (dark) to ``top`` (light); not finite is grey."""
+    values = np.asarray(values)
+    return _coloured(values, np.isfinite(values), lambda v: v / top, SHARE_COLOURS)
+
+
+def _drawn(width: int, height: int, draw: Callable[[Any], None]) -> np.ndarray:
+    """``(height, width, 3)`` uint8 of what is drawn into a white figure of matplotlib."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    draw(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:height, :width, :3]
+
+
+def _points(pixels: float) -> float:
+    return pixels * 72 / DPI
+
+
+Marks = tuple[tuple[float, str], ...]
+
+
+@lru_cache(maxsize=8)
+def _bar(
+    height: int, colours: str, label: str, marks: tuple[tuple[float, str], ...], unknown: bool
+) -> np.ndarray:
+    """Colour bar with marks at shares of it, and where pixels are unknown a grey key."""
+    size = max(12, height // 26)
+    gap, bar = size // 2, max(14, height // 24)
+    width, low, high = gap + bar + 5 * size, size * (3 if unknown else 1), height - 2 * size
+    letters = {"fontsize": _points(size), "color": "black"}
+
+    def draw(figure: Any) -> None:
+        axes = figure.add_axes((gap / width, low / height, bar / width, (high - low) / height))
+        axes.imshow(
+            np.linspace(0, 1, 512)[:, None], cmap=colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1)
+        )
+        axes.set_xticks([])
+        axes.yaxis.tick_right()
+        axes.set_yticks([share for share, _ in marks], [text for _, text in marks], **letters)
+        axes.tick_params(length=_points(size / 3), pad=_points(size / 4))
+        figure.text(gap / width, 1 - 0.9 * size / height, label, va="center", **letters)
+        if unknown:
+            key = figure.add_axes(
+                (gap / width, size / height, bar / width, size / height), facecolor=str(GREY / 255)
+            )
+            key.set(xticks=[], yticks=[])
+            figure.text((gap + bar + size / 2) / width, 1.5 * size / height, "none", va="center", **letters)
+
+    return _drawn(width, height, draw)
+
+
+def _enlarged(picture: np.ndarray) -> np.ndarray:
+    """Small maps by a whole factor, so that pixels stay squares."""
+    factor = math.ceil(FIGURE_MIN_HEIGHT / len(picture))
+    return picture.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def _title(text: str, width: int, height: int, size: float) -> np.ndarray:
+    """A centred line of text, smaller where it is too long."""
+    size = min(size, 1.7 * width / max(1, len(text)))
+    return _drawn(width, height, lambda figure: figure.text(
+        0.5, 0.5, text, ha="center", va="center", fontsize=_points(size), parse_math=False
+    ))  # fmt: skip
+
+
+def depth_figure(
+    depth_m: Any,
+    valid: Any = None,
+    near: float | None = None,
+    far: float | None = None,
+    title: str | None = None,
+    unit: str | None = "m",
+) -> Image.Image:
+    """A coloured depth map beside a colour bar, far on top; small maps are enlarged by a whole factor.
+
+    Args:
+        depth_m: as in ``colour_depth``, likewise ``valid``, ``near``, ``far`` and the errors.
+        valid: likewise.
+        near: likewise.
+        far: likewise.
+        title: a line above it.
+        unit: ``"m"``, or ``None`` for a depth without one, as the legend then says.
+    """
+    near, far = depth_range(depth_m, valid, near, far)
+    picture = _enlarged(colour_depth(depth_m, valid, near, far))
+    marks = tuple((math.log(z / near) / math.log(far / near), f"{z:g}") for z in ticks(near, far))
+    unknown = not _usable(_as_map(depth_m), valid).all()
+    label = "no unit" if unit is None else f"depth, {unit}"
+    figure = np.hstack([picture, _bar(len(picture), f"{DEPTH_COLOURS}_r", label, marks, unknown)])
+    if title is not None:
+        head = 2 * max(12, len(picture) // 26)
+        figure = np.vstack([_title(title, figure.shape[1], head, head / 2), figure])
+    return Image.fromarray(figure)
+
+
+def share_figure(values: np.ndarray, label: str, top: float) -> Image.Image:
+    """A map ``(H, W)`` of something from 0 to ``top`` (> 0), beside a colour bar under its ``label``."""
+    picture = _enlarged(colour_share(values, top))
+    marks = tuple((share, f"{share * top:.2g}") for share in (0.0, 0.25, 0.5, 0.75, 1.0))
+    unknown = not np.isfinite(values).all()
+    return Image.fromarray(np.hstack([picture, _bar(len(picture), SHARE_COLOURS, label, marks, unknown)]))
+
+
+def _as_picture(image: Any) -> Image.Image:
+    if isinstance(image, Image.Image):
+        return image.convert("RGB")
+    values = np.asarray(image)
+    if values.dtype.kind in "fb":
+        values = np.rint(np.clip(np.nan_to_num(values.astype(np.float32)), 0.0, 1.0) * 255).astype(np.uint8)
+    if values.dtype != np.uint8 or not (values.ndim == 2 or (values.ndim == 3 and values.shape[-1] == 3)):
+        expected = "PIL, or (H, W) or (H, W, 3) of uint8, bool or [0, 1]"
+        bad_value("images", expected, f"{values.dtype} {values.shape}")
+    return Image.fromarray(values).convert("RGB")
+
+
+def grid(
+    images: Sequence[Any],
+    titles: Sequence[str] | None = None,
+    *,
+    columns: int | None = None,
+    cell_width: int = 320,
+) -> Image.Image:
+    """A contact sheet: pictures side by side, each under its title.
+
+    Args:
+        images: PIL images, or ``(H, W)`` or ``(H, W, 3)`` arrays of uint8, bool or floats in [0, 1].
+        titles: one a picture; ``None`` leaves no room for them.
+        columns: pictures in a row; ``None`` takes all, up to 4.
+        cell_width: pixels that each is scaled to; heights follow, and a row is as high as its highest.
+
+    Raises:
+        ValueError: no pictures, another number of titles, an array that is no picture, no columns.
+    """
+    pictures = [_as_picture(image) for image in images]
+    if not pictures:
+        bad_value("images", "at least one picture", "none")
+    if titles is not None and len(titles) != len(pictures):
+        bad_value("titles", f"one for each of {len(pictures)} pictures", f"{len(titles)}")
+    if columns is not None and columns < 1:
+        bad_value("columns", "at least 1", columns)
+    columns, gap, head = columns or min(len(pictures), 4), 6, 0 if titles is None else 24
+    cells = [p.resize((cell_width, max(1, round(p.height * cell_width / p.width)))) for p in pictures]
+    rows = [range(start, min(start + columns, len(cells))) for start in range(0, len(cells), columns)]
+    heights = [head + max(cells[i].height for i in row) for row in rows]
+    size = gap + columns * (cell_width + gap), gap + sum(height + gap for height in heights)
+    sheet, top = Image.new("RGB", size, "white"), gap
+    for row, height in zip(rows, heights, strict=True):
+        for column, index in enumerate(row):
+            left = gap + column * (cell_width + gap)
+            sheet.paste(cells[index], (left, top + head))
+            if titles is not None:
+                sheet.paste(Image.fromarray(_title(titles[index], cell_width, head, 15)), (left, top))
+        top += height + gap
+    return sheet
+
+
+def overview(
+    left_01: np.ndarray,
+    depth_m: np.ndarray,
+    confidence: np.ndarray | None,
+    error: np.ndarray | None,
+    unit: str | None = "m",
+) -> Image.Image:
+    """Left image, depth with legend, and where there are any confidence and photometric error, two a row.
+
+    Args:
+        left_01: ``(H, W, 3)`` in [0, 1].
+        depth_m: ``(H, W)`` metres.
+        confidence: ``(H, W)`` in [0, 1], or ``None``.
+        error: ``(H, W)`` in [0, 1], not finite where no right view sees the pixel, or ``None``.
+        unit: of the depth, as in ``depth_figure``.
+    """
+    every = max(1, depth_m.shape[1] // (2 * CELL_WIDTH))
+    left_01, depth_m = left_01[::every, ::every], depth_m[::every, ::every]
+    depth = depth_figure(depth_m, unit=unit)
+    left = _as_picture(left_01.astype(np.float32))
+    beside = Image.new("RGB", depth.size, "white")  # as wide as a map with its bar: all have one scale
+    beside.paste(left.resize((round(left.width * depth.height / left.height), depth.height)), (0, 0))
+    cells, titles = [beside, depth], ["left image", "depth"]
+    if confidence is not None:
+        cells.append(share_figure(confidence[::every, ::every], "within 10 %", 1.0))
+        titles.append("confidence")
+    if error is not None:
+        error = error[::every, ::every]
+        finite = error[np.isfinite(error)]
+        top = max(LEAST_ERROR, float(np.quantile(finite, 0.98))) if finite.size else LEAST_ERROR
+        cells.append(share_figure(error, "difference", top))
+        titles.append("photometric error (grey: not seen from the right)")
+    return grid(cells, titles, columns=2, cell_width=CELL_WIDTH)
+
+
+def depth_frames(
+    depths_m: Sequence[np.ndarray],
+    photographs: Iterable[Image.Image] | None = None,
+    near: float | None = None,
+    far: float | None = None,
+    unit: str | None = "m",
+) -> Iterator[Image.Image]:
+    """One picture a depth map, all of one size and in the same colours; each is drawn when it is asked for.
+
+    Args:
+        depths_m: ``(H, W)`` metres each, of one shape.
+        photographs: one a map, shown on its left; each is taken when its picture is drawn.
+        near: depth of the last colour, metres; ``None`` takes the 2nd percentile over all maps.
+        far: depth of the first colour, metres; ``None`` takes the 98th.
+        unit: of all maps, as in ``depth_figure``.
+
+    Raises:
+        ValueError: no maps, or maps of several shapes; at the last picture: another number of photographs.
+    """
+    shapes, samples = set(), []
+    for depth_m in depths_m:  # one pass: a map may be read from its file whenever it is asked for
+        every = max(1, math.ceil(len(depths_m) * depth_m.size / (4 * MOST_FOR_RANGE)))
+        shapes.add(depth_m.shape)
+        samples.append(np.asarray(depth_m).reshape(-1)[::every].copy())
+    if len(shapes) != 1:
+        bad_value("depths_m", "at least one map, all of one shape", sorted(shapes) or "none")
+    near, far = depth_range(np.concatenate(samples)[None], near=near, far=far)
+    figures = (depth_figure(depth_m, near=near, far=far, unit=unit) for depth_m in depths_m)
+    if photographs is None:
+        return figures
+    ((height, width),) = shapes
+    pairs = zip(photographs, figures, strict=True)
+    return (_beside(photograph, figure, width / height) for photograph, figure in pairs)
+
+
+def _beside(photograph: Image.Image, figure: Image.Image, shape: float) -> Image.Image:
+    """A photograph as large as the map in a figure, on its left."""
+    left = photograph.convert("RGB").resize((round(shape * figure.height), figure.height))
+    joined = Image.fromarray(np.hstack([np.asarray(left), np.asarray(figure)]))
+    factor = min(1.0, MOST_VIDEO_WIDTH / joined.width)
+    size = round(joined.width * factor), round(joined.height * factor)
+    return joined.resize(size, Image.Resampling.LANCZOS)
+
+
+def check_video(path: str | os.PathLike[str], fps: float) -> None:
+    """Refuse a video that could not be written, before its frames are drawn.
+
+    Args:
+        path: the video to appear.
+        fps: frames a second, in [0.1, 120].
+
+    Raises:
+        ValueError: another ending than ``VIDEO_SUFFIXES``, a folder, no folder to write into, or ``fps``.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        bad_value("the video", f"a file that ends in {', '.join(VIDEO_SUFFIXES)}", path.name)
+    if os.path.isdir(path):
+        bad_value("the video", "a file", f"the folder {path}", "Name a file inside of it.")
+    if not os.path.isdir(path.parent):
+        bad_value("the video", "in an existing folder", path, f"Make the folder {path.parent} first.")
+    check_number(fps, "fps", 0.1, 120)
+
+
+def _write_mp4(path: Path, size: tuple[int, int], frames: Iterable[Image.Image], fps: float) -> None:
+    width, height = (side // 2 * 2 for side in size)  # H.264 and its like want even sides
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
+    if not writer.isOpened():
+        raise OSError("OpenCV cannot open it")
+    try:
+        for frame in frames:
+            writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))
+    finally:  # an open file can be neither renamed nor removed on Windows
+        writer.release()
+
+
+def write_depth_video(path: str | os.PathLike[str], frames: Iterable[Image.Image], fps: float = 10.0) -> None:
+    """Write frames as a video, of the kind that the file's name ends in; whole or not at all.
+
+    An MP4 is written frame by frame; all frames of the others are in memory, as Pillow wants them.
+
+    Args:
+        path: ends in .mp4 (OpenCV writes it), .webp or .gif.
+        frames: of one size.
+        fps: frames a second, in [0.1, 120].
+
+    Raises:
+        ValueError: as ``check_video``; no frames.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    check_video(path, fps)
+    rest = iter(frames)
+    first = next(rest, None)
+    if first is None:
+        bad_value("frames", "at least one picture", "none")
+    kind = path.suffix.lower()
+    try:
+        with atomic_path(path) as temporary:
+            if kind == ".mp4":
+                _write_mp4(temporary, first.size, itertools.chain([first], rest), fps)
+                return
+            more: dict[str, Any] = {"quality": 85} if kind == ".webp" else {}
+            more |= {"duration": round(1000 / fps), "loop": 0}
+            with open(temporary, "wb") as file:  # Pillow leaves its own open file behind after a Ctrl-C
+                first.save(file, kind[1:], save_all=True, append_images=rest, **more)
+    except InputError:  # of a photograph, or of the file, which it names
+        raise
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputFileError(
+            f"the video must be a file that can be written; got {path} ({reason})."
+        ) from error
