@@ -136,8 +136,8 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
         if needs_matches:
             found = find_matches(left_01, views, K_left, volume=volume)
             matches = _on_grid(found, left, K_loss)
-        check = mirrored_pose_preferred(left_01, views, K_left, found)
-        if check.preferred:
+        inverse = mirrored_pose_preferred(left_01, views, K_left, found)
+        if inverse:
             warnings.append(INVERSE)
     if points is not None:
         known, left_out = points_to_matches(points, K_left, size, K_loss, size_loss)

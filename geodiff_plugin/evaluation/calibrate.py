@@ -108,13 +108,13 @@ def observe_matches(sample: StereoSample, settings: Settings, priors: PriorCache
         priors: not used.
     """
     volume = sweep(sample, settings.device)
-    found = consistency.checked_matches(volume)
+    inverse_depth, evidence, checked = consistency.checked_matches(volume)
     truth = torch.from_numpy(np.where(sample.valid, sample.depth_m, 0.0)).float()[None, None]
     truth_m = F.interpolate(truth, volume.size, mode="nearest-exact")[0, 0].numpy()
-    known = found.checked.cpu().numpy() & (truth_m > 0)
-    error = np.abs(found.inverse_depth.cpu().numpy() - 1.0 / np.where(truth_m > 0, truth_m, 1.0))
+    known = checked.cpu().numpy() & (truth_m > 0)
+    error = np.abs(inverse_depth.cpu().numpy() - 1.0 / np.where(truth_m > 0, truth_m, 1.0))
     right = error <= consistency.RIGHT_WITHIN_PLANES * float(volume.plane_step)
-    return _drawn(found.evidence.cpu().numpy(), right, known, settings.seed)
+    return _drawn(evidence.cpu().numpy(), right, known, settings.seed)
 
 
 def _stack(pairs: Sequence[Observed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -5,11 +5,10 @@ Paper: S7.3 (the search is a lookup in this volume); the matches go beyond it.
 """
 
 from geodiff_plugin.matching.aggregation import aggregate
-from geodiff_plugin.matching.build import build_cost_volume, find_matches
+from geodiff_plugin.matching.build import build_cost_volume, find_matches, mirrored_pose_preferred
 from geodiff_plugin.matching.cleaning import clean
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches, MatchTarget
-from geodiff_plugin.matching.mirrored import PoseCheck, mirrored_pose_preferred
 from geodiff_plugin.matching.points import points_to_matches, with_points
 from geodiff_plugin.matching.reflections import reject_reflections
 from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
@@ -18,7 +17,6 @@ __all__ = [
     "CostVolume",
     "MatchTarget",
     "Matches",
-    "PoseCheck",
     "aggregate",
     "build_cost_volume",
     "clean",

@@ -1,7 +1,6 @@
 """Semi-global aggregation: neighbours vote for similar inverse depths along straight paths.
 
-Data flow: cost levels (D, H, W) -> sums over paths (D, H, W), in small integers.
-Paper: none (Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual information", Eq. 13).
+Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual information", Eq. 13.
 """
 
 from __future__ import annotations

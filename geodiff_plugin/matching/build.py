@@ -1,8 +1,4 @@
-"""From two or more views to a cost volume that spans the scene, and its matches.
-
-Data flow: images, K's, T's -> grid, span of inverse depth -> ``CostVolume`` -> ``Matches``.
-Paper: S7.3 ("a predefined depth range"); here the views find the range by themselves.
-"""
+"""From two or more views to a cost volume that spans the scene, and its matches (S7.3)."""
 
 from __future__ import annotations
 
@@ -11,6 +7,7 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
+from kornia.geometry.linalg import inverse_transformation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
@@ -26,7 +23,7 @@ from geodiff_plugin.matching.sweep import (
 )
 from geodiff_plugin.types import CameraView
 
-__all__ = ["build_cost_volume", "find_matches", "pilot_volume"]
+__all__ = ["build_cost_volume", "find_matches", "mirrored_pose_preferred", "pilot_volume"]
 
 # Fewer planes than this make no parabola worth the name.
 _FEWEST_PLANES = 24
@@ -44,6 +41,9 @@ PILOT_SHIFT = 0.4
 PILOT_CONFIDENCE, PILOT_QUANTILE, PILOT_LEAST_SHARE = 0.8, 0.995, 0.03
 # The planes reach this factor nearer than that, and at least to the depth of this shift, in image widths.
 HEADROOM, LEAST_SHIFT = 1.25, 0.03
+# The inverse pose must match this many times as much of the image as the given one, in sweeps of so many
+# pixels; where the given one matches this share of the image, it is not asked.
+_CLEARLY, _INVERSE_PIXELS, _PLAINLY = 1.25, 15_000, 0.4
 
 
 def _shrink(
@@ -126,12 +126,12 @@ def _at_shift(
     rights: Sequence[CameraView], K: torch.Tensor, size: tuple[int, int], fraction: float
 ) -> torch.Tensor:
     """Inverse depth at which the view that moves most has moved by this fraction of the width."""
-    found = []
+    nearest = []
     for v, (_, K_r, T) in enumerate(rights, 1):
         name = "E" if len(rights) == 1 else f"E of right view {v}"
         rays = plane_rays(K[None], K_r[None], T[None], size)
-        found.append(inverse_depth_at_shift(rays, fraction * size[1], name))
-    return torch.stack(found).amin()
+        nearest.append(inverse_depth_at_shift(rays, fraction * size[1], name))
+    return torch.stack(nearest).amin()
 
 
 def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
@@ -215,3 +215,40 @@ def find_matches(
     if volume is None:
         volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range, config=config)
     return match_volume(volume)
+
+
+@torch.no_grad()
+def mirrored_pose_preferred(
+    left_01: torch.Tensor,
+    rights: Sequence[CameraView],
+    K_left: torch.Tensor,
+    matches: Matches | None = None,
+) -> bool:
+    """Whether the inverse pose matches clearly more of the image than the pose as given.
+
+    The inverse is the pose that is true when the two images were swapped, and when a world-to-camera pose was
+    given for a camera-to-world one. For a rectified pair it is the baseline with the other sign.
+
+    Args:
+        left_01: ``(3, H, W)`` float in [0, 1].
+        rights: as for ``build_cost_volume``.
+        K_left: ``(3, 3)`` pixels of ``left_01``.
+        matches: what ``find_matches`` gave for the pose as given, if it was called already.
+
+    Returns:
+        The answer of two coarse sweeps, or of none where the matches leave no doubt.
+    """
+    if matches is not None and float(matches.confidence.mean()) > _PLAINLY:
+        return False
+
+    def confidence(views: Sequence[CameraView]) -> float:
+        return float(match_volume(pilot_volume(left_01, views, K_left, _INVERSE_PIXELS)).confidence.mean())
+
+    given = confidence(rights)
+    try:
+        turned = confidence(
+            [CameraView(image, K_right, inverse_transformation(T)) for image, K_right, T in rights]
+        )
+    except ValueError:  # under the inverse pose the views do not overlap, so it is not the true one
+        turned = 0.0
+    return turned > _CLEARLY * given

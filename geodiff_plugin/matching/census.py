@@ -1,8 +1,4 @@
-"""Soft census transform: an exposure-invariant descriptor in small integers.
-
-Data flow: grey image -> 16 comparisons a pixel; two of them -> matching cost.
-Paper: none (Zabih and Woodfill 1994, "Non-parametric local transforms for computing visual correspondence").
-"""
+"""Soft census transform (Zabih and Woodfill 1994): an exposure-invariant descriptor in small integers."""
 
 from __future__ import annotations
 
@@ -27,7 +23,7 @@ COST_LEVELS = 2 * VOTE_LEVELS * _SIDE * _SIDE
 
 
 def grey(image_01: torch.Tensor) -> torch.Tensor:
-    """Luma of an image.
+    """Luma of an image; kornia's ``rgb_to_grayscale`` rounds another way (1e-7), which turns single votes.
 
     Args:
         image_01: ``(3, H, W)`` or already ``(1, H, W)``, float in [0, 1].
@@ -74,19 +70,19 @@ def census(levels: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tenso
     return out.clamp_(-VOTE_LEVELS, VOTE_LEVELS)
 
 
-def census_cost(one: torch.Tensor, other: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+def census_cost(left: torch.Tensor, right: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
     """Difference between two descriptions.
 
     Args:
-        one: ``(16, H, W)`` of ``census``, int8 or int16.
-        other: the same shape and type.
-        out: the same shape and type, to work in; may be ``one`` where that is not needed any more.
+        left: ``(16, H, W)`` of ``census``, int8 or int16.
+        right: the same shape and type.
+        out: the same shape and type, to work in; may be ``left`` where that is not needed any more.
 
     Returns:
         ``(H, W)`` uint8, 0 to ``COST_LEVELS``; about 0.35 of that for unrelated natural texture, 0.5 for
         unrelated noise.
     """
-    apart = torch.sub(one, other, out=out).abs_()
+    apart = torch.sub(left, right, out=out).abs_()
     if apart.dtype == torch.int8:
         return apart.view(torch.uint8).sum(dim=0, dtype=torch.uint8)
     return apart.sum(dim=0, dtype=torch.int16).to(torch.uint8)

@@ -1,21 +1,19 @@
 """Removal of JPEG blocks and sensor noise from photographs before they are compared.
 
-Data flow: photograph -> how coarsely it was compressed, how noisy it is -> photograph to match with.
-Paper: none. The filter is hard thresholding of a shifted 8 x 8 DCT (Coifman and Donoho 1995,
-"Translation-invariant de-noising"), the steps of the quantisation those of ITU-T T.81, table K.1.
+The filter is hard thresholding of a shifted 8 x 8 DCT (Coifman and Donoho 1995, "Translation-invariant
+de-noising"), the steps of the quantisation those of ITU-T T.81, table K.1.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 
 from geodiff_plugin.matching.census import grey
 
-__all__ = ["Flaws", "clean", "find_flaws"]
+__all__ = ["clean", "find_flaws"]
 
 _SIDE = 8
 _LUMA_STEPS = (
@@ -46,20 +44,6 @@ _SHIFTS = tuple((i, (3 * i + k) % _SIDE) for i in range(_SIDE) for k in (0, _SID
 # Shrinking averages a picture of more than so many times the pixels of the grid that it is compared on:
 # 1280 x 960 still gains from cleaning.
 _SHRUNK = 6.0
-
-
-@dataclass(frozen=True)
-class Flaws:
-    """What a camera and a file format did to a photograph.
-
-    Attributes:
-        jpeg_scale: its steps of quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at 80; 0
-            where no trace of compression was found.
-        noise: standard deviation of the sensor noise, grey levels of 255.
-    """
-
-    jpeg_scale: float
-    noise: float
 
 
 def _basis(like: torch.Tensor) -> torch.Tensor:
@@ -94,7 +78,7 @@ def _first_edge(levels: torch.Tensor, axis: int) -> int:
 
 
 def _jpeg_scale(levels: torch.Tensor, basis: torch.Tensor) -> float:
-    """``Flaws.jpeg_scale``: the largest steps that the coefficients of a picture are whole multiples of."""
+    """The largest steps that the coefficients of a picture are whole multiples of."""
     rows, columns = zip(*_KEPT, strict=True)
     top, left = _first_edge(levels, 0), _first_edge(levels, 1)
     blocks = _to_blocks(levels[top:, left:], basis).reshape(-1, _SIDE, _SIDE)
@@ -118,33 +102,30 @@ def _noise(levels: torch.Tensor, basis: torch.Tensor) -> float:
     return math.sqrt(float(torch.quantile(energy, _FLATTEST))) * _NOISE_OF_FLATTEST
 
 
-def _flaws(levels: torch.Tensor, basis: torch.Tensor) -> Flaws:
-    return Flaws(_jpeg_scale(levels, basis), _noise(levels, basis))
-
-
-def find_flaws(image_01: torch.Tensor) -> Flaws:
+def find_flaws(image_01: torch.Tensor) -> tuple[float, float]:
     """How coarsely a photograph was compressed, and how noisy it is.
-
-    Compression shows as long as the picture was not resampled since: shrunk, undistorted or rectified.
 
     Args:
         image_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1], at least 32 pixels a side.
 
     Returns:
-        ``Flaws``.
+        The steps of the JPEG quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at 80; 0 where
+        no trace of compression remains, as after resampling. And the standard deviation of the noise, grey
+        levels of 255.
     """
     levels = grey(image_01)[0] * 255.0
-    return _flaws(levels, _basis(levels))
+    basis = _basis(levels)
+    return _jpeg_scale(levels, basis), _noise(levels, basis)
 
 
-def _threshold(flaws: Flaws, like: torch.Tensor) -> torch.Tensor | None:
+def _threshold(jpeg_scale: float, noise: float, like: torch.Tensor) -> torch.Tensor | None:
     """Size ``(8, 8)`` below which a coefficient counts for nothing; ``None`` if none does."""
     low, high = _NOISE_RANGE
-    noise = flaws.noise * min(max((flaws.noise - low) / (high - low), 0.0), 1.0)
-    if not flaws.jpeg_scale and not noise:
+    noise *= min(max((noise - low) / (high - low), 0.0), 1.0)
+    if not jpeg_scale and not noise:
         return None
-    threshold = torch.hypot(_STEPS * flaws.jpeg_scale * _table(like), like.new_tensor(_DEVIATIONS * noise))
-    threshold[0, 0] = 0.0  # the mean of a block is always its own
+    threshold = torch.hypot(_STEPS * jpeg_scale * _table(like), like.new_tensor(_DEVIATIONS * noise))
+    threshold[0, 0] = 0.0  # the mean of a block is always kept
     return threshold
 
 
@@ -167,7 +148,7 @@ def clean(image_01: torch.Tensor, grid_pixels: int) -> torch.Tensor:
         return image_01
     levels = grey(image_01)[0] * 255.0
     basis = _basis(levels)
-    threshold = _threshold(_flaws(levels, basis), levels)
+    threshold = _threshold(_jpeg_scale(levels, basis), _noise(levels, basis), levels)
     if threshold is None:
         return image_01
     height, width = levels.shape

@@ -1,13 +1,8 @@
-"""Matches that both views agree on: winner, left-right check, uniqueness, sub-plane position.
-
-Data flow: ``CostVolume`` -> aggregated costs -> ``Matches`` (inverse depth and confidence on the left grid).
-Paper: none; the evidence that a photometric loss does not have.
-"""
+"""Matches that both views agree on: winner, left-right check, uniqueness, position between planes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -22,14 +17,13 @@ __all__ = [
     "LOG_ODDS",
     "RIGHT_WITHIN_PLANES",
     "SIGNS",
-    "CheckedMatches",
     "checked_matches",
     "match_volume",
 ]
 
 #: Planes of the truth within which a match counts as right.
 RIGHT_WITHIN_PLANES = 3.0
-#: Log-odds that a checked match is right, linear in ``_evidence``, by logistic regression on pairs with truth
+#: Log-odds that a checked match is right, linear in its evidence, by logistic regression on pairs with truth
 #: (``python -m geodiff_plugin.evaluation.calibrate`` refits them).
 LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
 #: Which sign each of them may have; 0 for any.
@@ -45,36 +39,33 @@ _EVERY_ROW = 2
 _PLANES = 1 << 12
 
 
-@dataclass(frozen=True)
-class _Winner:
-    """Per pixel ``(H, W)``: the best plane, that between planes, and the ``(3, H, W)`` planes around it."""
+def _winner(total: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The best plane of sums over the paths, with a parabola through its neighbours.
 
-    index: torch.Tensor
-    position: torch.Tensor
-    around: torch.Tensor
-    best: torch.Tensor
+    Args:
+        total: ``(D, H, W)`` of ``aggregate``.
 
-
-def _winner(total: torch.Tensor) -> _Winner:
-    """The best plane of sums over the paths, with a parabola through its neighbours."""
+    Returns:
+        Per pixel: the best plane, the position between planes, the ``(3, H, W)`` planes around it, its sum.
+    """
     keys = torch.full_like(total[0], NEVER, dtype=torch.int32).mul_(_PLANES)
-    own = torch.empty_like(keys)
+    plane_keys = torch.empty_like(keys)
     for plane in range(len(total)):
-        torch.minimum(keys, own.copy_(total[plane]).mul_(_PLANES).add_(plane), out=keys)
+        torch.minimum(keys, plane_keys.copy_(total[plane]).mul_(_PLANES).add_(plane), out=keys)
     index, last = (keys % _PLANES).long(), len(total) - 1
     around = (index + torch.arange(-1, 2, device=index.device)[:, None, None]).clamp_(0, last)
     below, best, above = total.gather(0, around).float()
     offset = 0.5 * (below - above) / (below + above - 2.0 * best).clamp_min(1e-6)
     inner = (index > 0) & (index < last)
     position = index + torch.where(inner, offset.clamp(-0.5, 0.5), torch.zeros_like(offset))
-    return _Winner(index, position, around, best)
+    return index, position, around, best
 
 
 def _right_winners(volume: CostVolume, view: AlignedView, room: Room) -> torch.Tensor:
     """The position between planes that a right view takes for the best, ``(ceil(h / 2), w)`` of its canvas.
 
-    Its costs are those of the same sweep, looked up along its own pixels, and aggregated along its own edges:
-    an opinion of its own without a sweep of its own. Every second row is enough to ask it.
+    Its costs are those of the same sweep, looked up along its own pixels and aggregated along its own edges,
+    so that it needs no sweep of its own. Every second row is enough.
     """
     height, width = volume.size
     # One row and one column more: what a right view's pixel reads beside the left image.
@@ -82,10 +73,10 @@ def _right_winners(volume: CostVolume, view: AlignedView, room: Room) -> torch.T
     rows, columns = view.sources(height, 1)[:, ::_EVERY_ROW], view.sources(width, 0)
     size = (rows.shape[1], columns.shape[1])
     levels = room.cells("levels", len(volume.levels), size, volume.levels)
-    for k, own in enumerate(volume.levels):
-        plane[:height, :width] = own
+    for k, of_plane in enumerate(volume.levels):
+        plane[:height, :width] = of_plane
         levels[k] = plane.index_select(0, rows[k]).index_select(1, columns[k])
-    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], room=room)).position
+    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], room=room))[1]
 
 
 def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
@@ -103,13 +94,13 @@ def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor
     at_scale = torch.lerp(scale[below], scale[below + 1], part)
     height, width = position.shape
     lines = (torch.arange(width, device=device), torch.arange(height, device=device)[:, None])
-    found, inside = [], at_scale > 0
+    places, inside = [], at_scale > 0
     for axis, line in enumerate(lines):
         at = (at_scale * line + torch.lerp(shift[below, axis], shift[below + 1, axis], part)).round()
         last = view.size[1 - axis] - 1
         inside = inside & (at >= 0) & (at <= last)
-        found.append(at.clamp(0, last).long())
-    column, row = found
+        places.append(at.clamp(0, last).long())
+    column, row = places
     if view.valid is not None:
         inside = inside & view.valid[row, column]
     # Between two matched rows, their mean: at an edge it agrees with neither.
@@ -132,79 +123,54 @@ def _contrast(volume: CostVolume, index: torch.Tensor, reach: int) -> torch.Tens
     return gain[0]
 
 
-@dataclass(frozen=True)
-class _Candidates:
-    """Per pixel ``(H, W)``: the winning plane, and how far each right view disagrees with it.
+_Candidates = tuple[torch.Tensor, torch.Tensor, Iterator[tuple[torch.Tensor, torch.Tensor]]]
 
-    Attributes:
-        position: between planes.
-        margin: least cost two planes away, less that of the winner; aggregated, in [0, 1] units.
-        cost: of the winner, aggregated.
-        contrast: ``_contrast``.
-        differences: left-right differences in planes.
+
+def _candidates(volume: CostVolume, views: Sequence[AlignedView]) -> _Candidates:
+    """Aggregate, take the winner, and compare it with the matches of right views.
+
+    Returns:
+        Inverse depths ``(H, W)``, 1/m; how much better than the mean plane they are (``_contrast``); and for
+        every view the evidence ``(4, H, W)``, in which the log-odds of a match are linear (1, logarithm of
+        the margin to the best plane elsewhere, cost, left-right difference), with that difference in planes.
     """
-
-    position: torch.Tensor
-    margin: torch.Tensor
-    cost: torch.Tensor
-    contrast: torch.Tensor
-    differences: Iterator[torch.Tensor]
-
-
-def _find_candidates(volume: CostVolume, views: Sequence[AlignedView]) -> _Candidates:
-    """Aggregate, take the winner, and compare it with the matches of right views."""
     room = Room()
     total = aggregate(volume.levels, volume.left_01[0], room=room)
-    winner = _winner(total)
-    second = total.scatter_(0, winner.around, NEVER).amin(dim=0)
+    index, position, around, best = _winner(total)
+    second = total.scatter_(0, around, NEVER).amin(dim=0)
     unit = 1.0 / (PATHS * COST_LEVELS)
-    margin, cost = (second - winner.best) * unit, winner.best * unit
-    differences = (_disagreement(view, _right_winners(volume, view, room), winner.position) for view in views)
-    contrast = _contrast(volume, winner.index, CONTRAST_REACH)
-    return _Candidates(winner.position, margin, cost, contrast, differences)
+    margin, cost = ((second - best) * unit).clamp(0.0, 0.5), (best * unit).clamp(0.0, 0.8)
+
+    def evidence() -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        for view in views:
+            difference = _disagreement(view, _right_winners(volume, view, room), position)
+            differs = difference.clamp_max(AGREEMENT_PLANES)
+            yield torch.stack([torch.ones_like(margin), (margin + 0.03).log(), cost, differs]), difference
+
+    contrast = _contrast(volume, index, CONTRAST_REACH)
+    return volume.inverse_depth[0] + position * volume.plane_step, contrast, evidence()
 
 
-def _evidence(found: _Candidates, difference: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """1, log of the margin (0.03 + second best cost - best cost), best cost, left-right difference."""
-    margin = found.margin.clamp(0.0, 0.5)
-    ones = torch.ones_like(margin)
-    differs = difference.clamp_max(AGREEMENT_PLANES)
-    return ones, (margin + 0.03).log(), found.cost.clamp(0.0, 0.8), differs
-
-
-def _confidence(found: _Candidates, difference: torch.Tensor) -> torch.Tensor:
-    """Probability ``(H, W)`` that the winner is right, given the left-right difference in planes."""
+def _confidence(evidence: torch.Tensor, difference: torch.Tensor, contrast: torch.Tensor) -> torch.Tensor:
+    """Probability ``(H, W)`` that the winner is right."""
     odds = torch.zeros_like(difference)
-    for weight, x in zip(LOG_ODDS, _evidence(found, difference), strict=True):
+    for weight, x in zip(LOG_ODDS, evidence, strict=True):
         odds = odds + weight * x
-    probability = torch.sigmoid(odds)
-    probability = probability * (found.contrast / LEAST_CONTRAST).clamp_max(1.0)
+    probability = torch.sigmoid(odds) * (contrast / LEAST_CONTRAST).clamp_max(1.0)
     return torch.where(difference <= AGREEMENT_PLANES, probability, torch.zeros_like(probability))
 
 
-@dataclass(frozen=True)
-class CheckedMatches:
-    """What the confidence of matches is fitted on.
-
-    Attributes:
-        inverse_depth: ``(H, W)`` float32, 1/m.
-        evidence: ``(4, H, W)``, what their log-odds are linear in.
-        checked: ``(H, W)`` bool: the right view agrees, and there is texture to agree on.
-    """
-
-    inverse_depth: torch.Tensor
-    evidence: torch.Tensor
-    checked: torch.Tensor
-
-
 @torch.no_grad()
-def checked_matches(volume: CostVolume) -> CheckedMatches:
-    """Matches of a cost volume and their evidence, by its first right view."""
-    found = _find_candidates(volume, volume.aligned[:1])
-    (difference,) = found.differences
-    checked = (difference <= AGREEMENT_PLANES) & (found.contrast >= LEAST_CONTRAST)
-    inverse_depth = volume.inverse_depth[0] + found.position * volume.plane_step
-    return CheckedMatches(inverse_depth, torch.stack(_evidence(found, difference)), checked)
+def checked_matches(volume: CostVolume) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """What the confidence of matches is fitted on, by the first right view of a cost volume.
+
+    Returns:
+        Inverse depths ``(H, W)``, 1/m; evidence ``(4, H, W)``, in which the log-odds are linear; and
+        ``(H, W)`` bool: the right view agrees, and there is texture to agree on.
+    """
+    inverse_depth, contrast, views = _candidates(volume, volume.aligned[:1])
+    ((evidence, difference),) = views
+    return inverse_depth, evidence, (difference <= AGREEMENT_PLANES) & (contrast >= LEAST_CONTRAST)
 
 
 @torch.no_grad()
@@ -216,11 +182,10 @@ def match_volume(volume: CostVolume) -> Matches:
 
     Returns:
         ``Matches``; zero confidence where no right view agrees, else about the probability that the match is
-        within ``RIGHT_WITHIN_PLANES`` of the truth (that of the right view most sure of it).
+        within ``RIGHT_WITHIN_PLANES`` of the truth, by the right view that is most certain of it.
     """
-    found = _find_candidates(volume, volume.aligned)
-    confidence = torch.zeros_like(found.cost)
-    for difference in found.differences:
-        confidence = torch.maximum(confidence, _confidence(found, difference))
-    inverse_depth = volume.inverse_depth[0] + found.position * volume.plane_step
+    inverse_depth, contrast, views = _candidates(volume, volume.aligned)
+    confidence = torch.zeros_like(inverse_depth)
+    for evidence, difference in views:
+        confidence = torch.maximum(confidence, _confidence(evidence, difference, contrast))
     return Matches(inverse_depth[None], confidence[None], volume.plane_step, volume.K, volume.size)

@@ -1,8 +1,4 @@
-"""Plane sweep: cost of each inverse depth at each pixel, for any pose and any number of views.
-
-Data flow: left view + right views (grey image, K, pose) + inverse depths -> ``CostVolume``.
-Paper: S7.3, which calls its search for g_s a variant of the plane sweep volume.
-"""
+"""Plane sweep (S7.3): cost of each inverse depth at each pixel, for any pose and any number of views."""
 
 from __future__ import annotations
 
@@ -16,9 +12,8 @@ import torch.nn.functional as F
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import NEAREST_M, PlaneRays, image_size, is_rectified, plane_rays
 from geodiff_plugin.matching.aggregation import cells
-from geodiff_plugin.matching.alignment import AlignedView, align_view
+from geodiff_plugin.matching.alignment import AlignedView, ComparedView, align_view
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, census, grey_levels
-from geodiff_plugin.matching.comparison import ComparedView
 from geodiff_plugin.types import CameraView
 
 __all__ = [
@@ -188,7 +183,7 @@ def sweep_planes(
     in_view = left.new_empty(levels.shape, dtype=torch.bool)
     unseen = levels.new_full((), UNSEEN_LEVEL)
     for plane in range(len(inverse_depth)):
-        costs, seen = [one.cost(plane) for one in compared], [one.seen(plane) for one in compared]
+        costs, seen = [view.cost(plane) for view in compared], [view.seen(plane) for view in compared]
         cost, in_view[plane] = (costs[0], seen[0]) if len(costs) == 1 else _mean(costs, seen)
         levels[plane] = torch.where(in_view[plane], cost, unseen)
     return CostVolume(levels, in_view, inverse_depth, K_left, left_01, tuple(rights), aligned)
@@ -197,7 +192,7 @@ def sweep_planes(
 def _mean(costs: list[torch.Tensor], seen: list[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean cost over the views that see a pixel, uint8, and whether any does."""
     total, count = (torch.zeros_like(costs[0], dtype=torch.float32) for _ in range(2))
-    for cost, one in zip(costs, seen, strict=True):
-        total += cost * one
-        count += one
+    for cost, of_view in zip(costs, seen, strict=True):
+        total += cost * of_view
+        count += of_view
     return (total / count.clamp_min(1.0)).round().to(torch.uint8), count > 0

@@ -22,9 +22,8 @@ from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import plane_rays, warp_right_to_left
 from geodiff_plugin.matching.aggregation import aggregate
-from geodiff_plugin.matching.build import build_cost_volume, pilot_volume
+from geodiff_plugin.matching.build import build_cost_volume, mirrored_pose_preferred, pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
-from geodiff_plugin.matching.mirrored import mirrored_pose_preferred
 from geodiff_plugin.matching.sweep import CostVolume, median_shift, sweep_planes
 from geodiff_plugin.types import CameraView
 

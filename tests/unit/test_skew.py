@@ -24,8 +24,7 @@ from geodiff_plugin.evaluation.figures.clouds import render_cloud
 from geodiff_plugin.formats.clouds import write_ply
 from geodiff_plugin.matching import build_cost_volume, find_matches, points_to_matches
 from geodiff_plugin.matching.alignment import align_view
-from geodiff_plugin.matching.build import pilot_volume
-from geodiff_plugin.matching.mirrored import mirrored_pose_preferred
+from geodiff_plugin.matching.build import mirrored_pose_preferred, pilot_volume
 from geodiff_plugin.matching.sweep import sweep_planes
 from geodiff_plugin.types import CameraView
 from tests.conftest import textured
@@ -46,7 +45,7 @@ HAND_ON = {
     "evaluation.datasets.booster._quarter_intrinsics",  # by resize_intrinsics
     "formats.rigs.make_rig",
     "guidance.inputs.read_inputs",
-    "matching.mirrored.mirrored_pose_preferred",
+    "matching.build.mirrored_pose_preferred",
     "matching.build.find_matches",
     "matching.build.pilot_volume",
     "runtime.reprojection.reprojection",  # to warp_right_to_left
@@ -184,7 +183,7 @@ def test_the_sweep_and_all_that_is_made_of_it():
         sure = found.confidence > 0.5
         assert sure.float().mean() > 0.3
         assert float((1 / found.inverse_depth[sure]).median()) == pytest.approx(2.0, rel=0.04)
-    assert not mirrored_pose_preferred(left, rights, camera).preferred
+    assert not mirrored_pose_preferred(left, rights, camera)
     config = GuidanceConfig().changed(loss_resolution=48)
     known = prepare_evidence(EvidenceInputs(left, rights, camera, None, config, needs_matches=True))
     matched = known.sweep_matches.confidence > 0.5
