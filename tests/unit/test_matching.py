@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from kornia.geometry.linalg import inverse_transformation, relative_transformation
@@ -306,47 +307,59 @@ def forward_view(left, depth, K, T):
     return image.view(3, *SIZE)
 
 
-def as_levels(cost):
-    return (cost * COST_LEVELS).round().to(torch.uint8)
+def test_costs_of_two_views_are_the_mean_over_those_that_see_a_pixel():
+    """By NumPy, from the sweeps of each alone; a corner of the image is seen by neither."""
+    (left, first, K, _, _), (_, second, _, _, _) = scene(), scene(at=(0.15, 0.3, 0.0), seed=1)
+    left, rights = left.mean(0, keepdim=True), [(r[0].mean(0, keepdim=True), *r[1:]) for r in (first, second)]
+    planes = torch.linspace(0.0, 0.6, 9)
+    both = m.sweep_planes(left, rights, K, planes)
+    alone = [m.sweep_planes(left, [right], K, planes) for right in rights]
+    levels = np.stack([volume.levels.numpy() for volume in alone]).astype(np.float64)
+    seen = np.stack([volume.in_view.numpy() for volume in alone])
+    count = seen.sum(0)
+    expected = np.rint(np.where(seen, levels, 0.0).sum(0) / np.maximum(count, 1))
+    expected[count == 0] = UNSEEN_LEVEL
+    assert all((count == n).mean() > 0.01 for n in (0, 1, 2)), "else one of the three is not tested"
+    np.testing.assert_array_equal(both.levels.numpy(), expected)
+    np.testing.assert_array_equal(both.in_view.numpy(), count > 0)
 
 
-def test_aggregation_fills_a_gap_from_its_neighbours():
-    """One plane is right everywhere but in a patch that says nothing; the paths carry it across."""
-    cost = torch.full((9, 20, 24), 0.4)
-    cost[4] = 0.0
-    cost[:, 8:12, 10:14] = 0.2
-    out = m.aggregate(as_levels(cost), torch.full((20, 24), 0.5))
-    assert out.shape == cost.shape and (out.argmin(dim=0) == 4).all()
-    assert out.dtype == torch.int16 and out.min() >= 0
-
-
-def test_aggregation_against_a_plain_loop(monkeypatch):
-    """Hirschmueller's recursion written out pixel by pixel; the memory of one run may serve the next."""
-    generator, room = torch.Generator().manual_seed(0), Room()
-    for planes, height, width in ((7, 5, 9), (5, 4, 6)):
-        levels = torch.randint(0, COST_LEVELS + 1, (planes, height, width), generator=generator)
-        p1, p2 = 0.1, 0.3
-        small, large = round(p1 * COST_LEVELS), round(p2 * COST_LEVELS)
-        expected = torch.zeros_like(levels)
-        for down, along in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            path = torch.zeros_like(levels)
-            for y in range(height) if down >= 0 else reversed(range(height)):
-                for x in range(width) if along >= 0 else reversed(range(width)):
-                    py, px = y - down, x - along
-                    path[:, y, x] = levels[:, y, x]
-                    if not (0 <= py < height and 0 <= px < width):
-                        continue
+def reference_aggregation(levels, grey, step, jump, contrast):
+    """Hirschmueller's recursion pixel by pixel in NumPy, with jumps that edges make cheaper."""
+    planes, height, width = levels.shape
+    total, small = np.zeros(levels.shape, int), round(step * COST_LEVELS)
+    for down, along in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        path = np.zeros(levels.shape, int)
+        for y in range(height)[:: down or 1]:
+            for x in range(width)[:: along or 1]:
+                py, px = y - down, x - along
+                path[:, y, x] = levels[:, y, x]
+                if 0 <= py < height and 0 <= px < width:
+                    edge = abs(grey[y, x] - grey[py, px])
+                    large = np.rint(np.float32(COST_LEVELS * max(jump / (1 + edge / contrast), 2 * step)))
                     before = path[:, py, px]
-                    for d in range(planes):
-                        options = [before[d], before.min() + large]
-                        options += [before[e] + small for e in (d - 1, d + 1) if 0 <= e < planes]
-                        path[d, y, x] += min(options) - before.min()
-            expected += path
-        flat = torch.full((height, width), 0.5)
-        monkeypatch.setattr(aggregation, "STEP_PENALTY", p1)
-        monkeypatch.setattr(aggregation, "JUMP_PENALTY", p2)
-        out = m.aggregate(levels.to(torch.uint8), flat, room=room)
-        assert torch.equal(out.long(), expected)
+                    beside = np.minimum(np.r_[before[1:], 10**6], np.r_[10**6, before[:-1]]) + small
+                    best = np.minimum(np.minimum(before, beside), before.min() + int(large))
+                    path[:, y, x] += best - before.min()
+        total += path
+    return total
+
+
+@pytest.mark.parametrize(("step", "jump"), [(None, None), (0.1, 0.3), (0.05, 0.6), (0.02, 2.0)])
+def test_aggregation_against_numpy(monkeypatch, step, jump):
+    """Noise, and a gap that its neighbours fill; the memory of one run serves the next, of another size."""
+    if step is not None:
+        monkeypatch.setattr(aggregation, "STEP_PENALTY", step)
+        monkeypatch.setattr(aggregation, "JUMP_PENALTY", jump)
+    penalties = (aggregation.STEP_PENALTY, aggregation.JUMP_PENALTY, aggregation.JUMP_CONTRAST)
+    rng, room = np.random.default_rng(0), Room()
+    for shape in ((7, 6, 9), (5, 4, 6), (2, 1, 8), (12, 9, 3)):
+        levels = rng.integers(0, COST_LEVELS + 1, shape)
+        grey = (rng.random(shape[1:]) > 0.6).astype(np.float32) * rng.choice([0.05, 0.4])
+        levels[:, 0, :2] = UNSEEN_LEVEL
+        out = m.aggregate(torch.from_numpy(levels).to(torch.uint8), torch.from_numpy(grey), room=room)
+        np.testing.assert_array_equal(out.numpy(), reference_aggregation(levels, grey, *penalties))
+        assert out.dtype == torch.int16 and out.max() < NEVER
 
 
 def test_the_worst_costs_do_not_overflow():
@@ -365,20 +378,6 @@ def test_with_few_reliable_matches_the_planes_reach_as_near_as_the_coarse_sweep(
     usual = nearest()
     monkeypatch.setattr(build, "PILOT_LEAST_SHARE", 1.0)
     assert nearest() > usual
-
-
-def test_an_edge_makes_a_jump_cheap(monkeypatch):
-    cost = torch.full((6, 1, 20), 0.3)
-    cost[1, :, :10] = 0.1
-    cost[4, :, 10:12] = 0.1  # a thin thing behind an edge
-    cost[1, :, 12:] = 0.1
-    edge = torch.zeros(1, 20)
-    edge[:, 10:12] = 1.0
-    monkeypatch.setattr(aggregation, "STEP_PENALTY", 0.05)
-    monkeypatch.setattr(aggregation, "JUMP_PENALTY", 0.6)
-    with_edge = m.aggregate(as_levels(cost), edge)[:, 0, 10:12].argmin(0)
-    without = m.aggregate(as_levels(cost), torch.zeros(1, 20))[:, 0, 10:12].argmin(0)
-    assert (with_edge == 4).all() and (without == 1).all()
 
 
 def second_sweep(volume, inverse_depth):
