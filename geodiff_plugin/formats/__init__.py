@@ -13,6 +13,7 @@ _MODULE_OF = {
     "as_image_01": "images",
     "atomic_path": "out",
     "check_file": "files",
+    "depth_mm": "depth",
     "flying_points": "clouds",
     "make_cloud": "clouds",
     "picture_size": "images",

@@ -124,10 +124,6 @@ class _Bytes:
         text, self._at = self._data[self._at : end].decode("utf-8", errors="replace"), end + 1
         return text
 
-    def skip(self, count: int) -> None:
-        """Pass over so many bytes."""
-        self._at += count
-
 
 def _binary_cameras(path: Path) -> Iterator[str]:
     take = _Bytes(path)
@@ -145,7 +141,7 @@ def _binary_images(path: Path) -> Iterator[str]:
     for _ in range(*take("Q")):
         number, *pose, camera = take("I7dI")
         name, (points,) = take.name(), take("Q")
-        take.skip(24 * points)
+        take(f"{24 * points}x")
         yield f"{number} {' '.join(map(repr, pose))} {camera} {name}"
 
 

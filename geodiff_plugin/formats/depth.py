@@ -15,6 +15,7 @@ from geodiff_plugin.formats.out import atomic_path
 
 __all__ = [
     "STRIP_PIXELS",
+    "depth_mm",
     "read_depth_mm_png",
     "read_depth_png",
     "read_disparity_kitti_png",

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import InputError, bad_value, check_number
-from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.images import open_image
 from geodiff_plugin.formats.rigs import intrinsics
 
 __all__ = ["intrinsics_from_exif", "intrinsics_from_fov", "warn_of_other_lens"]
@@ -61,7 +61,7 @@ def intrinsics_from_exif(
     """
     if isinstance(source, Image.Image):
         return _of(source, name, turned=False)
-    with Image.open(check_file(source, name, "an image file")) as image:
+    with open_image(source, name) as image:
         return _of(image, name, turned=image.getexif().get(_ORIENTATION) in (5, 6, 7, 8))
 
 

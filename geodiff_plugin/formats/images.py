@@ -5,16 +5,16 @@ from __future__ import annotations
 import os
 import warnings
 import zlib
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin._checks import InputError, bad_type, bad_value
 from geodiff_plugin.formats.files import check_file
 
-__all__ = ["MIN_SIDE", "as_image_01", "picture_size", "read_image"]
+__all__ = ["MIN_SIDE", "as_image_01", "open_image", "picture_size", "read_image"]
 
 #: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
 MIN_SIDE = 32
@@ -34,7 +34,10 @@ TURNS = {
 #: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
 DARK_16_BITS = 8192
 ALPHA_DROPPED = "{name} has an alpha channel; it is dropped."
-DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError)
+#: Formats of Pillow whose files may hold several frames or pages that are pictures of their own.
+MANY_FRAMES = ("GIF", "PNG", "TIFF", "WEBP")
+HEIC = (".heic", ".heif")
+DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, zlib.error)
 
 
 def _has_alpha(image: Image.Image) -> bool:
@@ -97,6 +100,46 @@ def _check_sides(height: int, width: int, name: str) -> None:
         )
 
 
+def open_image(path: str | os.PathLike[str], name: str) -> Image.Image:
+    """Open an image file with Pillow, HEIC by pillow-heif where that is installed; no pixel is read yet.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
+        ValueError: not an image, or one of more pixels than Pillow takes.
+    """
+    file = check_file(path, name, "an image file")
+    if file.suffix.lower() in HEIC:
+        try:
+            import pillow_heif
+        except ImportError:
+            cure = "Run: pip install pillow-heif, or convert it to PNG or JPEG."
+            bad_value(name, "an image file", f"{file}, which Pillow reads with pillow-heif only", cure)
+        pillow_heif.register_heif_opener()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # what is too large is an error
+            return Image.open(file)
+    except Image.DecompressionBombError:
+        expected = f"an image of at most {2 * (Image.MAX_IMAGE_PIXELS or 0) // 1_000_000} megapixels"
+        bad_value(name, expected, f"{file}, a larger one", "Scale it down first, and K with it.")
+    except UnidentifiedImageError:
+        cure = "Convert it to PNG or JPEG."
+        bad_value(name, "an image file", f"{file}, a format that Pillow does not read", cure)
+    except DECODE_ERRORS as error:
+        _refuse_damaged(name, file, error)
+
+
+def _refuse_damaged(name: str, path: object, error: Exception) -> NoReturn:
+    cure = "Is it cut off? Fetch it again."
+    bad_value(name, "a whole image file", f"{path}, which does not decode ({error})", cure)
+
+
+def _frame_notes(image: Image.Image, name: str) -> list[str]:
+    """A sentence for an animation or a file of several pages; nothing for what goes with a phone's JPEG."""
+    frames = getattr(image, "n_frames", 1) if image.format in MANY_FRAMES else 1
+    return [f"{name} holds {frames} frames or pages; only the first is taken."] if frames > 1 else []
+
+
 def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.ndarray, list[str]]:
     """Read an image file, upright.
 
@@ -108,36 +151,27 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
 
     Returns:
         ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it: alpha dropped, or turned
-        as the EXIF orientation says (K must belong to the turned image), or 16 bits of which few are used.
+        as the EXIF orientation says (K must belong to the turned image), 16 bits of which few are used, or
+        only the first of several frames taken.
 
     Raises:
         FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
         ValueError: not an image, cut off, or a side under 32 pixels.
     """
-    found = check_file(path, name, "an image file")
     try:
-        with Image.open(found) as image:
-            deep = _has_16_bits(image)
+        with open_image(path, name) as image:
+            deep, notes = _has_16_bits(image), _frame_notes(image, name)
+            image.seek(0)
             image.load()
             turn = TURNS.get(image.getexif().get(EXIF_ORIENTATION, UPRIGHT))
             upright = ImageOps.exif_transpose(image)
             alpha = _has_alpha(image)
-    except UnidentifiedImageError:
-        bad_value(
-            name,
-            "an image file",
-            f"{found}, a format that Pillow does not read",
-            "Convert it to PNG or JPEG.",
-        )
+    except InputError:
+        raise
     except DECODE_ERRORS as error:
-        bad_value(
-            name,
-            "a whole image file",
-            f"{found}, which does not decode ({error})",
-            "Is it cut off? Fetch it again.",
-        )
+        _refuse_damaged(name, path, error)
     _check_sides(upright.height, upright.width, name)
-    notes = [ALPHA_DROPPED.format(name=name)] if alpha else []
+    notes += [ALPHA_DROPPED.format(name=name)] if alpha else []
     notes += _dark_notes(upright, name) if deep else []
     if turn is not None:
         notes.append(
@@ -243,6 +277,8 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
                 "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image.",
                 stacklevel=3,
             )
+        for note in _frame_notes(raw, name):
+            warnings.warn(note, stacklevel=3)
         if _has_alpha(raw):
             warnings.warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
         hwc = _pil_to_array(raw, name)

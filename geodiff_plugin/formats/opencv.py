@@ -159,8 +159,8 @@ def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     entries = _merged(texts)
     named = _named(entries)
     if named.keys() >= {"P1", "P2"}:
-        size = _size(named)
-        return projected(*(_of_shape(named, name, (3, 4)) for name in ("P1", "P2")), size, size)
+        P_left, P_right = (_of_shape(named, name, (3, 4)) for name in ("P1", "P2"))
+        return projected(P_left, P_right, _size(named), _size(named))
     return _as_taken(entries, named)
 
 

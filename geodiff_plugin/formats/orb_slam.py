@@ -62,8 +62,8 @@ def _as_taken(entries: Entries, left: str, pose: str, kind: str) -> RawRig:
     matrix = entries[pose.lower()]
     if np.shape(matrix) not in ((3, 4), (4, 4)):
         bad_value(pose, "of shape (4, 4)", f"{np.shape(matrix)}")
-    cameras = [_camera(entries, name, kind) for name in (left, "Camera2")]
-    return RawRig(*cameras, rigid(matrix, pose))
+    first, second = (_camera(entries, name, kind) for name in (left, "Camera2"))
+    return RawRig(first, second, rigid(matrix, pose))
 
 
 def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:

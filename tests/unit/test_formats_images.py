@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 import warnings
 
 import numpy as np
@@ -141,6 +142,42 @@ def test_file_errors(tmp_path):
         read_image(saved(tmp_path, Image.fromarray(ramp()[:31])))
     with pytest.raises(TypeError, match="left"):
         read_image(5)
+
+
+@pytest.mark.parametrize("name", ["x.gif", "x.png", "x.tiff", "x.webp"])
+def test_only_the_first_of_several_frames_is_taken_and_told(tmp_path, name):
+    first, second = (Image.fromarray(value) for value in (ramp(), ramp()[::-1]))
+    more = {"lossless": True} if name == "x.webp" else {}
+    path = saved(tmp_path, first, name, save_all=True, append_images=[second], **more)
+    image, notes = read_image(path)
+    assert notes == ["left holds 2 frames or pages; only the first is taken."]
+    tolerance = 0.15 if name == "x.gif" else 0  # 256 colours
+    np.testing.assert_allclose(image, ramp().astype(np.float32) / 255, atol=tolerance)
+    with Image.open(path) as opened, pytest.warns(UserWarning, match="left holds 2 frames"):
+        as_image_01(opened, "left")
+    assert read_image(saved(tmp_path, first, "one.gif"))[1] == []
+
+
+def test_an_image_beyond_pillows_limit_says_so(tmp_path, monkeypatch):
+    path = saved(tmp_path, Image.fromarray(ramp()))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", H * W - 1)
+    assert read_image(path)[1] == []  # beyond Pillow's warning alone
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", H * W // 3)
+    with pytest.raises(ValueError, match=r"at most 0 megapixels; got .*x\.png, a larger one\. Scale it down"):
+        read_image(path)
+
+
+def test_heic_is_read_where_pillow_heif_is(tmp_path, monkeypatch):
+    path = tmp_path / "x.HEIC"
+    path.write_bytes(b"no image")
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(ValueError, match="pillow-heif only. Run: pip install pillow-heif"):
+        read_image(path)
+    monkeypatch.undo()
+    heif = pytest.importorskip("pillow_heif")
+    heif.from_pillow(Image.fromarray(ramp())).save(path, quality=-1)
+    image, notes = read_image(path)
+    assert notes == [] and np.abs(image - ramp() / 255).mean() < 0.02
 
 
 def test_as_image_01_all_kinds_agree():
