@@ -82,7 +82,7 @@ def check_intrinsics_fit(
             f"for {image} of {width}x{height} pixels",
             f"principal point ({cx:.1f}, {cy:.1f}) outside of it",
             f"It probably belongs to another resolution: {SCALED_K}. "
-            "If it is a crop, say so with cropped=True.",
+            "If it is a crop, say so with cropped=True (--cropped).",
         )
 
 

@@ -6,9 +6,12 @@ Paper: none.
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+import sys
+from numbers import Integral, Real
+from typing import TYPE_CHECKING, Any, NoReturn
 
-import numpy as np
+if TYPE_CHECKING:  # numpy takes longer to import than a wrong option to be said
+    import numpy as np
 
 __all__ = [
     "FolderError",
@@ -101,8 +104,7 @@ def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
 
 def check_number(value: Any, name: str, low: float, high: float, *, integer: bool = False) -> Any:
     """A finite number in ``[low, high]``, returned as it came."""
-    kinds = (int, np.integer) if integer else (int, float, np.integer, np.floating)
-    if isinstance(value, bool) or not isinstance(value, kinds):
+    if isinstance(value, bool) or not isinstance(value, Integral if integer else Real):
         bad_type(name, "an integer" if integer else "a number", value)
     # Whole numbers may be longer than any float: compared, not converted. NaN is not within anything.
     if not low <= value <= high or value in (float("inf"), float("-inf")):
@@ -112,7 +114,8 @@ def check_number(value: Any, name: str, low: float, high: float, *, integer: boo
 
 def check_flag(value: Any, name: str) -> bool:
     """``True`` or ``False``; a number or a text is neither."""
-    if not isinstance(value, (bool, np.bool_)):
+    numpy = sys.modules.get("numpy")
+    if not isinstance(value, bool) and not (numpy and isinstance(value, numpy.bool_)):
         bad_type(name, "True or False", value)
     return bool(value)
 

@@ -111,7 +111,8 @@ class Item:
         payload: what the first stage works on.
         inputs: fingerprint of its inputs, unless ``key`` is it; a record of other inputs does not count.
         name: in messages; ``key`` by default.
-        words: texts of this item alone, such as its paths, which are no part of the cause of a failure.
+        words: texts of this item alone, such as its paths, which are no part of the cause of a failure; its
+            label where there are none.
     """
 
     key: str
@@ -484,7 +485,7 @@ class _Failures:
         is_plain = isinstance(error, (InputError, OSError, ValueError))
         message = str(error) if is_plain else f"{type(error).__name__}: {error}"
         cause = message
-        for word in sorted((*item.words, item.label), key=len, reverse=True):
+        for word in sorted(item.words or (item.label,), key=len, reverse=True):
             cause = cause.replace(word, "") if word else cause
         is_new = cause not in self._labels
         self._labels.setdefault(cause, []).append(item.label)

@@ -17,6 +17,7 @@ LAYER = {
     "types": 0,
     "geometry": 1,
     "config": 1,
+    "options": 1,
     "pose": 2,
     "matching": 3,
     "formats": 3,

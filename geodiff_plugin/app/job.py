@@ -6,7 +6,6 @@ Paper: Algorithm 1, run by the pipeline.
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable
@@ -16,21 +15,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import bad_value, check_choice, check_number
+from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
 from geodiff_plugin.app.priors import Priors
-from geodiff_plugin.cli.checks import LARGEST_SEED, check_resolution
-from geodiff_plugin.cli.messages import collected_warnings
 from geodiff_plugin.cli.report import used_poses
-from geodiff_plugin.config import DEFAULT, PAPER
+from geodiff_plugin.cli.terminal import collected_warnings
 from geodiff_plugin.formats import read_image
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.options import PRESETS, RunOptions
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["PRESETS", "Request", "Result", "Stopped", "run_job"]
 
-PRESETS = {"default": DEFAULT, "paper": PAPER}
 MOST_STEPS, MOST_MEMBERS, LARGEST_RESOLUTION = 100, 20, 4096
+#: What the page calls an option, where that is not its name.
+FIELD_NAMES = {"near": "the nearest depth", "far": "the farthest depth", "ensemble": "members"}
 Report = Callable[[float, str], None]
 
 
@@ -127,31 +126,40 @@ def _views(request: Request) -> tuple[Views, list[str]]:
 
 def _knobs(request: Request) -> dict[str, Any]:
     """Keywords of the guidance."""
-    check_choice(request.preset, "preset", PRESETS)
-    if (request.near is None) != (request.far is None):
-        bad_value("near and far", "both given or neither", f"{request.near} and {request.far}", "In metres.")
-    if request.near is None or request.far is None:
-        return {"config": PRESETS[request.preset]}
-    for name, value in (("the nearest depth", request.near), ("the farthest depth", request.far)):
-        if not 0 < value < math.inf:
-            bad_value(name, "a number of metres above 0", value)
-    if request.near >= request.far:
-        bad_value("the nearest depth", f"below the farthest, {request.far:g} m", request.near)
-    key = "g_s_range" if request.preset == "paper" else "depth_range"
-    return {"config": PRESETS[request.preset], key: (request.near, request.far)}
+    return {"config": _run_options(request).config()}
+
+
+def _run_options(request: Request) -> RunOptions:
+    """The options of the run, checked.
+
+    Raises:
+        InputError: naming the field of the page.
+    """
+    for name, value, most in (
+        ("steps", request.steps, MOST_STEPS),
+        ("members", request.members, MOST_MEMBERS),
+        ("resolution", request.resolution, LARGEST_RESOLUTION),
+    ):
+        check_number(value, name, 0, most, integer=True)
+    options = RunOptions(
+        prior=request.prior,
+        preset=request.preset,
+        steps=request.steps or None,
+        ensemble=request.members,
+        resolution=request.resolution or None,
+        near=request.near,
+        far=request.far,
+        seed=request.seed,
+    )
+    options.check(lambda field: FIELD_NAMES.get(field.name, field.name))
+    return options
 
 
 def _call_options(request: Request) -> dict[str, Any]:
     """Keywords of the call that a guided and a plain one share."""
-    check_number(request.steps, "steps", 0, MOST_STEPS, integer=True)
-    check_number(request.members, "members", 1, MOST_MEMBERS, integer=True)
-    check_resolution(request.resolution, "resolution", LARGEST_RESOLUTION, "the prior's own")
-    check_number(request.seed, "seed", 0, LARGEST_SEED, integer=True)
-    return {
-        "num_inference_steps": request.steps or None,
-        "processing_resolution": request.resolution or None,
-        "ensemble_size": request.members,
-    }
+    call = _run_options(request).call()
+    del call["output_uncertainty"]
+    return call
 
 
 def _map(value: Any) -> np.ndarray:
@@ -215,7 +223,7 @@ def run_job(request: Request, priors: Priors, stop: threading.Event, report: Rep
 
     warnings: list[str] = []
     seconds, started = {}, time.perf_counter()
-    with collected_warnings(warnings):
+    with collected_warnings(warnings.append):
         stage(0.0, "Reading the photographs and cameras")
         options = _call_options(request)
         views, notes = _views(request)

@@ -13,6 +13,7 @@ import torch
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin._threads import available_cores
 from geodiff_plugin.capture.neighbours import choose_neighbours
+from geodiff_plugin.capture.options import NEIGHBOURS
 from geodiff_plugin.formats.captures import CaptureFiles, CaptureFrame, read_capture
 from geodiff_plugin.formats.distortion import undistorted
 from geodiff_plugin.formats.images import read_image
@@ -21,10 +22,7 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["NEIGHBOURS", "Capture"]
-
-#: Neighbours of a frame by default.
-NEIGHBOURS = 4
+__all__ = ["Capture"]
 
 
 class Capture:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import multiprocessing
@@ -10,7 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,8 @@ from transformers.utils import logging as of_transformers
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import InputError, bad_value, check_choice, check_number
 from geodiff_plugin._threads import available_cores
-from geodiff_plugin.capture.capture import NEIGHBOURS, Capture
+from geodiff_plugin.capture.capture import Capture
+from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.capture.store import load_solved, save_solved
 from geodiff_plugin.formats.files import read_matrix
 from geodiff_plugin.formats.out import atomic_path
@@ -33,7 +33,7 @@ from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["CaptureOptions", "Writer", "open_capture", "run_capture", "run_frames", "solved_poses"]
+__all__ = ["Writer", "open_capture", "run_capture", "run_frames", "solved_poses"]
 
 #: Writes the files of one frame: folder, output, image ``(H, W, 3)`` -> counts for the report.
 Writer = Callable[[Path, MetricDepthOutput, np.ndarray], dict[str, Any]]
@@ -43,37 +43,6 @@ POSES_FILE, SCALE_FILE, JOURNAL, REPORT = "poses.npz", "scale.json", "frames.jso
 PROCESS_BYTES = 1.5e9
 #: Captures with more frames are told how long they will take.
 MANY = 300
-
-
-@dataclass(frozen=True)
-class CaptureOptions:
-    """What to do with a capture; help and units stand in ``cli.capture``."""
-
-    path: Path
-    out: Path
-    frames: str | None = None
-    neighbours: int = NEIGHBOURS
-    poses: str = "refined"
-    points: str = "none"
-    metres_per_unit: float | None = None
-    known_length: str | None = None
-    distance: str | None = None
-    k: Path | None = None
-    fov: float | None = None
-    trajectory: Path | None = None
-    prior: str = "bundled"
-    steps: int | None = None
-    seed: int = 0
-    device: str = "auto"
-    processes: int | None = None
-    overwrite: bool = False
-    quiet: bool = False
-
-    def key(self, names: Sequence[str], *of: str) -> str:
-        """A digest of the settings ``of`` and the frames that a result depends on."""
-        said = {name: str(value) for name, value in asdict(self).items() if name in of}
-        said |= {"version": __version__, "names": list(names), "path": str(self.path.resolve())}
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def open_capture(options: CaptureOptions) -> Capture:

@@ -1,37 +1,137 @@
-"""The ``geodiff`` command: its subcommands, with their options and help where these are few.
-
-Data flow: argv -> a function of ``geodiff_plugin.cli`` -> exit code 0, 2 (bad input) or 130 (Ctrl-C).
-Paper: none.
+"""The ``geodiff`` command: its subcommands, with the options of those that have few.
 
 Torch and diffusers are imported inside the commands, so that ``--help`` and ``--version`` answer at once.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import io
+import os
 import sys
+from collections.abc import Callable
+from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
+from typer.core import TyperGroup
 
-from geodiff_plugin.cli.capture import add_capture
-from geodiff_plugin.cli.depth_options import add_depth
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.cli.eval.app import eval_app
-from geodiff_plugin.cli.messages import CommandGroup
-from geodiff_plugin.cli.options import OUT, OUTPUT, RUN, Device, Overwrite, option, out_folder
+from geodiff_plugin.cli.options import DepthOptions, demo_options, start_pair
+from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, StopWatch, say
+from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, flag_of
 
-__all__ = ["app", "main"]
+__all__ = ["add_command", "app", "main", "new_group"]
 
-app = typer.Typer(
-    cls=CommandGroup,
-    help="Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+
+class CommandGroup(TyperGroup):
+    """A group of subcommands: bad input is one line and exit code 2, Ctrl-C is exit code 130."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen subcommand."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            say("geodiff: interrupted")
+            sys.exit(EXIT_INTERRUPTED)
+        except InputError as error:  # any other is a defect, and keeps its traceback
+            say(f"geodiff: {error}")
+            sys.exit(EXIT_BAD_INPUT)
+
+
+def new_group(help_text: str) -> typer.Typer:
+    """A group whose commands are added by ``add_command``."""
+    return typer.Typer(
+        cls=CommandGroup,
+        help=help_text,
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+
+def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
+    """An option or argument of typer for a field of a dataclass of options."""
+    rules, default = field.metadata, field.default
+    flags = rules["flags"] or (flag_of(field),)
+    if get_origin(kind) is tuple:
+        if rules["split"]:
+            kind, default = str | None, ",".join(map(str, default)) or None
+        else:
+            kind, default = list[get_args(kind)[0]] | None, list(default) or None  # type: ignore[misc]
+    if flags == ("",):
+        typed: Any = typer.Argument(metavar=rules["metavar"], help=rules["help"])
+    else:
+        typed = typer.Option(
+            *flags, metavar=rules["metavar"], help=rules["help"], rich_help_panel=rules["panel"] or None
+        )
+    default = Parameter.empty if default is dataclasses.MISSING else default
+    return Parameter(field.name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind, typed], default=default)
+
+
+def _value(field: dataclasses.Field[Any], value: Any, kind: Any) -> Any:
+    """What was typed, as the field has it."""
+    if get_origin(kind) is not tuple:
+        return value
+    if field.metadata["split"]:
+        parts = (part.strip() for part in (value or "").split(","))
+        return tuple(get_args(kind)[0](part) for part in parts if part)
+    return tuple(value or ())
+
+
+def add_command(group: typer.Typer, name: str, options: type, run: Callable[[Any], None], about: str) -> None:
+    """Add a command whose options are the fields of a dataclass.
+
+    Args:
+        group: of the command.
+        name: as typed.
+        options: dataclass with fields of ``geodiff_plugin.options.declare``.
+        run: called with an instance.
+        about: what the command does, a sentence.
+    """
+    kinds = get_type_hints(options)
+    panels = [CAMERAS, RUN, OUTPUT]
+    known = [field for field in dataclasses.fields(options) if field.metadata]
+    known.sort(key=lambda f: (flag_of(f)[0] == "-", panels.index(f.metadata["panel"] or RUN)))
+
+    def call(**typed: Any) -> None:
+        run(options(**{f.name: _value(f, typed[f.name], kinds[f.name]) for f in known}))
+
+    vars(call)["__signature__"] = Signature([_parameter(field, kinds[field.name]) for field in known])
+    group.command(name, help=about)(call)
+
+
+def _out_folder(typed: Path | None, default: str, overwrite: bool) -> Path:
+    """The folder that was named, else the default, with a number where it is taken."""
+    from geodiff_plugin.formats.out import free_folder
+
+    if typed is not None:
+        return typed
+    return Path(default) if overwrite else free_folder(Path(default))
+
+
+def prepare_torch(quiet: bool) -> None:
+    """What is to be settled before torch is imported, and said while that takes its seconds.
+
+    OpenMP's threads spin while they wait, which on a busy machine takes the core from the thread that they
+    wait for; asleep they cost one call in ten on an idle machine and save half of it on a busy one.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if not quiet and "torch" not in sys.modules and sys.stderr.isatty():
+        sys.stderr.write("loading torch and diffusers ...\r")
+        sys.stderr.flush()
+
+
+app = new_group(
+    "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."
 )
-app.add_typer(eval_app, name="eval")
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar.", rich_help_panel=OUTPUT)]
+Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:N or mps.", rich_help_panel=RUN)]
 
 
 def _print_version(wanted: bool) -> None:
@@ -49,42 +149,89 @@ def _root(
         typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
     ] = False,
 ) -> None:
-    """Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."""
+    pass
 
 
-add_depth(app)
-add_capture(app)
+def _run_depth(options: DepthOptions) -> None:
+    from geodiff_plugin.cli.pairs import is_many, start_many
+
+    if is_many(options.left):
+        options = dataclasses.replace(options, out=options.out or Path("geodiff-out"))
+        refs = start_many(options)
+        prepare_torch(options.quiet)
+        from geodiff_plugin.cli.many import run_many
+
+        run_many(options, refs)
+        return
+    out = _out_folder(options.out, "geodiff-out", options.overwrite)
+    options = dataclasses.replace(options, out=out)
+    watch = StopWatch()
+    with start_pair(options) as folder:
+        with watch.stage("start"):
+            prepare_torch(options.quiet)
+            from geodiff_plugin.cli.depth import run_depth
+
+        run_depth(options, folder, watch)
+
+
+add_command(
+    app,
+    "depth",
+    DepthOptions,
+    _run_depth,
+    "Estimate the metric depth of LEFT with RIGHT as its guide; of one pair, or of many.",
+)
+
+
+def _run_capture(options: CaptureOptions) -> None:
+    prepare_torch(options.quiet)
+    from geodiff_plugin.cli.capture import run_and_report
+
+    run_and_report(options)
+
+
+add_command(
+    app,
+    "capture",
+    CaptureOptions,
+    _run_capture,
+    "Depth of every frame of a capture, with poses solved together, and one cloud of all.",
+)
 
 
 @app.command()
 def demo(
     out: Annotated[
         Path | None,
-        option("Folder for the results; geodiff-demo, or -2 and so on where it is taken.", OUTPUT, *OUT),
+        typer.Option(
+            "--out", "-o", help="Folder for the results; geodiff-demo, or -2 and so on where taken."
+        ),
     ] = None,
-    overwrite: Overwrite = False,
-    quiet: Annotated[bool, option("No progress bar.", OUTPUT, "--quiet", "-q")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Write into a folder that holds files.")
+    ] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Run on a rendered pair that ships with the package, offline, and print how good it is."""
-    from geodiff_plugin.cli.arguments import demo_arguments
-    from geodiff_plugin.cli.start import start_run
-
-    arguments = demo_arguments(out_folder(out, "geodiff-demo", overwrite), overwrite, quiet)
-    with start_run(arguments) as held:
+    options = demo_options(_out_folder(out, "geodiff-demo", overwrite), overwrite, quiet)
+    with start_pair(options) as folder:
+        prepare_torch(quiet)
         from geodiff_plugin.cli.demo import run_demo
 
-        run_demo(arguments, held)
+        run_demo(options, folder)
 
 
 @app.command()
 def info(
-    prior: Annotated[str | None, option("Describe this prior as well.", RUN, "--prior")] = None,
+    prior: Annotated[str | None, typer.Option(help="Describe this prior as well.")] = None,
     space: Annotated[
-        str | None, option("Space in which its map is affine, if its folder does not say.", RUN, "--space")
+        str | None, typer.Option(help="Space in which its map is affine, if its folder does not say.")
     ] = None,
     knobs: Annotated[
         bool,
-        option("List the knobs of the guidance instead: default, range, what each does.", RUN, "--knobs"),
+        typer.Option(
+            "--knobs", help="List the knobs of the guidance instead: default, range, what each does."
+        ),
     ] = False,
 ) -> None:
     """Print versions, devices, priors and what is cached."""
@@ -99,31 +246,11 @@ def info(
 
 
 @app.command()
-def bench(
-    points: Annotated[
-        int | None,
-        option(
-            "Complete depth from this many known points instead, guided and by a fitted LoRA.",
-            RUN,
-            "--points",
-        ),
-    ] = None,
-    prior: Annotated[
-        str | None, option("With --points: a Marigold V2; by default a tiny random one.", RUN, "--prior")
-    ] = None,
-    device: Device = "auto",
-) -> None:
-    """Measure what guidance costs: seconds and peak memory against the plain pipeline, for both gradients."""
-    if points is not None:
-        from geodiff_plugin.cli.bench_points import run_bench_points
-
-        run_bench_points(points, prior, device)
-        return
-    from geodiff_plugin._checks import bad_value
+def bench(device: Device = "auto") -> None:
+    """Measure what guidance costs, in seconds and peak memory, and where the seconds of a command go."""
+    prepare_torch(True)
     from geodiff_plugin.cli.bench import run_bench
 
-    if prior is not None:
-        bad_value("--prior", "given together with --points", "alone")
     run_bench(device)
 
 
@@ -133,14 +260,14 @@ def video(
         list[Path],
         typer.Argument(metavar="FRAME...", help="Folders of geodiff depth, or .npy maps, in order."),
     ],
-    out: Annotated[Path, option("The video: .mp4 (OpenCV), .webp or .gif.", OUTPUT, "--out", "-o")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", help="The video: .mp4 (OpenCV), .webp or .gif.")] = Path(
         "depth.webp"
     ),
-    fps: Annotated[float, option("Frames a second.", OUTPUT, "--fps")] = 10.0,
-    near: Annotated[float | None, option("Depth of the last colour, metres.", OUTPUT, "--near")] = None,
-    far: Annotated[float | None, option("Depth of the first colour, metres.", OUTPUT, "--far")] = None,
+    fps: Annotated[float, typer.Option(help="Frames a second.")] = 10.0,
+    near: Annotated[float | None, typer.Option(help="Depth of the last colour, metres.")] = None,
+    far: Annotated[float | None, typer.Option(help="Depth of the first colour, metres.")] = None,
     photographs: Annotated[
-        bool, option("Show the left images beside the depth.", OUTPUT, "--photographs")
+        bool, typer.Option("--photographs", help="Show the left images beside the depth.")
     ] = False,
 ) -> None:
     """Join the depth maps of a sequence into a video, in one range of colours."""
@@ -152,16 +279,17 @@ def video(
 @app.command("app")
 def page(
     prior: Annotated[
-        list[str] | None, option("A prior that visitors may choose; repeatable.", RUN, "--prior")
+        list[str] | None, typer.Option(help="A prior that visitors may choose; repeatable.")
     ] = None,
     device: Device = "auto",
     host: Annotated[
-        str, typer.Option("--host", help="Address to listen on; 0.0.0.0 lets other machines in.")
+        str, typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.")
     ] = "127.0.0.1",
-    port: Annotated[int | None, typer.Option("--port", help="Port; by default the first free one.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port; by default the first free one.")] = None,
     browser: Annotated[bool, typer.Option("--browser", help="Open the page in a browser.")] = False,
 ) -> None:
     """Serve a web page: drop two photographs and measure in their depth (needs the extra app)."""
+    prepare_torch(False)
     from geodiff_plugin.app.launch import run_app
 
     run_app(tuple(prior or ("bundled",)), device, host, port, browser)
@@ -187,19 +315,20 @@ def convert(
     space: Annotated[
         str | None,
         typer.Option(
-            "--space",
-            help="marigold-v2: space of its map, if the name of CHECKPOINT's folder does not say it.",
+            help="marigold-v2: space of its map, if the name of CHECKPOINT's folder does not say it."
         ),
     ] = None,
     lora: Annotated[
-        str | None,
-        typer.Option("--lora", help="marigold-v2: merged (default), apart (peft), or 4bit (CUDA)."),
+        str | None, typer.Option(help="marigold-v2: merged (default), apart (peft), or 4bit (CUDA).")
     ] = None,
 ) -> None:
     """Convert pickled or split weights to a folder for --prior; no code in a pickle is run."""
     from geodiff_plugin.cli.convert import run_convert
 
     run_convert(paths, part, space, lora)
+
+
+app.add_typer(eval_app, name="eval")
 
 
 def main(argv: list[str] | None = None) -> None:

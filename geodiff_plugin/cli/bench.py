@@ -1,8 +1,4 @@
-"""``geodiff bench``: time and memory of a guided call against a plain one.
-
-Data flow: a prior and the demo pair -> plain, guided ("denoised"), guided ("full") -> ratios.
-Paper: S5.4 (cost), as ratios and not as seconds of another machine.
-"""
+"""``geodiff bench``: time and memory of a guided call against a plain one."""
 
 from __future__ import annotations
 

@@ -1,11 +1,8 @@
-"""``geodiff convert``: weights in their authors' format to a folder for ``--prior``.
-
-Data flow: .ckpt or .pth file, folder of .bin weights, or base and LoRA -> a new folder, whole or not at all.
-Paper: none.
-"""
+"""``geodiff convert``: weights in their authors' format to a folder for ``--prior``."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import tempfile
@@ -13,13 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.converters import CONVERTERS
-from geodiff_plugin.cli.converters.folder import convert_folder
+from geodiff_plugin.cli.converters import depthfm, ppd
 from geodiff_plugin.cli.converters.marigold_v2 import MARIGOLD_V2, convert_marigold_v2
-from geodiff_plugin.cli.converters.reading import read_checkpoint
+from geodiff_plugin.cli.converters.reading import read_checkpoint, save_weights
 
 __all__ = ["run_convert"]
 
+CONVERTERS = {"depthfm": depthfm, "ppd": ppd}
 #: Keys of an unknown checkpoint that the error names.
 NAMED_KEYS = 8
 
@@ -71,7 +68,7 @@ def run_convert(
 def _fill(source: Path, folder: Path, part: str | None) -> str:
     """Convert into an empty folder; what kind it was."""
     if os.path.isdir(source):
-        convert_folder(source, folder)
+        _convert_folder(source, folder)
         return "folder"
     checkpoint = read_checkpoint(source)
     for kind, converter in CONVERTERS.items():
@@ -88,3 +85,45 @@ def _fill(source: Path, folder: Path, part: str | None) -> str:
         f"{source} with the keys {got or 'of an empty mapping'}",
         "docs/reference/priors.md tells which prior comes from where.",
     )
+
+
+#: What is copied beside weights: configs, vocabularies, licences.
+COPIED = (".json", ".txt", ".md", ".model", ".safetensors")
+
+
+def _safe_name(name: str) -> str:
+    """Of ``pytorch_model.bin`` (transformers) or ``diffusion_pytorch_model.bin`` (diffusers), or a shard."""
+    name = name.replace(".bin", ".safetensors")
+    return name.replace("pytorch_model", "model") if name.startswith("pytorch_model") else name
+
+
+def _convert_folder(source: Path, folder: Path) -> None:
+    """Write the same folder with safetensors in place of pickled ``.bin`` files.
+
+    Args:
+        source: of one component or several.
+        folder: an empty one to fill.
+
+    Raises:
+        ValueError: no .bin file in it, or one that cannot be read.
+    """
+    if not any(source.rglob("*.bin")):
+        cure = "One with .safetensors needs no conversion: give it to --prior."
+        bad_value(
+            "SRC", "a checkpoint file, or a folder with .bin weights", f"the folder {source} without", cure
+        )
+    for path in sorted(p for p in source.rglob("*") if p.is_file()):
+        target = folder / path.relative_to(source)
+        safe = target.with_name(_safe_name(path.name))
+        if path.suffix == ".bin":
+            if not (source / safe.relative_to(folder)).is_file():  # else it is copied
+                safe.parent.mkdir(parents=True, exist_ok=True)
+                save_weights(read_checkpoint(path), safe)
+        elif path.name.endswith(".bin.index.json"):
+            index = json.loads(path.read_text(encoding="utf-8"))
+            index["weight_map"] = {key: _safe_name(name) for key, name in index["weight_map"].items()}
+            safe.parent.mkdir(parents=True, exist_ok=True)
+            safe.write_text(json.dumps(index, indent=2), encoding="utf-8")
+        elif path.suffix in COPIED or path.name.upper().startswith("LICEN"):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target)

@@ -1,8 +1,4 @@
-"""``geodiff demo``: a guided call on a rendered pair whose depth is known, offline.
-
-Data flow: the demo pair -> ``geodiff depth`` on it -> files, a picture and a table of errors.
-Paper: S5.1 (AbsRel, delta1, RMSE).
-"""
+"""``geodiff demo``: a guided call on a rendered pair whose depth is known, offline."""
 
 from __future__ import annotations
 
@@ -12,11 +8,10 @@ import numpy as np
 import torch
 
 from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
-from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.depth import estimate_and_write
-from geodiff_plugin.cli.messages import say
+from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.report import single_map, summary_line
-from geodiff_plugin.cli.terminal import new_table, show
+from geodiff_plugin.cli.terminal import StopWatch, new_table, say, show
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.formats import atomic_path
@@ -37,18 +32,18 @@ def _write_comparison(path: Path, pair: DemoPair, aligned_m: np.ndarray, guided_
         grid([pair.left, *maps], titles, cell_width=CELL_WIDTH).save(temporary, optimize=True)
 
 
-def run_demo(arguments: DepthArguments, out: OutFolder) -> None:
+def run_demo(options: DepthOptions, out: OutFolder) -> None:
     """Write what ``geodiff depth`` writes and ``comparison.png``, and print how far it is from the truth.
 
     Args:
-        arguments: of ``demo_arguments``, checked by ``start.start_run``.
+        options: of ``demo_options``, which ``start_pair`` has seen.
         out: the folder that it gave, held.
     """
-    run = estimate_and_write(arguments, out)
+    pipe, _, output, report = estimate_and_write(options, out, StopWatch())
     pair = read_demo_pair()
-    plain = run.pipe(pair.left, generator=torch.Generator("cpu").manual_seed(arguments.seed))
-    aligned_m = align(single_map(plain.prediction), pair.depth_m, pair.valid, run.pipe.config.prediction_type)
-    guided_m = single_map(run.output.prediction)
+    plain = pipe(pair.left, generator=torch.Generator("cpu").manual_seed(options.seed))
+    aligned_m = align(single_map(plain.prediction), pair.depth_m, pair.valid, pipe.config.prediction_type)
+    guided_m = single_map(output.prediction)
     table = new_table(("", "AbsRel", "delta1", "RMSE, m"))
     for name, depth_m in (
         ("prior, aligned by an oracle", aligned_m),
@@ -61,4 +56,4 @@ def run_demo(arguments: DepthArguments, out: OutFolder) -> None:
         _write_comparison(out.path / "comparison.png", pair, aligned_m, guided_m)
     except OSError as error:  # the result itself is safe
         say(f"geodiff: comparison.png could not be written ({error.strerror or error}).")
-    print(summary_line(run.report, f"{out.path}/"))
+    print(summary_line(report, f"{out.path}/"))

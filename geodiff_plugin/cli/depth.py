@@ -1,142 +1,204 @@
-"""``geodiff depth``: two images and their cameras to a folder of metric depth.
-
-Data flow: ``DepthArguments``, ``OutFolder`` held -> prior -> guided call -> files, report, one line.
-Paper: Algorithm 1.
-"""
+"""``geodiff depth`` on one pair: two images and their cameras to a folder of metric depth (Algorithm 1)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from geodiff_plugin.cli.arguments import DepthArguments
-from geodiff_plugin.cli.estimate import StopWatch, guided_call, load_guided_prior
+import torch
+from diffusers.utils import logging as diffusers_logging
+from transformers.utils import logging as transformers_logging
+
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.exports import (
-    Scene,
-    check_exports,
     check_image_names,
     make_scene,
+    pick_viewer,
     show_scene,
     write_exports,
+    write_maps,
+    write_undistorted,
 )
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
-from geodiff_plugin.cli.messages import collected_warnings, in_options, say
-from geodiff_plugin.cli.outputs import write_maps, write_report, write_undistorted
-from geodiff_plugin.cli.photographs import read_photographs
+from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.report import build_report, summary_line
-from geodiff_plugin.cli.settings import Settings, read_settings
+from geodiff_plugin.cli.terminal import StopWatch, collected_warnings, say
 from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.priors import find_prior
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.runtime.machine import pick_device
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["DepthRun", "estimate_and_write", "run_depth", "write_result"]
+__all__ = [
+    "estimate_and_write",
+    "guided_call",
+    "load_guided_prior",
+    "loading_bars",
+    "run_depth",
+    "write_result",
+]
 
 
-@dataclass(frozen=True)
-class DepthRun:
-    """What a run leaves in memory, for commands that go on with it.
+@contextmanager
+def loading_bars(prior: str, quiet: bool = False) -> Iterator[None]:
+    """Switch off the bars of diffusers and transformers, but for a download, which is worth one.
 
-    Attributes:
-        inputs: views and cameras.
-        output: of the guided call.
-        pipe: the prior, guidance enabled.
-        settings: device, dtype, range.
-        report: as in ``report.json``.
-        report_text: the same as JSON.
+    Args:
+        prior: as typed.
+        quiet: switch them off for a download too.
     """
+    on_disk = prior == "bundled" or os.path.isdir(prior) or os.path.isdir(prior.partition(":")[2])
+    libraries = (diffusers_logging, transformers_logging) if on_disk or quiet else ()
+    shown = [library for library in libraries if library.is_progress_bar_enabled()]
+    for library in shown:
+        library.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for library in shown:
+            library.enable_progress_bar()
 
-    inputs: Inputs
-    output: MetricDepthOutput
-    pipe: Any
-    settings: Settings
-    report: dict[str, Any]
-    report_text: str
+
+def load_guided_prior(options: DepthOptions, device: torch.device) -> Any:
+    """The prior of ``--prior``, with guidance enabled and its own progress bars off.
+
+    Which it is and its licence are said on stderr, unless ``--quiet``.
+
+    Raises:
+        InputError: no such prior, not cached, of no known kind; an option that it does not take.
+    """
+    with loading_bars(options.prior, options.quiet):
+        found = find_prior(options.prior)
+        if not options.quiet:
+            say(f"prior: {options.prior} ({found.key}; {found.licence})")
+        pipe = found.load(device, getattr(torch, options.dtype), options.space)
+    taken = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
+    for entry in options.option:
+        if (name := entry.partition("=")[0]) not in taken:
+            expected = f"one that {found.key} takes ({', '.join(taken) or 'none'})"
+            bad_value("--option", expected, repr(name))
+    pipe.set_progress_bar_config(disable=True)
+    enable_geometry_guidance(pipe)
+    return pipe
 
 
-def estimate_and_write(arguments: DepthArguments, out: OutFolder) -> DepthRun:
+def guided_call(pipe: Any, inputs: Inputs, options: DepthOptions, **further: Any) -> MetricDepthOutput:
+    """Call the pipeline as the options say; unless ``--quiet``, with the loss in a progress bar on stderr.
+
+    Args:
+        pipe: of ``load_guided_prior``.
+        inputs: views and cameras.
+        options: of this pair.
+        **further: what else the call takes.
+
+    Raises:
+        InputError: what only both views together show, such as no overlap; with ``--strict`` a depth that is
+            not to be trusted.
+    """
+    call = options.call() | {"generator": torch.Generator("cpu").manual_seed(options.seed)} | further
+    pipe.set_progress_bar_config(disable=options.quiet, file=sys.stderr, leave=False)
+    try:
+        return pipe(inputs.left, guidance=inputs.guidance, strict=options.strict, **call)
+    finally:
+        pipe.set_progress_bar_config(disable=True)
+
+
+def estimate_and_write(
+    options: DepthOptions, out: OutFolder, watch: StopWatch
+) -> tuple[Any, Inputs, MetricDepthOutput, dict[str, Any]]:
     """Everything of ``geodiff depth`` but its answer on stdout.
 
     Args:
-        arguments: checked by ``start.start_run``.
+        options: that ``start_pair`` has seen.
         out: the folder that it gave, held.
+        watch: of the stages so far.
+
+    Returns:
+        The pipeline, the inputs, the output and the report.
 
     Raises:
-        OSError, TypeError, ValueError: bad input; before any weights load where it can be seen that early.
+        InputError: bad input; before any weights load where it can be seen that early.
     """
-    watch = StopWatch()
     warnings: list[str] = []
-    with collected_warnings(warnings):
-        settings = read_settings(arguments)
-        check_exports(arguments.export, arguments.show)
+
+    def tell(sentence: str) -> None:
+        if sentence not in warnings:
+            warnings.append(sentence)
+            say(f"warning: {sentence}")
+
+    with collected_warnings(tell):
+        device, config = pick_device(options.device), options.config()
+        pick_viewer(options.show)
         with watch.stage("calibration"):
-            read = read_photographs if arguments.estimate_pose else read_inputs
-            inputs = read(arguments, settings)
-            check_image_names(arguments, inputs)
+            inputs = read_inputs(options, config)
+            check_image_names(options, inputs)
         with watch.stage("load"):
-            pipe = load_guided_prior(arguments, settings)
+            pipe = load_guided_prior(options, device)
         with watch.stage("guided call"):
-            output = guided_call(pipe, inputs, arguments, settings)
-        for sentence in map(in_options, output.warnings):
-            if sentence not in warnings:
-                warnings.append(sentence)
-                say(f"warning: {sentence}")
-        report = build_report(inputs, output, pipe, arguments, settings, warnings)
-        report_text = write_result(arguments, out, inputs, output, report, watch)
-    return DepthRun(inputs, output, pipe, settings, report, report_text)
+            output = guided_call(pipe, inputs, options)
+        for sentence in output.warnings:
+            tell(sentence)
+        report = build_report(inputs, output, pipe, options, warnings)
+        write_result(options, out, inputs, output, report, watch)
+    return pipe, inputs, output, report
 
 
 def write_result(
-    arguments: DepthArguments,
+    options: DepthOptions,
     out: OutFolder,
     inputs: Inputs,
     output: MetricDepthOutput,
     report: dict[str, Any],
     watch: StopWatch,
-) -> str:
-    """Fill the folder: every map, what ``--export`` asks for, and the report.
+) -> None:
+    """Fill the folder: every map, what ``--export`` asks for, and last the report.
 
     Args:
-        arguments: of this pair.
+        options: of this pair.
         out: its folder, held.
         inputs: views and cameras.
         output: of the guided call.
         report: of ``build_report``; files and seconds are added to it.
         watch: of the stages so far.
-
-    Returns:
-        The report as JSON.
     """
 
-    def fill(folder: Path) -> str:
+    def fill(folder: Path) -> None:
         with watch.stage("write"):
-            report["files"] = write_maps(folder, output, inputs.left, arguments.min_confidence)
+            report["files"] = write_maps(folder, output, inputs.left, options.min_confidence)
             if inputs.undistorted:
                 write_undistorted(folder, inputs.left)
-            if arguments.export:
-                write_exports(folder, arguments.export, _scene(output, inputs, arguments))
+            if options.export:
+                write_exports(folder, options.export, make_scene(output, inputs, options))
         report["files"]["names"] = [*sorted(path.name for path in folder.iterdir()), "report.json"]
         report["seconds"] = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
-        return write_report(folder, report)
+        (folder / "report.json").write_text(_text(report) + "\n", encoding="utf-8")
 
-    return out.write(fill)
-
-
-def _scene(output: MetricDepthOutput, inputs: Inputs, arguments: DepthArguments) -> Scene:
-    return make_scene(output, inputs, arguments.photographs(), arguments.min_confidence)
+    out.write(fill)
 
 
-def run_depth(arguments: DepthArguments, out: OutFolder) -> None:
+def _text(report: dict[str, Any]) -> str:
+    return json.dumps(report, indent=2, allow_nan=False)
+
+
+def run_depth(options: DepthOptions, out: OutFolder, watch: StopWatch) -> None:
     """Run the command and answer on stdout: the summary, or the report with ``--json``.
 
     Args:
-        arguments: checked by ``start.start_run``.
+        options: that ``start_pair`` has seen.
         out: the folder that it gave, held.
+        watch: of the stages so far.
     """
-    run = estimate_and_write(arguments, out)
-    if arguments.json:
-        print(run.report_text)
-    elif not arguments.quiet:
-        print(summary_line(run.report, f"{out.path}/"))
-    viewer = check_exports((), arguments.show)
+    _, inputs, output, report = estimate_and_write(options, out, watch)
+    if options.json:
+        print(_text(report))
+    elif not options.quiet:
+        print(summary_line(report, f"{out.path}/"))
+    viewer = pick_viewer(options.show)
     if viewer is not None:
-        show_scene(viewer, _scene(run.output, run.inputs, arguments))
+        show_scene(viewer, make_scene(output, inputs, options))

@@ -1,40 +1,98 @@
-"""Exports of ``geodiff depth``: GLB and COLMAP files, and viewers (rerun, viser).
-
-Data flow: ``MetricDepthOutput``, ``Inputs`` -> files in ``--out``, or a window.
-Paper: none.
-"""
+"""Files of ``geodiff depth``: maps, cloud, GLB and COLMAP; and viewers (rerun, viser)."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.cli.arguments import DepthArguments, undistorted_name
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.inputs import Inputs
-from geodiff_plugin.cli.messages import say
-from geodiff_plugin.cli.outputs import write_undistorted
+from geodiff_plugin.cli.options import DepthOptions, undistorted_name
 from geodiff_plugin.cli.report import single_map, used_poses
-from geodiff_plugin.formats import Cloud, flying_points, make_cloud, write_colmap, write_glb
+from geodiff_plugin.cli.terminal import say
+from geodiff_plugin.formats import (
+    Cloud,
+    flying_points,
+    make_cloud,
+    write_colmap,
+    write_depth_mm,
+    write_depth_npy,
+    write_glb,
+    write_ply,
+)
 from geodiff_plugin.formats.colmap import check_colmap_names
+from geodiff_plugin.plotting import depth_figure, overview, share_figure
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = [
-    "EXPORTS",
-    "VIEWERS",
     "Scene",
-    "check_exports",
     "check_image_names",
     "make_scene",
+    "pick_viewer",
     "show_scene",
     "write_exports",
+    "write_maps",
+    "write_undistorted",
 ]
+
+
+def write_maps(
+    folder: Path, output: MetricDepthOutput, left: np.ndarray, min_confidence: float = 0.0
+) -> dict[str, Any]:
+    """Write every file but exports and the report.
+
+    Args:
+        folder: an existing one.
+        output: of the guided call, at the left image's resolution.
+        left: ``(H, W, 3)`` image in [0, 1], colours of the cloud.
+        min_confidence: pixels below it are no points of the cloud, [0, 1].
+
+    Returns:
+        Counts for the report.
+    """
+    depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
+    write_depth_npy(folder / "depth.npy", depth_m)
+    zeros = write_depth_mm(folder / "depth_mm.png", depth_m)
+    depth_figure(depth_m, unit=output.unit).save(folder / "depth.png")
+    error = confidence = None
+    if output.visible is not None:
+        visible = single_map(output.visible).astype(bool)
+        Image.fromarray(visible.astype(np.uint8) * 255).save(folder / "visible.png")
+        error = single_map(output.photometric_error).astype(np.float32)
+        np.save(folder / "photometric_error.npy", error)
+        error = np.where(visible, error, np.nan)
+    if output.uncertainty is not None:
+        np.save(folder / "uncertainty.npy", single_map(output.uncertainty).astype(np.float32))
+    for name, extra in output.extras.items():
+        np.save(folder / f"{name}.npy", np.asarray(extra)[0].astype(np.float32))
+    flying, doubtful = flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool)
+    if output.confidence is not None:
+        confidence = single_map(output.confidence).astype(np.float32)
+        np.save(folder / "confidence.npy", confidence)
+        share_figure(confidence, "confidence", 1.0).save(folder / "confidence.png")
+        doubtful = confidence < min_confidence
+    overview(left, depth_m, confidence, error, output.unit).save(folder / "overview.png")
+    points = write_ply(folder / "cloud.ply", depth_m, left, K, valid=~(flying | doubtful), unit=output.unit)
+    return {
+        "depth_mm_zero_pixels": zeros,
+        "cloud_points": points,
+        "flying_points": int(flying.sum()),
+        "doubtful_points": int(doubtful.sum()),
+    }
+
+
+def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> None:
+    """Write a view without its lens distortion; the depth belongs to the first, which is the left one."""
+    image = Image.fromarray(np.rint(image_01.clip(0, 1) * 255).astype(np.uint8))
+    image.save(folder / undistorted_name(number))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +100,7 @@ class Scene:
     """What can be exported and shown.
 
     Attributes:
-        cloud: the sure points, without those that hang between two surfaces.
+        cloud: points of at least the least confidence, without those that hang between two surfaces.
         cameras: ``(K, E, (width, height))``, the left one first; poses as the call used them.
         names: of their images, which a pinhole camera took: the photographs, or without lens distortion
             those of ``write_undistorted``.
@@ -57,44 +115,31 @@ class Scene:
     further: tuple[np.ndarray, ...] = ()
 
 
-def check_image_names(arguments: DepthArguments, inputs: Inputs) -> None:
-    """Refuse photographs whose names an export cannot hold, before the work that would be lost.
-
-    Raises:
-        ValueError: naming the photograph.
-    """
-    if "colmap" in arguments.export and not inputs.undistorted:
-        check_colmap_names(_image_names(arguments.photographs()))
-
-
-def make_scene(
-    output: MetricDepthOutput, inputs: Inputs, names: tuple[Path, ...], min_confidence: float
-) -> Scene:
+def make_scene(output: MetricDepthOutput, inputs: Inputs, options: DepthOptions) -> Scene:
     """The cloud of a guided call with the cameras of all its views.
 
     Args:
         output: at the left image's resolution.
         inputs: the views and cameras.
-        names: paths of the images, the left one first.
-        min_confidence: pixels below it are no points.
+        options: names of the images, and the least confidence of a point.
     """
     depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
     keep = ~flying_points(depth_m)
     if output.confidence is not None:
-        keep &= single_map(output.confidence) >= min_confidence
+        keep &= single_map(output.confidence) >= options.min_confidence
     cameras = [(K, np.eye(4), (depth_m.shape[1], depth_m.shape[0]))]
     Es = used_poses(output, inputs.guidance)
     for rig, E, image in zip(inputs.guidance.rigs, Es, inputs.guidance.rights, strict=True):
         cameras.append((rig.K_right, E, (image.shape[-1], image.shape[-2])))
     cloud = make_cloud(depth_m, inputs.left, K, keep)
     if not inputs.undistorted:
-        return Scene(cloud, tuple(cameras), _image_names(names), inputs.left)
+        return Scene(cloud, tuple(cameras), _image_names(options.photographs().values()), inputs.left)
     further = tuple(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)
     written = tuple(undistorted_name(number) for number in range(1, 2 + len(further)))
     return Scene(cloud, tuple(cameras), written, inputs.left, further)
 
 
-def _image_names(paths: tuple[Path, ...]) -> tuple[str, ...]:
+def _image_names(paths: Collection[Path]) -> tuple[str, ...]:
     """Names of the images, with their folders below a common one where two of them are alike."""
     names = tuple(path.name for path in paths)
     if len(set(names)) == len(names):
@@ -104,25 +149,25 @@ def _image_names(paths: tuple[Path, ...]) -> tuple[str, ...]:
     return tuple(path.relative_to(root).as_posix() for path in absolute)
 
 
-def _glb(folder: Path, scene: Scene) -> None:
-    write_glb(folder / "cloud.glb", scene.cloud, scene.cameras)
+def check_image_names(options: DepthOptions, inputs: Inputs) -> None:
+    """Refuse photographs whose names an export cannot hold, before the work that would be lost.
+
+    Raises:
+        InputError: naming the photograph.
+    """
+    if "colmap" in options.export and not inputs.undistorted:
+        check_colmap_names(_image_names(options.photographs().values()))
 
 
-def _colmap(folder: Path, scene: Scene) -> None:
-    for number, image_01 in enumerate(scene.further, 2):  # the left one is there without any export
-        write_undistorted(folder, image_01, number)
-    views = [(name, *camera) for name, camera in zip(scene.names, scene.cameras, strict=True)]
-    write_colmap(folder, views, scene.cloud)
-
-
-#: What ``--export`` writes, by name.
-EXPORTS: dict[str, Callable[[Path, Scene], None]] = {"glb": _glb, "colmap": _colmap}
-
-
-def write_exports(folder: Path, kinds: tuple[str, ...], scene: Scene) -> None:
-    """Write every kind of ``EXPORTS`` that was asked for."""
-    for kind in kinds:
-        EXPORTS[kind](folder, scene)
+def write_exports(folder: Path, kinds: Collection[str], scene: Scene) -> None:
+    """Write what ``--export`` asks for, into a folder with the maps."""
+    if "glb" in kinds:
+        write_glb(folder / "cloud.glb", scene.cloud, scene.cameras)
+    if "colmap" in kinds:
+        for number, image_01 in enumerate(scene.further, 2):  # the left one is there without any export
+            write_undistorted(folder, image_01, number)
+        views = [(name, *camera) for name, camera in zip(scene.names, scene.cameras, strict=True)]
+        write_colmap(folder, views, scene.cloud)
 
 
 def _in_rerun(scene: Scene) -> None:
@@ -169,26 +214,20 @@ VIEWERS: dict[str, tuple[str, Callable[[Scene], None]]] = {
 }
 
 
-def check_exports(kinds: tuple[str, ...], viewer: str | None) -> str | None:
-    """Refuse unknown exports, and a viewer that is not installed, before anything is computed.
-
-    Returns:
-        The viewer to open, ``"auto"`` resolved, or ``None``.
+def pick_viewer(wanted: str | None) -> str | None:
+    """The viewer to open, ``"auto"`` resolved, or ``None``; asked before anything is computed.
 
     Raises:
-        ValueError: naming the option and what to install.
+        InputError: naming what to install.
     """
-    for kind in kinds:
-        check_choice(kind, "--export", EXPORTS)
-    if viewer is None:
+    if wanted is None:
         return None
-    check_choice(viewer, "--show", ("auto", *VIEWERS))
-    wanted = tuple(VIEWERS) if viewer == "auto" else (viewer,)
-    for name in wanted:
+    names = tuple(VIEWERS) if wanted == "auto" else (wanted,)
+    for name in names:
         if importlib.util.find_spec(name) is not None:
             return name
-    packages = " or ".join(VIEWERS[name][0] for name in wanted)
-    bad_value("--show", "a viewer that is installed", repr(viewer), f"pip install {packages}")
+    packages = " or ".join(VIEWERS[name][0] for name in names)
+    bad_value("--show", "a viewer that is installed", repr(wanted), f"pip install {packages}")
 
 
 def show_scene(viewer: str, scene: Scene) -> None:

@@ -1,8 +1,4 @@
-"""``geodiff info``: installed packages, devices and available priors.
-
-Data flow: the machine -> lines of text.
-Paper: none.
-"""
+"""``geodiff info``: installed packages, devices and available priors."""
 
 from __future__ import annotations
 
@@ -12,9 +8,9 @@ import torch
 from huggingface_hub import CacheNotFound, scan_cache_dir
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.cli.checks import SPACES
-from geodiff_plugin.cli.estimate import loading_bars
+from geodiff_plugin.cli.depth import loading_bars
 from geodiff_plugin.cli.terminal import print_lines
+from geodiff_plugin.options import SPACES
 from geodiff_plugin.priors import BUNDLED_FOLDER, PRIORS, FoundPrior, find_adapter, find_prior
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import versions

@@ -1,17 +1,14 @@
-"""Reads and checks the input files of ``geodiff depth``, before any weights load.
-
-Data flow: ``DepthArguments`` -> images, a ``Rig`` and the ``GeometryGuidance`` made of them.
-Paper: S3.3 (two views with known cameras).
-"""
+"""Reads the files of ``geodiff depth`` into images, cameras and a guidance (S3.3), before weights load."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from geodiff_plugin._camera_checks import (
     check_baseline,
@@ -21,22 +18,29 @@ from geodiff_plugin._camera_checks import (
     check_pose,
 )
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.cli.arguments import DepthArguments
-from geodiff_plugin.cli.checks import check_positive
-from geodiff_plugin.cli.lenses import Lenses, lenses_of, pinhole
-from geodiff_plugin.cli.settings import Settings
-from geodiff_plugin.cli.start import PARAMETERS, calibration_way
+from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, calibration_way, intrinsics_way
+from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
-from geodiff_plugin.formats.distortion import undistorted_points
-from geodiff_plugin.formats.exif import warn_of_other_lens
-from geodiff_plugin.formats.rigs import intrinsics
+from geodiff_plugin.formats.distortion import (
+    distortion_from_text,
+    undistorted,
+    undistorted_pixels,
+    undistorted_points,
+)
+from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov, warn_of_other_lens
+from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.guidance.posing import cleaned
+from geodiff_plugin.options import check_positive
 from geodiff_plugin.types import Distortion, Rig
 
-__all__ = ["Inputs", "read_inputs", "read_known", "read_rig"]
+__all__ = ["Inputs", "lenses_of", "pinhole", "read_inputs", "read_rig"]
 
 MOST_PIXELS = 1e6
+Size = tuple[int, int]
+Lenses = tuple[Distortion | None, ...]
+"""One entry a photograph, the left one first; ``None`` for a pinhole camera."""
 
 
 @dataclass(frozen=True)
@@ -56,216 +60,291 @@ class Inputs:
     undistorted: bool = False
 
 
-def _size(image: np.ndarray) -> tuple[int, int]:
-    """``(width, height)``."""
-    return image.shape[1], image.shape[0]
+def read_inputs(
+    options: DepthOptions, config: GuidanceConfig, frames: Sequence[np.ndarray] | None = None
+) -> Inputs:
+    """Read the images and the cameras, and see that they fit each other.
+
+    Args:
+        options: that the checks of ``cli.options`` have seen.
+        config: of the guidance.
+        frames: left and right image, ``(H, W, 3)`` float32 in [0, 1], where they are no files of their own.
+
+    Raises:
+        InputError: naming the option or the file, or why there is no pose to be had.
+    """
+    views = options.photographs()
+    images = list(frames or map(_read_view, views.values(), views))
+    sizes = [(image.shape[1], image.shape[0]) for image in images]
+    rig = None
+    if options.estimate_pose:
+        Ks = [_intrinsics(options, path, i, sizes[i]) for i, path in enumerate(views.values())]
+        poses = []
+    else:
+        rig = read_rig(options, *sizes[:2])
+        if frames is None:
+            for K, (name, path) in zip((rig.K_left, rig.K_right), list(views.items())[:2], strict=False):
+                warn_of_other_lens(path, K, name)
+        further = [_further_camera(options, i, rig.K_left, size) for i, size in enumerate(sizes[2:])]
+        Ks = [rig.K_left, rig.K_right, *(K for K, _ in further)][: len(images)]
+        poses = [np.eye(4), rig.E, *(E for _, E in further)]
+    lenses = lenses_of(options, rig)
+    images = [pinhole(*each, config) for each in zip(images, Ks, lenses, strict=False)]
+    points, cropped = _read_known(options, Ks[0], lenses[0], sizes[0]), options.cropped
+    if rig is None:
+        if options.baseline is not None:
+            check_positive(options.baseline, "--baseline", "metres")
+        guidance = GeometryGuidance.from_photographs(
+            images,
+            K=Ks,
+            baseline_m=options.baseline,
+            known_length=_known_length(options.known_length, Ks[0], lenses[0]),
+            points=points,
+            matcher=options.matcher or "sift",
+            cropped=cropped,
+            config=config,
+        )
+        rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
+    elif len(images) == 1:
+        guidance = GeometryGuidance(None, rig.K_left, points=points, cropped=cropped, config=config)
+    else:
+        posed = list(zip([None, *images[1:]], Ks, poses, strict=True))
+        lengths = {"unit": rig.unit, "measured_baseline": rig.measured}
+        guidance = GeometryGuidance.from_views(
+            posed, points=points, cropped=cropped, **lengths, config=config
+        )
+    return Inputs(images[0], rig, guidance, any(lens is not None for lens in lenses))
 
 
 def _read_view(path: Path, name: str) -> np.ndarray:
-    image, notes = read_image(path, name)
+    image, notes = read_image(path, name if name in ("LEFT", "RIGHT") else f"--view {path}")
     for note in notes:
         warnings.warn(note, stacklevel=2)
     return image
 
 
-def _rig_from_options(arguments: DepthArguments, size: tuple[int, int], alone: bool) -> Rig:
+def read_rig(options: DepthOptions, left_size: Size, right_size: Size | None = None) -> Rig:
+    """The cameras, from whichever of the three ways was taken, for images of these sizes.
+
+    Args:
+        options: of one pair.
+        left_size: ``(width, height)`` of the left image.
+        right_size: likewise; ``None`` without a right one.
+
+    Raises:
+        InputError: no calibration or more than one, a file that is none, K for images of another size.
+    """
+    way, alone = calibration_way(options), right_size is None
+    if way == "file":
+        rig = read_calibration(
+            options.calib,
+            options.camera_pair(),
+            str(options.left),
+            image_names=None if options.right is None else (str(options.left), str(options.right)),
+            image_size=left_size,
+            baseline_m=options.baseline,
+            distorted=True,
+        )
+    else:
+        rig = (_rig_from_parameters if way == "parameters" else _rig_from_matrices)(options, left_size, alone)
+    for side, K, calibrated, size, path in (
+        ("left", rig.K_left, rig.size_left, left_size, options.left),
+        ("right", rig.K_right, rig.size_right, right_size, options.right),
+    ):
+        if size is None:
+            continue
+        cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
+        check_calibrated_size(size, calibrated, f"the {side} image {path}", rig.source, cure)
+        if not options.cropped:
+            check_intrinsics_fit(
+                K, *size, f"K of the {side} camera ({rig.source})", f"the {side} image {path}"
+            )
+    return replace(rig, size_left=left_size, size_right=right_size)
+
+
+def _rig_from_parameters(options: DepthOptions, size: Size, alone: bool) -> Rig:
     names = PARAMETERS[:-1] if alone else PARAMETERS
-    values = {name: getattr(arguments, name) for name in names}
+    values = {name: getattr(options, name) for name in names}
     missing = [f"--{name}" for name, value in values.items() if value is None]
     if missing:
-        centre = ((size[0] - 1) / 2, (size[1] - 1) / 2)
         bad_value(
             " ".join(missing),
             "given as well, with " + " ".join(f"--{name}" for name in names if f"--{name}" not in missing),
             "nothing",
-            f"--fy is --fx where pixels are square; --cx, --cy are near the centre, here {centre[0]:g} and "
-            f"{centre[1]:g}; --baseline is the distance of the cameras in metres.",
+            f"--fy is --fx where pixels are square; --cx, --cy are near the centre, here "
+            f"{(size[0] - 1) / 2:g} and {(size[1] - 1) / 2:g}; --baseline is the distance of the cameras in "
+            "metres.",
         )
-    check_positive(values["fx"], "--fx", "pixels")
-    check_positive(values["fy"], "--fy", "pixels")
-    check_number(values["cx"], "--cx", -MOST_PIXELS, MOST_PIXELS)
-    check_number(values["cy"], "--cy", -MOST_PIXELS, MOST_PIXELS)
+    for name in ("fx", "fy"):
+        check_positive(values[name], f"--{name}", "pixels")
+    for name in ("cx", "cy"):
+        check_number(values[name], f"--{name}", -MOST_PIXELS, MOST_PIXELS)
     if alone:
         K = intrinsics(*values.values())
         return Rig(K, K, np.eye(4))
-    cure = (
-        "Two views from one place do not tell the scale; "
-        "if the right camera is the left one, swap the images."
-    )
+    cure = "Two views from one place tell no scale; if the right camera is the left one, swap the images."
     check_positive(values["baseline"], "--baseline", "metres", cure)
     return rig_from_parameters(*values.values())
 
 
-def _rig_from_matrices(arguments: DepthArguments, alone: bool) -> Rig:
-    for option, path in (("--K", arguments.k), ("--E", arguments.e)):
+def _matrix(path: Path, option: str) -> np.ndarray:
+    """K out of a file, which is named where an option is given several times."""
+    named = f"{option} {path}" if option.startswith("--view") else option
+    return check_intrinsics(read_matrix(path, option), named)
+
+
+def _rig_from_matrices(options: DepthOptions, _size: Size, alone: bool) -> Rig:
+    for option, path in (("--K", options.k), ("--E", options.e)):
         if path is None and not (alone and option == "--E"):
             bad_value(option, "given as well", "nothing", "--K and --E go together; --K-right is optional.")
-    K = check_intrinsics(read_matrix(arguments.k, "--K"), "--K")
+    assert options.k is not None
+    K, source = _matrix(options.k, "--K"), str(options.k)
     if alone:
-        return Rig(K, K, np.eye(4), source=str(arguments.k))
-    K_right = K
-    if arguments.k_right is not None:
-        K_right = check_intrinsics(read_matrix(arguments.k_right, "--K-right"), "--K-right")
-    E = check_pose(read_matrix(arguments.e, "--E"), "--E")
-    return Rig(K, K_right, E, source=str(arguments.k), measured=False)
+        return Rig(K, K, np.eye(4), source=source)
+    K_right = K if options.k_right is None else _matrix(options.k_right, "--K-right")
+    E = check_pose(read_matrix(options.e, "--E"), "--E")
+    return Rig(K, K_right, E, source=source, measured=False)
 
 
-def read_rig(
-    arguments: DepthArguments,
-    cameras: tuple[int, int] | None,
-    left_size: tuple[int, int],
-    right_size: tuple[int, int] | None,
-) -> Rig:
-    """The cameras, from whichever of the three ways was taken, for images of these sizes.
+def _further_camera(
+    options: DepthOptions, i: int, K_left: np.ndarray, size: Size
+) -> tuple[np.ndarray, np.ndarray]:
+    """K and pose of a ``--view``, checked under its own name."""
+    option, K, pose = f"--view {options.view[i]}", K_left, options.view_e[i]
+    if options.view_k:
+        K = _matrix(options.view_k[i], "--view-K")
+    if not options.cropped:
+        check_intrinsics_fit(K, *size, f"K of {option}", "its image")
+    E = check_pose(read_matrix(pose, "--view-E"), f"--view-E {pose}")
+    check_baseline(E, f"--view-E {pose}")
+    return K, E
 
-    Args:
-        arguments: the options.
-        cameras: numbers of the left and the right camera of the calibration, or ``None``.
-        left_size: ``(width, height)`` of the left image.
-        right_size: ``(width, height)`` of the right image; ``None`` without one.
+
+def _intrinsics(options: DepthOptions, path: Path, i: int, size: Size) -> np.ndarray:
+    """K of photograph ``i`` without a pose, 0 being the left one, from the options, else from its EXIF."""
+    way = intrinsics_way(options)
+    if i > 1 and options.view_k:
+        return _matrix(options.view_k[i - 2], "--view-K")
+    if way == "matrices":
+        if i > 0 and options.k_right is not None:
+            return _matrix(options.k_right, "--K-right")
+        assert options.k is not None
+        return _matrix(options.k, "--K")
+    if way == "parameters":
+        return intrinsics(*(getattr(options, name) for name in PARAMETERS[:-1]))
+    if options.fov is not None:
+        return intrinsics_from_fov(options.fov, size)
+    K, notes = intrinsics_from_exif(path, path.name)
+    for note in notes:
+        say(note)
+    return K
+
+
+def _known_length(
+    text: str | None, K: np.ndarray, lens: Distortion | None
+) -> tuple[float, float, float, float, float] | None:
+    """``X1,Y1,X2,Y2,METRES`` as typed, its ends where the image without lens distortion has them.
 
     Raises:
-        OSError, TypeError, ValueError: no calibration or more than one, a file that is none, K for images
-            of another size.
+        InputError: not five numbers; an end that the lens model sends no ray to.
     """
-    way = calibration_way(arguments)
-    if way == "file":
-        rig = read_calibration(
-            arguments.calib,
-            cameras,
-            str(arguments.left),
-            image_names=None if arguments.right is None else (str(arguments.left), str(arguments.right)),
-            image_size=left_size,
-            baseline_m=arguments.baseline,
-            distorted=True,
-        )
-    else:
-        alone = right_size is None  # not by RIGHT: a frame of two images side by side has none
-        rig = (
-            _rig_from_options(arguments, left_size, alone)
-            if way == "parameters"
-            else _rig_from_matrices(arguments, alone)
-        )
-    views = (
-        ("left", rig.K_left, rig.size_left, left_size, arguments.left),
-        ("right", rig.K_right, rig.size_right, right_size, arguments.right),
-    )
-    for side, K, calibrated_size, size, path in views:
-        if size is None:
-            continue
-        cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
-        check_calibrated_size(size, calibrated_size, f"the {side} image {path}", rig.source, cure)
-        if not arguments.cropped:
-            named = f"K of the {side} camera ({rig.source})", f"the {side} image {path}"
-            check_intrinsics_fit(K, *size, *named)
-    return replace(rig, size_left=left_size, size_right=right_size)
+    if text is None:
+        return None
+    try:
+        *ends, metres = (float(part) for part in text.split(","))
+        x1, y1, x2, y2 = ends
+    except ValueError:  # not numbers, or not five of them
+        cure = "Two pixels of LEFT and the distance of the two places, such as 100,200,400,210,1.5."
+        bad_value("--known-length", "X1,Y1,X2,Y2,METRES", repr(text), cure)
+    if lens is None:
+        return x1, y1, x2, y2, metres
+    straight = undistorted_pixels(np.reshape(ends, (2, 2)), K, lens)
+    if not np.isfinite(straight).all():
+        got = f"{ends}, of which the lens model has no ray"
+        cure = "Choose ends nearer to the middle of LEFT, or check --distortion."
+        bad_value("--known-length", "between two pixels that the lens shows", got, cure)
+    (x1, y1), (x2, y2) = straight.tolist()
+    return x1, y1, x2, y2, metres
 
 
-def _read_further_views(
-    arguments: DepthArguments, K_left: np.ndarray, lenses: Lenses, config: GuidanceConfig
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Image without lens distortion, K and pose of every ``--view``, checked under its own name."""
-    images, poses, matrices = arguments.view, arguments.view_e, arguments.view_k
-    views = []
-    for i, path in enumerate(images):
-        option = f"--view {path}"
-        image, K = _read_view(path, option), K_left
-        if matrices:
-            K = check_intrinsics(read_matrix(matrices[i], "--view-K"), f"--view-K {matrices[i]}")
-        if not arguments.cropped:
-            check_intrinsics_fit(K, *_size(image), f"K of {option}", "its image")
-        E = check_pose(read_matrix(poses[i], "--view-E"), f"--view-E {poses[i]}")
-        check_baseline(E, f"--view-E {poses[i]}")
-        views.append((pinhole(image, K, lenses[i], config), K, E))
-    return views
-
-
-def read_known(
-    arguments: DepthArguments, K: np.ndarray, lens: Distortion | None, size: tuple[int, int]
+def _read_known(
+    options: DepthOptions, K: np.ndarray, lens: Distortion | None, size: Size
 ) -> np.ndarray | None:
     """The depths of ``--points`` as the left image without lens distortion has them; ``None`` for none.
 
     Points in the camera's frame stay as they are. The pixels of a map are those of the image as it was
     taken, so behind a lens with distortion its depths become points.
 
-    Args:
-        arguments: the options.
-        K: ``(3, 3)`` pixels of the left image.
-        lens: that it was taken through; ``None`` for a lens without distortion.
-        size: ``(width, height)`` of the left image.
-
     Returns:
         ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)`` float32 metres.
-
-    Raises:
-        OSError, ValueError: as ``read_points``; a map of another size than the image behind a lens.
     """
-    if arguments.points is None:
+    if options.points is None:
         return None
-    scale, calibration = arguments.points_scale, arguments.points_calib
-    known = read_points(arguments.points, "--points", scale=scale, calibration=calibration)
+    scale, calibration = options.points_scale, options.points_calib
+    known = read_points(options.points, "--points", scale=scale, calibration=calibration)
     if lens is None or known.shape[1] == 3:
         return known
-    if _size(known) != size:
-        expected, got = ("{}x{}".format(*of) for of in (size, _size(known)))
+    if known.shape[::-1] != size:
+        expected, got = ("{}x{}".format(*of) for of in (size, known.shape[::-1]))
         cure = "A map belongs to the image as it was taken, pixel by pixel; else give points (N, 3)."
         bad_value("--points", f"a map of the left image's {expected} pixels", got, cure)
     return undistorted_points(known, K, lens)
 
 
-def _make_guidance(
-    arguments: DepthArguments,
-    settings: Settings,
-    views: tuple[np.ndarray, np.ndarray | None],
-    rig: Rig,
-    lenses: Lenses,
-) -> GeometryGuidance:
-    (left, right), config, cropped = views, settings.config, arguments.cropped
-    points = read_known(arguments, rig.K_left, lenses[0], _size(left))
-    if right is None:
-        return GeometryGuidance(None, rig.K_left, points=points, cropped=cropped, config=config)
-    further = _read_further_views(arguments, rig.K_left, lenses[2:], config)
-    posed = [(None, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E), *further]
-    lengths = {"unit": rig.unit, "measured_baseline": rig.measured}
-    return GeometryGuidance.from_views(posed, points=points, cropped=cropped, **lengths, config=config)
-
-
-def _compare_with_exif(arguments: DepthArguments, rig: Rig) -> None:
-    """Warn of a K that the photographs' own EXIF contradicts."""
-    warn_of_other_lens(arguments.left, rig.K_left, "LEFT")
-    if arguments.right is not None:
-        warn_of_other_lens(arguments.right, rig.K_right, "RIGHT")
-
-
-def read_inputs(
-    arguments: DepthArguments,
-    settings: Settings,
-    views: tuple[np.ndarray, np.ndarray] | None = None,
-    rig_of: Callable[..., Rig] = read_rig,
-) -> Inputs:
-    """Read the images and the calibration, and see that they fit each other.
+def pinhole(
+    image_01: np.ndarray, K: np.ndarray, lens: Distortion | None, config: GuidanceConfig
+) -> np.ndarray:
+    """The image as a pinhole camera would have taken it.
 
     Args:
-        arguments: the options.
-        settings: what was understood of them.
-        views: left and right image, ``(H, W, 3)`` float32 in [0, 1], where they are no files of their own.
-        rig_of: ``read_rig``, or what remembers its answer.
+        image_01: ``(H, W, 3)`` float32 in [0, 1].
+        K: ``(3, 3)`` pixels.
+        lens: what it was taken through; ``None`` for a lens without distortion.
+        config: says whether photographs are cleaned. That comes first: once an image is resampled, the
+            blocks of its compression are no longer found.
+
+    Returns:
+        The same shape; the array that was given where the lens has no distortion.
+    """
+    if lens is None:
+        return image_01
+    ready = cleaned(torch.from_numpy(image_01).permute(2, 0, 1), config)
+    return undistorted(ready.permute(1, 2, 0).contiguous().numpy(), K, lens)
+
+
+def lenses_of(options: DepthOptions, rig: Rig | None = None) -> Lenses:
+    """Distortion of every photograph's lens, the left one first; ``None`` for a lens without distortion.
+
+    Options take precedence over the calibration. A further view without ``--view-distortion`` has the left
+    one's lens, as it has its K.
+
+    Args:
+        options: of one pair.
+        rig: the calibration, with the lenses that it knows; ``None`` where there is none.
 
     Raises:
-        OSError, TypeError, ValueError: naming the option or the file.
+        InputError: more than two lenses, malformed coefficients, lenses for rectified images, or a further
+            view with a K of its own and a lens that is not given.
     """
-    right: np.ndarray | None = None
-    if views is not None:
-        left, right = views
-    else:
-        left = _read_view(arguments.left, "LEFT")
-        right = None if arguments.right is None else _read_view(arguments.right, "RIGHT")
-    rig = rig_of(arguments, settings.cameras, _size(left), None if right is None else _size(right))
-    if views is None:
-        _compare_with_exif(arguments, rig)
-    lenses = lenses_of(arguments, rig)
-    left = pinhole(left, rig.K_left, lenses[0], settings.config)
-    if right is not None:
-        right = pinhole(right, rig.K_right, lenses[1], settings.config)
-    guidance = _make_guidance(arguments, settings, (left, right), rig, lenses)
-    return Inputs(left, rig, guidance, any(lens is not None for lens in lenses))
+    typed = [distortion_from_text(text) for text in options.distortion]
+    if len(typed) > 2:
+        bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
+    if rig is not None and rig.rectified and any(is_distorted(lens) for lens in typed):
+        bad_value(
+            "--distortion",
+            f"left out where the calibration is of rectified images ({rig.source})",
+            " and ".join(options.distortion),
+            "Drop it and give the rectified images. If its numbers are of the raw cameras, give them as "
+            "--fx --fy --cx --cy --baseline (parallel cameras with one K), or as --K, --K-right and --E.",
+        )
+    pair = (None, None) if rig is None else rig.distortion
+    pair = (typed[0], typed[-1]) if typed else pair
+    further: list[Distortion | None] = [
+        distortion_from_text(text, "--view-distortion") for text in options.view_distortion
+    ]
+    if not further:
+        if options.view_k and any(is_distorted(lens) for lens in pair):
+            cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
+            bad_value("--view-distortion", "given for each --view", "none", cure)
+        further = [pair[0]] * len(options.view)
+    return tuple(lens if is_distorted(lens) else None for lens in (*pair, *further))

@@ -1,37 +1,353 @@
-"""Options that several commands of ``geodiff`` share, and their help panels.
-
-Data flow: a help text -> an option of typer.
-Paper: none.
-"""
+"""``geodiff depth``: its options, and every check of them that needs neither torch nor a decoded image."""
 
 from __future__ import annotations
 
+import itertools
+import os
+from collections.abc import Iterable
+from dataclasses import MISSING, dataclass, fields
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
 
-import typer
+from PIL import Image, UnidentifiedImageError
 
-__all__ = ["CAMERAS", "OUT", "OUTPUT", "RUN", "Device", "Overwrite", "option", "out_folder"]
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.options import CAMERAS, OUTPUT, RunOptions, declare, flag_of
 
-CAMERAS, RUN, OUTPUT = "Cameras", "Prior and run", "Output"
-OUT = ("--out", "-o")
-
-
-def option(help_text: str, panel: str, *names: str) -> Any:
-    """An option under one of the headings of the help."""
-    return typer.Option(*names, help=help_text, rich_help_panel=panel, show_default=True)
-
-
-def out_folder(typed: Path | None, default: str, overwrite: bool) -> Path:
-    """The folder that was named, else the default, with a number where it is taken."""
-    from geodiff_plugin.formats.out import free_folder
-
-    if typed is not None:
-        return typed
-    return Path(default) if overwrite else free_folder(Path(default))
-
-
-Device = Annotated[str, option("auto, cpu, cuda, cuda:N or mps.", RUN, "--device")]
-Overwrite = Annotated[
-    bool, option("Write into a folder that holds files; do finished pairs anew.", OUTPUT, "--overwrite")
+__all__ = [
+    "CAMERA_FILES",
+    "MODEL_FILES",
+    "PARAMETERS",
+    "DepthOptions",
+    "calibration_way",
+    "check_files",
+    "demo_options",
+    "intrinsics_way",
+    "out_folder_of",
+    "start_pair",
+    "undistorted_name",
 ]
+
+#: What a run writes, or may write by its prior and its lenses.
+FILES = (
+    *("depth.npy", "depth_mm.png", "depth.png", "overview.png", "visible.png", "photometric_error.npy"),
+    *("uncertainty.npy", "confidence.npy", "confidence.png", "normals.npy", "cloud.ply", "undistorted.png"),
+    "report.json",
+)
+#: What is read of a COLMAP model, the one kind of calibration that is a folder.
+MODEL_FILES = ("cameras.txt", "images.txt")
+#: What ``--export`` adds.
+EXPORT_FILES = {"glb": ("cloud.glb",), "colmap": (*MODEL_FILES, "points3D.txt")}
+_camera, _output = partial(declare, panel=CAMERAS), partial(declare, panel=OUTPUT)
+PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
+#: Fields that name the files that cameras are read from.
+CAMERA_FILES = ("calib", "k", "e", "k_right")
+
+
+def undistorted_name(number: int) -> str:
+    """File of a view without its lens distortion: 1 for the left one, 2 for the right one, and so on."""
+    return "undistorted.png" if number == 1 else f"undistorted-{number}.png"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthOptions(RunOptions):
+    """The options of ``geodiff depth`` as they were typed."""
+
+    left: Path = declare(
+        MISSING,
+        "Left image, whose depth is estimated; its EXIF rotation is applied. Or a folder of images, "
+        "a video, or a list with LEFT,RIGHT[,CALIB] per line.",
+        "",
+        metavar="LEFT",
+    )
+    right: Path | None = declare(
+        None,
+        "Right image, of any size; not needed with --points. Or a folder, or a video; without it, a "
+        "video LEFT has both views side by side.",
+        "",
+        metavar="RIGHT",
+    )
+    calib: tuple[Path, ...] = _camera(
+        (), "Calibration file in any known format, or COLMAP folder; twice if each view has its own."
+    )
+    cameras: str | None = _camera(None, "Which two cameras of a file that has more, as 2,3.")
+    fx: float | None = _camera(None, "Focal length, pixels.")
+    fy: float | None = _camera(None, "Focal length, pixels.")
+    cx: float | None = _camera(None, "Principal point, pixels.")
+    cy: float | None = _camera(None, "Principal point, pixels.")
+    baseline: float | None = _camera(
+        None, "Distance of the cameras, metres, right one to the right; replaces that of --calib."
+    )
+    k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
+    e: Path | None = _camera(None, "4x4 pose of the right camera in the left one's frame, metres.", "--E")
+    k_right: Path | None = _camera(None, "3x3 intrinsics of the right image, if they differ.", "--K-right")
+    distortion: tuple[str, ...] = _camera(
+        (), "Lens: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; twice for two lenses."
+    )
+    estimate_pose: bool = _camera(
+        False, "Find the cameras' poses from the photographs (needs the extra pose)."
+    )
+    fov: float | None = _camera(None, "Horizontal field of view, degrees, if EXIF has no focal length.")
+    known_length: str | None = _camera(
+        None, "Distance between two points of LEFT, X1,Y1,X2,Y2,METRES; instead of --baseline."
+    )
+    matcher: str | None = _camera(
+        None, "Finds points in the photographs: sift, lightglue, superglue, a folder."
+    )
+    view: tuple[Path, ...] = _camera((), "A further view, with --view-E; repeat both for each.")
+    view_k: tuple[Path, ...] = _camera((), "3x3 intrinsics of each --view; LEFT's if none.", "--view-K")
+    view_e: tuple[Path, ...] = _camera(
+        (), "4x4 pose of each --view in the left camera's frame, metres.", "--view-E"
+    )
+    view_distortion: tuple[str, ...] = _camera(
+        (), "Lens of each --view, 0,0,0,0 for none; LEFT's if not given."
+    )
+    cropped: bool = _camera(False, "The principal point may lie outside: the images are crops.")
+    points: Path | None = declare(
+        None, "Known depths: a map of LEFT (PNG, PFM, .npy) or points (.npy, text, .ply, .bin)."
+    )
+    points_scale: float | None = declare(
+        None,
+        "How many units of that file are a metre: 1000 for mm, 256 for KITTI's PNG.",
+        above_0="units per metre",
+    )
+    points_calib: tuple[Path, ...] = declare(
+        (), "KITTI's lidar calibration, for a .bin; twice if it is in two files."
+    )
+    warm_start: bool = declare(
+        False, "Many pairs: start each from the result of the previous frame, in fewer steps."
+    )
+    min_confidence: float = _output(0.0, "Least confidence of a point in the cloud, 0 to 1.", low=0, high=1)
+    out: Path | None = _output(
+        None, "Folder for the results; geodiff-out, or -2 and so on where it is taken.", *("--out", "-o")
+    )
+    overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")
+    strict: bool = _output(False, "End with an error if the result is not to be trusted.")
+    export: tuple[str, ...] = _output(
+        (), "Also write the cloud and cameras as glb or colmap; repeatable.", choices=tuple(EXPORT_FILES)
+    )
+    show: str | None = _output(
+        None,
+        "Open the cloud and cameras in rerun, viser, or auto (whichever is installed).",
+        choices=("auto", "rerun", "viser"),
+    )
+    quiet: bool = _output(False, "No progress bar, no summary.", "--quiet", "-q")
+    json: bool = _output(False, "Print the report instead of the summary.")
+
+    def photographs(self) -> dict[str, Path]:
+        """Paths of the views of one pair by the name of their option, the left one first."""
+        further = {f"--view {number}": path for number, path in enumerate(self.view, 1)}
+        return {"LEFT": self.left} | ({} if self.right is None else {"RIGHT": self.right}) | further
+
+    def other_files(self) -> list[tuple[str, Path]]:
+        """Name and path of every input that is no photograph."""
+        named = [("calibration" if name == "calib" else name, getattr(self, name)) for name in CAMERA_FILES]
+        named += [(name, getattr(self, name)) for name in ("view_k", "view_e", "points", "points_calib")]
+        flags = {field.name: flag_of(field) for field in fields(self)}
+        return [
+            (flags.get(name, name), path)
+            for name, value in named
+            for path in (value if isinstance(value, tuple) else (value,))
+            if path is not None
+        ]
+
+    def output_files(self) -> set[str]:
+        """Names of all files that a run with these options may write."""
+        names = {*FILES, *(name for kind in self.export for name in EXPORT_FILES[kind])}
+        if "colmap" in self.export:
+            names.update(undistorted_name(number) for number in range(2, 3 + len(self.view)))
+        return names
+
+    def refuse(self, names: Iterable[str], expected: str, got: str, cure: str = "") -> None:
+        """Refuse every option of these that was given.
+
+        Raises:
+            InputError: naming the first.
+        """
+        for field in fields(self):
+            if field.name in names and getattr(self, field.name) not in (None, (), False):
+                bad_value(flag_of(field), expected, got, cure)
+
+    def camera_pair(self) -> tuple[int, int] | None:
+        """The two numbers of ``--cameras``.
+
+        Raises:
+            InputError: not two different numbers with a comma.
+        """
+        if self.cameras is None:
+            return None
+        parts = self.cameras.split(",")
+        if len(parts) != 2 or not all(part.strip().isdecimal() and len(part) < 10 for part in parts):
+            cure = repr(self.cameras)
+            bad_value("--cameras", "two camera numbers with a comma, left first, such as 2,3", cure)
+        left, right = (int(part) for part in parts)
+        if left == right:
+            bad_value("--cameras", "two different cameras", repr(self.cameras))
+        return left, right
+
+    def check_all(self) -> None:
+        """``check``, and what options exclude or need each other; knobs are checked when torch is there.
+
+        Raises:
+            InputError: naming the option.
+        """
+        self.check()
+        self.camera_pair()
+        if self.preset == "paper":
+            given, got = "given with the default preset", "--preset paper"
+            self.refuse(["points"], given, got, "Algorithm 1 has no points.")
+            self.refuse(["view"], given, got, "Algorithm 1 has two views.")
+            cure = "Its scale is settled once, by a search over one number."
+            self.refuse(["warm_start"], given, got, cure)
+        if not self.estimate_pose:
+            names = ("fov", "known_length", "matcher")
+            self.refuse(names, "given together with --estimate-pose", "no --estimate-pose")
+        if self.points is None:
+            self.refuse(["points_scale", "points_calib"], "given with --points", "no --points")
+        if self.right is None:
+            self._check_alone()
+        poses = 0 if self.estimate_pose else len(self.view)
+        for option, given, counts in (
+            ("--view-E", self.view_e, {poses}),
+            ("--view-K", self.view_k, {0, len(self.view)}),
+            ("--view-distortion", self.view_distortion, {0, len(self.view)}),
+        ):
+            if len(given) not in counts:
+                bad_value(option, f"given once for each of {len(self.view)} --view", f"{len(given)} times")
+
+    def _check_alone(self) -> None:
+        """LEFT without RIGHT: known points, and nothing that is of a second camera."""
+        if self.points is None:
+            cure = (
+                "One photograph alone does not tell metres: give a second one, or known depths with --points."
+            )
+            bad_value("RIGHT", "given, or --points instead of it", "neither", cure)
+        expected, got, cure = "given with RIGHT", "no RIGHT", "It belongs to a second view."
+        self.refuse(("baseline", "e", "k_right", "view", "estimate_pose"), expected, got, cure)
+        if self.preset == "paper":
+            bad_value("--preset paper", expected, got, cure)
+
+
+def demo_options(out: Path, overwrite: bool, quiet: bool) -> DepthOptions:
+    """``geodiff depth`` on the pair that ships with the package (``bundled.demo_pair``)."""
+    pair = Path(__file__).resolve().parents[1] / "bundled" / "pair"
+    views = {"left": pair / "left.png", "right": pair / "right.png", "calib": (pair / "calib.txt",)}
+    return DepthOptions(**views, device="cpu", out=out, overwrite=overwrite, quiet=quiet)
+
+
+def calibration_way(options: DepthOptions) -> str:
+    """Which of the three ways was taken: ``"file"``, ``"parameters"`` or ``"matrices"``.
+
+    Raises:
+        InputError: none, or more than one.
+    """
+    # --baseline beside --calib gives a file its unit, as COLMAP's models need it.
+    parameters = PARAMETERS[:-1] if options.calib else PARAMETERS
+    ways = {
+        "file": bool(options.calib),
+        "parameters": any(getattr(options, name) is not None for name in parameters),
+        "matrices": any(path is not None for path in (options.k, options.e, options.k_right)),
+    }
+    taken = [way for way, is_taken in ways.items() if is_taken]
+    known = "--calib FILE, or --fx --fy --cx --cy --baseline, or --K FILE --E FILE"
+    if options.right is None:
+        known = known.replace(" --baseline", "").replace(" --E FILE", "")
+    if not taken:
+        bad_value("calibration", f"given: {known}", "none", "Without cameras two images do not tell metres.")
+    if len(taken) > 1:
+        bad_value("calibration", f"given in one way: {known}", " and ".join(taken), "Drop the others.")
+    if taken != ["file"]:
+        cure = "It chooses among the cameras of a file."
+        options.refuse(["cameras"], "given with --calib only", "no --calib", cure)
+    return taken[0]
+
+
+def intrinsics_way(options: DepthOptions) -> str:
+    """How K of photographs without poses is given: as "matrices", "parameters", "--fov" or in "EXIF".
+
+    Raises:
+        InputError: in more than one way, in parts, or beside options that only given poses go with.
+    """
+    cure = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
+    options.refuse(("calib", "cameras", "e", "view_e"), "left out with --estimate-pose", "both", cure)
+    parameters = [getattr(options, name) is not None for name in PARAMETERS if name != "baseline"]
+    ways = {
+        "matrices": options.k is not None or options.k_right is not None,
+        "parameters": any(parameters),
+        "--fov": options.fov is not None,
+    }
+    taken = [way for way, is_taken in ways.items() if is_taken]
+    if len(taken) > 1:
+        known = "--K FILE, or --fx --fy --cx --cy, or --fov, or EXIF"
+        bad_value("K", f"given in one way: {known}", " and ".join(taken), "Drop the others.")
+    if options.k_right is not None and options.k is None:
+        bad_value("--K", "given with --K-right", "--K-right alone", "It is K of LEFT.")
+    if any(parameters) and not all(parameters):
+        bad_value("--fx --fy --cx --cy", "given all together", "some of them")
+    way = taken[0] if taken else "EXIF"
+    if options.cropped and way in ("--fov", "EXIF") and not options.view_k:
+        cure = "A field of view, or EXIF, does not tell where the principal point of a crop is."
+        bad_value("--cropped", "given with --K, or --fx --fy --cx --cy", f"K by {way}", cure)
+    return way
+
+
+def _check_photograph(name: str, path: Path) -> None:
+    file = check_file(path, name, "an image file")
+    try:
+        with Image.open(file):  # the head alone; the rest when it is read
+            pass
+    except (UnidentifiedImageError, Image.DecompressionBombError):
+        cure = "Convert it to PNG or JPEG."
+        bad_value(name, "an image file", f"{file}, which Pillow does not recognise as an image", cure)
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        cure = "Is it cut off? Fetch it again."
+        bad_value(name, "a whole image file", f"{file}, which does not decode ({error})", cure)
+
+
+def check_files(options: DepthOptions, photographs: bool = True) -> None:
+    """Look at every file that was named.
+
+    Args:
+        options: that ``check_all`` has seen.
+        photographs: the views too; those of a video are looked at when they are counted.
+
+    Raises:
+        InputError: naming the option or the file.
+    """
+    if photographs:
+        views = options.photographs()
+        for name, path in views.items():
+            _check_photograph(name, path)
+        for (one, a), (other, b) in itertools.combinations(views.items(), 2):
+            if a.samefile(b):
+                bad_value(other, f"another photograph than {one}", f"{b} for both")
+    for name, path in options.other_files():
+        model = any(os.path.exists(path / file) for file in (*MODEL_FILES, "images.bin"))
+        if not (name == "calibration" and model):  # missing files of a model are reported when it is read
+            check_file(path, name, "a calibration file" if name == "calibration" else "a file")
+
+
+def out_folder_of(options: DepthOptions) -> OutFolder:
+    """The output folder of one pair, which refuses to replace what the pair is made of."""
+    assert options.out is not None
+    inputs = [*options.photographs().values(), *(path for _, path in options.other_files())]
+    inputs += [path / name for path in options.calib for name in MODEL_FILES]
+    return OutFolder(options.out, options.output_files(), inputs=inputs, overwrite=options.overwrite)
+
+
+def start_pair(options: DepthOptions) -> OutFolder:
+    """Check the options and files of a run over one pair.
+
+    Returns:
+        Its output folder, to be held during the work.
+
+    Raises:
+        InputError: naming the option or the file.
+    """
+    options.refuse(["warm_start"], "given with many pairs", "one pair", "It goes on from the pair before.")
+    options.check_all()
+    (intrinsics_way if options.estimate_pose else calibration_way)(options)
+    check_files(options)
+    return out_folder_of(options)

@@ -1,8 +1,4 @@
-"""``report.json``: every number of a guided call as one JSON document.
-
-Data flow: inputs, ``MetricDepthOutput``, options, seconds -> ``dict`` for ``report.json`` and ``--json``.
-Paper: none.
-"""
+"""``report.json``: every number of a guided call as one JSON document, and the line that sums it up."""
 
 from __future__ import annotations
 
@@ -13,9 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin.cli.arguments import DepthArguments
 from geodiff_plugin.cli.inputs import Inputs
-from geodiff_plugin.cli.settings import Settings
+from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.types import MetricDepthOutput
@@ -113,8 +108,7 @@ def build_report(
     inputs: Inputs,
     output: MetricDepthOutput,
     pipe: Any,
-    arguments: DepthArguments,
-    settings: Settings,
+    options: DepthOptions,
     warnings: list[str],
 ) -> dict[str, Any]:
     """The report without seconds and files, which are known when everything else is written.
@@ -123,8 +117,7 @@ def build_report(
         inputs: the views and cameras.
         output: of the guided call.
         pipe: the pipeline that made it.
-        arguments: options as typed.
-        settings: what was understood of them.
+        options: as typed.
         warnings: sentences, those of the output included.
     """
     rig = inputs.rig
@@ -168,14 +161,14 @@ def build_report(
             ],
         },
         "prior": {
-            "name": arguments.prior,
+            "name": options.prior,
             "pipeline": type(pipe).__name__,
             "scheduler": type(pipe.scheduler).__name__,
-            "device": str(settings.device),
-            "dtype": arguments.dtype,
+            "device": str(pipe._execution_device),
+            "dtype": options.dtype,
         },
         "guidance": inputs.guidance.as_run().to_dict(),
-        "arguments": arguments.as_json(),
+        "arguments": options.as_json(),
         "versions": versions(),
     }
     return _plain(report)

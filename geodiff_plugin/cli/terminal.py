@@ -1,28 +1,88 @@
-"""Tables and lines on standard output, drawn by ``rich``.
-
-Data flow: cells -> text as wide as the terminal, or as wide as it needs where standard output is a file or a
-    pipe.
-Paper: none.
-"""
+"""What the command says: lines on stderr, warnings as sentences, and tables that ``rich`` draws on stdout."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from rich import box
-from rich.console import Console, RenderableType
-from rich.table import Table
-from rich.text import Text
+if TYPE_CHECKING:  # drawn by few commands
+    from rich.console import Console, RenderableType
+    from rich.table import Table
 
-__all__ = ["new_console", "new_table", "print_lines", "show"]
+__all__ = [
+    "EXIT_BAD_INPUT",
+    "EXIT_INTERRUPTED",
+    "EXIT_SOME_FAILED",
+    "StopWatch",
+    "collected_warnings",
+    "new_console",
+    "new_table",
+    "print_lines",
+    "say",
+    "show",
+]
 
+EXIT_BAD_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 2, 4, 130
+PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 #: Characters a line may have where nobody's terminal bounds it.
 UNBOUNDED = 10_000
 
 
+def say(line: str) -> None:
+    """Print one line on stderr, apart from the results on stdout, and above a progress bar."""
+    tqdm = sys.modules.get("tqdm")
+    if tqdm is None:
+        print(line, file=sys.stderr, flush=True)
+    else:
+        tqdm.tqdm.write(line, file=sys.stderr)
+        sys.stderr.flush()
+
+
+class StopWatch:
+    """Wall-clock seconds by stage, in the order of the stages."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what is inside."""
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - started
+
+
+@contextmanager
+def collected_warnings(tell: Callable[[str], None]) -> Iterator[None]:
+    """Hand every warning of this package to ``tell`` as a sentence.
+
+    Warnings of other packages are shown as usual, and the warning filters are restored at the end.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", category=UserWarning, module=r"geodiff_plugin")
+        shown_elsewhere = warnings.showwarning
+
+        def collect(
+            message: Any, category: Any, filename: str, lineno: int, file: Any = None, line: Any = None
+        ) -> None:
+            if PACKAGE_FOLDER in Path(filename).resolve().parents:
+                tell(str(message))
+            else:
+                shown_elsewhere(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = collect
+        yield
+
+
 def new_console() -> Console:
     """A console on the present standard output that takes text as it is, without markup."""
+    from rich.console import Console
+
     console = Console(markup=False, highlight=False, emoji=False)
     if not console.is_terminal:
         console.width = UNBOUNDED
@@ -33,28 +93,24 @@ def show(*shown: RenderableType) -> None:
     """Print on the present standard output; lines of a file or a pipe do not end in blanks."""
     console = new_console()
     if console.is_terminal:
-        for one in shown:
-            console.print(one)
+        for part in shown:
+            console.print(part)
         return
     with console.capture() as captured:
-        for one in shown:
-            console.print(one)
+        for part in shown:
+            console.print(part)
     sys.stdout.write("".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
 
 
 def new_table(header: Sequence[str], title: str = "") -> Table:
-    """A table whose first column is text and whose others are numbers.
+    """A table whose first column is text and whose others are numbers; no title where that is empty."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
 
-    Args:
-        header: column headings.
-        title: above it, or empty.
-    """
     # Text instead of str: a title as str would have its markup read whatever the console says.
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        title=Text(title, style="bold") if title else None,
-        title_justify="left",
-    )
+    heading = Text(title, style="bold") if title else None
+    table = Table(box=box.SIMPLE_HEAD, title=heading, title_justify="left")
     for index, name in enumerate(header):
         table.add_column(name, justify="right" if index else "left", overflow="fold")
     return table
@@ -62,6 +118,8 @@ def new_table(header: Sequence[str], title: str = "") -> Table:
 
 def print_lines(rows: Sequence[tuple[str, str]]) -> None:
     """Print names and values in two columns, with values wrapped inside their own."""
+    from rich.table import Table
+
     table = Table.grid(padding=(0, 2, 0, 0))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")

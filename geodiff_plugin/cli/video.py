@@ -1,8 +1,4 @@
-"""``geodiff video``: the results of a sequence as one video.
-
-Data flow: folders of ``geodiff depth``, or depth maps -> a video.
-Paper: none.
-"""
+"""``geodiff video``: the results of a sequence as one video."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation, Slerp
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import MissingFileError, bad_value
 from geodiff_plugin.formats.colmap import (
     model_files,
     read_colmap_cameras,
@@ -126,7 +126,7 @@ def read_capture(
     """
     source = Path(path)
     if not source.exists():
-        raise FileNotFoundError(f"PATH must be a capture; there is no {source}.")
+        raise MissingFileError(f"PATH must be a capture; there is no {source}.")
     typed = None if K is None else (np.asarray(K, dtype=np.float64), None)
     typed = (None, float(fov)) if fov is not None else typed
     for recognised, read in READERS:

@@ -200,7 +200,7 @@ def _odd(signs: Signs, trusted: bool) -> list[str]:
     if signs.on_edge and (not trusted or signs.at_end > MOST_AT_END):
         found.append(
             "The search for the scale ended on the edge of its range: the depth may lie beyond it. Check the "
-            "units of the baseline, or widen depth_range."
+            "units of the baseline, or widen depth_range (--near, --far)."
         )
     return found
 

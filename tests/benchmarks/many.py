@@ -20,19 +20,17 @@ import numpy as np
 import torch
 from PIL import Image
 
-from geodiff_plugin.cli.arguments import DepthArguments
-from geodiff_plugin.cli.estimate import load_guided_prior
-from geodiff_plugin.cli.many.conveyor import Conveyor
-from geodiff_plugin.cli.many.job import Job, Stages, ThreadWarnings
-from geodiff_plugin.cli.many.pairs import find_pairs
-from geodiff_plugin.cli.many.run import MOST_ON_THE_WAY
-from geodiff_plugin.cli.settings import read_settings
-from geodiff_plugin.cli.start import start_many
+from geodiff_plugin.cli.depth import load_guided_prior
+from geodiff_plugin.cli.many import Stages
+from geodiff_plugin.cli.options import DepthOptions
+from geodiff_plugin.cli.pairs import start_many
 from geodiff_plugin.cli.terminal import new_table, show
+from geodiff_plugin.runner import Item, Journal, Runner
 from tests.scenes import render_pair
 
 __all__ = ["WAYS", "ManyPairs", "main"]
 
+MOST_ON_THE_WAY = 4
 #: Name -> pairs that may be on the way at a time, and whether matching and guiding share the cores.
 WAYS = {
     "one after the other": (1, False),
@@ -42,7 +40,7 @@ WAYS = {
 KIND, BASELINE_M = "street", 0.54
 
 
-def write_pairs(folder: Path, count: int, size: tuple[int, int]) -> DepthArguments:
+def write_pairs(folder: Path, count: int, size: tuple[int, int]) -> DepthOptions:
     """Write rendered pairs of one rig, and give the options that ``geodiff depth`` takes for them.
 
     Args:
@@ -58,7 +56,7 @@ def write_pairs(folder: Path, count: int, size: tuple[int, int]) -> DepthArgumen
             (folder / side).mkdir(exist_ok=True)
             pixels = (getattr(pair, side).image_01 * 255).round().byte().permute(1, 2, 0).numpy()
             Image.fromarray(pixels).save(folder / side / f"{seed:06}.png")
-    return DepthArguments(
+    return DepthOptions(
         left=folder / "left",
         right=folder / "right",
         fx=K[0, 0],
@@ -76,13 +74,13 @@ class ManyPairs:
     """The work of a run on many pairs, to be done as often as wanted with the same prior.
 
     Args:
-        arguments: of the run.
+        options: of the run.
     """
 
-    def __init__(self, arguments: DepthArguments) -> None:
-        start_many(arguments)
-        self._arguments, self._settings = arguments, read_settings(arguments)
-        self._pipe = load_guided_prior(arguments, self._settings)
+    def __init__(self, options: DepthOptions) -> None:
+        self._options, self._refs = options, start_many(options)
+        self._device = torch.device(options.device)
+        self._pipe = load_guided_prior(options, self._device)
 
     def seconds(self, most: int, shared: bool) -> tuple[float, float]:
         """Seconds of a clock and of all cores for all pairs.
@@ -94,18 +92,14 @@ class ManyPairs:
         Raises:
             Exception: what a stage raised.
         """
-        jobs = [Job.of(ref, self._arguments) for ref in find_pairs(self._arguments)]
-        stages, broken = Stages(self._pipe, self._settings, ThreadWarnings(), False, shared), []
+        stages = Stages(self._options, self._refs, self._device, self._pipe, 2 if shared else 1)
         steps = [stages.read, stages.evidence, stages.guide, stages.write]
-        conveyor = Conveyor(steps, lambda job, error: broken.append(error), most)
-        clock, cores = time.perf_counter(), time.process_time()
-        with closing(stages), closing(conveyor.run(jobs)) as finished:
-            for job in finished:
-                job.let_go()
-        taken = time.perf_counter() - clock, time.process_time() - cores
-        if broken:
-            raise broken[0]
-        return taken
+        with tempfile.TemporaryDirectory() as folder, closing(stages):
+            items = [Item(ref.name, ref) for ref in self._refs]
+            runner = Runner(items, Journal(Path(folder) / "pairs.jsonl"), progress=False)
+            clock, cores = time.perf_counter(), time.process_time()
+            runner.run(*steps, release=stages.release, most=most)
+            return time.perf_counter() - clock, time.process_time() - cores
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

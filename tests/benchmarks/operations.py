@@ -23,8 +23,8 @@ import torch
 from diffusers import AutoencoderKL, UNet2DConditionModel
 from torch.utils.flop_counter import FlopCounterMode
 
+from examples.fitted_lora import draw_points
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
-from geodiff_plugin.cli.bench_points import draw_points
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.priors.tiny import TINY, tiny_autoencoder

@@ -103,6 +103,20 @@ def _out(make: Callable[[Path], object], out: str) -> Callable[[Path], Words]:
     return write
 
 
+def _view(*more: object, which: str = "third.png", **files: np.ndarray) -> Callable[[Path], Words]:
+    """A further view with a pose, and with a K where one is given."""
+
+    def write(folder: Path) -> Words:
+        Image.new("RGB", (64, 48)).save(folder / "third.png")
+        words = ["left.png", "right.png", "--calib", "calib.txt", "--view", which, *map(str, more)]
+        for name, matrix in ({"E": MOVED} | files).items():
+            np.savetxt(folder / f"view-{name}.txt", matrix)
+            words += [f"--view-{name}", f"view-{name}.txt"]
+        return words
+
+    return write
+
+
 def _changed(matrix: object, index: tuple[int, int], value: float) -> np.ndarray:
     matrix = np.array(matrix, dtype=float)
     matrix[index] = value
@@ -116,6 +130,7 @@ GOOD_K = [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]
 KINDS: dict[str, Callable[[Path], Words]] = {
     # options
     "steps-zero": _with("--steps", 0),
+    "steps-negative": _with("--steps", -3),
     "steps-many": _with("--steps", 100_000),
     "ensemble-zero": _with("--ensemble", 0),
     "resolution-odd": _with("--resolution", 100),
@@ -130,7 +145,10 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "near-nan": _with("--near", "nan", "--far", 2),
     "far-infinite": _with("--near", 1, "--far", "inf"),
     "near-zero": _with("--near", 0, "--far", 2),
+    "near-is-far": _with("--near", 2, "--far", 2),
     "device-unknown": _with("--device", "tpu"),
+    "device-meta": _with("--device", "meta"),
+    "device-not-here": _with("--device", "cuda"),
     "device-number": _with("--device", "cuda:99"),
     "dtype-unknown": _with("--dtype", "float64"),
     "preset-unknown": _with("--preset", "best"),
@@ -145,11 +163,20 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "knob-form": _with("--knob", "inner_steps"),
     "knob-unknown": _with("--knob", "speed=9"),
     "knob-range": _with("--knob", "inner_steps=-1"),
+    "knob-weight": _with("--knob", "weights.smooth=1"),
     "knob-type": _with("--knob", "refine=maybe"),
     "knob-nested": _with("--knob", "smoothness=" + "[" * 100_000),
     "knob-depth-range": _with("--knob", "depth_range=[1,2]"),
     "paper-with-points": _with("--preset", "paper", "--points", "calib.txt"),
     "paper-with-view": _with("--preset", "paper", "--view", "left.png"),
+    "fov-alone": _with("--fov", 60),
+    "known-length-alone": _with("--known-length", "1,2,3,4,5"),
+    "matcher-alone": _with("--matcher", "sift"),
+    "known-length-short": _bare("--estimate-pose", *CAMERA[:-2], "--known-length", "1,2,3"),
+    "known-length-words": _bare("--estimate-pose", *CAMERA[:-2], "--known-length", "a,b,c,d,e"),
+    "warm-start-of-one": _with("--warm-start"),
+    "export-unknown": _with("--export", "fbx"),
+    "show-unknown": _with("--show", "blender"),
     "points-scale-alone": _with("--points-scale", 256),
     "points-calib-alone": _with("--points-calib", "calib.txt"),
     # calibration, chosen
@@ -173,6 +200,9 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "K-without-numbers": _matrices(K_right="# fx 0 cx\n"),
     "K-last-row": _matrices(K=_changed(GOOD_K, (2, 0), 1)),
     "K-of-another-size": _matrices(K=4 * np.diag([60, 60, 0.25]) + 128 * np.eye(3, k=2)),
+    "K-right-outside": _matrices(K_right="60 0 500\n0 60 23.5\n0 0 1\n"),
+    "E-last-row": _matrices(E=_changed(MOVED, (3, 0), 0.5)),
+    "E-image": lambda f: [*_matrices()(f)[:4], "--E", "left.png"],
     "K-right-words": _matrices(K_right="fx fy cx cy"),
     "E-shape": _matrices(E=np.eye(3)),
     "E-ragged": lambda f: [*_matrices()(f)[:4], "--E", (f / "r.txt").write_text("1 0 0\n1 0\n") and "r.txt"],
@@ -224,6 +254,15 @@ KINDS: dict[str, Callable[[Path], Words]] = {
         *_calib(f"distortion_model: plumb_bob\nP: [{P.format(-84).replace(' ', ', ')}]\n", "r.yaml")(f)[2:],
     ],
     "distortion-of-rectified": _with("--distortion", "-0.1,0,0,0"),
+    "distortion-short": _bare(*CAMERA, "--distortion", "0.1"),
+    "distortion-fisheye-short": _bare(*CAMERA, "--distortion", "fisheye:1,2,3"),
+    "distortion-words": _bare(*CAMERA, "--distortion", "a,b,c,d"),
+    "distortion-unknown": _bare(*CAMERA, "--distortion", "lens:1,2,3,4"),
+    "calib-middlebury-still": _calib(
+        "cam0=[60 0 32; 0 60 24; 0 0 1]\ncam1=[60 0 32; 0 60 24; 0 0 1]\ndoffs=0\nbaseline=0\nwidth=64\n"
+        "height=48\n"
+    ),
+    "calib-image": _bare("--calib", "left.png"),
     "calib-entities": _calib('<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage></opencv_storage>'),
     "calib-nerf-other-images": _calib(NERF.replace("left", "elsewhere")),
     "calib-nerf-lens": _calib(NERF.replace('"w"', '"camera_model": "EQUIRECTANGULAR", "w"')),
@@ -247,6 +286,15 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "same-twice": _all("left.png", "left.png", "--calib", "calib.txt"),
     "right-none": _all("left.png", "--calib", "calib.txt"),
     "alone-with-baseline": lambda f: ["left.png", *_points("0 0 2\n")(f)[-2:], *CAMERA],
+    "view-lens-twice": _with(
+        *("--view", "third.png", "--view-E", "E.txt"),
+        *("--view-distortion", "0,0,0,0", "--view-distortion", "0,0,0,0"),
+    ),
+    "view-still": _view(E=np.eye(4)),
+    "view-K-of-another-size": _view(K=4.0 * np.diag([60.0, 60.0, 0.25]) + 128.0 * np.eye(3, k=2)),
+    "view-is-right": _view(which="right.png"),
+    "view-missing": _view(which="none.png"),
+    "paper-with-posed-view": _view("--preset", "paper"),
     "view-without-pose": _with("--view", "calib.txt"),
     "pose-without-view": _with("--view-E", "calib.txt"),
     # points

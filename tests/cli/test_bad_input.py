@@ -7,14 +7,31 @@ differs.
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from geodiff_plugin.options import DTYPES, PRESETS, SPACES
 from tests.cli.bad_inputs import KINDS
 
 TABLE = Path(__file__).with_name("bad_input.txt")
 WRITE = bool(os.environ.get("GEODIFF_WRITE"))
+#: Fails on the first import of what takes seconds.
+WITHOUT_TORCH = """
+import sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("torch", "diffusers", "transformers", "kornia"):
+            raise SystemExit("imported " + name)
+
+sys.meta_path.insert(0, Refuse())
+from geodiff_plugin.cli.app import main
+main(sys.argv[1:])
+"""
 
 
 def read_table() -> dict[str, str]:
@@ -51,3 +68,73 @@ def test_bad_input(kind, geodiff, pair_files, monkeypatch):
         kept = {name: MESSAGES[name] for name in KINDS if name in MESSAGES}
         TABLE.write_text("".join(f"{name}: {text}\n" for name, text in kept.items()), encoding="utf-8")
     assert message == MESSAGES[kind]
+
+
+def test_what_the_option_parser_refuses_has_the_same_exit_code(geodiff, pair_files):
+    for words in ([*pair_files.command, "--stepps", 3], [*pair_files.command, "--steps", "many"], ["dept"]):
+        assert geodiff(*words).code == 2
+    assert geodiff("depth", pair_files.left).code == 2
+
+
+def test_what_needs_no_torch_is_said_without_it(pair_files):
+    """In one process: options, files, the folder; and that good ones do import it."""
+    folder = pair_files.folder
+    (folder / "empty.npy").write_bytes(b"")
+    np.save(folder / "x.npy", np.ones(3))
+    (folder / "geodiff-out").mkdir()
+    (folder / "x.npy").rename(folder / "geodiff-out" / "x.npy")
+    cases = [
+        (["--steps", "0"], "--steps"),
+        (["--seed", str(10**30)], "--seed"),
+        (["--device", "tpu"], "--device"),
+        (["--space", "banana"], "--space"),
+        (["--out", "left.png"], "--out must be a folder; got the file left.png"),
+        (["--out", "geodiff-out"], "--overwrite"),
+        (["--near", "3"], "--far"),
+        (["--cameras", "2"], "--cameras"),
+        (["--points", "empty.npy"], "empty"),
+        (["--view", "left.png"], "--view-E"),
+        (["--calib", "nothing.txt"], "nothing.txt"),
+        (["--fx", "60"], "one way"),
+        (["--option", "domain"], "--option"),
+        ([], "imported"),  # the folder that is taken is numbered
+    ]
+    commands = [([*pair_files.command, *more], word) for more, word in cases]
+    calib = ["--calib", str(pair_files.calib)]
+    commands += [
+        (["depth", "nothing.png", "right.png", *calib], "LEFT"),
+        (["depth", "left.png", "calib.txt", *calib], "RIGHT"),
+        (["depth", "left.png", "left.png", *calib], "another photograph"),
+        (["demo", "--out", "left.png"], "--out must be a folder; got the file left.png"),
+        (["eval", "pairs", "synthetic:1", "--out", "left.png"], "--out must be a folder"),
+    ]
+    before = sorted(folder.iterdir())
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-c", WITHOUT_TORCH, *words], cwd=folder, stderr=subprocess.PIPE, text=True
+        )
+        for words, _ in commands
+    ]
+    for process, (words, word) in zip(running, commands, strict=True):
+        said = process.communicate(timeout=60)[1]
+        assert word in said and (word == "imported" or said.count("\n") == 1), (words, said)
+    assert sorted(folder.iterdir()) == before
+
+
+def test_names_that_are_known_without_torch_are_those_with_it():
+    import torch
+
+    from geodiff_plugin.config import PRESETS as CONFIGS
+    from geodiff_plugin.scale import space
+
+    assert set(SPACES) == set(space.SPACES) and set(PRESETS) <= set(CONFIGS)
+    assert all(isinstance(getattr(torch, name), torch.dtype) for name in DTYPES)
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["--version"], ["depth", "--help"], ["eval", "pairs", "--help"]]
+)
+def test_help_imports_neither_torch_nor_numpy(words):
+    code = WITHOUT_TORCH.replace('"torch",', '"torch", "numpy",')
+    answer = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+    assert answer.returncode == 0 and "imported" not in answer.stderr, answer.stderr

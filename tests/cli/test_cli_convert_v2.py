@@ -11,7 +11,6 @@ from diffusers import AutoencoderKLQwenImage, QwenImageTransformer2DModel
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from geodiff_plugin.cli.converters import shards
 from geodiff_plugin.cli.converters.marigold_v2 import Trainables, read_prompt
 from geodiff_plugin.priors import find_prior, load_prior, unmerged_lora
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
@@ -86,12 +85,11 @@ def test_merging_adds_the_factors_product_and_replaces_the_decoder(convert, asse
     assert torch.equal(pipe.vae.decoder.conv_out.weight, decoder)
 
 
-def test_no_shard_is_larger_than_the_bound(convert, assets, monkeypatch):
-    monkeypatch.setattr(shards, "SHARD_BYTES", 60_000)
+def test_the_files_of_the_base_keep_their_names_and_index(convert, assets):
     assert convert().code == 0
     folder = assets / "out" / "transformer"
     files = sorted(folder.glob("*.safetensors"))
-    assert len(files) > 2 and all(file.stat().st_size < 60_000 + 20_000 for file in files)  # and a header
+    assert len(files) > 1
     index = json.loads((folder / "diffusion_pytorch_model.safetensors.index.json").read_text())
     assert set(index["weight_map"].values()) == {file.name for file in files}
     for file in files:

@@ -120,7 +120,7 @@ def test_writes_everything(geodiff, command, pair_files):
     assert report["depth"]["median_m"] == pytest.approx(float(np.median(depth_m)))
     assert report["depth"]["visible_fraction"] == pytest.approx((visible > 0).mean())
     assert report["files"]["depth_mm_zero_pixels"] == (millimetres == 0).sum()
-    assert set(report["seconds"]) == {"calibration", "load", "guided call", "write"}
+    assert set(report["seconds"]) == {"start", "calibration", "load", "guided call", "write"}
     assert len(report["history"]) == 2 and report["inputs"]["baseline_m"] == pytest.approx(0.12)
     assert report["arguments"]["seed"] == 0 and report["versions"]["torch"]
 

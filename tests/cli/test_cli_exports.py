@@ -138,7 +138,7 @@ def test_exported_cameras_are_those_that_the_cloud_fits(geodiff, prior, tmp_path
 def test_a_name_that_colmap_cannot_hold_is_refused_before_the_work(geodiff, bent, pair_files, monkeypatch):
     assert geodiff(*bent, "--export", "colmap", "--out", "bent").code == 0, "it names undistorted.png"
     monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", never)
-    monkeypatch.setattr("geodiff_plugin.cli.many.job.Stages.guide", never)
+    monkeypatch.setattr("geodiff_plugin.cli.many.Stages.guide", never)
     left = pair_files.left.rename(pair_files.folder / "left one.png")
     command = [*pair_files.command[3:], "--prior", "bundled", "--export", "colmap"]
     answer = geodiff("depth", left, pair_files.right, *command)

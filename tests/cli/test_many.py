@@ -9,9 +9,6 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
-import time
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,13 +18,9 @@ import torch
 from PIL import Image
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.cli.arguments import DepthArguments
-from geodiff_plugin.cli.many.conveyor import Conveyor
-from geodiff_plugin.cli.many.digests import MODEL_FILES, file_digests
-from geodiff_plugin.cli.many.finished import _as_option, finished_report
-from geodiff_plugin.cli.many.pairs import assumption, find_pairs
-from geodiff_plugin.cli.many.processes import Processes
-from geodiff_plugin.cli.many.rigs import RigStore
+from geodiff_plugin.cli.many import JOURNAL, _as_typed
+from geodiff_plugin.cli.options import DepthOptions
+from geodiff_plugin.cli.pairs import assumption, find_pairs
 from geodiff_plugin.formats.video import VideoReader, both_halves, count_frames
 
 #: One update of one step: for tests of everything but the depth.
@@ -59,80 +52,11 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-# The conveyor
-
-
-def test_stages_work_side_by_side_in_order_and_within_bounds():
-    alive, most, threads, lock = set(), [], [set(), set()], threading.Lock()
-    met = threading.Barrier(2, timeout=10)
-
-    def items():
-        for i in range(6):
-            with lock:
-                alive.add(i)
-                most.append(len(alive))
-            yield [i]
-
-    def stage(number):
-        def work(item):
-            threads[number].add(threading.get_ident())
-            if item[0] + number == 1:  # item 1 in the first stage while item 0 is in the second
-                met.wait()
-            item.append(number)
-
-        return work
-
-    found = []
-    for item in Conveyor([stage(0), stage(1)], failed=pytest.fail, most=2).run(items()):
-        found.append(item)
-        with lock:
-            alive.remove(item[0])
-    assert found == [[i, 0, 1] for i in range(6)]
-    assert max(most) <= 3  # two on the way, and the one that waits to get in
-    assert len(threads[0] | threads[1]) == 2
-
-
-def test_an_item_that_fails_leaves_the_rest_alone():
-    told, seen = [], []
-
-    def first(item):
-        if item == "bad":
-            raise ValueError("broken")
-
-    conveyor = Conveyor([first, seen.append], failed=lambda item, error: told.append((item, str(error))))
-    assert list(conveyor.run(["good", "bad", "better"])) == ["good", "bad", "better"]
-    assert told == [("bad", "broken")] and seen == ["good", "better"]
-
-
-def test_leaving_early_ends_every_stage():
-    before, started = threading.active_count(), []
-
-    def slow(item):
-        started.append(item)
-        time.sleep(0.02)
-
-    run = Conveyor([slow, slow], failed=pytest.fail, most=2).run(range(1000))
-    next(run)
-    run.close()
-    assert threading.active_count() == before and len(started) < 20
-
-
-def test_what_the_source_raises_is_raised_behind_what_came_before():
-    def items():
-        yield 1
-        raise OSError("gone")
-
-    run = Conveyor([lambda item: None], failed=pytest.fail).run(items())
-    assert next(run) == 1
-    with pytest.raises(OSError, match="gone"):
-        next(run)
-
-
 # Which pairs
 
 
 def names_of(left, right=None):
-    return [ref.name for ref in find_pairs(DepthArguments(Path(left), right))]
+    return [ref.name for ref in find_pairs(DepthOptions(left=Path(left), right=right))]
 
 
 def test_folders_go_by_name_else_by_order(tmp_path, textured_plane):
@@ -142,7 +66,7 @@ def test_folders_go_by_name_else_by_order(tmp_path, textured_plane):
     assert names_of(left, right) == ["a", "b"]
     for path in right.iterdir():
         path.rename(path.with_stem(f"{path.stem}_R"))
-    refs = find_pairs(DepthArguments(left, right))
+    refs = find_pairs(DepthOptions(left=left, right=right))
     assert [(ref.left.name, ref.right.name) for ref in refs] == [("a.png", "a_R.png"), ("b.png", "b_R.png")]
 
 
@@ -152,14 +76,14 @@ def test_numbers_in_names_are_sorted_as_numbers(tmp_path, textured_plane):
     assert names_of(left, right) == ["f1", "f2", "f10"]
     for path in right.iterdir():
         path.rename(path.with_stem(f"R{path.stem}"))
-    refs = find_pairs(DepthArguments(left, right))
+    refs = find_pairs(DepthOptions(left=left, right=right))
     assert [ref.left.stem for ref in refs] == ["f1", "f2", "f10"]
     assert [ref.right.stem for ref in refs] == ["Rf1", "Rf2", "Rf10"]
 
 
 def test_folders_that_share_no_name_are_said_to_go_by_order(tmp_path, textured_plane):
     write_folders(tmp_path, textured_plane, ["10", "20", "30"])
-    arguments = DepthArguments(tmp_path / "left", tmp_path / "right")
+    arguments = DepthOptions(left=tmp_path / "left", right=tmp_path / "right")
     assert assumption(find_pairs(arguments), arguments) is None
     for path in arguments.right.iterdir():
         path.rename(path.with_stem(f"{int(path.stem) + 3}"))
@@ -181,7 +105,7 @@ def test_lists_by_comma_tab_or_blank(tmp_path):
         "left,right,calib\n# a comment\n\none/im 0.png,one/im1.png,one/calib.txt\n"
         "two/im 0.png\ttwo/im1.png\nthree/x.png three/y.png\n"
     )
-    refs = find_pairs(DepthArguments(listed))
+    refs = find_pairs(DepthOptions(left=listed))
     assert [ref.name for ref in refs] == ["one_im 0", "two_im 0", "three_x"]
     assert refs[0].calib == tmp_path / "one" / "calib.txt" and refs[1].calib is None
     assert refs[2].right == tmp_path / "three" / "y.png"
@@ -217,7 +141,7 @@ def test_a_heading_begins_with_left_and_names_no_file(tmp_path, heading, names):
 def test_commas_in_names_and_comments_behind_a_line(tmp_path, line, cells):
     listed = tmp_path / "pairs.tsv"
     listed.write_text(f"{line}\n")
-    (ref,) = find_pairs(DepthArguments(listed))
+    (ref,) = find_pairs(DepthOptions(left=listed))
     assert [ref.left, ref.right, ref.calib] == [*(tmp_path / cell for cell in cells), None]
 
 
@@ -250,7 +174,7 @@ def test_two_folders_give_what_single_runs_give(geodiff, folders):
     root, command = folders
     answer = geodiff(*command)
     assert answer.code == 0, answer.err
-    assert "3 pairs: 3 done, 0 there already, 0 failed" in answer.out and "pairs: 100%" in answer.err
+    assert "3 pairs: 3 done, 0 there already, 0 failed" in answer.out and "3/3" in answer.err
     single = [*command[:1], "left/b.png", "right/b.png", *command[3:]]
     single[single.index("out")] = "single"
     assert geodiff(*single, "-q").code == 0
@@ -260,24 +184,6 @@ def test_two_folders_give_what_single_runs_give(geodiff, folders):
     assert {path.name for path in (root / "out" / "b").iterdir()} == {
         path.name for path in (root / "single").iterdir()
     }
-
-
-def test_the_prior_and_the_cameras_are_read_once(geodiff, folders, monkeypatch):
-    from geodiff_plugin.cli.many import rigs, run
-
-    counts = {"prior": 0, "rig": 0}
-
-    def counted(name, function):
-        def call(*arguments):
-            counts[name] += 1
-            return function(*arguments)
-
-        return call
-
-    monkeypatch.setattr(run, "load_guided_prior", counted("prior", run.load_guided_prior))
-    monkeypatch.setattr(rigs, "read_rig", counted("rig", rigs.read_rig))
-    assert geodiff(*folders[1], "-q").code == 0
-    assert counts == {"prior": 1, "rig": 1}
 
 
 def test_warnings_about_the_cameras_are_those_of_every_pair(geodiff, folders):
@@ -291,15 +197,6 @@ def test_warnings_about_the_cameras_are_those_of_every_pair(geodiff, folders):
     for name in "abc":
         (warning,) = json.loads((root / "out" / name / "report.json").read_text())["warnings"][:1]
         assert "for the right image" in warning
-
-
-def test_a_calibration_that_was_corrected_meanwhile_is_read_anew(pair_files, textured_plane):
-    arguments, store, size = DepthArguments(*map(Path, pair_files.images[1:])), RigStore(), (64, 48)
-    arguments = replace(arguments, calib=(pair_files.calib,))
-    before = store.read(arguments, None, size, size)
-    assert store.read(arguments, None, size, size) is before
-    pair_files.write_calibration(textured_plane.K, 0.25, size)
-    assert store.read(arguments, None, size, size).E[0, 3] == pytest.approx(0.25)
 
 
 def test_finished_pairs_are_skipped_and_overwrite_does_them_anew(geodiff, folders):
@@ -349,16 +246,6 @@ def test_results_of_files_that_changed_are_not_taken_for_these(geodiff, folders,
     assert answer.code == 0 and "3 done, 0 there already" in answer.out
 
 
-def test_a_colmap_model_is_compared_by_its_texts(tmp_path):
-    for name in MODEL_FILES:
-        (tmp_path / name).write_text(name)
-    arguments = DepthArguments(tmp_path / "left.png", calib=(tmp_path,))
-    before = file_digests(arguments)
-    assert list(before) == [str(tmp_path / name) for name in MODEL_FILES]
-    (tmp_path / "images.txt").write_text("moved")
-    assert file_digests(arguments) != before
-
-
 def test_a_finished_pair_is_judged_with_strict(geodiff, folders):
     root, command = folders
     assert geodiff(*command, "-q").code == 0
@@ -387,20 +274,7 @@ def test_a_finished_pair_is_judged_with_strict(geodiff, folders):
     ],
 )
 def test_options_are_told_as_they_are_typed(name, value, said):
-    assert _as_option(name, value) == said
-
-
-def test_a_result_is_whole_or_not_there(geodiff, folders):
-    root, command = folders
-    assert geodiff(*command, "-q").code == 0
-    report = json.loads((root / "out" / "a" / "report.json").read_text())
-    plain = DepthArguments(Path("left/a.png"))
-    typed = {name: report["arguments"][name] for name in ("prior", "steps", "preset")}
-    asked = replace(plain, right=Path("right/a.png"), out=root / "out" / "a", **typed)
-    asked = replace(asked, calib=tuple(Path(p) for p in report["arguments"]["calib"]))
-    assert finished_report(asked)["pair"]["name"] == "a"
-    (root / "out" / "a" / "depth.png").unlink()
-    assert finished_report(asked) is None
+    assert _as_typed(name, value) == said
 
 
 def test_a_broken_pair_is_reported_and_the_rest_go_on(geodiff, folders):
@@ -418,7 +292,7 @@ def test_a_broken_pair_is_reported_and_the_rest_go_on(geodiff, folders):
 @pytest.mark.parametrize("fault", ["calibration", "size", "cut off"])
 def test_what_fails_all_pairs_is_said_once_before_the_prior_is_loaded(geodiff, folders, monkeypatch, fault):
     root, command = folders
-    monkeypatch.setattr("geodiff_plugin.cli.many.run.load_guided_prior", never)
+    monkeypatch.setattr("geodiff_plugin.cli.many.load_guided_prior", never)
     calib = root / "calib.txt"
     if fault == "calibration":
         calib.write_text("no calibration")
@@ -443,31 +317,17 @@ def test_pairs_that_fail_for_several_reasons_are_reported_each(geodiff, folders)
     assert [row["result"] for row in rows_of(root / "out")] == ["failed"] * 3
 
 
-def test_reports_are_not_kept_in_memory(geodiff, folders, monkeypatch):
-    from geodiff_plugin.cli.many import run
-
-    jobs, work = [], run._run
-
-    def kept(arguments, settings, own, *rest):
-        jobs.extend(own)
-        return work(arguments, settings, own, *rest)
-
-    monkeypatch.setattr(run, "_run", kept)
-    assert geodiff(*folders[1], "-q").code == 0
-    assert len(jobs) == 3 and all(job.report is None and job.inputs is None for job in jobs)
-
-
 def test_a_defect_in_one_pair_keeps_its_traceback(geodiff, folders, monkeypatch):
-    from geodiff_plugin.cli.many import job
+    from geodiff_plugin.cli import many
 
-    write = job.write_result
+    write = many.write_result
 
-    def broken(arguments, *rest):
-        if arguments.out.name == "a":
+    def broken(options, *rest):
+        if options.out.name == "a":
             raise KeyError("nobody thought of this")
-        return write(arguments, *rest)
+        return write(options, *rest)
 
-    monkeypatch.setattr(job, "write_result", broken)
+    monkeypatch.setattr(many, "write_result", broken)
     answer = geodiff(*folders[1])
     assert answer.code == 4 and "Traceback" in answer.err and "nobody thought of this" in answer.err
     assert "2 done" in answer.out
@@ -509,7 +369,7 @@ def never(*_, **__):
 @pytest.mark.parametrize("kind", ["list", "linked list", "other table", "folder"])
 def test_what_the_table_may_not_replace_stays(geodiff, folders, monkeypatch, kind):
     root, command = folders
-    monkeypatch.setattr("geodiff_plugin.cli.many.run.load_guided_prior", never)
+    monkeypatch.setattr("geodiff_plugin.cli.many.load_guided_prior", never)
     (root / "mine").mkdir()
     table, text = root / "mine" / "pairs.csv", "left,right\n../left/a.png,../right/a.png\n"
     words, told = ["mine/pairs.csv"], "which is not the table of an earlier run"
@@ -535,8 +395,8 @@ def test_a_folder_that_takes_no_table_is_refused_before_the_work(geodiff, folder
         raise PermissionError(errno.EACCES, "Permission denied")
 
     root, command = folders
-    monkeypatch.setattr("geodiff_plugin.cli.many.run.load_guided_prior", never)
-    monkeypatch.setattr("geodiff_plugin.cli.many.summary.TemporaryFile", no_file)
+    monkeypatch.setattr("geodiff_plugin.cli.many.load_guided_prior", never)
+    monkeypatch.setattr("geodiff_plugin.cli.pairs.TemporaryFile", no_file)
     answer = geodiff(*command, "--out", "deep/out")
     assert answer.code == 2 and "can be written to; got deep" in answer.err
     assert "(Permission denied)" in answer.err and not (root / "deep").exists()
@@ -546,7 +406,7 @@ def test_a_table_that_cannot_be_written_in_the_end_is_shown(geodiff, folders, mo
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("geodiff_plugin.cli.many.summary.atomic_path", full)
+    monkeypatch.setattr("geodiff_plugin.cli.many.atomic_path", full)
     root, command = folders
     answer = geodiff(*command)
     assert answer.code == 0 and "3 pairs: 3 done" in answer.out
@@ -644,12 +504,8 @@ def test_the_video_of_a_rig(geodiff, folders, textured_plane, views, beside, cam
         words = ["depth", "l.avi", "r.avi", *command[3:]]
     answer = geodiff(*words)
     assert answer.code == 0, answer.err
-    assert sorted(path.name for path in (root / "out").iterdir()) == [
-        "000000",
-        "000001",
-        "000002",
-        "pairs.csv",
-    ]
+    found = sorted(path.name for path in (root / "out").iterdir())
+    assert found == [JOURNAL, "000000", "000001", "000002", "pairs.csv"]
     report = json.loads((root / "out" / "000002" / "report.json").read_text())
     assert report["pair"]["frame"] == 2 and report["inputs"]["right_size"] == [64, 48]
     answer = geodiff("video", *sorted(root.glob("out/0*")), "--photographs", "--out", "depth.gif")
@@ -661,21 +517,46 @@ def test_the_video_of_a_rig(geodiff, folders, textured_plane, views, beside, cam
 # Several processes
 
 
-def test_shares_are_neighbours_and_together_everything():
-    entries = list(range(11))
-    shares = [list(Processes(index, 4).share(entries)) for index in range(4)]
-    assert sum(shares, []) == entries and {len(share) for share in shares} == {2, 3}
-
-
 @pytest.mark.slow
-def test_two_processes_share_the_pairs(folders):
+@pytest.mark.parametrize("launcher", ["torchrun", "two terminals"])
+def test_two_processes_share_the_pairs(folders, launcher):
     root, command = folders
-    launch = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0"]
-    launch = [*launch[:-2], "--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0"]
+    torchrun = [*("torch.distributed.run", "--nproc-per-node", "2", "--rdzv-backend", "c10d")]
+    torchrun += ["--rdzv-endpoint", "localhost:0", "-m"]
+    words = [sys.executable, "-m", *(torchrun if launcher == "torchrun" else ()), "geodiff_plugin"]
     package = Path(__file__).resolve().parents[2]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(package)}
-    words = [*launch, "-m", "geodiff_plugin", *map(str, command)]
-    done = subprocess.run(words, cwd=root, capture_output=True, text=True, timeout=300, env=environment)
-    assert done.returncode == 0, done.stderr
-    assert "3 pairs: 3 done" in done.stdout and done.stdout.count("pairs:") == 1
-    assert "pairs of process 1" in done.stderr and "pairs of process 2" in done.stderr
+    started = [
+        subprocess.Popen(
+            [*words, *map(str, command)], cwd=root, env=environment, text=True, stdout=-1, stderr=-1
+        )
+        for _ in range(1 if launcher == "torchrun" else 2)
+    ]
+    for process in started:
+        out, err = process.communicate(timeout=300)
+        assert process.returncode == 0, err
+        assert "3 pairs: " in out and ", 0 failed" in out and out.count("pairs:") == 1
+    assert {row["result"] for row in rows_of(root / "out")} <= {"done", "there"}
+
+
+def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(geodiff, folders, monkeypatch):
+    from geodiff_plugin.cli import many
+
+    root, command = folders
+    write = many.write_result
+
+    def full(options, *rest):
+        if options.out.name == "b":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(options, *rest)
+
+    monkeypatch.setattr(many, "write_result", full)
+    before = set(root.iterdir())
+    answer = geodiff(*command)
+    assert answer.code == 2 and "(No space left on device). Finished pairs stay" in answer.err
+    assert set(root.iterdir()) - before == {root / "out"}
+    assert (root / "out" / "a" / "report.json").exists() and not (root / "out" / "b").exists()
+    monkeypatch.undo()
+    monkeypatch.chdir(root)
+    answer = geodiff(*command)
+    assert answer.code == 0 and "2 done, 1 there already" in answer.out

@@ -8,37 +8,17 @@ import numpy as np
 import pytest
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.cli.arguments import DepthArguments
-from geodiff_plugin.cli.checks import check_arguments
-from geodiff_plugin.cli.inputs import read_inputs, read_known
-from geodiff_plugin.cli.lenses import lenses_of
-from geodiff_plugin.cli.photographs import known_length, read_photographs
-from geodiff_plugin.cli.settings import read_settings
-from geodiff_plugin.cli.start import intrinsics_way
+from geodiff_plugin.cli.inputs import _read_known, lenses_of, read_inputs
+from geodiff_plugin.cli.options import DepthOptions, intrinsics_way
 from geodiff_plugin.formats.distortion import distortion_from_text
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
 
 
-def test_a_known_length_is_five_numbers() -> None:
-    assert known_length("1,2,3.5,4,0.5") == (1, 2, 3.5, 4, 0.5)
-    assert known_length(None) is None
-    for text in ("1,2,3", "a,b,c,d,e"):
-        with pytest.raises(ValueError, match="--known-length"):
-            known_length(text)
-
-
-@pytest.mark.parametrize("given", [{"fov": 60.0}, {"known_length": "1,2,3,4,5"}, {"matcher": "sift"}])
-def test_they_need_estimate_pose(given, tmp_path) -> None:
-    arguments = DepthArguments(Path("l.png"), Path("r.png"), out=tmp_path / "new", **given)
-    with pytest.raises(ValueError, match="--estimate-pose"):
-        check_arguments(arguments)
-
-
 def told(*, own=(None, None), rectified=False, **given) -> list[float | None]:
     """First coefficient of every lens."""
     rig = Rig(np.eye(3), np.eye(3), np.eye(4), source="calib.txt", distortion=own, rectified=rectified)
-    lenses = lenses_of(DepthArguments(Path("l.png"), Path("r.png"), **given), rig)
+    lenses = lenses_of(DepthOptions(left=Path("l.png"), right=Path("r.png"), **given), rig)
     return [None if lens is None else float(lens.coefficients[0]) for lens in lenses]
 
 
@@ -68,13 +48,6 @@ def test_rectified_images_have_no_lens() -> None:
     assert told(distortion=("0.1,0,0,0",)) == [0.1, 0.1], "cameras as they took the images"
 
 
-def test_lenses_are_counted_with_their_views(tmp_path) -> None:
-    many = {"view": (Path("v.png"),), "view_distortion": ("0,0,0,0",) * 2, "estimate_pose": True}
-    arguments = DepthArguments(Path("l.png"), Path("r.png"), out=tmp_path / "new", **many)
-    with pytest.raises(InputError, match="--view-distortion must be given once for each of 1"):
-        check_arguments(arguments)
-
-
 FILE = Path("K.txt")
 FOUR = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
 
@@ -97,7 +70,7 @@ FOUR = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
 )
 def test_there_is_one_way_to_give_intrinsics(given, said) -> None:
     with pytest.raises(InputError, match=said):
-        intrinsics_way(DepthArguments(Path("l.png"), Path("r.png"), estimate_pose=True, **given))
+        intrinsics_way(DepthOptions(left=Path("l.png"), right=Path("r.png"), estimate_pose=True, **given))
 
 
 @pytest.mark.parametrize(
@@ -111,7 +84,10 @@ def test_there_is_one_way_to_give_intrinsics(given, said) -> None:
     ],
 )
 def test_ways_to_give_intrinsics(given, way) -> None:
-    assert intrinsics_way(DepthArguments(Path("l.png"), Path("r.png"), estimate_pose=True, **given)) == way
+    assert (
+        intrinsics_way(DepthOptions(left=Path("l.png"), right=Path("r.png"), estimate_pose=True, **given))
+        == way
+    )
 
 
 LENS = "0.2,0,0,0"
@@ -151,11 +127,11 @@ def told_to_estimate(pair_files, monkeypatch, **given) -> dict:
         raise InterruptedError
 
     monkeypatch.setattr(GeometryGuidance, "from_photographs", stop)
-    arguments = DepthArguments(
-        pair_files.left, pair_files.right, device="cpu", estimate_pose=True, **FOUR | given
+    options = DepthOptions(
+        left=pair_files.left, right=pair_files.right, device="cpu", estimate_pose=True, **FOUR | given
     )
     with pytest.raises(InterruptedError):
-        read_photographs(arguments, read_settings(arguments))
+        read_inputs(options, options.config())
     return told
 
 
@@ -185,14 +161,14 @@ def test_cropped_photographs_are_told_of(pair_files, monkeypatch) -> None:
 def test_a_map_of_known_depths_goes_through_the_lens(pair_files, millimetres) -> None:
     known = {"points": millimetres, "points_scale": 1000.0, "device": "cpu"}
     cameras = FOUR | {"baseline": 0.12, "distortion": (LENS,)}
-    arguments = DepthArguments(pair_files.left, pair_files.right, **known, **cameras)
-    inputs = read_inputs(arguments, read_settings(arguments))
+    options = DepthOptions(left=pair_files.left, right=pair_files.right, **known, **cameras)
+    inputs = read_inputs(options, options.config())
     found = inputs.guidance._inputs[0].points.numpy()
     np.testing.assert_allclose(found, expected_points(), atol=1e-4)
     lens, K = distortion_from_text(LENS), inputs.rig.K_left
     with pytest.raises(InputError, match="--points must be a map of .* 32x24 pixels; got 64x48"):
-        read_known(arguments, K, lens, (32, 24))
+        _read_known(options, K, lens, (32, 24))
     points = pair_files.folder / "points.txt"
     points.write_text("0.1 0.2 2\n")
-    listed = DepthArguments(pair_files.left, points=points)
-    np.testing.assert_allclose(read_known(listed, K, lens, (64, 48)), [[0.1, 0.2, 2.0]], atol=1e-6)
+    listed = DepthOptions(left=pair_files.left, points=points)
+    np.testing.assert_allclose(_read_known(listed, K, lens, (64, 48)), [[0.1, 0.2, 2.0]], atol=1e-6)

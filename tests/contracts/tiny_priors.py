@@ -5,7 +5,7 @@ from __future__ import annotations
 from diffusers import DDIMScheduler, MarigoldDepthPipeline
 from transformers import CLIPTokenizer
 
-from geodiff_plugin.cli.tiny_marigold_v2 import tiny_marigold_v2
+from examples.marigold_v2 import tiny_marigold_v2
 from geodiff_plugin.priors.e2e_ft import E2EFTPipeline
 from tests.conftest import SCHEDULER, make_text_encoder, make_unet, make_vae
 from tests.contracts.tiny_depthfm import make_depthfm

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.cli.many.pairs import is_many
+from geodiff_plugin.cli.pairs import is_many
 from geodiff_plugin.config import KNOBS
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
 from geodiff_plugin.formats.exif import warn_of_other_lens

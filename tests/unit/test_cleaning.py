@@ -11,7 +11,7 @@ from PIL import Image
 
 from geodiff_plugin import GuidanceConfig
 from geodiff_plugin.algorithm.evidence import EvidenceInputs
-from geodiff_plugin.cli.lenses import pinhole
+from geodiff_plugin.cli.inputs import pinhole
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 from geodiff_plugin.guidance.evidence_store import make_evidence
 from geodiff_plugin.matching import clean, find_matches

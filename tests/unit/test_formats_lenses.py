@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.cli.arguments import DepthArguments
-from geodiff_plugin.cli.lenses import lenses_of, pinhole
+from geodiff_plugin.cli.inputs import lenses_of, pinhole
+from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.config import GuidanceConfig
 from tests.contracts import factory_calibrations as factory
 from tests.contracts import test_formats_table as table
@@ -71,7 +71,7 @@ def straight_pair(rig, arguments):
 
 
 def test_a_pair_is_undistorted_by_kalibr_as_by_opencv(reading, tmp_path) -> None:
-    arguments = DepthArguments(tmp_path / "l.png", tmp_path / "r.png")
+    arguments = DepthOptions(left=tmp_path / "l.png", right=tmp_path / "r.png")
     ours, theirs = reading(kalibr()), reading(opencv(LEFT, RIGHT))
     np.testing.assert_array_equal(ours.K_left, theirs.K_left)
     np.testing.assert_allclose(ours.E, theirs.E, atol=1e-12)

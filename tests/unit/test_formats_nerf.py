@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
-from geodiff_plugin.cli.arguments import DepthArguments
-from geodiff_plugin.cli.many.rigs import RigStore
+from geodiff_plugin.cli.inputs import read_rig
+from geodiff_plugin.cli.options import DepthOptions
 from tests.contracts import factory_calibrations as factory
 from tests.scenes import render_pair
 
@@ -227,11 +227,11 @@ def test_every_pair_of_a_folder_has_its_own_cameras(tmp_path, kind):
         for path, text in zip(calib, (factory.COLMAP_CAMERAS, factory.COLMAP_IMAGES), strict=True):
             path.write_text(text)
     folder = Path("images" if kind == "nerf" else "rig")
-    store, size = RigStore(), (640, 480)
+    size = (640, 480)
 
     def read(right: str):
-        given = DepthArguments(folder / "left.jpg", folder / right, calib=calib, baseline=0.12)
-        return store.read(given, None, size, size)
+        given = DepthOptions(left=folder / "left.jpg", right=folder / right, calib=calib, baseline=0.12)
+        return read_rig(given, size, size)
 
     first = read("right.jpg")
     assert np.abs(read("other.jpg").E - first.E).max() > 0.01

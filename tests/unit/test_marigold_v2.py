@@ -10,8 +10,8 @@ import torch
 from diffusers import QwenImageEditPipeline
 from PIL import Image
 
+from examples.marigold_v2 import tiny_marigold_v2
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.cli.tiny_marigold_v2 import tiny_marigold_v2
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline, frame_of, latents_of, pack, unpack
 from geodiff_plugin.priors.pipelines.sides import SidesOf

@@ -1,20 +1,6 @@
-"""Converters of published checkpoints, one kind a file, one table.
+"""Converters of published checkpoints, one kind a file.
 
-Data flow: an unpickled checkpoint -> the kind that it is -> a folder of safetensors.
-Paper: none.
-
-A new kind is a new file and one line in ``CONVERTERS``.
+A kind has two functions: ``recognises`` says by its keys whether an unpickled checkpoint is of it; ``write``
+takes the checkpoint, an empty folder to fill, and what ``--with`` names (or ``None``), and raises an
+``InputError`` that says what is wrong. A new kind is a new file and an entry of ``convert.CONVERTERS``.
 """
-
-from __future__ import annotations
-
-from geodiff_plugin.cli.converters.depthfm import DEPTHFM
-from geodiff_plugin.cli.converters.kinds import Converter
-from geodiff_plugin.cli.converters.ppd import PPD
-
-__all__ = ["CONVERTERS", "Converter"]
-
-CONVERTERS: dict[str, Converter] = {
-    "depthfm": DEPTHFM,
-    "ppd": PPD,
-}

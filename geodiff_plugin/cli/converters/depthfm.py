@@ -1,8 +1,4 @@
-"""Converter of ``depthfm-v1.ckpt``: CompVis' U-Net and empty prompt; the VAE is Stable Diffusion 1.5's.
-
-Data flow: ``state_dict, ldm_hparams, noising_step, empty_text_embedding`` -> ``DepthFMPipeline`` -> folder.
-Paper: none (DepthFM, arXiv 2403.13788).
-"""
+"""Converter of ``depthfm-v1.ckpt``: CompVis' U-Net and empty prompt; the VAE is Stable Diffusion 1.5's."""
 
 from __future__ import annotations
 
@@ -16,12 +12,12 @@ from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, UNet2DCond
 from torch import Tensor
 
 from geodiff_plugin._checks import InputError, bad_value
-from geodiff_plugin.cli.converters.kinds import Converter, write_card
+from geodiff_plugin.cli.converters.reading import write_card
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.loading import check_weights
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
 
-__all__ = ["DEPTHFM", "diffusers_name", "unet_config"]
+__all__ = ["diffusers_name", "recognises", "unet_config", "write"]
 
 KEYS = {"state_dict", "ldm_hparams", "noising_step", "empty_text_embedding"}
 #: A copy of runwayml/stable-diffusion-v1-5, which the authors name and which is gone.
@@ -182,11 +178,13 @@ def _load_vae(part: str | None) -> AutoencoderKL:
         ) from error
 
 
-def _recognises(checkpoint: Mapping[str, Any]) -> bool:
+def recognises(checkpoint: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint is of this kind, by its keys."""
     return KEYS <= set(checkpoint)
 
 
-def _write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
+def write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
+    """Fill an empty folder; ``part`` is what ``--with`` names."""
     unet = _load_unet(checkpoint["state_dict"], checkpoint["ldm_hparams"])
     embedding = torch.as_tensor(checkpoint["empty_text_embedding"]).float()
     embedding = embedding.reshape(1, *embedding.shape[-2:])
@@ -206,6 +204,3 @@ def _write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> Non
         "DepthFM (CompVis/depth-fm), converted by `geodiff convert`. The VAE is that of Stable Diffusion 1.5 "
         "and the U-Net was fine-tuned from it, so its CreativeML Open RAIL-M licence applies as well.",
     )
-
-
-DEPTHFM = Converter(_recognises, _write)

@@ -1,9 +1,4 @@
-"""Converter of Marigold V2: base model, trained checkpoint and prompt files to one folder.
-
-Data flow: ``transformer/``, ``vae/`` of the base; ``trainables.safetensors``; ``*_prompt_*.pt``
-    -> prior's folder.
-Paper: none (Marigold V2, arXiv 2609.08084; LoRA, arXiv 2106.09685).
-"""
+"""Converter of Marigold V2 (arXiv 2609.08084): base, trained checkpoint and prompt to a folder."""
 
 from __future__ import annotations
 
@@ -18,13 +13,17 @@ import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
 from diffusers import __version__ as diffusers_version
 from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.cli.converters.kinds import write_card
-from geodiff_plugin.cli.converters.reading import read_tensor
-from geodiff_plugin.cli.converters.shards import rewrite_shards, shapes_of, weight_files
+from geodiff_plugin.cli.converters.reading import (
+    read_tensor,
+    rewrite_weights,
+    save_weights,
+    shapes_of,
+    weight_files,
+    write_card,
+)
 from geodiff_plugin.priors.loading import check_weights
 from geodiff_plugin.priors.marigold_v2 import SPACE_OF_CHECKPOINT, MarigoldV2Pipeline
 from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
@@ -89,8 +88,7 @@ class Trainables:
         pairs = {name for name, _ in self.factors}
         lacking = [f"{name} of factor {f}" for name in pairs for f in "AB" if (name, f) not in self.factors]
         check_weights(lacking, (pairs | set(self.whole)) - set(base), str(self.file))
-        with safe_open(self.file, "pt") as opened:
-            shapes = {k: tuple(opened.get_slice(k).get_shape()) for k in opened.keys()}  # noqa: SIM118
+        shapes = shapes_of([self.file])
         for name in sorted(pairs):
             a, b = (shapes[self.factors[name, f]] for f in "AB")
             if len(a) != 2 or len(b) != 2 or (b[0], a[1]) != base[name] or a[0] != b[1]:
@@ -163,7 +161,7 @@ def _prompt_folder(file: Path, requested: str | None) -> Path:
 def convert_marigold_v2(
     base: Path, checkpoint: Path, folder: Path, prompts: str | None, space: str | None, lora: str
 ) -> None:
-    """Write the folder of a prior; at most one shard of it is in memory.
+    """Write the folder of a prior; at most one file of the base is in memory.
 
     Args:
         base: Qwen-Image-Edit-2509 in diffusers' layout, of which ``transformer/`` and ``vae/`` are read.
@@ -184,7 +182,7 @@ def convert_marigold_v2(
         if not os.path.isfile(base / name / "config.json"):
             bad_value("BASE", f"a folder of Qwen/Qwen-Image-Edit-2509 with {name}/", base, "Check the path.")
         files, trained = weight_files(base / name, "BASE"), Trainables.of(file, component)
-        trained.check({key: shape for key, (_, shape, _) in shapes_of(files).items()})
+        trained.check(shapes_of(files))
         parts[component] = files, trained
     if not parts["Diffuser"][1].factors:
         bad_value(str(file), "a checkpoint of Marigold V2 with a LoRA (Diffuser.*.lora_A.*)", "one without")
@@ -194,7 +192,7 @@ def convert_marigold_v2(
         shutil.copyfile(base / FOLDERS[component] / "config.json", target / "config.json")
         apart = component == "Diffuser" and lora != "merged"
         own = Trainables(file, {}, trained.whole) if apart else trained
-        rewrite_shards(files, target, own.merged)
+        rewrite_weights(files, target, own.merged)
     if lora != "merged":
         _write_lora(parts["Diffuser"][1], folder / LORA_FOLDER)
     _write_rest(folder, prompt, space, lora)
@@ -206,7 +204,7 @@ def _write_lora(trained: Trainables, folder: Path) -> None:
         name.removesuffix("weight") + f"lora_{factor}.weight": trained.read(key)
         for (name, factor), key in trained.factors.items()
     }
-    save_file(named, folder / LORA_FILE, metadata={"format": "pt"})
+    save_weights(named, folder / LORA_FILE)
 
 
 def _write_rest(folder: Path, prompt: Tensor, space: str, lora: str) -> None:

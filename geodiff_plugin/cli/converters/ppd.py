@@ -1,8 +1,4 @@
-"""Converter of ``ppd.pth``: a diffusion transformer on pixels, with the encoder of Depth Anything V2 Large.
-
-Data flow: ``dit.*`` and the encoder that ``--with`` names -> ``PPDPipeline`` -> folder.
-Paper: none; Pixel-Perfect Depth (arXiv 2510.07316).
-"""
+"""Converter of ``ppd.pth``: a transformer on pixels, with the encoder of Depth Anything V2 Large."""
 
 from __future__ import annotations
 
@@ -20,14 +16,13 @@ from torch import Tensor
 from transformers import Dinov2Config, Dinov2Model
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.converters.kinds import Converter, write_card
-from geodiff_plugin.cli.converters.reading import read_checkpoint
+from geodiff_plugin.cli.converters.reading import read_checkpoint, write_card
 from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.loading import check_weights, load_component
 from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
 from geodiff_plugin.priors.ppd import PPDPipeline
 
-__all__ = ["PPD", "encoder_name"]
+__all__ = ["encoder_name", "recognises", "write"]
 
 TRANSFORMER, IN_CHECKPOINT, IN_FILE, IN_FOLDER = "dit.", "sem_encoder.pretrained.", "pretrained.", "backbone."
 #: The same weights as depth_anything_v2_vitl.pth, as transformers has them.
@@ -146,11 +141,13 @@ def _load_transformer(state: Mapping[str, Tensor]) -> PixelDiT:
     return dit.eval()
 
 
-def _recognises(checkpoint: Mapping[str, Any]) -> bool:
+def recognises(checkpoint: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint is of this kind, by its keys."""
     return {f"{TRANSFORMER}x_embedder.proj.weight", f"{TRANSFORMER}proj_fusion.0.weight"} <= set(checkpoint)
 
 
-def _write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
+def write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
+    """Fill an empty folder; ``part`` is what ``--with`` names."""
     dit = _load_transformer(_without(TRANSFORMER, checkpoint))
     encoder = _load_encoder(_encoder_state(checkpoint, part), part or "the checkpoint")
     if encoder.config.hidden_size != dit.config.semantic_size:
@@ -165,6 +162,3 @@ def _write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> Non
         "Pixel-Perfect Depth (gangweix/pixel-perfect-depth, Apache-2.0), converted by `geodiff convert`. "
         "The encoder of Depth Anything V2 Large, without which it cannot run, is CC-BY-NC-4.0.",
     )
-
-
-PPD = Converter(_recognises, _write)

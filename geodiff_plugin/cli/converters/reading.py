@@ -1,26 +1,35 @@
-"""Safe reading of pickled checkpoints: tensors, numbers and text, never code.
-
-Data flow: .ckpt, .pth, .pt or .bin -> what was saved in it.
-Paper: none.
-"""
+"""What converters share: reading pickles as plain data, never code; files of safetensors; the model card."""
 
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import pickle
-from collections.abc import Mapping
+import shutil
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from geodiff_plugin._checks import InputError, bad_value
 
-__all__ = ["read_checkpoint", "read_tensor"]
+__all__ = [
+    "read_checkpoint",
+    "read_tensor",
+    "rewrite_weights",
+    "save_weights",
+    "shapes_of",
+    "weight_files",
+    "write_card",
+]
 
+INDEX = "diffusion_pytorch_model.safetensors.index.json"
 _reconstruct = importlib.import_module("numpy._core.multiarray")._reconstruct
 
 #: A numpy array in a checkpoint is rebuilt by these; files of numpy 1 call the module ``numpy.core``.
@@ -99,3 +108,69 @@ def _foreign_names(path: Path) -> str:
             return ", ".join(sorted(torch.serialization.get_unsafe_globals_in_checkpoint(path)))
     except (RuntimeError, ValueError):  # files from before PyTorch 1.6 cannot be listed
         return "other objects"
+
+
+def weight_files(folder: Path, name: str) -> list[Path]:
+    """The safetensors of a component.
+
+    Args:
+        folder: of the component.
+        name: of the argument that it came from, for the message.
+
+    Raises:
+        ValueError: none there; an index that names a file which is not.
+    """
+    index = folder / INDEX
+    if index.is_file():
+        files = [folder / f for f in sorted(set(json.loads(index.read_text("utf-8"))["weight_map"].values()))]
+    else:
+        files = sorted(folder.glob("*.safetensors"))
+    missing = [file.name for file in files if not file.is_file()]
+    if missing or not files:
+        got = f"one without {', '.join(missing)}" if missing else "one without"
+        bad_value(name, f"a folder with safetensors in {folder}", got, "Fetch it anew.")
+    return files
+
+
+def shapes_of(files: list[Path]) -> dict[str, tuple[int, ...]]:
+    """Shape of every tensor by its name, read from the headers alone."""
+    found = {}
+    for file in files:
+        with safe_open(file, "pt") as opened:
+            for name in opened.keys():  # noqa: SIM118 - no mapping
+                found[name] = tuple(opened.get_slice(name).get_shape())
+    return found
+
+
+def rewrite_weights(files: list[Path], folder: Path, change: Callable[[str, Tensor], Tensor]) -> None:
+    """Write the weights of a component anew, file by file, with at most one of them in memory.
+
+    Args:
+        files: of the component, by ``weight_files``.
+        folder: an existing one to fill; the names stay, so that their index does too.
+        change: a tensor of that name to another of its shape and dtype.
+    """
+    for file in files:
+        with safe_open(file, "pt") as opened:
+            names = list(opened.keys())
+            save_weights({name: change(name, opened.get_tensor(name)) for name in names}, folder / file.name)
+    index = files[0].parent / INDEX
+    if index.is_file():
+        shutil.copyfile(index, folder / INDEX)
+
+
+def save_weights(state: Mapping[str, Tensor], path: Path) -> None:
+    """Write safetensors, which refuse tensors that share memory (tied weights) or have gaps."""
+    apart = {name: value.clone(memory_format=torch.contiguous_format) for name, value in state.items()}
+    save_file(apart, path, metadata={"format": "pt"})
+
+
+def write_card(folder: Path, licence: str, text: str) -> None:
+    """``README.md`` with the licence where it is looked for on load.
+
+    Args:
+        folder: of the weights.
+        licence: its identifier, such as ``"mit"``.
+        text: where the weights come from, a sentence or two.
+    """
+    (folder / "README.md").write_text(f"---\nlicense: {licence}\n---\n\n{text}\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""``geodiff bench --points``: both ways run on one prior, and the peer is what it says it is."""
+"""``examples/fitted_lora.py``: both ways run on one prior, and the peer is what it says it is."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from examples.fitted_lora import FittedLora, compare_completions, complete_by_lora, draw_points
+from examples.marigold_v2 import tiny_marigold_v2
 from geodiff_plugin.bundled.demo_pair import DemoPair
-from geodiff_plugin.cli.bench_points import compare_completions, draw_points
-from geodiff_plugin.cli.tiny_marigold_v2 import tiny_marigold_v2
-from geodiff_plugin.evaluation.fitted_lora import FittedLora, complete_by_lora
 from geodiff_plugin.types import Rig
 
 
@@ -67,10 +66,3 @@ def test_both_ways_are_measured(pair):
 def test_a_prior_in_another_space_is_refused(pair):
     with pytest.raises(ValueError, match="log depth"):
         complete_by_lora(tiny_marigold_v2(space="disparity"), pair.left, torch.ones(4, 4))
-
-
-def test_options_that_do_not_go_together(geodiff):
-    answer = geodiff("bench", "--prior", "bundled")
-    assert answer.code == 2 and "--points" in answer.err
-    answer = geodiff("bench", "--points", "500", "--prior", "bundled")
-    assert answer.code == 2 and "Marigold V2" in answer.err

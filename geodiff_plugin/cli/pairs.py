@@ -1,8 +1,4 @@
-"""Which pairs a run consists of: from two folders, a list, or the video of a rig.
-
-Data flow: LEFT and RIGHT as typed -> one ``PairRef`` a pair
-    -> the arguments that ``geodiff depth`` would have had.
-Paper: none.
+"""Which pairs a run over many consists of: from two folders, a list, or the video of a rig.
 
 Nothing here imports torch: what is wrong with a list is said at once.
 """
@@ -16,16 +12,21 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from PIL import Image
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.arguments import DepthArguments
+from geodiff_plugin.cli.options import DepthOptions, calibration_way, check_files, intrinsics_way
 from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.out import check_out, reason_of
 from geodiff_plugin.formats.video import VIDEOS, count_frames, is_video
 
-__all__ = ["LISTS", "PairRef", "arguments_of", "assumption", "find_pairs", "is_many"]
+__all__ = ["COLUMNS", "SUMMARY", "PairRef", "assumption", "find_pairs", "is_many", "options_of", "start_many"]
 
+#: The table of a run, and its columns.
+SUMMARY = "pairs.csv"
+COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "trusted", "confidence", "seconds", "message")
 LISTS = (".csv", ".tsv", ".txt")
 #: A list's heading, which is no pair, begins with this.
 HEADING = "left"
@@ -57,13 +58,80 @@ def is_many(left: Path) -> bool:
     return os.path.isdir(left) or left.suffix.lower() in LISTS or is_video(left)
 
 
-def find_pairs(arguments: DepthArguments) -> list[PairRef]:
+def start_many(options: DepthOptions) -> list[PairRef]:
+    """Find the pairs of a run over many, and make all checks that need neither images nor torch.
+
+    Args:
+        options: with ``out``.
+
+    Raises:
+        InputError: naming the option or the file.
+    """
+    names = ("show", "points", "view", "known_length")
+    options.refuse(names, "left out with many pairs", "given", "It is of one pair.")
+    refs = find_pairs(options)
+    if refs[0].frame is not None:
+        cure = "Extract some frames, and try it there."
+        options.refuse(["estimate_pose"], "left out with a video", "given", cure)
+        if "colmap" in options.export:
+            cure = "A model names image files: extract the frames, and give their folders."
+            bad_value("--export colmap", "left out with a video", "given", cure)
+    first = options_of(refs[0], options)
+    first = first if first.right is not None else replace(first, right=first.left)
+    first.check_all()
+    if options.estimate_pose:
+        intrinsics_way(first)
+    elif all(ref.calib is None for ref in refs):
+        calibration_way(first)
+    check_files(options, photographs=False)
+    _check_summary(options)
+    return refs
+
+
+def _check_summary(options: DepthOptions) -> None:
+    """See that the table can be written when the pairs are done, and that no other file is lost by it.
+
+    Nothing is left behind, also no folder: several processes may look at the same time.
+
+    Raises:
+        InputError: the folder holds the result of one pair or cannot be written to; its ``pairs.csv`` is a
+            folder, or a file of the user's, such as the list of pairs.
+    """
+    assert options.out is not None
+    folder = check_out(options.out)
+    if (folder / "report.json").exists():
+        got = f"{options.out}, which holds the result of one pair"
+        bad_value("--out", "a folder for the folders of many pairs", got, "Name another.")
+    path = options.out / SUMMARY
+    try:
+        if os.path.lexists(path) and not _is_summary(path):
+            got = f"{path}, which is {'a folder' if path.is_dir() else 'not the table of an earlier run'}"
+            cure = f"Name another --out, or move that {SUMMARY}: a table of the results takes its place."
+            bad_value("--out", f"a folder whose {SUMMARY} may be replaced", got, cure)
+        absolute = options.out.absolute()
+        there = next(path for path in (absolute, *absolute.parents) if path.exists())
+        with TemporaryFile(dir=there) as file:  # finds out whether the disk takes a byte
+            file.write(b"0")
+    except OSError as error:
+        cure = "Name another with --out, or free disk space and check its permissions."
+        bad_value("--out", "a folder that can be written to", f"{options.out} ({reason_of(error)})", cure)
+
+
+def _is_summary(path: Path) -> bool:
+    """Whether a file has the heading of our table."""
+    if not path.is_file():
+        return False
+    with open(path, encoding="utf-8", errors="replace") as file:
+        return file.readline().rstrip("\n") == ",".join(COLUMNS)
+
+
+def find_pairs(options: DepthOptions) -> list[PairRef]:
     """The pairs of a run, in order.
 
     Raises:
         OSError, ValueError: a folder or list without pairs, views that have no partner, a line that is none.
     """
-    left, right = arguments.left, arguments.right
+    left, right = options.left, options.right
     if os.path.isdir(left):
         return _of_folders(left, right)
     if is_video(left):
@@ -74,12 +142,12 @@ def find_pairs(arguments: DepthArguments) -> list[PairRef]:
     return _of_list(left)
 
 
-def assumption(refs: Sequence[PairRef], arguments: DepthArguments) -> str | None:
+def assumption(refs: Sequence[PairRef], options: DepthOptions) -> str | None:
     """What was assumed about which views belong together, for the user to check; ``None`` for nothing."""
     first, last = refs[0], refs[-1]
     if first.frame is not None and first.right is None:
         return f"{first.left} is read as both views side by side; with a video for each view, name both."
-    if first.right is None or last.right is None or not os.path.isdir(arguments.left):
+    if first.right is None or last.right is None or not os.path.isdir(options.left):
         return None
     if first.left.stem == first.right.stem:
         return None
@@ -90,10 +158,10 @@ def assumption(refs: Sequence[PairRef], arguments: DepthArguments) -> str | None
     )
 
 
-def arguments_of(ref: PairRef, arguments: DepthArguments) -> DepthArguments:
+def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
     """What ``geodiff depth`` would have been asked for this pair alone."""
-    calib = arguments.calib if ref.calib is None else (ref.calib,)
-    return replace(arguments, left=ref.left, right=ref.right, calib=calib, out=arguments.out / ref.name)
+    calib = options.calib if ref.calib is None else (ref.calib,)
+    return replace(options, left=ref.left, right=ref.right, calib=calib, out=options.out / ref.name)
 
 
 def _photographs(folder: Path) -> list[Path]:

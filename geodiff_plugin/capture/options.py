@@ -1,0 +1,69 @@
+"""Options of ``geodiff capture``; nothing here imports torch."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import MISSING, asdict, dataclass
+from pathlib import Path
+
+from geodiff_plugin import __version__
+from geodiff_plugin.options import CAMERAS, OUTPUT, declare
+
+__all__ = ["NEIGHBOURS", "CaptureOptions"]
+
+#: Right views of a frame, at most.
+NEIGHBOURS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """What to do with a capture, as it was typed."""
+
+    path: Path = declare(
+        MISSING,
+        "COLMAP model, transforms.json (nerfstudio, Polycam, Record3D, instant-ngp) or its folder, "
+        "folder of 7-Scenes, ScanNet or TUM RGB-D, video with --trajectory, or folder of images.",
+        "",
+        metavar="PATH",
+    )
+    out: Path = declare(
+        Path("geodiff-capture"), "Folder for the results, one folder a frame.", "--out", "-o", panel=OUTPUT
+    )
+    frames: str | None = declare(
+        None, "Which frames get depth: NAME,NAME by file stem, or FIRST:LAST:STEP; all by default."
+    )
+    neighbours: int = declare(NEIGHBOURS, "Right views of a frame, at most.")
+    poses: str = declare(
+        "refined", "refined: solved together over the capture; given: as they are.", panel=CAMERAS
+    )
+    points: str = declare(
+        "none", "Known depths: none, model (points of a COLMAP model), depth (maps it names)."
+    )
+    metres_per_unit: float | None = declare(None, "Length of one unit of the poses, metres.", panel=CAMERAS)
+    known_length: str | None = declare(
+        None, "A distance in the scene, NAME:X1,Y1,X2,Y2,METRES by pixels of a frame.", panel=CAMERAS
+    )
+    distance: str | None = declare(None, "Distance of two cameras, NAME,NAME,METRES.", panel=CAMERAS)
+    k: Path | None = declare(None, "3x3 intrinsics, text or .npy.", "--K", panel=CAMERAS)
+    fov: float | None = declare(None, "Horizontal field of view, degrees.", panel=CAMERAS)
+    trajectory: Path | None = declare(
+        None, "Of a video: lines of seconds tx ty tz qx qy qz qw, camera-to-world.", panel=CAMERAS
+    )
+    prior: str = declare("bundled", "'bundled', a hub id or a folder.")
+    steps: int | None = declare(None, "Denoising steps; by default the prior's own, at least 4.")
+    seed: int = declare(0, "Seed of the noise.")
+    device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
+    processes: int | None = declare(None, "Processes that share the frames; by default one a core.")
+    overwrite: bool = declare(
+        False, "Write into a folder that holds files; do finished frames anew.", panel=OUTPUT
+    )
+    quiet: bool = declare(False, "No progress bar.", "--quiet", "-q", panel=OUTPUT)
+    json: bool = declare(False, "Print the report instead of a summary.", panel=OUTPUT)
+
+    def key(self, names: Sequence[str], *of: str) -> str:
+        """A digest of the settings ``of`` and the frames that a result depends on."""
+        said = {name: str(value) for name, value in asdict(self).items() if name in of}
+        said |= {"version": __version__, "names": list(names), "path": str(self.path.resolve())}
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]

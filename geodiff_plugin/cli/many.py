@@ -1,0 +1,446 @@
+"""``geodiff depth`` on many pairs: one prior, four stages side by side, a folder and a table row a pair."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import json
+import os
+import sys
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.text import Text
+
+from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin._threads import WithinCores
+from geodiff_plugin.cli.depth import guided_call, load_guided_prior, write_result
+from geodiff_plugin.cli.exports import check_image_names
+from geodiff_plugin.cli.inputs import Inputs, read_inputs
+from geodiff_plugin.cli.options import CAMERA_FILES, MODEL_FILES, DepthOptions, check_files, out_folder_of
+from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, assumption, options_of
+from geodiff_plugin.cli.report import build_report
+from geodiff_plugin.cli.terminal import (
+    EXIT_SOME_FAILED,
+    StopWatch,
+    collected_warnings,
+    new_table,
+    say,
+    show,
+)
+from geodiff_plugin.formats.files import file_digest
+from geodiff_plugin.formats.out import OutFolder, atomic_path, reason_of
+from geodiff_plugin.formats.video import VideoReader, both_halves
+from geodiff_plugin.guidance.evidence_store import EvidenceStore
+from geodiff_plugin.options import flag_of
+from geodiff_plugin.runner import BROKEN, Item, Journal, Runner
+from geodiff_plugin.runtime.guided_call import native_images
+from geodiff_plugin.runtime.machine import pick_device
+from geodiff_plugin.types import MetricDepthOutput
+
+__all__ = ["JOURNAL", "Stages", "finished_row", "run_many"]
+
+#: What became of every pair, as it is known to all processes of a run.
+JOURNAL = ".pairs.jsonl"
+#: A table of more pairs than this has only those that want to be looked at.
+MOST_ROWS = 20
+#: Options by which a finished result is no other one.
+NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "show", "strict", "device"}
+#: The next pair cannot be written either.
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+Row = dict[str, Any]
+
+
+class _EndsRun(BaseException):
+    """What no pair can be spared: the prior does not load, the disk is full; its cause says which."""
+
+
+@dataclass(eq=False)
+class _Job:
+    """A pair on its way through the stages, and what is known of it so far."""
+
+    ref: PairRef
+    options: DepthOptions
+    warnings: list[str] = field(default_factory=list)
+    watch: StopWatch = field(default_factory=StopWatch)
+    held: ExitStack = field(default_factory=ExitStack)
+    inputs: Inputs | None = None
+    output: MetricDepthOutput | None = None
+    out: OutFolder | None = None
+    digests: dict[str, str] = field(default_factory=dict)
+    began_from: str | None = None
+
+
+class Stages:
+    """The stages of a pair, each called in a thread of its own.
+
+    Args:
+        options: of the run.
+        refs: its pairs, in order.
+        device: where the prior runs.
+        pipe: the prior where it is loaded; otherwise it is loaded when the first pair has been read.
+        among: stages that compute at the same time and share the cores.
+    """
+
+    def __init__(
+        self,
+        options: DepthOptions,
+        refs: Sequence[PairRef],
+        device: torch.device,
+        pipe: Any = None,
+        among: int = 2,
+    ) -> None:
+        self._options, self._device, self._pipe, self._among = options, device, pipe, among
+        self._number = {ref.name: number for number, ref in enumerate(refs)}
+        self._jobs: dict[str, _Job] = {}
+        self._videos, self._held = dict[Path, VideoReader](), ExitStack()
+        self._before: tuple[PairRef, tuple[int, ...], MetricDepthOutput] | None = None
+        self._thread, self._told = threading.local(), set[str]()
+
+    def close(self) -> None:
+        """Close the videos, when the threads are done."""
+        self._held.close()
+
+    def tell(self, sentence: str) -> None:
+        """Note a warning with the pair that this thread is at, and say it the first time."""
+        noted = getattr(self._thread, "warnings", [])
+        if sentence not in noted:
+            noted.append(sentence)
+        if sentence not in self._told:
+            self._told.add(sentence)
+            say(f"warning: {sentence}")
+
+    def read(self, item: Item) -> _Job:
+        """Look at the files, take the folder, decode the views."""
+        ref: PairRef = item.payload
+        job = self._jobs[item.key] = _Job(ref, options_of(ref, self._options))
+        self._thread.warnings = job.warnings
+        with job.watch.stage("calibration"):
+            views_of_one = ref.frame is not None and ref.right is None
+            (replace(job.options, right=ref.left) if views_of_one else job.options).check_all()
+            check_files(job.options, photographs=ref.frame is None)
+            try:
+                job.out = job.held.enter_context(out_folder_of(job.options))
+            except InputError as error:
+                if _is_full(error):
+                    raise _EndsRun from error
+                raise
+            job.digests = _file_digests(job.options)  # before: what changes later is another version
+            frames = None if ref.frame is None else self._frames(ref, ref.frame)
+            job.inputs = read_inputs(job.options, job.options.config(), frames)
+            check_image_names(job.options, job.inputs)
+        return job
+
+    def _frames(self, ref: PairRef, frame: int) -> Sequence[np.ndarray]:
+        views = [self._video(path).read(frame) for path in (ref.left, ref.right) if path is not None]
+        return both_halves(views[0], "LEFT") if ref.right is None else views
+
+    def _video(self, path: Path) -> VideoReader:
+        if path not in self._videos:
+            self._videos[path] = self._held.enter_context(VideoReader(path))
+        return self._videos[path]
+
+    def evidence(self, job: _Job) -> _Job:
+        """What the views say by themselves, into a store of the pair's own, where the call finds it."""
+        self._thread.warnings = job.warnings
+        assert job.inputs is not None
+        if self._pipe is None:
+            try:
+                self._pipe = load_guided_prior(self._options, self._device)
+            except Exception as error:
+                raise _EndsRun from error
+        device = self._pipe._execution_device
+        with (
+            job.watch.stage("evidence"),
+            WithinCores(self._among),
+            torch.no_grad(),
+            torch.autocast(device.type, enabled=False),
+        ):
+            job.inputs.guidance.evidence_store = EvidenceStore(1, copies=False)
+            job.inputs.guidance.prepare(native_images(job.inputs.left, device))
+        return job
+
+    def guide(self, job: _Job) -> _Job:
+        """The guided call, from the pair before where that is wanted."""
+        self._thread.warnings = job.warnings
+        assert job.inputs is not None
+        guidance, size, before = job.inputs.guidance, job.inputs.left.shape, self._before
+        self._before = None  # whatever happens now: a sequence with a hole begins anew
+        # A pair between that failed before this stage, or that was there already, has left no trace here.
+        if before is not None and before[1] == size:
+            if self._number[before[0].name] == self._number[job.ref.name] - 1:
+                job.began_from, guidance.previous = before[0].name, before[2]
+        warm = self._options.warm_start
+        with job.watch.stage("guided call"), WithinCores(self._among):
+            quiet = replace(job.options, quiet=True)
+            job.output = guided_call(self._pipe, job.inputs, quiet, output_latent=warm)
+        guidance.evidence_store = guidance.previous = None
+        if warm:  # without its maps
+            needed = ("latent", "space", "scale", "shift", "global_scale", "rescaled")
+            kept = {name: getattr(job.output, name) for name in needed}
+            small = MetricDepthOutput(prediction=job.output.prediction[:0], **kept)
+            self._before = job.ref, size, small
+        return job
+
+    def write(self, job: _Job) -> Row:
+        """The files, the report last, and the row of the table."""
+        self._thread.warnings = job.warnings
+        assert job.inputs is not None and job.output is not None and job.out is not None
+        job.warnings += [w for w in job.output.warnings if w not in job.warnings]
+        report = build_report(job.inputs, job.output, self._pipe, job.options, job.warnings)
+        report["pair"] = {
+            "name": job.ref.name,
+            "frame": job.ref.frame,
+            "began_from": job.began_from,
+            "sha256": job.digests,
+        }
+        try:
+            write_result(job.options, job.out, job.inputs, job.output, report, job.watch)
+        except OSError as error:
+            if _is_full(error):
+                raise _EndsRun from error
+            raise
+        return _row(report)
+
+    def release(self, item: Item) -> None:
+        """Give back the folder and the memory of a pair."""
+        job = self._jobs.pop(item.key, None)
+        if job is not None:
+            job.held.close()
+
+
+def _is_full(error: BaseException | None) -> bool:
+    """Whether a full disk is behind an error."""
+    while error is not None and getattr(error, "errno", None) not in DISK_FULL:
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _file_digests(options: DepthOptions) -> dict[str, str]:
+    """SHA-256 by path of the readable files that a pair is made from; of a COLMAP model, of its texts."""
+    paths: list[Path] = [options.left, *([options.right] if options.right else [])]
+    for name in CAMERA_FILES:
+        value = getattr(options, name)
+        for path in value if isinstance(value, tuple) else (value,):
+            if path is not None:
+                paths += [path / file for file in MODEL_FILES] if path.is_dir() else [path]
+    digests = {}
+    for path in paths:
+        with suppress(OSError):  # its reader says why
+            digests[str(path)] = file_digest(path)
+    return digests
+
+
+def finished_row(options: DepthOptions) -> Row | None:
+    """The row of a pair that an earlier run has finished; ``None`` where it is still to be done.
+
+    The report is written last and names every file, so a folder that holds all of them is whole.
+
+    Args:
+        options: of this pair alone.
+
+    Raises:
+        InputError: it was made with other options, or from files whose content has changed since.
+    """
+    assert options.out is not None
+    try:
+        report = json.loads((options.out / "report.json").read_text(encoding="utf-8"))
+        names, made = report["files"]["names"], report["arguments"]
+        whole = all((options.out / name).stat().st_size > 0 for name in names)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if not whole:
+        return None
+    wanted = options.as_json()
+    others = [n for n in wanted if n not in NOT_OF_THE_RESULT and wanted[n] != made.get(n, wanted[n])]
+    if others:
+        earlier, now = (", ".join(_as_typed(name, of[name]) for name in others) for of in (made, wanted))
+        got = f"{options.out}, made {earlier} and now asked for {now}"
+        bad_value(
+            "--out", "a folder of results of the same options", got, "Name another --out, or add --overwrite."
+        )
+    digests = report.get("pair", {}).get("sha256", {})
+    changed = [path for path, digest in _file_digests(options).items() if digests.get(path, digest) != digest]
+    if changed:
+        got = f"{options.out}, made before {' and '.join(changed)} changed"
+        cure = "Name another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
+        bad_value("--out", "a folder of results of the same files", got, cure)
+    return _row(report)
+
+
+def _as_typed(name: str, value: Any) -> str:
+    """An option, or one of the views, as it stands on the command line."""
+    flag = flag_of(DepthOptions.__dataclass_fields__[name])
+    if value is None or value is False or value == []:
+        return f"without {flag}"
+    shown = " ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return f"with {flag}" if value is True else f"with {flag} {shown}"
+
+
+def _row(report: dict[str, Any]) -> Row:
+    """What the table says of a pair, and why it is not to be trusted."""
+    depth, judgement = report["depth"], report["judgement"]
+    return {
+        "near_m": depth["min_m"],
+        "median_m": depth["median_m"],
+        "far_m": depth["max_m"],
+        "trusted": judgement["trusted"],
+        "confidence": judgement["signs"]["confidence"],
+        "seconds": round(sum(report["seconds"].values()), 3),
+        "message": " ".join(report["warnings"]) or None,
+        "reasons": " ".join(judgement["reasons"]),
+    }
+
+
+def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
+    """Run the command on all pairs, answer on stdout, and leave with a code if one of them failed.
+
+    Args:
+        options: that ``start_many`` has seen.
+        refs: the pairs, in order.
+
+    Raises:
+        InputError: ``--out`` has results of other options, or of files that have changed since: then nothing
+            is computed, and nothing written; all pairs fail for one reason; the disk is full.
+    """
+    assert options.out is not None
+    device, _ = pick_device(options.device), options.config()
+    there: dict[str, Row] = {}
+    if not options.overwrite:
+        rows = {ref.name: finished_row(options_of(ref, options)) for ref in refs}
+        there = {name: row for name, row in rows.items() if row is not None}
+
+    def is_whole(item: Item, _: Row) -> bool:
+        return not options.overwrite and finished_row(options_of(item.payload, options)) is not None
+
+    journal = Journal(options.out / JOURNAL)
+    items = [Item(r.name, r, words=(str(r.left), str(r.right), str(options.out / r.name))) for r in refs]
+    for item in items:
+        if item.key in there and journal.get(item) is None:
+            journal.put(item, there[item.key])
+    runner = Runner(
+        items,
+        journal,
+        noun="pair",
+        survives=(Exception,),
+        whole=is_whole,
+        in_order=options.warm_start,
+        progress=not options.quiet,
+        say=say,
+    )
+    process = runner.process
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", process.local % torch.cuda.device_count())
+    assumed = assumption(refs, options)
+    if assumed and process.index == 0 and not options.quiet:
+        say(assumed)
+    stages = Stages(options if process.index == 0 else replace(options, quiet=True), refs, device)
+    try:
+        with collected_warnings(stages.tell):
+            records = runner.run(
+                stages.read, stages.evidence, stages.guide, stages.write, release=stages.release
+            )
+    except _EndsRun as ended:
+        _raise_cause(ended, options.out)
+    except InputError:  # all of them, for one reason
+        _forget(journal)
+        raise
+    except KeyboardInterrupt:
+        say("geodiff: finished pairs stay; the same command goes on with the rest")
+        raise
+    finally:
+        stages.close()
+    rows_of_all = [_final(record, there.get(record["key"]), options) for record in records]
+    if process.index == 0:
+        _answer(rows_of_all, options)
+    if any(row["result"] == "failed" for row in rows_of_all):
+        sys.exit(EXIT_SOME_FAILED)
+
+
+def _raise_cause(ended: _EndsRun, out: Path) -> None:
+    """Say why the run had to end."""
+    cause = ended.__cause__
+    assert cause is not None
+    if _is_full(cause):
+        got = f"{out} ({os.strerror(errno.ENOSPC)})"
+        bad_value(
+            "--out",
+            "on a disk with room",
+            got,
+            "Finished pairs stay; the same command goes on with the rest.",
+        )
+    raise cause
+
+
+def _forget(journal: Journal) -> None:
+    """Leave no folder behind where nothing was computed."""
+    if journal.others_work():
+        return
+    with suppress(OSError):
+        journal.path.unlink()
+        journal.path.parent.rmdir()
+
+
+def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:
+    """A row of the table from a record of the journal, or from the report that an earlier run left.
+
+    With ``--strict`` what is not trusted has failed.
+    """
+    record = record | (there or {})
+    row = dict.fromkeys(COLUMNS) | {name: record[name] for name in COLUMNS if name in record}
+    row |= {"pair": record["key"], "result": "there" if there else "done"}
+    if record.get("status") == BROKEN:
+        row |= {"result": "failed", "message": record["error"]}
+    elif options.strict and record["trusted"] is False:
+        assert options.out is not None
+        reason = f"The depth in {options.out / row['pair']} is not to be trusted: {record['reasons']}"
+        say(f"geodiff: {row['pair']}: {reason}")
+        row = dict.fromkeys(COLUMNS) | {"pair": row["pair"], "result": "failed", "message": reason}
+    return row
+
+
+def _answer(rows: Sequence[Row], options: DepthOptions) -> None:
+    """Print the table, or the rows as JSON, and write ``pairs.csv``."""
+    assert options.out is not None
+    if options.json:
+        print(json.dumps(rows, indent=2))
+    elif not options.quiet:
+        _print(rows, options.out)
+    path = options.out / SUMMARY
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:  # what became of the pairs is on the screen, and each result in its folder
+        say(f"geodiff: {path} could not be written ({reason_of(error)}).")
+
+
+def _print(rows: Sequence[Row], out: Path) -> None:
+    """The table and what it comes to."""
+    shown = [row for row in rows if row["result"] == "failed" or row["trusted"] is False]
+    shown = list(rows) if len(rows) <= MOST_ROWS else shown
+    if shown:
+        table = new_table(("pair", "result", "near m", "median m", "far m", "confidence", "s"))
+        for row in shown:
+            numbers = [row[name] for name in ("near_m", "median_m", "far_m", "confidence", "seconds")]
+            result = "not to be trusted" if row["trusted"] is False else row["result"]
+            table.add_row(row["pair"], result, *("-" if v is None else f"{v:.2f}" for v in numbers))
+        show(table)
+    counts = {kind: sum(row["result"] == kind for row in rows) for kind in ("done", "there", "failed")}
+    doubtful = sum(row["trusted"] is False for row in rows)
+    number = "1 pair" if len(rows) == 1 else f"{len(rows)} pairs"
+    totals = [f"{number}: {counts['done']} done, {counts['there']} there already"]
+    totals.append(f"{counts['failed']} failed, {doubtful} not to be trusted -> {out}/")
+    show(Text(", ".join(totals)))
+    for row in shown:
+        if row["result"] == "failed":
+            show(Text(f"{row['pair']}: {row['message']}"))
