@@ -180,7 +180,7 @@ class MetricDepthOutput(BaseOutput):
         poses: one ``PoseReport`` per image with right views.
         extras: further maps of the prior by name (GeoWizard's ``"normals"``), shaped as ``prediction`` except
             for the channels.
-        judgements: one ``runtime.judgement.Judgement`` per image: whether the depth can be trusted, and why
+        verdicts: one ``runtime.verdict.Verdict`` per image: whether the depth can be trusted, and why
             not.
         unit: ``"m"``, or ``None`` if no length is known; lengths are then in the unit of the given poses, or
             in units of the first baseline where poses were estimated.
@@ -189,7 +189,7 @@ class MetricDepthOutput(BaseOutput):
         scale_spread: relative spread of that scale over matches or the prior's map; ``None`` if unknown.
         rescaled: factor from the lengths of ``GeometryGuidance`` to metres, if only the prior knows the unit;
             else 1.
-        warnings: sentences for the user about this result, including those of the judgements.
+        warnings: sentences for the user about this result, including those of the verdicts.
     """
 
     prediction: np.ndarray | torch.Tensor
@@ -214,5 +214,5 @@ class MetricDepthOutput(BaseOutput):
     scale_spread: float | None = None
     rescaled: float = 1.0
     extras: dict[str, np.ndarray | torch.Tensor] = field(default_factory=dict)
-    judgements: list[Any] = field(default_factory=list)
+    verdicts: list[Any] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)

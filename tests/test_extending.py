@@ -13,7 +13,7 @@ from diffusers import UNet2DModel
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
-from geodiff_plugin.algorithm.rules import RULES
+from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings, find_method
@@ -107,7 +107,7 @@ def test_a_space_is_known_to_map_fit_and_alignment(page):
     depth_m = metric(x, metric.from_range(near, far))
     torch.testing.assert_close(metric.range_of(metric.from_range(near, far)), (near, far), rtol=2e-3, atol=0)
     K = torch.tensor([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
-    points, _ = points_to_matches(depth_m[0, 0], K, (24, 32), K, (24, 32))
+    points, _ = points_to_matches(depth_m[0, 0], K, (24, 32), (24, 32))
     found = fit_to_points(x, points, metric)
     assert ((metric(x, metric.from_range(*found)) - depth_m).abs() / depth_m).median() < 0.1
     truth = depth_m[0, 0].numpy()

@@ -1,25 +1,21 @@
-"""Bring a metric map to its matches by an edge-aware fit, as stiff as the prior is good.
-
-Data flow: metric depth, ``MatchTarget``, left image, error of the prior -> smooth log correction -> metric
-depth.
-Paper: none; its output is the decoded latent, which the decoder's grid and its blur limit.
-"""
+"""Fit a metric map to its matches and points: edge-aware least squares, as stiff as the prior is good."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.solver import solve_robust
-from geodiff_plugin.algorithm.terms.base import MatchTarget
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.geometry.cameras import image_size
+from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.scale.points import weighted_quantile
 
-__all__ = ["Refined", "off_edges", "prior_error", "refine_depth"]
+__all__ = ["correction_target", "off_edges", "prior_error", "refine_depth"]
 
 #: Longer side in pixels of the grid that ``smoothness``, ``IMAGE_EDGE`` and ``DEPTH_EDGE`` are numbers of; on
 #: another one they are scaled, so that a correction reaches the same share of the image.
@@ -54,24 +50,7 @@ EDGE_REACH, EDGE_STEP, EDGE_ERROR = 0.006, 0.3, 0.11
 SHARE, DEVIATIONS = 0.8, 1.2816
 
 
-@dataclass(frozen=True)
-class Refined:
-    """Result of ``refine_depth``.
-
-    Attributes:
-        depth_m: ``(B, 1, H, W)`` metres, on the grid of the depth that was given.
-        support: ``(B, 1, H, W)`` in [0, 1]: how far matches, own or near on the same surface, decided the
-            depth; 0 where it is the one given.
-        field: ``(B, 1, h, w)`` on the grid of the matches, log of the factor on inverse depth.
-    """
-
-    depth_m: Tensor
-    support: Tensor
-    field: Tensor
-
-
-@dataclass(frozen=True)
-class _Observations:
+class _Observations(NamedTuple):
     """Matches against a map on their grid, ``(B, 1, h, w)`` each, and the links of that grid.
 
     Attributes:
@@ -89,16 +68,14 @@ class _Observations:
     links: tuple[Tensor, Tensor]
 
 
-def _observations(
-    depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: GuidanceConfig
-) -> _Observations:
+def _observations(depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig) -> _Observations:
     size = image_size(target.inverse_depth)
     guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
     log_depth = _log_depth(depth_m, size)
-    known, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
-    noise = ((step / known) ** 2 + config.match_noise**2).sqrt()
+    matched, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
+    noise = ((step / matched) ** 2 + config.match_noise**2).sqrt()
     weight = target.confidence * (config.match_noise / noise) ** 2
-    residual = torch.where(weight > 0, known.log() + log_depth, torch.zeros_like(known))
+    residual = torch.where(weight > 0, matched.log() + log_depth, torch.zeros_like(matched))
     right = (weight * target.confidence.clamp_max(1.0)).flatten(1).sum(1, keepdim=True)
     right_share = right / weight.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
     across, down = (_links(guide, log_depth, axis) for axis in (-1, -2))
@@ -122,8 +99,38 @@ def _times(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Te
     return smoothness * links[0], smoothness * links[1]
 
 
+def correction_target(
+    matches: Matches | None,
+    points: Matches | None,
+    kept: Tensor | None,
+    error: Tensor | None,
+    depth_m: Tensor,
+) -> Matches | None:
+    """What an estimate is fitted to: matches, but for reflections and those beside its edges, and points.
+
+    Args:
+        matches: of some samples, ``(B, 1, h, w)``; or ``None``.
+        points: on the same grid, or ``None``.
+        kept: ``(B, 1, h', w')`` in [0, 1], the share of each match's confidence that remains once reflections
+            are rejected; without it no match is used.
+        error: ``(B, 1, 1, 1)`` of the prior, or ``None`` before it is measured.
+        depth_m: ``(B, 1, H, W)`` metres, the estimate.
+
+    Returns:
+        On the grid of the matches; ``None`` where there are neither.
+    """
+    if matches is None or kept is None:
+        return None if points is None else with_points(None, points)
+    if image_size(kept) != matches.size:
+        kept = F.interpolate(kept, matches.size, mode="bilinear", align_corners=False)
+    matches = replace(matches, confidence=kept * matches.confidence)
+    if error is not None:
+        matches = off_edges(matches, depth_m, error)
+    return matches if points is None else with_points(matches, points)
+
+
 @torch.no_grad()
-def off_edges(target: MatchTarget, depth_m: Tensor, error: Tensor) -> MatchTarget:
+def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
     """Matches with less confidence near the depth edges of a map, as far as the map knows where they are.
 
     A window of the matching that lies across an edge takes the nearer surface's depth for both.
@@ -176,15 +183,15 @@ def _spread(residual: Tensor, observed: _Observations) -> Tensor:
     Matches that are expected to be wrong are taken for those with the largest residuals, and left out.
     """
     weight = observed.weight.flatten(1)
-    found = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.right_share) / DEVIATIONS
+    largest = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.right_share)
     noise = weighted_quantile(observed.noise.flatten(1), weight, 0.5)
-    beyond = (found**2 - noise**2 / 4.0).clamp_min(0.0).sqrt() * (weight.sum(1) > 0)
+    beyond = ((largest / DEVIATIONS) ** 2 - noise**2 / 4.0).clamp_min(0.0).sqrt() * (weight.sum(1) > 0)
     return beyond.view(-1, 1, 1, 1)
 
 
 @torch.no_grad()
 def prior_error(
-    depth_m: Tensor, target: MatchTarget, left_01: Tensor, config: GuidanceConfig = DEFAULT
+    depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig = DEFAULT
 ) -> Tensor:
     """How far a prior is wrong, in log depth, as far as its matches can tell.
 
@@ -220,11 +227,11 @@ def _bounded(error: Tensor) -> Tensor:
 @torch.no_grad()
 def refine_depth(
     depth_m: Tensor,
-    target: MatchTarget,
+    target: Matches,
     left_01: Tensor,
     error: Tensor,
     config: GuidanceConfig = DEFAULT,
-) -> Refined:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Least-squares correction of log depth that follows matches and stops at edges.
 
     Args:
@@ -236,11 +243,15 @@ def refine_depth(
         config: the fit's numbers; it solves a fixed number of times, so that no device is waited for.
 
     Returns:
-        ``Refined``. With ``u`` the log of the factor on inverse depth and ``r`` what each match asks of it,
-        less what earlier passes found, a pass is the minimiser of ``sum w (u - r)^2 + a sum g |grad u|^2 +
-        b sum u^2``: ``w`` is the confidence over the match's relative variance, robustly reweighted, and
-        ``g`` falls at edges of the image and of the given depth. Passes go from a broad ``a`` to the one of
-        the prior's error: what no match is near keeps what the broad passes say of its region.
+        The fitted depth ``(B, 1, H, W)`` metres; its support ``(B, 1, H, W)`` in [0, 1], how far matches, at
+        the pixel or near on the same surface, decided it (0 where it is the depth given); and the field ``(B,
+        1, h, w)`` on the grid of the matches, log of the factor on inverse depth.
+
+    With ``u`` that field and ``r`` what each match asks of it, less the result of earlier passes, a pass is
+    the minimiser of ``sum w (u - r)^2 + a sum g |grad u|^2 + b sum u^2``: ``w`` is the confidence over the
+    match's relative variance, robustly reweighted, and ``g`` falls at edges of the image and of the given
+    depth. Passes go from a broad ``a`` to the one of the prior's error: a pixel that no match is near keeps
+    what the broad passes say of its region.
     """
     observed = _observations(depth_m, target, left_01, config)
     broad = _stiff(observed, observed.weight, error, config)
@@ -249,36 +260,36 @@ def refine_depth(
     def robust(left_over: Tensor) -> Tensor:
         return trusted / (1.0 + (left_over / (CAUCHY * observed.noise)) ** 2)
 
-    found, weights = torch.zeros_like(observed.residual), trusted
-    decided = torch.zeros_like(found)
+    total, weights = torch.zeros_like(observed.residual), trusted
+    decided = torch.zeros_like(total)
     levels = _levels(error, config)
     for k, (smoothness, inertia) in enumerate(levels):
-        data = observed.residual - found
+        data = observed.residual - total
         if k == len(levels) - 1:  # a second right-hand side of ones shows where the correction is decided
             data = torch.cat([data, torch.ones_like(data)], 1)
         links = _times(observed.links, smoothness)
         part, weights = solve_robust(links, data, inertia, weights, robust, REWEIGHTINGS, SOLVER_STEPS)
-        found, decided = found + part[:, :1], part[:, 1:]
+        total, decided = total + part[:, :1], part[:, 1:]
     size = tuple(depth_m.shape[-2:])
     change, support = (
         F.interpolate(
             field, size, mode="bilinear", align_corners=False, antialias=size < tuple(field.shape[-2:])
         )
-        for field in (found, decided)
+        for field in (total, decided)
     )
     refined_m = depth_m.float() * torch.exp(-change)
-    return Refined(refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), found)
+    return refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), total
 
 
 def _levels(error: Tensor, config: GuidanceConfig) -> list[tuple[Tensor, Tensor]]:
     """Smoothness and inertia ``(B, 1, 1, 1)`` of every pass, from broad to the prior's own."""
     ratio = REFERENCE_ERROR / error
-    own = (config.smoothness * ratio**STIFFNESS_POWER).clamp(LOOSEST, STIFFEST)
-    broad = own.clamp_min(BROAD_SMOOTHNESS)
+    last = (config.smoothness * ratio**STIFFNESS_POWER).clamp(LOOSEST, STIFFEST)
+    broad = last.clamp_min(BROAD_SMOOTHNESS)
     inertia = (INERTIA * ratio**4).clamp_max(MOST_INERTIA)
     levels = []
     for k in range(PASSES):
         share = k / (PASSES - 1) if PASSES > 1 else 1.0
         least = BROAD_INERTIA ** (1.0 - share) * LEAST_INERTIA**share
-        levels.append((broad ** (1.0 - share) * own**share, inertia.clamp_min(least)))
+        levels.append((broad ** (1.0 - share) * last**share, inertia.clamp_min(least)))
     return levels

@@ -1,10 +1,8 @@
 """The arithmetic between a network's output, the clean latent and the noise, for every prediction type.
 
-Data flow: ``model_output, z_t`` at noise level ``(alpha, sigma)`` -> ``z0_hat, eps`` -> and back.
-Paper: Eq. 6 (eq:tweedie) and the Tweedie line of Algorithm 1.
-
-The paper's line divides by sqrt(alpha_bar), which is 0 at the first step of a zero-terminal-SNR
-schedule, and its sign fits a score, not a noise prediction; this is the schedulers' own arithmetic.
+The Tweedie line of Algorithm 1, Eq. 6 (eq:tweedie), divides by sqrt(alpha_bar), which is 0 at the first step
+of a zero-terminal-SNR schedule, and its sign fits a score, not a noise prediction; this is the schedulers'
+own arithmetic.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Prepare one left image and its further views for guidance: common grid, cost volume, matches, points.
+"""What the views and points say of one left image, once a call; and the views of a chunk of samples.
 
-Data flow: images, K's, T's, points as the user gave them -> ``Evidence`` (once a call) -> ``Views`` of a
-chunk.
-Paper: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
+Two grids: that of the losses, on which the loop works, and that of the sweep, which is finer for wide images.
+Source: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
 """
 
 from __future__ import annotations
@@ -14,10 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.objective import FurtherView, Views
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
-from geodiff_plugin.geometry.projection import plane_rays
+from geodiff_plugin.geometry.projection import PlaneRays, plane_rays
 from geodiff_plugin.matching import (
     CostVolume,
     Matches,
@@ -31,7 +29,15 @@ from geodiff_plugin.scale.order import SURE
 from geodiff_plugin.scale.points import sure_matches
 from geodiff_plugin.types import CameraView, PoseReport
 
-__all__ = ["Evidence", "EvidenceInputs", "as_fine_as", "chunk_views", "prepare_evidence", "resize_long_edge"]
+__all__ = [
+    "Evidence",
+    "EvidenceInputs",
+    "Views",
+    "as_fine_as",
+    "chunk_views",
+    "prepare_evidence",
+    "resize_long_edge",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +67,7 @@ class EvidenceInputs:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known before any diffusion step, on the grid of the losses.
+    """What the views and points say before any diffusion step, on the grid of the losses.
 
     Attributes:
         left_01: ``(3, H, W)`` in [0, 1].
@@ -73,7 +79,7 @@ class Evidence:
         sweep_matches: the same on the grid of the sweep, which is finer for wide images.
         points: depths that the user knows, in the form of matches, or ``None``.
         sweep_points: the same on the grid of ``sweep_matches``, where there are any.
-        sure: ``matches`` as points for the search, where enough are sure; else ``None``.
+        sure: ``matches`` as points for the search, where enough are confident; else ``None``.
         native: the further views as everything downstream sees them, at their native sizes.
         pose: how their poses fit; ``None`` where only points are known.
         warnings: sentences for the user.
@@ -115,7 +121,7 @@ def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tenso
 
 
 def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> Evidence:
-    """Bring all views and points to the loss grid and let them speak for themselves.
+    """Cost volume, matches and points of one image.
 
     Args:
         given: images, cameras, points and settings.
@@ -124,29 +130,27 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
     Raises:
         InputError: views that do not overlap; points of which none is in the image.
     """
-    left_01, views, K_left, points = given.left_01, given.views, given.K_left, given.points
-    config, needs_matches = given.config, given.needs_matches
+    left_01, views, K_left, config = given.left_01, tuple(given.views), given.K_left, given.config
     left, K_loss = resize_long_edge(left_01, K_left, config.loss_resolution)
-    size, size_loss = image_size(left_01), image_size(left)
-    volume, found, matches, known, sweep_known = None, None, None, None, None
+    size, loss_size = image_size(left_01), image_size(left)
+    volume, sweep_matches, matches, points, sweep_points = None, None, None, None, None
     warnings: list[str] = [] if pose is None else list(pose.warnings)
-    if views and (config.search == "volume" or needs_matches):
+    if views and (config.search == "volume" or given.needs_matches):
         # The sweep chooses its own grid, finer than that of the losses for wide images.
         volume = build_cost_volume(left_01, views, K_left, depth_range=config.depth_range, config=config)
-        if needs_matches:
-            found = find_matches(left_01, views, K_left, volume=volume)
-            matches = _on_grid(found, left, K_loss)
-        inverse = mirrored_pose_preferred(left_01, views, K_left, found)
-        if inverse:
+        if given.needs_matches:
+            sweep_matches = find_matches(left_01, views, K_left, volume=volume)
+            matches = _on_grid(sweep_matches, loss_size)
+        if mirrored_pose_preferred(left_01, views, K_left, sweep_matches):
             warnings.append(INVERSE)
-    if points is not None:
-        known, left_out = points_to_matches(points, K_left, size, K_loss, size_loss)
-        K_grid, size_grid = (K_loss, size_loss) if found is None else (found.K, found.size)
-        sweep_known, _ = points_to_matches(points, K_left, size, K_grid, size_grid)
+    if given.points is not None:
+        points, left_out = points_to_matches(given.points, K_left, size, loss_size)
+        sweep_size = loss_size if sweep_matches is None else sweep_matches.size
+        sweep_points, _ = points_to_matches(given.points, K_left, size, sweep_size)
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
     sure = None if matches is None else sure_matches(matches)
-    _read_back_once(volume, [one for one in (matches, known, sure) if one is not None])
+    _read_back_once(volume, (matches, points, sure))
     return Evidence(
         left,
         left_01,
@@ -154,36 +158,36 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
         tuple(CameraView(*as_fine_as(v.image_01, v.K, K_loss), v.T_right_from_left) for v in views),
         volume,
         matches,
-        found,
-        known,
-        sweep_known,
+        sweep_matches,
+        points,
+        sweep_points,
         sure,
-        tuple(views),
+        views,
         pose,
         tuple(dict.fromkeys(warnings)),  # the same mistake may show in two ways
     )
 
 
-def _read_back_once(volume: CostVolume | None, known: Sequence[Matches]) -> None:
+def _read_back_once(volume: CostVolume | None, targets: Sequence[Matches | None]) -> None:
     """Ask now for what only the device knows and these objects keep, so that no step waits for it."""
     if volume is not None:
         _ = volume.reach_m, volume.rectified
-    for one in known:
-        _ = one.above(0.0), one.above(SURE)
+    for target in targets:
+        if target is not None:
+            _ = target.above(0.0), target.above(SURE)
 
 
 def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
     """A right image, ``(3, H, W)``, at no more pixels per radian than the left one, and the K of it.
 
-    So that neither aliases in the other.
+    Neither then aliases in the other.
     """
     ratio = float(K_left[0, 0] / K_right[0, 0])
     return resize_long_edge(right_01, K_right, round(max(right_01.shape[-2:]) * min(1.0, ratio)))
 
 
-def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
-    """Matches of the sweep's grid on that of the losses."""
-    size = image_size(left_01)
+def _on_grid(matches: Matches, size: tuple[int, int]) -> Matches:
+    """Matches of the sweep's grid on another one."""
     if matches.size == size:
         return matches
     # Nearest centre: a mean of two inverse depths across an edge is the depth of neither surface.
@@ -191,36 +195,56 @@ def _on_grid(matches: Matches, left_01: Tensor, K_left: Tensor) -> Matches:
         F.interpolate(m[None], size, mode="nearest-exact")[0]
         for m in (matches.inverse_depth, matches.confidence)
     )
-    return Matches(inverse_depth, confidence, matches.plane_step, K_left, size)
+    return Matches(inverse_depth, confidence, matches.plane_step)
 
 
-def chunk_views(evidence: Sequence[Evidence], owners: Sequence[int]) -> Views:
+@dataclass(frozen=True)
+class Views:
+    """What the cameras saw of every sample of a chunk, on the grid where losses are computed.
+
+    Attributes:
+        left_01: ``(B, 3, H, W)`` in [0, 1].
+        K_left: ``(B, 3, 3)`` pixels of ``left_01``.
+        further: the further views with a batch axis on each of their tensors, as many for every sample; none
+            where only points are known.
+        rays: each of these cameras and the left one as one affine map per left pixel, made once a chunk.
+    """
+
+    left_01: Tensor
+    K_left: Tensor
+    further: tuple[CameraView, ...]
+    rays: tuple[PlaneRays, ...]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(H, W)`` of the loss grid."""
+        return image_size(self.left_01)
+
+
+def chunk_views(evidence: Sequence[Evidence]) -> Views:
     """Stack the views of a chunk of samples.
 
     Args:
-        evidence: one entry per image.
-        owners: for every sample of the chunk the image that it belongs to.
+        evidence: one entry per sample.
 
     Returns:
-        Views with ``B = len(owners)``. Further images of different sizes are brought to the largest one,
+        Views with ``B = len(evidence)``. Further images of different sizes are brought to the largest one,
         their K with them. An image with fewer views than another repeats its first: the terms take the best
         view of each pixel, which a repetition does not change.
     """
-    own = [evidence[i] for i in owners]
-    left = torch.stack([e.left_01 for e in own])
-    K_left = torch.stack([e.K_left for e in own])
-    most = max(len(e.views) for e in own)
+    left = torch.stack([image.left_01 for image in evidence])
+    K_left = torch.stack([image.K_left for image in evidence])
+    count = max(len(image.views) for image in evidence)
     further = tuple(
-        _stack([e.views[v if v < len(e.views) else 0] for e in own], K_left, image_size(left))
-        for v in range(most)
+        _stack([image.views[v if v < len(image.views) else 0] for image in evidence]) for v in range(count)
     )
-    return Views(left, K_left, further)
+    rays = tuple(plane_rays(K_left, K, T, image_size(left)) for _, K, T in further)
+    return Views(left, K_left, further, rays)
 
 
-def _stack(views: Sequence[CameraView], K_left: Tensor, size_left: tuple[int, int]) -> FurtherView:
+def _stack(views: Sequence[CameraView]) -> CameraView:
     """One further view of every sample; smaller images are brought to the largest one, their K with them."""
-    height = max(view.image_01.shape[-2] for view in views)
-    width = max(view.image_01.shape[-1] for view in views)
+    height, width = (max(view.image_01.shape[axis] for view in views) for axis in (-2, -1))
     images, Ks = [], []
     for image, K, _ in views:
         size = image_size(image)
@@ -229,5 +253,6 @@ def _stack(views: Sequence[CameraView], K_left: Tensor, size_left: tuple[int, in
             K = resize_intrinsics(K[None], size, (height, width))[0]
         images.append(image)
         Ks.append(K)
-    K, T = torch.stack(Ks), torch.stack([view.T_right_from_left for view in views])
-    return FurtherView(torch.stack(images), K, T, plane_rays(K_left, K, T, size_left))
+    return CameraView(
+        torch.stack(images), torch.stack(Ks), torch.stack([view.T_right_from_left for view in views])
+    )

@@ -1,71 +1,28 @@
-"""From a relative map to one loss per sample.
+"""From a relative map to one loss per sample: metric depth on the loss grid, warped views, weighted terms.
 
-Data flow: ``x (B, 1, h, w)`` -> metric depth on the loss grid -> warp -> terms -> ``loss (B,)``.
-Paper: Eq. 14 (eq:geo-loss) with Eq. 16 and 17.
+Source: Eq. 14 (eq:geo-loss) with Eq. 16 and 17.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.terms import TERMS, Estimate, MatchTarget
+from geodiff_plugin.algorithm.evidence import Views
+from geodiff_plugin.algorithm.terms import TERMS, Compared
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry.cameras import image_size
-from geodiff_plugin.geometry.projection import PlaneRays
 from geodiff_plugin.geometry.warping import hidden_in_right, warp_right_to_left
+from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState, MetricMap
 
-__all__ = ["Loss", "Objective", "FurtherView", "Views"]
+__all__ = ["Loss", "Objective"]
 
 
-@dataclass(frozen=True)
-class FurtherView:
-    """One further view of every sample of a chunk.
-
-    Attributes:
-        image_01: ``(B, 3, Hr, Wr)`` in [0, 1].
-        K: ``(B, 3, 3)`` pixels of ``image_01``.
-        T_right_from_left: ``(B, 4, 4)`` metres.
-        rays: these cameras and the left one as one affine map per left pixel, made once a chunk.
-    """
-
-    image_01: Tensor
-    K: Tensor
-    T_right_from_left: Tensor
-    rays: PlaneRays
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """``(Hr, Wr)``."""
-        return image_size(self.image_01)
-
-
-@dataclass(frozen=True)
-class Views:
-    """What the cameras saw of every sample of a chunk, on the grid where losses are computed.
-
-    Attributes:
-        left_01: ``(B, 3, H, W)`` in [0, 1].
-        K_left: ``(B, 3, 3)`` pixels of ``left_01``.
-        further: the further views, as many for every sample; none where only points are known.
-    """
-
-    left_01: Tensor
-    K_left: Tensor
-    further: tuple[FurtherView, ...]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """``(H, W)`` of the loss grid."""
-        return image_size(self.left_01)
-
-
-@dataclass(frozen=True)
-class Loss:
+class Loss(NamedTuple):
     """One evaluation: ``total (B,)`` with its graph, the unweighted ``terms``, the share in view ``(B,)``.
 
     A pixel is in view where any further camera has it in its picture.
@@ -76,21 +33,20 @@ class Loss:
     visible_fraction: Tensor
 
 
-@dataclass(frozen=True)
 class Objective:
     """The weighted sum of guidance terms for one chunk of samples.
 
-    Attributes:
+    Args:
         views: what the cameras saw.
         metric: the prior's metric parametrisation.
-        config: weights by name of ``TERMS``, a term of weight 0 is not computed; what the terms ask for by
-            name; and ``min_visible``, the share in view below which a sample's photometric term is switched
-            off: a depth that pushes the scene out of the right image leaves nothing to compare and would win.
+        config: weights by name of ``TERMS``, of which one of weight 0 is not computed; the options of the
+        terms;
+            and ``min_visible``, the share in view below which a sample's photometric term is switched off: a
+            depth that pushes the scene out of the right image leaves nothing to compare and would win.
     """
 
-    views: Views
-    metric: MetricMap
-    config: GuidanceConfig
+    def __init__(self, views: Views, metric: MetricMap, config: GuidanceConfig) -> None:
+        self.views, self.metric, self.config = views, metric, config
 
     def metric_depth(self, x: Tensor, affine: AffineState) -> Tensor:
         """``x (B, 1, h, w)`` upsampled to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""
@@ -106,8 +62,8 @@ class Objective:
         affine_start: AffineState,
         z0: Tensor,
         z0_prior: Tensor,
-        matches: MatchTarget | None,
-        points: MatchTarget | None = None,
+        matches: Matches | None,
+        points: Matches | None = None,
         hidden: Tensor | None = None,
     ) -> Loss:
         """Loss of one estimate; differentiable in ``x``, ``z0`` and the affine state.
@@ -136,19 +92,16 @@ class Objective:
         needs_warp = any(TERMS[name].needs_warp for name in active)
         with torch.set_grad_enabled(torch.is_grad_enabled() and needs_warp):
             warped_01, in_view = self._warp(depth_m)
-        left_01 = self.views.left_01
         visible = in_view if hidden is None else in_view & ~hidden
-        estimate = Estimate(
-            depth_m, left_01, warped_01, visible, affine, affine_start, z0, z0_prior, matches, points
+        compared = Compared(
+            *(depth_m, self.views.left_01, warped_01, visible),
+            *(affine, affine_start, z0, z0_prior, matches, points),
         )
         visible_fraction = in_view.any(1).float().flatten(1).mean(1)
-        total = torch.zeros_like(visible_fraction)
-        values = {}
+        total, values = torch.zeros_like(visible_fraction), {}
         for name, weight in active.items():
             term = TERMS[name]
-            value = term.function(
-                estimate, **{option: getattr(self.config, option) for option in term.options}
-            )
+            value = term.function(compared, **{o: getattr(self.config, o) for o in term.options})
             if term.needs_warp:
                 value = value * (visible_fraction >= self.config.min_visible)
             values[name] = value
@@ -160,8 +113,8 @@ class Objective:
         depth_m, v = self.metric_depth(x, affine), self.views
         return torch.stack(
             [
-                hidden_in_right(depth_m, v.K_left, r.K, r.T_right_from_left, r.size, rays=r.rays)
-                for r in v.further
+                hidden_in_right(depth_m, v.K_left, K, T, image_size(image), rays=rays)
+                for (image, K, T), rays in zip(v.further, v.rays, strict=True)
             ],
             1,
         )
@@ -170,8 +123,8 @@ class Objective:
         """Every further image seen from the left ``(B, V, 3, H, W)``, and where its camera has it in view."""
         v = self.views
         warps = [
-            warp_right_to_left(r.image_01, depth_m, v.K_left, r.K, r.T_right_from_left, rays=r.rays)
-            for r in v.further
+            warp_right_to_left(image, depth_m, v.K_left, K, T, rays=rays)
+            for (image, K, T), rays in zip(v.further, v.rays, strict=True)
         ]
         if not warps:
             nothing = v.left_01[:, None][:, :0]

@@ -1,11 +1,9 @@
 """Depth edges made steep: pixels that hang in the air between two surfaces are given to one of them.
 
-Data flow: metric depth, left image, spacing of the prior's pixels -> metric depth.
-Paper: none. A weighted median at depth discontinuities, after Ma et al., Constant Time Weighted Median
-Filtering for Stereo Matching and Beyond, ICCV 2013.
-
 An autoencoder blurs the edges of its maps over a pixel or two of its own grid, and enlargement to the image's
 size makes these ramps wider. A correction that is smooth on both sides of an edge cannot undo that.
+Source: a weighted median at depth discontinuities, after Ma et al., Constant Time Weighted Median Filtering
+for Stereo Matching and Beyond, ICCV 2013.
 """
 
 from __future__ import annotations

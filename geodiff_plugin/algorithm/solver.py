@@ -1,8 +1,7 @@
 """Weighted least squares of a smooth field on an image grid, coarse to fine.
 
-Data flow: what each pixel asks for, its weight, links between neighbours -> the field.
-Paper: none; a screened Poisson equation, solved by conjugate gradients on a pyramid (cascadic multigrid,
-Bornemann and Deuflhard 1996).
+A screened Poisson equation, solved by conjugate gradients on a pyramid (cascadic multigrid, Bornemann and
+Deuflhard 1996).
 """
 
 from __future__ import annotations

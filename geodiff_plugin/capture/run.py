@@ -199,7 +199,7 @@ def frame_report(
         "scale_spread": None if math.isnan(spread) else round(spread, 4),
         "depth": {"p02": low, "median": middle, "p98": high},
         "poses": [pose.status for pose in output.poses],
-        "trusted": [bool(judgement.trusted) for judgement in output.judgements],
+        "trusted": [bool(verdict.trusted) for verdict in output.verdicts],
         "warnings": list(output.warnings),
     }
 

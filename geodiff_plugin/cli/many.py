@@ -40,8 +40,8 @@ from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.options import flag_of
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner
-from geodiff_plugin.runtime.guided_call import native_images
 from geodiff_plugin.runtime.machine import pick_device
+from geodiff_plugin.runtime.pipeline import native_images
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["JOURNAL", "Stages", "finished_row", "run_many"]

@@ -13,6 +13,7 @@ from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.machine import versions
+from geodiff_plugin.runtime.verdict import Verdict
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["build_report", "depth_summary", "single_map", "summary_line", "used_poses"]
@@ -130,7 +131,7 @@ def build_report(
         )
     report = {
         "depth": depth_summary(depth_m, visible),
-        "judgement": asdict(output.judgements[0]),
+        "judgement": _judgement(output.verdicts[0]),
         "photometric_error_mean": error_mean,
         "uncertainty_median_m": None
         if output.uncertainty is None
@@ -172,6 +173,12 @@ def build_report(
         "versions": versions(),
     }
     return _plain(report)
+
+
+def _judgement(verdict: Verdict) -> dict[str, Any]:
+    """JSON values of a verdict; the file has its indicators under ``signs``."""
+    values = asdict(verdict)
+    return values | {"signs": values.pop("indicators")}
 
 
 def _quality(judgement: dict[str, Any]) -> str:

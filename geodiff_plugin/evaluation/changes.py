@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from geodiff_plugin.algorithm.rules import RULES
+from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.config import DEFAULT, value_of
 from geodiff_plugin.evaluation.cells import by_method, cell, count_of_pairs, interval_cell, label_of
 from geodiff_plugin.evaluation.layout import Table

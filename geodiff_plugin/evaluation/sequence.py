@@ -25,8 +25,8 @@ from geodiff_plugin.evaluation.records import append_record, clean_records, read
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.guidance.evidence_store import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.runtime.guided_call import native_images
 from geodiff_plugin.runtime.machine import pick_device
+from geodiff_plugin.runtime.pipeline import native_images
 
 __all__ = ["SEQUENCES", "WAYS", "SequenceOptions", "Way", "flicker", "run_sequence", "sequence_table"]
 

@@ -1,6 +1,6 @@
 """How often a wrong calibration is detected, and a right one is not trusted: ``geodiff eval trust``.
 
-Data flow: pairs, right and made wrong -> guided calls -> signs -> judgements -> one table.
+Data flow: pairs, right and made wrong -> guided calls -> indicators -> verdicts -> one table.
 Paper: none.
 
 The folder keeps the signs of every call, so that other thresholds need no new calls.
@@ -37,8 +37,7 @@ from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, Case, case_kinds, cases_of
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.runtime.judgement import judge
-from geodiff_plugin.runtime.signs import Signs
+from geodiff_plugin.runtime.verdict import Indicators, judge
 
 __all__ = ["TEN", "TrustOptions", "run_trust"]
 
@@ -98,24 +97,24 @@ def _measure(case: Case, pipe: Any, settings: Settings) -> dict[str, Any]:
         except InputError as error:
             return {"status": "refused", "said": [str(error)], "off": None}
         said += [str(warning.message) for warning in caught if warning.category is UserWarning]
-    judgement, depth_m = out.judgements[0], out.prediction[0, ..., 0]
-    of_judgement = {judgement.sentence, *judgement.remarks}
-    said += [sentence for sentence in out.warnings if sentence not in of_judgement]
+    verdict, depth_m = out.verdicts[0], out.prediction[0, ..., 0]
+    of_verdict = {verdict.sentence, *verdict.remarks}
+    said += [sentence for sentence in out.warnings if sentence not in of_verdict]
     off = None
     if case.truth:
         off = float(np.median(np.abs(depth_m[sample.valid] / sample.depth_m[sample.valid] - 1.0)))
-    signs = {name: None if value != value else value for name, value in asdict(judgement.signs).items()}
+    signs = {name: None if value != value else value for name, value in asdict(verdict.indicators).items()}
     return {"status": "finished", "said": said, "off": off, "signs": signs}
 
 
 def _judged(record: dict[str, Any]) -> dict[str, Any]:
-    """The record with what today's judgement makes of its signs."""
+    """The record with what today's verdict makes of its signs."""
     if record["status"] == "refused":
         return record
     signs = {name: math.nan if value is None else value for name, value in record["signs"].items()}
-    judgement = judge(Signs(**signs | {"mistakes": tuple(signs["mistakes"])}))
-    status = "trusted" if judgement.trusted else "not trusted"
-    return record | {"status": status, "said": [*record["said"], *judgement.reasons, *judgement.remarks]}
+    verdict = judge(Indicators(**signs | {"mistakes": tuple(signs["mistakes"])}))
+    status = "trusted" if verdict.trusted else "not trusted"
+    return record | {"status": status, "said": [*record["said"], *verdict.reasons, *verdict.remarks]}
 
 
 def _refs(options: TrustOptions) -> dict[str, list[SampleRef]]:

@@ -7,7 +7,7 @@ Paper: none.
 from __future__ import annotations
 
 from geodiff_plugin._checks import bad_value, check_choice, refuse
-from geodiff_plugin.algorithm.rules import RULES
+from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.config import GuidanceConfig, UpdatePlan
 

@@ -8,14 +8,13 @@ from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.build import build_cost_volume, find_matches, mirrored_pose_preferred
 from geodiff_plugin.matching.cleaning import clean
 from geodiff_plugin.matching.consistency import match_volume
-from geodiff_plugin.matching.matches import Matches, MatchTarget
+from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.points import points_to_matches, with_points
 from geodiff_plugin.matching.reflections import reject_reflections
 from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
 
 __all__ = [
     "CostVolume",
-    "MatchTarget",
     "Matches",
     "aggregate",
     "build_cost_volume",

@@ -188,4 +188,4 @@ def match_volume(volume: CostVolume) -> Matches:
     confidence = torch.zeros_like(inverse_depth)
     for evidence, difference in views:
         confidence = torch.maximum(confidence, _confidence(evidence, difference, contrast))
-    return Matches(inverse_depth[None], confidence[None], volume.plane_step, volume.K, volume.size)
+    return Matches(inverse_depth[None], confidence[None], volume.plane_step)

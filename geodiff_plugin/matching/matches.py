@@ -1,55 +1,53 @@
-"""``Matches``: inverse depth and confidence per pixel.
-
-Data flow: ``match_volume`` -> ``Matches`` of one image -> ``MatchTarget`` of a chunk of samples.
-Paper: none; the evidence that a photometric loss does not have.
-"""
+"""``Matches``: inverse depth and confidence per pixel, of matches between the views or of known points."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Self
 
 import torch
 
-__all__ = ["MatchTarget", "Matches"]
+__all__ = ["Matches"]
 
 
 @dataclass(frozen=True)
-class MatchTarget:
-    """Matches between the views, or known points, on one grid of the left view.
+class Matches:
+    """Matches between the views, or known points, on one grid of the left view; of one image or of a chunk.
 
     Attributes:
-        inverse_depth: ``(B, 1, H, W)`` 1/m, ``(1, H, W)`` of one image; to be read where ``confidence > 0``.
-        confidence: of the same shape, in [0, 1]; 0 where nothing is known.
-        plane_step: ``(B,)`` 1/m, ``()`` of one image, the unit of the residual: between two planes of the
+        inverse_depth: ``(1, H, W)`` float32, 1/m, of one image, or ``(B, 1, H, W)``; defined everywhere, to
+        be
+            read where ``confidence > 0``.
+        confidence: of the same shape, in [0, 1]; 0 where nothing is matched or known.
+        plane_step: ``()`` or ``(B,)`` 1/m, the unit in which errors are measured: between two planes of the
             sweep, or ``matching.points.UNIT`` of the points' median inverse depth.
     """
 
     inverse_depth: torch.Tensor
     confidence: torch.Tensor
     plane_step: torch.Tensor
-
-
-@dataclass(frozen=True)
-class Matches(MatchTarget):
-    """What the views alone say about the depth of one image, with its grid.
-
-    Attributes:
-        inverse_depth: ``(1, H, W)`` float32, 1/m; defined everywhere, to be read where ``confidence > 0``.
-        confidence: ``(1, H, W)`` float32 in [0, 1].
-        plane_step: ``()`` float32, 1/m, the unit in which errors of matches are measured.
-        K: ``(3, 3)`` pixels of this grid.
-        size: ``(H, W)``.
-    """
-
-    K: torch.Tensor
-    size: tuple[int, int]
     _above: dict[float, torch.Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    def above(self, confidence: float) -> torch.Tensor:
-        """``(P,)`` flat indices of the pixels that are believed more than that.
+    @classmethod
+    def stack(cls, images: Sequence[Self | None]) -> Self | None:
+        """Matches of several images as a chunk, all on grids of one size; ``None`` if some image has none."""
+        given = [matches for matches in images if matches is not None]
+        if len(given) < len(images):
+            return None
+        names = ("inverse_depth", "confidence", "plane_step")
+        return cls(*(torch.stack([getattr(matches, name) for matches in given]) for name in names))
 
-        To count them is to wait for the device, so it is done once; ``prepare_evidence`` does it for all that
-        the loop asks for.
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(H, W)`` of the grid."""
+        return self.confidence.shape[-2], self.confidence.shape[-1]
+
+    def above(self, confidence: float) -> torch.Tensor:
+        """``(P,)`` flat indices of the pixels of one image with more confidence than that.
+
+        Counting them waits for the device, so it is done once; ``prepare_evidence`` does it for every
+        threshold that the loop asks for.
         """
         if confidence not in self._above:
             self._above[confidence] = (self.confidence.flatten() > confidence).nonzero()[:, 0]

@@ -7,27 +7,23 @@ Paper: none; what Marigold-DC (Viola et al. 2024) completes.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
 
 import torch
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import NEAREST_M, project
-from geodiff_plugin.matching.matches import Matches, MatchTarget
+from geodiff_plugin.matching.matches import Matches
 
 __all__ = ["UNIT", "points_to_matches", "with_points"]
 
 #: The unit in which errors at points are measured, as a share of their median inverse depth.
 UNIT = 0.01
 
-Target = TypeVar("Target", bound=MatchTarget)
-
 
 def points_to_matches(
     points: torch.Tensor,
     K_left: torch.Tensor,
     size: tuple[int, int],
-    K_grid: torch.Tensor,
     size_grid: tuple[int, int],
 ) -> tuple[Matches, int]:
     """Put known depths on a grid of the left view; where several fall on one pixel, the nearest wins.
@@ -37,7 +33,6 @@ def points_to_matches(
             ``(H, W)`` of ``size``, metres, 0 where unknown.
         K_left: ``(3, 3)`` pixels of the left image.
         size: ``(H, W)`` of the left image.
-        K_grid: ``(3, 3)`` pixels of the grid.
         size_grid: ``(h, w)`` of the grid.
 
     Returns:
@@ -74,10 +69,10 @@ def points_to_matches(
     nearest = z.new_zeros(height * width).scatter_reduce_(0, at, 1.0 / z[inside], "amax")
     inverse_depth = nearest.view(1, height, width)
     unit = UNIT * nearest[nearest > 0].median()
-    return Matches(inverse_depth, (inverse_depth > 0).float(), unit, K_grid, size_grid), left_out
+    return Matches(inverse_depth, (inverse_depth > 0).float(), unit), left_out
 
 
-def with_points(matches: Target | None, points: Target) -> Target:
+def with_points(matches: Matches | None, points: Matches) -> Matches:
     """Matches with known points in their place: what the refinement follows.
 
     Args:
@@ -89,13 +84,13 @@ def with_points(matches: Target | None, points: Target) -> Target:
         that it stands for: few points then decide as much as many, and one that a poor prior contradicts is
         not taken for an outlier, as a match would be.
     """
-    known = points.confidence > 0
-    share = known.float().mean((-2, -1), keepdim=True)
-    confidence = points.confidence / share.clamp_min(1.0 / known[0].numel())
+    given = points.confidence > 0
+    share = given.float().mean((-2, -1), keepdim=True)
+    confidence = points.confidence / share.clamp_min(1.0 / given[0].numel())
     if matches is None:
         return replace(points, confidence=confidence)
     return replace(
         matches,
-        inverse_depth=torch.where(known, points.inverse_depth, matches.inverse_depth),
-        confidence=torch.where(known, confidence, matches.confidence),
+        inverse_depth=torch.where(given, points.inverse_depth, matches.inverse_depth),
+        confidence=torch.where(given, confidence, matches.confidence),
     )

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.matching.matches import MatchTarget
+from geodiff_plugin.matching.matches import Matches
 
 __all__ = ["reject_reflections"]
 
@@ -28,7 +28,7 @@ LARGEST = 1.5
 
 
 @torch.no_grad()
-def reject_reflections(matches: MatchTarget, depth_m: Tensor) -> Tensor:
+def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     """What remains of each match, given the depth that the prior saw before any match moved it.
 
     One-sided: a reflection and what is seen through glass lie behind the surface, never before it. A prior

@@ -1,18 +1,22 @@
-"""Confidence: the probability that a pixel's depth is within 10 % of the truth.
+"""Confidence: the probability that a pixel's depth is within 10 % of the truth; photometric error.
 
-Data flow: support by matches, photometric error, error of the prior, spread of an ensemble
-    -> confidence in [0, 1].
-Paper: none; it names wrong depth where views say nothing as a limit (Limitations).
+The error is that of Eq. 14's re-rendered left image, as a report per pixel at the output's resolution.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
+from geodiff_plugin.algorithm.evidence import as_fine_as
+from geodiff_plugin.algorithm.photometric import match_exposure
 from geodiff_plugin.formats.depth import row_strips
+from geodiff_plugin.geometry.warping import warp_right_to_left
+from geodiff_plugin.types import CameraView
 
-__all__ = ["BY_EVIDENCE", "RIGHT_WITHIN", "SIGNS", "depth_confidence", "depth_evidence"]
+__all__ = ["BY_EVIDENCE", "RIGHT_WITHIN", "SIGNS", "depth_confidence", "depth_evidence", "reprojection"]
 
 #: What confidence is the probability of: a relative error below this.
 RIGHT_WITHIN = 0.1
@@ -41,12 +45,7 @@ def depth_evidence(
 ) -> Tensor:
     """What the log-odds of ``depth_confidence`` are linear in.
 
-    Args:
-        support: as for ``depth_confidence``.
-        error: likewise.
-        visible: likewise.
-        spread: likewise.
-        prior_error: likewise.
+    Args are those of ``depth_confidence``.
 
     Returns:
         ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. The measured error of the prior
@@ -59,12 +58,12 @@ def depth_evidence(
     agreement = -(error.clamp(_LEAST_ERROR, _MOST_ERROR) / _MOST_ERROR).log()
     measured = support.new_tensor(_USELESS) if prior_error is None else prior_error.clamp(_BEST, _USELESS)
     share = support / (support + _HALF_KNOWN)
-    own = measured**share * _USELESS ** (1.0 - share)
-    left = (1.0 - support) * own
+    left_to_prior = measured**share * _USELESS ** (1.0 - share)
+    left = (1.0 - support) * left_to_prior
     evidence = [
         torch.ones_like(support),
         -(left.clamp(_LEAST_LEFT, _MOST_LEFT) / _MOST_LEFT).log(),
-        -(own.clamp(_STRONG, _WEAK) / _WEAK).log(),
+        -(left_to_prior.clamp(_STRONG, _WEAK) / _WEAK).log(),
         torch.where(visible, agreement, torch.zeros_like(agreement)),
         torch.zeros_like(support) if spread is None else spread,
     ]
@@ -90,7 +89,56 @@ def depth_confidence(
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
     for rows in row_strips(*support.shape[-2:]):  # evidence is five times as large as what it says
-        own, at, seen = (part[:, :, rows] for part in (support, error, visible))
-        evidence = depth_evidence(own, at, seen, None if spread is None else spread[:, :, rows], prior_error)
+        maps = (part[:, :, rows] for part in (support, error, visible))
+        evidence = depth_evidence(*maps, None if spread is None else spread[:, :, rows], prior_error)
         confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
     return confidence
+
+
+def reprojection(
+    views: Sequence[CameraView], depth_m: Tensor, left_01: Tensor, K_left: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Where any right view sees the pixel, and the least mean absolute error to the re-rendered left image.
+
+    The error is that of the view that explains the pixel best, compared in the left image's exposure.
+
+    Args:
+        views: the right views of one image, native.
+        depth_m: ``(1, 1, H, W)`` metres.
+        left_01: ``(1, 3, H, W)`` in [0, 1].
+        K_left: ``(1, 3, 3)`` pixels of that grid.
+
+    Returns:
+        ``(1, 1, H, W)`` bool and float in [0, 1], 0 where no view sees the pixel.
+    """
+    best, visible = torch.full_like(depth_m, torch.inf), torch.zeros_like(depth_m, dtype=torch.bool)
+    for image, K_right, T in views:
+        image, K_right = as_fine_as(image, K_right, K_left[0])
+        warped, seen = _warped(image[None], depth_m, K_left, K_right[None], T[None])
+        error = torch.zeros_like(depth_m)
+        for channel in range(left_01.shape[1]):  # one by one: at this size a copy of all three counts
+            layer = slice(channel, channel + 1)
+            matched = match_exposure(warped[:, layer], left_01[:, layer], seen)
+            error += matched.sub_(left_01[:, layer]).abs_()
+        error /= left_01.shape[1]
+        best = torch.where(seen, torch.minimum(best, error), best)
+        visible |= seen
+    return visible, best.where(visible, torch.zeros_like(best))
+
+
+def _warped(
+    right_01: Tensor, depth_m: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The right image on the left grid and where it is visible, a strip of rows at a time.
+
+    Rays and places to sample at take ten times the memory of the image that comes of them.
+    """
+    height, width = depth_m.shape[-2:]
+    warped = right_01.new_empty((1, right_01.shape[1], height, width))
+    visible = torch.empty_like(depth_m, dtype=torch.bool)
+    for rows in row_strips(height, width):
+        K_strip = K_left.clone()
+        K_strip[:, 1, 2] -= rows.start
+        part = warp_right_to_left(right_01, depth_m[:, :, rows], K_strip, K_right, T_right_from_left)
+        warped[:, :, rows], visible[:, :, rows] = part.image, part.visible
+    return warped, visible

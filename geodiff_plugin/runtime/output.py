@@ -1,8 +1,4 @@
-"""Assembles ``MetricDepthOutput`` on the grid of the output.
-
-Data flow: stock output in metres + ``GuidedRun`` -> ``MetricDepthOutput``.
-Paper: Eq. 14's re-rendered left image, as a per-pixel report.
-"""
+"""``MetricDepthOutput`` of a finished call: all on the grid of the output, with a verdict."""
 
 from __future__ import annotations
 
@@ -21,13 +17,10 @@ from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.scale import NO_UNIT
-from geodiff_plugin.runtime.confidence import depth_confidence
-from geodiff_plugin.runtime.ensembling import median
-from geodiff_plugin.runtime.judgement import Judgement, agreement_of_points, judge
-from geodiff_plugin.runtime.refinement import refine_result, spread_of_members
-from geodiff_plugin.runtime.reprojection import reprojection
+from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
+from geodiff_plugin.runtime.finish import finish_images, median, spread_of_members
 from geodiff_plugin.runtime.run import GuidedRun
-from geodiff_plugin.runtime.signs import read_signs
+from geodiff_plugin.runtime.verdict import Verdict, judge, points_agreement, read_indicators
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["assemble_output"]
@@ -52,29 +45,21 @@ def assemble_output(
         guidance: what was configured.
         call: arguments of the stock call by name.
     """
-    lefts_01 = _as_compared(run)
+    lefts_01 = _native_lefts(run)
     count, size = lefts_01.shape[0], image_size(lefts_01)
     depth_m = run.within_range(_as_maps(stock.prediction).to(lefts_01.device))  # or the processing grid
-    known_of = [run.known(i) for i in range(count)]
     grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
-    depth_m, support = refine_result(run, known_of, depth_m, lefts_01, lefts)
+    depth_m, support = finish_images(run, depth_m, lefts)
     uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
     if uncertainty is not None and support is not None:
-        uncertainty = spread_of_members(run, depth_m, lefts_01, lefts, call)
+        uncertainty = spread_of_members(run, depth_m, lefts, call)
     K_lefts = torch.stack(
-        [torch.as_tensor(own.K_left, dtype=torch.float32, device=depth_m.device) for own in guidance.inputs]
+        [torch.as_tensor(i.K_left, dtype=torch.float32, device=depth_m.device) for i in guidance.inputs]
     )
     K = resize_intrinsics(K_lefts, size, grid)
-    seen = [
-        reprojection(own.native, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1])
-        for i, own in enumerate(run.evidence)
-        if own.native
-    ]
-    visible = torch.cat([where for where, _ in seen]) if seen else None
-    error = torch.cat([difference for _, difference in seen]) if seen else None
-    errors = [own.error for own in known_of if own.error is not None]
-    prior_error = torch.cat(errors) if len(errors) == count else None  # (N, 1, 1, 1)
+    visible, error = _reprojected(run, depth_m, lefts, K)
+    prior_error = run.prior_error()  # (N, 1, 1, 1)
     confidence = None
     if support is not None:
         spread = None if uncertainty is None else uncertainty / depth_m
@@ -85,20 +70,17 @@ def assemble_output(
     own_ratios = [math.nan] * count
     if over_own is not None and guidance.unit is not None:
         own_ratios = over_own.reshape(count, -1).median(1).values.tolist()
-    judgements = [
-        _judged(run, i, lefts_01[i], K_lefts[i], confidence, own_ratios[i], guidance) for i in range(count)
-    ]
+    verdicts = [_verdict(run, i, K_lefts[i], confidence, own_ratios[i], guidance) for i in range(count)]
     if confidence is not None:
-        agreed = confidence.new_tensor([agreement_of_points(each.signs) for each in judgements])
-        confidence = confidence * agreed.view(-1, 1, 1, 1)
+        agreement = confidence.new_tensor([points_agreement(verdict.indicators) for verdict in verdicts])
+        confidence = confidence * agreement.view(-1, 1, 1, 1)
     relative = torch.cat(run.relative)
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
     if call["match_input_resolution"]:
         relative = F.interpolate(relative, size, mode="bilinear", align_corners=False)
-    affine = [t.affine for t in run.trajectories]
 
-    def members(name: str) -> Tensor:
-        return torch.cat([getattr(a, name) for a in affine]).reshape(count, -1).cpu()
+    def of_members(name: str) -> Tensor:
+        return torch.cat([getattr(t.affine, name) for t in run.trajectories]).reshape(count, -1).cpu()
 
     def out(x: Tensor | None) -> Any:
         return x if call["output_type"] == "pt" or x is None else x.permute(0, 2, 3, 1).cpu().numpy()
@@ -109,9 +91,9 @@ def assemble_output(
         uncertainty=out(uncertainty),
         relative=out(relative),
         space=run.prior.space,
-        scale=members("scale"),
-        shift=members("shift"),
-        global_scale=members("g_s"),
+        scale=of_members("scale"),
+        shift=of_members("shift"),
+        global_scale=of_members("g_s"),
         own_scale=None if over_own is None else over_own.median(1).values.reshape(count, -1).cpu(),
         visible=out(visible),
         photometric_error=out(error),
@@ -120,11 +102,11 @@ def assemble_output(
         prior_error=None if prior_error is None else prior_error.flatten().cpu(),
         K=K if call["output_type"] == "pt" else K.cpu().numpy(),
         history=[report for t in run.trajectories for report in t.history],
-        poses=[own.pose for own in run.evidence if own.pose is not None],
+        poses=[evidence.pose for evidence in run.evidence if evidence.pose is not None],
         extras=getattr(stock, "extras", {}),
-        judgements=judgements,
+        verdicts=verdicts,
         unit=guidance.unit,
-        warnings=_warnings(run, visible, judgements) + list([] if estimated is None else estimated.warnings),
+        warnings=_warnings(run, visible, verdicts) + list([] if estimated is None else estimated.warnings),
         scale_from=None if estimated is None else estimated.scale.source,
         scale_spread=None if estimated is None else estimated.scale.spread,
     )
@@ -133,22 +115,36 @@ def assemble_output(
     return output
 
 
+def _reprojected(
+    run: GuidedRun, depth_m: Tensor, lefts: Tensor, K: Tensor
+) -> tuple[Tensor, Tensor] | tuple[None, None]:
+    """Visibility and photometric error of every image, ``(N, 1, H, W)``; nothing where no view is."""
+    maps = [
+        reprojection(evidence.native, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1])
+        for i, evidence in enumerate(run.evidence)
+        if evidence.native
+    ]
+    if not maps:
+        return None, None
+    visible, error = zip(*maps, strict=True)
+    return torch.cat(visible), torch.cat(error)
+
+
 def _over_own(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
     """``(N * E, h w)`` the depth ``(N, 1, H, W)`` over a metric prior's own, on the prior's grid."""
-    known = [t.own_depth for t in run.trajectories if t.own_depth is not None]
-    if len(known) < len(run.trajectories):
+    maps = [t.own_depth for t in run.trajectories if t.own_depth is not None]
+    if len(maps) < len(run.trajectories):
         return None
-    own = torch.cat(known)
-    found = F.interpolate(depth_m, own.shape[-2:], mode="bilinear", align_corners=False)
-    owners = [owner for t in run.trajectories for owner in t.owners]
-    return (found[owners] / own.clamp_min(LEAST_M)).flatten(1)
+    priors_m = torch.cat(maps)
+    resized = F.interpolate(depth_m, priors_m.shape[-2:], mode="bilinear", align_corners=False)
+    return (resized[run.owners] / priors_m.clamp_min(LEAST_M)).flatten(1)
 
 
 def _in_the_priors_metres(output: MetricDepthOutput, over_own: Tensor) -> MetricDepthOutput:
     """The output of estimated poses without a unit, in the metres of a prior that has some.
 
     Everything that is a length is multiplied by one number, that which brings the depth to the prior's at
-    half of the pixels; how much it differs from pixel to pixel says how sure it is.
+    half of the pixels; how much it differs from pixel to pixel tells how uncertain it is.
     """
     factor = 1.0 / float(over_own.median())
     spread = 1.4826 * float((over_own * factor).clamp_min(1e-9).log().abs().median())
@@ -156,7 +152,7 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_own: Tensor) -> Metric
     def moved(E: np.ndarray) -> np.ndarray:
         return np.block([[E[:3, :3], factor * E[:3, 3:]], [E[3:]]])
 
-    said = (
+    warning = (
         f"No length is known: the metres are the prior's own, and as wrong as those. From pixel to pixel its "
         f"depth and that of the views differ by {100 * spread:.0f} % in the middle."
     )
@@ -166,44 +162,41 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_own: Tensor) -> Metric
         setattr(output, name, getattr(output, name) * factor)
     output.history = [replace(step, g_s=step.g_s * factor) for step in output.history]
     output.poses = [
-        pose.changed(E=tuple(map(moved, pose.E)), E_given=tuple(map(moved, pose.E_given)))
+        replace(pose, E=tuple(map(moved, pose.E)), E_given=tuple(map(moved, pose.E_given)))
         for pose in output.poses
     ]
     output.unit, output.scale_from, output.scale_spread, output.rescaled = "m", "prior", spread, factor
-    output.warnings = [sentence for sentence in output.warnings if sentence != NO_UNIT] + [said]
+    output.warnings = [sentence for sentence in output.warnings if sentence != NO_UNIT] + [warning]
     return output
 
 
-def _judged(
+def _verdict(
     run: GuidedRun,
     image: int,
-    left_01: Tensor,
     K_left: Tensor,
     confidence: Tensor | None,
     own_ratio: float,
     guidance: GeometryGuidance,
-) -> Judgement:
-    """What the signs of one image's run say of it."""
-    own = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
-    order = torch.stack([t.order[i] for t, i in own if t.order is not None]).nanmean()
-    signs = read_signs(
+) -> Verdict:
+    """The verdict on one image's run."""
+    samples = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
+    order = torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean()
+    indicators = read_indicators(
         run.evidence[image],
-        left_01,
-        run.evidence[image].native,
         K_left,
         order=float(order),
         confidence=None if confidence is None else confidence[image],
-        on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in own),
+        on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in samples),
         range_given=run.config.depth_range is not None,
         own_ratio=own_ratio,
         has_unit=guidance.unit is not None,
     )
-    return judge(signs)
+    return judge(indicators)
 
 
-def _as_compared(run: GuidedRun) -> Tensor:
+def _native_lefts(run: GuidedRun) -> Tensor:
     """The left images at native size, ``(N, 3, H, W)``, cleaned as the right ones are."""
-    lefts = [own.native_left for own in run.evidence]
+    lefts = [evidence.native_left for evidence in run.evidence]
     return lefts[0][None] if len(lefts) == 1 else torch.stack(lefts)  # one large picture is not copied
 
 
@@ -214,19 +207,19 @@ def _as_maps(values: Any) -> Tensor:
     return torch.from_numpy(values).permute(0, 3, 1, 2).float()
 
 
-def _warnings(run: GuidedRun, visible: Tensor | None, judgements: Sequence[Judgement]) -> list[str]:
-    found = []
-    for i, judgement in enumerate(judgements):
-        spoken = [judgement.sentence] if judgement.reasons else []
-        spoken += judgement.remarks
+def _warnings(run: GuidedRun, visible: Tensor | None, verdicts: Sequence[Verdict]) -> list[str]:
+    warnings = []
+    for i, verdict in enumerate(verdicts):
+        sentences = [verdict.sentence] if verdict.reasons else []
+        sentences += verdict.remarks
         share = 1.0 if visible is None else visible[i].float().mean().item()
         if share < LITTLE_OVERLAP:
-            spoken.append(
+            sentences.append(
                 f"Only {share:.0%} of the left image is seen by a right camera at this depth; "
                 "scale rests on little."
             )
-        named = {INVERSE, *judgement.signs.mistakes}  # of a pose: reasons of the judgement already
-        spoken += [sentence for sentence in run.evidence[i].warnings if sentence not in named]
-        which = "" if len(judgements) == 1 else f"Image {i + 1}: "
-        found += [which + sentence for sentence in spoken]
-    return found
+        reasons = {INVERSE, *verdict.indicators.mistakes}  # of a pose: in the verdict already
+        sentences += [sentence for sentence in run.evidence[i].warnings if sentence not in reasons]
+        prefix = "" if len(verdicts) == 1 else f"Image {i + 1}: "
+        warnings += [prefix + sentence for sentence in sentences]
+    return warnings

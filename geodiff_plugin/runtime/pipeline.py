@@ -1,24 +1,275 @@
-"""Switching guidance on and off for a pipeline object.
+"""Guidance on a live pipeline: switched on and off, and the guided call from its arguments to metric depth.
 
-Data flow: a live pipeline -> the same object, of a class whose call takes ``guidance`` -> the stock class.
-Paper: S4, Figure 3 (fig:framework).
+Source: S4, Figure 3 (fig:framework).
 """
 
 from __future__ import annotations
 
+import copy
 import functools
-from typing import Any
+import inspect
+import warnings
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
+import torch
 from diffusers import DiffusionPipeline, MarigoldDepthPipeline
+from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
+from torch import Tensor
+from tqdm.auto import tqdm
 
+from geodiff_plugin._checks import bad_type, bad_value, refuse
+from geodiff_plugin.algorithm.schedule import count_steps
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
-from geodiff_plugin.runtime.guided_call import GuidedCall, stock_class
+from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.priors.tiny import tiny_autoencoder
+from geodiff_plugin.runtime.checks import check_arguments, check_guidable, check_left_images
+from geodiff_plugin.runtime.estimate import ProcessingGrid
+from geodiff_plugin.runtime.finish import ensemble_metric
+from geodiff_plugin.runtime.hooks import Exclusive, exclusive_call
+from geodiff_plugin.runtime.output import assemble_output
+from geodiff_plugin.runtime.run import GuidedRun, StepCallback
+from geodiff_plugin.runtime.start import depth_prompt, plan_warm_start
 
-__all__ = ["GuidedMarigoldDepthPipeline", "disable_geometry_guidance", "enable_geometry_guidance"]
+__all__ = [
+    "GuidedCall",
+    "GuidedMarigoldDepthPipeline",
+    "disable_geometry_guidance",
+    "enable_geometry_guidance",
+    "native_images",
+]
+
+if TYPE_CHECKING:  # mixed in before a class that has all of a stock pipeline
+    _Stock = MarigoldDepthPipeline
+else:
+    _Stock = object
+
+
+class GuidedCall(_Stock):
+    """Mixin for a pipeline class: a ``__call__`` that takes ``guidance``, and metric ensembling while guided.
+
+    It comes before the stock class, whose call does all the rest: preprocessing, latents, loop, resizing.
+    """
+
+    _guided_run: GuidedRun | None = None
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        image: Any,
+        *args: Any,
+        guidance: GeometryGuidance | None = None,
+        callback_on_step_end: Callable[..., dict[str, Tensor] | None] | None = None,
+        strict: bool = False,
+        **kwargs: Any,
+    ) -> Any:
+        """The stock call; with ``guidance`` its depth is in metres.
+
+        Args:
+            image: left image(s), as the stock call takes them; guided, all that ``right`` takes as well.
+            *args: as the stock call takes them.
+            guidance: the second view; ``None`` is the stock call, bit for bit.
+            callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
+                ``latents`` in what it returns replace the pipeline's. The others are those of the last step
+                that was corrected or updated, and ``None`` before the first.
+            strict: a depth that is not to be trusted (``output.verdicts``) is an error.
+            **kwargs: as the stock call takes them.
+
+        Returns:
+            ``MetricDepthOutput``, or with ``return_dict=False`` the stock tuple (prediction, uncertainty,
+            latent).
+
+        Raises:
+            TypeError: ``guidance`` is no ``GeometryGuidance``; a scheduler that cannot be guided.
+            ValueError: an image that the right one could not be either; inputs that do not fit each other;
+                offloading that forbids guidance.
+            RuntimeError: called inside ``torch.inference_mode()``, or by a hook of a guided call's own
+                networks. From ``callback_on_step_end`` the pipeline may be called, guided or not: there it
+                is as the user left it. A call in another thread waits.
+        """
+        if guidance is None and callback_on_step_end is not None:
+            bad_value("callback_on_step_end", "given together with guidance", "guidance=None")
+        with exclusive_call(self, guidance is not None) as held:
+            if self._guided_run is not None:
+                raise RuntimeError(
+                    "This pipeline is in the middle of a guided call; call it again from "
+                    "callback_on_step_end, or afterwards, but not from a hook of its networks."
+                )
+            if guidance is None:
+                return super().__call__(image, *args, **kwargs)
+            stock_call = super().__call__
+            extra = (guidance, callback_on_step_end, strict)
+            return self._call_guided(stock_call, held, *extra, image, *args, **kwargs)
+
+    def _call_guided(
+        self,
+        stock_call: Callable[..., Any],
+        held: Exclusive,
+        guidance: GeometryGuidance,
+        callback: StepCallback | None,
+        strict: bool,
+        image: Any,
+        *args: Any,
+        **kwargs: Any,
+    ) -> Any:
+        _check_guided_call(guidance, callback)
+        image, count = check_left_images(image)
+        call, prior = _bind(stock_call, image, *args, **kwargs), find_adapter(self)(self)
+        check_arguments(call, count)
+        asked = call["num_inference_steps"]
+        wanted = guidance.denoising_steps(asked, self.default_denoising_steps)
+        call["num_inference_steps"], rounds = count_steps(wanted, asked, prior.max_steps)
+        call["resample_method_output"] = call["resample_method_output"] or "bilinear"
+        check_guidable(self, prior, guidance)
+        tiny = tiny_autoencoder(self, prior, guidance.config.decoder)
+        if prior.deterministic and call["ensemble_size"] > 1:
+            call |= _one_member(call)
+        wants_dict, wants_latent = call["return_dict"], call["output_latent"]
+        device = self._execution_device
+        lefts_01 = native_images(image, device)  # (N, 3, H, W)
+        grid = self._processing_grid(image, call, device)
+        with torch.autocast(device.type, enabled=False):
+            evidence = guidance.prepare(lefts_01)
+            if prior.takes_prompt and call.get("prompt_depth") is None:
+                call["prompt_depth"] = depth_prompt(evidence, guidance.config)
+        warm = plan_warm_start(self, prior, guidance, call, grid.size)
+        if warm is not None and warm.latents is not None:
+            call |= {"latents": warm.latents, "generator": None}  # the latents hold the noise already
+        if call["latents"] is not None:
+            call["image"] = lefts_01  # beside latents Marigold takes no channels-last image
+        run = GuidedRun(
+            self,
+            prior,
+            guidance,
+            evidence,
+            ensemble_size=call["ensemble_size"],
+            batch_size=call["batch_size"],
+            grid=grid,
+            rounds=rounds,
+            callback=callback,
+            wants_latents=wants_latent,
+            tiny=tiny,
+            held=held,
+            warm=warm,
+        )
+        try:
+            with run:
+                stock = stock_call(**{**call, "return_dict": True, "output_latent": True})
+        finally:
+            run.release()
+        run.check_finite()
+        with torch.autocast(device.type, enabled=False):
+            output = assemble_output(stock, run, guidance, call)
+        for verdict in output.verdicts if strict else ():
+            if not verdict.trusted:
+                refuse(verdict.sentence)
+        output.latent = stock.latent if wants_latent else None
+        return output if wants_dict else (output.prediction, output.uncertainty, output.latent)
+
+    def _processing_grid(self, image: Any, call: dict[str, Any], device: torch.device) -> ProcessingGrid:
+        """The grid that the stock call will denoise on, found by its own preprocessing."""
+        resolution = call["processing_resolution"]
+        resolution = self.default_processing_resolution if resolution is None else resolution
+        preprocess = self.image_processor.preprocess
+        padded, padding, _ = preprocess(image, resolution, call["resample_method_input"], device)
+        return ProcessingGrid((padded.shape[-2] - padding[0], padded.shape[-1] - padding[1]), padding)
+
+    def progress_bar(self, iterable: Any = None, total: int | None = None, **kwargs: Any) -> Any:
+        """Stock bars, one within another; while guided, one bar of the run's own stands for all."""
+        if self._guided_run is None:
+            return super().progress_bar(iterable, total, **kwargs)
+        return tqdm(iterable, total=total, disable=True)
+
+    def decode_prediction(self, pred_latent: Tensor) -> Tensor:
+        """Stock decode; while guided, metres instead of the clipped relative map."""
+        if self._guided_run is None:
+            return super().decode_prediction(pred_latent)
+        return self._guided_run.metric_prediction(pred_latent)
+
+    def ensemble_depth(self, depth: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
+        """Stock ensembling; while guided, the median of members that are in metres already."""
+        if self._guided_run is None:
+            return super().ensemble_depth(depth, *args, **kwargs)
+        self._guided_run.members.append(depth)
+        return ensemble_metric(depth, kwargs.get("reduction", "median"))
+
+    def put_together(self, maps: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
+        """A prior's own ending of ensembles; while guided, ``ensemble_depth`` for every image."""
+        if self._guided_run is None:
+            return super().put_together(maps, *args, **kwargs)
+        return DepthDiffusionPipeline.put_together(self, maps, *args, **kwargs)
+
+    def save_pretrained(self, *args: Any, **kwargs: Any) -> None:
+        """Save the stock pipeline: the folder loads where this package is not installed.
+
+        A call that runs in another thread is waited for; one that begins meanwhile is not disturbed.
+        """
+        with exclusive_call(self, guided=False):
+            twin = copy.copy(self)
+        twin.__class__ = _stock_class(type(self))
+        twin.save_pretrained(*args, **kwargs)
+
+
+def native_images(image: Any, device: torch.device) -> Tensor:
+    """Left image(s) in any form that the stock call takes, as they go to ``GeometryGuidance.prepare``.
+
+    Args:
+        image: PIL, numpy or torch, or a list.
+        device: where the call runs.
+
+    Returns:
+        ``(N, 3, H, W)`` float32 in [0, 1], native size.
+    """
+    as_given = MarigoldImageProcessor(vae_scale_factor=1, do_normalize=False)
+    return as_given.preprocess(image, 0, device=device, dtype=torch.float32)[0].contiguous()
+
+
+def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
+    """All arguments of the stock call by name, defaults and what a prior adds included."""
+    signature = inspect.signature(stock_call)
+    bound = signature.bind(*args, **kwargs)
+    bound.apply_defaults()
+    call = dict(bound.arguments)
+    for name, parameter in signature.parameters.items():
+        if parameter.kind is parameter.VAR_KEYWORD:
+            call |= call.pop(name)
+    return call
+
+
+def _check_guided_call(guidance: Any, callback: Any) -> None:
+    if not isinstance(guidance, GeometryGuidance):
+        bad_type("guidance", "a GeometryGuidance", guidance, "GeometryGuidance(right, K, E)")
+    if callback is not None and not callable(callback):
+        bad_type("callback_on_step_end", "a function", callback)
+    if torch.is_inference_mode_enabled():
+        raise RuntimeError(
+            "A guided call needs gradients, which torch.inference_mode() forbids; "
+            "use torch.no_grad() or nothing."
+        )
+
+
+def _one_member(call: dict[str, Any]) -> dict[str, Any]:
+    """What changes of a call's arguments for the ensemble of a prior that gives the same map every time."""
+    first = slice(None, None, call["ensemble_size"])
+    changed = {"ensemble_size": 1, "output_uncertainty": False}
+    for name, kind in (("generator", list), ("latents", Tensor)):
+        if isinstance(call[name], kind):
+            changed[name] = call[name][first]
+    warnings.warn(
+        "This prior gives the same map every time: of the ensemble one member runs.",
+        stacklevel=5,
+    )
+    return changed
 
 
 class GuidedMarigoldDepthPipeline(GuidedCall, MarigoldDepthPipeline):
     """``MarigoldDepthPipeline`` whose call takes ``guidance``; ``from_pretrained`` as always."""
+
+
+def _stock_class(guided: type) -> type:
+    """The class that ``GuidedCall`` was mixed into."""
+    return next(c for c in guided.__mro__ if not issubclass(c, GuidedCall))
 
 
 @functools.cache
@@ -31,7 +282,7 @@ def _guided_class(stock: type) -> type:
 
 def _reduced(pipe: GuidedCall) -> tuple[Any, ...]:
     """For pickle, which finds no class by name that was made at run time."""
-    return _without_state, (stock_class(type(pipe)),), vars(pipe)
+    return _without_state, (_stock_class(type(pipe)),), vars(pipe)
 
 
 def _without_state(stock: type) -> Any:
@@ -59,5 +310,5 @@ def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
 def disable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
     """Undo ``enable_geometry_guidance``; on a pipeline that is not enabled it does nothing."""
     if isinstance(pipe, GuidedCall):
-        pipe.__class__ = stock_class(type(pipe))
+        pipe.__class__ = _stock_class(type(pipe))
     return pipe

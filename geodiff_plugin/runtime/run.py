@@ -1,14 +1,9 @@
-"""State of one guided call: its hooks on the pipeline, one ``Trajectory`` per batch chunk, the callbacks.
-
-Data flow: pipeline + ``GeometryGuidance`` -> hooks on -> trajectories -> metric depth of every member
-    -> hooks off.
-Paper: Algorithm 1 around ``algorithm.guided_step``.
-"""
+"""State of one guided call: hooks on the pipeline, schedule, one ``Trajectory`` a chunk, callbacks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -16,30 +11,28 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value
-from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.evidence import Evidence
-from geodiff_plugin.algorithm.known import Known
+from geodiff_plugin.algorithm.schedule import make_schedule
 from geodiff_plugin.algorithm.state import Trajectory
-from geodiff_plugin.algorithm.step import StepContext, guided_step
+from geodiff_plugin.algorithm.step import guided_step
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
-from geodiff_plugin.runtime.channels import put_channels
-from geodiff_plugin.runtime.codec import MapCodec
-from geodiff_plugin.runtime.denoiser import DenoiserTap
-from geodiff_plugin.runtime.exclusive import Exclusive
-from geodiff_plugin.runtime.flags import FrozenWeights, Running
-from geodiff_plugin.runtime.grid import ProcessingGrid
-from geodiff_plugin.runtime.half_precision import ImagesInFloat32
+from geodiff_plugin.runtime.checks import needs_network
+from geodiff_plugin.runtime.estimate import MapCodec, ProcessingGrid, StepEstimate, StepInputs
+from geodiff_plugin.runtime.hooks import (
+    DenoiserTap,
+    Exclusive,
+    GuidedScheduler,
+    frozen_weights,
+    images_in_float32,
+    replaced,
+)
 from geodiff_plugin.runtime.noise_levels import noise_level
-from geodiff_plugin.runtime.preconditions import needs_network
-from geodiff_plugin.runtime.scheduler import GuidedScheduler
-from geodiff_plugin.runtime.warm_start import WarmStart
+from geodiff_plugin.runtime.start import WarmStart
 
-__all__ = ["GuidedRun"]
+__all__ = ["GuidedRun", "StepCallback"]
 
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Tensor] | None]
-#: What the scheduler's step is given: network output, noisy latent, and what to add to its result.
-StepResult = tuple[Tensor, Tensor, Tensor | None]
 
 
 class GuidedRun:
@@ -53,7 +46,7 @@ class GuidedRun:
         ensemble_size: members per image.
         batch_size: samples per chunk, as the pipeline slices them.
         grid: the processing grid of the pipeline.
-        rounds: how often each denoising step is corrected and updated, see ``rounds.plan_steps``.
+        rounds: of each denoising step, see ``schedule.count_steps``.
         callback: ``callback_on_step_end`` or ``None``.
         wants_latents: whether the call returns the final latents.
         tiny: autoencoder that is used in the loop; ``None`` for the pipeline's.
@@ -61,6 +54,7 @@ class GuidedRun:
         warm: the start from the previous frame, or ``None``.
 
     Attributes:
+        schedule: what happens at each step; ``None`` before the first one.
         trajectories: one per chunk.
         relative: decoded maps of the final latents, one per chunk, without padding.
         members: of every image with an ensemble, ``(E, 1, H, W)`` metres without padding.
@@ -83,41 +77,43 @@ class GuidedRun:
         warm: WarmStart | None = None,
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
-        self.full = needs_network(guidance)
         self.owners = [i for i in range(len(evidence)) for _ in range(ensemble_size)]
-        self.batch_size, self.grid = batch_size, grid
-        self.rounds, self.callback, self._held = rounds, callback, held
-        self.warm, self._skipped = warm, 0 if warm is None else warm.skipped
-        self._reads_latents = wants_latents or callback is not None
-        self._codec = MapCodec(pipe, prior, grid, tiny)
+        self.batch_size, self.grid, self.schedule = batch_size, grid, None
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
         self.members: list[Tensor] = []
-        self.step_index = 0
-        self.timesteps: list[float] = []
-        self._decoded_chunks = 0
+        self._plan, self._rounds, self._warm = guidance.updates, rounds, warm
+        self._callback, self._held = callback, held
+        self._reads_latents = wants_latents or callback is not None
+        self._codec = MapCodec(pipe, prior, grid, tiny)
+        self._step, self._timesteps = 0, []
+        self._shown: Tensor | None = None  # relative map of the chunk's latest evaluation
+        self._results: list[Tensor | None] = []  # of every chunk, the map that its output starts from
         self._ends_m: list[tuple[Tensor, Tensor]] = []  # nearest and farthest of the final maps of a chunk
         self._stack, self._bar = ExitStack(), None
         self._tap = None
-        if self.full and prior.network_input is not None:
+        if needs_network(guidance) and prior.network_input is not None:
             self._tap = DenoiserTap(*prior.network(), prior.network_input)
         self._scheduler = GuidedScheduler(
-            pipe, self._on_trajectory, self._on_step, self._on_done, self.config.respace, self._skipped
+            *(pipe, self._on_trajectory, self._on_step, self._on_done),
+            *(self.config.respace, 0 if warm is None else warm.skipped),
         )
-        self._hooks: list[AbstractContextManager[object]] = [
-            FrozenWeights(pipe),
-            ImagesInFloat32(pipe.image_processor),
-            *([self._tap] if self._tap else []),
-            self._scheduler,
-            Running(pipe, self),
-        ]
 
     def __enter__(self) -> GuidedRun:
         with ExitStack() as stack:
-            for hook in self._hooks:
-                stack.enter_context(hook)
+            for context in self._contexts():
+                stack.enter_context(context)
             self._stack = stack.pop_all()
         return self
+
+    def _contexts(self) -> Iterator[AbstractContextManager[object]]:
+        yield frozen_weights(self.pipe)
+        yield images_in_float32(self.pipe.image_processor)
+        yield nullcontext() if self._tap is None else self._tap.attached()
+        yield self._scheduler.attached()
+        yield replaced(
+            self.pipe, "_guided_run", self
+        )  # its decode and ensembling then know that they are guided
 
     def __exit__(self, *exc: object) -> None:
         self._stack.close()
@@ -131,7 +127,6 @@ class GuidedRun:
         """
         self._scheduler.release()
         del self._scheduler
-        self._hooks.clear()
 
     @contextmanager
     def _suspended(self) -> Iterator[None]:
@@ -143,12 +138,6 @@ class GuidedRun:
         finally:
             self.__enter__()
 
-    @property
-    def rounds_of_step(self) -> range:
-        """Numbers of the current step's rounds in the schedule; steps skipped by a warm start count."""
-        first = (self._skipped + self.step_index) * self.rounds
-        return range(first, first + self.rounds)
-
     def metric_prediction(self, latents: Tensor) -> Tensor:
         """Metric depth of the next chunk of final latents, instead of the clipping decode.
 
@@ -158,16 +147,14 @@ class GuidedRun:
         Returns:
             ``(B, 1, H, W)`` metres on the padded processing grid, in float32.
         """
-        trajectory = self.trajectories[self._decoded_chunks]
-        self._decoded_chunks += 1
-        # The map that was encoded last: decoding would add the autoencoder's loss and the scheduler's noise.
-        x = trajectory.result
+        chunk = len(self.relative)
+        trajectory, x = self.trajectories[chunk], self._results[chunk]
         if x is None:
-            x = self.grid.filled(self.prior.decode(latents[:, self.prior.latents]).float())
-        else:
+            x = self.grid.padded(self.prior.decode(latents[:, self.prior.latents]).float())
+        else:  # as it was encoded: decoding would add the autoencoder's loss and the scheduler's noise
             x = self.grid.padded(x)
         self.relative.append(self.grid.cropped(x))
-        trajectory.watch.note("the map of the final latent", len(self.timesteps) - 1, x)
+        trajectory.note("the map of the final latent", x)
         depth_m = trajectory.metric(x, trajectory.affine)
         self._ends_m.append((depth_m.amin((1, 2, 3), keepdim=True), depth_m.amax((1, 2, 3), keepdim=True)))
         return depth_m
@@ -182,32 +169,38 @@ class GuidedRun:
         Returns:
             The same tensor, changed in place.
         """
-        own = [i for i, owner in enumerate(self.owners) if image in (None, owner)]
+        samples = [i for i, owner in enumerate(self.owners) if image in (None, owner)]
         near_m, far_m = (
-            torch.cat(ends).to(depth_m)[own].view(len(depth_m), -1, 1, 1)
+            torch.cat(ends).to(depth_m)[samples].view(len(depth_m), -1, 1, 1)
             for ends in zip(*self._ends_m, strict=True)
         )
         return depth_m.clamp_(near_m.amin(1, keepdim=True), far_m.amax(1, keepdim=True))
 
-    def known(self, image: int, member: int | None = None) -> Known:
-        """Matches and points of one image on the grid of the sweep, weighted by what the loop found of them.
+    def of_prior(self, image: int, member: int | None = None) -> tuple[Tensor | None, Tensor | None]:
+        """What the prior's first estimates say of one image.
 
         Args:
             image: its index in the call.
-            member: index of the ensemble member whose weights are used; ``None`` for the mean of all.
+            member: index of the ensemble member; ``None`` for the mean of all.
+
+        Returns:
+            ``(1, 1, h, w)`` on the grid of the losses, the share of each match's confidence that remains once
+            reflections are rejected; and ``(1, 1, 1, 1)``, the prior's error in log depth. ``None`` where it
+            was not measured.
         """
-        members = [
-            t.known.of_sample(i)
-            for t in self.trajectories
-            for i, owner in enumerate(t.owners)
-            if owner == image
-        ]
-        chosen = members if member is None else members[member : member + 1]
-        means = []
-        for values in zip(*chosen, strict=True):  # what is kept of each match, and the prior's error
-            present = [value for value in values if value is not None]
-            means.append(torch.stack(present).mean(0, keepdim=True) if present else None)
-        return Known.of([self.evidence[image]], self.config, "sweep", *means)
+        samples = [(t, i) for t in self.trajectories for i, owner in enumerate(t.owners) if owner == image]
+        chosen = samples if member is None else samples[member : member + 1]
+
+        def mean(name: str) -> Tensor | None:
+            values = [value[i] for t, i in chosen if (value := getattr(t, name)) is not None]
+            return torch.stack(values).mean(0, keepdim=True) if values else None
+
+        return mean("kept"), mean("error")
+
+    def prior_error(self) -> Tensor | None:
+        """``(N, 1, 1, 1)`` error of the prior in log depth, ``None`` if it is not known of every image."""
+        errors = [error for i in range(len(self.evidence)) if (error := self.of_prior(i)[1]) is not None]
+        return torch.cat(errors) if len(errors) == len(self.evidence) else None
 
     def check_finite(self) -> None:
         """Check, once and after the loop, that everything computed in it is finite.
@@ -221,85 +214,59 @@ class GuidedRun:
     def _on_trajectory(self, timesteps: Tensor) -> None:
         first = len(self.trajectories) * self.batch_size
         chunk = slice(first, first + self.batch_size)
-        own_range = self.prior.metric_range(chunk)
-        start = None if self.warm is None else (self.warm.near_m[chunk], self.warm.far_m[chunk])
+        start = None if self._warm is None else (self._warm.near_m[chunk], self._warm.far_m[chunk])
         self.trajectories.append(
-            Trajectory(self.config, self.evidence, self.owners[chunk], self.prior.space, own_range, start)
+            Trajectory(
+                *(self.config, self.evidence, self.owners[chunk], self.prior.space, self._plan.step_latents),
+                *(self.prior.metric_range(chunk), start),
+            )
         )
-        self.step_index, self.timesteps = 0, timesteps.tolist()
-        if self._bar is None:
+        self._results.append(None)
+        self._step, self._timesteps, self._shown = 0, timesteps.tolist(), None
+        if self.schedule is None:
+            self.schedule = make_schedule(
+                *(self.config, self._plan, len(timesteps)),
+                rounds=self._rounds,
+                skipped=0 if self._warm is None else self._warm.skipped,
+                encodes=self._tap is None,
+            )
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
             chunks = -(-len(self.owners) // self.batch_size)
-            self._bar = tqdm(total=chunks * len(self.timesteps), **options)
+            self._bar = tqdm(total=chunks * len(timesteps), **options)
 
-    def _on_step(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepResult:
-        level = noise_level(self.pipe.scheduler, timestep)
-        trajectory, depth = self.trajectories[-1], self.prior.latents
-        wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
-        wide_output, wide_z_t = output[:, depth].to(wide), z_t[:, depth].to(wide)
-        if self.step_index == 0:
-            trajectory.watch.note("the prior's output", 0, wide_output)
-        eps = noise_from(wide_output, wide_z_t, level)
-        tap = self._tap
-        leaf = z0_from(wide_output, wide_z_t, level) if tap is None else tap.leaf
-
-        def z0_of(z: Tensor) -> Tensor:
-            return z if tap is None else z0_from(tap.output_at(z)[:, depth].to(wide), z, level)
-
-        codec = self._codec
-        encode = codec.encode if tap is None else None
-        timestep_now = self.timesteps[self.step_index]
-        last = self.step_index == len(self.timesteps) - 1
-        decode_result = codec.decode_result if last and not self._reads_latents else None
-        rounds, count = self.rounds_of_step, (self._skipped + len(self.timesteps)) * self.rounds
-        at = StepContext(
-            self.step_index, timestep_now, rounds, count, eps, z0_of, codec.decode, encode, decode_result
-        )
-        with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
-            move = guided_step(trajectory, leaf, at)
-        if codec.has_tiny and decode_result is None:
-            trajectory.result = None  # its map is a tiny decoder's
-        active = any(trajectory.is_active(i / count) for i in rounds)
-        if move is None or not self.config.optimize_latents or not active:
-            result: StepResult = output, z_t, None  # bit for bit the pipeline's own step
-        elif tap is not None:
-            result = self._moved_noisy(tap, output, z_t, leaf, move)
-        else:
-            moved_output, moved_z_t = output_from(leaf + move, eps, level)
-            result = (
-                put_channels(output, depth, moved_output.to(output.dtype)),
-                put_channels(z_t, depth, moved_z_t.to(z_t.dtype)),
-                None,
-            )
-        if tap is not None:
-            tap.release()
-        return result
-
-    def _moved_noisy(
-        self, tap: DenoiserTap, output: Tensor, z_t: Tensor, leaf: Tensor, move: Tensor
-    ) -> StepResult:
-        """What the scheduler steps from where z_t was moved: the full gradient."""
-        depth = self.prior.latents
-        if self.prior.max_steps == 1:
-            # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
-            moved = (leaf + move).detach()
-            return tap.output_at(moved).detach(), put_channels(z_t, depth, moved.to(z_t.dtype)), None
-        if self.config.step_from == "updated":
-            moved = (leaf + move).detach().to(z_t.dtype)
-            return output, put_channels(z_t, depth, moved), None
-        wide = torch.promote_types(z_t.dtype, torch.float32)
-        return output, z_t, put_channels(torch.zeros_like(z_t, dtype=wide), depth, move)
+    def _on_step(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepInputs:
+        trajectory, schedule = self.trajectories[-1], self.schedule
+        assert schedule is not None  # of _on_trajectory
+        trajectory.begin_step(self._step, self._timesteps[self._step])
+        level, is_last = noise_level(self.pipe.scheduler, timestep), schedule.is_last(self._step)
+        latent_is_read = self._reads_latents or not is_last
+        estimate = StepEstimate(self._codec, level, output, z_t, self._tap, latent_is_read)
+        if self._step == 0:
+            trajectory.note("the prior's output", estimate.output)
+        inputs: StepInputs = output, z_t, None  # bit for bit the pipeline's own step
+        self._results[-1] = None
+        if rounds := schedule.steps[self._step]:
+            with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
+                move, self._shown, stands = guided_step(trajectory, estimate, rounds, is_last)
+            # A tiny decoder's map is no result.
+            if stands and (self._codec.tiny is None or not latent_is_read):
+                self._results[-1] = self._shown
+            if schedule.moves_at(self._step):
+                inputs = estimate.step_inputs(move, self.config.step_from == "updated")
+        if self._tap is not None:
+            self._tap.release()
+        return inputs
 
     def _on_done(self, timestep: Tensor, latents: Tensor) -> Tensor:
-        if self.callback is not None:
+        if self._callback is not None:
             values = {"latents": latents, **self._seen_by_callback(latents)}
             before = latents.clone()
             with self._suspended():
-                answer = self.callback(self.pipe, self.step_index, timestep, values)
+                answer = self._callback(self.pipe, self._step, timestep, values)
             latents = _latents_of(answer, latents)
             if not torch.equal(latents, before):  # replaced, or changed in place
-                self.trajectories[-1].result = None
-        self.step_index += 1
+                self._results[-1] = None
+        self._step += 1
         if self._bar is not None:
             history = self.trajectories[-1].history
             loss = history[-1].loss if history else None
@@ -310,17 +277,16 @@ class GuidedRun:
         return latents
 
     def _seen_by_callback(self, latents: Tensor) -> dict[str, Tensor | None]:
-        trajectory = self.trajectories[-1]
-        if not trajectory.has_scale:  # the steps before the first correction are the prior's own
+        trajectory, x = self.trajectories[-1], self._shown
+        if x is None:  # the steps before the first correction are the prior's own
             return dict.fromkeys(("metric_depth", "loss", "scale", "shift"))
-        affine, x = trajectory.affine, trajectory.last_x
-        if x is None or self.step_index == len(self.timesteps) - 1:
-            x = self._codec.decode_result(latents[:, self.prior.latents])
+        if self._step == len(self._timesteps) - 1:
+            x = self._codec.decode(latents[:, self.prior.latents], final=True)
         return {
-            "metric_depth": trajectory.metric(x, affine),
+            "metric_depth": trajectory.metric(x, trajectory.affine),
             "loss": trajectory.history[-1].loss,
-            "scale": affine.scale,
-            "shift": affine.shift,
+            "scale": trajectory.affine.scale,
+            "shift": trajectory.affine.shift,
         }
 
 

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, disable_geometry_guidance, enable_geometry_guidance
-from geodiff_plugin.algorithm.rules import RULES, Adam
+from geodiff_plugin.algorithm.gradients import RULES, Adam
 from geodiff_plugin.priors import PRIORS, find_adapter, find_prior
 from geodiff_plugin.scale.space import SPACES
 from tests.contracts.tiny_priors import TINY

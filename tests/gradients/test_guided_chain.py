@@ -6,12 +6,14 @@ import pytest
 import torch
 
 from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_from, z0_from
-from geodiff_plugin.algorithm.objective import FurtherView, Objective, Views
-from geodiff_plugin.algorithm.terms import MatchTarget
+from geodiff_plugin.algorithm.evidence import Views
+from geodiff_plugin.algorithm.objective import Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry.projection import plane_rays
+from geodiff_plugin.matching import Matches
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.scale.space import AffineState, MetricMap
+from geodiff_plugin.types import CameraView
 
 WEIGHTS = {"photometric": 1.0, "matches": 0.3, "points": 0.1, "prior_pull": 0.01, "anchor": 0.2}
 CONFIG = GuidanceConfig(weights=WEIGHTS, pyramid_levels=2, pull_to="zero", min_visible=0.0)
@@ -26,11 +28,12 @@ def views_of(pair):
     K, T = double(pair.K)[None], torch.linalg.inv(double(pair.E))[None]
     below = T.clone()
     below[:, 1, 3] = -0.1
-    rights = tuple(FurtherView(right, K, pose, plane_rays(K, K, pose, (48, 64))) for pose in (T, below))
+    rights = tuple(CameraView(right, K, pose) for pose in (T, below))
+    rays = tuple(plane_rays(K, K, pose, (48, 64)) for pose in (T, below))
     known = torch.zeros(1, 1, 48, 64, dtype=torch.float64)
     known[..., ::7, ::5] = 1.0
-    points = MatchTarget(known / double(pair.depth_m), known, double([0.005]))
-    return Views(left, K, rights), points
+    points = Matches(known / double(pair.depth_m), known, double([0.005]))
+    return Views(left, K, rights, rays), points
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity", "log", "sqrt_disparity"])
@@ -47,7 +50,7 @@ def test_whole_chain_against_finite_differences(make_pipeline, textured_plane, s
     near, far = torch.tensor([1.3]), torch.tensor([3.1])
     start = objective.metric.from_range(near, far)
     start = AffineState(double(start.s_hat), double(start.t_hat), double(start.g_s))
-    matches = MatchTarget(
+    matches = Matches(
         1.0 / double(textured_plane.depth_m)[None, None],
         torch.ones(1, 1, 48, 64, dtype=torch.float64),
         double([0.02]),

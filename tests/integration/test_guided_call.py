@@ -28,7 +28,7 @@ from geodiff_plugin import (
     disable_geometry_guidance,
     enable_geometry_guidance,
 )
-from geodiff_plugin.algorithm.rules import RULES
+from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.runtime.run import GuidedRun
 from tests.conftest import SCHEDULER, plane_pair
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.runtime.half_precision import ImagesInFloat32
+from geodiff_plugin.runtime.hooks import images_in_float32
 from tests.contracts.tiny_priors import make_e2e_ft
 
 
@@ -35,7 +35,7 @@ def test_white_of_16_bits_is_no_overflow(make_pipeline, textured_plane):
     pipe = make_pipeline().to(torch.float16)
     image = textured_plane.left.astype(np.uint16) * 257
     image[0, 0] = 65535
-    with ImagesInFloat32(pipe.image_processor):
+    with images_in_float32(pipe.image_processor):
         images, *_ = pipe.image_processor.preprocess(image, 0, "bilinear", torch.device("cpu"), torch.float16)
     assert images.dtype == torch.float16 and images.max() == 1.0
     assert "preprocess" not in vars(pipe.image_processor)

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, InputError, enable_geometry_guidance
-from geodiff_plugin.runtime.lefts import check_lefts
+from geodiff_plugin.runtime.checks import check_left_images
 
 FAST = {"inner_steps": 0, "min_steps": 1, "loss_resolution": 64}
 LEFT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
@@ -118,7 +118,7 @@ def test_a_batch_with_alpha_or_of_two_kinds_becomes_tensors(call):
 )
 def test_what_the_stock_call_reads_goes_on_untouched(image):
     before = image.copy() if isinstance(image, np.ndarray) else image
-    found, count = check_lefts(image)
+    found, count = check_left_images(image)
     assert found is image and count == (2 if isinstance(image, list) or np.ndim(image) == 4 else 1)
     if isinstance(image, np.ndarray):
         np.testing.assert_array_equal(image, before)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.algorithm import correction
-from geodiff_plugin.algorithm.rules import RULES
+from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS, Term
 from geodiff_plugin.config import GuidanceConfig, UpdatePlan
 from tests.conftest import render_plane

@@ -12,7 +12,7 @@ from geodiff_plugin.evaluation import trust
 from geodiff_plugin.evaluation.baselines import Settings
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.wrong import WRONG, WRONG_POINTS, case_kinds, cases_of
-from geodiff_plugin.runtime.signs import Signs
+from geodiff_plugin.runtime.verdict import Indicators
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_counts_and_resumption(tmp_path, monkeypatch, capsys):
         missed = case.kind == "K-2" and case.sample.rectified
         distrusted = case.kind == "right" and not case.sample.rectified
         bad = distrusted or (case.kind != "right" and not missed)
-        signs = asdict(Signs(confidence=0.1 if bad else 0.9, matched=0.8, order=0.8))
+        signs = asdict(Indicators(confidence=0.1 if bad else 0.9, matched=0.8, order=0.8))
         signs = {name: None if value != value else value for name, value in signs.items()}
         off = 0.01 if case.kind == "right" else 0.5
         return {"status": "finished", "said": [], "off": off, "signs": signs}

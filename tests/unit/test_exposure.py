@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.terms.exposure import match_exposure
+from geodiff_plugin.algorithm.photometric import match_exposure
 
 SIZE = (48, 60)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.gradient import FiniteWatch, pull_back
+from geodiff_plugin.algorithm.gradients import FiniteWatch, pull_back
 
 
 def _in_half(z: torch.Tensor) -> torch.Tensor:

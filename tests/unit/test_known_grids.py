@@ -42,7 +42,7 @@ def wide_pair(size_right, focal_right, at_m=0.1):
 )
 def test_above_640_pixels_the_truth_still_explains_the_left_image(size_right, focal_right):
     """Neither K may stay that of the image as given, nor the right image be finer than the left one."""
-    views = chunk_views([wide_pair(size_right, focal_right)], [0])
+    views = chunk_views([wide_pair(size_right, focal_right)])
     assert views.size == (96, 640)
     right = views.further[0]
     assert right.image_01.shape[-2:] == (96, 640)
@@ -51,7 +51,7 @@ def test_above_640_pixels_the_truth_still_explains_the_left_image(size_right, fo
     errors = []
     for factor in (1.0, 1.05):
         depth = factor * torch.from_numpy(depth_m)[None, None]
-        warped = warp_right_to_left(right.image_01, depth, *cameras, rays=right.rays)
+        warped = warp_right_to_left(right.image_01, depth, *cameras, rays=views.rays[0])
         assert warped.visible.float().mean() > 0.8
         errors.append(
             float((warped.image - views.left_01).abs().mean(1, keepdim=True)[warped.visible].mean())
@@ -62,7 +62,7 @@ def test_above_640_pixels_the_truth_still_explains_the_left_image(size_right, fo
 @pytest.mark.parametrize("min_visible", [0.0, 0.4, 0.8])
 def test_below_min_visible_the_photographs_have_no_say(min_visible):
     """At this depth the plane shows some 60 % of the left image to a right camera that far away."""
-    views = chunk_views([wide_pair((120, 800), 600.0, at_m=0.6)], [0])
+    views = chunk_views([wide_pair((120, 800), 600.0, at_m=0.6)])
     metric = MetricMap("depth")
     config = GuidanceConfig(
         weights={"photometric": 1.0}, pyramid_levels=1, exposure=False, min_visible=min_visible

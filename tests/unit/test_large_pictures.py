@@ -12,8 +12,7 @@ from geodiff_plugin.formats import flying_points, make_cloud, write_depth_mm, wr
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.formats.points import read_ply_points
 from geodiff_plugin.plotting import colour_depth, depth_range, overview, share_figure
-from geodiff_plugin.runtime.confidence import depth_confidence
-from geodiff_plugin.runtime.reprojection import reprojection
+from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
 from geodiff_plugin.types import CameraView
 
 

@@ -13,7 +13,7 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.algorithm.evidence import EvidenceInputs, prepare_evidence
 from geodiff_plugin.cli.report import summary_line
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.runtime.prompting import PROMPT_LONG_EDGE, prompt_of
+from geodiff_plugin.runtime.start import PROMPT_LONG_EDGE, depth_prompt
 from geodiff_plugin.types import CameraView
 from tests.contracts.tiny_transformers import make_transformers
 from tests.scenes import render_pair
@@ -121,7 +121,7 @@ def evidence_of(pair, points=None, rights=True):
 
 
 def test_matches_become_a_dense_prompt(textured_plane):
-    prompt = prompt_of([evidence_of(textured_plane)], DEFAULT)
+    prompt = depth_prompt([evidence_of(textured_plane)], DEFAULT)
     assert prompt.shape[:2] == (1, 1) and max(prompt.shape[-2:]) <= PROMPT_LONG_EDGE
     truth = torch.from_numpy(textured_plane.depth_m)[None, None]
     truth = torch.nn.functional.interpolate(truth, prompt.shape[-2:], mode="bilinear", antialias=True)
@@ -131,11 +131,11 @@ def test_matches_become_a_dense_prompt(textured_plane):
 def test_points_alone_become_a_prompt_and_nothing_becomes_none(textured_plane):
     points = torch.zeros(textured_plane.depth_m.shape)
     points[::8, ::8] = torch.from_numpy(textured_plane.depth_m)[::8, ::8]
-    prompt = prompt_of([evidence_of(textured_plane, points, rights=False)], DEFAULT)
+    prompt = depth_prompt([evidence_of(textured_plane, points, rights=False)], DEFAULT)
     middle = float(np.median(textured_plane.depth_m))
     assert prompt.isfinite().all() and float(prompt.median()) == pytest.approx(middle, rel=0.01)
     bare = evidence_of(textured_plane, points, rights=False)
-    assert prompt_of([bare, replace(bare, points=None, sweep_points=None)], DEFAULT) is None
+    assert depth_prompt([bare, replace(bare, points=None, sweep_points=None)], DEFAULT) is None
 
 
 def test_prompt_depth_anything_is_given_what_is_known(textured_plane):
@@ -150,7 +150,7 @@ def test_prompt_depth_anything_is_given_what_is_known(textured_plane):
     assert told[-1] is None  # without guidance it is a relative prior
 
 
-def test_a_prompt_of_ones_own_goes_before_ours_and_only_where_it_is_taken(textured_plane):
+def test_a_depth_prompt_ones_own_goes_before_ours_and_only_where_it_is_taken(textured_plane):
     pipe = make_transformers("prompt_depth_anything")
     told = knows(pipe, textured_plane.depth_m)
     own = torch.full((1, 1, 4, 6), 7.0)
@@ -164,7 +164,7 @@ def test_a_prompt_of_ones_own_goes_before_ours_and_only_where_it_is_taken(textur
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 @pytest.mark.parametrize("varies_m", [0.0, 0.01])
-def test_a_prompt_of_a_wall_far_away_has_a_span(textured_plane, dtype, varies_m):
+def test_a_depth_prompt_a_wall_far_away_has_a_span(textured_plane, dtype, varies_m):
     """A millionth of a metre is no step beside 40 m, nor is a centimetre one in half precision."""
     pipe = make_transformers("prompt_depth_anything").to(dtype=dtype)
     wall_m = 40.0 + varies_m * torch.linspace(0, 1, 24).view(1, 1, 4, 6)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -12,10 +10,10 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
-from geodiff_plugin.algorithm.rules import RULES, Plain
+from geodiff_plugin.algorithm.gradients import RULES, Plain
+from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from geodiff_plugin.runtime.noise_levels import check_scheduler, noise_level
-from geodiff_plugin.runtime.rounds import plan_steps
 from tests.conftest import SCHEDULER
 from tests.contracts.tiny_priors import make_e2e_ft
 
@@ -69,13 +67,12 @@ def test_e2e_ft_ends_at_the_clean_latent():
 )
 def test_plan_of_steps_and_rounds(textured_plane, most, asked, default, planned):
     guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, min_steps=4)
-    assert plan_steps(guidance, SimpleNamespace(max_steps=most), asked, default) == planned
+    assert count_steps(guidance.denoising_steps(asked, default), asked, most) == planned
 
 
-def test_more_steps_than_it_has_are_refused(textured_plane):
-    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E)
+def test_more_steps_than_it_has_are_refused():
     with pytest.raises(ValueError, match="num_inference_steps must be at most 1 with this prior; got 4"):
-        plan_steps(guidance, SimpleNamespace(max_steps=1), 4, 1)
+        count_steps(4, 4, 1)
 
 
 @pytest.mark.parametrize(("start", "rounds"), [(0.0, 3), (0.5, 1)])

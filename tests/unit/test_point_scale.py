@@ -14,7 +14,7 @@ SIZE = (40, 60)
 
 def matches_of(depth_m: torch.Tensor, confidence: float = 0.9) -> Matches:
     inverse = 1.0 / depth_m
-    return Matches(inverse, torch.full_like(inverse, confidence), torch.tensor(2e-3), torch.eye(3), SIZE)
+    return Matches(inverse, torch.full_like(inverse, confidence), torch.tensor(2e-3))
 
 
 @pytest.fixture

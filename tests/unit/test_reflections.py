@@ -5,21 +5,20 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.terms import MatchTarget
-from geodiff_plugin.matching import reject_reflections
+from geodiff_plugin.matching import Matches, reject_reflections
 
 SIZE = (60, 80)
 REGION = (slice(20, 40), slice(30, 60))
 
 
-def scene(factor: float, scatter: float = 0.02, region=REGION) -> tuple[MatchTarget, torch.Tensor]:
+def scene(factor: float, scatter: float = 0.02, region=REGION) -> tuple[Matches, torch.Tensor]:
     """A slanted wall, the prior's noisy view of it, and its matches, ``factor`` times as far in a region."""
     generator = torch.Generator().manual_seed(0)
     wall = torch.linspace(2.0, 4.0, SIZE[1]).expand(1, 1, *SIZE)
     matched = wall.clone()
     matched[..., region[0], region[1]] *= factor
     prior = wall * torch.exp(scatter * torch.randn(wall.shape, generator=generator))
-    return MatchTarget(1.0 / matched, torch.ones_like(wall), torch.tensor([1e-3])), prior
+    return Matches(1.0 / matched, torch.ones_like(wall), torch.tensor([1e-3])), prior
 
 
 def inside(kept: torch.Tensor) -> torch.Tensor:
@@ -53,7 +52,7 @@ def test_a_gap_between_things_is_no_region():
 def test_scale_does_not_matter_and_samples_do_not_mix():
     target, prior = scene(2.0)
     other, _ = scene(1.0)
-    both = MatchTarget(
+    both = Matches(
         torch.cat([target.inverse_depth / 7.0, other.inverse_depth]),
         torch.cat([target.confidence, other.confidence]),
         torch.tensor([1e-3, 1e-3]),
@@ -65,5 +64,5 @@ def test_scale_does_not_matter_and_samples_do_not_mix():
 
 def test_without_a_match_there_is_nothing_to_reject():
     target, prior = scene(2.0)
-    empty = MatchTarget(target.inverse_depth, torch.zeros_like(target.confidence), target.plane_step)
+    empty = Matches(target.inverse_depth, torch.zeros_like(target.confidence), target.plane_step)
     assert reject_reflections(empty, prior).min() == 1.0

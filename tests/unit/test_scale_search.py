@@ -135,7 +135,7 @@ def test_refinement_finds_the_truth_among_outliers(scene, space):
     wrong = torch.rand(depth.shape, generator=generator) < 0.1
     span = volume.inverse_depth[-1]
     target = torch.where(wrong, span * torch.rand(depth.shape, generator=generator), target)
-    matches = m.Matches(target, torch.ones_like(depth), volume.plane_step / 4, volume.K, volume.size)
+    matches = m.Matches(target, torch.ones_like(depth), volume.plane_step / 4)
     ends = torch.quantile(depth.flatten(), torch.tensor([0.02, 0.98]))
     start = (ends[:1] * 1.08, ends[1:] * 0.9)
     before = metres(x[0], float(start[0]), float(start[1]), space)
@@ -153,7 +153,7 @@ def test_noise_of_far_matches_does_not_pull_the_far_end_nearer(scene, seed):
     generator = torch.Generator().manual_seed(seed)
     inverse = step * torch.cat([torch.linspace(0.5, 2.0, 48 * 144), torch.linspace(2.0, 60.0, 48 * 144)])
     noisy = (inverse + step * torch.randn(inverse.shape, generator=generator)).clamp_min(0.0).view(1, *SIZE)
-    matches = m.Matches(noisy, torch.full_like(noisy, 0.96), step, volume.K, volume.size)
+    matches = m.Matches(noisy, torch.full_like(noisy, 0.96), step)
     depth = (1.0 / inverse).view(1, *SIZE)
     true = (depth.amin()[None], depth.amax()[None])
     near, far = refine_to_matches(
@@ -166,7 +166,7 @@ def test_noise_of_far_matches_does_not_pull_the_far_end_nearer(scene, seed):
 def test_refinement_without_matches_changes_nothing(scene):
     volume, depth = scene
     x = relative(depth, "depth")
-    nothing = m.Matches(1 / depth, torch.zeros_like(depth), volume.plane_step, volume.K, volume.size)
+    nothing = m.Matches(1 / depth, torch.zeros_like(depth), volume.plane_step)
     start = (torch.tensor([2.0]), torch.tensor([9.0]))
     near, far = refine_to_matches(x, nothing, *start, "depth")
     torch.testing.assert_close((near, far), start)
@@ -175,9 +175,7 @@ def test_refinement_without_matches_changes_nothing(scene):
 @pytest.mark.parametrize("space", ["depth", "disparity", "log"])
 def test_points_of_one_depth_give_a_finite_range(scene, space):
     volume, depth = scene
-    same = m.Matches(
-        torch.full_like(depth, 0.4), torch.ones_like(depth), torch.tensor(0.004), volume.K, volume.size
-    )
+    same = m.Matches(torch.full_like(depth, 0.4), torch.ones_like(depth), torch.tensor(0.004))
     near, far = refine_to_matches(
         relative(depth, space), same, torch.tensor([2.0]), torch.tensor([9.0]), space
     )

@@ -16,7 +16,7 @@ from geodiff_plugin._checks import InputError, InputTypeError
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.sequence import SequenceOptions, flicker, run_sequence
 from geodiff_plugin.priors import find_adapter
-from geodiff_plugin.runtime.warm_start import plan_warm_start
+from geodiff_plugin.runtime.start import plan_warm_start
 from geodiff_plugin.types import MetricDepthOutput
 from tests.contracts.tiny_geowizard import make_geowizard
 from tests.scenes import render_sequence

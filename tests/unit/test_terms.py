@@ -4,13 +4,13 @@ import kornia.metrics
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.terms import TERMS, Estimate, MatchTarget, masked_mean
-from geodiff_plugin.algorithm.terms.anchor import FLOOR
-from geodiff_plugin.algorithm.terms.matches import CAUCHY as MATCHES_CAUCHY
-from geodiff_plugin.algorithm.terms.photometric import photometric, photometric_map, ssim
-from geodiff_plugin.algorithm.terms.points import CAUCHY as POINTS_CAUCHY
+from geodiff_plugin.algorithm.photometric import masked_mean, photometric_map, ssim
+from geodiff_plugin.algorithm.terms import ANCHOR_FLOOR, CAUCHY, TERMS, Compared
 from geodiff_plugin.config import DEFAULT
+from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState
+
+photometric = TERMS["photometric"].function
 
 
 def estimate(**changes):
@@ -25,14 +25,14 @@ def estimate(**changes):
         "affine_start": affine,
         "z0": torch.zeros(2, 4, 8, 10),
         "z0_prior": torch.zeros(2, 4, 8, 10),
-        "points": MatchTarget(
+        "points": Matches(
             torch.full((2, 1, 32, 40), 0.5), torch.ones(2, 1, 32, 40), torch.tensor([0.01, 0.02])
         ),
-        "matches": MatchTarget(
+        "matches": Matches(
             torch.full((2, 1, 32, 40), 0.5), torch.ones(2, 1, 32, 40), torch.tensor([0.01, 0.02])
         ),
     }
-    return Estimate(**(values | changes))
+    return Compared(**(values | changes))
 
 
 @pytest.mark.parametrize("name", [n for n in TERMS if n != "prior_pull"])
@@ -72,9 +72,9 @@ def test_points_robust_and_in_metres():
     points = TERMS["points"].function
     known = torch.zeros(2, 1, 32, 40)
     known[:, :, 3, 4] = known[:, :, 20, 30] = 1.0
-    target = MatchTarget(torch.full((2, 1, 32, 40), 0.5) * known, known, torch.tensor([0.005, 0.005]))
+    target = Matches(torch.full((2, 1, 32, 40), 0.5) * known, known, torch.tensor([0.005, 0.005]))
     off = estimate(depth_m=torch.full((2, 1, 32, 40), 2.5), points=target)
-    c2 = POINTS_CAUCHY**2
+    c2 = CAUCHY**2
     expected = torch.full((2,), c2 / 2 * float(torch.log1p(torch.tensor(20.0**2 / c2))))
     torch.testing.assert_close(points(off), expected)
     torch.testing.assert_close(points(off, points_loss="l1l2"), torch.full((2,), 0.5 + 0.25))
@@ -85,7 +85,7 @@ def test_points_gradient_in_float64(points_loss):
     g = torch.Generator().manual_seed(5)
     depth = torch.rand(1, 1, 6, 7, generator=g, dtype=torch.float64) + 1.0
     known = (torch.rand(1, 1, 6, 7, generator=g) < 0.4).double()
-    target = MatchTarget(
+    target = Matches(
         known / (torch.rand(1, 1, 6, 7, generator=g, dtype=torch.float64) + 1.0),
         known,
         known.new_tensor([0.01]),
@@ -93,7 +93,7 @@ def test_points_gradient_in_float64(points_loss):
     base = estimate(points=target)
 
     def loss(d):
-        return TERMS["points"].function(Estimate(**{**base.__dict__, "depth_m": d}), points_loss=points_loss)
+        return TERMS["points"].function(Compared(**{**base.__dict__, "depth_m": d}), points_loss=points_loss)
 
     assert torch.autograd.gradcheck(loss, depth.requires_grad_())
     (grad,) = torch.autograd.grad(loss(depth).sum(), depth)
@@ -114,7 +114,7 @@ def test_photometric_gradient_in_float64():
     base = estimate(left_01=left, visible=seen)
 
     def loss(w):
-        return photometric(Estimate(**{**base.__dict__, "warped_01": w}), pyramid_levels=2)
+        return photometric(Compared(**{**base.__dict__, "warped_01": w}), pyramid_levels=2)
 
     warped.requires_grad_()
     (grad,) = torch.autograd.grad(loss(warped).sum(), warped)
@@ -127,7 +127,7 @@ def test_photometric_gradient_in_float64():
 
 def test_matches_in_planes():
     near = estimate(depth_m=torch.full((2, 1, 32, 40), 1 / 0.53))
-    c2 = MATCHES_CAUCHY**2
+    c2 = CAUCHY**2
     expected = c2 / 2 * torch.log(1 + torch.tensor([3.0, 1.5]) ** 2 / c2)
     torch.testing.assert_close(TERMS["matches"].function(near), expected, rtol=1e-4, atol=0)
 
@@ -140,7 +140,7 @@ def test_a_surface_far_from_its_matches_is_still_pulled():
 
 def test_no_matches_cost_nothing_and_pull_nothing():
     target = estimate().matches
-    empty = MatchTarget(target.inverse_depth, torch.zeros_like(target.confidence), target.plane_step)
+    empty = Matches(target.inverse_depth, torch.zeros_like(target.confidence), target.plane_step)
     depth = torch.full((2, 1, 32, 40), 7.0, requires_grad=True)
     value = TERMS["matches"].function(estimate(depth_m=depth, matches=empty))
     assert value.abs().max() == 0
@@ -161,9 +161,9 @@ def test_anchor_holds_what_no_match_holds():
     target = estimate().matches
     half = target.confidence.clone()
     half[..., :20] = 0.0
-    half = MatchTarget(target.inverse_depth, half, target.plane_step)
+    half = Matches(target.inverse_depth, half, target.plane_step)
     value = TERMS["anchor"].function(estimate(z0=moved, matches=half))
-    torch.testing.assert_close(value, torch.full((2,), 9.0 * (1.0 + FLOOR) / 2.0))
+    torch.testing.assert_close(value, torch.full((2,), 9.0 * (1.0 + ANCHOR_FLOOR) / 2.0))
 
 
 def test_masked_mean():

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.rules import RULES, Adam, NormMatched, Plain
+from geodiff_plugin.algorithm.gradients import RULES, Adam, NormMatched, Plain
 
 
 def test_plain_is_algorithm_1():

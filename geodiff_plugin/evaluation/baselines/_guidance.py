@@ -21,7 +21,7 @@ from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Pred
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
-from geodiff_plugin.runtime.preconditions import needs_network
+from geodiff_plugin.runtime.checks import needs_network
 
 __all__ = [
     "Preset",

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import check_number
-from geodiff_plugin.algorithm.terms import masked_mean, photometric_map
+from geodiff_plugin.algorithm.photometric import masked_mean, photometric_map
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache
 from geodiff_plugin.evaluation.datasets import StereoSample
 from geodiff_plugin.evaluation.figures.base import Drawing, FigureOptions, samples

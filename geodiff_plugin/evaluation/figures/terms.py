@@ -18,7 +18,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.algorithm.state import Trajectory
-from geodiff_plugin.algorithm.terms.matches import CAUCHY
+from geodiff_plugin.algorithm.terms import CAUCHY
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines._guidance import call_arguments, posed_views, prior_space
 from geodiff_plugin.evaluation.datasets import StereoSample
@@ -134,23 +134,23 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
     start = held.history[first]
     found = AffineState(*(value.cpu() for value in (start.s_hat, start.t_hat, start.g_s)))
     relative = trajectory.metric.relative(estimates[first], found)
-    trajectory.settle_scale(relative)
+    trajectory.prepare(relative, relative)
     first_m = trajectory.metric(relative, trajectory.affine)
-    known, usable = trajectory.known.matches, trajectory.matches
-    there = (known.confidence > 0) & (known.inverse_depth > 0)
+    matches, usable = trajectory.matches, trajectory.usable_matches
+    there = (matches.confidence > 0) & (matches.inverse_depth > 0)
     final_m = torch.from_numpy(out.prediction).permute(0, 3, 1, 2).float()
-    inverse_m = 1.0 / _resized(final_m, known.inverse_depth.shape[-2:])
+    inverse_m = 1.0 / _resized(final_m, matches.size)
 
     def where_matched(values: Tensor) -> np.ndarray:
         return torch.where(there, values, torch.full_like(values, torch.nan))[0, 0].numpy()
 
     return TermByTerm(
         first_m=_resized(first_m, size)[0, 0].numpy(),
-        matches_m=where_matched(1.0 / known.inverse_depth),
+        matches_m=where_matched(1.0 / matches.inverse_depth),
         match_weight=where_matched(usable.confidence),
         denoised_m=_resized(steps[-1], size)[0, 0].numpy(),
         final_m=out.prediction[0, ..., 0],
-        residual=where_matched((inverse_m - known.inverse_depth) / known.plane_step.view(-1, 1, 1, 1)),
+        residual=where_matched((inverse_m - matches.inverse_depth) / matches.plane_step.view(-1, 1, 1, 1)),
         difference=np.where(out.visible[0, ..., 0], out.photometric_error[0, ..., 0], np.nan),
         hidden=_hidden(guidance, final_m)[0, 0].numpy(),
         confidence=out.confidence[0, ..., 0],

@@ -15,20 +15,19 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.runtime.judgement import agreement_of_points, judge
-from geodiff_plugin.runtime.signs import Signs, read_signs
+from geodiff_plugin.runtime.verdict import Indicators, judge, points_agreement, read_indicators
 from geodiff_plugin.scale.order import order_agreement
 from geodiff_plugin.types import PoseReport
 from tests.scenes import render_pair
 
-GOOD = Signs(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0)
+GOOD = Indicators(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0)
 
 
 def test_a_good_run_is_trusted_in_silence():
-    judgement = judge(GOOD)
-    assert judgement.trusted and not judgement.reasons and not judgement.remarks and judgement.sentence == ""
+    verdict = judge(GOOD)
+    assert verdict.trusted and not verdict.reasons and not verdict.remarks and verdict.sentence == ""
     assert judge(replace(GOOD, own_ratio=1.4, view_deg=21.0)).remarks == ()
-    assert judge(Signs()).trusted  # nothing is known, as of a search without matches
+    assert judge(Indicators()).trusted  # nothing is known, as of a search without matches
 
 
 @pytest.mark.parametrize(
@@ -58,9 +57,9 @@ def test_a_good_run_is_trusted_in_silence():
     ],
 )
 def test_reasons(signs, words):
-    judgement = judge(replace(GOOD, **signs))
-    assert not judgement.trusted
-    assert words in judgement.sentence and judgement.sentence.startswith("Do not trust this depth: ")
+    verdict = judge(replace(GOOD, **signs))
+    assert not verdict.trusted
+    assert words in verdict.sentence and verdict.sentence.startswith("Do not trust this depth: ")
 
 
 @pytest.mark.parametrize(
@@ -78,21 +77,21 @@ def test_reasons(signs, words):
     ],
 )
 def test_remarks(signs, words):
-    judgement = judge(replace(GOOD, **signs))
-    assert judgement.trusted and any(words in remark for remark in judgement.remarks)
+    verdict = judge(replace(GOOD, **signs))
+    assert verdict.trusted and any(words in remark for remark in verdict.remarks)
 
 
 def test_a_residual_alone_that_is_a_pixel_is_no_fault():
-    judgement = judge(replace(GOOD, epipolar_px=1.5))
-    assert judgement.trusted and not judgement.remarks
+    verdict = judge(replace(GOOD, epipolar_px=1.5))
+    assert verdict.trusted and not verdict.remarks
 
 
-def signs_of(pose) -> Signs:
+def signs_of(pose) -> Indicators:
     evidence = SimpleNamespace(
         sweep_matches=None, sweep_points=None, volume=None, points=None, warnings=(), pose=pose
     )
-    left = torch.zeros(3, 8, 8)
-    return read_signs(evidence, left, (), torch.eye(3), order=math.nan, confidence=None, on_edge=False)
+    evidence.native_left, evidence.native = torch.zeros(3, 8, 8), ()
+    return read_indicators(evidence, torch.eye(3), order=math.nan, confidence=None, on_edge=False)
 
 
 def test_signs_of_poses():
@@ -100,10 +99,10 @@ def test_signs_of_poses():
     refined = PoseReport("refined", (), (), (3.0, math.nan, 1.0), (0.4, math.nan, 0.6), warnings=sentences)
     assert signs_of(refined).epipolar_px == 0.6, "of the poses as used, the worst view's"
     assert signs_of(refined).mistakes == (), "what is said of a refined pose is no mistake"
-    mistaken = refined.changed(status="mistaken", residual_px=(9.0,))
+    mistaken = replace(refined, status="mistaken", residual_px=(9.0,))
     assert signs_of(mistaken).mistakes == sentences[:1], "the inverse is asked apart"
-    judgement = judge(signs_of(mistaken))
-    assert not judgement.trusted and judgement.reasons[0] == sentences[0]
+    verdict = judge(signs_of(mistaken))
+    assert not verdict.trusted and verdict.reasons[0] == sentences[0]
     assert math.isnan(signs_of(PoseReport("given", (), ())).epipolar_px)
     assert math.isnan(signs_of(None).epipolar_px)
 
@@ -119,9 +118,9 @@ def test_a_poor_prior_is_no_fault_of_good_matches():
 
 
 def test_confidence_falls_with_disagreement():
-    factors = [agreement_of_points(replace(GOOD, points_ratio=r)) for r in (1.0, 1.05, 1.12, 1.2, 3.0, 1 / 3)]
+    factors = [points_agreement(replace(GOOD, points_ratio=r)) for r in (1.0, 1.05, 1.12, 1.2, 3.0, 1 / 3)]
     assert factors[:2] == [1.0, 1.0] and factors[3:] == pytest.approx([0.25] * 3)
-    assert 0.25 < factors[2] < 1.0 and agreement_of_points(GOOD) == 1.0
+    assert 0.25 < factors[2] < 1.0 and points_agreement(GOOD) == 1.0
 
 
 def test_points_are_held_against_matches(textured_plane):
@@ -132,9 +131,9 @@ def test_points_are_held_against_matches(textured_plane):
     guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, points=points)
     left = torch.from_numpy(textured_plane.left).permute(2, 0, 1)[None].float() / 255
     (evidence,) = guidance.prepare(left)
-    given = (evidence, left[0], evidence.native, torch.as_tensor(K).float())
+    given = (evidence, torch.as_tensor(K).float())
     known = {"order": 1.0, "confidence": None, "on_edge": False}
-    assert read_signs(*given, **known).points_ratio == pytest.approx(3.0, rel=0.1)
+    assert read_indicators(*given, **known).points_ratio == pytest.approx(3.0, rel=0.1)
 
 
 def test_rank_correlation(textured_plane):
@@ -182,11 +181,11 @@ def said(out) -> str:
 def test_a_rendered_pair_right_and_wrong(run, scene):
     left, right, _, E, _ = scene
     good = run(strict=True)
-    assert good.judgements[0].trusted and good.warnings == []
+    assert good.verdicts[0].trusted and good.warnings == []
     for wrong in (run(left=right, right=left), run(E=np.linalg.inv(E))):
-        assert not wrong.judgements[0].trusted and "swapped" in said(wrong)
+        assert not wrong.verdicts[0].trusted and "swapped" in said(wrong)
     mirrored = run(right=np.ascontiguousarray(right[:, ::-1]))
-    assert not mirrored.judgements[0].trusted
+    assert not mirrored.verdicts[0].trusted
     assert "same picture" in said(run(right=left.copy()))
     assert "shifted copy" in said(run(right=np.roll(left, -6, axis=1)))
     with pytest.raises(InputError, match="Do not trust this depth"):
@@ -198,9 +197,9 @@ def test_nearly_black_views_are_not_one_picture(run, scene):
     """8 bits in a TIFF of 32 and views that are all black differ by less than rounding does elsewhere."""
     left, right = (Image.fromarray(np.asarray(view[..., 0], np.int32)) for view in scene[:2])
     black = np.zeros_like(scene[0])
-    assert not run(left=left, right=right).judgements[0].signs.same
-    assert not run(left=black, right=black).judgements[0].signs.same
-    assert run(left=left, right=left).judgements[0].signs.same
+    assert not run(left=left, right=right).verdicts[0].indicators.same
+    assert not run(left=black, right=black).verdicts[0].indicators.same
+    assert run(left=left, right=left).verdicts[0].indicators.same
 
 
 def test_units_of_the_baseline(run, scene):
@@ -213,7 +212,7 @@ def test_units_of_the_baseline(run, scene):
             warnings.simplefilter("always", UserWarning)
             out = run(E=scaled)
         lines = [*(str(warning.message) for warning in caught), *out.warnings]
-        assert out.judgements[0].trusted
+        assert out.verdicts[0].trusted
         assert sum(word in line for line in lines) == 1, (factor, lines)
 
 
@@ -225,7 +224,7 @@ def test_points_that_contradict_the_views(run, scene, factor, words):
     known = np.zeros_like(depth)
     known[4::9, 4::9] = depth[4::9, 4::9]
     right = run(points=known)
-    assert right.judgements[0].trusted
+    assert right.verdicts[0].trusted
     wrong = run(points=factor * known)
-    assert not wrong.judgements[0].trusted and words in said(wrong)
+    assert not wrong.verdicts[0].trusted and words in said(wrong)
     assert wrong.confidence.mean() < 0.45 * right.confidence.mean()

@@ -1,29 +1,38 @@
-"""Warm start: a guided call from the latent, noised again, and the scale of the previous frame.
+"""What a call starts from beside noise: the previous frame's latent and scale, or a dense depth prompt.
 
-Data flow: ``guidance.previous`` -> latents at a middle step, how many steps to leave out, depths of both
-    ends.
-Paper: none; the start in the middle is SDEdit's (Meng et al. 2022), of another frame's result.
+The start in the middle of the schedule is SDEdit's (Meng et al. 2022), of another frame's result. Depth
+prompts are for priors such as Prompt Depth Anything (arXiv 2412.14015), which takes a phone's lidar of 256 x
+192.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
+import torch
+import torch.nn.functional as F
 from diffusers import DDIMScheduler
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin.algorithm.correction import prior_error, refine_depth
+from geodiff_plugin.algorithm.evidence import Evidence
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.noise_levels import noise_level, trailing_timesteps
 from geodiff_plugin.scale.space import SPACES
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["WarmStart", "plan_warm_start"]
+__all__ = ["PROMPT_LONG_EDGE", "WarmStart", "depth_prompt", "plan_warm_start"]
+
+#: Longer side of the depth prompt, pixels.
+PROMPT_LONG_EDGE = 256
 
 
 @dataclass(frozen=True)
@@ -34,7 +43,7 @@ class WarmStart:
         near_m: ``(N * E,)`` metres, depth of the nearest end of the relative map.
         far_m: ``(N * E,)`` metres, depth of its farthest end.
         skipped: steps of the schedule that are left out.
-        latents: ``(N * E, C, h, w)`` what the first step that is left begins with; ``None`` for noise.
+        latents: ``(N * E, C, h, w)`` what the first remaining step begins with; ``None`` for noise.
     """
 
     near_m: Tensor
@@ -65,8 +74,7 @@ def plan_warm_start(
     previous = guidance.previous
     if previous is None:
         return None
-    assert previous.latent is not None and previous.scale is not None  # as GeometryGuidance saw to
-    device = pipe._execution_device
+    assert previous.latent is not None and previous.scale is not None  # GeometryGuidance has checked that
     # Not their product alone: three members of one image are no start for three images.
     given, wanted = tuple(previous.scale.shape), (len(guidance.inputs), call["ensemble_size"])
     if given != wanted:
@@ -74,10 +82,10 @@ def plan_warm_start(
     if previous.space not in (None, prior.space):  # None of one that was put together by hand
         expected = f"the output of a prior whose map is affine in {prior.space}"
         bad_value("previous", expected, f"one in {previous.space}", "Use one prior for a whole sequence.")
+    device, steps = pipe._execution_device, call["num_inference_steps"]
     # Its lengths may have become a metric prior's metres, where those of this call are in baselines.
     metres = 1.0 if guidance.unit else previous.rescaled
     near, far = (end.to(device) / metres for end in _ends(previous, prior.space))
-    steps = call["num_inference_steps"]
     skipped = min(steps - 1, round(steps * guidance.config.warm_start))
     if skipped < 1 or not isinstance(pipe.scheduler, DDIMScheduler):
         return WarmStart(near, far)
@@ -85,18 +93,8 @@ def plan_warm_start(
     latent_size = tuple(side // factor for side in size)
     if tuple(z0.shape[-2:]) != latent_size:
         cure = "A frame of another size begins a sequence of its own."
-        got = f"{tuple(z0.shape[-2:])}"
-        bad_value("previous", f"an output with a latent of {latent_size}", got, cure)
-    noise = call["latents"]
-    if noise is None:
-        depth = z0[:, prior.latents]
-        noise = randn_tensor(depth.shape, generator=call["generator"], device=device, dtype=z0.dtype)
-        # What a prior denoises beside depth, GeoWizard's normals, starts from the same noise.
-        noise = noise.repeat(1, z0.shape[1] // depth.shape[1], 1, 1)
-    elif not isinstance(noise, Tensor):
-        bad_type("latents", "None or a torch.Tensor", noise)
-    elif noise.shape != z0.shape:
-        bad_value("latents", f"of shape {tuple(z0.shape)}, as those of previous", f"{tuple(noise.shape)}")
+        bad_value("previous", f"an output with a latent of {latent_size}", f"{tuple(z0.shape[-2:])}", cure)
+    noise = _noise(z0, prior, call, device)
     scheduler = copy.deepcopy(pipe.scheduler)
     scheduler.set_timesteps(steps)
     trailing = trailing_timesteps(scheduler, steps) if guidance.config.respace else None
@@ -104,6 +102,21 @@ def plan_warm_start(
     level = noise_level(scheduler, timesteps[skipped])
     latents = level.alpha.to(device) * z0.float() + level.sigma.to(device) * noise.to(device).float()
     return WarmStart(near, far, skipped, latents.to(pipe.dtype))
+
+
+def _noise(z0: Tensor, prior: DepthPrior, call: Mapping[str, Any], device: torch.device) -> Tensor:
+    """Noise for a latent: the call's own ``latents``, or drawn by its generator."""
+    noise = call["latents"]
+    if noise is None:
+        depth = z0[:, prior.latents]
+        noise = randn_tensor(depth.shape, generator=call["generator"], device=device, dtype=z0.dtype)
+        # What a prior denoises beside depth, GeoWizard's normals, starts from the same noise.
+        return noise.repeat(1, z0.shape[1] // depth.shape[1], 1, 1)
+    if not isinstance(noise, Tensor):
+        bad_type("latents", "None or a torch.Tensor", noise)
+    if noise.shape != z0.shape:
+        bad_value("latents", f"of shape {tuple(z0.shape)}, as those of previous", f"{tuple(noise.shape)}")
+    return noise
 
 
 def _counted(images: int, members: int) -> str:
@@ -118,3 +131,35 @@ def _ends(previous: MetricDepthOutput, space: str) -> tuple[Tensor, Tensor]:
     )
     formulas = SPACES[space]
     return formulas.ends(formulas.forward(shift, g_s), formulas.forward(scale + shift, g_s))
+
+
+def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
+    """Confident matches and points, spread along surfaces, for priors that take a depth prompt.
+
+    Args:
+        evidence: one entry per image, all of one size.
+        config: how they are spread.
+
+    Returns:
+        ``(N, 1, h, w)`` metres everywhere: the median depth where no match or point is near; ``None`` if some
+        image has neither.
+    """
+    maps = [depth_m for image in evidence if (depth_m := _spread(image, config)) is not None]
+    return torch.cat(maps) if len(maps) == len(evidence) else None
+
+
+def _spread(evidence: Evidence, config: GuidanceConfig) -> Tensor | None:
+    """``(1, 1, h, w)`` metres: a flat map corrected by matches and points, as a prior's would be."""
+    confident, points = Matches.stack([evidence.sure]), Matches.stack([evidence.points])
+    target = confident if points is None else with_points(confident, points)
+    if target is None:
+        return None
+    height, width = evidence.left_01.shape[-2:]
+    factor = min(1.0, PROMPT_LONG_EDGE / max(height, width))
+    size = max(1, round(height * factor)), max(1, round(width * factor))
+    median = 1.0 / target.inverse_depth[target.confidence > 0].median()
+    flat = median.expand(1, 1, height, width)
+    left = evidence.left_01[None]
+    error = prior_error(flat, target, left, config=config)
+    depth_m, _, _ = refine_depth(flat, target, left, error, config=config)
+    return F.interpolate(depth_m, size, mode="bilinear", antialias=True)

@@ -1,7 +1,7 @@
-"""Photometric error between the left image and the right ones seen through the estimate.
+"""Photometric error between the left image and the right ones seen through an estimate.
 
-Data flow: ``Estimate`` -> ``(B,)`` in [0, 1].
-Paper: S4.2, Eq. 14 (eq:geo-loss).
+Source: S4.2, Eq. 14 (eq:geo-loss). Deviations: masked to visible pixels, differences in exposure are taken
+out, and an image pyramid.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.terms.base import Estimate, masked_mean
-from geodiff_plugin.algorithm.terms.exposure import match_exposure
 from geodiff_plugin.config import DEFAULT
 
-__all__ = ["photometric", "photometric_map", "ssim"]
+__all__ = ["masked_mean", "match_exposure", "photometric", "photometric_map", "ssim"]
 
 #: A pyramid level with a shorter side than this says nothing that its parent does not.
 MIN_SIDE = 24
@@ -26,6 +24,29 @@ BESIDE = math.exp(-0.5 / 1.5**2)
 BESIDE, CENTRE = BESIDE / (1.0 + 2.0 * BESIDE), 1.0 / (1.0 + 2.0 * BESIDE)
 #: More than any error of a view that sees the pixel.
 UNSEEN = 2.0
+#: Added to a spread, so that a blank image divides nothing by zero.
+LEAST_SPREAD = 1e-3
+#: Gains beyond these say that two photographs do not show the same scene.
+GAINS = (0.2, 5.0)
+#: Rows and columns of the field of slow shading: vignetting, sun from one side; and the share of a cell in
+#: view that counts as much as the mean of the whole image.
+CELLS, CELL_PRIOR = (4, 5), 0.2
+
+
+def masked_mean(value: Tensor, weight: Tensor) -> Tensor:
+    """Weighted mean per sample.
+
+    Args:
+        value: ``(B, C, H, W)``.
+        weight: ``(B, 1, H, W)`` bool or float >= 0.
+
+    Returns:
+        ``(B,)``; 0 (and no gradient) for a sample whose weights are all zero. Whoever must not go on
+        without a valid pixel checks the visible fraction first.
+    """
+    weight = weight.to(value.dtype)
+    total = (value.mean(1, keepdim=True) * weight).flatten(1).sum(1)
+    return total / weight.flatten(1).sum(1).clamp_min(1e-6)
 
 
 def photometric_map(left_01: Tensor, warped_01: Tensor, eta: float) -> Tensor:
@@ -69,8 +90,45 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     return (2.0 * means + C1) * (2.0 * covariance + C2) / ((squares + C1) * (variances + C2) + LEAST)
 
 
+def _moments(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation per sample and channel, ``(B, C, 1, 1)`` each."""
+    total = weight.sum((-2, -1), keepdim=True).clamp_min(1.0)
+    mean = (image * weight).sum((-2, -1), keepdim=True) / total
+    square = ((image - mean) ** 2 * weight).sum((-2, -1), keepdim=True) / total
+    return mean, (square + LEAST_SPREAD**2).sqrt()
+
+
+def match_exposure(warped_01: Tensor, left_01: Tensor, visible: Tensor) -> Tensor:
+    """Bring the warped right image to the left one's gain and bias per channel, and to its slow shading.
+
+    In closed form: gain and bias make mean and spread over the visible pixels agree. A least-squares fit
+    pixel by pixel would take every wrong depth for a lower gain. What remains of the difference in a coarse
+    grid of cells is added as a smooth field.
+
+    Args:
+        warped_01: ``(B, 3, H, W)`` in [0, 1].
+        left_01: ``(B, 3, H, W)`` in [0, 1].
+        visible: ``(B, 1, H, W)`` bool or float, what is compared.
+
+    Returns:
+        ``(B, 3, H, W)``, about [0, 1]; differentiable in ``warped_01``.
+
+    Source: beyond the paper, which names illumination as a limit and takes both images as they are.
+    """
+    weight = visible.to(left_01.dtype)
+    mean_left, spread_left = _moments(left_01, weight)
+    mean_right, spread_right = _moments(warped_01, weight)
+    gain = (spread_left / spread_right).clamp(*GAINS)
+    matched = mean_left + gain * (warped_01 - mean_right)
+    share = F.adaptive_avg_pool2d(weight, CELLS)
+    field = F.adaptive_avg_pool2d((left_01 - matched) * weight, CELLS) / (share + CELL_PRIOR)
+    return matched + F.interpolate(field, left_01.shape[-2:], mode="bilinear", align_corners=False)
+
+
 def photometric(
-    estimate: Estimate,
+    left_01: Tensor,
+    warped_01: Tensor,
+    visible: Tensor,
     *,
     eta: float = DEFAULT.eta,
     pyramid_levels: int = DEFAULT.pyramid_levels,
@@ -82,23 +140,24 @@ def photometric(
     in which something hides the pixel then does not count.
 
     Args:
-        estimate: needs ``left_01``, ``warped_01`` and ``visible``.
+        left_01: ``(B, 3, H, W)`` in [0, 1].
+        warped_01: ``(B, V, 3, H, W)`` every right image seen from the left.
+        visible: ``(B, V, 1, H, W)`` bool, what is compared.
         eta: weight of SSIM against L1.
         pyramid_levels: 1 is the paper's; coarser levels widen the basin of attraction.
-        exposure: compare in the left image's exposure (``exposure.match_exposure``).
+        exposure: compare in the left image's exposure (``match_exposure``).
 
     Returns:
-        ``(B,)`` float; differentiable in the depth through ``warped_01`` (bilinear, so the gradient is
-        zero where the right image is constant and jumps where a sample crosses a pixel centre).
+        ``(B,)`` float in [0, 1]; differentiable in the depth through ``warped_01`` (bilinear, so the gradient
+        is zero where the right image is constant and jumps where a sample crosses a pixel centre).
 
     Source: Eq. 14 (eq:geo-loss). Deviation: masked to visible pixels (the paper's mean over all
     pixels rewards depths that push pixels out of the right image), and the pyramid. Minimum over views:
     Godard et al. 2019, "Digging into self-supervised monocular depth estimation", Eq. 4.
     """
-    views = estimate.warped_01.shape[1]
-    left = estimate.left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), a view's pixels by themselves
-    warped = estimate.warped_01.flatten(0, 1)
-    mask = estimate.visible.flatten(0, 1).to(left.dtype)
+    views = warped_01.shape[1]
+    left = left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), a view's pixels by themselves
+    warped, mask = warped_01.flatten(0, 1), visible.flatten(0, 1).to(left.dtype)
     if exposure:
         warped = match_exposure(warped, left, mask)
     total, levels = left.new_zeros(()), 0

@@ -7,15 +7,15 @@ import torch
 
 from geodiff_plugin.algorithm import correction
 from geodiff_plugin.algorithm.correction import off_edges, prior_error, refine_depth
-from geodiff_plugin.algorithm.terms import MatchTarget
+from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import SPACES, AffineState, MetricMap, inverse_softplus
 
 SIZE = (40, 60)
 WEAK, STRONG = (torch.full((1, 1, 1, 1), error) for error in (0.3, 0.02))
 
 
-def _target(depth_m: torch.Tensor, confidence: torch.Tensor) -> MatchTarget:
-    return MatchTarget(1.0 / depth_m, confidence, torch.full((len(depth_m),), 1e-3))
+def _target(depth_m: torch.Tensor, confidence: torch.Tensor) -> Matches:
+    return Matches(1.0 / depth_m, confidence, torch.full((len(depth_m),), 1e-3))
 
 
 def _grey(value: float = 0.5) -> torch.Tensor:
@@ -24,16 +24,16 @@ def _grey(value: float = 0.5) -> torch.Tensor:
 
 def test_sure_matches_everywhere_are_followed():
     truth = torch.linspace(2.0, 4.0, SIZE[1]).expand(1, 1, *SIZE)
-    refined = refine_depth(1.3 * truth, _target(truth, torch.ones_like(truth)), _grey(), WEAK)
-    assert ((refined.depth_m - truth).abs() / truth).max() < 0.01
-    assert refined.support.min() > 0.99
+    depth_m, support, _ = refine_depth(1.3 * truth, _target(truth, torch.ones_like(truth)), _grey(), WEAK)
+    assert ((depth_m - truth).abs() / truth).max() < 0.01
+    assert support.min() > 0.99
 
 
 def test_without_a_match_nothing_moves():
     depth = torch.linspace(2.0, 4.0, SIZE[1]).expand(1, 1, *SIZE)
-    refined = refine_depth(depth, _target(depth, torch.zeros_like(depth)), _grey(), WEAK)
-    assert torch.equal(refined.depth_m, depth)
-    assert refined.support.max() == 0.0
+    depth_m, support, _ = refine_depth(depth, _target(depth, torch.zeros_like(depth)), _grey(), WEAK)
+    assert torch.equal(depth_m, depth)
+    assert support.max() == 0.0
 
 
 def test_a_correction_spreads_over_its_surface_and_stops_at_an_edge():
@@ -42,12 +42,12 @@ def test_a_correction_spreads_over_its_surface_and_stops_at_an_edge():
     confidence = torch.zeros_like(truth)
     confidence[..., :, 5:10] = 1.0
     error = torch.full((1, 1, 1, 1), 0.1)
-    refined = refine_depth(1.2 * truth, _target(truth, confidence), left, error)
-    own, other = refined.depth_m[..., 10:14], refined.depth_m[..., 31:]
+    depth_m, support, _ = refine_depth(1.2 * truth, _target(truth, confidence), left, error)
+    own, other = depth_m[..., 10:14], depth_m[..., 31:]
     assert (own / 2.0 - 1.0).abs().max() < 0.09
     assert (other / 2.4 - 1.0).abs().max() < 0.09  # half of what the surface beside it moved by
-    assert refined.support[..., 10:14].min() > 0.3
-    assert refined.support[..., 31:].max() < 0.1
+    assert support[..., 10:14].min() > 0.3
+    assert support[..., 31:].max() < 0.1
 
 
 def test_an_outlier_among_matches_loses():
@@ -55,22 +55,22 @@ def test_an_outlier_among_matches_loses():
     matched = truth.clone()
     matched[..., 20, 30] = 8.0
     error = torch.full((1, 1, 1, 1), 0.1)
-    refined = refine_depth(1.1 * truth, _target(matched, torch.ones_like(truth)), _grey(), error)
-    assert (refined.depth_m / 2.0 - 1.0).abs().max() < 0.05
+    depth_m, support, _ = refine_depth(1.1 * truth, _target(matched, torch.ones_like(truth)), _grey(), error)
+    assert (depth_m / 2.0 - 1.0).abs().max() < 0.05
 
 
 def test_samples_of_a_batch_do_not_mix_and_any_resolution_comes_back():
     truth = torch.full((2, 1, *SIZE), 3.0)
     confidence = torch.stack([torch.ones(1, *SIZE), torch.zeros(1, *SIZE)])
-    refined = refine_depth(
+    depth_m, support, _ = refine_depth(
         torch.full((2, 1, 90, 130), 3.3),
         _target(truth, confidence),
         _grey().expand(2, -1, -1, -1),
         WEAK.expand(2, 1, 1, 1),
     )
-    assert refined.depth_m.shape == (2, 1, 90, 130)
-    assert refined.depth_m[0].mean() == pytest.approx(3.0, rel=0.01)
-    assert refined.depth_m[1].mean() == pytest.approx(3.3, rel=1e-5)
+    assert depth_m.shape == (2, 1, 90, 130)
+    assert depth_m[0].mean() == pytest.approx(3.0, rel=0.01)
+    assert depth_m[1].mean() == pytest.approx(3.3, rel=1e-5)
 
 
 def _wavy(truth: torch.Tensor, error: float) -> torch.Tensor:
@@ -105,7 +105,7 @@ def test_a_good_prior_keeps_its_surface_where_matches_are_noisy():
     truth, grey = torch.full((1, 1, 128, 256), 2.0), torch.full((1, 3, 128, 256), 0.5)
     noisy = truth * torch.exp(0.03 * torch.randn(truth.shape, generator=generator))
     target = _target(noisy, torch.ones_like(truth))
-    strong, weak = (refine_depth(truth, target, grey, error).depth_m for error in (STRONG, WEAK))
+    strong, weak = (refine_depth(truth, target, grey, error)[0] for error in (STRONG, WEAK))
     assert (strong - truth).abs().mean() < 0.2 * (weak - truth).abs().mean()
 
 
@@ -114,7 +114,7 @@ def test_matches_that_a_good_prior_contradicts_over_a_region_lose():
     matched = truth.clone()
     matched[..., 10:16, 20:26] = 2.6
     target = _target(matched, torch.ones_like(truth))
-    strong = refine_depth(truth, target, _grey(), STRONG).depth_m
+    strong = refine_depth(truth, target, _grey(), STRONG)[0]
     assert (strong / 2.0 - 1.0).abs().max() < 0.02
 
 
@@ -139,7 +139,7 @@ def test_what_no_match_is_near_follows_its_region_in_the_broad_passes(monkeypatc
     target = _target(truth, confidence)
 
     def left_over() -> float:
-        return float((refine_depth(1.5 * truth, target, _grey(), WEAK).depth_m / truth).log().abs().max())
+        return float((refine_depth(1.5 * truth, target, _grey(), WEAK)[0] / truth).log().abs().max())
 
     usual = left_over()
     monkeypatch.setattr(correction, "PASSES", 1)

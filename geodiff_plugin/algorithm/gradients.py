@@ -1,0 +1,158 @@
+"""Gradients: pulled back through networks of half precision, checked to be finite, and turned into steps.
+
+The loss is a mean, so a gradient in one pixel may be below float16's least number (a mean over a whole image)
+or, scaled by any constant that lifts it, above its greatest (a mean over a handful of known points).
+Source: Algorithm 1 (plain step), Eq. 15 (eq:final_score), S5.1 (learning rate 1e-2, no optimiser).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from geodiff_plugin._checks import bad_value
+
+__all__ = ["RULES", "Adam", "FiniteWatch", "NormMatched", "Plain", "Rule", "pull_back"]
+
+
+def pull_back(output: Tensor, source: Tensor, gradient: Tensor) -> Tensor:
+    """The gradient in ``source`` of a loss whose gradient in ``output`` is known; frees the graph between.
+
+    Args:
+        output: ``(B, ...)`` with its graph to ``source``.
+        source: ``(B, ...)`` float32 or wider, requires a gradient.
+        gradient: as ``output``, float32 or wider.
+
+    Returns:
+        As ``source``. Between the two, the largest entry of every sample is between 1/2 and 1. The factor is
+        a power of two, so that in float32 the result is what it would be without it.
+    """
+    largest = gradient.detach().abs().flatten(1).amax(1)
+    unit = torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent)
+    scaled = gradient / unit.view(-1, *([1] * (gradient.ndim - 1)))
+    (pulled,) = torch.autograd.grad(output, source, scaled.to(output.dtype))
+    return pulled * unit.view(-1, *([1] * (pulled.ndim - 1))).to(pulled.dtype)
+
+
+class FiniteWatch:
+    """Remembers which tensors of a trajectory were finite, on their device, and is asked once at the end."""
+
+    def __init__(self) -> None:
+        self._names: list[tuple[str, int]] = []
+        self._finite: list[Tensor] = []
+
+    def note(self, name: str, step: int, tensor: Tensor) -> None:
+        """Look at a tensor; nothing waits for the device.
+
+        Args:
+            name: what it is, for the message.
+            step: index of the denoising step.
+            tensor: any.
+        """
+        self._names.append((name, step))
+        self._finite.append(torch.isfinite(tensor.detach()).all())
+
+    def check(self, dtype: torch.dtype) -> None:
+        """Name the first tensor that was not finite.
+
+        Args:
+            dtype: of the prior's networks, for the message.
+
+        Raises:
+            ValueError: there is one.
+        """
+        if not self._finite:
+            return
+        finite = torch.stack(self._finite).cpu()
+        if finite.all():
+            return
+        name, step = self._names[int((~finite).nonzero()[0])]
+        short = str(dtype).removeprefix("torch.")
+        cure = "Load the prior with dtype=torch.bfloat16 or torch.float32."
+        if short != "float16":
+            cure = "Are all weights of the prior finite?"
+        bad_value(f"{name} of denoising step {step + 1}", f"finite in {short}", "NaN or infinity in it", cure)
+
+
+class Rule(Protocol):
+    """How far one gradient moves a tensor; made anew for every trajectory."""
+
+    def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
+        """What to add, for ``gradient`` (B, ...); ``reference`` (B, ...) is there for rules that need it."""
+
+
+def _per_sample_norm(x: Tensor) -> Tensor:
+    norm = x.flatten(1).norm(dim=1) if x.ndim > 1 else x.abs()
+    return norm.view(-1, *([1] * (x.ndim - 1)))
+
+
+class Plain:
+    """``-rate * gradient``: Algorithm 1 as printed."""
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+
+    def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
+        """As ``Rule``; ``reference`` is not used."""
+        return -self.rate * gradient
+
+
+class NormMatched:
+    """``-rate * gradient * |reference| / |gradient|`` per sample: a fixed share of the predicted noise."""
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+
+    def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
+        """As ``Rule``; without ``reference`` the step has length 1. A zero gradient gives a zero step."""
+        length = _per_sample_norm(reference) if reference is not None else 1.0
+        return -self.rate * gradient * (length / _per_sample_norm(gradient).clamp_min(1e-12))
+
+
+class Adam:
+    """Adam with bias correction, element-wise, so that samples of a batch do not see each other.
+
+    Args:
+        rate: step size.
+        betas: decay of the two moments.
+        eps: least denominator.
+        to_norm: scale each sample's gradient to the norm of the reference first, which weighs the steps of
+            a schedule against each other in the moments.
+    """
+
+    def __init__(
+        self,
+        rate: float,
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-10,
+        to_norm: bool = False,
+    ) -> None:
+        self.rate, self.betas, self.eps, self.to_norm = rate, betas, eps, to_norm
+        self._count = 0
+        self._moments: tuple[Tensor, Tensor] | None = None
+
+    def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
+        """As ``Rule``, for gradients of the same shape at every call; ``to_norm`` uses ``reference``."""
+        b1, b2 = self.betas
+        if self.to_norm and reference is not None:
+            gradient = gradient * (_per_sample_norm(reference) / _per_sample_norm(gradient).clamp_min(1e-8))
+        first, second = self._moments or (torch.zeros_like(gradient), torch.zeros_like(gradient))
+        self._count += 1
+        first = b1 * first + (1 - b1) * gradient
+        second = b2 * second + (1 - b2) * gradient * gradient
+        self._moments = (first, second)
+        corrected = second / (1 - b2**self._count)
+        return -self.rate * (first / (1 - b1**self._count)) / (corrected.sqrt() + self.eps)
+
+
+#: Name in the configuration -> rule for a step size. ``adam-norm`` is Marigold-DC's.
+RULES: dict[str, Callable[[float], Rule]] = {
+    "plain": Plain,
+    "adam": Adam,
+    "norm": NormMatched,
+    "adam-norm": partial(Adam, betas=(0.9, 0.999), eps=1e-8, to_norm=True),
+}

@@ -1,0 +1,135 @@
+"""What a guided call does at every denoising step, decided once a call; ``print`` shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.config import GuidanceConfig, UpdatePlan
+
+__all__ = ["Round", "Schedule", "count_steps", "make_schedule"]
+
+
+class Round(NamedTuple):
+    """A correction or none, then so many gradient updates; with neither, the scale is settled."""
+
+    corrects: bool
+    updates: int
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Every denoising step of a guided call.
+
+    Attributes:
+        steps: the rounds of each step that runs; none where it is the prior's own, which decodes nothing.
+        skipped: steps before them that a warm start leaves out.
+        moves: whether rounds move latents, and not only scale and shift.
+    """
+
+    steps: tuple[tuple[Round, ...], ...]
+    skipped: int = 0
+    moves: bool = True
+
+    def is_last(self, step: int) -> bool:
+        """Whether no step follows, so that a corrected map is the result."""
+        return step == len(self.steps) - 1
+
+    def moves_at(self, step: int) -> bool:
+        """Whether the step differs from the prior's own."""
+        return self.moves and bool(self.steps[step])
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        for i in range(self.skipped):
+            yield f"step {i + 1}: skipped, as the call starts from the previous frame"
+        for i, rounds in enumerate(self.steps):
+            actions = [
+                " and ".join(
+                    ["correct"] * r.corrects + [f"update {r.updates} x"] * (r.updates > 0)
+                    or ["settle the scale"]
+                )
+                for r in rounds
+            ]
+            last = ", last" if self.is_last(i) else ""
+            yield f"step {self.skipped + i + 1}: {'; '.join(actions) or 'leave'}{last}"
+
+
+def count_steps(wanted: int, requested: int | None, most: int | None) -> tuple[int, int]:
+    """Denoising steps of a guided call, and rounds in each.
+
+    A prior that can only take fewer steps than guidance wants makes the rounds of all of them in those that
+    it has, each with a search of its own, as a step would have.
+
+    Args:
+        wanted: steps that guidance wants.
+        requested: ``num_inference_steps`` of the call.
+        most: steps that make sense with the prior, or ``None``.
+
+    Raises:
+        ValueError: more steps are requested than the prior has.
+    """
+    if most is None or wanted <= most:
+        return wanted, 1
+    if requested is not None:
+        cure = "Leave it out: the prior was trained for so few."
+        bad_value("num_inference_steps", f"at most {most} with this prior", requested, cure)
+    return most, -(-wanted // most)
+
+
+def make_schedule(
+    config: GuidanceConfig,
+    plan: UpdatePlan,
+    steps: int,
+    *,
+    rounds: int = 1,
+    skipped: int = 0,
+    encodes: bool = True,
+) -> Schedule:
+    """The schedule of a call.
+
+    Early estimates are vague, and later corrections replace what earlier ones did. So the last active round
+    is corrected, and the others are spread over the second half of the active rounds, or over more of them if
+    they do not fit there. An estimate that was corrected in a round without updates is not corrected again in
+    the same step: it would be brought to the same matches, which only follows their noise.
+
+    Args:
+        config: hyperparameters.
+        plan: number and start of the updates.
+        steps: denoising steps that run.
+        rounds: in each of them.
+        skipped: steps before them that a warm start leaves out; they count in fractions of the schedule.
+        encodes: whether corrected maps can be encoded: not where guidance moves z_t.
+    """
+    count = (skipped + steps) * rounds
+    active = [i for i in range(count) if config.start <= i / count < config.stop]
+    corrects = config.correct and config.optimize_latents and encodes
+    chosen = _spread(active, config.corrections) if corrects and active else set()
+    made = []
+    for step in range(skipped, skipped + steps):
+        current: list[Round] = []
+        fresh = False  # corrected, and not moved since
+        for i in range(step * rounds, (step + 1) * rounds):
+            if i not in active:
+                continue
+            updates = plan.inner_steps if (i + 1) / count > plan.updates_from else 0
+            corrected = i in chosen and not fresh
+            if corrected or updates:
+                current.append(Round(corrected, updates))
+                fresh = (corrected or fresh) and updates == 0
+        made.append(tuple(current))
+    if not any(made):  # the output needs a scale, even if no step corrects or moves anything
+        made[-1] = (Round(False, 0),)
+    return Schedule(tuple(made), skipped, config.optimize_latents)
+
+
+def _spread(active: list[int], wanted: int) -> set[int]:
+    """So many of the rounds, the last one among them, the others over the second half if they fit there."""
+    wanted = min(wanted, len(active))
+    first = min(len(active) // 2, len(active) - wanted)
+    step = (len(active) - 1 - first) / max(wanted - 1, 1)
+    return {active[len(active) - 1 - round(k * step)] for k in range(wanted)}

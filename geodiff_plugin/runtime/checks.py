@@ -1,0 +1,211 @@
+"""What a guided call refuses before it computes anything: arguments, images, offloading, casting."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, refuse
+from geodiff_plugin.formats import as_image_01
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.priors import DepthPrior
+from geodiff_plugin.priors.pipelines.base import RESAMPLING
+from geodiff_plugin.runtime.noise_levels import check_scheduler
+
+__all__ = ["check_arguments", "check_guidable", "check_left_images", "needs_network"]
+
+#: What every stock pipeline's call takes, whatever the prior.
+STOCK_ARGUMENTS = (
+    *("output_type", "resample_method_input", "resample_method_output", "batch_size", "num_inference_steps"),
+    *("processing_resolution", "ensemble_size", "generator", "latents"),
+)
+#: Modes of PIL images that ``MarigoldImageProcessor`` reads; a palette's indices it takes for grey values.
+STOCK_MODES = ("L", "RGB", "I;16")
+STOCK_TYPES = (np.uint8, np.uint16, np.float16, np.float32, np.float64)
+#: More than any call asks for, of steps, pixels or members.
+MOST = 1 << 20
+
+
+def check_arguments(call: Mapping[str, Any], images: int) -> None:
+    """Refuse arguments of the call that no pipeline takes, in our own words.
+
+    What the stock pipeline refuses in a sentence that names the argument is left to it.
+
+    Args:
+        call: arguments of the stock call by name.
+        images: number of left images.
+
+    Raises:
+        TypeError, ValueError: another output type than ``"np"`` and ``"pt"``; a number of steps, a
+            resolution, a batch or ensemble size that is no whole number or too small; a way of resampling
+            that does not exist; no generator, or a list of another number than that of all members; latents
+            that are not finite.
+    """
+    missing = [name for name in STOCK_ARGUMENTS if name not in call]
+    if missing:
+        refuse(
+            f"The pipeline's __call__ must name the arguments of the stock pipeline that it overrides; "
+            f"it has no {', '.join(missing)}. A **kwargs that hands them on hides them: write them out."
+        )
+    check_choice(call["output_type"], "output_type", ("np", "pt"))
+    check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
+    if call["resample_method_output"] is not None:
+        check_choice(call["resample_method_output"], "resample_method_output", RESAMPLING)
+    check_number(call["batch_size"], "batch_size", 1, MOST, integer=True)
+    for name, least in (("num_inference_steps", 1), ("processing_resolution", 0)):
+        if call[name] is not None:
+            check_number(call[name], name, least, MOST, integer=True)
+    members = images * check_number(call["ensemble_size"], "ensemble_size", 1, MOST, integer=True)
+    given = call["generator"]
+    generators = given if isinstance(given, list) else [] if given is None else [given]
+    if not all(isinstance(generator, torch.Generator) for generator in generators):
+        bad_type("generator", "None, a torch.Generator or a list of them", given)
+    if isinstance(given, list) and len(given) != members:
+        expected = (
+            f"one torch.Generator, or a list of {members}: one for every image and member of its ensemble"
+        )
+        bad_value("generator", expected, f"a list of {len(given)}")
+    latents = call["latents"]
+    if isinstance(latents, torch.Tensor) and not latents.isfinite().all():
+        bad_value("latents", "finite", "NaN or infinity in it")
+
+
+def check_left_images(image: Any) -> tuple[Any, int]:
+    """Check left images as ``GeometryGuidance`` checks right ones.
+
+    Args:
+        image: PIL image, numpy ``(H, W, C)``, ``(H, W)`` or ``(N, H, W, C)``, torch ``(C, H, W)``, ``(H, W)``
+            or ``(N, C, H, W)``, or a list of them.
+
+    Returns:
+        The same object if the stock call reads it as it is meant, so that guidance changes nothing of what
+        the prior sees; else (alpha, a palette, CMYK, a little overshoot) a ``(3, H, W)`` tensor in [0, 1], or
+        a list of them. And the number of images.
+
+    Raises:
+        TypeError, ValueError: as ``as_image_01``, naming ``image`` or ``image[i]``; no image, or of several
+            sizes.
+    """
+    named = list(_named(image, "image"))
+    if not named:
+        bad_value("image", "an image or a list of images", "an empty one")
+    tensors = [as_image_01(entry, name) for name, entry in named]
+    size = tensors[0].shape
+    for (name, _), tensor in zip(named, tensors, strict=True):
+        if tensor.shape != size:
+            expected = f"of {size[2]}x{size[1]} pixels, as {named[0][0]}"
+            got = f"{tensor.shape[2]}x{tensor.shape[1]}"
+            bad_value(name, expected, got, "Call once for every size.")
+    # The stock check of sizes compares the last two axes, which of arrays may be columns and channels.
+    ranks = {entry.ndim if isinstance(entry, np.ndarray) else 0 for _, entry in named}
+    if len(ranks) == 1 and all(_stock_reads(entry) for _, entry in named):
+        return image, len(named)
+    return tensors if isinstance(image, list) or len(named) > 1 else tensors[0], len(named)
+
+
+def _named(image: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Every single image with its name in messages; of a batch with its index."""
+    several = isinstance(image, list)
+    if isinstance(image, (np.ndarray, torch.Tensor)):
+        several = image.ndim == 4
+        image = image[None] if isinstance(image, torch.Tensor) and image.ndim == 2 else image
+    if not several:
+        yield name, image
+        return
+    for i, entry in enumerate(image):
+        yield from _named(entry, f"{name}[{i}]")
+
+
+def _stock_reads(image: Image.Image | np.ndarray | torch.Tensor) -> bool:
+    """Whether the stock call reads a good image as ``as_image_01`` does."""
+    if isinstance(image, Image.Image):
+        return image.mode in STOCK_MODES
+    if isinstance(image, torch.Tensor):
+        if image.shape[0] == 4:
+            return False
+        return image.dtype == torch.uint8 or (image.is_floating_point() and _in_unit_range(image))
+    if image.dtype not in STOCK_TYPES or (image.ndim == 3 and image.shape[-1] == 4):
+        return False
+    # torch takes no array that was flipped; integers are copied before.
+    return image.dtype.kind == "u" or (min(image.strides) >= 0 and _in_unit_range(image))
+
+
+def _in_unit_range(image: np.ndarray | torch.Tensor) -> bool:
+    return bool(image.min() >= 0.0 and image.max() <= 1.0)
+
+
+def needs_network(guidance: GeometryGuidance) -> bool:
+    """Whether gradients of z_t are taken through the network."""
+    return guidance.config.gradient == "full" and _moves_latents(guidance)
+
+
+def _moves_latents(guidance: GeometryGuidance) -> bool:
+    return guidance.config.optimize_latents and guidance.updates.inner_steps > 0
+
+
+def check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) -> None:
+    """Refuse a pipeline that cannot be guided as configured.
+
+    Raises:
+        TypeError, ValueError: a scheduler, offloading, casting or network that cannot be guided.
+    """
+    check_scheduler(pipe.scheduler)
+    _check_offloading(pipe, guidance.config.gradient)
+    _check_casting(pipe, guidance)
+    if needs_network(guidance) and prior.network_input is None:
+        cure = "z_t is no input of its network, so only the clean latent can be moved."
+        bad_value("gradient", "'denoised' with this prior", "'full'", cure)
+
+
+def _check_offloading(pipe: Any, gradient: str) -> None:
+    """Refuse offloading that takes weights away before the backward pass needs them."""
+    for component in pipe.components.values():
+        for module in component.modules() if isinstance(component, torch.nn.Module) else ():
+            hook = getattr(module, "_hf_hook", None)
+            hooks = getattr(hook, "hooks", [hook] if hook else [])
+            sequential = any(type(h).__name__ == "AlignDevicesHook" for h in hooks) and any(
+                getattr(h, "offload", False) for h in hooks
+            )
+            grouped = any("group_offloading" in name for name in _diffusers_hooks(module))
+            if sequential or grouped:
+                bad_value(
+                    "pipe",
+                    "without sequential or group CPU offloading while guided",
+                    f"{type(component).__name__} whose weights leave the device after each forward",
+                    "The backward pass needs them: use pipe.enable_model_cpu_offload() or pipe.to(device).",
+                )
+    if gradient == "full" and getattr(pipe, "_all_hooks", None):
+        bad_value(
+            "gradient",
+            "'denoised' with enable_model_cpu_offload()",
+            "'full'",
+            "Decoding pushes the U-Net to the CPU before its backward pass; "
+            "use gradient='denoised' or pipe.to(device).",
+        )
+
+
+def _check_casting(pipe: Any, guidance: GeometryGuidance) -> None:
+    """Refuse layerwise casting of a module that gradients go through: its weights are others by then."""
+    if not _moves_latents(guidance):
+        return
+    components = (
+        pipe.components.values() if guidance.config.gradient == "full" else [getattr(pipe, "vae", None)]
+    )
+    for component in components:
+        modules = component.modules() if isinstance(component, torch.nn.Module) else ()
+        if any("layerwise_casting" in _diffusers_hooks(module) for module in modules):
+            bad_value(
+                "pipe",
+                "without layerwise casting where gradients go through",
+                f"{type(component).__name__} whose weights are cast after each layer",
+                "Leave inner_steps at 0, or load the pipeline in half precision.",
+            )
+
+
+def _diffusers_hooks(module: torch.nn.Module) -> Mapping[str, Any]:
+    registry = getattr(module, "_diffusers_hook", None)
+    return {} if registry is None else registry.hooks

@@ -1,0 +1,174 @@
+"""The prior's estimate at one denoising step: clean latent, relative map, and the way between the two.
+
+Maps cover the pixels of the image, latents the padded processing grid. ``D`` of Algorithm 1 is ``decode``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_from, z0_from
+from geodiff_plugin.priors import DepthPrior
+from geodiff_plugin.runtime.hooks import DenoiserTap, put_channels
+
+__all__ = ["MapCodec", "ProcessingGrid", "StepEstimate", "StepInputs"]
+
+#: What the scheduler's step is given: network output, noisy latent, and what to add to its result.
+StepInputs = tuple[Tensor, Tensor, Tensor | None]
+
+
+@dataclass(frozen=True)
+class ProcessingGrid:
+    """The grid that a pipeline denoises on, with and without its padding.
+
+    Attributes:
+        content: ``(H, W)`` without padding.
+        padding: rows at the bottom and columns at the right that were added to it.
+    """
+
+    content: tuple[int, int]
+    padding: tuple[int, int]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(H, W)`` with padding."""
+        return self.content[0] + self.padding[0], self.content[1] + self.padding[1]
+
+    def cropped(self, x: Tensor) -> Tensor:
+        """``(B, C, H, W)`` without its padding."""
+        height, width = self.content
+        return x[:, :, :height, :width]
+
+    def padded(self, x: Tensor) -> Tensor:
+        """A map on the whole grid: as with the image, its last row and column repeat.
+
+        It may lack the padding, or what lies beyond the last whole cell of the latent.
+        """
+        bottom, right = (full - side for full, side in zip(self.size, x.shape[-2:], strict=True))
+        return F.pad(x, (0, right, 0, bottom), mode="replicate") if bottom or right else x
+
+
+class MapCodec:
+    """Decodes and encodes relative maps during one guided call.
+
+    Args:
+        pipe: the live pipeline.
+        prior: its adapter.
+        grid: the processing grid.
+        tiny: autoencoder that stands in for the pipeline's between the steps, or ``None``.
+    """
+
+    def __init__(self, pipe: Any, prior: DepthPrior, grid: ProcessingGrid, tiny: Any | None) -> None:
+        self._pipe, self.prior, self.grid, self.tiny = pipe, prior, grid, tiny
+
+    @contextmanager
+    def _loop_autoencoder(self) -> Iterator[None]:
+        users = self._pipe.vae if self.tiny is not None else None
+        if self.tiny is not None:  # past ``__setattr__``, which would rewrite the pipeline's config
+            object.__setattr__(self._pipe, "vae", self.tiny)
+        try:
+            yield
+        finally:
+            if self.tiny is not None:
+                object.__setattr__(self._pipe, "vae", users)
+
+    def decode(self, z0: Tensor, final: bool = False) -> Tensor:
+        """Unclipped relative map of a clean latent ``(B, C, h, w)``, differentiable.
+
+        Args:
+            z0: depth channels of the latent.
+            final: the map is a result: the pipeline's own autoencoder decodes it.
+
+        Returns:
+            ``(B, 1, H, W)`` float32, without padding.
+        """
+        with nullcontext() if final else self._loop_autoencoder():
+            x = self.prior.decode(z0).float()  # of a prior in float64 as well: the views are in float32
+        return self.grid.cropped(self.grid.padded(x))
+
+    def encode(self, x: Tensor) -> Tensor:
+        """Clean latent of a relative map ``(B, 1, H, W)``, padded as the image was."""
+        with self._loop_autoencoder():
+            return self.prior.encode(self.grid.padded(x))
+
+
+class StepEstimate:
+    """One denoising step's estimate, as ``algorithm.step`` guides it.
+
+    Args:
+        codec: between latents and maps.
+        level: signal and noise of the step.
+        output: ``(B, C, h, w)`` the network's output, all channels, in the pipeline's precision.
+        z_t: the same of the noisy latent.
+        tap: of the network for the full gradient; ``None`` where guidance moves the clean latent.
+        latent_is_read: another step follows, or the user asked for the latent; else a last map needs no code.
+
+    Attributes:
+        latent: ``(B, c, h, w)`` float32, what guidance moves: z_t ("full") or z0_hat ("denoised").
+        eps: ``(B, c, h, w)`` float32, the predicted noise.
+        can_encode: whether a corrected map can be encoded: not where z_t is moved.
+    """
+
+    def __init__(
+        self,
+        codec: MapCodec,
+        level: NoiseLevel,
+        output: Tensor,
+        z_t: Tensor,
+        tap: DenoiserTap | None,
+        latent_is_read: bool,
+    ) -> None:
+        self._codec, self._level, self._output, self._z_t, self._tap = codec, level, output, z_t, tap
+        self._wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
+        channels = codec.prior.latents
+        self.output = output[:, channels].to(self._wide)
+        wide_z_t = z_t[:, channels].to(self._wide)
+        self.eps = noise_from(self.output, wide_z_t, level)
+        self.latent = z0_from(self.output, wide_z_t, level) if tap is None else tap.leaf
+        self.can_encode, self.latent_is_read = tap is None, latent_is_read
+
+    def z0(self, latent: Tensor) -> Tensor:
+        """The clean latent of a guided one: Tweedie with the network's graph in "full", else the same."""
+        if self._tap is None:
+            return latent
+        output = self._tap.output_at(latent)[:, self._codec.prior.latents].to(self._wide)
+        return z0_from(output, latent, self._level)
+
+    def decode(self, z0: Tensor, final: bool = False) -> Tensor:
+        """As ``MapCodec.decode``; a ``final`` map is given out, unless its latent is read."""
+        return self._codec.decode(z0, final and not self.latent_is_read)
+
+    def encode(self, x: Tensor) -> Tensor:
+        """As ``MapCodec.encode``."""
+        return self._codec.encode(x)
+
+    def step_inputs(self, move: Tensor, from_moved: bool) -> StepInputs:
+        """What the scheduler's own step is given once the latent has been moved.
+
+        Args:
+            move: ``(B, c, h, w)`` what guidance adds to ``latent``.
+            from_moved: with the full gradient the step starts from the moved z_t, instead of the move being
+                added to its result.
+        """
+        moved, prior = (self.latent + move).detach(), self._codec.prior
+        if self._tap is None:
+            new = output_from(moved, self.eps, self._level)
+            output, z_t = (self._put(*pair) for pair in zip((self._output, self._z_t), new, strict=True))
+            return output, z_t, None
+        if prior.max_steps == 1:
+            # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
+            return self._tap.output_at(moved).detach(), self._put(self._z_t, moved), None
+        if from_moved:
+            return self._output, self._put(self._z_t, moved), None
+        nothing = torch.zeros_like(self._z_t, dtype=self._wide)
+        return self._output, self._z_t, put_channels(nothing, prior.latents, move)
+
+    def _put(self, whole: Tensor, part: Tensor) -> Tensor:
+        return put_channels(whole, self._codec.prior.latents, part.to(whole.dtype))

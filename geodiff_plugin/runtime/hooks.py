@@ -1,0 +1,321 @@
+"""All that a guided call changes on a live pipeline, and puts back: scheduler, network, weights.
+
+Each ``attached()`` or context manager undoes itself at exit, and may be entered again: while a callback runs
+the pipeline is as the user left it. The guided ``step`` is the DDIM line of Algorithm 1.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from geodiff_plugin._threads import WithinCores
+from geodiff_plugin.runtime.noise_levels import trailing_timesteps
+
+__all__ = [
+    "DenoiserTap",
+    "Exclusive",
+    "GuidedScheduler",
+    "exclusive_call",
+    "frozen_weights",
+    "images_in_float32",
+    "put_channels",
+    "replaced",
+]
+
+_LOCKS: WeakKeyDictionary[Any, threading.RLock] = WeakKeyDictionary()
+_LOCKS_GUARD = threading.Lock()
+
+
+def put_channels(whole: Tensor, channels: slice, part: Tensor) -> Tensor:
+    """``whole (B, C, h, w)`` with ``part (B, c, h, w)`` at ``channels``; differentiable in both.
+
+    A slice of all channels gives back ``part`` itself.
+    """
+    start, stop, _ = channels.indices(whole.shape[1])
+    if stop - start == whole.shape[1]:
+        return part
+    return torch.cat([whole[:, :start], part, whole[:, stop:]], dim=1)
+
+
+@contextmanager
+def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """Hide a class's attribute by one of the instance ``owner``; then put back what was there."""
+    before = vars(owner).get(name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        if before is None:
+            delattr(owner, name)
+        else:
+            setattr(owner, name, before)
+
+
+@contextmanager
+def frozen_weights(pipe: Any) -> Iterator[None]:
+    """``requires_grad`` off on every weight of a pipeline; otherwise each of them would keep a graph."""
+    flags = [(p, p.requires_grad) for module in _modules(pipe) for p in module.parameters()]
+    for parameter, _ in flags:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter, flag in flags:
+            parameter.requires_grad_(flag)
+
+
+def _modules(pipe: Any) -> list[torch.nn.Module]:
+    return [m for m in pipe.components.values() if isinstance(m, torch.nn.Module)]
+
+
+def images_in_float32(processor: Any) -> AbstractContextManager[None]:
+    """An image processor's ``preprocess`` reads and resizes in float32, and casts last.
+
+    PyTorch has no kernels for half precision on a CPU, and float16 has no number for the white of a 16-bit
+    image.
+    """
+    stock = processor.preprocess
+
+    def preprocess(
+        image: Any,
+        processing_resolution: int | None = None,
+        resample_method_input: str = "bilinear",
+        device: torch.device | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> Any:
+        images, *rest = stock(image, processing_resolution, resample_method_input, device, torch.float32)
+        return images.to(dtype), *rest
+
+    return replaced(processor, "preprocess", preprocess)
+
+
+class Exclusive:
+    """Context manager that holds the locks of some objects; a thread may enter it again inside.
+
+    Args:
+        owners: objects that can be weakly referenced.
+        inside: further context managers, entered once the locks are held, and again after ``given_back``.
+    """
+
+    def __init__(self, owners: Iterable[Any], *inside: AbstractContextManager[object]) -> None:
+        with _LOCKS_GUARD:
+            locks = {id(lock): lock for lock in (_LOCKS.setdefault(o, threading.RLock()) for o in owners)}
+        # All threads take them in one order, so that no two wait for each other.
+        self._contexts = [*(lock for _, lock in sorted(locks.items())), *inside]
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Exclusive:
+        with ExitStack() as stack:
+            for context in self._contexts:
+                stack.enter_context(context)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stack.close()
+
+    @contextmanager
+    def given_back(self) -> Iterator[None]:
+        """Release everything for a while, and wait for the locks afterwards."""
+        self.__exit__()
+        try:
+            yield
+        finally:
+            self.__enter__()
+
+
+def exclusive_call(pipe: Any, guided: bool) -> Exclusive:
+    """What a call holds: the pipeline, and a guided one also its networks and ``WithinCores``.
+
+    A guided call then changes no pipeline whose stock call runs in another thread, and two pipelines that
+    share networks are not guided at once. Stock calls of other pipelines are not held up.
+    """
+    return Exclusive([pipe, *_modules(pipe)], WithinCores()) if guided else Exclusive([pipe])
+
+
+class DenoiserTap:
+    """Runs the network with gradients to its depth latent, and again at another latent.
+
+    Source: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
+
+    Args:
+        owner: object whose method the loop calls: the U-Net, or a pipeline of ours.
+        method: name of the method, ``"forward"`` of a module; its first argument holds the latent.
+        channels: which channels of that argument are the depth latent.
+
+    The instance gets an attribute that hides its class's method, so that hooks and compiled forwards below
+    are called as before.
+    """
+
+    def __init__(self, owner: Any, method: str, channels: slice) -> None:
+        self._owner, self._method, self._channels = owner, method, channels
+        self._at: Callable[[Tensor], Any] | None = None  # the latest call, at another latent
+        self._leaf: Tensor | None = None
+        self._output: Tensor | None = None
+
+    @contextmanager
+    def attached(self) -> Iterator[None]:
+        """The method is tapped inside; afterwards it is as it was and the graph is dropped."""
+        stock, thread = getattr(self._owner, self._method), threading.get_ident()
+
+        @functools.wraps(stock)
+        def tapped(model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != thread:  # a stock call of another pipeline with the same network
+                return stock(model_input, *args, **kwargs)
+            return self._run(stock, model_input, *args, **kwargs)
+
+        try:
+            with replaced(self._owner, self._method, tapped):
+                yield
+        finally:
+            self.release()
+
+    @property
+    def leaf(self) -> Tensor:
+        """``(B, C, h, w)`` the latest call's depth latent, float32 or wider, requires a gradient."""
+        assert self._leaf is not None
+        return self._leaf
+
+    def release(self) -> None:
+        """Drop the graph and everything that it holds."""
+        self._at = self._leaf = self._output = None
+
+    def _run(self, forward: Callable[..., Any], model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
+        """The tapped call: same result, detached; the graph is kept until ``release``."""
+        model_input = model_input.detach()
+        wide = torch.promote_types(model_input.dtype, torch.float32)
+        kind = model_input.device.type
+        mixed, precision = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
+
+        def at(z_t: Tensor) -> Any:
+            # Guided steps leave the user's autocast, under which the other arguments were made.
+            with torch.enable_grad(), torch.autocast(kind, precision, enabled=mixed):
+                joined = put_channels(model_input, self._channels, z_t.to(model_input.dtype))
+                return forward(joined, *args, **kwargs)
+
+        self._at, self._leaf = at, model_input[:, self._channels].to(wide).requires_grad_()
+        result = at(self._leaf)
+        self._output = _first(result)
+        detached = self._output.detach()
+        if isinstance(result, Tensor):
+            return detached
+        return (detached, *result[1:]) if isinstance(result, tuple) else type(result)(detached)
+
+    def output_at(self, z_t: Tensor) -> Tensor:
+        """Network output with its graph to ``z_t (B, C, h, w)`` float32.
+
+        The pipeline's own forward is reused for its own input: one update costs no second network call.
+        """
+        assert self._at is not None and self._output is not None
+        return self._output if z_t is self._leaf else _first(self._at(z_t))
+
+
+def _first(result: Any) -> Tensor:
+    """The tensor out of a tensor, a tuple or a ``BaseOutput``."""
+    return result if isinstance(result, Tensor) else result[0]
+
+
+class GuidedScheduler:
+    """A copy of the scheduler: ``set_timesteps`` starts a trajectory, ``step`` is guided.
+
+    A pipeline that shares the scheduler never meets a guided ``step``, and the state of the user's scheduler
+    stays what it was. The copy is of the same class with the same config and attributes. It goes onto the
+    pipeline past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config. A scheduler of
+    which the user replaced one of the two methods on the instance is used itself, since such a method usually
+    holds on to the instance; all its attributes are put back.
+
+    ``step`` gets the timesteps on the CPU, where diffusers keeps the tables that they index: compared and
+    looked up on another device, each would be waited for several times a step.
+
+    Args:
+        pipe: the live pipeline.
+        on_trajectory: called at ``set_timesteps`` with the timesteps; Marigold does so for every chunk.
+        on_step: ``(model_output, timestep, z_t) -> (model_output, z_t, shift)``: what the scheduler's own
+            step shall be given, and what to add to its ``z_{t-1}`` (``None`` for nothing).
+        on_done: ``(timestep, z_{t-1}) -> z_{t-1}``, after the step.
+        respace: run a leading DDIM as trailing.
+        skipped: steps at the beginning of the schedule that are left out; for a DDIM, whose step asks for the
+            timestep alone.
+    """
+
+    def __init__(
+        self,
+        pipe: Any,
+        on_trajectory: Callable[[Tensor], None],
+        on_step: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor | None]],
+        on_done: Callable[[Tensor, Tensor], Tensor],
+        respace: bool,
+        skipped: int = 0,
+    ) -> None:
+        self._pipe, self._respace, self._skipped = pipe, respace, skipped
+        self._on_trajectory, self._on_step, self._on_done = on_trajectory, on_step, on_done
+        users = pipe.scheduler
+        is_patched = any(name in vars(users) for name in ("set_timesteps", "step"))
+        self._scheduler = users if is_patched else copy.copy(users)
+        self._inside = dict(vars(self._scheduler)) | self._wrapped()
+
+    @contextmanager
+    def attached(self) -> Iterator[None]:
+        """The guided scheduler is on the pipeline; entered again in mid-call, its trajectory goes on."""
+        users, outside = self._pipe.scheduler, dict(vars(self._scheduler))
+        _set_attributes(self._scheduler, self._inside)
+        object.__setattr__(self._pipe, "scheduler", self._scheduler)
+        try:
+            yield
+        finally:
+            self._inside = dict(vars(self._scheduler))
+            _set_attributes(self._scheduler, outside)
+            object.__setattr__(self._pipe, "scheduler", users)
+
+    def release(self) -> None:
+        """Let go of the call, after its end: the wrapped methods and this object hold each other."""
+        self._inside = {}
+
+    def _wrapped(self) -> dict[str, Callable[..., Any]]:
+        """The two methods as instance attributes, which hide those of the class."""
+        scheduler = self._scheduler
+        stock_set_timesteps, stock_step = scheduler.set_timesteps, scheduler.step
+
+        @functools.wraps(stock_set_timesteps)
+        def set_timesteps(*args: Any, **kwargs: Any) -> None:
+            device = kwargs.get("device")
+            stock_set_timesteps(*args, **kwargs | ({} if device is None else {"device": "cpu"}))
+            trailing = trailing_timesteps(scheduler, len(scheduler.timesteps)) if self._respace else None
+            self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()[self._skipped :]
+            self._done = 0
+            self._on_trajectory(self._timesteps)
+            scheduler.timesteps = self._timesteps.to(device=device)  # what the host's loop is about to take
+
+        @functools.wraps(stock_step)
+        def step(model_output: Tensor, timestep: Any, sample: Tensor, *args: Any, **kwargs: Any) -> Any:
+            given = timestep
+            scheduler.timesteps, timestep = self._timesteps, self._timesteps[self._done]
+            self._done += 1
+            output, z_t, shift = self._on_step(model_output, timestep, sample)
+            result = stock_step(output, timestep, z_t, *args, **kwargs)
+            is_tuple = isinstance(result, tuple)
+            previous = result[0] if is_tuple else result.prev_sample
+            if shift is not None:
+                previous = (previous.float() + shift).to(previous.dtype)
+            previous = self._on_done(torch.as_tensor(given, device=previous.device), previous)
+            if is_tuple:
+                return (previous, *result[1:])
+            result.prev_sample = previous
+            return result
+
+        return {"set_timesteps": set_timesteps, "step": step}
+
+
+def _set_attributes(instance: Any, attributes: dict[str, Any]) -> None:
+    """Make ``attributes`` all that an instance has."""
+    vars(instance).clear()
+    vars(instance).update(attributes)

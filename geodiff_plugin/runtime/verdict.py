@@ -1,0 +1,369 @@
+"""Whether a result can be trusted, and if not, why: indicators of a run, and a verdict on them.
+
+No indicator shows everything: a rectified pair with a wrong focal length, or with a baseline that is wrong by
+a factor that a rig might have, matches as well as a right one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.algorithm.evidence import Evidence
+from geodiff_plugin.formats.depth import row_strips
+from geodiff_plugin.matching import Matches
+from geodiff_plugin.pose.mistakes import INVERSE
+from geodiff_plugin.types import PoseReport
+
+__all__ = ["EPIPOLAR_PX", "Indicators", "Verdict", "judge", "points_agreement", "read_indicators"]
+
+#: Confidence from which a match counts.
+CONFIDENT = 0.5
+#: Two images whose values differ by less, in [0, 1], and by less than this share of their contrast (all
+#: pictures that are nearly black differ by little), are one picture.
+SAME, SAME_SHARE = 1.5 / 255, 0.05
+#: Points that are compared with matches: at least so many, each with matches this near, pixels of the grid.
+FEWEST_COMPARED, REACH_PX = 12, 3
+FEWEST_MATCHES = 40
+#: Log of the ratio of the 95 % and the 5 % quantile of depth below which a scene may be one plane.
+FLAT = 0.2
+#: Below these a run is not to be trusted: mean confidence, share matched; and a rank correlation of near and
+#: far that is this far below 0. Right pairs, real and rendered, had .66 to .98, .32 to .96 and +.18 to +.97;
+#: where nothing is matched, confidence is about .45.
+LEAST_CONFIDENCE, LEAST_MATCHED, MOST_EXCHANGED = 0.5, 0.12, -0.2
+#: No agreement on near and far is bad where few pixels are matched; with many, a poor prior may be at fault.
+LEAST_ORDER, MATCHED_ENOUGH = 0.2, 0.5
+#: Two weak signs together weigh as much as one that is bad.
+WEAK_CONFIDENCE, WEAK_MATCHED, WEAK_ORDER = 0.6, 0.4, 0.45
+#: A rank correlation says nothing of a scene whose matched depths all lie within this (log of 95 % over 5 %).
+LEAST_SPREAD = 0.15
+#: Points and matches that differ by the first factor are reported; by the second, the result is not trusted.
+POINTS_REPORTED, POINTS_WRONG = math.log(1.08), math.log(1.2)
+#: A rig's baseline in metres is longer, and a lens's horizontal field of view lies between these, in degrees:
+#: that of 135 mm and that of 10 mm in 35 mm equivalent. A long baseline is warned of when it is given.
+LEAST_BASELINE_M, VIEWS_DEG = 1e-3, (15.0, 120.0)
+#: No lens that keeps lines straight sees as much, degrees.
+TOO_WIDE_DEG = 150.0
+#: Factor over a metric prior's own metres from which the difference is reported.
+OWN_METRES = math.log(1.9)
+#: Distance of matches from their epipolar lines, under the best pose near the given one, from which they
+#: count as weak, are reported, and are not trusted; pixels of the grid of the matches.
+EPIPOLAR_WEAK, EPIPOLAR_PX, EPIPOLAR_WRONG = 1.0, 2.0, 4.0
+#: Known depths that fix a scale and a shift, and show when one of them is wrong.
+LEAST_POINTS = 3
+#: Share of the matches on the first or last plane of a range from which it is too narrow.
+MOST_AT_END = 0.05
+
+#: Factor of the points over the views -> the likely cause.
+FACTORS = {
+    0.256: "KITTI's PNG, whose unit is 1/256 m, read as millimetres: give the points' scale as 256",
+    1000 / 256: "millimetres read as KITTI's 1/256 m: give the points' scale as 1000",
+    1000.0: "millimetres taken for metres: divide the points by 1000, or give their scale as 1000",
+    0.001: "metres divided by 1000 once too often: give the points' scale as 1",
+    256.0: "KITTI's integers taken for metres: divide the points by 256, or give their scale as 256",
+    100.0: "centimetres taken for metres: divide the points by 100, or give their scale as 100",
+    1 / 0.3048: "feet taken for metres",
+    0.3048: "metres taken for feet",
+}
+NEARLY = math.log(1.04)
+
+
+@dataclass(frozen=True)
+class Indicators:
+    """Numbers of one image's run; NaN where the run does not tell.
+
+    Attributes:
+        confidence: mean of the confidence map, [0, 1].
+        matched: share of the left image with a match that both views agree on, [0, 1].
+        order: rank correlation of the prior's first map with matches or points, [-1, 1].
+        spread: of the matched depths, log of their 95 % over their 5 % quantile.
+        points_ratio: median of known points over matched depths at the same places.
+        points: known depths within the image, a number of pixels; 0 without any.
+        at_end: share of the confident matches that lie on the first or the last plane of a given range, [0,
+        1].
+        baseline_m: distance of the first right camera; 0 without one, or where it has no unit.
+        view_deg: horizontal field of view that K gives the left image.
+        own_ratio: of the depth over a metric prior's own, median.
+        epipolar_px: how far matches lie beside their epipolar lines, pixels, with the poses as used; of the
+            worst right view.
+        mistakes: sentences on mistakes of a given pose that would explain its misfit (``pose.mistakes``).
+        flat: all confident matches lie within two planes of the sweep, and near enough for that to mean
+        something.
+        same: the left and a right view are one picture.
+        inverse_fits: the inverse pose matches clearly more.
+        on_edge: the search for the scale ended on the edge of its range.
+    """
+
+    confidence: float = math.nan
+    matched: float = math.nan
+    order: float = math.nan
+    spread: float = math.nan
+    points_ratio: float = math.nan
+    points: int = 0
+    at_end: float = 0.0
+    baseline_m: float = 0.0
+    view_deg: float = math.nan
+    own_ratio: float = math.nan
+    epipolar_px: float = math.nan
+    mistakes: tuple[str, ...] = ()
+    flat: bool = False
+    same: bool = False
+    inverse_fits: bool = False
+    on_edge: bool = False
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether one image's depth can be trusted.
+
+    Attributes:
+        trusted: whether no indicator speaks against it.
+        reasons: sentences on those that do, the likeliest cause first; empty where it is trusted.
+        remarks: sentences on what is unusual but may be right.
+        indicators: the numbers behind it.
+    """
+
+    trusted: bool
+    reasons: tuple[str, ...]
+    remarks: tuple[str, ...]
+    indicators: Indicators
+
+    @property
+    def sentence(self) -> str:
+        """One line for people; empty where it is trusted."""
+        return "" if self.trusted else f"Do not trust this depth: {' '.join(self.reasons)}"
+
+
+def _alike(image_01: Tensor, left_01: Tensor) -> bool:
+    """Whether no value differs by more than rounding; most images differ in their first rows."""
+    if image_01.shape != left_01.shape:
+        return False
+    largest = 0.0
+    for rows in row_strips(*left_01.shape[-2:]):
+        largest = max(largest, float((image_01[:, rows] - left_01[:, rows]).abs().max()))
+        if largest >= SAME:
+            return False
+    darkest, brightest = left_01.aminmax()
+    return largest < SAME_SHARE * float(brightest - darkest)
+
+
+def _points_ratio(matches: Matches, points: Matches) -> float:
+    """Median ratio of points to matched depths; NaN for too few that can be compared."""
+    confident = (matches.confidence > CONFIDENT).float()
+    window = (2 * REACH_PX + 1, 1, REACH_PX)
+    near = F.avg_pool2d(confident[None], *window)[0]
+    mean = F.avg_pool2d((confident * matches.inverse_depth)[None], *window)[0] / near.clamp_min(1e-6)
+    at = (points.confidence > 0) & (near > 0) & (mean > matches.plane_step)
+    if int(at.sum()) < FEWEST_COMPARED:
+        return math.nan
+    return float((mean[at] / points.inverse_depth[at]).median())
+
+
+def _of_matches(matches: Matches, planes: Tensor | None) -> dict[str, Any]:
+    """Share matched, spread of the depths, and how many lie on the ends of a given range."""
+    confident = matches.confidence > CONFIDENT
+    numbers: dict[str, Any] = {"matched": float(confident.float().mean())}
+    inverse_depth = matches.inverse_depth[confident & (matches.inverse_depth > 0)]
+    if len(inverse_depth) >= FEWEST_MATCHES:
+        sample = inverse_depth[:: max(1, len(inverse_depth) // 100_000)]
+        low, high = torch.quantile(sample, sample.new_tensor([0.05, 0.95]))
+        spread = float((high / low.clamp_min(1e-9)).log())
+        flat = spread < FLAT and float(high - low) < 2.0 * float(matches.plane_step)
+        numbers |= {"spread": spread, "flat": flat}
+        if planes is not None:
+            ends = (inverse_depth - planes[[0, -1], None]).abs().amin(0) < 0.75 * matches.plane_step
+            numbers["at_end"] = float(ends.float().mean())
+    return numbers
+
+
+def _of_pose(pose: PoseReport) -> dict[str, Any]:
+    """How the poses fit, and mistakes that explain why they do not, but for the inverse pose."""
+    residuals = [px for px in pose.residual_px if not math.isnan(px)]
+    numbers: dict[str, Any] = {"epipolar_px": max(residuals)} if residuals else {}
+    if pose.status == "mistaken":
+        numbers["mistakes"] = tuple(sentence for sentence in pose.warnings if sentence != INVERSE)
+    return numbers
+
+
+def read_indicators(
+    evidence: Evidence,
+    K_left: Tensor,
+    *,
+    order: float,
+    confidence: Tensor | None,
+    on_edge: bool,
+    range_given: bool = False,
+    own_ratio: float = math.nan,
+    has_unit: bool = True,
+) -> Indicators:
+    """The indicators of one image.
+
+    Args:
+        evidence: of it.
+        K_left: ``(3, 3)`` pixels of the native left image.
+        order: rank correlation, NaN where unknown.
+        confidence: ``(1, H, W)``, or ``None``.
+        on_edge: whether the search for the scale ended on the edge of its range.
+        range_given: whether that range was given by the user.
+        own_ratio: of the depth over a metric prior's own, NaN for a relative prior.
+        has_unit: whether lengths are in metres, so that the length of a baseline means something.
+    """
+    matches, points = evidence.sweep_matches, evidence.sweep_points
+    left_01, rights = evidence.native_left, evidence.native
+    numbers: dict[str, Any] = {}
+    if matches is not None:
+        swept = range_given and evidence.volume is not None
+        numbers = _of_matches(matches, evidence.volume.inverse_depth if swept else None)
+        if points is not None:
+            numbers["points_ratio"] = _points_ratio(matches, points)
+    if evidence.pose is not None:
+        numbers |= _of_pose(evidence.pose)
+    return Indicators(
+        **numbers,
+        confidence=math.nan if confidence is None else float(confidence.mean()),
+        order=order,
+        points=0 if evidence.points is None else int((evidence.points.confidence > 0).sum()),
+        baseline_m=float(rights[0].T_right_from_left[:3, 3].norm()) if rights and has_unit else 0.0,
+        view_deg=2.0 * math.degrees(math.atan(0.5 * left_01.shape[-1] / float(K_left[0, 0]))),
+        own_ratio=own_ratio,
+        same=any(_alike(view.image_01, left_01) for view in rights),
+        inverse_fits=INVERSE in evidence.warnings,
+        on_edge=on_edge,
+    )
+
+
+def points_agreement(run: Indicators) -> float:
+    """How well points and views agree, [0.25, 1]: what the confidence is multiplied by.
+
+    Two that differ by a factor of 1.2 cannot both be within 10 %, and nothing tells which of them is.
+    """
+    if math.isnan(run.points_ratio):
+        return 1.0
+    off = abs(math.log(run.points_ratio))
+    return min(1.0, max(0.25, 1.0 - 0.75 * (off - POINTS_REPORTED) / (POINTS_WRONG - POINTS_REPORTED)))
+
+
+def _why_points(run: Indicators) -> str | None:
+    ratio = run.points_ratio
+    if math.isnan(ratio) or abs(math.log(ratio)) < POINTS_REPORTED:
+        return None
+    causes = [text for factor, text in FACTORS.items() if abs(math.log(ratio / factor)) < NEARLY]
+    cause = causes[0] if causes else "a unit, the baseline or K may be off by that, or the points want a pose"
+    return f"The points lie {ratio:.3g} times as far as what both views match: {cause}."
+
+
+def _why_order(run: Indicators) -> str | None:
+    varied = not run.spread < LEAST_SPREAD
+    if run.inverse_fits or (run.order < MOST_EXCHANGED and varied):
+        return (
+            "Near and far are exchanged against the prior, or the inverse pose fits better: are left and "
+            "right swapped, is the sign of the baseline wrong, or is E world-to-camera?"
+        )
+    if run.order < LEAST_ORDER and varied and not run.matched > MATCHED_ENOUGH:
+        return (
+            f"The prior and the matches hardly agree on near and far (rank correlation {run.order:+.2f}): "
+            "is E or K wrong, is the order of the images, or does the right image show something else?"
+        )
+    return None
+
+
+def _why_matches(run: Indicators) -> str | None:
+    if math.isnan(run.matched):  # known points alone: nothing that a second view could be wrong about
+        return None
+    few = run.matched < LEAST_MATCHED
+    weak = [
+        run.matched < WEAK_MATCHED,
+        run.confidence < WEAK_CONFIDENCE,
+        run.order < WEAK_ORDER,
+        run.epipolar_px > EPIPOLAR_WEAK,
+    ]
+    if not (few or run.confidence < LEAST_CONFIDENCE or sum(weak) > 1):
+        return None
+    shares = [f"{100 * run.matched:.0f} % of the left image is matched"]
+    shares += [] if math.isnan(run.confidence) else [f"mean confidence is {run.confidence:.2f}"]
+    cause = (
+        "Likely causes: E along the wrong axis or with a wrong rotation, images that are not rectified or "
+        "whose lens is not corrected, K of another size, a mirrored image, or views of different scenes or "
+        "moments."
+    )
+    return f"Only {' and '.join(shares)}. {cause}"
+
+
+def _why_lines(run: Indicators) -> str | None:
+    if not run.epipolar_px > EPIPOLAR_PX:
+        return None
+    return (
+        f"Matches lie {run.epipolar_px:.1f} px beside their epipolar lines, and no pose near the given one "
+        "brings them closer: are the images rectified or the poses right, and is K for them?"
+    )
+
+
+def _reasons(run: Indicators) -> list[str]:
+    if run.same:
+        return ["The left and a right view are the same picture, pixel by pixel; two places are needed."]
+    reasons = list(run.mistakes)
+    if run.flat:
+        reasons.append(
+            "All matches have one depth: the right image looks like a shifted copy of the left one. (Of a "
+            "flat wall seen head-on it may be true.)"
+        )
+    if run.view_deg > TOO_WIDE_DEG:
+        reasons.append(
+            f"K gives the left image {run.view_deg:.0f} degrees of view, which no lens without distortion "
+            "has: K must be in pixels of this image, not normalised by its size."
+        )
+    points = _why_points(run)
+    if points is not None and abs(math.log(run.points_ratio)) > POINTS_WRONG:
+        reasons.append(points)
+    if 0 < run.points < LEAST_POINTS and math.isnan(run.matched):
+        reasons.append(
+            f"Too few known depths to fix both scale and shift, {run.points}; give at least {LEAST_POINTS}."
+        )
+    order = _why_order(run)
+    lines = _why_lines(run) if run.epipolar_px > EPIPOLAR_WRONG else None
+    matches = _why_matches(run)
+    return reasons + [sentence for sentence in (order, lines, matches) if sentence is not None]
+
+
+def _remarks(run: Indicators, trusted: bool) -> list[str]:
+    remarks = []
+    if 0 < run.baseline_m < LEAST_BASELINE_M:
+        remarks.append(
+            f"The baseline is {1000 * run.baseline_m:.3g} mm: was it divided by 1000 once too often? "
+            "Baselines and poses are in metres."
+        )
+    if run.view_deg < VIEWS_DEG[0] or VIEWS_DEG[1] < run.view_deg <= TOO_WIDE_DEG:
+        remarks.append(
+            f"K gives the left image a field of view of {run.view_deg:.0f} degrees: is it for an image of "
+            "another size?"
+        )
+    if run.own_ratio > 0 and abs(math.log(run.own_ratio)) > OWN_METRES:
+        remarks.append(
+            f"The depth is {run.own_ratio:.2g} times the prior's own metres: is the baseline in metres, "
+            "and K for an image of this size? Or is the scene of a kind that the prior does not know?"
+        )
+    points = _why_points(run)
+    if points is not None and abs(math.log(run.points_ratio)) <= POINTS_WRONG:
+        remarks.append(points)
+    if 0 < run.points < LEAST_POINTS and not math.isnan(run.matched):
+        remarks.append(f"Known depths that lie in the image: {run.points}, too few to rely on.")
+    lines = _why_lines(run)
+    if lines is not None and not run.epipolar_px > EPIPOLAR_WRONG:
+        remarks.append(lines)
+    if run.on_edge and (not trusted or run.at_end > MOST_AT_END):
+        remarks.append(
+            "The search for the scale ended on the edge of its range: the depth may lie beyond it. Check the "
+            "units of the baseline, or widen depth_range (--near, --far)."
+        )
+    return remarks
+
+
+def judge(run: Indicators) -> Verdict:
+    """The verdict on one image's run: untrusted where any indicator is bad, or two are weak."""
+    reasons = _reasons(run)
+    return Verdict(not reasons, tuple(reasons), tuple(_remarks(run, not reasons)), run)
