@@ -1,4 +1,4 @@
-"""How many steps are corrected, on which grid, and what a corrected step decodes and encodes."""
+"""What a corrected step decodes and encodes, and that any other is the prior's own."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.algorithm.step import corrected_rounds
-from geodiff_plugin.config import DEFAULT, PRIOR_FIT, SEARCH_ONLY
+from geodiff_plugin.config import PRIOR_FIT, SEARCH_ONLY
 from tests.integration.test_tiny_decoder import Counted
 
 
@@ -19,28 +18,6 @@ def guided(pipe, pair, steps=5, **knobs):
     return enable_geometry_guidance(pipe)(
         pair.left, guidance=guidance, generator=generator, num_inference_steps=steps, **call
     )
-
-
-def corrected(count, corrections=2, **knobs):
-    return sorted(corrected_rounds(DEFAULT.changed(corrections=corrections, **knobs), count))
-
-
-def test_corrections_are_spread_over_the_second_half_of_what_is_active():
-    assert corrected(4) == [2, 3]
-    assert corrected(1) == corrected(1, 4) == [0]
-    assert corrected(10) == [5, 9]
-    assert corrected(9, 3) == [4, 6, 8]
-    assert corrected(9, 1) == [8]
-    assert corrected(8, 2, start=0.25, stop=0.75) == [4, 5]
-
-
-def test_more_corrections_than_fit_the_second_half_reach_further_back():
-    assert corrected(4, 3) == [1, 2, 3]
-    assert corrected(4, 4) == corrected(4, 9) == [0, 1, 2, 3]
-    assert corrected(5, 4) == [1, 2, 3, 4]
-
-    assert corrected(4, correct=False) == corrected(4, optimize_latents=False) == []
-    assert corrected(4, start=1.0) == []
 
 
 @pytest.mark.parametrize("corrections", [1, 2, 3])

@@ -70,11 +70,6 @@ def test_plan_of_steps_and_rounds(textured_plane, most, asked, default, planned)
     assert count_steps(guidance.denoising_steps(asked, default), asked, most) == planned
 
 
-def test_more_steps_than_it_has_are_refused():
-    with pytest.raises(ValueError, match="num_inference_steps must be at most 1 with this prior; got 4"):
-        count_steps(4, 4, 1)
-
-
 @pytest.mark.parametrize(("start", "rounds"), [(0.0, 3), (0.5, 1)])
 def test_one_step_makes_the_updates_of_all(textured_plane, monkeypatch, start, rounds):
     """3 rounds of 2 updates in the one step; ``start`` leaves out rounds as it would leave out steps."""
