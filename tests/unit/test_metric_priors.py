@@ -72,16 +72,16 @@ def test_a_relative_prior_has_no_metres_to_be_off(textured_plane):
 
 @pytest.mark.parametrize("kind", ["tipsv2", "depth_pro"])
 def test_the_search_starts_from_the_priors_own_metres(kind, textured_plane, monkeypatch):
-    from geodiff_plugin.algorithm import state
+    from geodiff_plugin.algorithm import settling
 
     started = []
-    own = state.search_scale
+    own = settling.search_scale
 
     def watched(*arguments, current=None, **options):
         started.append(current)
         return own(*arguments, current=current, **options)
 
-    monkeypatch.setattr(state, "search_scale", watched)
+    monkeypatch.setattr(settling, "search_scale", watched)
     pipe = make_transformers(kind)
     knows(pipe, textured_plane.depth_m)
     out = guided(pipe, textured_plane, refine=False)

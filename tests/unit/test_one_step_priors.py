@@ -77,7 +77,7 @@ def test_one_step_makes_the_updates_of_all(textured_plane, monkeypatch, start, r
 
     class Counted(Plain):
         def step(self, gradient, reference=None):
-            steps.append(gradient)
+            steps.extend([gradient] * (gradient.ndim == 4))  # not those of scale and shift
             return super().step(gradient, reference)
 
     monkeypatch.setitem(RULES, "counted", Counted)
