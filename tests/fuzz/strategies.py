@@ -19,7 +19,6 @@ from PIL import Image
 from geodiff_plugin._checks import InputError
 
 __all__ = [
-    "CALIBRATIONS",
     "EXAMPLES",
     "MANY",
     "damaged",
@@ -39,44 +38,6 @@ COMMON: dict[str, Any] = {
 EXAMPLES = settings(max_examples=25, **COMMON)
 MANY = settings(max_examples=int(os.environ.get("GEODIFF_FUZZ", "1500")), **COMMON)
 
-P = "700 0 320 {} 0 700 240 0 0 0 1 0"
-OPENCV = (
-    "%YAML:1.0\n---\nP1: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n   data: [{}]\n"
-    "P2: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n   data: [{}]\nimage_width: 640\n"
-).format(*(P.format(x).replace(" ", ", ") for x in (0, -84)))
-XML = "<?xml version='1.0'?>\n<opencv_storage>\n{}</opencv_storage>\n"
-MATRIX = '<{} type_id="opencv-matrix"><rows>{}</rows><cols>{}</cols><dt>d</dt><data>{}</data></{}>\n'
-MVSNET = (
-    "extrinsic\n1 0 0 {}\n0 1 0 0\n0 0 1 0\n0 0 0 1\n\nintrinsic\n700 0 320\n0 700 240\n0 0 1\n\n425 2.5\n"
-)
-JSON_MATRIX = '"{}": {{"type_id": "opencv-matrix", "rows": 3, "cols": 4, "dt": "d", "data": [{}]}}'
-
-#: One whole file of every format.
-CALIBRATIONS = {
-    "middlebury": "cam0=[700 0 320; 0 700 240; 0 0 1]\ncam1=[700 0 330; 0 700 240; 0 0 1]\ndoffs=10\n"
-    "baseline=120\nwidth=640\nheight=480\nndisp=64\n",
-    "kitti_cam_to_cam": "".join(
-        f"S_rect_0{i}: 6.4e+02 4.8e+02\nP_rect_0{i}: {P.format(-84 * i)}\n" for i in range(4)
-    ),
-    "kitti_projections": "".join(f"P{i}: {P.format(-84 * i)}\n" for i in range(4)),
-    "foundation_stereo": "700 0 320 0 700 240 0 0 1\n0.12\n",
-    "stereodemo": '{"fx": 700, "fy": 700, "cx0": 320, "cx1": 320, "cy": 240, "baseline_meters": 0.12, '
-    '"width": 640, "height": 480}',
-    "opencv": OPENCV,
-    "opencv_json": "{"
-    + ", ".join(JSON_MATRIX.format(n, P.format(x).replace(" ", ", ")) for n, x in (("P1", 0), ("P2", -84)))
-    + "}",
-    "booster": XML.format(
-        MATRIX.format("proj_matL", 3, 4, P.format(0), "proj_matL")
-        + MATRIX.format("proj_matR", 3, 4, P.format(-84), "proj_matR")
-        + MATRIX.format("baselineLR", 1, 1, "120", "baselineLR")
-    ),
-    "mvsnet": MVSNET.format(0),
-    "nerf": '{"fl_x": 700, "cx": 320, "cy": 240, "w": 640, "h": 480, "k1": 0, "camera_model": "OPENCV", '
-    '"frames": [\n'
-    '{"file_path": "./a", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, '
-    '{"file_path": "./b", "transform_matrix": [[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}]}',
-}
 WORDS = b"nan inf -inf 1e999 -1 0 1e-300 [ ] { } : , ; = < > 1e5 # rows:"
 TOKENS = [
     *WORDS.split(),

@@ -16,8 +16,8 @@ from geodiff_plugin.config import KNOBS
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
 from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.formats.out import check_out
+from tests.contracts.test_formats_table import CHOICES, SAMPLES, written
 from tests.fuzz.strategies import (
-    CALIBRATIONS,
     EXAMPLES,
     MANY,
     damaged,
@@ -38,20 +38,18 @@ IMAGES, POINT_FILES = image_bytes(), point_files()
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("kind", CALIBRATIONS)
-def test_calibrations(tmp_path, kind, size):
-    path, other = tmp_path / "calib.txt", tmp_path / "other.txt"
-    whole = CALIBRATIONS[kind].encode()
-    other.write_bytes(CALIBRATIONS["mvsnet"].replace("1 0 0 0", "1 0 0 -0.12", 1).encode())
-    pair, names = (path, other) if kind == "mvsnet" else path, ("a.png", "b.png")
-    path.write_bytes(whole)
-    assert survives(lambda: read_calibration(pair, image_names=names)), "the whole file must be understood"
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_calibrations(tmp_path, sample, size):
+    """Of formats with two files the second one is damaged."""
+    texts, choice = SAMPLES[sample][1], {"distorted": True} | CHOICES.get(sample, {})
+    paths = written(tmp_path, texts)
+    assert survives(lambda: read_calibration(paths, **choice)), "the whole file must be understood"
 
     @size
-    @given(data=damaged(whole), cameras=st.sampled_from([None, (0, 1), (2, 3), (7, 7)]))
+    @given(data=damaged(texts[-1].encode()), cameras=st.sampled_from([None, None, (0, 1), (2, 3), (7, 7)]))
     def check(data, cameras):
-        path.write_bytes(data)
-        survives(lambda: read_calibration(pair, cameras=cameras, image_names=names))
+        (paths[-1] if isinstance(paths, tuple) else paths).write_bytes(data)
+        survives(lambda: read_calibration(paths, cameras=cameras, **choice))
 
     check()
 
