@@ -168,39 +168,8 @@ def write_depth_mm(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None
     return int((whole == 0).sum())
 
 
-def _read_png16(path: PathLike, name: str) -> np.ndarray:
-    found = check_file(path, name, "a 16-bit PNG file")
-    try:
-        with Image.open(found) as image:
-            image.load()
-            mode, values = image.mode, np.asarray(image)
-    except (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError) as error:
-        bad_value(
-            name, "a whole 16-bit PNG file", f"{found}, which does not decode ({error})", "Is it cut off?"
-        )
-    if not mode.startswith("I"):
-        bad_value(
-            name, "a 16-bit grey PNG file", f"{found} of mode {mode}", "An 8-bit copy has lost the values."
-        )
-    return values.astype(np.float32)
-
-
-def read_disparity_kitti_png(path: PathLike, name: str = "disparity") -> tuple[np.ndarray, np.ndarray]:
-    """Read KITTI's 16-bit PNG of disparity * 256 (its depth files use the same step, in metres).
-
-    Returns:
-        ``(H, W)`` float32 pixels, and the ``(H, W)`` boolean mask of where it is known (not 0).
-
-    Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: not a 16-bit PNG, or cut off.
-    """
-    values = _read_png16(path, name)
-    return values / KITTI_STEP, values > 0
-
-
 def read_depth_png(path: PathLike, units_per_m: float, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
-    """Read a 16-bit PNG of depth in any unit.
+    """Read a 16-bit PNG of depth (or disparity) in any unit.
 
     Args:
         path: the file.
@@ -208,24 +177,31 @@ def read_depth_png(path: PathLike, units_per_m: float, name: str = "depth") -> t
         name: the argument that it came in, for messages.
 
     Returns:
-        ``(H, W)`` float32 metres, and the ``(H, W)`` boolean mask of where it is known (not 0).
+        ``(H, W)`` float32 metres (or pixels), and the ``(H, W)`` boolean mask of where it is known (not 0).
 
     Raises:
         FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
         ValueError: not a 16-bit PNG, or cut off.
     """
-    values = _read_png16(path, name)
-    return values / np.float32(units_per_m), values > 0
+    file = check_file(path, name, "a 16-bit PNG file")
+    try:
+        with Image.open(file) as image:
+            image.load()
+            mode, values = image.mode, np.asarray(image)
+    except (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError) as error:
+        got = f"{file}, which does not decode ({error})"
+        bad_value(name, "a whole 16-bit PNG file", got, "Is it cut off?")
+    if not mode.startswith("I"):
+        cure = "An 8-bit copy has lost the values."
+        bad_value(name, "a 16-bit grey PNG file", f"{file} of mode {mode}", cure)
+    return values.astype(np.float32) / np.float32(units_per_m), values > 0
+
+
+def read_disparity_kitti_png(path: PathLike, name: str = "disparity") -> tuple[np.ndarray, np.ndarray]:
+    """Read KITTI's 16-bit PNG of disparity * 256, in pixels; otherwise as ``read_depth_png``."""
+    return read_depth_png(path, KITTI_STEP, name)
 
 
 def read_depth_mm_png(path: PathLike, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
-    """Read a 16-bit PNG of millimetres.
-
-    Returns:
-        ``(H, W)`` float32 metres, and the ``(H, W)`` boolean mask of where it is known (not 0).
-
-    Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: not a 16-bit PNG, or cut off.
-    """
+    """Read a 16-bit PNG of millimetres, as metres; otherwise as ``read_depth_png``."""
     return read_depth_png(path, 1000.0, name)

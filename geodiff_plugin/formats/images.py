@@ -181,35 +181,25 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
     return _pil_to_array(upright, name), notes
 
 
-def _array_to_hwc(value: np.ndarray, name: str) -> np.ndarray:
-    if value.ndim == 2:
-        return value[..., None]
+def _hwc(value: np.ndarray | torch.Tensor, name: str) -> np.ndarray:
+    """``(H, W, C)``, C of 1, 3 or 4, of an array with channels last or a tensor with channels first."""
+    if isinstance(value, torch.Tensor):
+        batch, flat = "Take one image of the batch: value[0].", "Add a channel axis: value[None]."
+        first, last, shape, place = 0, -1, "(3, H, W)", "first"
+        turn = "torch images start with channels: value.permute(2, 0, 1)."
+    else:
+        batch, flat = "Take one image of the batch.", ""
+        first, last, shape, place = -1, 0, "(H, W, 3) or (H, W)", "last"
+        turn = "numpy images end in channels: value.transpose(1, 2, 0)."
+        value = value[..., None] if value.ndim == 2 else value
     if value.ndim != 3:
-        cure = "Take one image of the batch." if value.ndim == 4 else ""
-        bad_value(name, "an image of shape (H, W, 3) or (H, W)", f"shape {value.shape}", cure)
-    if value.shape[-1] not in (1, 3, 4):
-        cure = (
-            "numpy images end in channels: value.transpose(1, 2, 0)." if value.shape[0] in (1, 3, 4) else ""
-        )
-        bad_value(name, "an image with 1, 3 or 4 channels last", f"shape {value.shape}", cure)
-    return value
-
-
-def _tensor_to_hwc(value: torch.Tensor, name: str) -> np.ndarray:
-    if value.ndim != 3:
-        cure = (
-            "Take one image of the batch: value[0]."
-            if value.ndim == 4
-            else "Add a channel axis: value[None]."
-        )
-        bad_value(name, "an image of shape (3, H, W)", f"shape {tuple(value.shape)}", cure)
-    if value.shape[0] not in (1, 3, 4):
-        cure = (
-            "torch images start with channels: value.permute(2, 0, 1)."
-            if value.shape[-1] in (1, 3, 4)
-            else ""
-        )
-        bad_value(name, "an image with 1, 3 or 4 channels first", f"shape {tuple(value.shape)}", cure)
+        cure = batch if value.ndim == 4 else flat
+        bad_value(name, f"an image of shape {shape}", f"shape {tuple(value.shape)}", cure)
+    if value.shape[first] not in (1, 3, 4):
+        cure = turn if value.shape[last] in (1, 3, 4) else ""
+        bad_value(name, f"an image with 1, 3 or 4 channels {place}", f"shape {tuple(value.shape)}", cure)
+    if isinstance(value, np.ndarray):
+        return value
     value = value.detach().cpu()
     value = value.float() if value.dtype == torch.bfloat16 else value  # numpy has no bfloat16
     return value.permute(1, 2, 0).numpy()
@@ -233,7 +223,7 @@ def _raw(value: Any, name: str) -> Image.Image | np.ndarray:
         return value
     if not isinstance(value, (np.ndarray, torch.Tensor)):
         bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
-    raw = _array_to_hwc(value, name) if isinstance(value, np.ndarray) else _tensor_to_hwc(value, name)
+    raw = _hwc(value, name)
     _check_sides(raw.shape[0], raw.shape[1], name)
     # Readers of TIFF and PGM leave the file's byte order, which says nothing about the values.
     return raw.astype(raw.dtype.newbyteorder("="), copy=False)
