@@ -1,16 +1,10 @@
-"""What the views alone say about depth: plane sweep, aggregation, left-right check, for any pose.
-
-Data flow: images, K's, T's -> ``CostVolume`` -> ``Matches``.
-Paper: S7.3 (the search is a lookup in this volume); the matches go beyond it.
-"""
+"""What the views alone say about depth: plane sweep, aggregation, left-right check, for any pose (S7.3)."""
 
 from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.build import build_cost_volume, find_matches, mirrored_pose_preferred
 from geodiff_plugin.matching.cleaning import clean
 from geodiff_plugin.matching.consistency import match_volume
-from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.points import points_to_matches, with_points
-from geodiff_plugin.matching.reflections import reject_reflections
+from geodiff_plugin.matching.matches import Matches, points_to_matches, reject_reflections, with_points
 from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
 
 __all__ = [

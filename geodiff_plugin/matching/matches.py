@@ -1,14 +1,32 @@
-"""``Matches``: inverse depth and confidence per pixel, of matches between the views or of known points."""
+"""Inverse depth and confidence per pixel: of matches of the views, and of known points in the same form."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
-__all__ = ["Matches"]
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.geometry import NEAREST_M, project
+
+__all__ = ["UNIT", "Matches", "points_to_matches", "reject_reflections", "with_points"]
+
+#: The unit in which errors at points are measured, as a share of their median inverse depth.
+UNIT = 0.01
+#: Reflections. Half the side of the window over which matches must agree, in image sides; with a smaller one,
+#: gaps that the prior misses would be taken for reflections.
+REGION = 0.08
+#: How far behind the prior a reflection lies: in spreads of the matches around the prior's log depth, and at
+#: least, in log depth; from there to a multiple of it, a match's weight falls to nothing.
+SPREADS, LEAST_DISTANCE, MULTIPLE = 2.0, 0.2, 1.6
+#: Confidence above which a match counts in that spread, and the least spread that is assumed, in log depth.
+SPREAD_CONFIDENCE, LEAST_SPREAD = 0.3, 0.05
+#: Larger differences in log depth count as this one.
+LARGEST = 1.5
 
 
 @dataclass(frozen=True)
@@ -16,18 +34,17 @@ class Matches:
     """Matches between the views, or known points, on one grid of the left view; of one image or of a chunk.
 
     Attributes:
-        inverse_depth: ``(1, H, W)`` float32, 1/m, of one image, or ``(B, 1, H, W)``; defined everywhere, to
-        be
-            read where ``confidence > 0``.
+        inverse_depth: ``(1, H, W)`` float32, 1/m, of one image, or ``(B, 1, H, W)``; defined everywhere,
+            to be read where ``confidence > 0``.
         confidence: of the same shape, in [0, 1]; 0 where nothing is matched or known.
         plane_step: ``()`` or ``(B,)`` 1/m, the unit in which errors are measured: between two planes of the
-            sweep, or ``matching.points.UNIT`` of the points' median inverse depth.
+            sweep, or ``UNIT`` of the points' median inverse depth.
     """
 
-    inverse_depth: torch.Tensor
-    confidence: torch.Tensor
-    plane_step: torch.Tensor
-    _above: dict[float, torch.Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+    inverse_depth: Tensor
+    confidence: Tensor
+    plane_step: Tensor
+    _above: dict[float, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
     def stack(cls, images: Sequence[Self | None]) -> Self | None:
@@ -43,7 +60,7 @@ class Matches:
         """``(H, W)`` of the grid."""
         return self.confidence.shape[-2], self.confidence.shape[-1]
 
-    def above(self, confidence: float) -> torch.Tensor:
+    def above(self, confidence: float) -> Tensor:
         """``(P,)`` flat indices of the pixels of one image with more confidence than that.
 
         Counting them waits for the device, so it is done once; ``prepare_evidence`` does it for every
@@ -52,3 +69,112 @@ class Matches:
         if confidence not in self._above:
             self._above[confidence] = (self.confidence.flatten() > confidence).nonzero()[:, 0]
         return self._above[confidence]
+
+
+def points_to_matches(
+    points: Tensor,
+    K_left: Tensor,
+    size: tuple[int, int],
+    size_grid: tuple[int, int],
+) -> tuple[Matches, int]:
+    """Put known depths on a grid of the left view; where several fall on one pixel, the nearest wins.
+
+    Args:
+        points: ``(N, 3)`` float32, metres, in the left camera's frame (x right, y down, z forward); or a map
+            ``(H, W)`` of ``size``, metres, 0 where unknown.
+        K_left: ``(3, 3)`` pixels of the left image.
+        size: ``(H, W)`` of the left image.
+        size_grid: ``(h, w)`` of the grid.
+
+    Returns:
+        ``Matches`` of the grid, with confidence 1 where a depth is known and 0 elsewhere, and how many of the
+        points are left out: behind the camera, or outside the image.
+
+    Raises:
+        ValueError: no point is left, or a map is not of the image's size.
+    """
+    if points.shape[1] == 3:
+        uv, z = project(points[None, None], K_left[None])
+        uv, z = uv[0, 0], z[0, 0]
+    else:
+        if tuple(points.shape) != size:
+            cure = "A sparse depth map belongs to the left image, pixel by pixel; else give points (N, 3)."
+            got = f"{points.shape[1]}x{points.shape[0]}"
+            bad_value("points", f"a map of the left image's {size[1]}x{size[0]} pixels", got, cure)
+        rows, columns = (points > 0).nonzero(as_tuple=True)
+        uv, z = torch.stack([columns, rows], dim=1).float(), points[rows, columns]
+    # A pixel reaches half a pixel beyond its centre.
+    inside = ((uv >= -0.5) & (uv < uv.new_tensor([size[1], size[0]]) - 0.5)).all(dim=1) & (z > NEAREST_M)
+    left_out = int((~inside).sum())
+    if left_out == len(z):
+        bad_value(
+            "points",
+            "in front of the left camera and inside its image, at least one of them",
+            f"{left_out} of {len(z)} behind it or outside",
+            "They are metres in the left camera's frame: x right, y down, z forward. Is a pose missing?",
+        )
+    height, width = size_grid
+    scale = uv.new_tensor([width / size[1], height / size[0]])
+    cell = ((uv[inside] + 0.5) * scale).floor().long()
+    at = cell[:, 1].clamp(0, height - 1) * width + cell[:, 0].clamp(0, width - 1)
+    nearest = z.new_zeros(height * width).scatter_reduce_(0, at, 1.0 / z[inside], "amax")
+    inverse_depth = nearest.view(1, height, width)
+    unit = UNIT * nearest[nearest > 0].median()
+    return Matches(inverse_depth, (inverse_depth > 0).float(), unit), left_out
+
+
+def with_points(matches: Matches | None, points: Matches) -> Matches:
+    """Matches with known points in their place: what the refinement follows.
+
+    Args:
+        matches: of one image, or of a chunk of samples; ``None`` where there are none.
+        points: of the same, on the same grid.
+
+    Returns:
+        As ``matches`` (or ``points``, without), but that the confidence of a point is the number of pixels
+        that it stands for: few points then decide as much as many, and one that a poor prior contradicts is
+        not taken for an outlier, as a match would be.
+    """
+    given = points.confidence > 0
+    share = given.float().mean((-2, -1), keepdim=True)
+    confidence = points.confidence / share.clamp_min(1.0 / given[0].numel())
+    if matches is None:
+        return replace(points, confidence=confidence)
+    return replace(
+        matches,
+        inverse_depth=torch.where(given, points.inverse_depth, matches.inverse_depth),
+        confidence=torch.where(given, confidence, matches.confidence),
+    )
+
+
+@torch.no_grad()
+def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
+    """What remains of each match, given the depth that the prior saw before any match moved it.
+
+    One-sided: a reflection and what is seen through glass lie behind the surface, never before it. A prior
+    that is right to 5 % can name a reflection, one that errs by 30 % cannot.
+
+    Args:
+        matches: of a chunk of samples, ``(B, 1, H, W)``.
+        depth_m: ``(B, 1, H, W)`` metres, > 0, the prior's first estimate with the search's scale.
+
+    Returns:
+        ``(B, 1, H, W)`` in [0, 1]; 1 where a match, or the region around it, is not behind the prior by more
+        than chance.
+    """
+    weight = matches.confidence.float()
+    behind = -(matches.inverse_depth * depth_m).clamp_min(1e-6).log().clamp(-LARGEST, LARGEST)
+    counted = torch.where(weight > SPREAD_CONFIDENCE, behind, torch.full_like(behind, torch.nan)).flatten(1)
+    middle = counted.nanmedian(1, keepdim=True).values
+    spread = 1.4826 * (counted - middle).abs().nanmedian(1).values
+    spread = spread.nan_to_num(LARGEST).clamp_min(LEAST_SPREAD)
+    least = (SPREADS * spread).clamp_min(LEAST_DISTANCE)[:, None, None, None]
+    radius = max(1, round(REGION * max(depth_m.shape[-2:])))
+    region = _window_mean(behind * weight, radius) / _window_mean(weight, radius).clamp_min(1e-6)
+    rejected = ((torch.minimum(region, behind) / least - 1.0) / (MULTIPLE - 1.0)).clamp(0.0, 1.0)
+    return 1.0 - rejected
+
+
+def _window_mean(x: Tensor, radius: int) -> Tensor:
+    side = 2 * radius + 1
+    return F.avg_pool2d(F.avg_pool2d(x, (1, side), 1, (0, radius)), (side, 1), 1, (radius, 0))

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.matching.points import UNIT
+from geodiff_plugin.matching.matches import UNIT
 from geodiff_plugin.scale.space import SPACES, MetricMap, Space
 
 __all__ = [
