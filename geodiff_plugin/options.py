@@ -29,6 +29,7 @@ __all__ = [
     "check_positive",
     "declare",
     "flag_of",
+    "help_of",
 ]
 
 #: Headings of the help.
@@ -75,6 +76,12 @@ def flag_of(field: Field[Any]) -> str:
     """How an option is typed: ``--min-confidence``, or ``LEFT`` for an argument."""
     flags = field.metadata.get("flags") or (f"--{field.name.replace('_', '-')}",)
     return flags[0] or field.name.upper()
+
+
+def help_of(name: str, options: type | None = None) -> str:
+    """The sentence that says what an option of ``RunOptions``, or of another dataclass, is."""
+    text: str = (options or RunOptions).__dataclass_fields__[name].metadata["help"]  # type: ignore[attr-defined]
+    return text
 
 
 def check_positive(value: float, name: str, unit: str, cure: str = "") -> None:

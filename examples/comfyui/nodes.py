@@ -16,6 +16,7 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior, read_calibration
 from geodiff_plugin.formats import flying_points, make_cloud, rig_from_parameters, write_glb, write_ply
+from geodiff_plugin.options import PRESETS, help_of
 from geodiff_plugin.plotting import colour_depth
 
 CATEGORY = "GeoDiff"
@@ -82,11 +83,14 @@ class GeoDiffDepth:
                 "left": ("IMAGE",),
                 "right": ("IMAGE",),
                 "rig": ("GEODIFF_RIG",),
-                "prior": ("STRING", {"default": "bundled", "tooltip": "'bundled', a hub id or a folder."}),
-                "steps": ("INT", {"default": 0, "min": 0, "max": 100, "tooltip": "0: the prior's own."}),
-                "ensemble": ("INT", {"default": 1, "min": 1, "max": 20}),
-                "preset": (["default", "paper"],),
-                "seed": ("INT", {"default": 0, "min": 0, "max": 0xFFFFFFFFFFFFFFFF}),
+                "prior": ("STRING", {"default": "bundled", "tooltip": help_of("prior")}),
+                "steps": ("INT", {"default": 0, "min": 0, "max": 100, "tooltip": help_of("steps")}),
+                "ensemble": ("INT", {"default": 1, "min": 1, "max": 20, "tooltip": help_of("ensemble")}),
+                "preset": (list(PRESETS), {"tooltip": help_of("preset")}),
+                "seed": (
+                    "INT",
+                    {"default": 0, "min": 0, "max": 2**64 - 1, "tooltip": help_of("seed")},
+                ),
             }
         }
 

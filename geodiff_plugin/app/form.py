@@ -16,6 +16,7 @@ from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields
 from geodiff_plugin.app.examples import EXAMPLES
 from geodiff_plugin.app.job import MOST_MEMBERS, MOST_STEPS, PRESETS, Request
 from geodiff_plugin.app.priors import Priors
+from geodiff_plugin.options import help_of
 
 __all__ = ["Form", "build_form", "photograph_field"]
 
@@ -127,14 +128,10 @@ def _settings(priors: Priors) -> dict[str, Any]:
     with gr.Accordion("Settings", open=False):
         with gr.Row():
             prior = gr.Dropdown(list(priors.names), value=priors.names[0], label="Prior")
-            preset = gr.Dropdown(
-                list(PRESETS), value="default", label="Preset", info="paper: Algorithm 1 as printed"
-            )
+            preset = gr.Dropdown(list(PRESETS), value="default", label="Preset", info=help_of("preset"))
         with gr.Row():
-            steps = gr.Slider(0, MOST_STEPS, value=0, step=1, label="Steps", info="0: the prior's own")
-            members = gr.Slider(
-                1, MOST_MEMBERS, value=1, step=1, label="Ensemble", info="2: with an uncertainty"
-            )
+            steps = gr.Slider(0, MOST_STEPS, value=0, step=1, label="Steps", info=help_of("steps"))
+            members = gr.Slider(1, MOST_MEMBERS, value=1, step=1, label="Ensemble", info=help_of("ensemble"))
         with gr.Row():
             resolution = gr.Slider(
                 0, 1536, value=0, step=32, label="Resolution, px", info="0: the prior's own"

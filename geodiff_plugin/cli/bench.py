@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import tempfile
+import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -11,14 +16,14 @@ from typing import Any
 import torch
 from rich.live import Live
 
-from geodiff_plugin.bundled.demo_pair import read_demo_pair
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.cli.terminal import new_console, new_table
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
-__all__ = ["BUNDLED", "Cost", "Workload", "measure", "run_bench"]
+__all__ = ["BUNDLED", "Cost", "Workload", "command_seconds", "measure", "run_bench"]
 
 #: Name in the table -> gradient of the guidance, ``None`` for the plain pipeline.
 VARIANTS = {"plain": None, "guided, denoised gradient": "denoised", "guided, full gradient": "full"}
@@ -89,6 +94,22 @@ def measure(gradient: str | None, workload: Workload, device_name: str) -> Cost:
     return Cost(seconds, memory.peak_bytes)
 
 
+def command_seconds(device_name: str) -> dict[str, float]:
+    """Wall-clock seconds of ``geodiff depth`` on the demo pair by stage, in a process of its own.
+
+    "start" imports torch and diffusers, "python" is what comes before and behind the stages.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        pair = [DEMO_PAIR_FOLDER / name for name in ("left.png", "right.png", "calib.txt")]
+        words = ["depth", *pair[:2], "--calib", pair[2], "--device", device_name, "--json", "--quiet"]
+        words = [sys.executable, "-m", "geodiff_plugin", *map(str, words), "--out", f"{folder}/out"]
+        started = time.perf_counter()
+        answer = subprocess.run(words, check=True, capture_output=True, text=True)
+        whole = time.perf_counter() - started
+    stages: dict[str, float] = json.loads(answer.stdout)["seconds"]
+    return stages | {"python": whole - sum(stages.values())}
+
+
 def run_bench(device_name: str, workload: Workload = BUNDLED) -> None:
     """Print the table.
 
@@ -113,3 +134,6 @@ def run_bench(device_name: str, workload: Workload = BUNDLED) -> None:
             table.add_row(
                 name, f"{cost.seconds:.2f}", f"{cost.peak_bytes / 1e6:.0f}", *(f"{x:.2f}" for x in ratios)
             )
+    stages = command_seconds(device_name)
+    told = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
+    console.print(f"geodiff depth on the demo pair: {sum(stages.values()):.1f} s ({told})")
