@@ -1,8 +1,4 @@
-"""Checks of camera matrices and poses, and of images against them.
-
-Data flow: ``K``, ``E`` and sizes as the user gave them -> float64 matrices, a warning, or ``InputError``.
-Paper: none; S3.3 takes known cameras for granted.
-"""
+"""Checks of camera matrices and poses, and of images against them."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Error messages and checks of user input: every message says name, expected, got and the likely cure.
-
-Data flow: an argument as the user gave it -> the same argument, or ``InputError`` (a ``ValueError``).
-Paper: none.
-"""
+"""Error messages and checks of user input: every message says name, expected, got and the likely cure."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 """Threads of torch on the CPU: never more than cores that this process may use.
 
-Data flow: affinity, CPU quota -> number of cores; a ``with`` block -> torch's number of threads inside it.
-Paper: none.
-
 Beyond the cores every parallel operation waits for threads that are not running: with twice as many threads
 as cores a guided call takes twice as long. torch counts the cores of the affinity mask, but not the CPU quota
 of a container, and takes any number from ``OMP_NUM_THREADS`` and ``torch.set_num_threads``.

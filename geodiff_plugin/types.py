@@ -1,9 +1,4 @@
-"""Records shared by all layers: ``Rig``, ``CameraView``, reports, and ``MetricDepthOutput``.
-
-Data flow: files and user input -> ``Rig``, ``CameraView`` -> guidance
-    -> ``StepReport``, ``MetricDepthOutput``.
-Paper: S3.3 (two views with known cameras).
-"""
+"""Records shared by all layers: ``Rig``, ``CameraView``, reports, and ``MetricDepthOutput``."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Devices, package versions, time and peak memory on this machine.
-
-Data flow: name of a device -> ``torch.device``; a call -> seconds; a ``with`` block -> bytes.
-Paper: none.
-"""
+"""Devices, package versions, time and peak memory on this machine."""
 
 from __future__ import annotations
 

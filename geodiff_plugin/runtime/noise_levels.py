@@ -1,8 +1,5 @@
 """Noise level of a live scheduler at a timestep, one function per family.
 
-Data flow: scheduler, timestep -> ``NoiseLevel``.
-Paper: alpha_bar of Eq. 6 (eq:tweedie) and Algorithm 1.
-
 A new scheduler is one line in ``FAMILIES``; everything else goes through the scheduler's own ``step``.
 """
 
