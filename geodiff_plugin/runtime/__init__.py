@@ -1,1 +1,1 @@
-"""A guided call of a live pipeline, from its arguments to ``MetricDepthOutput``; nothing stays behind on it."""
+"""A guided call of a live pipeline, from its arguments to ``MetricDepthOutput``; it leaves nothing behind."""
