@@ -32,9 +32,9 @@ import os
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, Any
@@ -111,6 +111,7 @@ class Item:
         payload: what the first stage works on.
         inputs: fingerprint of its inputs, unless ``key`` is it; a record of other inputs does not count.
         name: in messages; ``key`` by default.
+        head: what its record begins with, also where it fails.
         words: texts of this item alone, such as its paths, which are no part of the cause of a failure; its
             label where there are none.
     """
@@ -120,6 +121,7 @@ class Item:
     inputs: str = ""
     name: str = ""
     words: tuple[str, ...] = ()
+    head: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -179,7 +181,7 @@ class Journal:
 
     def put(self, item: Item, record: Record) -> Record:
         """Append the record of an item, forced to the disk, and return it with its key."""
-        record = {"key": item.key} | ({"inputs": item.inputs} if item.inputs else {}) | record
+        record = {"key": item.key} | ({"inputs": item.inputs} if item.inputs else {}) | {**item.head} | record
         line = (json.dumps(record) + "\n").encode()
         with self._lock, open(self.path, "a+b", buffering=0) as file:
             if CAN_LOCK:

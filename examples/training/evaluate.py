@@ -17,9 +17,8 @@ from examples.training.data import held_out
 from examples.training.validate import contact_sheet, predict, score_scenes
 from geodiff_plugin.bundled import PRIOR_FOLDER
 from geodiff_plugin.bundled.loading import open_pipeline
-from geodiff_plugin.evaluation.alignment import align
 from geodiff_plugin.evaluation.datasets import load_pairs
-from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 
 __all__ = ["best_constant", "best_plane", "main", "score_pairs"]
 

@@ -14,8 +14,7 @@ from diffusers import MarigoldDepthPipeline
 from PIL import Image
 
 from examples.training.data import SCORED_M
-from geodiff_plugin.evaluation.alignment import align
-from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 
 __all__ = ["contact_sheet", "predict", "score_scenes"]
 

@@ -9,22 +9,21 @@ import dataclasses
 import io
 import os
 import sys
-from collections.abc import Callable
-from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.capture.options import CaptureOptions
+from geodiff_plugin.cli.commands import add_command
 from geodiff_plugin.cli.eval.app import eval_app
 from geodiff_plugin.cli.options import DepthOptions, demo_options, start_pair
 from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, StopWatch, say
-from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, flag_of
+from geodiff_plugin.options import OUTPUT, RUN
 
-__all__ = ["add_command", "app", "main", "new_group"]
+__all__ = ["app", "main", "new_group"]
 
 
 class CommandGroup(TyperGroup):
@@ -52,57 +51,6 @@ def new_group(help_text: str) -> typer.Typer:
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-
-
-def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
-    """An option or argument of typer for a field of a dataclass of options."""
-    rules, default = field.metadata, field.default
-    flags = rules["flags"] or (flag_of(field),)
-    if get_origin(kind) is tuple:
-        if rules["split"]:
-            kind, default = str | None, ",".join(map(str, default)) or None
-        else:
-            kind, default = list[get_args(kind)[0]] | None, list(default) or None  # type: ignore[misc]
-    if flags == ("",):
-        typed: Any = typer.Argument(metavar=rules["metavar"], help=rules["help"])
-    else:
-        typed = typer.Option(
-            *flags, metavar=rules["metavar"], help=rules["help"], rich_help_panel=rules["panel"] or None
-        )
-    default = Parameter.empty if default is dataclasses.MISSING else default
-    return Parameter(field.name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind, typed], default=default)
-
-
-def _value(field: dataclasses.Field[Any], value: Any, kind: Any) -> Any:
-    """What was typed, as the field has it."""
-    if get_origin(kind) is not tuple:
-        return value
-    if field.metadata["split"]:
-        parts = (part.strip() for part in (value or "").split(","))
-        return tuple(get_args(kind)[0](part) for part in parts if part)
-    return tuple(value or ())
-
-
-def add_command(group: typer.Typer, name: str, options: type, run: Callable[[Any], None], about: str) -> None:
-    """Add a command whose options are the fields of a dataclass.
-
-    Args:
-        group: of the command.
-        name: as typed.
-        options: dataclass with fields of ``geodiff_plugin.options.declare``.
-        run: called with an instance.
-        about: what the command does, a sentence.
-    """
-    kinds = get_type_hints(options)
-    panels = [CAMERAS, RUN, OUTPUT]
-    known = [field for field in dataclasses.fields(options) if field.metadata]
-    known.sort(key=lambda f: (flag_of(f)[0] == "-", panels.index(f.metadata["panel"] or RUN)))
-
-    def call(**typed: Any) -> None:
-        run(options(**{f.name: _value(f, typed[f.name], kinds[f.name]) for f in known}))
-
-    vars(call)["__signature__"] = Signature([_parameter(field, kinds[field.name]) for field in known])
-    group.command(name, help=about)(call)
 
 
 def _out_folder(typed: Path | None, default: str, overwrite: bool) -> Path:

@@ -12,8 +12,7 @@ from geodiff_plugin.cli.depth import estimate_and_write
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.report import single_map, summary_line
 from geodiff_plugin.cli.terminal import StopWatch, new_table, say, show
-from geodiff_plugin.evaluation.alignment import align
-from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.plotting import colour_depth, depth_range, grid

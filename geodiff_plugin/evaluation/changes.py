@@ -1,6 +1,5 @@
 """Ablations of a preset, one change at a time, and the flatness of its optimum.
 
-Data flow: records -> ``Table``.
 Paper: S5.3, which it extends.
 """
 
@@ -11,12 +10,25 @@ from typing import Any
 
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.config import DEFAULT, value_of
-from geodiff_plugin.evaluation.cells import by_method, cell, count_of_pairs, interval_cell, label_of
-from geodiff_plugin.evaluation.layout import Table
-from geodiff_plugin.evaluation.paper_tables import metric_values
-from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
+from geodiff_plugin.evaluation.experiment import RECORDS_NAME, Experiment
+from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
+from geodiff_plugin.evaluation.pairs import pair_cells, remarks_on
+from geodiff_plugin.evaluation.report import Page
+from geodiff_plugin.evaluation.table import (
+    Table,
+    by_method,
+    cell,
+    count_of_pairs,
+    interval_cell,
+    label_of,
+    mean_with_interval,
+    metric_values,
+    paired_difference,
+)
+from geodiff_plugin.evaluation.tables import regions_table, summary_table
+from geodiff_plugin.runner import Record
 
-__all__ = ["CHANGES", "NUMBERS", "changes_table", "flatness_methods", "flatness_table"]
+__all__ = ["CHANGES", "NUMBERS", "changes_table", "flatness_methods", "flatness_table", "run_changes"]
 
 CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
     "guided": (
@@ -135,3 +147,34 @@ def flatness_table(records: Sequence[dict[str, Any]]) -> Table:
     return Table(
         title, ("number", "value", "at half", "at twice", "largest change of a pair"), tuple(rows), note
     )
+
+
+def run_changes(name: str, options: PairsOptions) -> Page | None:
+    """Change one thing of the default at a time: its parts, or its numbers.
+
+    Args:
+        name: ``"parts"`` or ``"flatness"``.
+        options: as of ``geodiff eval pairs``; ``methods`` are run beside the table's own.
+
+    Raises:
+        ValueError, OSError: as ``Experiment.run``.
+    """
+    refs = select(all_refs(options), options)
+    rows = flatness_methods() if name == "flatness" else tuple(method for _, method in CHANGES[name])
+
+    def tables(records: list[Record]) -> list[Table]:
+        whole = [flatness_table(records)] if name == "flatness" else [changes_table(records, name)]
+        added = [record for record in records if record["method"] not in rows]
+        if added:
+            labels = {label_of(record) for record in added}
+            whole.append(
+                summary_table(added, labels, f"Further methods and priors, {count_of_pairs(len(labels))}")
+            )
+        return whole if name == "flatness" else [*whole, regions_table(records)]
+
+    title = "Flatness" if name == "flatness" else "Parts of the default"
+    cells = pair_cells(refs, tuple(dict.fromkeys((*rows, *options.methods))), options)
+    experiment = Experiment(
+        name, title, cells, tables, lambda records: remarks_on(records, options), journal=RECORDS_NAME
+    )
+    return experiment.run(options, command_line(name, options))

@@ -1,6 +1,5 @@
 """Seconds and peak memory of methods on a data set, as ratios to the plain pipeline.
 
-Data flow: references + methods -> one process per method -> records -> ``Table``.
 Paper: S9 (inference time, run time comparison), as ratios and not as seconds of another machine.
 """
 
@@ -15,14 +14,15 @@ from typing import Any
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
-from geodiff_plugin.evaluation.cells import count_of_pairs, label_of
-from geodiff_plugin.evaluation.commands import remarks_on
-from geodiff_plugin.evaluation.layout import Table
+from geodiff_plugin.evaluation.datasets.sample import SampleRef
+from geodiff_plugin.evaluation.experiment import measure_cells
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
+from geodiff_plugin.evaluation.pairs import pair_cells, remarks_on
 from geodiff_plugin.evaluation.report import Page, run_facts, write_page
-from geodiff_plugin.evaluation.runner import processes, run
+from geodiff_plugin.evaluation.table import Table, count_of_pairs, label_of
 from geodiff_plugin.priors import PRIORS, find_prior
 from geodiff_plugin.priors.base import OwnPipelinePrior
+from geodiff_plugin.runner import Record, this_process
 
 __all__ = ["COST_METHODS", "PLAIN", "cost_table", "run_cost"]
 
@@ -81,42 +81,38 @@ def _steps_of(prior: str) -> int | None:
     return STEPS if kind.max_steps is None or kind.max_steps >= STEPS else None
 
 
-def run_cost(options: PairsOptions) -> Page:
+def _method_records(refs: Sequence[SampleRef], method: str, options: PairsOptions) -> list[Record]:
+    """Records of one method; called in a process of its own."""
+    return measure_cells(pair_cells(refs, (method,), options), options) or []
+
+
+def run_cost(name: str, options: PairsOptions) -> Page:
     """Measure and write the table; records go to ``out/cost``, apart from those of other commands.
 
     Args:
+        name: ``"cost"``.
         options: as of ``geodiff eval pairs``; ``methods`` are measured beside ``COST_METHODS``.
 
     Raises:
         ValueError: no samples, bad options, or started as several processes.
         OSError: missing or unreadable files without ``skip_broken``.
     """
-    if processes(options.settings).num_processes > 1:
-        bad_value("the number of processes", "1 for cost", processes(options.settings).num_processes)
+    if this_process().count > 1:
+        bad_value("the number of processes", "1 for cost", this_process().count)
     refs = select(all_refs(options), options)
-    records, taken = [], {}
-    for method in with_priors(tuple(dict.fromkeys((*COST_METHODS, *options.methods))), options.priors):
-        prior = find_method(method).own_settings(options.settings).prior
+    records: list[Record] = []
+    taken: dict[str, int | None] = {}
+    alone = replace(options, prior=options.prior[:1], out=options.out / "cost")
+    for method in with_priors(tuple(dict.fromkeys((*COST_METHODS, *options.methods))), options.prior[1:]):
+        prior = find_method(method).prior or options.prior[0]
         if prior not in taken:
-            taken[prior] = options.settings.steps or _steps_of(prior)
-        settings = replace(options.settings, steps=taken[prior])
+            taken[prior] = options.steps or _steps_of(prior)
         # What one method frees stays with the allocator, where the next would find it at no cost.
         with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
-            job = fresh_process.submit(
-                run,
-                refs,
-                [method],
-                settings,
-                options.out / "cost",
-                crop=options.crop,
-                skip_broken=options.skip_broken,
-                save_depth=options.save_depth,
-                progress=not options.quiet,
-            )
+            job = fresh_process.submit(_method_records, refs, method, replace(alone, steps=taken[prior]))
             records += job.result()
-    facts = run_facts(command_line(options, ("eval", "cost", "--data", str(options.data)), ()))
     each = [f"{steps or 'its own number'} with {prior}" for prior, steps in taken.items()]
     remarks = [*remarks_on(records, options), f"Denoising steps of each: {', '.join(each)}."]
-    page = Page("Cost", facts, (cost_table(records),), tuple(remarks))
-    write_page(page, options.out, "cost")
+    page = Page("Cost", run_facts(command_line(name, options)), (cost_table(records),), tuple(remarks))
+    write_page(page, options.out, name, options.results)
     return page

@@ -1,8 +1,5 @@
 """Emulated prior of chosen strength: a network that answers with the truth plus a controlled error.
 
-Data flow: truth + ``Strength`` -> relative map of a prior -> its code -> what the network would have said.
-Paper: none; it stands for priors that cannot be had here, from exact ones to weak ones.
-
 The pipeline, its scheduler and its autoencoder are real. The network's clean estimate is
 ``(1 - follow) z0* + follow z0(z_t)``: ``z0*`` is the code of the erroneous truth, and ``z0(z_t)`` what its
 input says, so that an edit of one step is seen by the next one, as a trained network would see it.
@@ -24,9 +21,9 @@ from torch import Tensor
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.algorithm.denoising import output_from
 from geodiff_plugin.bundled import load_bundled_prior
-from geodiff_plugin.evaluation.alignment import to_space
 from geodiff_plugin.evaluation.baselines.base import PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.evaluation.metrics import to_space
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance

@@ -1,23 +1,27 @@
-"""Metrics of a depth map against the truth: errors in depth and disparity, and of the uncertainty.
-
-Data flow: predicted depth + truth + mask -> numbers, one image at a time.
-Paper: S5.1 (AbsRel, delta, RMSE; its printed RMSE lacks the root, docs/reference/paper-map.md E5).
-"""
+"""Errors of depth, disparity and uncertainty against the truth, and alignment with it (paper S5.1)."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.evaluation.options import CROPS
+from geodiff_plugin.scale.space import SPACES
 
 __all__ = [
     "FLOOR_M",
+    "MIN_DISPARITY",
+    "align",
     "ause",
     "ause_of_random",
     "confidence_deciles",
     "counted",
+    "crop_mask",
     "evaluate_depth",
     "evaluate_disparity",
+    "least_squares",
+    "to_space",
 ]
 
 FLOOR_M = 1e-5
@@ -223,3 +227,133 @@ def confidence_deciles(
         means = {name: float(np.mean(v[own])) if own.any() else None for name, v in values.items()}
         found.append({"share": float(own.mean()) if own.size else 0.0} | means)
     return found
+
+
+MIN_DISPARITY = 1e-3
+"""Aligned disparity, 1/m, is clipped here before it is inverted: nothing is farther than a kilometre."""
+
+
+def to_space(depth_m: np.ndarray, space: str) -> np.ndarray:
+    """What depths in metres are in a space, in float64: linear there in a prior that is right.
+
+    Args:
+        depth_m: any shape, metres, > 0.
+        space: key of ``SPACES``.
+    """
+    return SPACES[space].inverse(torch.from_numpy(np.asarray(depth_m, np.float64))).numpy()
+
+
+def _from_space(values: np.ndarray, space: str) -> np.ndarray:
+    """Metres of values in a space; where values fall with depth, none is less than that of a kilometre."""
+    kind, metre = SPACES[space], torch.ones((), dtype=torch.float64)
+    values = torch.from_numpy(np.asarray(values, np.float64))
+    if not kind.grows_with_depth:
+        values = values.clamp_min(float(kind.inverse(metre / MIN_DISPARITY)))
+    return kind.forward(values, metre).numpy()
+
+
+def least_squares(values: np.ndarray, target: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
+    """Scale and shift that bring ``values`` closest to ``target`` over the mask, in the sum of squares.
+
+    Args:
+        values: ``(H, W)`` float.
+        target: ``(H, W)`` float.
+        mask: ``(H, W)`` bool.
+
+    Returns:
+        ``(scale, shift)``; the scale is negative where the two run against each other, as the sum of squares
+        says.
+
+    Raises:
+        ValueError: the mask is empty: map and truth have no pixel in common.
+
+    Source: Marigold, ``align_depth_least_square`` (without its optional downscaling), in float64.
+    """
+    if not mask.any():
+        bad_value("the map to align", "known for at least one pixel with truth", "known for none")
+    x, y = np.asarray(values, np.float64)[mask], np.asarray(target, np.float64)[mask]
+    system = np.stack([x, np.ones_like(x)], axis=1)
+    scale, shift = np.linalg.lstsq(system, y, rcond=None)[0]
+    return float(scale), float(shift)
+
+
+def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str = "depth") -> np.ndarray:
+    """Depth in metres of a prediction that is right up to scale and shift in its space.
+
+    Args:
+        values: ``(H, W)`` float, affine in what ``space`` says; not finite where a method leaves a hole.
+        truth_m: ``(H, W)`` float, metres.
+        valid: ``(H, W)`` bool, where the truth counts.
+        space: key of ``SPACES``.
+
+    Returns:
+        ``(H, W)`` float64, metres, at least ``FLOOR_M``, where Marigold's evaluation clips what least
+        squares sends behind the camera; not finite where ``values`` is not, and nowhere finite where no pixel
+        has both truth and prediction.
+
+    Raises:
+        ValueError: an unknown space.
+
+    Source: Marigold's evaluation: ``least_square`` and ``least_square_disparity``, the latter over positive
+        predictions only and clipped at 1e-3; the other spaces are the same idea.
+    """
+    check_choice(space, "space", SPACES)
+    known = valid & np.isfinite(values) & (truth_m > 0)
+    if space == "disparity":
+        known &= np.nan_to_num(values) > 0
+    if not known.any():  # a method that finds nothing has no errors, as without alignment
+        return np.full(np.shape(truth_m), np.nan)
+    target = np.zeros(np.shape(truth_m))
+    target[known] = to_space(np.asarray(truth_m, np.float64)[known], space)
+    scale, shift = least_squares(values, target, known)
+    return np.maximum(_from_space(np.asarray(values, np.float64) * scale + shift, space), FLOOR_M)
+
+
+#: Shares of the image: first and last row, first and last column.
+_SHARES = {
+    "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),
+    "eigen": (0.3324324, 0.91351351, 0.0359477, 0.96405229),
+}
+#: Rows and columns that every image of KITTI's depth benchmark has.
+_BENCHMARK = (352, 1216)
+
+
+def crop_mask(name: str, size: tuple[int, int]) -> np.ndarray:
+    """Pixels inside of a crop; methods still see whole images.
+
+    Args:
+        name: one of ``CROPS``.
+        size: ``(H, W)`` of the image.
+
+    Returns:
+        ``(H, W)`` bool. Of 375 x 1242 pixels, Garg's crop keeps rows 153 to 370 and columns 44 to 1196,
+        Eigen's rows 124 to 341 and the same columns, the benchmark's rows 23 to 374 and columns 13 to 1228
+        (at the bottom, in the middle).
+
+    Raises:
+        ValueError: an unknown name, or an image smaller than the benchmark's.
+
+    Source: Marigold's evaluation of KITTI, which follows BTS and monodepth. Deviation: Marigold's tables take
+        Eigen's crop of an image that was cut to the benchmark's before; here each stands alone.
+    """
+    check_choice(name, "crop", CROPS)
+    height, width = size
+    if name == "none":
+        return np.ones(size, bool)
+    if name == "benchmark":
+        rows, columns = _BENCHMARK
+        if height < rows or width < columns:
+            cure = "It is for KITTI; leave --crop out."
+            bad_value(
+                "crop", f"'benchmark' for images of at least {columns} x {rows}", f"{width} x {height}", cure
+            )
+        top, left = height - rows, (width - columns) // 2
+        bottom, right = top + rows, left + columns
+    else:
+        top, bottom, left, right = (
+            int(share * side)
+            for share, side in zip(_SHARES[name], (height, height, width, width), strict=True)
+        )
+    mask = np.zeros(size, bool)
+    mask[top:bottom, left:right] = True
+    return mask

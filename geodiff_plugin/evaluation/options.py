@@ -1,198 +1,449 @@
-"""Options of a run: samples, methods, settings; and the command line that repeats it.
+"""Options of every command of ``geodiff eval``, one dataclass each, and the table of the commands.
 
-Data flow: ``PairsOptions`` -> references to samples; ``PairsOptions`` -> text of a command.
-Paper: none.
+Nothing here imports torch: the command line is built from these, and ``--help`` answers at once.
 """
 
 from __future__ import annotations
 
+import importlib
 import random
 import shlex
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.evaluation.baselines import POSES, Settings
-from geodiff_plugin.evaluation.crops import CROPS
-from geodiff_plugin.evaluation.datasets import find_pairs
-from geodiff_plugin.evaluation.datasets.sample import SampleRef
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.options import OUTPUT, SPACES, check_options, declare, flag_of
+
+if TYPE_CHECKING:
+    from geodiff_plugin.evaluation.baselines.base import Settings
+    from geodiff_plugin.evaluation.datasets.sample import SampleRef
 
 __all__ = [
+    "COMMANDS",
     "PAIRS_METHODS",
+    "POSES",
+    "Command",
+    "DirOptions",
+    "EvalOptions",
+    "OutOptions",
+    "FigureOptions",
     "PairsOptions",
+    "PosesOptions",
+    "SequenceOptions",
+    "StrengthOptions",
+    "TrustOptions",
     "all_refs",
     "command_line",
+    "data_of",
     "first_pairs",
+    "rendered_refs",
     "select",
-    "settings_words",
 ]
 
 PAIRS_METHODS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
+CROPS = ("none", "garg", "eigen", "benchmark")
+POSES = ("refine", "given", "estimated")
+"""Where ``guided`` has poses from: refined, as given, or withheld but for the baseline's length."""
+DTYPES = ("float32", "float16", "bfloat16")
+#: Fields that are those of ``Settings``.
+SETTINGS = ("ensemble", "seed", "steps", "resolution", "dtype", "space", "views")
+#: What a repeated run need not be told.
+_NOT_REPEATED = ("out", "results", "quiet", "skip_broken", "save_depth")
+_GIVEN = (
+    "Give a folder of data sets, or the name of a registered set (docs/how-to/extending.md); "
+    "geodiff eval list says how to obtain the public ones."
+)
 
 
-@dataclass(frozen=True)
-class PairsOptions:
-    """Options of ``geodiff eval pairs``; names as on the command line.
+@dataclass(frozen=True, kw_only=True)
+class OutOptions:
+    """What every command is told."""
 
-    Attributes:
-        data: folder that holds data sets in their official layouts.
-        methods: names that ``find_method`` knows.
-        datasets: names in ``DATASETS``, empty for all.
-        scenes: parts of sample names to keep, empty for all.
-        limit: at most so many samples; ``None`` for all.
-        sample: so many samples drawn at random with the settings' seed; ``None`` for all.
-        pairs: which pairs of a group of posed views, ``"default"`` or ``"all"``.
-        pixel_centre: coordinate of the first pixel's centre in posed cameras, 0.5 for COLMAP's; ``None`` for
-            each data set's own.
-        settings: what every method is given.
-        out: folder of the records and tables.
-        results: Markdown page to write beside; ``None`` for none.
-        skip_broken: go on after a broken sample.
-        save_depth: write depth maps.
-        quiet: no bar, no table on the screen.
-        crop: region that is scored, one of ``crops.CROPS``.
-        priors: further priors beside the settings' own: methods that use one are run with each.
-        seeds: how many seeds, from the settings' own on, methods that use a prior are run with.
-        pose: where the poses come from: rows of ``guided`` that differ in it, see ``POSES``.
-        perturb: largest turn in degrees and shift as a share of the baseline that poses are given wrong by.
-    """
-
-    data: Path
-    methods: tuple[str, ...]
-    datasets: tuple[str, ...]
-    scenes: tuple[str, ...]
-    limit: int | None
-    sample: int | None
-    pairs: str
-    pixel_centre: float | None
-    settings: Settings
-    out: Path
-    results: Path | None
-    skip_broken: bool
-    save_depth: bool
-    quiet: bool
-    crop: str = "none"
-    priors: tuple[str, ...] = ()
-    seeds: int = 1
-    pose: tuple[str, ...] = ()
-    perturb: tuple[float, float] | None = None
+    seed: int = declare(0, "Seed of the noise.")
+    steps: int | None = declare(None, "Denoising steps; each method's own by default.", low=1, high=1000)
+    out: Path = declare(
+        Path("geodiff-eval"), "Records and results; resumed where it exists.", "--out", "-o", panel=OUTPUT
+    )
+    results: Path | None = declare(None, "Write the Markdown page here as well.", panel=OUTPUT)
+    quiet: bool = declare(False, "No bar and nothing on the screen.", "--quiet", "-q", panel=OUTPUT)
 
     def __post_init__(self) -> None:
-        check_choice(self.crop, "crop", CROPS)
-        for pose in self.pose:
-            check_choice(pose, "pose", POSES)
+        check_options(self)
 
 
-def all_refs(options: PairsOptions, datasets: Sequence[str] | None = None) -> list[SampleRef]:
-    """References to all samples of the data: of the named data sets, else of those that the options name."""
-    return find_pairs(
-        options.data,
-        datasets or options.datasets or None,
-        pairs=options.pairs,
-        pixel_centre=options.pixel_centre,
+@dataclass(frozen=True, kw_only=True)
+class EvalOptions(OutOptions):
+    """What every command that runs a prior is told."""
+
+    prior: tuple[str, ...] = declare(
+        ("bundled",), "'bundled', a hub id or a folder; where several rows make sense, repeat it."
+    )
+    space: str | None = declare(
+        None, "Space in which the prior's map is affine, if its folder does not say.", choices=SPACES
+    )
+    dtype: str = declare("float32", "float32, bfloat16 or float16.", choices=DTYPES)
+    device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.prior) != 1 and not isinstance(self, PairsOptions):
+            bad_value("--prior", "given once", " ".join(self.prior) or "nothing")
+
+    @property
+    def settings(self) -> Settings:
+        """What methods are given; imports torch."""
+        from geodiff_plugin.evaluation.baselines.base import Settings
+        from geodiff_plugin.runtime.machine import pick_device
+
+        given = {name: getattr(self, name) for name in SETTINGS if hasattr(self, name)}
+        return Settings(self.prior[0], device=str(pick_device(self.device)), **given)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SampleOptions(EvalOptions):
+    """Which samples, of what data."""
+
+    data: Path | None = declare(
+        None, "Folder with data sets, or the name of a registered set.", metavar="DIR"
+    )
+    methods: tuple[str, ...] = declare(
+        (), "Comma-separated, see geodiff eval list; beside the built-in rows.", split=True
+    )
+    datasets: tuple[str, ...] = declare(
+        (), "Comma-separated; all that the folder has by default.", split=True
+    )
+    scenes: tuple[str, ...] = declare((), "Comma-separated parts of sample names to keep.", split=True)
+    limit: int | None = declare(
+        None, "The first N samples alone; in a table of the paper, of each set.", low=1, high=10**9
+    )
+    ensemble: int = declare(1, "Ensemble members.", low=1, high=1000)
+    resolution: int | None = declare(None, "Longer side for the prior, pixels.", low=0, high=8192)
+    views: int = declare(2, "Views that methods take of a group that has more than two.", low=2, high=100)
+    perturb: str | None = declare(
+        None, "Give poses wrongly: largest turn, and shift / baseline.", metavar="DEGREES,SHARE"
+    )
+
+    @property
+    def perturbed(self) -> tuple[float, float] | None:
+        """``perturb`` as numbers."""
+        from geodiff_plugin.evaluation.datasets.changed import perturbation
+
+        return None if self.perturb is None else perturbation(self.perturb)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsOptions(_SampleOptions):
+    """``geodiff eval pairs``, and without a few the tables of the paper, of parts, flatness and cost."""
+
+    sample: int | None = declare(None, "Draw this many samples at random, by --seed.", low=1, high=10**9)
+    pairs: str = declare(
+        "default", "Of a group of posed views: default (the first two) or all.", choices=("default", "all")
+    )
+    pixel_centre: float | None = declare(
+        None, "First pixel's centre in posed cameras, 0.5 for COLMAP's; each set's own by default."
+    )
+    crop: str = declare(
+        "none", "Region that is scored: none, garg, eigen or benchmark (KITTI).", choices=CROPS
+    )
+    seeds: int = declare(
+        1, "Seeds, from --seed on, of methods that use a prior; a table has their spread.", low=1, high=1000
+    )
+    pose: tuple[str, ...] = declare(
+        (),
+        "Rows of 'guided': refine, given or estimated (poses withheld), comma-separated.",
+        split=True,
+        choices=POSES,
+    )
+    skip_broken: bool = declare(False, "Go on after a broken sample and count it.", panel=OUTPUT)
+    save_depth: bool = declare(False, "Write every depth map as .npy.", panel=OUTPUT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirOptions(PairsOptions):
+    """``geodiff eval pairs DIR``."""
+
+    data: Path | None = declare(
+        MISSING, "Folder of data sets, or the name of a registered set.", "", metavar="DIR"
+    )
+    methods: tuple[str, ...] = declare(
+        PAIRS_METHODS, "Comma-separated, see geodiff eval list; five of them by default.", split=True
     )
 
 
-def _check_count(name: str, count: int | None) -> None:
-    if count is not None and count < 1:
-        bad_value(name, "at least 1", count)
+@dataclass(frozen=True, kw_only=True)
+class FigureOptions(_SampleOptions):
+    """``geodiff eval figure NAME``."""
+
+    name: str = declare(
+        MISSING,
+        "gs-sweep, inner-steps, ablation, exposure, qualitative, epipolar or terms.",
+        "",
+        metavar="NAME",
+    )
+    max: float = declare(80.0, "gs-sweep: the last g_s, metres.", low=1.01, high=1e6)
+    updates: tuple[int, ...] = declare(
+        (1, 2, 5, 10, 20, 40),
+        "inner-steps: updates per step, comma-separated.",
+        split=True,
+        low=1,
+        high=10_000,
+    )
+    results: Path | None = field(default=None)
+    clouds: bool = declare(False, "qualitative, ablation: point clouds from another view too.")
 
 
-def _check_names(option: str, refs: Sequence[SampleRef], data: Path) -> None:
+@dataclass(frozen=True, kw_only=True)
+class StrengthOptions(OutOptions):
+    """``geodiff eval strength``."""
+
+    data: tuple[Path, ...] = declare(
+        (), "Folder of data sets, or the name of a registered set; may be repeated.", metavar="DIR"
+    )
+    limit: int | None = declare(None, "The first N pairs alone, of each --data.", low=1, high=10**9)
+    strengths: tuple[str, ...] = declare(
+        ("exact", "2%", "5%", "10%", "20%", "blur", "gamma"),
+        "Comma-separated: exact, 2%, 5%, 10%, 20%, blur, gamma.",
+        split=True,
+        choices=("exact", "2%", "5%", "10%", "20%", "blur", "gamma"),
+    )
+    space: str = declare(
+        "disparity", "Affine in disparity, depth or log.", choices=("disparity", "depth", "log")
+    )
+    follow: float = declare(
+        0.3, "How far the prior's later answers follow their input, 0 to 1.", low=0.0, high=1.0
+    )
+    methods: tuple[str, ...] = declare(
+        ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5"),
+        "Comma-separated methods that use a prior, see geodiff eval list.",
+        split=True,
+    )
+    steps: int | None = declare(4, "Denoising steps.", low=1, high=1000)
+    resolution: int = declare(384, "Longer side for the prior, pixels.", low=64, high=8192)
+    figure: Path | None = declare(
+        None, "PNG: error against the prior's error, and lit surfaces.", panel=OUTPUT
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceOptions(EvalOptions):
+    """``geodiff eval sequence``."""
+
+    scenes: int = declare(4, "Sequences, of the seeds from 0 on.", low=1, high=10_000)
+    frames: int = declare(6, "Frames of each.", low=2, high=10_000)
+    size: tuple[int, int] = field(default=(192, 256))
+    ways: tuple[str, ...] = declare(
+        ("alone", "alone-half", "scale", "warm", "warm-50", "warm-75"),
+        "Comma-separated: alone, alone-half, scale, warm, warm-50, warm-75.",
+        split=True,
+        choices=("alone", "alone-half", "scale", "warm", "warm-50", "warm-75"),
+    )
+    steps: int | None = declare(4, "Denoising steps of a frame alone.", low=1, high=1000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrustOptions(EvalOptions):
+    """``geodiff eval trust``."""
+
+    data: Path | None = declare(None, "Folder of real pairs; none by default.", metavar="DIR")
+    limit: int | None = declare(None, "The first N real pairs alone.", low=1, high=10**9)
+    rendered: int = declare(
+        0, "Pairs of the registered set 'synthetic', every other one rectified.", low=0, high=10**6
+    )
+    width: int = declare(512, "Width of the rendered pairs, pixels.", low=64, high=8192)
+    kinds: tuple[str, ...] = declare(
+        (), "Comma-separated kinds of wrong calibration; ten by default.", split=True
+    )
+    out: Path = declare(
+        Path("geodiff-trust"), "Records and results; resumed where it exists.", "--out", "-o", panel=OUTPUT
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosesOptions(EvalOptions):
+    """``geodiff eval poses``."""
+
+    data: Path | None = declare(None, "Folder of real pairs; none by default.", metavar="DIR")
+    limit: int | None = declare(None, "The first N real pairs alone.", low=1, high=10**9)
+    rendered: int = declare(
+        0, "Pairs of the registered set 'synthetic' in a general pose.", low=0, high=10**6
+    )
+    rendered_size: str | None = declare(
+        None, "Size of rendered pairs; smaller is faster.", metavar="WIDTHxHEIGHT"
+    )
+    perturb: str = declare(
+        "1.5,0.1", "Rendered: largest turn, and shift / baseline.", metavar="DEGREES,SHARE"
+    )
+    drift: str = declare(
+        "0.3,1.5", "Rectified: turn, shift of the right image; 0,0: none.", metavar="DEGREES,PIXELS"
+    )
+    resolution: int | None = declare(None, "Longer side for the prior, pixels.", low=0, high=8192)
+    out: Path = declare(
+        Path("geodiff-poses"), "Records and results; resumed where it exists.", "--out", "-o", panel=OUTPUT
+    )
+
+
+class Command(NamedTuple):
+    """A command of ``geodiff eval``: its options, what it does, and ``module:function`` in this package."""
+
+    options: type[OutOptions]
+    about: str
+    run: str
+
+    def __call__(self, name: str, options: Any) -> Any:
+        """Run it: the page, the path of a figure, or ``None`` in a process that writes nothing."""
+        module, _, function = self.run.partition(":")
+        run: Callable[..., Any] = getattr(
+            importlib.import_module(f"geodiff_plugin.evaluation.{module}"), function
+        )
+        return run(name, options)
+
+
+COMMANDS: dict[str, Command] = {
+    "pairs": Command(
+        DirOptions, "Measure methods side by side on every metric pair below DIR.", "pairs:run_pairs"
+    ),
+    "table1": Command(
+        PairsOptions,
+        "Table 1: KITTI-Stereo, Booster and Middlebury, in metres and aligned.",
+        "paper:run_paper_table",
+    ),
+    "table2": Command(PairsOptions, "Table 2: Booster, beside stereo.", "paper:run_paper_table"),
+    "table3": Command(PairsOptions, "Table 3: two posed views, Tanks and Temples.", "paper:run_paper_table"),
+    "ablation": Command(
+        PairsOptions,
+        "Table 4, and one change at a time: gradients, rules, terms, no diffusion.",
+        "paper:run_paper_table",
+    ),
+    "parts": Command(
+        PairsOptions, "What each part of the default is worth: one left out at a time.", "changes:run_changes"
+    ),
+    "flatness": Command(
+        PairsOptions,
+        "How flat the default lies: every number of it at half and at twice its value.",
+        "changes:run_changes",
+    ),
+    "cost": Command(
+        PairsOptions, "Seconds and peak memory, plain against guided, as ratios.", "cost:run_cost"
+    ),
+    "strength": Command(
+        StrengthOptions,
+        "Accuracy with emulated priors from exact to weak: aligned to the truth, fitted once, and guided.",
+        "strength:run_strength",
+    ),
+    "sequence": Command(
+        SequenceOptions,
+        "Depth of a moving rig: every frame alone, or each from the frame before; error, flicker, seconds.",
+        "sequence:run_sequence",
+    ),
+    "figure": Command(
+        FigureOptions, "Draw one figure as PNG, with its numbers as JSON beside it.", "figures:run_figure"
+    ),
+    "trust": Command(
+        TrustOptions,
+        "How many wrong calibrations are detected, and how many right ones are not trusted.",
+        "trust:run_trust",
+    ),
+    "poses": Command(
+        PosesOptions,
+        "Accuracy with poses as given, perturbed, refined and estimated, and of rigs that have drifted.",
+        "poses:run_poses",
+    ),
+}
+"""Every command but ``list``, by name."""
+
+
+def command_line(name: str, options: Any) -> str:
+    """The command line that gives these options, defaults and what changes no number left out."""
+    words = ["geodiff", "eval", name]
+    for each in fields(options):
+        value = getattr(options, each.name)
+        if not each.metadata or each.name in _NOT_REPEATED or value == each.default:
+            continue
+        flag = flag_of(each) if each.metadata["flags"] != ("",) else ""
+        split = each.metadata["split"] and isinstance(value, tuple)
+        entries = (",".join(map(str, value)),) if split else value if isinstance(value, tuple) else (value,)
+        for entry in entries:
+            words += [flag] * bool(flag) + ([] if entry is True else [str(entry)])
+    return shlex.join(words)
+
+
+def data_of(options: Any) -> Path:
+    """Where the samples are: what was given, or the pair that ships with the package."""
+    from geodiff_plugin.bundled import PRIOR_FOLDER
+
+    return options.data or PRIOR_FOLDER.parent / "pair"
+
+
+def all_refs(options: PairsOptions | FigureOptions, datasets: Sequence[str] = ()) -> list[SampleRef]:
+    """References to all samples of the data: of the named data sets, else of those that the options name."""
+    from geodiff_plugin.evaluation.datasets import find_pairs
+
+    given = {name: getattr(options, name, None) for name in ("pairs", "pixel_centre")}
+    return find_pairs(data_of(options), datasets or options.datasets or None, **given)
+
+
+def _check_names(refs: Sequence[SampleRef], data: Path) -> None:
     """Refuse samples of one name, as two resolutions of a set have: records could not tell them apart."""
     twice = [label for label, count in Counter(ref.label for ref in refs).items() if count > 1]
     if twice:
         cure = "Name the folder of one of them, for instance that of one resolution."
-        bad_value(option, "a folder with one sample of each name", f"{data} with several {twice[0]}", cure)
+        bad_value("--data", "a folder with one sample of each name", f"{data} with several {twice[0]}", cure)
 
 
 def first_pairs(data: Path | None, limit: int | None) -> list[SampleRef]:
-    """The first pairs of a folder; none without a folder.
-
-    Args:
-        data: folder that holds data sets, or ``None``.
-        limit: at most so many; ``None`` for all.
+    """The first pairs of a folder, none without a folder.
 
     Raises:
-        ValueError: a folder without pairs, two of one name, or a limit below 1.
+        ValueError: a folder without pairs, or with two of one name.
     """
-    _check_count("limit", limit)
+    from geodiff_plugin.evaluation.datasets import find_pairs
+
     if data is None:
         return []
-    found = find_pairs(data)
-    if not found:
-        bad_value("--data", "a folder with pairs", str(data), "See: geodiff eval list.")
-    _check_names("--data", found, data)
-    return found[:limit]
+    refs = find_pairs(data)
+    if not refs:
+        bad_value("--data", "a folder with pairs", str(data), _GIVEN)
+    _check_names(refs, data)
+    return refs[:limit]
 
 
-def select(refs: Sequence[SampleRef], options: PairsOptions) -> list[SampleRef]:
+def rendered_refs(text: str, count: int) -> list[SampleRef]:
+    """``count`` pairs of the registered set ``synthetic``, which the package does not hold itself.
+
+    Args:
+        text: what the set is asked for, as ``synthetic:{}@512x384``.
+        count: how many; none for 0.
+    """
+    from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
+
+    if count and "synthetic" not in DATASETS:
+        cure = "A clone of the repository has it: python -m tests.scenes eval ..."
+        bad_value("--rendered", "0 where no data set 'synthetic' is registered", count, cure)
+    return find_pairs(text.format(count), ["synthetic"]) if count else []
+
+
+def select(refs: Sequence[SampleRef], options: PairsOptions | FigureOptions) -> list[SampleRef]:
     """Keep the samples whose label contains one of ``scenes``, draw ``sample``, keep the first ``limit``.
 
     Returns:
         References in the order of ``refs``.
 
     Raises:
-        ValueError: nothing is left, two samples have one name, more are to be drawn than there are, or a
-            number is below 1.
+        ValueError: nothing is left, two samples have one name, or more are to be drawn than there are.
     """
-    scenes, data = options.scenes, options.data
-    for name in ("limit", "sample"):
-        _check_count(name, getattr(options, name))
+    scenes, data, count = options.scenes, data_of(options), getattr(options, "sample", None)
     kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
     if not kept:
-        found = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
+        there = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
         wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
-        bad_value("DIR", f"a folder with a sample{wanted}", f"{data} with {found}", "See: geodiff eval list.")
-    _check_names("DIR", kept, data)
-    if options.sample is not None:
-        if options.sample > len(kept):
-            bad_value("sample", f"at most {len(kept)}, the number of samples found", options.sample)
-        drawn = random.Random(options.settings.seed).sample(range(len(kept)), options.sample)
+        bad_value("--data", f"a folder with a sample{wanted}", f"{data} with {there}", _GIVEN)
+    _check_names(kept, data)
+    if count is not None:
+        if count > len(kept):
+            bad_value("--sample", f"at most {len(kept)}, the number of samples found", count)
+        drawn = random.Random(options.seed).sample(range(len(kept)), count)
         kept = [kept[i] for i in sorted(drawn)]
     return kept[: options.limit]
-
-
-def settings_words(settings: Settings, without: Sequence[str] = ()) -> list[str]:
-    """Words of a command line that give these settings, defaults and those in ``without`` left out."""
-    words = []
-    for field in fields(Settings):
-        value: Any = getattr(settings, field.name)
-        if field.name not in without and value != field.default:
-            words += [f"--{field.name}", str(value)]
-    return words
-
-
-def command_line(
-    options: PairsOptions, head: Sequence[str], default_methods: tuple[str, ...] = PAIRS_METHODS
-) -> str:
-    """The command line that gives these options, defaults left out.
-
-    Args:
-        options: what was given.
-        head: subcommand and data, such as ``("eval", "pairs", "DIR")``.
-        default_methods: methods of the subcommand when none are named.
-    """
-    words = ["geodiff", *head]
-    if options.methods != default_methods:
-        words += ["--methods", ",".join(options.methods)]
-    for name in ("datasets", "scenes"):
-        if getattr(options, name):
-            words += [f"--{name}", ",".join(getattr(options, name))]
-    defaults = {"limit": None, "sample": None, "pairs": "default", "pixel_centre": None, "crop": "none"}
-    defaults["seeds"] = 1
-    for name, default in defaults.items():
-        if getattr(options, name) != default:
-            words += [f"--{name.replace('_', '-')}", str(getattr(options, name))]
-    if options.priors:
-        words += ["--prior", options.settings.prior]
-        words += [word for prior in options.priors for word in ("--prior", prior)]
-    words += settings_words(options.settings, () if not options.priors else ("prior",))
-    if options.pose:
-        words += ["--pose", ",".join(options.pose)]
-    if options.perturb is not None:
-        words += ["--perturb", "{:g},{:g}".format(*options.perturb)]
-    return shlex.join(words)

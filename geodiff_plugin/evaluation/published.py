@@ -1,6 +1,5 @@
 """The paper's published numbers, and the rows and columns of its tables.
 
-Data flow: name of a table -> ``Layout`` with published cells.
 Paper: Table 1 (tab:depth_comparison), 2 (tab:stereo_comparison), 3 (tab:two_views), 4 (tab:ablation_study).
 """
 

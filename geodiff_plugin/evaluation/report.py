@@ -1,8 +1,4 @@
-"""The page of a run, written as Markdown, LaTeX and JSON.
-
-Data flow: tables + command + versions -> files.
-Paper: none.
-"""
+"""The page of a run, written as Markdown, LaTeX and JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +13,7 @@ from typing import Any
 
 import torch
 
-from geodiff_plugin.evaluation.layout import Table
+from geodiff_plugin.evaluation.table import Table
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.runtime.machine import versions
 

@@ -1,6 +1,5 @@
 """Every metric of one prediction on one sample, as JSON values.
 
-Data flow: ``StereoSample`` + ``Prediction`` -> record.
 Paper: S5.1 (metrics, raw and aligned).
 """
 
@@ -15,9 +14,8 @@ import numpy as np
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.alignment import align, to_space
-from geodiff_plugin.evaluation.baselines._sweep import sweep
 from geodiff_plugin.evaluation.baselines.base import Prediction
+from geodiff_plugin.evaluation.baselines.stereo import sweep
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
 from geodiff_plugin.evaluation.edges import (
     boundary_errors,
@@ -26,12 +24,14 @@ from geodiff_plugin.evaluation.edges import (
     near_disparity_steps,
 )
 from geodiff_plugin.evaluation.metrics import (
+    align,
     ause,
     ause_of_random,
     confidence_deciles,
     counted,
     evaluate_depth,
     evaluate_disparity,
+    to_space,
 )
 from geodiff_plugin.matching import find_matches
 from geodiff_plugin.runtime.confidence import RIGHT_WITHIN

@@ -1,34 +1,31 @@
-"""Guidance of priors from exact to weak: ``geodiff eval strength``.
-
-Data flow: dense pairs + ``STRENGTHS`` -> emulated prior -> plain, fitted and guided -> tables.
-Paper: none; S5 measures one prior.
-"""
+"""Guidance of priors from exact to weak: ``geodiff eval strength``."""
 
 from __future__ import annotations
 
+import math
 import os
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from geodiff_plugin import __version__
-from geodiff_plugin._checks import bad_value, check_choice, check_number
-from geodiff_plugin.evaluation.alignment import align
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.edges import edge_error, surface_error
-from geodiff_plugin.evaluation.emulated import DENSE, SPACES, STRENGTHS, EmulatedPrior, EmulatedPriors
-from geodiff_plugin.evaluation.figures.strength import draw_strength, shaded
-from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page
-from geodiff_plugin.evaluation.strength_tables import strength_tables
+from geodiff_plugin.evaluation.emulated import DENSE, STRENGTHS, EmulatedPrior, EmulatedPriors
+from geodiff_plugin.evaluation.experiment import Experiment, cell_key, last_of
+from geodiff_plugin.evaluation.figures.curves import draw_strength, shaded
+from geodiff_plugin.evaluation.metrics import align, evaluate_depth
+from geodiff_plugin.evaluation.options import StrengthOptions, command_line, data_of
+from geodiff_plugin.evaluation.report import Page
+from geodiff_plugin.evaluation.table import Table, count_of_pairs
+from geodiff_plugin.runner import Item, Record
 
-__all__ = ["METHODS", "StrengthOptions", "run_strength"]
+__all__ = ["run_strength", "strength_tables"]
 
 #: First paragraph of the page.
 PURPOSE = (
@@ -42,175 +39,168 @@ PURPOSE = (
 
 #: The plain call whose scale and shift the truth decides.
 ORACLE = "prior-aligned"
-METHODS = (ORACLE, "prior-fit", "guided", "search-only", "guided:inner_steps=5")
 #: Strength whose surfaces the figure shows.
 SHOWN = "5%"
+#: Field of a record -> heading of its column.
+_VALUES = {"abs_rel": "AbsRel", "delta1": "δ1", "edges": "at edges", "surfaces": "surfaces"}
 
 
-@dataclass(frozen=True)
-class StrengthOptions:
-    """What to measure.
+def strength_tables(records: Sequence[Record]) -> tuple[Table, ...]:
+    """One table a group of pairs (all, rendered rectified, rendered posed, real), strengths by methods.
 
-    Attributes:
-        data: folders of data sets, or ``synthetic:N``; samples without dense truth are left out.
-        command: as typed, for the page.
-        strengths: keys of ``STRENGTHS``.
-        space: what the emulated prior is affine in.
-        follow: how far its later answers follow their input, [0, 1].
-        methods: of ``METHODS``, or any method that uses a prior.
-        steps: denoising steps of the plain call.
-        resolution: ``processing_resolution`` of every call.
-        seed: of noise and of the prior's error.
-        limit: samples of each folder at most.
-        out: folder of the records; a run goes on where it was stopped.
-        results: where the Markdown page is written as well.
-        figure: where the figure is drawn.
-        quiet: no progress bar.
+    Args:
+        records: of ``run_strength``.
     """
-
-    data: tuple[Path, ...]
-    command: str
-    strengths: tuple[str, ...] = tuple(STRENGTHS)
-    space: str = "disparity"
-    follow: float = 0.3
-    methods: tuple[str, ...] = METHODS
-    steps: int = 4
-    resolution: int = 384
-    seed: int = 0
-    limit: int | None = None
-    out: Path = Path("geodiff-eval")
-    results: Path | None = None
-    figure: Path | None = None
-    quiet: bool = False
-
-    def __post_init__(self) -> None:
-        for strength in self.strengths:
-            check_choice(strength, "strengths", STRENGTHS)
-        check_choice(self.space, "space", SPACES)
-        check_number(self.follow, "follow", 0.0, 1.0)
-        for name in self.methods:
-            method = find_method(name)
-            if not method.uses_prior or method.prior is not None:
-                bad_value("methods", "methods that use a prior, none named after an @", repr(name))
-        if self.figure is not None and ORACLE not in self.methods:
-            bad_value("methods", f"with {ORACLE}, the abscissa of the figure", repr(",".join(self.methods)))
+    groups: dict[str, Callable[[Record], bool]] = {
+        "All pairs": lambda r: True,
+        "Rendered, rectified": lambda r: r["rendered"] and r["rectified"],
+        "Rendered, any pose": lambda r: r["rendered"] and not r["rectified"],
+        "Real": lambda r: not r["rendered"],
+    }
+    tables = []
+    for title, belongs in groups.items():
+        own = [record for record in records if belongs(record)]
+        if own:
+            tables.append(_table(title, own))
+    return tuple(tables)
 
 
-def run_strength(options: StrengthOptions) -> Page:
+def _table(title: str, records: Sequence[Record]) -> Table:
+    strengths = list(dict.fromkeys(record["strength"] for record in records))
+    methods = list(dict.fromkeys(record["method"] for record in records))
+    rows, rules = [], []
+    for strength in strengths:
+        rules.append(len(rows))
+        for method in methods:
+            own = [r for r in records if r["strength"] == strength and r["method"] == method]
+            if not own:
+                continue
+            means = {name: _mean([r[name] for r in own]) for name in _VALUES}
+            worst = max(r["abs_rel"] for r in own)
+            shown = [f"{means[n]:.2f}" if n == "surfaces" else f"{means[n]:.4f}" for n in _VALUES]
+            rows.append((strength, find_method(method).title, *shown, f"{worst:.3f}"))
+    # Not by label: pairs of one name in two folders are two.
+    pairs = count_of_pairs(max(Counter((r["strength"], r["method"]) for r in records).values()))
+    note = (
+        f"{pairs}. AbsRel and δ1 in metres, without alignment but for the prior with oracle; AbsRel within "
+        f"3 px of the truth's edges; error of the slope of log depth away from them, per mille a pixel."
+    )
+    header = ("prior's error", "method", *_VALUES.values(), "worst AbsRel")
+    return Table(title, header, tuple(rows), note, rules=tuple(rules[1:]))
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else float("nan")
+
+
+def run_strength(name: str, options: StrengthOptions) -> Page | None:
     """Measure every method at every strength, and write the page.
 
     Raises:
         InputError: bad options, or no sample with dense truth.
         OSError: missing or unreadable files.
     """
-    refs = [ref for root in options.data for ref in find_pairs(root)[: options.limit]]
-    options.out.mkdir(parents=True, exist_ok=True)
-    path = options.out / "strength.jsonl"
-    clean_records(path)
-    found = {record["key"]: record for record in read_records(path)}
-    prior = EmulatedPrior(options.space, options.follow)
-    cache, records = EmulatedPriors(prior), []
-    for ref in tqdm(refs, disable=options.quiet, desc="pairs"):
-        keys = {(s, m): _key(ref, s, m, options) for s in options.strengths for m in options.methods}
-        if not all(key in found for key in keys.values()):
-            sample = load(ref)
-            if sample.valid.mean() < DENSE:
-                continue
-            for record in _measure(sample, prior, cache, keys, found, options):
-                found[record["key"]] = record
-                append_record(path, record)
-        records += [found[key] for key in keys.values() if key in found]
-    if not records:
-        bad_value("data", f"with dense truth (on {DENSE:.0%} of the pixels) for some pair", "none")
-    remarks = (
-        f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; processed "
-        f"at {options.resolution} px, {options.steps} steps, seed {options.seed}.",
+    _check_methods(options)
+    refs = [ref for root in options.data or (data_of(options),) for ref in find_pairs(root)[: options.limit]]
+    bench = _Bench(options)
+    cells = [cell for ref in refs for cell in bench.cells(ref)]
+
+    def dense(records: Sequence[Record]) -> list[Record]:
+        kept = [record for record in records if record.get("status") != "sparse"]
+        if not kept:
+            bad_value("--data", f"with dense truth (on {DENSE:.0%} of the pixels) for some pair", "none")
+        return kept
+
+    def remarks(records: list[Record]) -> list[str]:
+        sentences = [
+            f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; "
+            f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}."
+        ]
+        if options.figure is not None:
+            labels = {record["pair"] for record in dense(records)}
+            sample = load(next(ref for ref in refs if ref.label in labels))
+            draw_strength(dense(records), ORACLE, bench.pictures(sample), options.figure)
+            if options.results is not None:
+                picture = Path(os.path.relpath(options.figure, options.results.parent)).as_posix()
+                sentences.append(f"![What guidance gains by the prior's error; surfaces, lit]({picture})")
+        return sentences
+
+    title = "Priors from exact to weak"
+    experiment = Experiment(
+        name, title, cells, lambda records: strength_tables(dense(records)), remarks, PURPOSE
     )
-    if options.figure is not None and options.results is not None:
-        picture = Path(os.path.relpath(options.figure, options.results.parent)).as_posix()
-        remarks += (f"![What guidance gains by the prior's error; surfaces, lit]({picture})",)
-    tables = strength_tables(records)
-    page = Page("Priors from exact to weak", run_facts(options.command), tables, remarks, PURPOSE)
-    write_page(page, options.out, "strength", options.results)
-    if options.figure is not None:
-        labels = {record["pair"] for record in records}
-        sample = load(next(ref for ref in refs if ref.label in labels))
-        draw_strength(records, ORACLE, _pictures(sample, prior, cache, options), options.figure)
-    return page
+    return experiment.run(options, command_line(name, options))
 
 
-def _pictures(
-    sample: StereoSample, prior: EmulatedPrior, cache: PriorCache, options: StrengthOptions
-) -> dict[str, np.ndarray]:
-    """The middle of one pair, lit, at the strength of the figure: truth, prior, fitted once, guided."""
-    strength = SHOWN if SHOWN in options.strengths else options.strengths[0]
-    height, width = sample.depth_m.shape
-    window = np.s_[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
-    maps = {"truth": sample.depth_m}
-    for method in (ORACLE, "prior-fit", "guided"):
-        title = f"{find_method(method).title}, {strength}"
-        maps[title] = _depth(sample, prior, cache, strength, method, options)
-    return {title: shaded(depth_m[window], float(sample.K_left[0, 0])) for title, depth_m in maps.items()}
+def _check_methods(options: StrengthOptions) -> None:
+    for name in options.methods:
+        method = find_method(name)
+        if not method.uses_prior or method.prior is not None:
+            bad_value("--methods", "methods that use a prior, none named after an @", repr(name))
+    if options.figure is not None and ORACLE not in options.methods:
+        got = repr(",".join(options.methods))
+        bad_value("--methods", f"with {ORACLE}, the abscissa of the figure", got)
 
 
-def _key(ref: SampleRef, strength: str, name: str, options: StrengthOptions) -> str:
-    method = find_method(name)
-    configuration = method.configuration(method.own_settings(_settings(options)))
-    prior = f"emulated {options.space} {options.follow} {strength} {options.seed}"
-    return record_key(ref, name, configuration, prior, __version__)
+class _Bench:
+    """One emulated prior, which answers for one sample and strength after the other."""
 
+    def __init__(self, options: StrengthOptions) -> None:
+        self._options, self._read = options, last_of(load)
+        self._settings = Settings(steps=options.steps, resolution=options.resolution, seed=options.seed)
+        self._prior = EmulatedPrior(options.space, options.follow)
+        self._cache: PriorCache = EmulatedPriors(self._prior)
 
-def _settings(options: StrengthOptions) -> Settings:
-    return Settings(steps=options.steps, resolution=options.resolution, seed=options.seed)
+    def cells(self, ref: SampleRef) -> list[Item]:
+        """A cell for every strength and method."""
+        options, cells = self._options, []
+        for strength in options.strengths:
+            for name in options.methods:
+                method = find_method(name)
+                configuration = method.configuration(method.own_settings(self._settings))
+                prior = f"emulated {options.space} {options.follow} {strength} {options.seed}"
+                head = {"pair": ref.label, "strength": strength, "method": name}
+                work = partial(self._measure, ref, strength, name)
+                key = cell_key(ref, name, configuration, prior)
+                cells.append(Item(key, work, name=f"{ref.label}, {strength}, {name}", head=head))
+        return cells
 
+    def _measure(self, ref: SampleRef, strength: str, name: str) -> Record:
+        sample = self._read(ref)
+        if sample.valid.mean() < DENSE:
+            return {"status": "sparse"}
+        depth_m, truth = self.depth_m(sample, strength, name), (sample.depth_m, sample.valid)
+        scores = evaluate_depth(depth_m, *truth)
+        return {
+            "rectified": bool(sample.rectified),
+            "rendered": sample.dataset == "synthetic",
+            "abs_rel": scores["abs_rel"],
+            "delta1": scores["delta1"],
+            "edges": edge_error(depth_m, *truth),
+            "surfaces": surface_error(depth_m, *truth),
+        }
 
-def _measure(
-    sample: StereoSample,
-    prior: EmulatedPrior,
-    cache: PriorCache,
-    keys: dict[tuple[str, str], str],
-    found: dict[str, Any],
-    options: StrengthOptions,
-) -> list[dict[str, Any]]:
-    """A record of every method and strength that has none yet."""
-    truth, records = (sample.depth_m, sample.valid), []
-    for (strength, method), key in keys.items():
-        if key in found:
-            continue
-        depth_m = _depth(sample, prior, cache, strength, method, options)
-        scores = evaluate_depth(depth_m, sample.depth_m, sample.valid, None)
-        records.append(
-            {
-                "key": key,
-                "pair": sample.label,
-                "rectified": bool(sample.rectified),
-                "rendered": sample.dataset == "synthetic",
-                "strength": strength,
-                "method": method,
-                "abs_rel": scores["abs_rel"],
-                "delta1": scores["delta1"],
-                "edges": edge_error(depth_m, *truth),
-                "surfaces": surface_error(depth_m, *truth),
-            }
-        )
-    return records
+    def depth_m(self, sample: StereoSample, strength: str, name: str) -> np.ndarray:
+        """``(H, W)`` metres of a method with a prior of some strength, aligned where it is relative."""
+        self._prior.answer(sample, STRENGTHS[strength], self._options.resolution, self._options.seed)
+        method = find_method(name)
+        try:
+            prediction = method.run(sample, method.own_settings(self._settings), self._cache)
+        except NotApplicable as reason:
+            got = f"{name}, not on {sample.label}: {reason}"
+            bad_value("--methods", "methods that work on every pair", got)
+        if prediction.depth_m is not None:
+            return prediction.depth_m
+        return align(prediction.relative, sample.depth_m, sample.valid, prediction.space)
 
-
-def _depth(
-    sample: StereoSample,
-    prior: EmulatedPrior,
-    cache: PriorCache,
-    strength: str,
-    name: str,
-    options: StrengthOptions,
-) -> np.ndarray:
-    """``(H, W)`` metres of one method with a prior of one strength; relative depth aligned to the truth."""
-    prior.answer(sample, STRENGTHS[strength], options.resolution, options.seed)
-    method = find_method(name)
-    try:
-        found = method.run(sample, method.own_settings(_settings(options)), cache)
-    except NotApplicable as reason:
-        bad_value("methods", "methods that work on every pair", f"{name}, not on {sample.label}: {reason}")
-    if found.depth_m is not None:
-        return found.depth_m
-    return align(found.relative, sample.depth_m, sample.valid, found.space)
+    def pictures(self, sample: StereoSample) -> dict[str, np.ndarray]:
+        """The middle of one pair, lit, at the strength of the figure: truth, prior, fitted once, guided."""
+        strengths = self._options.strengths
+        strength = SHOWN if SHOWN in strengths else strengths[0]
+        height, width = sample.depth_m.shape
+        window = np.s_[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
+        maps = {"truth": sample.depth_m}
+        for name in (ORACLE, "prior-fit", "guided"):
+            maps[f"{find_method(name).title}, {strength}"] = self.depth_m(sample, strength, name)
+        return {title: shaded(depth_m[window], float(sample.K_left[0, 0])) for title, depth_m in maps.items()}

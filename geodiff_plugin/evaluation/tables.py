@@ -1,35 +1,40 @@
-"""Tables of ``geodiff eval pairs``, from records.
-
-Data flow: records -> ``Table``.
-Paper: none; per pair, with intervals and paired differences.
-"""
+"""Tables of a comparison: pair by pair, by metric, region, disparity, edges, confidence and seed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from geodiff_plugin.evaluation.baselines import find_method
-from geodiff_plugin.evaluation.cells import (
+from geodiff_plugin.evaluation.experiment import headline
+from geodiff_plugin.evaluation.table import (
     HEADINGS,
+    Table,
     by_method,
     cell,
     count_of_pairs,
     interval_cell,
     label_of,
+    mean_with_interval,
+    paired_difference,
 )
-from geodiff_plugin.evaluation.detail_tables import (
-    confidence_table,
-    disparity_table,
-    regions_table,
-    uncertainty_table,
-)
-from geodiff_plugin.evaluation.layout import Table
-from geodiff_plugin.evaluation.runner import headline
-from geodiff_plugin.evaluation.seed_tables import spread_table, without_copies
-from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
+from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
-__all__ = ["groups", "pairs_tables", "per_pair_table", "summary_table", "versus_table"]
+__all__ = [
+    "confidence_table",
+    "disparity_table",
+    "groups",
+    "pairs_tables",
+    "per_pair_table",
+    "regions_table",
+    "spread_table",
+    "summary_table",
+    "uncertainty_table",
+    "versus_table",
+    "without_copies",
+]
 
 _SUMMARY = ("abs_rel", "delta1", "delta2", "delta3", "rmse", "log_rmse", "silog")
 
@@ -166,3 +171,195 @@ def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -
     tables += [regions_table(records), disparity_table(records), uncertainty_table(records)]
     tables += [confidence_table(records), spread]
     return [table for table in tables if table.rows]
+
+
+_REGIONS = {
+    "visible": "visible",
+    "occluded": "occluded",
+    "out_of_view": "out of view",
+    "matched": "matched",
+    "unmatched": "unmatched",
+    "tom": "ToM",
+    "not_tom": "other material",
+}
+_DISPARITY = {"epe": "EPE px", "bad1": "bad-1", "bad2": "bad-2", "bad3": "bad-3", "d1": "D1"}
+
+Values = dict[str, dict[str, float]]
+
+
+def _columns_table(
+    records: Sequence[dict[str, Any]],
+    columns: dict[str, str],
+    value_of: Callable[[dict[str, Any], str], float | None],
+    title: str,
+    note: str,
+) -> Table:
+    """A row per method, a column per quantity: the mean over the pairs that have it; no rows for no value."""
+    values: dict[str, Values] = {
+        name: by_method(records, lambda record, name=name: value_of(record, name)) for name in columns
+    }
+    header = []
+    for name, heading in columns.items():
+        labels = {label for own in values[name].values() for label in own}
+        header.append(f"{heading} ({count_of_pairs(len(labels))})" if labels else heading)
+    rows = []
+    for method in dict.fromkeys(record["method"] for record in records):
+        own = [list(values[name][method].values()) for name in columns]
+        if any(own):
+            cells = (cell(mean_with_interval(numbers).value) if numbers else "-" for numbers in own)
+            rows.append((find_method(method).title, *cells))
+    return Table(title, ("method", *header), tuple(rows), note)
+
+
+def regions_table(records: Sequence[dict[str, Any]]) -> Table:
+    """AbsRel by what the right camera sees, matches and material, mean over the pairs with such pixels.
+
+    Args:
+        records: of a run.
+
+    Returns:
+        Columns for what is visible, occluded and out of view, for where the two views match and where they
+        do not, for Booster's "transparent or mirror" classes and the others, then for each class that
+        occurs; a dash where no pair says so.
+    """
+    classes = sorted({name for r in records for name in r.get("regions") or {} if name.startswith("mat")})
+    columns = _REGIONS | {name: name.replace("material_", "class ") for name in classes}
+    return _columns_table(
+        records,
+        columns,
+        lambda record, name: record["regions"].get(name),
+        "AbsRel by region and material",
+        "Under the cap; aligned for methods that know relative depth only. Visible and occluded are known "
+        "where the data set has a mask, out of view always; matched is where our sweep of both views has "
+        "a match of confidence 0.5 or more, the same pixels for every method; ToM is transparent or mirror "
+        "(classes 2 and 3).",
+    )
+
+
+def disparity_table(records: Sequence[dict[str, Any]]) -> Table:
+    """Errors in disparity, mean over the rectified pairs, not aligned.
+
+    Args:
+        records: of a run.
+
+    Returns:
+        A dash where the truth's step is not finer than the threshold; no rows without a rectified pair.
+    """
+    return _columns_table(
+        records,
+        _DISPARITY,
+        lambda record, name: (record["disparity"] or {}).get(name),
+        "Disparity, rectified pairs",
+        "Metres turned into disparity at the left image's resolution; shares of pixels for bad-k and D1.",
+    )
+
+
+def uncertainty_table(records: Sequence[dict[str, Any]]) -> Table:
+    """AUSE of the methods that give an uncertainty (an ensemble of at least 2)."""
+    values = by_method(records, lambda record: record["ause"])
+    rows = [
+        (find_method(method).title, str(len(own)), interval_cell(mean_with_interval(list(own.values()))))
+        for method, own in values.items()
+        if own
+    ]
+    note = "Area under the sparsification error of AbsRel; 0 where the least certain pixels are the worst."
+    return Table("Uncertainty", ("method", "pairs", "AUSE [95 %]"), tuple(rows), note)
+
+
+def confidence_table(records: Sequence[dict[str, Any]]) -> Table:
+    """What the confidence of each method promises by decile, and what it keeps; pairs weigh the same."""
+    rows = []
+    for method, own in by_method(records, lambda record: record.get("confidence")).items():
+        pairs = [deciles for deciles in own.values() if deciles]
+        for k in range(10):
+            filled = [deciles[k] for deciles in pairs if deciles[k]["share"]]
+            weight = sum(one["share"] for one in filled)
+            if not filled:
+                continue
+            means = [
+                sum(one[name] * one["share"] for one in filled) / weight
+                for name in ("promised", "kept", "abs_rel")
+            ]
+            title = find_method(method).title
+            rows.append(
+                (title, f"{k / 10:.1f} to {(k + 1) / 10:.1f}", cell(weight / len(pairs)), *map(cell, means))
+            )
+    note = f"Confidence is the probability of a relative error below {RIGHT_WITHIN:g}; pixels of all pairs."
+    header = ("method", "confidence", "share of pixels", "promised", "kept", "AbsRel")
+    return Table("Confidence by decile", header, tuple(rows), note)
+
+
+def _families(records: Sequence[dict[str, Any]]) -> dict[str, list[str]]:
+    """``METHOD`` -> its name and those of its ``METHOD#SEED``, for every method that was run unbound."""
+    names = list(dict.fromkeys(record["method"] for record in records))
+    families = {name: [name] for name in names if find_method(name).seed is None}
+    for name in names:
+        method = find_method(name)
+        if method.seed is not None and method.seedless_name in families:
+            families[method.seedless_name].append(name)
+    return families
+
+
+def without_copies(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The records but for those of ``METHOD#SEED`` where ``METHOD`` itself was run."""
+    copies = {name for family in _families(records).values() for name in family[1:]}
+    return [record for record in records if record["method"] not in copies]
+
+
+def _spread_row(
+    title: str, group: str, members: set[str], seeds: Sequence[dict[str, float]]
+) -> tuple[str, ...]:
+    """Cells of one method and group; ``seeds`` holds one value per pair for each of its seeds."""
+    shared = [label for label in seeds[0] if label in members and all(label in own for own in seeds)]
+    if not shared:
+        return ()
+    values = np.array([[own[label] for label in shared] for own in seeds])  # (seeds, pairs)
+    means = values.mean(axis=1)
+    whole = len(shared) == len(members)
+    over_seeds = (float(f(means)) for f in (np.mean, lambda x: np.std(x, ddof=1), np.min, np.max))
+    cells = [cell(value if whole else None, 4) for value in over_seeds]
+    spread = values.max(axis=0) - values.min(axis=0)
+    worst = int(spread.argmax())
+    return title, group, *cells, cell(float(spread[worst]), 4), shared[worst]
+
+
+def spread_table(
+    records: Sequence[dict[str, Any]],
+    groups: Mapping[str, set[str]],
+    value_of: Callable[[dict[str, Any]], float | None],
+) -> Table:
+    """Mean AbsRel of each method over the seeds that it was run with; no rows where that is one.
+
+    Args:
+        records: of a run.
+        groups: labels of samples by the name of their group.
+        value_of: AbsRel of a record.
+
+    Returns:
+        A row per method and group. A mean stands only where every seed has a number for every pair of the
+        group; the largest spread is over the pairs that every seed has a number for.
+    """
+    values = by_method(records, value_of)
+    families = {name: family for name, family in _families(records).items() if len(family) > 1}
+    rows, rules = [], []
+    for name, family in families.items():
+        seeds, title = [values[one] for one in family], find_method(name).title
+        own = [_spread_row(title, group, members, seeds) for group, members in groups.items()]
+        rules.append(len(rows))
+        rows += [row for row in own if row]
+    count = max(map(len, families.values()), default=1)
+    header = (
+        "method",
+        "AbsRel of",
+        "mean",
+        "deviation",
+        "least",
+        "largest",
+        "spread of a pair",
+        "that pair",
+    )
+    note = (
+        "All pixels, as in the first table. Over the seeds: mean, standard deviation (n - 1), least and "
+        "largest of the mean of these pairs; then the greatest difference between two seeds on one pair."
+    )
+    return Table(f"Spread over {count} seeds", header, tuple(rows), note, rules=tuple(rules))

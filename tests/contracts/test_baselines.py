@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.baselines._fill import fill_background
-from geodiff_plugin.evaluation.baselines.sgbm import sgbm_shift
+from geodiff_plugin.evaluation.baselines.stereo import fill_background, sgbm_shift
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.geometry import is_rectified

@@ -16,11 +16,10 @@ from PIL import Image
 
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, find_pairs, load, load_pairs
-from geodiff_plugin.evaluation.datasets.mvsnet import find_mvsnet
-from geodiff_plugin.evaluation.datasets.perturbed import perturbed_ref
-from geodiff_plugin.evaluation.datasets.robustmvd import KEY_VIEWS, find_robustmvd
+from geodiff_plugin.evaluation.datasets.changed import perturbed_ref
+from geodiff_plugin.evaluation.datasets.posed import KEY_VIEWS, find_mvsnet, find_robustmvd
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
-from geodiff_plugin.evaluation.records import record_key
+from geodiff_plugin.evaluation.experiment import cell_key
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
 from tests.contracts import factory_calibrations as factory
@@ -370,7 +369,7 @@ def test_a_posed_pair_is_another_one_when_a_file_of_its_group_changes(tmp_path, 
     mvsnet(tmp_path)
 
     def key():
-        return record_key(find_mvsnet(tmp_path)[0], "guided", {}, "", "0.1.0")
+        return cell_key(find_mvsnet(tmp_path)[0], "guided", {})
 
     before = key()
     assert key() == before

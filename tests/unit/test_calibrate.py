@@ -8,9 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geodiff_plugin.evaluation.calibrate import Observed, calibrate, main, observe_emulated
+from geodiff_plugin.evaluation.calibrate import (
+    Observed,
+    calibrate,
+    deciles,
+    fit_log_odds,
+    main,
+    observe_emulated,
+    promised,
+)
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.evaluation.logistic import deciles, fit_log_odds, promised
 
 TRUE = (-0.5, 1.2, -0.7)
 

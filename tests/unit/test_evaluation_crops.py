@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geodiff_plugin.evaluation.crops import CROPS, crop_mask
+from geodiff_plugin.evaluation.metrics import CROPS, crop_mask
 
 #: (H, W) -> crop -> first and last row, first and last column.
 RANGES = {

@@ -11,10 +11,9 @@ from geodiff_plugin.algorithm.terms import TERMS, Term
 from geodiff_plugin.cli.eval.app import eval_app
 from geodiff_plugin.config import DEFAULT_WEIGHTS
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings
-from geodiff_plugin.evaluation.baselines._guidance import call_arguments
+from geodiff_plugin.evaluation.baselines.guided import call_arguments
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.evaluation.datasets.exposure import exposed_ref
-from geodiff_plugin.evaluation.figures import FIGURES
+from geodiff_plugin.evaluation.datasets.changed import exposed_ref
 from geodiff_plugin.evaluation.figures.canvas import (
     mark,
     new_figure,
@@ -23,9 +22,9 @@ from geodiff_plugin.evaluation.figures.canvas import (
     show_error,
     show_values,
 )
-from geodiff_plugin.evaluation.figures.clouds import SHRINK, orbit, render_cloud
 from geodiff_plugin.evaluation.figures.gs_sweep import sweep_g_s
-from geodiff_plugin.evaluation.figures.terms import term_by_term
+from geodiff_plugin.evaluation.figures.maps import SHRINK, orbit, render_cloud
+from geodiff_plugin.evaluation.figures.one_pair import term_by_term
 from geodiff_plugin.formats import write_depth_npy
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 
@@ -64,7 +63,7 @@ def draw(pair_folder, make_pipeline, tmp_path):
         picture = np.asarray(Image.open(out / f"figure-{name}.png").convert("RGB"))
         assert picture.shape[0] > 100 and picture.std() > 5
         numbers = json.loads((out / f"figure-{name}.json").read_text())
-        assert f"eval figure {name} --data {pair_folder}" in numbers["command"]
+        assert "eval figure" in numbers["command"] and f"--data {pair_folder}" in numbers["command"]
         return picture, numbers
 
     return run
@@ -183,11 +182,10 @@ def test_poses_are_perturbed_where_a_figure_is_asked_to(draw, pair_folder, tmp_p
 def test_bad_options_are_named(draw):
     with pytest.raises(ValueError, match="the figure must be one of"):
         draw("pie")
-    with pytest.raises(ValueError, match="updates must be whole numbers"):
+    with pytest.raises(ValueError, match="--updates must be whole numbers"):
         draw("inner-steps", "--updates", "1,a")
-    with pytest.raises(ValueError, match="max must be between"):
+    with pytest.raises(ValueError, match="--max must be between"):
         draw("gs-sweep", "--max", "1")
-    assert {kind.summary for kind in FIGURES.values()}
 
 
 def test_the_sweep_of_a_true_map_is_best_at_the_true_scale(textured_plane, pair_folder):

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from geodiff_plugin.evaluation import runner, scoring
-from geodiff_plugin.evaluation.baselines._sweep import sweep
+from geodiff_plugin.evaluation import experiment, scoring
 from geodiff_plugin.evaluation.baselines.base import Prediction
+from geodiff_plugin.evaluation.baselines.stereo import sweep
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.evaluation.detail_tables import regions_table
 from geodiff_plugin.evaluation.scoring import matched, regions, score
+from geodiff_plugin.evaluation.tables import regions_table
 
 
 def textured_sample(**changes) -> StereoSample:
@@ -39,7 +39,7 @@ def test_views_are_matched_once_a_sample_and_left_out_where_they_do_not_overlap(
     monkeypatch.setattr(scoring, "sweep", lambda sample, device: swept.append(1) or sweep(sample, device))
     sample = textured_sample()
     for factor in (1, 2):
-        score(runner._cropped(sample, "none"), Prediction(factor * sample.depth_m), None)
+        score(experiment._cropped(sample, "none"), Prediction(factor * sample.depth_m), None)
     assert len(swept) == 1
     away = np.diag([-1.0, 1, -1, 1])
     away[0, 3] = 0.12
@@ -48,10 +48,10 @@ def test_views_are_matched_once_a_sample_and_left_out_where_they_do_not_overlap(
 
 
 def test_crop_makes_one_object_of_a_sample(monkeypatch):
-    monkeypatch.setattr(runner, "crop_mask", lambda crop, shape: np.arange(shape[1]) > 3)
+    monkeypatch.setattr(experiment, "crop_mask", lambda crop, shape: np.arange(shape[1]) > 3)
     sample = textured_sample()
-    first = runner._cropped(sample, "garg")
-    assert first is runner._cropped(sample, "garg") and first.valid.sum() == 64 * 124
+    first = experiment._cropped(sample, "garg")
+    assert first is experiment._cropped(sample, "garg") and first.valid.sum() == 64 * 124
 
 
 def test_matched_and_unmatched_have_columns():

@@ -18,13 +18,13 @@ from geodiff_plugin.evaluation.baselines import (
     NotApplicable,
     PriorCache,
     Settings,
+    constant,
     find_method,
-    no_diffusion,
 )
-from geodiff_plugin.evaluation.baselines._constant import constant_method
-from geodiff_plugin.evaluation.baselines._guidance import guided_prediction
-from geodiff_plugin.evaluation.baselines._sweep import native_depth
-from geodiff_plugin.evaluation.baselines.files import map_name
+from geodiff_plugin.evaluation.baselines.constant import constant_method
+from geodiff_plugin.evaluation.baselines.guided import guided_prediction
+from geodiff_plugin.evaluation.baselines.outside import map_name
+from geodiff_plugin.evaluation.baselines.stereo import native_depth
 from geodiff_plugin.evaluation.datasets.folder import find_folder, load_folder
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
@@ -272,7 +272,7 @@ def test_no_diffusion_makes_the_updates_of_the_default_without_the_network(
         "short",
         "short",
         partial(GeometryGuidance, inner_steps=3, correct=False),
-        no_diffusion._start,
+        constant._ramp,
     )
     prediction = short.run(plane_sample(textured_plane), Settings(steps=steps), OnePipe(pipe))
     assert prediction.depth_m.shape == textured_plane.depth_m.shape and (prediction.depth_m > 0).all()

@@ -5,14 +5,16 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.evaluation.alignment import MIN_DISPARITY, align, least_squares
 from geodiff_plugin.evaluation.metrics import (
     FLOOR_M,
+    MIN_DISPARITY,
+    align,
     ause,
     confidence_deciles,
     counted,
     evaluate_depth,
     evaluate_disparity,
+    least_squares,
 )
 
 ALL = np.ones((1, 2), bool)

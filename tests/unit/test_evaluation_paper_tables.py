@@ -10,10 +10,9 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from geodiff_plugin.cli.eval.app import eval_app
-from geodiff_plugin.evaluation import cost, experiments, paper_tables
+from geodiff_plugin.evaluation import cost, paper
 from geodiff_plugin.evaluation.baselines import METHODS, Settings, find_method
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction
-from geodiff_plugin.evaluation.cells import label_of
 from geodiff_plugin.evaluation.changes import (
     CHANGES,
     NUMBERS,
@@ -21,9 +20,9 @@ from geodiff_plugin.evaluation.changes import (
     flatness_methods,
     flatness_table,
 )
-from geodiff_plugin.evaluation.layout import Table, latex_escape
-from geodiff_plugin.evaluation.paper_tables import FoundColumn, layout_table
+from geodiff_plugin.evaluation.paper import FoundColumn, layout_table
 from geodiff_plugin.evaluation.published import LAYOUTS
+from geodiff_plugin.evaluation.table import Table, label_of, latex_escape
 from geodiff_plugin.formats import write_pfm
 from tests.contracts.tiny_transformers import make_transformers
 
@@ -101,7 +100,7 @@ def test_a_method_fills_the_row_that_its_name_has_the_word_of(monkeypatch):
     peer = Method(
         "files:maps/unidepth", "UniDepth files", "", lambda *_: None, lambda _: {}, uses_prior=False
     )
-    monkeypatch.setattr(paper_tables, "find_method", lambda name: peer)
+    monkeypatch.setattr(paper, "find_method", lambda name: peer)
     layout = LAYOUTS["table1"]
     records = [make_record(peer.name, "0", 0.3, 0.4)]
     rows = {r[0]: r[2] for r in layout_table(layout, columns_of(layout, 1), records, [peer.name]).rows}
@@ -205,7 +204,7 @@ def free_methods(monkeypatch):
 
         return Method(name, name, name, measure, lambda settings: {"steps": settings.steps}, uses_prior=False)
 
-    names = {name for own in LAYOUTS for name in experiments.methods_of(own, ())} | {*cost.COST_METHODS}
+    names = {name for own in LAYOUTS for name in paper.methods_of(own, ())} | {*cost.COST_METHODS}
     names |= {*flatness_methods(), *(method for _, method in CHANGES["parts"])}
     monkeypatch.setattr("geodiff_plugin.evaluation.baselines.METHODS", {name: free(name) for name in names})
 
@@ -262,7 +261,9 @@ def test_published_columns_after_a_run_on_a_faked_full_set(free_methods, scene, 
 def test_without_data_the_error_says_how_to_obtain_them(free_methods, name, tmp_path):
     (tmp_path / "empty").mkdir()
     for words in ((), ("--data", tmp_path / "empty")):
-        with pytest.raises(ValueError, match=r"data must be .* https?://|data must be .*folders of images"):
+        with pytest.raises(
+            ValueError, match=r"--data must be .* https?://|--data must be .*folders of images"
+        ):
             invoke(name, *words, "-o", tmp_path / "out")
 
 
@@ -301,9 +302,9 @@ def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, 
         def __exit__(self, *_):
             pass
 
-        def submit(self, function, refs, methods, *arguments, **keywords):
-            jobs.append(methods)
-            self.answer = function(refs, methods, *arguments, **keywords)
+        def submit(self, function, refs, method, options):
+            jobs.append(method)
+            self.answer = function(refs, method, options)
             return self
 
         def result(self):
@@ -311,7 +312,7 @@ def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, 
 
     monkeypatch.setattr(cost, "ProcessPoolExecutor", Inline)
     answer = invoke("cost", "--data", scene, "-o", tmp_path / "out", "--save-depth")
-    assert jobs == [[name] for name in cost.COST_METHODS]
+    assert jobs == list(cost.COST_METHODS)
     assert re.search("plain pipeline +1 ", answer.stdout)
     assert "Denoising steps of each: 4 with bundled." in answer.stdout
     assert (tmp_path / "out" / "cost" / "samples.jsonl").is_file()
@@ -326,6 +327,6 @@ def test_cost_asks_no_prior_for_more_steps_than_it_was_trained_for(tmp_path):
 
 def test_every_built_in_row_is_a_method():
     for name in LAYOUTS:
-        for method in experiments.methods_of(name, ()):
+        for method in paper.methods_of(name, ()):
             assert find_method(method).name == method
     assert set(METHODS) >= {"guided", "paper"}

@@ -11,19 +11,18 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from geodiff_plugin.cli.eval.app import eval_app
-from geodiff_plugin.cli.eval.options import pairs_options
-from geodiff_plugin.evaluation import poses
-from geodiff_plugin.evaluation.baselines import Settings, find_method, with_poses
-from geodiff_plugin.evaluation.commands import command_line
+from geodiff_plugin.evaluation import experiment
+from geodiff_plugin.evaluation.baselines import find_method, with_poses
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.evaluation.datasets.perturbed import (
+from geodiff_plugin.evaluation.datasets.changed import (
     drift_of,
     drifted_ref,
     perturbation,
     perturbed_pose,
     perturbed_ref,
 )
-from geodiff_plugin.evaluation.poses import PosesOptions, run_poses
+from geodiff_plugin.evaluation.options import DirOptions, PosesOptions, command_line
+from geodiff_plugin.evaluation.poses import run_poses
 
 
 def test_perturbed_poses_stay_within_what_was_asked() -> None:
@@ -64,18 +63,21 @@ def test_poses_make_rows_of_guided() -> None:
 
 
 def test_options_come_back_as_a_command_line() -> None:
-    typed = {
-        "data": Path("synthetic-posed:2"),
-        "methods": "guided",
-        "pose": "refine,given",
-        "perturb": "1.5,0.1",
-    }
-    typed |= {"limit": None, "out": Path("x"), "device": "cpu", "datasets": None, "scenes": None}
-    options = pairs_options(typed)
-    assert options.pose == ("refine", "given") and options.perturb == (1.5, 0.1)
-    assert "--pose refine,given --perturb 1.5,0.1" in command_line(options, ("eval", "pairs", "d"))
-    with pytest.raises(ValueError, match="pose"):
-        pairs_options(typed | {"pose": "guess"})
+    given = {"data": Path("synthetic-posed:2"), "methods": ("guided",), "perturb": "1.5,0.1"}
+    options = DirOptions(**given, pose=("refine", "given"), limit=3, out=Path("x"), quiet=True)
+    assert options.perturbed == (1.5, 0.1)
+    line = command_line("pairs", options)
+    assert line.startswith("geodiff eval pairs") and "quiet" not in line and "--out" not in line
+    for words in (
+        "--pose refine,given",
+        "--perturb 1.5,0.1",
+        "--limit 3",
+        "--methods guided",
+        " synthetic-posed:2 ",
+    ):
+        assert words in f"{line} "
+    with pytest.raises(ValueError, match="--pose"):
+        DirOptions(**given, pose=("guess",))
 
 
 def test_a_drifted_rig_keeps_its_calibration_and_moves_its_right_image() -> None:
@@ -98,54 +100,36 @@ def test_a_drift_that_is_none(text: str) -> None:
         drift_of(text)
 
 
-def record(ref, method: str, error: float | None, warned: bool) -> dict:
-    both = {"raw": {"abs_rel": error}}
-    status = "not applicable" if error is None else "ok"
-    notes = {"method": {"warnings": ["said"] * warned, "residual_px_given": [1.25], "residual_px": [0.5]}}
-    head = {"dataset": ref.dataset, "sample": ref.name, "method": method, "rectified": False}
-    return head | {"status": status, "all_pixels": both, "notes": notes}
-
-
 def test_the_page_of_poses(tmp_path, monkeypatch) -> None:
     """Two rendered pairs: estimated, one has no pose and the other is off by half without a word."""
-    errors = {"given": 0.1, "refine": 0.06}
-    sizes = []
+    errors, sizes = {"given": 0.1, "refine": 0.06}, set()
 
-    def run(refs, methods, settings, out, progress):
-        found = []
-        sizes.extend({ref.files["size"] for ref in refs} - set(sizes))
-        for i, ref in enumerate(refs):
-            for method in methods:
-                pose = method.partition("=")[2]
-                error = errors.get(pose, None if i else 0.5)
-                if "perturbed" not in ref.files and pose == "given":
-                    error = 0.05
-                found.append(record(ref, method, error, warned=pose != "estimated"))
-        return found
+    def measure(ref, read, method, *_):
+        sizes.add(ref.files["size"])
+        pose = method.name.partition("=")[2]
+        error = errors.get(pose, None if ref.files["seed"] > 1 else 0.5)
+        error = 0.05 if "perturbed" not in ref.files and pose == "given" else error
+        warnings = [] if pose == "estimated" else ["said"]
+        notes = {"method": {"warnings": warnings, "residual_px_given": [1.25], "residual_px": [0.5]}}
+        status = {"rectified": False, "status": "not applicable" if error is None else "ok"}
+        return status | {"all_pixels": {"raw": {"abs_rel": error}, "aligned": None}, "notes": notes}
 
-    monkeypatch.setattr(poses, "run", run)
+    monkeypatch.setattr(experiment, "_measure", measure)
     page = tmp_path / "docs" / "results-pose.md"
-    options = PosesOptions(
-        None, 2, (1.5, 0.1), (0.3, 1.5), None, Settings("bundled"), tmp_path / "out", page, True
-    )
-    run_poses(options)
+    options = PosesOptions(rendered=2, out=tmp_path / "out", results=page, quiet=True)
+    run_poses("poses", options)
     text = page.read_text()
     assert text == (tmp_path / "out" / "poses.md").read_text()
-    assert "geodiff eval poses --rendered 2 --perturb 1.5,0.1 --drift 0.3,1.5" in text
+    assert "geodiff eval poses --rendered 2\n" in text
     assert "| pair | true, given | perturbed, given | perturbed, refined | estimated |" in text
     assert "| mean of 2 pairs | 0.050 | 0.100 | 0.060 | 0.500 of 1 |" in text
     assert "| without a result | 0 | 0 | 0 | 1 |" in text
     assert "| off by more than 0.25, no warning | 0 | 0 | 0 | 1 |" in text
-    sized = replace(options, rendered_size=(256, 192), out=tmp_path / "small")
-    run_poses(sized)
-    assert "geodiff eval poses --rendered 2 --rendered-size 256x192 --perturb" in page.read_text()
-    assert sizes == [(384, 512), (192, 256)]
-    run_poses(replace(options, settings=Settings("bundled", steps=2), out=tmp_path / "steps"))
-    assert "--drift 0.3,1.5 --steps 2\n" in page.read_text()
+    run_poses("poses", replace(options, rendered_size="256x192", steps=2, out=tmp_path / "small"))
+    assert "geodiff eval poses --steps 2 --rendered 2 --rendered-size 256x192\n" in page.read_text()
+    assert sizes == {(384, 512), (192, 256)}
     with pytest.raises(ValueError, match="--data"):
-        run_poses(replace(options, rendered=0))
-    with pytest.raises(ValueError, match="limit must be at least 1; got 0"):
-        run_poses(replace(options, data=tmp_path, limit=0))
+        run_poses("poses", replace(options, rendered=0))
 
 
 @pytest.mark.parametrize("text", ["256", "256x", "0x0", "256x32", "-256x192"])

@@ -1,6 +1,5 @@
 """Scoring, resuming, statistics and tables, with methods that cost nothing."""
 
-import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -8,17 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geodiff_plugin.evaluation import runner, scoring
+from geodiff_plugin.evaluation import experiment, scoring
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, Settings
-from geodiff_plugin.evaluation.datasets.perturbed import with_perturbed_poses
+from geodiff_plugin.evaluation.datasets.changed import with_perturbed_poses
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
-from geodiff_plugin.evaluation.detail_tables import disparity_table, regions_table, uncertainty_table
-from geodiff_plugin.evaluation.records import append_record, clean_records, read_records, record_key
-from geodiff_plugin.evaluation.runner import headline, run
+from geodiff_plugin.evaluation.experiment import RECORDS_NAME, cell_key, headline
 from geodiff_plugin.evaluation.scoring import matched, out_of_view, regions, score
-from geodiff_plugin.evaluation.statistics import mean_with_interval, paired_difference
-from geodiff_plugin.evaluation.tables import pairs_tables, per_pair_table
+from geodiff_plugin.evaluation.table import mean_with_interval, paired_difference
+from geodiff_plugin.evaluation.tables import (
+    disparity_table,
+    pairs_tables,
+    per_pair_table,
+    regions_table,
+    uncertainty_table,
+)
+from tests.evaluating import run
 
 SHAPE = (6, 8)
 K = np.array([[10.0, 0, 3.5], [0, 10.0, 2.5], [0, 0, 1]])
@@ -65,14 +69,14 @@ def bench(monkeypatch, tmp_path):
     }
     samples = {name: make_sample(name, name != "c") for name in "abc"}
     monkeypatch.setattr("geodiff_plugin.evaluation.baselines.METHODS", methods)
-    monkeypatch.setattr(runner, "load", lambda ref: samples[ref.name])
+    monkeypatch.setattr(experiment, "load", lambda ref: samples[ref.name])
     refs = [SampleRef("middlebury2014", name, {"left": Path(name)}) for name in samples]
 
     def go(**keywords):
         calls.clear()
-        return run(refs, ["exact", "double"], Settings(), tmp_path, progress=False, **keywords)
+        return run(refs, ["exact", "double"], Settings(), tmp_path, **keywords)
 
-    return go, calls, methods, samples, tmp_path / runner.RECORDS_NAME
+    return go, calls, methods, samples, tmp_path / RECORDS_NAME
 
 
 def test_score_of_a_perfect_map_and_its_double():
@@ -164,7 +168,7 @@ def test_run_measures_everything_once_and_resumes(bench):
     first = go()
     assert len(calls) == 6 and [r["status"] for r in first].count("not applicable") == 1
     assert go() == first and calls == []
-    assert len(read_records(path)) == 6
+    assert len(path.read_bytes().splitlines()) == 6
 
 
 @pytest.mark.parametrize("cut", [2, 40, 400])
@@ -179,7 +183,6 @@ def test_killed_run_does_only_what_is_missing(bench, cut):
     assert [{k: v for k, v in r.items() if k not in drop} for r in again] == [
         {k: v for k, v in r.items() if k not in drop} for r in first
     ]
-    assert all(json.loads(line) for line in path.read_text().splitlines())
 
 
 def test_another_configuration_is_another_result(bench):
@@ -199,16 +202,15 @@ def test_broken_sample_stops_or_is_counted_and_tried_again(bench, monkeypatch):
             raise FileNotFoundError("left.png is missing")
         return samples[ref.name]
 
-    monkeypatch.setattr(runner, "load", fails)
+    monkeypatch.setattr(experiment, "load", fails)
     with pytest.raises(FileNotFoundError, match=r"left\.png"):
         go()
     records = go(skip_broken=True)
     assert [r["status"] for r in records] == ["ok", "ok", "broken", "broken", "ok", "not applicable"]
     assert records[2]["error"] == "left.png is missing"
-    monkeypatch.setattr(runner, "load", lambda ref: samples[ref.name])
+    monkeypatch.setattr(experiment, "load", lambda ref: samples[ref.name])
     assert [r["status"] for r in go()] == ["ok"] * 5 + ["not applicable"]
     assert {name for _, name in calls} == {"b"}
-    assert all(record["status"] != "broken" for record in read_records(path))
 
 
 def test_depth_maps_are_saved_on_request(bench):
@@ -321,22 +323,22 @@ def test_crop_is_scored_and_is_another_result(bench):
     assert len(calls) == 6 and records[0]["all_pixels"]["raw"]["pixels"] == 352 * 1216
     samples["a"] = replace(samples["a"], valid=samples["a"].depth_m > 3)
     with pytest.raises(ValueError, match="the truth of middlebury2014/a must be known somewhere in the crop"):
-        runner._cropped(samples["a"], "garg")
+        experiment._cropped(samples["a"], "garg")
 
 
 def test_further_priors_give_further_rows(bench, monkeypatch):
     go, calls, methods, _, path = bench
     methods["exact"] = replace(methods["exact"], uses_prior=True)
-    monkeypatch.setattr(runner.PriorCache, "fingerprint", lambda self, settings: settings.prior[::-1])
+    monkeypatch.setattr(experiment.PriorCache, "fingerprint", lambda self, settings: settings.prior[::-1])
     names = with_priors(["exact", "double"], ["org/other"])
     assert names == ("exact", "double", "exact@org/other")
     refs = [SampleRef("middlebury2014", "a", {})]
-    records = run(refs, names, Settings(), path.parent, progress=False)
+    records = run(refs, names, Settings(), path.parent)
     assert [r["method"] for r in records] == list(names)
     assert per_pair_table(records, "", headline, 3, "").header == ("pair", "exact", "double", "exact (other)")
     calls.clear()
     # The other prior alone, named first: the same result under its plain name.
-    again = run(refs, ["exact"], Settings(prior="org/other"), path.parent, progress=False)
+    again = run(refs, ["exact"], Settings(prior="org/other"), path.parent)
     assert calls == [] and again[0]["method"] == "exact" and again[0]["key"] == records[2]["key"]
     with pytest.raises(ValueError, match="METHOD@PRIOR with a method that uses a prior"):
         find_method("double@org/other")
@@ -346,48 +348,20 @@ def pairs_tables_of(records):
     return pairs_tables(records, reference="exact")
 
 
-def test_key_depends_on_everything_but_where_the_files_lie():
-    ref = SampleRef("mvsnet", "scan", {"group": Path("/here/scan"), "left": 0, "right": 1})
-    moved = SampleRef("mvsnet", "scan", {"group": Path("/there/scan"), "left": 0, "right": 1})
-    base = (ref, "guided", {"seed": 0}, "bundled 12", "0.1.0")
-    key = record_key(*base)
-    assert key == record_key(moved, *base[1:])
-    others = [
-        (SampleRef("mvsnet", "scan", ref.files | {"right": 2}), *base[1:]),
-        (ref, "paper", *base[2:]),
-        (ref, "guided", {"seed": 1}, *base[3:]),
-        (*base[:3], "bundled 13", "0.1.0"),
-        (*base[:4], "0.2.0"),
-    ]
-    assert len({key, *(record_key(*other) for other in others)}) == 6
+def test_key_depends_on_everything_but_where_the_files_lie(tmp_path, monkeypatch):
+    def key(folder="here", method="guided", configuration=None, prior="bundled 12", **files):
+        files = {"group": Path(f"/{folder}/scan"), "left": 0, "right": None, **files}
+        ref = SampleRef("mvsnet", "scan", files)
+        return cell_key(ref, method, configuration or {"seed": 0}, prior)
 
-
-def test_key_depends_on_what_the_files_hold(tmp_path):
-    keys = []
-    for folder, text in (("a", "1.0"), ("b", "2.0"), ("c", "1.0")):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "depth.npy").write_text(text)
-        ref = SampleRef("folder", "pair", {"depth": tmp_path / folder / "depth.npy", "left": None})
-        keys.append(record_key(ref, "guided", {}, "", "0.1.0"))
-    assert keys[0] == keys[2] != keys[1]
-    (tmp_path / "a" / "depth.npy").write_text("3.00")
-    ref = SampleRef("folder", "pair", {"depth": tmp_path / "a" / "depth.npy", "left": None})
-    assert record_key(ref, "guided", {}, "", "0.1.0") not in keys
-
-
-def test_cleaning_leaves_a_clean_file_alone(tmp_path):
-    path = tmp_path / "samples.jsonl"
-    clean_records(path)
-    assert not path.exists()
-    append_record(path, {"key": "1"})
-    before = path.stat().st_mtime_ns
-    clean_records(path)
-    assert path.stat().st_mtime_ns == before
-    append_record(path, {"key": "2", "status": "broken"})
-    with open(path, "a") as file:
-        file.write('{"key": "3", "torn')
-    clean_records(path)
-    assert path.read_text() == '{"key": "1"}\n'
+    assert key() == key("there")
+    for name, text in (("a", "1.0"), ("b", "2.0"), ("c", "1.0")):
+        (tmp_path / name).write_text(text)
+    depths = [key(depth=tmp_path / name) for name in "abc"]
+    assert depths[0] == depths[2]
+    others = [key(right=2), key(method="paper"), key(configuration={"seed": 1}), key(prior="bundled 13")]
+    monkeypatch.setattr(experiment, "__version__", "0.2.0")
+    assert len({key("there"), *others, *depths, key()}) == len(others) + 3
 
 
 def test_interval_covers_the_mean_and_needs_five():

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geodiff_plugin.evaluation import runner
+from geodiff_plugin.evaluation import experiment
 from geodiff_plugin.evaluation.baselines import find_method, with_priors, with_seeds
 from geodiff_plugin.evaluation.baselines.base import Method, Prediction, Settings
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
-from geodiff_plugin.evaluation.runner import headline, run
-from geodiff_plugin.evaluation.seed_tables import spread_table, without_copies
-from geodiff_plugin.evaluation.tables import groups, pairs_tables
+from geodiff_plugin.evaluation.experiment import headline
+from geodiff_plugin.evaluation.tables import groups, pairs_tables, spread_table, without_copies
+from tests.evaluating import run
 
 SIZES = {"a": 0.1, "b": 0.2, "c": 0.4}
 REFS = [SampleRef("middlebury2014", name, {"left": Path(name)}) for name in SIZES]
@@ -43,8 +43,8 @@ def calls(monkeypatch):
         "exact": Method("exact", "exact", "", exact, lambda settings: {}, False),
     }
     monkeypatch.setattr("geodiff_plugin.evaluation.baselines.METHODS", methods)
-    monkeypatch.setattr(runner, "load", lambda ref: make_sample(ref.name))
-    monkeypatch.setattr(runner.PriorCache, "fingerprint", lambda self, settings: settings.prior[::-1])
+    monkeypatch.setattr(experiment, "load", lambda ref: make_sample(ref.name))
+    monkeypatch.setattr(experiment.PriorCache, "fingerprint", lambda self, settings: settings.prior[::-1])
     return made
 
 
@@ -71,24 +71,24 @@ def test_a_name_binds_a_prior_and_a_seed_once(calls):
 
 
 def test_a_seed_that_is_named_by_itself_is_a_row(calls, tmp_path):
-    records = run(REFS, ["noisy#2", "exact"], Settings(), tmp_path, progress=False)
+    records = run(REFS, ["noisy#2", "exact"], Settings(), tmp_path)
     tables = pairs_tables(records, reference="exact")
     assert tables[0].header == ("pair", "noisy, seed 2", "exact")
     assert not any(table.title.startswith("Spread") for table in tables)
 
 
 def test_another_seed_first_finds_the_same_record(calls, tmp_path):
-    first = run(REFS, ["noisy", "noisy#2"], Settings(), tmp_path, progress=False)
+    first = run(REFS, ["noisy", "noisy#2"], Settings(), tmp_path)
     assert len(calls) == 6
     calls.clear()
-    again = run(REFS, ["noisy"], Settings(seed=2), tmp_path, progress=False)
+    again = run(REFS, ["noisy"], Settings(seed=2), tmp_path)
     assert calls == [] and {r["method"] for r in again} == {"noisy"}
     assert [r["key"] for r in again] == [r["key"] for r in first if r["method"] == "noisy#2"]
 
 
 def test_further_seeds_have_one_table_and_no_part_in_others(calls, tmp_path):
     names = with_seeds(["noisy", "exact"], 0, 3)
-    records = run(REFS, names, Settings(), tmp_path, progress=False)
+    records = run(REFS, names, Settings(), tmp_path)
     assert {r["method"] for r in without_copies(records)} == {"noisy", "exact"}
     *others, spread = pairs_tables(records, reference="exact")
     assert others == pairs_tables(without_copies(records), reference="exact")
@@ -101,7 +101,7 @@ def test_further_seeds_have_one_table_and_no_part_in_others(calls, tmp_path):
 
 
 def test_a_mean_over_seeds_needs_every_pair_of_each(calls, tmp_path):
-    records = run(REFS, ["noisy", "noisy#1", "noisy#2"], Settings(), tmp_path, progress=False)
+    records = run(REFS, ["noisy", "noisy#1", "noisy#2"], Settings(), tmp_path)
     torn = [r for r in records if (r["method"], r["sample"]) != ("noisy#2", "c")]
     rows = spread_table(torn, groups(torn), headline).rows
     assert rows[0][2:] == ("-", "-", "-", "-", "0.4000", "middlebury2014/b")

@@ -11,7 +11,8 @@ import torch
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, find_method
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.emulated import SPACES, STRENGTHS, EmulatedPrior, relative_map
-from geodiff_plugin.evaluation.strength import StrengthOptions, run_strength
+from geodiff_plugin.evaluation.options import StrengthOptions
+from geodiff_plugin.evaluation.strength import run_strength
 
 SMALL = "synthetic:1+4@128x96"
 
@@ -57,7 +58,6 @@ def test_its_answer_follows_its_input_as_far_as_asked(sample, follow):
 def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
     options = StrengthOptions(
         data=(SMALL,),
-        command="geodiff eval strength",
         strengths=("exact", "20%"),
         methods=("prior-aligned", "prior-fit", "guided"),
         steps=2,
@@ -67,7 +67,7 @@ def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkey
         figure=tmp_path / "strength.png",
         quiet=True,
     )
-    page = run_strength(options)
+    page = run_strength("strength", options)
     rows = {(row[0], row[1]): float(row[2]) for row in page.tables[0].rows}
     assert len(rows) == 6 and rows["exact", "prior + oracle"] < rows["20%", "prior + oracle"]
     assert rows["20%", "guided"] < rows["20%", "prior + oracle"]
@@ -77,14 +77,12 @@ def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkey
     def measured_again(*args: object) -> None:
         raise AssertionError("every record is there")
 
-    monkeypatch.setattr("geodiff_plugin.evaluation.strength._measure", measured_again)
-    run_strength(StrengthOptions(**{**vars(options), "figure": None}))
+    monkeypatch.setattr("geodiff_plugin.evaluation.strength._Bench._measure", measured_again)
+    assert run_strength("strength", replace(options, figure=None)).tables == page.tables
     assert (tmp_path / "strength.jsonl").read_text() == written
-    monkeypatch.setattr("geodiff_plugin.evaluation.strength._measure", lambda *_: [])
     (tmp_path / "strength.jsonl").write_text(written[:-20])  # killed while it wrote
-    run_strength(StrengthOptions(**{**vars(options), "figure": None}))
-    whole = "".join(written.splitlines(keepends=True)[:-1])
-    assert (tmp_path / "strength.jsonl").read_text() == whole  # the next record begins a line of its own
+    with pytest.raises(AssertionError, match="every record is there"):
+        run_strength("strength", replace(options, figure=None))
 
 
 def test_a_result_is_that_of_its_pair_and_its_seed(tmp_path):
@@ -92,7 +90,7 @@ def test_a_result_is_that_of_its_pair_and_its_seed(tmp_path):
 
     def measure(data, *methods):
         given = {"strengths": ("5%",), "steps": 1, "resolution": 64, "out": tmp_path, "quiet": True}
-        table = run_strength(StrengthOptions(data, "", methods=methods, **given)).tables[0]
+        table = run_strength("strength", StrengthOptions(data=data, methods=methods, **given)).tables[0]
         return [row[2:6] for row in table.rows], table.note
 
     large, small = "synthetic:1+4@128x96", "synthetic:1+4@64x48"
@@ -111,18 +109,18 @@ def test_a_method_that_does_not_apply_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(METHODS, "prior-fit", method)
     options = {"strengths": ("5%",), "methods": ("prior-fit",), "out": tmp_path, "quiet": True}
     with pytest.raises(ValueError, match=r"not on synthetic/seed0004: no pose could be estimated"):
-        run_strength(StrengthOptions((SMALL,), "", **options))
+        run_strength("strength", StrengthOptions(data=(SMALL,), **options))
 
 
 @pytest.mark.parametrize(
     ("methods", "figure"), [(("prior-fit@other",), None), (("prior-fit",), "figure.png")]
 )
 def test_methods_that_cannot_be_shown(methods, figure):
-    with pytest.raises(ValueError, match="methods must be"):
-        StrengthOptions((SMALL,), "", methods=methods, figure=figure)
+    with pytest.raises(ValueError, match="--methods must be"):
+        run_strength("strength", StrengthOptions(data=(SMALL,), methods=methods, figure=figure))
 
 
 @pytest.mark.parametrize("wrong", [{"strengths": ("7%",)}, {"space": "inverse"}, {"methods": ("sgbm",)}])
 def test_options_that_do_not_exist(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
-        StrengthOptions(data=(SMALL,), command="", **wrong)
+        run_strength("strength", StrengthOptions(data=(SMALL,), **wrong))

@@ -14,7 +14,8 @@ from diffusers import DDIMScheduler, LCMScheduler
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError, InputTypeError
 from geodiff_plugin.evaluation.baselines import PriorCache
-from geodiff_plugin.evaluation.sequence import SequenceOptions, flicker, run_sequence
+from geodiff_plugin.evaluation.options import SequenceOptions
+from geodiff_plugin.evaluation.sequence import SEQUENCES, flicker, run_sequence
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.start import plan_warm_start
 from geodiff_plugin.types import MetricDepthOutput
@@ -62,27 +63,30 @@ def test_flicker_is_what_changes_on_the_same_points(sequence):
 
 
 def test_the_command_measures_and_goes_on(tmp_path, monkeypatch):
-    options = SequenceOptions("x", 1, 2, (64, 96), ("alone", "warm"), steps=2, out=tmp_path, quiet=True)
-    page = run_sequence(options)
+    given = {"size": (64, 96), "ways": ("alone", "warm"), "steps": 2, "out": tmp_path, "quiet": True}
+    options = SequenceOptions(scenes=1, frames=2, **given)
+    page = run_sequence("sequence", options)
     assert [row[0] for row in page.tables[0].rows] == ["each frame alone", "warm start, a quarter left out"]
     records = [json.loads(line) for line in (tmp_path / "sequence.jsonl").read_text().splitlines()]
     assert all(0 < record["abs_rel"] < 2 and record["seconds"] > 0 for record in records)
     measured = []
 
-    def measure(pipe, sequence, way, *_):
+    def measure(pipe, render, seed, way, *_):
         measured.append(way.title)
         return dict.fromkeys(("abs_rel", "worst", "flicker", "breath", "seconds"), 0.5)
 
     rendered = SimpleNamespace(seed=0, kind="room")
-    monkeypatch.setattr("geodiff_plugin.evaluation.sequence.render_sequence", lambda *_, **__: rendered)
+    monkeypatch.setitem(SEQUENCES, "synthetic", lambda *_, **__: rendered)
     monkeypatch.setattr("geodiff_plugin.evaluation.sequence._measure", measure)
-    assert run_sequence(options).tables == page.tables and not measured  # nothing left to do
+    assert run_sequence("sequence", options).tables == page.tables and not measured  # nothing left to do
     path = tmp_path / "sequence.jsonl"
     path.write_bytes(path.read_bytes()[:-20])  # killed while it wrote
-    assert run_sequence(options).tables != page.tables and measured == ["warm start, a quarter left out"]
-    assert run_sequence(options) and len(measured) == 1
+    assert run_sequence("sequence", options).tables != page.tables and measured == [
+        "warm start, a quarter left out"
+    ]
+    assert run_sequence("sequence", options) and len(measured) == 1
     monkeypatch.setattr(PriorCache, "fingerprint", lambda self, settings: "trained further")
-    assert run_sequence(options) and len(measured) == 3
+    assert run_sequence("sequence", options) and len(measured) == 3
 
 
 # Calls that go on

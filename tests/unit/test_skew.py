@@ -20,7 +20,7 @@ from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit
 from geodiff_plugin.algorithm.evidence import EvidenceInputs, as_fine_as, prepare_evidence, resize_long_edge
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
-from geodiff_plugin.evaluation.figures.clouds import render_cloud
+from geodiff_plugin.evaluation.figures.maps import render_cloud
 from geodiff_plugin.formats.clouds import write_ply
 from geodiff_plugin.matching import build_cost_volume, find_matches, points_to_matches
 from geodiff_plugin.matching.alignment import align_view

@@ -1,25 +1,19 @@
-"""The ``geodiff eval`` commands: options and their help.
-
-Data flow: argv -> ``PairsOptions`` -> ``evaluation.commands`` -> its page, printed.
-Paper: S5 (experiments).
+"""The ``geodiff eval`` commands, built from ``evaluation.options.COMMANDS``.
 
 Torch and diffusers are imported inside the commands, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from geodiff_plugin.cli.eval import options as o
-from geodiff_plugin.cli.eval.figures import add_figures
-from geodiff_plugin.cli.eval.poses import add_poses
-from geodiff_plugin.cli.eval.sequence import add_sequence
-from geodiff_plugin.cli.eval.strength import add_strength
-from geodiff_plugin.cli.eval.tables import add_tables
-from geodiff_plugin.cli.eval.trust import add_trust
+from geodiff_plugin.cli.commands import add_command
+from geodiff_plugin.evaluation.options import COMMANDS
+from geodiff_plugin.formats.out import check_out
 
 __all__ = ["eval_app"]
 
@@ -32,33 +26,21 @@ eval_app = typer.Typer(
 )
 
 
-@eval_app.command("pairs")
-@o.takes(
-    *o.SAMPLES,
-    *("sample", "pairs", "pixel_centre", "crop", "prior", *o.SETTINGS, "seeds", "pose", "perturb"),
-    *("out", "results", "skip_broken", "save_depth", "quiet"),
-)
-def pairs(
-    data: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of data sets, or synthetic:N.")],
-    methods: Annotated[
-        str | None, typer.Option(help="Comma-separated, see geodiff eval list; five of them by default.")
-    ] = None,
-    **shared: Any,
-) -> None:
-    """Measure methods side by side on every metric pair below DIR."""
-    from geodiff_plugin.evaluation.commands import run_pairs
-    from geodiff_plugin.evaluation.options import PAIRS_METHODS
+def _run(name: str, options: Any) -> None:
+    check_out(options.out)
+    result = COMMANDS[name](name, options)
+    if result is None or options.quiet:
+        return
+    if isinstance(result, Path):
+        typer.echo(result)
+    else:
+        from geodiff_plugin.cli.eval.printing import print_page
 
-    chosen = methods or ",".join(PAIRS_METHODS)
-    o.run_and_print(run_pairs, o.pairs_options({"data": data, "methods": chosen, **shared}))
+        print_page(result)
 
 
-add_tables(eval_app)
-add_strength(eval_app)
-add_sequence(eval_app)
-add_figures(eval_app)
-add_trust(eval_app)
-add_poses(eval_app)
+for _name, _command in COMMANDS.items():
+    add_command(eval_app, _name, _command.options, partial(_run, _name), _command.about)
 
 
 @eval_app.command("list")

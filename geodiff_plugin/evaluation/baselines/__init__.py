@@ -1,8 +1,4 @@
-"""Methods side by side, one file each, one table.
-
-Data flow: ``StereoSample`` -> every method's ``Prediction``.
-Paper: S5.1 (compared methods), S5.3 (ablation).
-"""
+"""Methods side by side, by name (paper S5.1, S5.3)."""
 
 from __future__ import annotations
 
@@ -10,34 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.baselines.base import (
-    Method,
-    NotApplicable,
-    Prediction,
-    PriorCache,
-    Settings,
-)
-from geodiff_plugin.evaluation.baselines.files import files_method
-from geodiff_plugin.evaluation.baselines.guided import GUIDED
-from geodiff_plugin.evaluation.baselines.hf import hf_method
-from geodiff_plugin.evaluation.baselines.matches_only import MATCHES_ONLY
-from geodiff_plugin.evaluation.baselines.no_diffusion import NO_DIFFUSION
-from geodiff_plugin.evaluation.baselines.paper import PAPER
-from geodiff_plugin.evaluation.baselines.photometric_only import PHOTOMETRIC_ONLY
-from geodiff_plugin.evaluation.baselines.plane_sweep import PLANE_SWEEP
-from geodiff_plugin.evaluation.baselines.prior_aligned import PRIOR_ALIGNED
-from geodiff_plugin.evaluation.baselines.prior_fit import PRIOR_FIT_METHOD
-from geodiff_plugin.evaluation.baselines.reprojection_only import REPROJECTION_ONLY
-from geodiff_plugin.evaluation.baselines.scale_shift_only import SCALE_SHIFT_ONLY
-from geodiff_plugin.evaluation.baselines.search_only import SEARCH_ONLY
-from geodiff_plugin.evaluation.baselines.sgbm import SGBM, SGBM_WLS
-from geodiff_plugin.evaluation.baselines.sweep_sgm import SWEEP_SGM
-from geodiff_plugin.evaluation.baselines.variants import default_variant, paper_variant
+from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.baselines.constant import NO_DIFFUSION, REPROJECTION_ONLY
+from geodiff_plugin.evaluation.baselines.guided import GUIDED_METHODS, default_variant, paper_variant
+from geodiff_plugin.evaluation.baselines.outside import files_method, hf_method
+from geodiff_plugin.evaluation.baselines.stereo import STEREO_METHODS
 
 __all__ = [
     "FAMILIES",
     "METHODS",
-    "POSES",
     "Method",
     "NotApplicable",
     "Prediction",
@@ -50,23 +27,7 @@ __all__ = [
 ]
 
 METHODS: dict[str, Method] = {
-    method.name: method
-    for method in (
-        PRIOR_ALIGNED,
-        SEARCH_ONLY,
-        SCALE_SHIFT_ONLY,
-        PAPER,
-        PRIOR_FIT_METHOD,
-        GUIDED,
-        PHOTOMETRIC_ONLY,
-        MATCHES_ONLY,
-        REPROJECTION_ONLY,
-        NO_DIFFUSION,
-        SGBM,
-        SGBM_WLS,
-        PLANE_SWEEP,
-        SWEEP_SGM,
-    )
+    method.name: method for method in (*GUIDED_METHODS, REPROJECTION_ONLY, NO_DIFFUSION, *STEREO_METHODS)
 }
 """Every method by name, in the order of the tables' columns."""
 
@@ -77,10 +38,6 @@ FAMILIES: dict[str, Callable[[str], Method]] = {
     "files": files_method,
 }
 """Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter."""
-
-POSES = ("refine", "given", "estimated")
-"""Where ``guided`` may have poses from: the given ones refined, as given, or withheld but for the baseline's
-length."""
 
 PRIORLESS = ("hf", "files")
 """Families that use no prior, so that an @ in their parameter is part of it."""

@@ -1,15 +1,13 @@
-"""Interface of a method under test: what it is given and what it returns.
-
-Data flow: ``StereoSample`` + ``Settings`` -> ``Prediction``.
-Paper: S5.1 (compared methods).
-"""
+"""What a method under test is given and what it returns (paper S5.1)."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +21,19 @@ from geodiff_plugin.priors import load_prior
 from geodiff_plugin.priors.hf_model import HFDepthModel
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
-__all__ = ["Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
+__all__ = ["Method", "NotApplicable", "Prediction", "PriorCache", "Settings", "folder_fingerprint"]
+
+
+def folder_fingerprint(folder: Path) -> str:
+    """16 hexadecimal digits that change with any file of the folder; empty where there is no such folder."""
+    if not os.path.isdir(folder):
+        return ""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        status = path.stat()
+        digest.update(f"{path.relative_to(folder)} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:16]
+
 
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 

@@ -1,6 +1,5 @@
 """Data sets in their official layouts, one file each, one table.
 
-Data flow: folder -> references -> ``StereoSample``.
 Paper: S5.1 (data sets of Tables 1 to 3).
 """
 
@@ -12,14 +11,11 @@ from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.datasets.booster import BOOSTER
-from geodiff_plugin.evaluation.datasets.exposure import with_exposure
+from geodiff_plugin.evaluation.datasets.changed import with_drifted_rig, with_exposure, with_perturbed_poses
 from geodiff_plugin.evaluation.datasets.folder import FOLDER
-from geodiff_plugin.evaluation.datasets.kitti2012 import KITTI2012
-from geodiff_plugin.evaluation.datasets.kitti2015 import KITTI2015
+from geodiff_plugin.evaluation.datasets.kitti import KITTI2012, KITTI2015
 from geodiff_plugin.evaluation.datasets.middlebury import ETH3D, MIDDEVAL3, MIDDLEBURY2014
-from geodiff_plugin.evaluation.datasets.mvsnet import MVSNET
-from geodiff_plugin.evaluation.datasets.perturbed import with_drifted_rig, with_perturbed_poses
-from geodiff_plugin.evaluation.datasets.robustmvd import ROBUSTMVD
+from geodiff_plugin.evaluation.datasets.posed import MVSNET, ROBUSTMVD
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load", "load_pairs"]

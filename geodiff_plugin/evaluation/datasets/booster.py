@@ -1,6 +1,5 @@
 """Booster: indoor scenes full of glass and mirrors, with dense truth and material classes.
 
-Data flow: folder -> references -> ``StereoSample`` at a quarter of the images' size.
 Paper: S5.1, Table 1 (228 pairs of the balanced split).
 """
 
@@ -14,8 +13,17 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.datasets._files import check_size, folders, make_sample, read_npy, read_rgb
-from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample, disparity_to_depth
+from geodiff_plugin.evaluation.datasets.sample import (
+    Dataset,
+    SampleRef,
+    StereoSample,
+    check_size,
+    disparity_to_depth,
+    folders,
+    make_sample,
+    read_npy,
+    read_rgb,
+)
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.geometry.cameras import resize_intrinsics
 

@@ -1,8 +1,4 @@
-"""The user's pairs: one folder each, with left, right, calibration and, for scores, depth.
-
-Data flow: folder -> references -> ``StereoSample``.
-Paper: none.
-"""
+"""The user's pairs: one folder each, with left, right, calibration and, for scores, depth."""
 
 from __future__ import annotations
 
@@ -11,7 +7,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from geodiff_plugin.evaluation.datasets._files import (
+from geodiff_plugin.evaluation.datasets.sample import (
+    Dataset,
+    SampleRef,
+    StereoSample,
     check_calibrated_sizes,
     check_size,
     folders,
@@ -19,12 +18,11 @@ from geodiff_plugin.evaluation.datasets._files import (
     read_depth_m,
     read_rgb,
 )
-from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 from geodiff_plugin.formats import read_calibration
 
 __all__ = ["FOLDER", "find_folder", "load_folder"]
 
-_DEPTHS = ("depth.npy", "depth.pfm", "depth.png")
+_DEPTHS = ("depth.npy", "depth.pfm", "depth.png", "depth_mm.png")
 
 
 def _image(folder: Path, stem: str) -> Path | None:

@@ -1,6 +1,5 @@
 """Middlebury 2014, MiddEval3 and ETH3D two-view: three sets in one file format.
 
-Data flow: folder -> references -> ``StereoSample``.
 Paper: S5.1, Table 3 (15 pairs). Depth in metres is ``f b / (d + doffs)``, with doffs in pixels and b from
 millimetres.
 """
@@ -11,18 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin.evaluation.datasets._files import (
-    check_calibrated_sizes,
-    check_size,
-    folders,
-    make_sample,
-    read_rgb,
-)
 from geodiff_plugin.evaluation.datasets.sample import (
     Dataset,
     SampleRef,
     StereoSample,
+    check_calibrated_sizes,
+    check_size,
     disparity_to_depth,
+    folders,
+    make_sample,
+    read_rgb,
 )
 from geodiff_plugin.formats import read_calibration, read_pfm
 

@@ -1,30 +1,42 @@
-"""Drawing tools of the figures: a sheet, maps with shared colour bars, small PNG files.
-
-Data flow: arrays -> matplotlib figure -> PNG.
-Paper: none.
-"""
+"""What the figures share: options, depth maps of methods, a sheet, maps with colour bars, small PNG files."""
 
 from __future__ import annotations
 
-import importlib
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import LogNorm, Normalize, to_rgba
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 from PIL import Image
 
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, find_method
+from geodiff_plugin.evaluation.baselines.base import Settings
+from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
+from geodiff_plugin.evaluation.datasets.changed import perturbed_ref
+from geodiff_plugin.evaluation.metrics import align, evaluate_depth
+from geodiff_plugin.evaluation.options import FigureOptions, all_refs, select
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.plotting import ticks
 
 __all__ = [
     "COLOURS",
+    "Drawing",
+    "MethodDepth",
     "depth_bar",
+    "depths_of",
     "error_bar",
     "mark",
     "new_figure",
     "plain_log_axis",
+    "references",
+    "samples",
     "save_png",
     "show_depth",
     "show_error",
@@ -32,6 +44,63 @@ __all__ = [
     "show_values",
     "value_bar",
 ]
+
+
+#: A figure of matplotlib, and what it shows as JSON values.
+Drawing = tuple[Any, dict[str, Any]]
+
+
+class MethodDepth(NamedTuple):
+    """A method's answer for one sample, ready to be drawn.
+
+    Attributes:
+        title: of its column.
+        depth_m: ``(H, W)`` metres, ``None`` where the method cannot work on the sample.
+        abs_rel: over all pixels with truth; ``None`` without a map, or where it is empty.
+    """
+
+    title: str
+    depth_m: np.ndarray | None
+    abs_rel: float | None
+
+
+def references(options: FigureOptions) -> list[SampleRef]:
+    """The samples that a figure shows, their poses perturbed where the options say so.
+
+    Raises:
+        ValueError: none, or bad options.
+    """
+    refs, change = select(all_refs(options), options), options.perturbed
+    return refs if change is None else [perturbed_ref(ref, change) for ref in refs]
+
+
+def samples(options: FigureOptions) -> list[StereoSample]:
+    """The same, read.
+
+    Raises:
+        ValueError: none, a broken one, or one without truth.
+        OSError: missing files.
+    """
+    read = [load(ref) for ref in references(options)]
+    for sample in read:
+        if not sample.valid.any():
+            bad_value(f"the truth of {sample.label}", "known for at least one pixel", "none")
+    return read
+
+
+def depths_of(sample: StereoSample, name: str, settings: Settings, priors: PriorCache) -> MethodDepth:
+    """Run one method; relative depth gets scale and shift from the truth, and its title says so."""
+    method = find_method(name)
+    try:
+        prediction = method.run(sample, method.own_settings(settings), priors)
+    except NotApplicable as reason:
+        return MethodDepth(f"{method.title}:\n{reason}", None, None)
+    depth_m = prediction.depth_m
+    if depth_m is None:
+        depth_m = align(prediction.relative, sample.depth_m, sample.valid, prediction.space)
+    abs_rel = evaluate_depth(depth_m, sample.depth_m, sample.valid)["abs_rel"]
+    return MethodDepth(method.title, depth_m, None if math.isnan(abs_rel) else abs_rel)
+
 
 DPI = 90
 #: Colours of lines, in order (Okabe and Ito's, distinguishable for the colour-blind).
@@ -41,13 +110,9 @@ WORST_SHOWN = 0.5
 _GREY = "#808080"
 
 
-def _matplotlib(part: str = "") -> Any:
-    return importlib.import_module(f"matplotlib.{part}" if part else "matplotlib")
-
-
 def new_figure(width_in: float, height_in: float) -> Any:
     """An empty figure that lays itself out; it belongs to no global state."""
-    return _matplotlib("figure").Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
 def save_png(figure: Any, path: Path) -> None:
@@ -70,7 +135,7 @@ def show_image(axes: Any, image: np.ndarray, title: str = "") -> None:
 
 def _map(axes: Any, values: np.ndarray, title: str, name: str, norm: Any) -> Any:
     show_image(axes, np.zeros((*values.shape, 3), np.uint8), title)
-    colours = _matplotlib().colormaps[name].with_extremes(bad=_GREY)
+    colours = colormaps[name].with_extremes(bad=_GREY)
     # No smoothing: a pixel without a value must not bleed into its neighbours.
     return axes.imshow(np.ma.masked_invalid(values), cmap=colours, norm=norm, interpolation="nearest")
 
@@ -89,7 +154,7 @@ def show_depth(axes: Any, depth_m: np.ndarray, near: float, far: float, title: s
         What a colour bar is made of.
     """
     known = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
-    return _map(axes, known, title, "plasma_r", _matplotlib("colors").LogNorm(near, far, clip=True))
+    return _map(axes, known, title, "plasma_r", LogNorm(near, far, clip=True))
 
 
 def show_error(
@@ -99,18 +164,18 @@ def show_error(
     known = valid & np.isfinite(depth_m) & (depth_m > 0)
     safe = np.where(known, truth_m, 1.0)
     error = np.where(known, np.abs(np.where(known, depth_m, 1.0) - safe) / safe, np.nan)
-    return _map(axes, error, title, "inferno", _matplotlib("colors").Normalize(0, WORST_SHOWN, clip=True))
+    return _map(axes, error, title, "inferno", Normalize(0, WORST_SHOWN, clip=True))
 
 
 def show_values(axes: Any, values: np.ndarray, title: str, colours: str, low: float, high: float) -> Any:
     """A map of anything else between two values, in a colour map of matplotlib; NaN is grey."""
-    return _map(axes, values, title, colours, _matplotlib("colors").Normalize(low, high, clip=True))
+    return _map(axes, values, title, colours, Normalize(low, high, clip=True))
 
 
 def mark(axes: Any, mask: np.ndarray, colour: str) -> None:
     """Paint pixels of a map in one colour that its own colours do not have."""
     rgba = np.zeros((*mask.shape, 4))
-    rgba[mask] = _matplotlib("colors").to_rgba(colour)
+    rgba[mask] = to_rgba(colour)
     axes.imshow(rgba, interpolation="nearest")
 
 
@@ -119,7 +184,7 @@ def plain_log_axis(axis: Any, low: float, high: float) -> None:
     axis.axes.set(**{f"{axis.axis_name}scale": "log"})
     values = ticks(low, max(high, 1.01 * low), 7)
     axis.set_ticks(values, labels=[f"{value:g}" for value in values])
-    axis.set_minor_locator(_matplotlib("ticker").NullLocator())
+    axis.set_minor_locator(NullLocator())
 
 
 def depth_bar(figure: Any, drawn: Any, axes: Sequence[Any], near: float, far: float) -> None:

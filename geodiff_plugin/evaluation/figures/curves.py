@@ -1,25 +1,30 @@
-"""Curves of error against updates per step, and against the exposure of the right view.
-
-Data flow: samples + variants -> records (resumable) -> mean per variant -> figure.
-Paper: S9 (fig:error_time); S11 (limits) for the exposure.
-"""
+"""Curves of error: against updates per step (paper S9), exposure (S11), and the strength of the prior."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from geodiff_plugin._checks import check_number
-from geodiff_plugin.evaluation.baselines import find_method
-from geodiff_plugin.evaluation.cells import count_of_pairs
-from geodiff_plugin.evaluation.datasets import SampleRef
-from geodiff_plugin.evaluation.datasets.exposure import exposed_ref
-from geodiff_plugin.evaluation.figures.base import Drawing, FigureOptions, references
-from geodiff_plugin.evaluation.figures.canvas import COLOURS, new_figure, plain_log_axis
-from geodiff_plugin.evaluation.runner import headline, run
-from geodiff_plugin.evaluation.statistics import Mean, mean_with_interval
+import numpy as np
 
-__all__ = ["draw_exposure", "draw_inner_steps"]
+from geodiff_plugin.evaluation.baselines import find_method
+from geodiff_plugin.evaluation.datasets import SampleRef
+from geodiff_plugin.evaluation.datasets.changed import exposed_ref
+from geodiff_plugin.evaluation.experiment import headline, measure_cells, method_cells
+from geodiff_plugin.evaluation.figures.canvas import (
+    COLOURS,
+    Drawing,
+    new_figure,
+    plain_log_axis,
+    references,
+    save_png,
+)
+from geodiff_plugin.evaluation.options import FigureOptions
+from geodiff_plugin.evaluation.table import Mean, count_of_pairs, mean_with_interval
+from geodiff_plugin.runner import Record
+
+__all__ = ["draw_exposure", "draw_inner_steps", "draw_strength", "shaded"]
 
 EXPOSURE_METHODS = ("paper", "guided", "sgbm")
 #: Half and twice the light, and the steps between.
@@ -28,17 +33,8 @@ GAMMAS = (0.5, 0.7, 1.0, 1.4, 2.0)
 PRESETS = ("guided", "paper")
 
 
-def _records(
-    options: FigureOptions, refs: Sequence[SampleRef], methods: Sequence[str]
-) -> list[dict[str, Any]]:
-    return run(
-        refs,
-        methods,
-        options.run.settings,
-        options.run.out,
-        skip_broken=options.run.skip_broken,
-        progress=not options.run.quiet,
-    )
+def _records(options: FigureOptions, refs: Sequence[SampleRef], methods: Sequence[str]) -> list[Record]:
+    return measure_cells(method_cells(refs, methods, options.settings, options.out), options) or []
 
 
 def _mean(records: Sequence[dict[str, Any]], value_of: Callable[[dict[str, Any]], float | None]) -> Mean:
@@ -78,7 +74,7 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     Raises:
         ValueError: no samples, or numbers of updates that are no positive integers.
     """
-    updates = sorted({check_number(n, "updates", 1, 10_000, integer=True) for n in options.updates})
+    updates = sorted(set(options.updates))
     methods = {preset: [f"{preset}:inner_steps={n}" for n in updates] for preset in PRESETS}
     refs = references(options)
     records = _records(options, refs, [name for names in methods.values() for name in names])
@@ -99,7 +95,7 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     right.set_ylim(bottom=0)
     right.legend(fontsize=8)
     figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
-    return Drawing(figure, numbers)
+    return (figure, numbers)
 
 
 def draw_exposure(options: FigureOptions) -> Drawing:
@@ -108,7 +104,7 @@ def draw_exposure(options: FigureOptions) -> Drawing:
     Raises:
         ValueError: no samples, or an unknown method.
     """
-    methods, refs = options.run.methods or EXPOSURE_METHODS, references(options)
+    methods, refs = options.methods or EXPOSURE_METHODS, references(options)
     panels = {"gain": [(gain, 1.0) for gain in GAINS], "gamma": [(1.0, gamma) for gamma in GAMMAS]}
     changes = list(dict.fromkeys(change for own in panels.values() for change in own))
     exposed = {change: [exposed_ref(ref, *change) for ref in refs] for change in changes}
@@ -135,4 +131,66 @@ def draw_exposure(options: FigureOptions) -> Drawing:
         plain_log_axis(axes_of["gain"].yaxis, min(drawn), max(drawn))
     axes_of["gain"].legend(fontsize=8)
     figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
-    return Drawing(figure, numbers)
+    return (figure, numbers)
+
+
+LIGHT = np.array([-0.4, -0.5, 0.77])
+
+
+def shaded(depth_m: np.ndarray, focal_px: float) -> np.ndarray:
+    """``(H, W)`` in [0, 1]: the surface lit from the upper left, so that roughness shows."""
+    rows, columns = np.gradient(np.log(np.maximum(depth_m, 1e-6)))
+    normal = np.stack([-columns * focal_px, -rows * focal_px, np.ones_like(rows)], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.clip(normal @ LIGHT, 0.0, 1.0)
+
+
+def draw_strength(
+    records: Sequence[Mapping[str, Any]], oracle: str, pictures: Mapping[str, np.ndarray], path: Path
+) -> None:
+    """Write the figure.
+
+    Args:
+        records: of ``run_strength``.
+        oracle: the method whose error is the abscissa.
+        pictures: title -> shaded crop.
+        path: PNG to write.
+    """
+    strengths = list(dict.fromkeys(r["strength"] for r in records))
+    methods = [m for m in dict.fromkeys(r["method"] for r in records) if m != oracle]
+    figure = new_figure(11.0, 4.4)
+    grid = figure.add_gridspec(2, 4)
+    axes = figure.add_subplot(grid[:, :2])
+
+    def mean(strength: str, method: str) -> float:
+        own = [r["abs_rel"] for r in records if (r["strength"], r["method"]) == (strength, method)]
+        return float(np.mean(own))
+
+    at = {s: mean(s, oracle) for s in strengths}
+    ordered = sorted(strengths, key=at.__getitem__)
+    for index, method in enumerate(methods):
+        axes.plot(
+            [at[s] for s in ordered],
+            [mean(s, method) for s in ordered],
+            color=COLOURS[index % len(COLOURS)],
+            marker="osD^vP"[index % 6],
+            markersize=4,
+            label=find_method(method).title,
+        )
+    ends = (min(at.values()) * 0.8, max(at.values()) * 1.2)
+    axes.plot(ends, ends, color="0.6", linestyle="--", linewidth=1, label=find_method(oracle).title)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("AbsRel of the prior, aligned by an oracle", fontsize=9)
+    axes.set_ylabel("AbsRel in metres", fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=8)
+    for k, (title, picture) in enumerate(pictures.items()):
+        row, column = divmod(k, 2)
+        panel = figure.add_subplot(grid[row, 2 + column])
+        panel.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        panel.set_title(title, fontsize=8)
+        panel.set_axis_off()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_png(figure, path)

@@ -1,6 +1,5 @@
 """Sweep of the global scale: L_geo and AbsRel against g_s, with re-rendered left images.
 
-Data flow: sample + the prior's relative map -> losses and errors per g_s -> figure.
 Paper: S7.3, supplementary figures (fig:lossAbs1, fig:lossAbs2, fig:warp).
 """
 
@@ -17,9 +16,16 @@ from geodiff_plugin._checks import check_number
 from geodiff_plugin.algorithm.photometric import masked_mean, photometric_map
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache
 from geodiff_plugin.evaluation.datasets import StereoSample
-from geodiff_plugin.evaluation.figures.base import Drawing, FigureOptions, samples
-from geodiff_plugin.evaluation.figures.canvas import COLOURS, new_figure, plain_log_axis, show_image
+from geodiff_plugin.evaluation.figures.canvas import (
+    COLOURS,
+    Drawing,
+    new_figure,
+    plain_log_axis,
+    samples,
+    show_image,
+)
 from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.options import FigureOptions
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.scale.space import SPACES, smooth_floor
@@ -132,9 +138,9 @@ def draw_gs_sweep(options: FigureOptions) -> Drawing:
     Raises:
         ValueError: no sample, or ``largest`` not above 1 m.
     """
-    largest = check_number(options.largest, "max", 1.01, 1e6)
+    largest = check_number(options.max, "max", 1.01, 1e6)
     sample, priors = samples(options)[0], PriorCache()
-    prior = METHODS["prior-aligned"].run(sample, options.run.settings, priors)
+    prior = METHODS["prior-aligned"].run(sample, options.settings, priors)
     sweep = sweep_g_s(sample, prior.relative, prior.space, largest)
     figure = new_figure(8.6, 4.9)
     upper, lower = figure.subfigures(2, 1, height_ratios=[2.0, 1.0])
@@ -146,4 +152,4 @@ def draw_gs_sweep(options: FigureOptions) -> Drawing:
         show_image(axes, picture, title)
     numbers = {"sample": sample.label, "visible": sweep.visible.tolist()}
     numbers |= {"g_s_m": sweep.g_s.tolist(), "loss": sweep.loss.tolist(), "abs_rel": sweep.abs_rel.tolist()}
-    return Drawing(figure, numbers)
+    return (figure, numbers)

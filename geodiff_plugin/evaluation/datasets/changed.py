@@ -1,8 +1,4 @@
-"""A sample whose pose is given wrongly, or whose rig has drifted, by a known amount.
-
-Data flow: ``StereoSample`` + degrees + share of the baseline, or pixels -> ``StereoSample``.
-Paper: none; it takes exact poses for granted (S3.3).
-"""
+"""Samples changed on purpose: another exposure of the right view, wrong poses, a rig that has drifted."""
 
 from __future__ import annotations
 
@@ -21,12 +17,35 @@ from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 __all__ = [
     "drift_of",
     "drifted_ref",
+    "exposed_ref",
     "perturbation",
     "perturbed_pose",
     "perturbed_ref",
     "with_drifted_rig",
+    "with_exposure",
     "with_perturbed_poses",
 ]
+
+
+def exposed_ref(ref: SampleRef, gain: float, gamma: float) -> SampleRef:
+    """The reference to a sample with a changed right view; it is named by what was changed."""
+    name = f"{ref.name}-gain{gain:g}-gamma{gamma:g}"
+    return replace(ref, name=name, files={**ref.files, "right_exposure": (gain, gamma)})
+
+
+def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
+    """Change the right view only.
+
+    Args:
+        sample: as it was taken.
+        change: gain and gamma; a value v in [0, 1] becomes ``gain * v ** gamma``, clipped as a sensor clips
+            and rounded to 8 bits again.
+        name: of the result.
+    """
+    gain, gamma = change
+    right_01 = np.clip(gain * (sample.right / 255.0) ** gamma, 0.0, 1.0)
+    return replace(sample, name=name, right=np.rint(255 * right_01).astype(np.uint8))
+
 
 #: Errors are drawn between this share of the asked ones and all of them.
 LEAST = 0.3

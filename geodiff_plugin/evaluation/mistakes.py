@@ -1,41 +1,20 @@
-"""Typical calibration mistakes applied to correct pairs, for ``geodiff eval trust``.
-
-Data flow: ``StereoSample`` -> the same with another calibration, images or points.
-Paper: none.
-"""
+"""Typical calibration mistakes, applied to correct pairs for ``geodiff eval trust``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 
-__all__ = ["WRONG", "Case", "case_kinds", "cases_of"]
+__all__ = ["WRONG", "WRONG_POINTS", "case_kinds", "make_case"]
 
 Other = Callable[[], StereoSample]
 Change = Callable[[StereoSample, Other], StereoSample]
 #: Known points of the cases about points: so many of the truth.
 POINTS = 200
-
-
-@dataclass(frozen=True)
-class Case:
-    """One sample, right or wrong.
-
-    Attributes:
-        kind: key of ``WRONG``, or ``"right"``.
-        sample: as it is given to the method.
-        points: ``(N, 3)`` metres that go with it, or ``None``.
-        truth: whether the depth of ``sample`` still is that of its left image.
-    """
-
-    kind: str
-    sample: StereoSample
-    points: np.ndarray | None = None
-    truth: bool = True
 
 
 def _scaled_baseline(factor: float) -> Change:
@@ -130,27 +109,27 @@ def _points(sample: StereoSample, seed: int = 0) -> np.ndarray:
 
 
 def case_kinds(kinds: tuple[str, ...]) -> tuple[str, ...]:
-    """Kinds of ``cases_of``, in its order."""
+    """The right sample, with points too where some kind is about them, and then the kinds."""
     pointed = any(kind in WRONG_POINTS for kind in kinds)
     return ("right", *(("right, points",) if pointed else ()), *kinds)
 
 
-def cases_of(
-    sample: StereoSample, other: Callable[[], StereoSample], kinds: tuple[str, ...]
-) -> Iterator[Case]:
-    """The sample as it is, and made wrong in every way that is asked for.
+def make_case(kind: str, sample: StereoSample, other: Other) -> tuple[StereoSample, np.ndarray | None, bool]:
+    """A sample, right or wrong in one way.
 
     Args:
+        kind: of ``case_kinds``.
         sample: right.
         other: gives another one, whose right image is "unrelated".
-        kinds: keys of ``WRONG`` and ``WRONG_POINTS``.
+
+    Returns:
+        The sample as it is given to the method; ``(N, 3)`` points in metres that go with it, or ``None``; and
+        whether its truth still is that of its left image.
     """
-    for kind in case_kinds(kinds):
-        if kind == "right":
-            yield Case(kind, sample)
-        elif kind == "right, points":
-            yield Case(kind, sample, _points(sample))
-        elif kind in WRONG_POINTS:
-            yield Case(kind, sample, WRONG_POINTS[kind] * _points(sample))
-        else:
-            yield Case(kind, WRONG[kind][1](sample, other), truth=kind != "swapped")
+    if kind == "right":
+        return sample, None, True
+    if kind == "right, points":
+        return sample, _points(sample), True
+    if kind in WRONG_POINTS:
+        return sample, WRONG_POINTS[kind] * _points(sample), True
+    return WRONG[kind][1](sample, other), None, kind != "swapped"

@@ -1,8 +1,4 @@
-"""Depth or disparity maps computed elsewhere, one file per sample.
-
-Data flow: ``StereoSample`` -> file of its name -> metres, or relative values to be aligned.
-Paper: S5.1 (UniDepth, RAFT-Stereo, IGEV-Stereo and DUSt3R among the compared methods).
-"""
+"""Depth that others compute: models of transformers, and maps in files (paper S5.1)."""
 
 from __future__ import annotations
 
@@ -15,13 +11,52 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.baselines._folder import folder_fingerprint
-from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
-from geodiff_plugin.evaluation.datasets._files import read_depth_m, read_npy
-from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth
+from geodiff_plugin.evaluation.baselines.base import (
+    Method,
+    NotApplicable,
+    Prediction,
+    PriorCache,
+    Settings,
+    folder_fingerprint,
+)
+from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth, read_depth_m, read_npy
 from geodiff_plugin.formats import read_disparity_kitti_png, read_pfm
 
-__all__ = ["KINDS", "files_method", "map_name"]
+__all__ = ["KINDS", "files_method", "hf_method", "map_name"]
+
+
+def hf_method(name: str) -> Method:
+    """A depth checkpoint of transformers, hub id or folder; relative ones are scored aligned only.
+
+    Args:
+        name: hub id, or folder as ``save_pretrained`` wrote it.
+
+    Returns:
+        The method; the checkpoint is loaded when it is first run.
+
+    Raises:
+        ValueError: an empty name. When run: what ``HFDepthModel.from_pretrained`` raises.
+    """
+    if not name:
+        bad_value("methods", "hf:MODEL with a hub id or a folder", "'hf:'")
+
+    def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+        model = priors.depth_model(name, settings)
+        left_01 = torch.from_numpy(sample.left).permute(2, 0, 1)[None].to(settings.device) / 255.0
+        found = model(left_01, sample.left.shape[:2])
+        values = found.values[0, 0].cpu().numpy()
+        if not found.metric:
+            return Prediction(None, relative=values, space=found.space)
+        depth_m = found.metres()[0, 0].cpu().numpy()
+        return Prediction(depth_m, relative=values, space=found.space)
+
+    def configuration(settings: Settings) -> dict[str, Any]:
+        files = folder_fingerprint(Path(name))
+        return {"device": settings.device, "dtype": settings.dtype, "files": files}
+
+    title = Path(name).name
+    return Method(f"hf:{name}", title, f"{title} by transformers", run, configuration, uses_prior=False)
+
 
 KINDS = {
     "depth": "metres",

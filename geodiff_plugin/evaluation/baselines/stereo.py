@@ -1,0 +1,224 @@
+"""Stereo without a prior: OpenCV's semi-global matching, and our plane sweep for any pose."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.formats import as_image_01
+from geodiff_plugin.matching import CostVolume, build_cost_volume, find_matches
+
+__all__ = ["STEREO_METHODS", "fill_background", "native_depth", "sgbm_shift", "sweep"]
+
+
+def fill_background(shift: np.ndarray) -> np.ndarray:
+    """Fill holes with the farther of the two neighbours in the row, as KITTI's development kit does.
+
+    Args:
+        shift: ``(H, W)`` float, smaller is farther (pixels or 1/m), NaN in holes.
+
+    Returns:
+        ``(H, W)`` without holes: within a row the smaller of the nearest known values to either side, the
+        only one at the row's ends; an empty row copies the nearest filled one above, else below. All NaN
+        where nothing is known.
+    """
+    known = np.isfinite(shift)
+    columns = np.arange(shift.shape[1])[None]
+    from_left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
+    from_right = np.minimum.accumulate(np.where(known, columns, shift.shape[1])[:, ::-1], axis=1)[:, ::-1]
+    rows = np.arange(shift.shape[0])[:, None]
+    padded = np.pad(np.where(known, shift, np.inf), ((0, 0), (1, 1)), constant_values=np.inf)
+    filled = np.minimum(padded[rows, from_left + 1], padded[rows, from_right + 1])
+    full_rows = np.flatnonzero(known.any(axis=1))
+    if full_rows.size == 0:
+        return np.full_like(shift, np.nan)
+    above = np.searchsorted(full_rows, rows[:, 0], side="right") - 1
+    return filled[full_rows[np.maximum(above, 0)]].astype(shift.dtype)
+
+
+def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
+    """Sweep planes from infinity to the package's default nearest one through the left view.
+
+    Args:
+        sample: any pose.
+        device: where the work is done.
+        views: the most views to compare, the left one counted.
+
+    Returns:
+        The volume, on a grid of at most 828 pixels a side.
+    """
+
+    def moved(x: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(x, dtype=torch.float32, device=device)
+
+    given = ((sample.right, sample.K_right, sample.E), *sample.extra_views)[: views - 1]
+    rights = [
+        (as_image_01(image, "right").to(device), moved(K), moved(np.linalg.inv(E))) for image, K, E in given
+    ]
+    return build_cost_volume(as_image_01(sample.left, "left").to(device), rights, moved(sample.K_left))
+
+
+def native_depth(
+    inverse_depth: torch.Tensor, volume: CostVolume, size: tuple[int, int], mode: str
+) -> np.ndarray:
+    """Depth at the left image's resolution.
+
+    Args:
+        inverse_depth: ``(H, W)`` 1/m on the volume's grid, NaN in holes.
+        volume: its planes; nothing is farther than half a step from infinity.
+        size: ``(H, W)`` of the left image.
+        mode: ``"nearest-exact"`` keeps holes as they are; ``"bilinear"`` for maps without.
+
+    Returns:
+        ``(H, W)`` float64, metres, NaN in holes.
+    """
+    farthest = 0.5 * float(volume.plane_step)
+    options = {} if mode == "nearest-exact" else {"align_corners": False}
+    full = F.interpolate(inverse_depth[None, None], size, mode=mode, **options)[0, 0]
+    return 1.0 / np.maximum(full.cpu().numpy().astype(np.float64), farthest)
+
+
+#: Largest shift that is tried, as a share of the image width.
+MAX_SHIFT = 0.25
+#: Matches with a smaller shift than this, in pixels, are taken for mistakes and filled: one such match in the
+#: sky's neighbourhood costs more AbsRel than a hundred good ones gain.
+MIN_SHIFT_PX = 1.0
+#: As OpenCV's own example sets the filter.
+WLS_LAMBDA, WLS_SIGMA = 8000.0, 1.5
+PARAMETERS = {
+    "blockSize": 5,
+    "uniquenessRatio": 10,
+    "speckleWindowSize": 100,
+    "speckleRange": 2,
+    "disp12MaxDiff": 1,
+}
+
+
+def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
+    """Shift of a rectified pair, ``f b / z``, with holes.
+
+    Args:
+        sample: a rectified sample.
+        wls: smooth it, with that of the right view, by OpenCV's weighted least squares: no holes are left.
+
+    Returns:
+        ``(H, W)`` float32, pixels, disparity plus Middlebury's doffs; NaN where the match was rejected.
+    """
+    width, block = sample.left.shape[1], PARAMETERS["blockSize"]
+    # Depth at infinity has the disparity cx_left - cx_right, which is 0 but for Middlebury's doffs.
+    lowest = int(np.floor(sample.K_left[0, 2] - sample.K_right[0, 2]))
+    count = 16 * int(np.ceil(MAX_SHIFT * width / 16))
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=lowest,
+        numDisparities=count,
+        P1=8 * 3 * block**2,
+        P2=32 * 3 * block**2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        **PARAMETERS,
+    )
+    # OpenCV leaves the first lowest + count columns empty; a padded left edge keeps them.
+    pad = max(0, lowest + count)
+    left, right = (
+        np.pad(image, ((0, 0), (pad, 0), (0, 0)), mode="edge") for image in (sample.left, sample.right)
+    )
+    left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
+    raw = matcher.compute(left, right)
+    if wls:
+        smoother = cv2.ximgproc.createDisparityWLSFilter(matcher)
+        smoother.setLambda(WLS_LAMBDA)
+        smoother.setSigmaColor(WLS_SIGMA)
+        opposite = cv2.ximgproc.createRightMatcher(matcher).compute(right, left)
+        raw = smoother.filter(raw, left, disparity_map_right=opposite)
+    raw = raw[:, pad:]
+    shift = raw.astype(np.float32) / 16.0 + np.float32(sample.K_right[0, 2] - sample.K_left[0, 2])
+    shift[(raw <= 16 * (lowest - 1)) | (shift < MIN_SHIFT_PX)] = np.nan
+    return shift
+
+
+def _run_sgbm(wls: bool, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+    if not sample.rectified:
+        raise NotApplicable("not rectified")
+    if sample.left.shape != sample.right.shape:
+        raise NotApplicable("views of different sizes")
+    if wls and not hasattr(cv2, "ximgproc"):
+        raise NotApplicable("cv2.ximgproc, of opencv-contrib-python, is not installed")
+    with_holes = sgbm_shift(sample, wls)
+    depth_m = sample.K_left[0, 0] * sample.E[0, 3] / fill_background(with_holes)
+    notes = {"density": float(np.isfinite(with_holes).mean())}
+    return Prediction(depth_m=depth_m, space="disparity", notes=notes)
+
+
+def _run_plane_sweep(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+    volume = sweep(sample, settings.device, settings.views)
+    # A plane on which the right camera does not see the pixel cannot win.
+    cost = torch.where(volume.in_view, volume.cost, torch.inf)
+    best, index = cost.min(dim=0)
+    inverse_depth = torch.where(torch.isfinite(best), volume.inverse_depth[index], torch.nan)
+    depth_m = native_depth(inverse_depth, volume, sample.left.shape[:2], "nearest-exact")
+    return Prediction(depth_m=depth_m, space="disparity")
+
+
+def _run_sweep_sgm(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+    volume = sweep(sample, settings.device, settings.views)
+    matches = find_matches(volume.left_01, volume.rights, volume.K, volume=volume)
+    # A match at infinity is none: the sky would spread over every hole beside it.
+    matched = (matches.confidence[0] > 0) & (matches.inverse_depth[0] > 0.5 * volume.plane_step)
+    with_holes = torch.where(matched, matches.inverse_depth[0], torch.nan).cpu().numpy()
+    filled = torch.from_numpy(fill_background(with_holes))
+    depth_m = native_depth(filled, volume, sample.left.shape[:2], "bilinear")
+    notes = {"density": float(matched.float().mean())}
+    return Prediction(depth_m=depth_m, space="disparity", notes=notes)
+
+
+def _sgbm_configuration(wls: bool, settings: Settings) -> dict[str, Any]:
+    smoother = {"wls": [WLS_LAMBDA, WLS_SIGMA]} if wls else {}
+    shifts = {"max_shift": MAX_SHIFT, "min_shift_px": MIN_SHIFT_PX}
+    return shifts | {"mode": "3way", "fill": "background"} | PARAMETERS | smoother
+
+
+def _sweep_configuration(choices: dict[str, str], settings: Settings) -> dict[str, Any]:
+    return choices | {"views": settings.views, "device": settings.device}
+
+
+STEREO_METHODS = tuple(
+    Method(name, title, summary, run, configuration, uses_prior=False)
+    for name, title, summary, run, configuration in (
+        (
+            "sgbm",
+            "SGBM + fill",
+            "OpenCV StereoSGBM (3-way) with background fill; rectified pairs only",
+            partial(_run_sgbm, False),
+            partial(_sgbm_configuration, False),
+        ),
+        (
+            "sgbm-wls",
+            "SGBM + WLS",
+            "OpenCV StereoSGBM smoothed by its WLS filter (opencv-contrib); rectified pairs only",
+            partial(_run_sgbm, True),
+            partial(_sgbm_configuration, True),
+        ),
+        (
+            "plane-sweep",
+            "plane sweep",
+            "winner take all over our own plane sweep, any pose",
+            _run_plane_sweep,
+            partial(_sweep_configuration, {"cost": "census", "winner": "take all"}),
+        ),
+        (
+            "sweep-sgm",
+            "sweep + SGM",
+            "our own plane sweep, aggregated, left-right checked and filled, any pose",
+            _run_sweep_sgm,
+            partial(
+                _sweep_configuration, {"cost": "census", "aggregation": "semi-global", "fill": "background"}
+            ),
+        ),
+    )
+)
