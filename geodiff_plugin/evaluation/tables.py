@@ -20,15 +20,19 @@ from geodiff_plugin.evaluation.table import (
     mean_with_interval,
     paired_difference,
 )
+from geodiff_plugin.runner import Record
 from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
 __all__ = [
     "confidence_table",
+    "boundaries_table",
+    "disparity_regions_table",
     "disparity_table",
     "groups",
     "pairs_tables",
     "per_pair_table",
     "regions_table",
+    "sorting_table",
     "spread_table",
     "summary_table",
     "uncertainty_table",
@@ -168,7 +172,8 @@ def pairs_tables(records: Sequence[dict[str, Any]], reference: str = "guided") -
         tables.append(versus_table(records, reference))
     for group, members in groups(records).items():
         tables.append(summary_table(records, members, f"All metrics, {group}"))
-    tables += [regions_table(records), disparity_table(records), uncertainty_table(records)]
+    tables += [regions_table(records), disparity_table(records), disparity_regions_table(records)]
+    tables += [boundaries_table(records), uncertainty_table(records), sorting_table(records)]
     tables += [confidence_table(records), spread]
     return [table for table in tables if table.rows]
 
@@ -236,21 +241,50 @@ def regions_table(records: Sequence[dict[str, Any]]) -> Table:
     )
 
 
-def disparity_table(records: Sequence[dict[str, Any]]) -> Table:
-    """Errors in disparity, mean over the rectified pairs, not aligned.
-
-    Args:
-        records: of a run.
-
-    Returns:
-        A dash where the truth's step is not finer than the threshold; no rows without a rectified pair.
-    """
+def disparity_table(records: Sequence[Record]) -> Table:
+    """Errors in disparity, mean over the rectified pairs, not aligned; no rows without a rectified pair."""
     return _columns_table(
         records,
         _DISPARITY,
         lambda record, name: (record["disparity"] or {}).get(name),
         "Disparity, rectified pairs",
-        "Metres turned into disparity at the left image's resolution; shares of pixels for bad-k and D1.",
+        "Metres turned into disparity at the left image's resolution; shares of pixels for bad-k and D1, "
+        "a dash where the truth's step is coarser than the threshold.",
+    )
+
+
+def disparity_regions_table(records: Sequence[Record]) -> Table:
+    """The same by what the right camera sees and by nearness to an edge."""
+    columns = {
+        f"{region} {name}": f"{region}, {heading}"
+        for region in ("visible", "edge", "flat")
+        for name, heading in _DISPARITY.items()
+        if name != "bad3"
+    }
+
+    def value_of(record: Record, column: str) -> float | None:
+        region, name = column.split()
+        return ((record["disparity"] or {}).get("regions") or {}).get(region, {}).get(name)
+
+    return _columns_table(
+        records,
+        columns,
+        value_of,
+        "Disparity by region, rectified pairs",
+        "Visible: neither hidden in the right view nor beside it; edge: within 4 px of a step of the true "
+        "disparity of more than 3 px; flat: the rest.",
+    )
+
+
+def boundaries_table(records: Sequence[Record]) -> Table:
+    """How well the boundaries of a map follow those of dense truth."""
+    columns = {"f1": "boundary F1", "dbe_acc": "ε acc px", "dbe_comp": "ε comp px"}
+    return _columns_table(
+        records,
+        columns,
+        lambda record, name: (record.get("boundaries") or {}).get(name),
+        "Boundaries, dense truth",
+        "F1 as Depth Pro defines it, higher is better; distances of depth boundaries as iBims-1 does.",
     )
 
 
@@ -264,6 +298,17 @@ def uncertainty_table(records: Sequence[dict[str, Any]]) -> Table:
     ]
     note = "Area under the sparsification error of AbsRel; 0 where the least certain pixels are the worst."
     return Table("Uncertainty", ("method", "pairs", "AUSE [95 %]"), tuple(rows), note)
+
+
+def sorting_table(records: Sequence[Record]) -> Table:
+    """How well the confidence sorts pixels by their error, beside a random order; an oracle's is 0."""
+    return _columns_table(
+        records,
+        {"ause": "AUSE", "random": "AUSE of a random order"},
+        lambda record, name: (record.get("ause_confidence") or {}).get(name),
+        "AUSE of the confidence",
+        "Area under the sparsification error of AbsRel; 0 where the least certain pixels are the worst.",
+    )
 
 
 def confidence_table(records: Sequence[dict[str, Any]]) -> Table:
