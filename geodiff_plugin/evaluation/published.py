@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 __all__ = ["LAYOUTS", "Column", "Layout", "PaperRow"]
 
-_THREE = ("abs_rel", "delta1", "rmse")
-
 
 @dataclass(frozen=True)
 class Column:
@@ -82,165 +80,90 @@ _MIDDLEBURY = Column("Middlebury", ("middeval3", "middlebury2014"), 15)
 _TANKS = Column("Tanks and Temples", ("robustmvd", "mvsnet"), 116)
 
 
-def _three_sets(kitti: str, booster: str, middlebury: str) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    cells = (tuple(text.split()) for text in (kitti, booster, middlebury))
-    return tuple(zip((c.title for c in (_KITTI, _BOOSTER, _MIDDLEBURY)), cells, strict=True))
+#: Tables 1 to 4: title, whether aligned, the method that is built in or how one is named for the row
+#: (``word=hint``), and the cells of each column as printed.
+_ROWS: dict[str, str] = {
+    "table1": """
+        MiDaS | aligned | dpt=hf:Intel/dpt-large | 0.63 0.24 11.72 | 0.18 0.71 0.23 | 0.22 0.72 2.09
+        Marigold | aligned | prior-aligned | 0.13 0.85 4.81 | 0.04 0.98 0.06 | 0.14 0.83 1.61
+        GeoWizard | aligned | geowizard=files:DIR/geowizard | 0.18 0.75 5.7 | 0.04 0.96 0.08 | 0.15 0.81 1.55
+        ZoeDepth | metres | zoedepth=hf:Intel/zoedepth-nyu-kitti | 0.74 - 16.26 | 7.37 - 7.72 | 0.60 - 6.04
+        UniDepth | metres | unidepth=files:DIR/unidepth | 0.19 0.86 4.18 | 4.55 - 4.91 | 0.61 - 6.03
+        DepthPro | metres | depthpro=hf:apple/DepthPro-hf | 0.16 0.81 4.43 | 0.34 0.51 0.67 | 0.54 0.02 5.60
+        GeoDiff†{} | metres | paper | 0.07 0.91 3.94 | 0.11 0.81 0.18 | 0.11 0.85 2.31
+        GeoDiff{} | aligned | paper | 0.09 0.91 3.72 | 0.04 0.98 0.06 | 0.11 0.87 1.41
+    """,
+    "table2": """
+        RAFT-Stereo | metres | raft=files:DIR/raft-stereo | 5.4 - 18.89
+        IGEV-Stereo | metres | igev=files:DIR/igev-stereo | 0.10 0.94 0.31
+        GeoDiff†{} | metres | paper | 0.11 0.81 0.18
+        GeoDiff{} | aligned | paper | 0.04 0.98 0.06
+    """,
+    "table3": """
+        DUSt3R | metres | dust3r=files:DIR/dust3r | 0.51 0.35 0.56
+        GeoDiff†{} | metres | paper | 0.47 0.38 0.62
+        DUSt3R | aligned | dust3r=files:DIR/dust3r | 0.07 0.93 0.17
+        GeoDiff{} | aligned | paper | 0.08 0.92 0.18
+    """,
+    "ablation": """
+        Learning scale and shift only | metres | paper:optimize_latents=false | 0.14 0.80
+        Our full model{} | metres | paper | 0.07 0.91
+    """,
+}
 
 
-def _one_set(column: Column, text: str) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    return ((column.title, tuple(text.split())),)
+def _rows(name: str, columns: tuple[Column, ...]) -> tuple[PaperRow, ...]:
+    """The rows of one table."""
+    rows = []
+    for line in _ROWS[name].strip().splitlines():
+        title, kind, method, *cells = (part.strip() for part in line.split("|"))
+        title = title.replace("{}", ", Algorithm 1 as printed")
+        word, named_for, hint = (
+            method.partition("=") if "=" in method and not method.startswith("paper:") else ("", "", "")
+        )
+        published = tuple((c.title, tuple(text.split())) for c, text in zip(columns, cells, strict=True))
+        built_in = "" if named_for else method
+        rows.append(PaperRow(title, kind == "aligned", built_in, word, hint, published))
+    return tuple(rows)
 
 
-_TABLE1 = (
-    PaperRow(
-        "MiDaS",
-        True,
-        word="dpt",
-        hint="hf:Intel/dpt-large",
-        published=_three_sets("0.63 0.24 11.72", "0.18 0.71 0.23", "0.22 0.72 2.09"),
-    ),
-    PaperRow(
-        "Marigold",
-        True,
-        method="prior-aligned",
-        published=_three_sets("0.13 0.85 4.81", "0.04 0.98 0.06", "0.14 0.83 1.61"),
-    ),
-    PaperRow(
-        "GeoWizard",
-        True,
-        word="geowizard",
-        hint="files:DIR/geowizard",
-        published=_three_sets("0.18 0.75 5.7", "0.04 0.96 0.08", "0.15 0.81 1.55"),
-    ),
-    PaperRow(
-        "ZoeDepth",
-        False,
-        word="zoedepth",
-        hint="hf:Intel/zoedepth-nyu-kitti",
-        published=_three_sets("0.74 - 16.26", "7.37 - 7.72", "0.60 - 6.04"),
-    ),
-    PaperRow(
-        "UniDepth",
-        False,
-        word="unidepth",
-        hint="files:DIR/unidepth",
-        published=_three_sets("0.19 0.86 4.18", "4.55 - 4.91", "0.61 - 6.03"),
-    ),
-    PaperRow(
-        "DepthPro",
-        False,
-        word="depthpro",
-        hint="hf:apple/DepthPro-hf",
-        published=_three_sets("0.16 0.81 4.43", "0.34 0.51 0.67", "0.54 0.02 5.60"),
-    ),
-    PaperRow(
-        "GeoDiff†, Algorithm 1 as printed",
-        False,
-        method="paper",
-        published=_three_sets("0.07 0.91 3.94", "0.11 0.81 0.18", "0.11 0.85 2.31"),
-    ),
-    PaperRow(
-        "GeoDiff, Algorithm 1 as printed",
-        True,
-        method="paper",
-        published=_three_sets("0.09 0.91 3.72", "0.04 0.98 0.06", "0.11 0.87 1.41"),
-    ),
-)
-_TABLE2 = (
-    PaperRow(
-        "RAFT-Stereo",
-        False,
-        word="raft",
-        hint="files:DIR/raft-stereo",
-        published=_one_set(_BOOSTER, "5.4 - 18.89"),
-    ),
-    PaperRow(
-        "IGEV-Stereo",
-        False,
-        word="igev",
-        hint="files:DIR/igev-stereo",
-        published=_one_set(_BOOSTER, "0.10 0.94 0.31"),
-    ),
-    PaperRow(
-        "GeoDiff†, Algorithm 1 as printed",
-        False,
-        method="paper",
-        published=_one_set(_BOOSTER, "0.11 0.81 0.18"),
-    ),
-    PaperRow(
-        "GeoDiff, Algorithm 1 as printed",
-        True,
-        method="paper",
-        published=_one_set(_BOOSTER, "0.04 0.98 0.06"),
-    ),
-)
-_DUST3R = {"word": "dust3r", "hint": "files:DIR/dust3r"}
-_TABLE3 = (
-    PaperRow("DUSt3R", False, **_DUST3R, published=_one_set(_TANKS, "0.51 0.35 0.56")),
-    PaperRow(
-        "GeoDiff†, Algorithm 1 as printed",
-        False,
-        method="paper",
-        published=_one_set(_TANKS, "0.47 0.38 0.62"),
-    ),
-    PaperRow("DUSt3R", True, **_DUST3R, published=_one_set(_TANKS, "0.07 0.93 0.17")),
-    PaperRow(
-        "GeoDiff, Algorithm 1 as printed", True, method="paper", published=_one_set(_TANKS, "0.08 0.92 0.18")
-    ),
-)
-_TABLE4 = (
-    PaperRow(
-        "Learning scale and shift only",
-        False,
-        method="paper:optimize_latents=false",
-        published=_one_set(_KITTI, "0.14 0.80"),
-    ),
-    PaperRow(
-        "Our full model, Algorithm 1 as printed",
-        False,
-        method="paper",
-        published=_one_set(_KITTI, "0.07 0.91"),
-    ),
-)
+def _layout(
+    name: str,
+    title: str,
+    columns: tuple[Column, ...],
+    rules: tuple[int, ...],
+    methods: tuple[str, ...],
+    metrics: tuple[str, ...] = ("abs_rel", "delta1", "rmse"),
+) -> Layout:
+    return Layout(name, title, columns, metrics, _rows(name, columns), rules, methods)
 
+
+_PEERS = ("guided", "no-diffusion", "sweep-sgm", "sgbm")
 LAYOUTS: dict[str, Layout] = {
     layout.name: layout
     for layout in (
-        Layout(
+        _layout(
             "table1",
             "Table 1: monocular depth on KITTI-Stereo, Booster and Middlebury",
             (_KITTI, _BOOSTER, _MIDDLEBURY),
-            _THREE,
-            _TABLE1,
             (3, 6),
-            ("guided", "no-diffusion", "sweep-sgm", "sgbm"),
+            _PEERS,
         ),
-        Layout(
-            "table2",
-            "Table 2: stereo on Booster",
-            (_BOOSTER,),
-            _THREE,
-            _TABLE2,
-            (2,),
-            ("guided", "no-diffusion", "sweep-sgm", "sgbm"),
-        ),
-        Layout(
+        _layout("table2", "Table 2: stereo on Booster", (_BOOSTER,), (2,), _PEERS),
+        _layout(
             "table3",
             "Table 3: two views with known poses on Tanks and Temples",
             (_TANKS,),
-            _THREE,
-            _TABLE3,
             (2,),
-            ("guided", "no-diffusion", "sweep-sgm"),
+            _PEERS[:-1],
         ),
-        Layout(
+        _layout(
             "ablation",
             "Table 4: ablation on KITTI-Stereo",
             (_KITTI,),
-            ("abs_rel", "delta1"),
-            _TABLE4,
             (),
             ("guided", "scale-shift-only", "reprojection-only", "no-diffusion"),
+            ("abs_rel", "delta1"),
         ),
     )
 }
