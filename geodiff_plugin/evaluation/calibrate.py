@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -75,8 +74,7 @@ def fit_log_odds(
     return found.x / scale
 
 
-@dataclass(frozen=True)
-class Decile:
+class Decile(NamedTuple):
     """One tenth of the promises: their mean ``promised``, the part ``kept``, their ``share`` of all."""
 
     promised: float
@@ -106,8 +104,7 @@ def deciles(probability: np.ndarray, right: np.ndarray, weights: np.ndarray) -> 
 PIXELS = 5000
 
 
-@dataclass(frozen=True)
-class Observed:
+class Observed(NamedTuple):
     """Pixels of one pair: ``evidence (N, F)`` float64, and whether each was ``right (N,)``."""
 
     evidence: np.ndarray

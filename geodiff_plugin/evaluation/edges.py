@@ -107,9 +107,9 @@ def boundary_f1(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> f
         recall = precision = 0.0
         for (ratio, both), (true_ratio, _) in zip(pred, truth, strict=True):
             drawn, true = both & (ratio > threshold), both & (true_ratio > threshold)
-            hits = np.count_nonzero(drawn & true)
-            recall += 0.25 * hits / max(np.count_nonzero(true), 1)
-            precision += 0.25 * hits / max(np.count_nonzero(drawn), 1)
+            hits = 0.25 * float((drawn & true).sum())
+            recall += hits / max(float(true.sum()), 1.0)
+            precision += hits / max(float(drawn.sum()), 1.0)
         if recall + precision > 0:
             total += threshold * 2 * recall * precision / (recall + precision)
     return float(total / RATIOS.sum())

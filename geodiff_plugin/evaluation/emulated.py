@@ -7,8 +7,7 @@ input says, so that an edit of one step is seen by the next one, as a trained ne
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -40,8 +39,7 @@ ENDS = (0.02, 0.98)
 SMOOTH, SEGMENTS, BLUR = 0.12, 0.16, 0.012
 
 
-@dataclass(frozen=True)
-class Strength:
+class Strength(NamedTuple):
     """How a prior errs.
 
     Attributes:

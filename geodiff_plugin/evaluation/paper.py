@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
@@ -32,8 +32,7 @@ __all__ = ["FoundColumn", "how_to_obtain", "layout_table", "methods_of", "run_pa
 _ARROWS = {"abs_rel": "↓", "rmse": "↓", "delta1": "↑"}
 
 
-@dataclass(frozen=True)
-class FoundColumn:
+class FoundColumn(NamedTuple):
     """A column of a layout and what stands for it.
 
     Attributes:
@@ -179,7 +178,7 @@ def _ablation_layout(layout: Layout, options: PairsOptions) -> Layout:
         for name in DATASETS
         if name in there - {d for c in kitti for d in c.datasets}
     ]
-    return replace(layout, columns=tuple(kitti + others) or layout.columns)
+    return layout._replace(columns=tuple(kitti + others) or layout.columns)
 
 
 def _tables(

@@ -5,13 +5,12 @@ Paper: Table 1 (tab:depth_comparison), 2 (tab:stereo_comparison), 3 (tab:two_vie
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 __all__ = ["LAYOUTS", "Column", "Layout", "PaperRow"]
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """One data set of a table.
 
     Attributes:
@@ -25,8 +24,7 @@ class Column:
     full_count: int
 
 
-@dataclass(frozen=True)
-class PaperRow:
+class PaperRow(NamedTuple):
     """One row of a table.
 
     Attributes:
@@ -51,8 +49,7 @@ class PaperRow:
         return dict(self.published).get(column, ("-",) * count)
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """A table as the paper lays it out.
 
     Attributes:

@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -250,8 +249,8 @@ def test_table1_runs_what_is_there_and_tells_how_to_obtain_the_rest(free_methods
 
 def test_published_columns_after_a_run_on_a_faked_full_set(free_methods, scene, tmp_path, monkeypatch):
     layout = LAYOUTS["table1"]
-    small = tuple(replace(column, datasets=column.datasets[::-1], full_count=1) for column in layout.columns)
-    monkeypatch.setitem(LAYOUTS, "table1", replace(layout, columns=small))
+    small = tuple(column._replace(datasets=column.datasets[::-1], full_count=1) for column in layout.columns)
+    monkeypatch.setitem(LAYOUTS, "table1", layout._replace(columns=small))
     answer = invoke("table1", "--data", scene, "-o", tmp_path / "out")
     assert "Middlebury, as published: RMSE m ↓" in answer.stdout
     assert re.search(r" 2\.31\s", answer.stdout)

@@ -5,8 +5,7 @@ Paper: S7.3, supplementary figures (fig:lossAbs1, fig:lossAbs2, fig:warp).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -38,8 +37,7 @@ ETA = 0.85
 SHOWN = 4
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
+class Sweep(NamedTuple):
     """One sample at every candidate.
 
     Attributes:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -118,8 +117,7 @@ WORST_DIFFERENCE = 0.2
 HIDDEN_COLOUR = COLOURS[5]
 
 
-@dataclass(frozen=True, eq=False)
-class TermByTerm:
+class TermByTerm(NamedTuple):
     """One guided call taken apart; ``(h, w)`` is the grid of the losses, ``(H, W)`` the left image's.
 
     Attributes:
