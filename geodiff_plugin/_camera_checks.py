@@ -17,6 +17,7 @@ __all__ = [
     "check_intrinsics",
     "check_intrinsics_fit",
     "check_pose",
+    "check_size_of",
     "warn_of_long_baseline",
     "warn_of_other_size",
 ]
@@ -80,6 +81,12 @@ def check_intrinsics_fit(
             f"It probably belongs to another resolution: {SCALED_K}. "
             "If it is a crop, say so with cropped=True (--cropped).",
         )
+
+
+def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -> None:
+    """Refuse a camera matrix that cannot be that of an image ``(H, W)``, and warn of one that hardly is."""
+    check_intrinsics_fit(K, size[1], size[0], name, image)
+    warn_of_other_size(K, size[1], size[0], name, image)
 
 
 def check_calibrated_size(

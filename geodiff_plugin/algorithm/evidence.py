@@ -25,44 +25,17 @@ from geodiff_plugin.matching import (
     points_to_matches,
 )
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.scale.order import SURE
-from geodiff_plugin.scale.points import sure_matches
+from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from geodiff_plugin.types import CameraView, PoseReport
 
 __all__ = [
     "Evidence",
-    "EvidenceInputs",
     "Views",
     "as_fine_as",
     "chunk_views",
     "prepare_evidence",
     "resize_long_edge",
 ]
-
-
-@dataclass(frozen=True, eq=False)
-class EvidenceInputs:
-    """What evidence is made from.
-
-    Attributes:
-        left_01: ``(3, H, W)`` float32 in [0, 1], native size.
-        views: the further views, native, of any size.
-        K_left: ``(3, 3)`` pixels of the native left image.
-        points: as ``points_to_matches`` takes them, or ``None``.
-        config: says how large the grids are, what the sweep spans, and whether the search needs it.
-        needs_matches: aggregate the volume and check it against each view.
-        unit: of the lengths, ``"m"`` or ``None``.
-        measured: whether the lengths of the baselines are measured; see ``Rig``.
-    """
-
-    left_01: Tensor
-    views: Sequence[CameraView]
-    K_left: Tensor
-    points: Tensor | None
-    config: GuidanceConfig
-    needs_matches: bool
-    unit: str | None = "m"
-    measured: bool = False
 
 
 @dataclass(frozen=True)
@@ -120,37 +93,49 @@ def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tenso
     return small, resize_intrinsics(K[None], (height, width), size)[0]
 
 
-def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> Evidence:
+def prepare_evidence(
+    left_01: Tensor,
+    views: Sequence[CameraView],
+    K_left: Tensor,
+    points: Tensor | None,
+    config: GuidanceConfig,
+    needs_matches: bool,
+    pose: PoseReport | None = None,
+) -> Evidence:
     """Cost volume, matches and points of one image.
 
     Args:
-        given: images, cameras, points and settings.
+        left_01: ``(3, H, W)`` float32 in [0, 1], native size.
+        views: the further views, native, of any size.
+        K_left: ``(3, 3)`` pixels of the native left image.
+        points: as ``points_to_matches`` takes them, or ``None``.
+        config: says how large the grids are, what the sweep spans, and whether the search needs it.
+        needs_matches: aggregate the volume and check it against each view.
         pose: how the poses of the views came about.
 
     Raises:
         InputError: views that do not overlap; points of which none is in the image.
     """
-    left_01, views, K_left, config = given.left_01, tuple(given.views), given.K_left, given.config
     left, K_loss = resize_long_edge(left_01, K_left, config.loss_resolution)
     size, loss_size = image_size(left_01), image_size(left)
-    volume, sweep_matches, matches, points, sweep_points = None, None, None, None, None
+    volume, sweep_matches, matches, targets, sweep_targets = None, None, None, None, None
     warnings: list[str] = [] if pose is None else list(pose.warnings)
-    if views and (config.search == "volume" or given.needs_matches):
+    if views and (config.search == "volume" or needs_matches):
         # The sweep chooses its own grid, finer than that of the losses for wide images.
         volume = build_cost_volume(left_01, views, K_left, depth_range=config.depth_range, config=config)
-        if given.needs_matches:
+        if needs_matches:
             sweep_matches = find_matches(left_01, views, K_left, volume=volume)
             matches = _on_grid(sweep_matches, loss_size)
         if mirrored_pose_preferred(left_01, views, K_left, sweep_matches):
             warnings.append(INVERSE)
-    if given.points is not None:
-        points, left_out = points_to_matches(given.points, K_left, size, loss_size)
+    if points is not None:
+        targets, left_out = points_to_matches(points, K_left, size, loss_size)
         sweep_size = loss_size if sweep_matches is None else sweep_matches.size
-        sweep_points, _ = points_to_matches(given.points, K_left, size, sweep_size)
+        sweep_targets, _ = points_to_matches(points, K_left, size, sweep_size)
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
-    sure = None if matches is None else sure_matches(matches)
-    _read_back_once(volume, (matches, points, sure))
+    sure = None if matches is None else reliable_matches(matches)
+    _read_back_once(volume, (matches, targets, sure))
     return Evidence(
         left,
         left_01,
@@ -159,10 +144,10 @@ def prepare_evidence(given: EvidenceInputs, pose: PoseReport | None = None) -> E
         volume,
         matches,
         sweep_matches,
-        points,
-        sweep_points,
+        targets,
+        sweep_targets,
         sure,
-        views,
+        tuple(views),
         pose,
         tuple(dict.fromkeys(warnings)),  # the same mistake may show in two ways
     )
@@ -174,7 +159,7 @@ def _read_back_once(volume: CostVolume | None, targets: Sequence[Matches | None]
         _ = volume.reach_m, volume.rectified
     for target in targets:
         if target is not None:
-            _ = target.above(0.0), target.above(SURE)
+            _ = target.above(0.0), target.above(RELIABLE)
 
 
 def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ from geodiff_plugin.algorithm.objective import Loss, Objective
 from geodiff_plugin.algorithm.settling import settle_ends, span_of_points
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.matching import Matches, reject_reflections
-from geodiff_plugin.scale.order import order_agreement
+from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.scale.space import AffineState, MetricMap
 from geodiff_plugin.scale.volume_search import argmin_over
 from geodiff_plugin.types import StepReport

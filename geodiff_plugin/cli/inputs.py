@@ -30,8 +30,8 @@ from geodiff_plugin.formats.distortion import (
 )
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov, warn_of_other_lens
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
+from geodiff_plugin.guidance.evidence import cleaned
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.posing import cleaned
 from geodiff_plugin.options import check_positive
 from geodiff_plugin.types import Distortion, Rig
 

@@ -37,7 +37,7 @@ from geodiff_plugin.cli.terminal import (
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import OutFolder, atomic_path, reason_of
 from geodiff_plugin.formats.video import VideoReader, both_halves
-from geodiff_plugin.guidance.evidence_store import EvidenceStore
+from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.options import flag_of
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner
 from geodiff_plugin.runtime.machine import pick_device

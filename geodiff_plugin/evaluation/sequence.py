@@ -18,7 +18,7 @@ from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import SequenceOptions, command_line
 from geodiff_plugin.evaluation.report import Page
 from geodiff_plugin.evaluation.table import Table
-from geodiff_plugin.guidance.evidence_store import EvidenceStore
+from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runner import Item, Record
 from geodiff_plugin.runtime.pipeline import native_images

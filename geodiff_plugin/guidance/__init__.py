@@ -1,5 +1,1 @@
-"""The user's side: ``GeometryGuidance``, its hyperparameters (``config``) and presets.
-
-Data flow: right views, cameras, points, hyperparameters -> ``GeometryGuidance``.
-Paper: S4.2, S5.1.
-"""
+"""The user's side: ``GeometryGuidance`` and what it is given (S3.3, S4.2, S5.1)."""

@@ -1,7 +1,6 @@
-"""``GeometryGuidance``: right views, cameras, known points and hyperparameters, as the user gives them.
+"""``GeometryGuidance``: right views, cameras, points and hyperparameters, as the user gives them.
 
-Data flow: ``right, K, E, points``, configuration -> ``GeometryGuidance`` -> at call time ``Evidence``.
-Paper: S3.3, S4.2, S5.1; ``GeometryGuidance.paper`` is Algorithm 1 with its printed numbers.
+S3.3, S4.2, S5.1; ``preset="paper"`` is Algorithm 1 with its printed numbers.
 """
 
 from __future__ import annotations
@@ -13,17 +12,18 @@ from typing import Any, Self
 import numpy as np
 from torch import Tensor
 
-from geodiff_plugin._camera_checks import check_calibrated_size, check_intrinsics_fit, warn_of_other_size
-from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, check_size
+from geodiff_plugin._camera_checks import check_calibrated_size, check_size_of
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, check_size, refuse
 from geodiff_plugin._threads import WithinCores
-from geodiff_plugin.algorithm.evidence import Evidence, EvidenceInputs
+from geodiff_plugin.algorithm.evidence import Evidence
+from geodiff_plugin.algorithm.gradients import RULES
+from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.config import PRESETS, GuidanceConfig, UpdatePlan
 from geodiff_plugin.formats import picture_size, read_calibration
 from geodiff_plugin.geometry.cameras import image_size
-from geodiff_plugin.guidance.evidence_store import EvidenceStore, make_evidence
-from geodiff_plugin.guidance.inputs import ImageInputs, read_inputs, split_views
+from geodiff_plugin.guidance.evidence import EvidenceStore, make_evidence
+from geodiff_plugin.guidance.inputs import read_inputs, split_views
 from geodiff_plugin.guidance.photographs import EstimatedRig, estimate_rig
-from geodiff_plugin.guidance.preconditions import check_fed, check_names
 from geodiff_plugin.types import MetricDepthOutput, Rig
 
 __all__ = ["GeometryGuidance"]
@@ -63,6 +63,9 @@ class GeometryGuidance:
             docs/reference/knobs.md and ``geodiff info --knobs`` list them.
 
     Attributes:
+        inputs: the checked input, one entry per left image.
+        config: the hyperparameters as given; ``None`` where they are chosen automatically.
+        unit: as the argument.
         evidence_store: cache of cost volumes and matches for further calls with the same images, cameras and
             settings; ``None``, the default, for no cache.
         previous: as the argument; it may be set before every call.
@@ -107,16 +110,15 @@ class GeometryGuidance:
             bad_value(
                 "unit", "'m' or None", repr(unit), "Give lengths in metres, or None for any other unit."
             )
-        self._config, self._unit = config.changed(**knobs), unit
-        check_names(self._config)
-        self._inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
+        self.config, self.unit = config.changed(**knobs), unit
+        _check_names(self.config)
+        self.inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
         self.measured_baseline = measured_baseline
         self.evidence_store: EvidenceStore | None = None
         self.previous = previous
         self._cropped, self._left_size = cropped, check_size(left_size, "left_size")
-        check_fed(
-            self._config, self.updates, views=bool(self.rights), points=self._inputs[0].points is not None
-        )
+        has_points = self.inputs[0].points is not None
+        _check_sufficient(self.config, self.updates, views=bool(self.rights), points=has_points)
 
     @classmethod
     def from_baseline(cls, right: Any, K: Any, baseline_m: float, K_right: Any = None, **knobs: Any) -> Self:
@@ -242,70 +244,28 @@ class GeometryGuidance:
         """
         photographs = list(left) if right is None and isinstance(left, (list, tuple)) else [left, right]
         Ks = K if K_right is None else [K, K_right]
-        found = estimate_rig(
-            photographs,
-            K=Ks,
-            fov=fov,
-            baseline_m=baseline_m,
-            known_length=known_length,
-            points=points,
-            matcher=matcher,
-            cropped=cropped,
-        )
-        views = zip((None, *photographs[1:]), found.Ks, (np.eye(4), *found.Es), strict=True)
-        points = points if found.scale.unit else None
-        guidance = cls.from_views(
-            list(views),
-            points=points,
-            left_size=found.size_left,
-            cropped=cropped,
-            unit=found.scale.unit,
-            measured_baseline=True,
-            **knobs,
-        )
-        guidance.estimated = found
+        scale_from = {"baseline_m": baseline_m, "known_length": known_length, "points": points}
+        rig = estimate_rig(photographs, K=Ks, fov=fov, matcher=matcher, cropped=cropped, **scale_from)
+        views = zip((None, *photographs[1:]), rig.Ks, (np.eye(4), *rig.Es), strict=True)
+        unit, lengths = rig.scale.unit, {"left_size": rig.size_left, "measured_baseline": True}
+        more = {"points": points if unit else None, "cropped": cropped, "unit": unit} | lengths
+        guidance = cls.from_views(list(views), **more, **knobs)
+        guidance.estimated = rig
         return guidance
 
     @classmethod
     def marigold_dc(cls, points: Any, K: Any, **knobs: Any) -> Self:
-        """Marigold-DC with its published settings: depth completion from points alone.
-
-        Adam of 0.05 on z_t and 0.005 on scale and shift, gradient through the U-Net scaled to the norm of the
-        predicted noise, L1 + L2 in metres, 50 steps. Use a Marigold with ``prediction_type="depth"``.
-
-        Args:
-            points: as in the constructor.
-            K: ``(3, 3)`` intrinsics of the left image, pixels.
-            **knobs: hyperparameters to change.
-
-        Source: Viola et al. 2024, Algorithm 1; prs-eth/Marigold-DC, in parity (tests/parity).
-        """
+        """Marigold-DC as published, depth completion from points; with ``prediction_type="depth"``."""
         return cls.from_points(points, K, preset="marigold-dc", **knobs)
 
     @classmethod
     def paper(cls, right: Any, K: Any, E: Any, **knobs: Any) -> Self:
-        """Algorithm 1 as printed: full gradient, plain steps of 1e-2, gamma 1e-2 towards 0, one-number g_s.
-
-        Args:
-            right: as in the constructor.
-            K: as in the constructor.
-            E: as in the constructor.
-            **knobs: hyperparameters to change; ``g_s_range`` is the paper's "predefined depth range".
-
-        Source: Algorithm 1, S5.1, S7.3, S9; docs/reference/paper-map.md settles what the paper leaves open.
-        """
+        """Algorithm 1 as printed; docs/reference/paper-map.md settles what the paper leaves open."""
         return cls(right, K, E, preset="paper", **knobs)
 
     @classmethod
     def search_only(cls, right: Any, K: Any, E: Any, **knobs: Any) -> Self:
-        """Only the scale and shift that the search finds: no correction, no gradient updates.
-
-        Args:
-            right: as in the constructor.
-            K: as in the constructor.
-            E: as in the constructor.
-            **knobs: hyperparameters to change.
-        """
+        """Only the scale and shift that the search finds: no correction, no gradient updates."""
         return cls(right, K, E, preset="search-only", **knobs)
 
     @property
@@ -322,40 +282,24 @@ class GeometryGuidance:
         self._previous = output
 
     @property
-    def unit(self) -> str | None:
-        """``"m"``, or ``None`` where no length is known."""
-        return self._unit
-
-    @property
-    def config(self) -> GuidanceConfig:
-        """The hyperparameters as given; ``None`` where they are chosen automatically."""
-        return self._config
-
-    @property
     def updates(self) -> UpdatePlan:
         """Number, start and size of the gradient updates, with automatic choices resolved."""
-        return self.config.plan_updates(points_given=self._inputs[0].points is not None)
+        return self.config.plan_updates(points_given=self.inputs[0].points is not None)
 
     def as_run(self) -> GuidanceConfig:
         """The configuration with all automatic choices resolved, for reports."""
-        return self.config.changed(
-            inner_steps=self.updates.inner_steps, step_latents=self.updates.step_latents
-        )
-
-    @property
-    def inputs(self) -> list[ImageInputs]:
-        """The checked input, one entry per left image."""
-        return list(self._inputs)
+        plan = self.updates
+        return self.config.changed(inner_steps=plan.inner_steps, step_latents=plan.step_latents)
 
     @property
     def rigs(self) -> list[Rig]:
         """The calibration of every further view, those of the first left image first."""
-        return [rig for one in self._inputs for rig in one.rigs]
+        return [rig for given in self.inputs for rig in given.rigs]
 
     @property
     def rights(self) -> list[Tensor]:
         """The further images, ``(3, H, W)`` float32 in [0, 1] each, native size, in the order of ``rigs``."""
-        return [image for one in self._inputs for image in one.rights]
+        return [view.image_01 for given in self.inputs for view in given.views]
 
     def denoising_steps(self, requested: int | None, pipeline_default: int | None) -> int:
         """Steps of a guided call: as requested, else the pipeline's default, at least ``min_steps``."""
@@ -374,36 +318,44 @@ class GeometryGuidance:
             InputError: another number of left images than of entries; ``K`` of another image size.
         """
         count, size = lefts_01.shape[0], image_size(lefts_01)
-        if len(self._inputs) != count:
+        if len(self.inputs) != count:
             name, kind = ("right", "images") if self.rights else ("points", "entries")
-            bad_value(name, f"a list of {count} {kind}, one per left image", f"{len(self._inputs)}")
+            bad_value(name, f"a list of {count} {kind}, one per left image", f"{len(self.inputs)}")
         if self._left_size not in (None, size[::-1]):
             width, height = self._left_size
             bad_value("image", f"of {width}x{height} pixels, as the left view", f"{size[1]}x{size[0]}")
-        evidence = []
+        used = self.updates.inner_steps > 0 or self.config.correct or self.config.refine
+        needs_matches = used and bool(self.config.weights.get("matches"))
         make = make_evidence if self.evidence_store is None else self.evidence_store.get
-        for i, one in enumerate(self._inputs):
-            name = "K" if count == 1 else f"K[{i}]"
+        evidence = []
+        for i, (left_01, given) in enumerate(zip(lefts_01, self.inputs, strict=True)):
             if not self._cropped:
-                fit = (one.K_left, size[1], size[0], name, "the left image")
-                check_intrinsics_fit(*fit)
-                warn_of_other_size(*fit)
-            views, K_left, points = one.on(lefts_01.device)
-            given = EvidenceInputs(
-                lefts_01[i],
-                views,
-                K_left,
-                points,
-                self.config,
-                self._needs_matches,
-                self.unit,
-                self.measured_baseline,
-            )
-            with WithinCores():  # here too, for who asks outside of a guided call
-                evidence.append(make(given))
+                check_size_of(given.K_left, size, "K" if count == 1 else f"K[{i}]", "the left image")
+            with WithinCores():  # here too, for calls outside of a guided one
+                evidence.append(make(left_01, given, self.config, needs_matches, self.measured_baseline))
         return evidence
 
-    @property
-    def _needs_matches(self) -> bool:
-        used = self.updates.inner_steps > 0 or self.config.correct or self.config.refine
-        return used and bool(self.config.weights.get("matches"))
+
+def _check_names(config: GuidanceConfig) -> None:
+    """Refuse names of rules and terms that do not exist, naming those that do."""
+    check_choice(config.rule, "rule", RULES)
+    for name in config.weights:
+        check_choice(name, "a key of weights", TERMS)
+
+
+def _check_sufficient(config: GuidanceConfig, updates: UpdatePlan, *, views: bool, points: bool) -> None:
+    """Refuse a configuration whose search, or whose every weighted term, lacks what it works on."""
+    if config.search == "one-number" and not (views and config.weights.get("photometric")):
+        refuse("search='one-number' needs a right view and a photometric weight; search='volume' does not.")
+    if config.search == "points-range" and not points:
+        refuse("search='points-range' needs points. search='volume' works without them.")
+    weighted = [TERMS[name] for name, weight in config.weights.items() if weight]
+    idle = [
+        term
+        for term in weighted
+        if ((term.needs_warp or term.needs_matches) and not views) or (term.needs_points and not points)
+    ]
+    makes_updates = updates.inner_steps or config.inner_steps is None
+    if makes_updates and len(idle) == len(weighted):
+        cure = "photometric and matches need a right view, points needs points; inner_steps=0 needs none."
+        bad_value("weights", "above 0 for a term that can work on what is given", dict(config.weights), cure)

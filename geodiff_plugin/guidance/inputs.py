@@ -1,7 +1,6 @@
-"""Checks and sorts the input beside the left image: right views with cameras, known points.
+"""What the user gives beside the left image, in any of its forms, checked: views, cameras, points.
 
-Data flow: ``right, K, E, points`` in any of their forms -> one ``ImageInputs`` per left image.
-Paper: S3.3 (two views with known cameras); more views and points go beyond it.
+S3.3 has two views with known cameras; more views, and points, go beyond it.
 """
 
 from __future__ import annotations
@@ -20,33 +19,36 @@ from geodiff_plugin._camera_checks import (
     check_intrinsics,
     check_intrinsics_fit,
     check_pose,
+    check_size_of,
     warn_of_long_baseline,
-    warn_of_other_size,
 )
 from geodiff_plugin._checks import bad_type, bad_value, check_metres
 from geodiff_plugin.formats import as_image_01, picture_size
 from geodiff_plugin.formats.exif import warn_of_other_lens
+from geodiff_plugin.geometry import image_size
 from geodiff_plugin.types import CameraView, Rig
 
-__all__ = ["ImageInputs", "as_points", "read_inputs", "split_views"]
+__all__ = ["Inputs", "as_points", "read_inputs", "split_views"]
 
 
 @dataclass(frozen=True, eq=False)
-class ImageInputs:
-    """What is known beside one left image.
+class Inputs:
+    """What the user gave beside one left image, checked.
 
     Attributes:
         K_left: ``(3, 3)`` float64, pixels of the left image.
-        rights: the right images, ``(3, H, W)`` float32 in [0, 1] each, native size.
-        rigs: the cameras, one a right image.
+        views: the further views, of native size, on the CPU.
+        rigs: their cameras in float64, for reports and exports.
         points: ``(N, 3)`` float32 metres in the left camera's frame, or ``(H, W)`` float32 metres with 0
             where unknown; ``None`` for none.
+        unit: of the lengths, ``"m"`` or ``None``.
     """
 
     K_left: np.ndarray
-    rights: tuple[Tensor, ...]
+    views: tuple[CameraView, ...]
     rigs: tuple[Rig, ...]
     points: Tensor | None
+    unit: str | None = "m"
 
     def on(self, device: torch.device) -> tuple[list[CameraView], Tensor, Tensor | None]:
         """The further views, ``K_left``, points: float32 on a device."""
@@ -54,31 +56,17 @@ class ImageInputs:
         def moved(x: np.ndarray | Tensor) -> Tensor:
             return torch.as_tensor(x, dtype=torch.float32, device=device)
 
-        views = [
-            CameraView(moved(image), moved(rig.K_right), moved(rig.T_right_from_left))
-            for image, rig in zip(self.rights, self.rigs, strict=True)
-        ]
+        views = [CameraView(*map(moved, view)) for view in self.views]
         return views, moved(self.K_left), None if self.points is None else moved(self.points)
 
 
 def read_inputs(
     right: Any, K: Any, E: Any, points: Any, *, cropped: bool = False, unit: str | None = "m"
-) -> list[ImageInputs]:
-    """Sort out the forms that ``GeometryGuidance`` takes, and check every entry.
-
-    Args:
-        right: as in ``GeometryGuidance``.
-        K: likewise.
-        E: likewise.
-        points: likewise.
-        cropped: likewise.
-        unit: likewise.
-
-    Returns:
-        One entry per left image.
+) -> list[Inputs]:
+    """Arguments of ``GeometryGuidance`` in any of their forms, checked: one entry per left image.
 
     Raises:
-        TypeError, ValueError: anything of the wrong rank, size, number or rigidity, naming the argument.
+        InputError: anything of the wrong rank, size, number or rigidity, naming the argument.
     """
     if right is None and points is None:
         bad_value("right", "an image, or None together with points", "None without points")
@@ -88,48 +76,42 @@ def read_inputs(
         K, E = _as_tuple(K), _as_tuple(E)
     if count == 0:
         bad_value("right", "an image or a list with one image per left image", "an empty list")
-    found = [_read_one(right, K, E, points, i, count, cropped, unit) for i in range(count)]
+    inputs = []
+    for i in range(count):
+        label = "{}" if count == 1 else f"{{}}[{i}]"
+        entries = (
+            _entry(x, name, i, count)
+            for x, name in ((right, "right"), (K, "K"), (E, "E"), (points, "points"))
+        )
+        inputs.append(_read_one(*entries, label, cropped, unit))
     for name, given in (
-        ("right", [bool(one.rights) for one in found]),
-        ("points", [one.points is not None for one in found]),
+        ("right", [bool(entry.views) for entry in inputs]),
+        ("points", [entry.points is not None for entry in inputs]),
     ):
         if any(given) and not all(given):
             bad_value(name, "given for every left image or for none", f"None for {given.index(False)}")
-    return found
+    return inputs
 
 
-def _read_one(
-    right: Any, K: Any, E: Any, points: Any, i: int, count: int, cropped: bool, unit: str | None
-) -> ImageInputs:
-    """The entry of left image ``i`` of ``count``."""
-
-    def label(name: str) -> str:
-        return name if count == 1 else f"{name}[{i}]"
-
-    own_right = _entry(right, "right", i, count)
-    views = own_right if isinstance(own_right, tuple) else () if own_right is None else (own_right,)
-    names = [
-        label("right") if len(views) == 1 else f"{label('right')}, view {v + 1}," for v in range(len(views))
-    ]
-    images = tuple(as_image_01(image, name) for image, name in zip(views, names, strict=True))
-    own_K = _entry(K, "K", i, count)
-    K_left, K_rights = _intrinsics(own_K, label("K"), len(images))
-    poses = _poses(_entry(E, "E", i, count), label("E"), len(images), unit)
-    for v, (K_right, image) in enumerate(zip(K_rights, images, strict=True)):
-        if cropped:
-            break
-        name = f"{label('K')}[{_view(v, len(images))}]" if isinstance(own_K, tuple) else label("K")
-        fit = (K_right, image.shape[-1], image.shape[-2], name, "the right image")
-        check_intrinsics_fit(*fit)
-        warn_of_other_size(*fit)
-    for image, K_right, name in zip(views, K_rights, names, strict=True):
-        if isinstance(image, Image.Image):
-            warn_of_other_lens(image, K_right, name)
+def _read_one(right: Any, K: Any, E: Any, points: Any, label: str, cropped: bool, unit: str | None) -> Inputs:
+    """The entry of one left image; ``label`` makes the names in messages."""
+    given = right if isinstance(right, tuple) else () if right is None else (right,)
+    count, name = len(given), label.format("right")
+    names = [name if count == 1 else f"{name}, view {v + 1}," for v in range(count)]
+    images = [as_image_01(image, name) for image, name in zip(given, names, strict=True)]
+    K_left, K_rights = _intrinsics(K, label.format("K"), count)
+    poses = _poses(E, label.format("E"), count, unit)
     rigs = tuple(Rig(K_left, K_right, pose) for K_right, pose in zip(K_rights, poses, strict=True))
-    own_points = _entry(points, "points", i, count)
-    return ImageInputs(
-        K_left, images, rigs, None if own_points is None else as_points(own_points, label("points"))
-    )
+    for v, (K_right, image) in enumerate(zip(K_rights, images, strict=True)):
+        if not cropped:
+            K_name = f"{label.format('K')}[{_view(v, count)}]" if isinstance(K, tuple) else label.format("K")
+            check_size_of(K_right, image_size(image), K_name, "the right image")
+        if isinstance(given[v], Image.Image):
+            warn_of_other_lens(given[v], K_right, names[v])
+    matrices = [(torch.from_numpy(rig.K_right), torch.from_numpy(rig.T_right_from_left)) for rig in rigs]
+    views = tuple(CameraView(x, K.float(), T.float()) for x, (K, T) in zip(images, matrices, strict=True))
+    points = None if points is None else as_points(points, label.format("points"))
+    return Inputs(K_left, views, rigs, points, unit)
 
 
 def _is_nested_matrix(value: list[Any]) -> bool:
@@ -165,7 +147,7 @@ def _intrinsics(K: Any, name: str, views: int) -> tuple[np.ndarray, list[np.ndar
     if len(K) != 1 + views:
         expected = f"a 3x3 matrix or a tuple (K_left, K_right{', ...' if views > 1 else ''}), left one first"
         bad_value(name, expected, f"a tuple of {len(K)} for {views} right views")
-    rights = [check_intrinsics(own, f"{name}[{_view(v, views)}]") for v, own in enumerate(K[1:])]
+    rights = [check_intrinsics(matrix, f"{name}[{_view(v, views)}]") for v, matrix in enumerate(K[1:])]
     return check_intrinsics(K[0], f"{name}[left]"), rights
 
 
@@ -180,12 +162,9 @@ def _poses(E: Any, name: str, views: int, unit: str | None) -> list[np.ndarray]:
             expected = "a tuple (E_left, E_right, ...) of camera-to-world poses, left one first"
             bad_value(name, expected, f"a tuple of {len(E)} for {views} right views")
         to_left = np.linalg.inv(check_pose(E[0], f"{name}[left]"))
-        poses = [to_left @ check_pose(own, f"{name}[{_view(v, views)}]") for v, own in enumerate(E[1:])]
+        poses = [to_left @ check_pose(pose, f"{name}[{_view(v, views)}]") for v, pose in enumerate(E[1:])]
     elif views > 1:
-        expected = (
-            "a tuple (E_left, E_right, ...) of camera-to-world poses where there are several right views"
-        )
-        bad_type(name, expected, E)
+        bad_type(name, "a tuple (E_left, E_right, ...) of camera-to-world poses for several right views", E)
     else:
         poses = [check_pose(E, name)]
     for v, pose in enumerate(poses):
@@ -218,11 +197,11 @@ def as_points(value: Any, name: str) -> Tensor:
     finite = np.isfinite(array)
     if array.shape[1] == 3:
         array = array[finite.all(1)]
-        known = len(array)
+        count = len(array)
     else:
         array = np.where(finite & (array > 0), array, np.float32(0))
-        known = int(np.count_nonzero(array))
-    if not known:
+        count = int(np.count_nonzero(array))
+    if not count:
         bad_value(name, forms + ", at least one of them known", "none: all are 0, NaN or infinite")
     return torch.from_numpy(np.ascontiguousarray(array))
 
@@ -230,17 +209,10 @@ def as_points(value: Any, name: str) -> Tensor:
 def split_views(
     views: Any, *, cropped: bool = False
 ) -> tuple[tuple[int, int] | None, tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
-    """Take ``[(image, K, E), ...]`` apart, the left view first.
-
-    Args:
-        views: as in ``GeometryGuidance.from_views``.
-        cropped: as in ``GeometryGuidance``.
-
-    Returns:
-        ``(width, height)`` of the left image or ``None``, the right images, all K's and all E's.
+    """Views of ``GeometryGuidance.from_views``, left one first: its size, the right images, all K's and E's.
 
     Raises:
-        TypeError, ValueError: not at least two triples; a left K that is not for its image.
+        InputError: not at least two triples; a left K that is not for its image.
     """
     form = "a list [(image, K, E), ...] with the left view first"
     if not isinstance(views, (list, tuple)):

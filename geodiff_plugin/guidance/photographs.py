@@ -1,13 +1,9 @@
-"""Cameras, poses and scale of photographs that come without poses.
-
-Data flow: images, K's or EXIF, one known length -> tracks -> poses up to scale -> ``EstimatedRig``.
-Paper: none; it takes known cameras for granted (S3.3).
-"""
+"""Cameras, poses and scale of photographs that come without poses; S3.3 takes known cameras for granted."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,14 +16,13 @@ from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
+from geodiff_plugin.guidance.evidence import cleaned, coarse_depth
 from geodiff_plugin.guidance.inputs import as_points
-from geodiff_plugin.guidance.posing import cleaned, coarse_depth
-from geodiff_plugin.pose.estimate import EstimatedPose, estimate_pose
-from geodiff_plugin.pose.matches import GreyViews, Matcher, find_matcher, grey_views
+from geodiff_plugin.pose.estimate import estimate_poses
+from geodiff_plugin.pose.matches import find_matcher, grey_views
 from geodiff_plugin.pose.refine import polished
 from geodiff_plugin.pose.scale import Scale, find_scale
 from geodiff_plugin.pose.solve import depth_spread, open_pose
-from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
 from geodiff_plugin.types import CameraView
 
 __all__ = ["EstimatedRig", "estimate_rig"]
@@ -70,69 +65,25 @@ def _cameras(
     given = list(K) if isinstance(K, (tuple, list)) and np.ndim(K[0]) == 2 else [K] * len(images)
     if len(given) != len(images):
         bad_value("K", f"one matrix, or {len(images)} of them", f"{len(given)}")
-    found, notes = [], []
-    for i, (photograph, image, own) in enumerate(zip(photographs, images, given, strict=True)):
-        name, size = (
-            ("the left photograph" if i == 0 else f"right photograph {i}"),
-            (image.shape[-1], image.shape[-2]),
-        )
-        if own is not None:
-            own = check_intrinsics(own, f"K of {name}")
+    Ks: list[np.ndarray] = []
+    notes: list[str] = []
+    for i, (photograph, image, matrix) in enumerate(zip(photographs, images, given, strict=True)):
+        name = "the left photograph" if i == 0 else f"right photograph {i}"
+        size = (image.shape[-1], image.shape[-2])
+        if matrix is not None:
+            Ks.append(check_intrinsics(matrix, f"K of {name}"))
             if not cropped:
-                check_intrinsics_fit(own, *size, f"K of {name}", name)
+                check_intrinsics_fit(Ks[-1], *size, f"K of {name}", name)
         elif fov is not None:
-            own = intrinsics_from_fov(fov, size)
+            Ks.append(intrinsics_from_fov(fov, size))
         elif hasattr(photograph, "getexif"):
-            own, said = intrinsics_from_exif(photograph, name)
-            notes += said
+            from_exif, sentences = intrinsics_from_exif(photograph, name)
+            Ks.append(from_exif)
+            notes += sentences
         else:
             cure = "Give K, a field of view (fov), or PIL images that carry their EXIF."
             bad_value(f"K of {name}", "known", "an array without EXIF", cure)
-        found.append(own)
-    return found, notes
-
-
-def _tracks(views: GreyViews, matcher: Matcher) -> tuple[Tracks, list[EstimatedPose]]:
-    """The inliers of all views, and the pose of each, the first baseline of length 1."""
-    tracks, poses = matcher(views), []
-    for v in range(len(views.rights)):
-        name = "the two photographs" if len(views.rights) == 1 else f"the left and right photograph {v + 1}"
-        own, mirrored = tracks.view(v), 0
-        if len(own) < 30:
-            turned = replace(
-                views, rights=(views.rights[v][:, ::-1].copy(),), K_rights=views.K_rights[v : v + 1]
-            )
-            mirrored = len(matcher(turned))
-        poses.append(estimate_pose(own, name, mirrored))
-    seen = tracks.seen.copy()
-    for v, pose in enumerate(poses):
-        seen[v, tracks.seen[v]] = pose.inliers
-    tracks = replace(tracks, seen=seen)
-    return tracks, [poses[0], *(_same_unit(tracks, poses, v) for v in range(1, len(poses)))]
-
-
-def _same_unit(tracks: Tracks, poses: Sequence[EstimatedPose], v: int) -> EstimatedPose:
-    """Pose ``v`` with its baseline in units of the first one, by the points that both see."""
-    both = tracks.kept(tracks.seen[0] & tracks.seen[v])
-    if len(both) < 15:
-        bad_value(
-            "photographs", "with points that all of them show", f"{len(both)} of them in view {v + 1} too"
-        )
-    first, other = (
-        solve_inverse_depth(
-            replace(
-                both,
-                right_px=both.right_px[i : i + 1],
-                seen=both.seen[i : i + 1],
-                K_rights=both.K_rights[i : i + 1],
-            ),
-            poses[i].T[None],
-        )
-        for i in (0, v)
-    )
-    T = poses[v].T.copy()
-    T[:3, 3] *= np.median(other / np.maximum(first, 1e-9))
-    return replace(poses[v], T=T)
+    return Ks, notes
 
 
 def _listed(points: Tensor, K_left: Tensor, size: tuple[int, int]) -> np.ndarray:
@@ -155,20 +106,10 @@ def estimate_rig(
     matcher: str = "sift",
     cropped: bool = False,
 ) -> EstimatedRig:
-    """Cameras of two photographs or more, left one first.
-
-    Args:
-        photographs: as ``GeometryGuidance`` takes images.
-        K: ``(3, 3)`` for all, or one for each; ``None`` for ``fov`` or EXIF.
-        fov: horizontal field of view of all, degrees.
-        baseline_m: distance of the first right camera from the left one.
-        known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left photograph and their distance.
-        points: ``(N, 3)`` metres in the left camera's frame, or a sparse depth map ``(H, W)`` of it.
-        matcher: of distinct points, see ``pose.matches.find_matcher``.
-        cropped: the photographs are crops, so the principal point of a given K may lie outside of them.
+    """Cameras of two photographs or more, left one first; arguments as ``GeometryGuidance.from_photographs``.
 
     Raises:
-        TypeError, ValueError: PoseLib is not installed; no K, or no pose to be had (``pose.estimate``).
+        InputError: PoseLib is not installed; no K, or no pose to be had (``pose.estimate``).
     """
     if len(photographs) < 2:
         bad_type("photographs", "two images or more", photographs)
@@ -179,7 +120,7 @@ def estimate_rig(
         check_number(baseline_m, "baseline_m", 1e-6, 1e6)
     K_left = torch.as_tensor(Ks[0], dtype=torch.float32, device="cpu")
     size = image_size(images[0])
-    own_points = None if points is None else _listed(as_points(points, "points"), K_left, size)
+    cloud = None if points is None else _listed(as_points(points, "points"), K_left, size)
     images = [cleaned(image, DEFAULT) for image in images]
 
     def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
@@ -189,23 +130,21 @@ def estimate_rig(
         ]
 
     nowhere = posed([np.eye(4)] * (len(images) - 1))
-    tracks, poses = _tracks(grey_views(images[0], nowhere, K_left), find_matcher(matcher))
+    tracks, poses = estimate_poses(grey_views(images[0], nowhere, K_left), find_matcher(matcher))
     Ts = np.stack([pose.T for pose in poses])
     rights, spread = posed(Ts), None
     if not all(pose.rectified for pose in poses):
-        Ts, tracks = polished(
-            images[0],
-            rights,
-            K_left,
-            lambda views: coarse_depth(images[0], views, K_left),
-            tracks.seen_anywhere(),
-        )
+
+        def first_depth(views: Sequence[CameraView]) -> Tensor:
+            return coarse_depth(images[0], views, K_left)
+
+        Ts, tracks = polished(images[0], rights, K_left, first_depth, tracks.seen_anywhere())
         spread = depth_spread(tracks, Ts)
     factor = tracks.K_left[0, 0] / Ks[0][0, 0]
-    scale = find_scale(tracks, Ts, factor, baseline_m, known_length, own_points)
+    scale = find_scale(tracks, Ts, factor, baseline_m, known_length, cloud)
     Ts[:, :3, 3] *= scale.factor
     return EstimatedRig(
-        (images[0].shape[-1], images[0].shape[-2]),
+        size[::-1],
         tuple(Ks),
         tuple(np.linalg.inv(T) for T in Ts),
         tuple(int(pose.inliers.sum()) for pose in poses),

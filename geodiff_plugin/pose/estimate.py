@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -11,9 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.pose.matches import GreyViews, Matcher
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
-__all__ = ["EstimatedPose", "estimate_pose", "parallax_deg"]
+__all__ = ["EstimatedPose", "estimate_pose", "estimate_poses", "parallax_deg"]
 
 #: An inlier lies nearer to its epipolar line, or to its place under a simpler motion, than this.
 INLIER_PX = 2.0
@@ -133,6 +135,60 @@ def estimate_pose(
     return EstimatedPose(
         T, inliers, parallax, float(np.median(residual[inliers])), sideways is not None, tuple(warnings)
     )
+
+
+def estimate_poses(views: GreyViews, matcher: Matcher) -> tuple[Tracks, list[EstimatedPose]]:
+    """Poses of the right views of two photographs or more, matched anew.
+
+    Args:
+        views: the photographs, without poses that mean anything.
+        matcher: of distinct points.
+
+    Returns:
+        The inliers of all views, and the pose of each; the first baseline has length 1.
+
+    Raises:
+        InputError: as ``estimate_pose``; or views that share too few points with the first one.
+    """
+    tracks, poses = matcher(views), []
+    for v in range(len(views.rights)):
+        name = "the two photographs" if len(views.rights) == 1 else f"the left and right photograph {v + 1}"
+        seen_here, mirrored = tracks.view(v), 0
+        if len(seen_here) < 30:
+            turned = replace(
+                views, rights=(views.rights[v][:, ::-1].copy(),), K_rights=views.K_rights[v : v + 1]
+            )
+            mirrored = len(matcher(turned))
+        poses.append(estimate_pose(seen_here, name, mirrored))
+    seen = tracks.seen.copy()
+    for v, pose in enumerate(poses):
+        seen[v, tracks.seen[v]] = pose.inliers
+    tracks = replace(tracks, seen=seen)
+    return tracks, [poses[0], *(_same_unit(tracks, poses, v) for v in range(1, len(poses)))]
+
+
+def _same_unit(tracks: Tracks, poses: Sequence[EstimatedPose], v: int) -> EstimatedPose:
+    """Pose ``v`` with its baseline in units of the first one, by the points that both see."""
+    both = tracks.kept(tracks.seen[0] & tracks.seen[v])
+    if len(both) < 15:
+        bad_value(
+            "photographs", "with points that all of them show", f"{len(both)} of them in view {v + 1} too"
+        )
+    first, other = (
+        solve_inverse_depth(
+            replace(
+                both,
+                right_px=both.right_px[i : i + 1],
+                seen=both.seen[i : i + 1],
+                K_rights=both.K_rights[i : i + 1],
+            ),
+            poses[i].T[None],
+        )
+        for i in (0, v)
+    )
+    T = poses[v].T.copy()
+    T[:3, 3] *= np.median(other / np.maximum(first, 1e-9))
+    return replace(poses[v], T=T)
 
 
 def _five_points(tracks: Tracks) -> np.ndarray:

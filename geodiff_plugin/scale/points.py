@@ -1,8 +1,6 @@
-"""Scale from matches and known points: which minimum is right, and the fit within it.
+"""Metres from matches and points: which minimum of the search is right, the fit within it, near against far.
 
-Data flow: matches or points, relative map ``x (B, 1, h, w)``
-    -> depths of its nearest and farthest end, per sample.
-Paper: none; the range of the points is where Marigold-DC starts (Viola et al. 2024, Eq. 2).
+The range of the points is where Marigold-DC starts (Viola et al. 2024, Eq. 2).
 """
 
 from __future__ import annotations
@@ -20,11 +18,13 @@ from geodiff_plugin.matching.matches import UNIT
 from geodiff_plugin.scale.space import SPACES, MetricMap, Space
 
 __all__ = [
+    "RELIABLE",
     "depth_span",
     "fit_to_points",
+    "order_agreement",
     "ordered",
     "refine_to_matches",
-    "sure_matches",
+    "reliable_matches",
     "weighted_quantile",
 ]
 
@@ -43,24 +43,26 @@ FIT_ITERATIONS, FIT_SAMPLES = 12, 20_000
 FIT_NOISE, FIT_FLOOR, FIT_CAUCHY = 0.5, 4e-3, 2.0
 #: How far near and far may move, as log factors.
 NEAR_REACH, FAR_REACH = 1.4, 0.7
+#: Reliable matches that the order of near and far is read from; fewer than the last number say nothing.
+ORDER_SAMPLES, ORDER_FEWEST = 4000, 40
 # What a match leaves to doubt, ``1 - confidence``, tells its variance as well: on pairs with truth the error
 # of matches, in planes, grows with its root. At the first ``FIT_NOISE`` holds; it falls to a share of it.
 _REFERENCE_DOUBT, _LEAST_DOUBT = 0.04, 0.16
 
 
 def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
-    """Metres, ``()`` each, of the nearest and the farthest known point."""
-    known = points.inverse_depth.flatten()[points.above(0.0)]
-    return 1.0 / known.amax(), 1.0 / known.amin()
+    """Metres, ``()`` each, of the nearest and the farthest point."""
+    inverse_depth = points.inverse_depth.flatten()[points.above(0.0)]
+    return 1.0 / inverse_depth.amax(), 1.0 / inverse_depth.amin()
 
 
-def sure_matches(matches: Matches) -> Matches | None:
+def reliable_matches(matches: Matches) -> Matches | None:
     """The matches that are more likely right than wrong, as if they were points; ``None`` for too few."""
-    sure = (matches.confidence > RELIABLE) & (matches.inverse_depth > matches.plane_step)
-    if int(sure.sum()) < FEWEST_RELIABLE:
+    reliable = (matches.confidence > RELIABLE) & (matches.inverse_depth > matches.plane_step)
+    if int(reliable.sum()) < FEWEST_RELIABLE:
         return None
-    unit = UNIT * matches.inverse_depth[sure].median()
-    return replace(matches, confidence=sure.float(), plane_step=unit)
+    unit = UNIT * matches.inverse_depth[reliable].median()
+    return replace(matches, confidence=reliable.float(), plane_step=unit)
 
 
 @torch.no_grad()
@@ -85,13 +87,13 @@ def fit_to_points(
     at = points.above(0.0)
     at = at[:: max(1, -(-len(at) // BASIN_SAMPLES))]
     target = points.inverse_depth.flatten()[at]
-    values = F.interpolate(x.float(), points.size, mode="bilinear", align_corners=False).flatten(1)[:, at]
+    values = _values_at(x, points.size, at)
     nearest, farthest = depth_span(points)
     low, high = (nearest / BASIN_REACH).log(), (farthest * BASIN_REACH).log()
     steps = torch.linspace(0, 1, BASIN_CANDIDATES, dtype=low.dtype, device=x.device)
     grid = torch.exp(low + (high - low) * steps)
     i, j = torch.triu_indices(len(grid), len(grid), 1, device=x.device)
-    found = []
+    best_ends = []
     for b, row in enumerate(values):
         near, far = grid[i], grid[j]
         if current is not None:
@@ -102,8 +104,8 @@ def fit_to_points(
         best = cost.argmin(keepdim=True)  # a 0-d index would be read back
         if current is not None:
             best = torch.where(cost[:1] <= BASIN_KEEP * cost[best], torch.zeros_like(best), best)
-        found.append(torch.cat([near[best], far[best]]))
-    nearest, farthest = torch.stack(found).unbind(1)
+        best_ends.append(torch.cat([near[best], far[best]]))
+    nearest, farthest = torch.stack(best_ends).unbind(1)
     return nearest, farthest
 
 
@@ -128,8 +130,7 @@ def refine_to_matches(
         match's own noise and of what the map leaves over, which is measured at every iteration: a map that
         is right is fitted to the noise of its matches, one that errs as a whole.
     """
-    height, width = matches.size
-    at = matches.above(0.0)  # known points are few: not one may be missed
+    at = matches.above(0.0)  # points are few: not one may be missed
     if not len(at):
         return near_m, far_m
     at = at[:: max(1, len(at) // FIT_SAMPLES)]
@@ -137,7 +138,7 @@ def refine_to_matches(
     confidence = matches.confidence.flatten()[at]
     doubt = ((1.0 - confidence) / _REFERENCE_DOUBT).clamp_min(_LEAST_DOUBT)
     fitted = _Fitted(inverse, confidence, doubt.sqrt(), FIT_NOISE * matches.plane_step)
-    values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
+    values = _values_at(x, matches.size, at)
     form = SPACES[space]
     start = _ends(form, near_m, far_m)
     reach = _ends(form, near_m / math.exp(NEAR_REACH), far_m / math.exp(FAR_REACH))
@@ -214,6 +215,42 @@ def _refine_once(
     alone = ends - (gradient + normal.flip(2).diagonal(dim1=1, dim2=2) * moved.flip(1)) / (diagonal + 1e-20)
     settled = torch.where((bound != free).flip(1), alone, bound)
     return torch.minimum(torch.maximum(settled, bounds[0]), bounds[1])
+
+
+def _ranks(values: Tensor) -> Tensor:
+    """Ranks along the last axis, about 0 and of length 1; equal values are ranked as they come."""
+    ranks = values.argsort(-1).argsort(-1).float()
+    ranks = ranks - ranks.mean(-1, keepdim=True)
+    return ranks / ranks.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+
+
+@torch.no_grad()
+def order_agreement(x: Tensor, matches: Matches, space: str) -> Tensor:
+    """Spearman's rank correlation of nearness, as the map and as matches or points have it.
+
+    Args:
+        x: ``(B, 1, h, w)`` relative maps of one image, of the prior alone: before any match moved them.
+        matches: matches or points of that image, on any grid.
+        space: what ``x`` is affine in, key of ``SPACES``.
+
+    Returns:
+        ``(B,)`` in [-1, 1]; NaN where fewer than 40 matches are reliable.
+
+    Convention:
+        Cameras in the wrong order turn near into far: -1 where +1 is right.
+    """
+    at = matches.above(RELIABLE)
+    if len(at) < ORDER_FEWEST:
+        return x.new_full((x.shape[0],), torch.nan)
+    at = at[:: max(1, len(at) // ORDER_SAMPLES)]
+    values = _values_at(x, matches.size, at)
+    nearness = -values if SPACES[space].grows_with_depth else values
+    return (_ranks(nearness) * _ranks(matches.inverse_depth.flatten()[at])[None]).sum(-1)
+
+
+def _values_at(x: Tensor, size: tuple[int, int], at: Tensor) -> Tensor:
+    """``(B, P)`` values of maps ``(B, 1, h, w)`` at flat indices of a grid of another size."""
+    return F.interpolate(x.float(), size, mode="bilinear", align_corners=False).flatten(1)[:, at]
 
 
 def weighted_quantile(values: Tensor, weight: Tensor, share: float | Tensor) -> Tensor:

@@ -1,7 +1,6 @@
 """From a relative map to metres: an affine map with positive scale and shift, times a global scale.
 
-Data flow: ``x (B, 1, H, W)`` unclipped relative map, ``s_hat, t_hat, g_s (B,)`` -> ``depth_m (B, 1, H, W)``.
-Paper: S4.1, Eq. 10 and 13 (eq:metric), Eq. 16 (no label); ``square`` is Marigold-DC's (its Eq. 2).
+S4.1, Eq. 10 and 13 (eq:metric), Eq. 16 (no label); ``square`` is Marigold-DC's (its Eq. 2).
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Search for the scale of a relative map, by lookup in a plane-sweep volume.
 
-Data flow: ``CostVolume``, relative map ``x (B, 1, h, w)`` -> depths of ``x = 0`` and ``x = 1``, per sample.
-Paper: S7.3 (pre-selection of g_s, "a variant of the traditional Plane Sweep Volume technique").
+S7.3 (pre-selection of g_s, "a variant of the traditional Plane Sweep Volume technique").
 
 The paper's one number, x = g_s x_rel, prefers depths at which every pixel leaves the right image;
 (near, far) jointly, on pixels that stay in view, does not (docs/reference/paper-map.md).
@@ -11,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -35,8 +35,7 @@ KEEP_MARGIN = 2e-3
 IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.6, 0.25
 
 
-@dataclass(frozen=True)
-class ScaleSearch:
+class ScaleSearch(NamedTuple):
     """Result of a search, ``(B,)`` each.
 
     Attributes:
@@ -111,47 +110,49 @@ def search_scale(
     cost, in_view = volume.at_pixels(at)
     least = IN_VIEW_RECTIFIED if volume.rectified else IN_VIEW_POSED
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
-    coarse, fine = COARSE_GRID, FINE_GRID
-    grid = torch.linspace(0, 1, coarse, dtype=values.dtype, device=x.device)
-    log_low, log_span = math.log(low), math.log(high / low)
-    i, j = torch.triu_indices(coarse, coarse, 1, device=x.device)
-    offsets = torch.linspace(-1, 1, fine, dtype=values.dtype, device=x.device)
-    found = []
-    for b in range(x.shape[0]):
 
-        def best_of(
-            near: Tensor, far: Tensor, row: Tensor = values[b], every: int = 1
-        ) -> tuple[Tensor, Tensor, Tensor]:
-            depth = SPACES[space].depth_at(row[None, ::every], near[:, None], far[:, None])
-            mean, share = _lookup(
-                cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth, COST_CLAMP
-            )
-            mean = mean + (share < least) * 1.0  # only if no pair keeps enough in view does one of these win
-            k = mean.argmin(keepdim=True)  # a 0-d index would be read back
-            return near[k], far[k], mean[k]
+    def best_of(row: Tensor, near: Tensor, far: Tensor, every: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+        """The best of candidate ends ``(M,)`` for the values of one map, and its cost, ``(1,)`` each."""
+        depth = SPACES[space].depth_at(row[None, ::every], near[:, None], far[:, None])
+        mean, share = _lookup(cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth, COST_CLAMP)
+        mean = mean + (share < least) * 1.0  # only if no pair keeps enough in view does one of these win
+        k = mean.argmin(keepdim=True)  # a 0-d index would be read back
+        return near[k], far[k], mean[k]
 
-        def to_m(u: Tensor) -> Tensor:
-            return torch.exp(log_low + log_span * u)
-
-        near, far, mean = best_of(to_m(grid[i]), to_m(grid[j]), every=max(1, len(at) // COARSE_SAMPLES))
-        reach = log_span / (coarse - 1)
-        for _ in range(2):
-            n = near.log() + reach * offsets.repeat_interleave(fine)
-            f = far.log() + reach * offsets.repeat(fine)
-            n, f = n.exp().clamp(low, high), f.exp().clamp(low, high)
-            near, far, mean = best_of(torch.minimum(n, f), torch.maximum(n, f))
-            reach = reach / (fine - 1) * 2
+    results = []
+    for b, row in enumerate(values):
+        near, far, mean = _coarse_to_fine(partial(best_of, row), low, high, row, len(at))
         if current is not None:
             a, c = (v[b : b + 1] for v in current)
-            now = best_of(torch.minimum(a, c), torch.maximum(a, c))
+            now = best_of(row, torch.minimum(a, c), torch.maximum(a, c))
             kept = now[2] <= mean + KEEP_MARGIN
             near, far, mean = (
                 torch.where(kept, old, new) for old, new in zip(now, (near, far, mean), strict=True)
             )
         # The volume's own near end lies nearer than anything seen, so only a given one can cut a scene off.
         on_edge = (far >= high * 0.98) | ((near <= low * 1.02) & (depth_range is not None))
-        found.append((near, far, mean, on_edge))
-    return ScaleSearch(*(torch.cat(column) for column in zip(*found, strict=True)))
+        results.append((near, far, mean, on_edge))
+    return ScaleSearch(*(torch.cat(column) for column in zip(*results, strict=True)))
+
+
+def _coarse_to_fine(
+    best_of: Callable[..., tuple[Tensor, Tensor, Tensor]], low: float, high: float, like: Tensor, samples: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Near and far in [low, high], and their cost, ``(1,)`` each: a coarse grid, then two finer ones."""
+    grid = torch.linspace(0, 1, COARSE_GRID, dtype=like.dtype, device=like.device)
+    log_low, log_span = math.log(low), math.log(high / low)
+    i, j = torch.triu_indices(COARSE_GRID, COARSE_GRID, 1, device=like.device)
+    offsets = torch.linspace(-1, 1, FINE_GRID, dtype=like.dtype, device=like.device)
+    ends = (torch.exp(log_low + log_span * grid[k]) for k in (i, j))
+    near, far, mean = best_of(*ends, every=max(1, samples // COARSE_SAMPLES))
+    reach = log_span / (COARSE_GRID - 1)
+    for _ in range(2):
+        n = near.log() + reach * offsets.repeat_interleave(FINE_GRID)
+        f = far.log() + reach * offsets.repeat(FINE_GRID)
+        n, f = n.exp().clamp(low, high), f.exp().clamp(low, high)
+        near, far, mean = best_of(torch.minimum(n, f), torch.maximum(n, f))
+        reach = reach / (FINE_GRID - 1) * 2
+    return near, far, mean
 
 
 def argmin_over(candidates: Tensor, cost: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:

@@ -163,7 +163,7 @@ def test_a_map_of_known_depths_goes_through_the_lens(pair_files, millimetres) ->
     cameras = FOUR | {"baseline": 0.12, "distortion": (LENS,)}
     options = DepthOptions(left=pair_files.left, right=pair_files.right, **known, **cameras)
     inputs = read_inputs(options, options.config())
-    found = inputs.guidance._inputs[0].points.numpy()
+    found = inputs.guidance.inputs[0].points.numpy()
     np.testing.assert_allclose(found, expected_points(), atol=1e-4)
     lens, K = distortion_from_text(LENS), inputs.rig.K_left
     with pytest.raises(InputError, match="--points must be a map of .* 32x24 pixels; got 64x48"):

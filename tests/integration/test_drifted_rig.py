@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
-from geodiff_plugin.guidance.posing import pose_views
+from geodiff_plugin.guidance.evidence import pose_views
 from tests.scenes import render_pair
 
 

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.guidance.posing import pose_views
+from geodiff_plugin.guidance.evidence import pose_views
 from geodiff_plugin.types import CameraView
 from tests.conftest import plane_pair
 from tests.contracts.tiny_priors import TINY

@@ -10,10 +10,10 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GuidanceConfig
-from geodiff_plugin.algorithm.evidence import EvidenceInputs
 from geodiff_plugin.cli.inputs import pinhole
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
-from geodiff_plugin.guidance.evidence_store import make_evidence
+from geodiff_plugin.guidance.evidence import make_evidence
+from geodiff_plugin.guidance.inputs import Inputs
 from geodiff_plugin.matching import clean, find_matches
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.cleaning import find_flaws
@@ -120,9 +120,9 @@ def test_fewer_matches_are_wrong(pair: SyntheticPair, flawed) -> None:
 @pytest.mark.parametrize("switched_on", [True, False])
 def test_evidence_is_of_cleaned_photographs(pair: SyntheticPair, switched_on: bool) -> None:
     left, right = (compressed(view.image_01, 40) for view in (pair.left, pair.right))
-    views = [CameraView(right, pair.K_right.float(), torch.linalg.inv(pair.E).float())]
+    views = (CameraView(right, pair.K_right.float(), torch.linalg.inv(pair.E).float()),)
     config = GuidanceConfig(pose="given", clean_photographs=switched_on)
-    made = make_evidence(EvidenceInputs(left, views, pair.K_left.float(), None, config, False))
+    made = make_evidence(left, Inputs(pair.K_left.numpy(), views, (), None), config, False)
     assert torch.equal(made.left_01, clean(left, GRID) if switched_on else left)
     assert torch.equal(made.native[0].image_01, clean(right, GRID) if switched_on else right)
 

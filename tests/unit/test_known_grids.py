@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.evidence import EvidenceInputs, chunk_views, prepare_evidence
+from geodiff_plugin.algorithm.evidence import chunk_views, prepare_evidence
 from geodiff_plugin.algorithm.objective import Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry import warp_right_to_left
@@ -34,7 +34,7 @@ def wide_pair(size_right, focal_right, at_m=0.1):
     views = [CameraView(images[1], torch.from_numpy(K_right).float(), T)]
     config = GuidanceConfig().changed(loss_resolution=640, search="one-number")
     K_left = torch.from_numpy(K).float()
-    return prepare_evidence(EvidenceInputs(images[0], views, K_left, None, config, needs_matches=False))
+    return prepare_evidence(images[0], views, K_left, None, config, needs_matches=False)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.algorithm.evidence import EvidenceInputs, prepare_evidence
+from geodiff_plugin.algorithm.evidence import prepare_evidence
 from geodiff_plugin.cli.report import summary_line
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.runtime.start import PROMPT_LONG_EDGE, depth_prompt
@@ -108,16 +108,9 @@ def evidence_of(pair, points=None, rights=True):
 
     T = torch.tensor(np.linalg.inv(pair.E)).float()
     right = CameraView(image(pair.right), torch.tensor(pair.K).float(), T)
-    return prepare_evidence(
-        EvidenceInputs(
-            image(pair.left),
-            [right] if rights else [],
-            torch.tensor(pair.K).float(),
-            points,
-            GuidanceConfig().changed(loss_resolution=512),
-            needs_matches=rights,
-        )
-    )
+    config = GuidanceConfig(loss_resolution=512)
+    K_left = torch.tensor(pair.K).float()
+    return prepare_evidence(image(pair.left), [right] if rights else [], K_left, points, config, rights)
 
 
 def test_matches_become_a_dense_prompt(textured_plane):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.scale.points import fit_to_points, sure_matches
+from geodiff_plugin.scale.points import fit_to_points, reliable_matches
 from geodiff_plugin.scale.space import MetricMap
 
 SIZE = (40, 60)
@@ -28,7 +28,7 @@ def street():
 
 def test_a_wrong_basin_is_left_and_a_right_one_kept(street):
     depth_m, x = street
-    sure = sure_matches(matches_of(depth_m))
+    sure = reliable_matches(matches_of(depth_m))
     metric = MetricMap("disparity")
     wrong = (torch.tensor([42.0]), torch.tensor([84.0]))
     near, far = fit_to_points(x, sure, metric, wrong)
@@ -41,9 +41,9 @@ def test_a_third_of_wrong_matches_does_not_matter(street):
     depth_m, x = street
     wrong = depth_m.clone()
     wrong[:, :, :20] = 5.0
-    near, far = fit_to_points(x, sure_matches(matches_of(wrong)), MetricMap("disparity"))
+    near, far = fit_to_points(x, reliable_matches(matches_of(wrong)), MetricMap("disparity"))
     assert near.item() == pytest.approx(6.0, rel=0.3) and far.item() > 30.0
 
 
 def test_too_few_sure_matches_say_nothing(street):
-    assert sure_matches(matches_of(street[0], confidence=0.4)) is None
+    assert reliable_matches(matches_of(street[0], confidence=0.4)) is None

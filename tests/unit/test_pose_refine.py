@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.guidance.posing import coarse_depth, pose_views
+from geodiff_plugin.guidance.evidence import coarse_depth, pose_views
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.refine import fit_displacement, straightened, undecided
 from geodiff_plugin.pose.scale import refined_scale

@@ -17,7 +17,7 @@ import torch
 import geodiff_plugin
 from geodiff_plugin import GeometryGuidance, geometry
 from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit, warn_of_other_size
-from geodiff_plugin.algorithm.evidence import EvidenceInputs, as_fine_as, prepare_evidence, resize_long_edge
+from geodiff_plugin.algorithm.evidence import as_fine_as, prepare_evidence, resize_long_edge
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.figures.maps import render_cloud
@@ -41,6 +41,8 @@ HAS_GRADIO = importlib.util.find_spec("gradio") is not None
 #: Functions that hand a camera matrix on or read no coordinate of it, beside those with a test below.
 HAND_ON = {
     "_camera_checks.check_intrinsics_fit",  # the principal point alone
+    "_camera_checks.check_size_of",
+    "algorithm.evidence.prepare_evidence",
     "_camera_checks.warn_of_other_size",
     "evaluation.datasets.booster._quarter_intrinsics",  # by resize_intrinsics
     "formats.rigs.make_rig",
@@ -49,7 +51,7 @@ HAND_ON = {
     "matching.build.find_matches",
     "matching.build.pilot_volume",
     "runtime.confidence.reprojection",  # to warp_right_to_left
-    "cli.lenses.pinhole",  # to OpenCV
+    "cli.inputs.pinhole",  # to OpenCV
     "cli.inputs.read_known",
     "formats.exif.warn_of_other_lens",  # the focal length alone
     "app.measure.read_pixel",
@@ -58,8 +60,8 @@ HAND_ON = {
     "formats.distortion.undistorted_points",
     "formats.clouds.make_cloud",
     "guidance.photographs.estimate_rig",
-    "guidance.posing.coarse_depth",
-    "guidance.posing.pose_views",
+    "guidance.evidence.coarse_depth",
+    "guidance.evidence.pose_views",
     "pose.refine.polished",
     "pose.refine.refine_views",
     "pose.tracks.project_tracks",
@@ -185,7 +187,7 @@ def test_the_sweep_and_all_that_is_made_of_it():
         assert float((1 / found.inverse_depth[sure]).median()) == pytest.approx(2.0, rel=0.04)
     assert not mirrored_pose_preferred(left, rights, camera)
     config = GuidanceConfig().changed(loss_resolution=48)
-    known = prepare_evidence(EvidenceInputs(left, rights, camera, None, config, needs_matches=True))
+    known = prepare_evidence(left, rights, camera, None, config, needs_matches=True)
     matched = known.sweep_matches.confidence > 0.5
     assert float((1 / known.sweep_matches.inverse_depth[matched]).median()) == pytest.approx(2.0, rel=0.04)
     np.testing.assert_allclose(

@@ -16,7 +16,7 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.runtime.verdict import Indicators, judge, points_agreement, read_indicators
-from geodiff_plugin.scale.order import order_agreement
+from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.types import PoseReport
 from tests.scenes import render_pair
 

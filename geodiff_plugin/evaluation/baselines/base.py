@@ -16,7 +16,7 @@ import torch
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.bundled.loading import no_bars
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.guidance.evidence_store import EvidenceStore
+from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.priors.hf_model import HFDepthModel
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance

@@ -38,8 +38,8 @@ from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import FigureOptions
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import hidden_in_right, warp_right_to_left
+from geodiff_plugin.guidance.evidence import pose_views
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.posing import pose_views
 from geodiff_plugin.plotting import depth_range
 from geodiff_plugin.pose.matches import grey_views, sparse_tracks
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, residuals_px
