@@ -408,7 +408,7 @@ def _write_mp4(path: Path, size: tuple[int, int], frames: Iterable[Image.Image],
     width, height = (side // 2 * 2 for side in size)  # H.264 and its like want even sides
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
     if not writer.isOpened():
-        raise OSError("OpenCV cannot open it")
+        raise InputFileError(f"the video must be one that OpenCV can write; got {path.suffix}.")
     try:
         for frame in frames:
             writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))

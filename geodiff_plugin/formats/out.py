@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self, TypeVar
+from typing import IO, NoReturn, Self, TypeVar
 
 from tqdm import tqdm
 
@@ -216,11 +216,9 @@ class OutFolder:
                 self._staging = _hidden(self._target, PARTIAL)
                 self._clear_leftovers()
                 if shutil.disk_usage(self._staging.parent).free < LEAST_FREE_BYTES:
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                    self._refuse_place(os.strerror(errno.ENOSPC))
             except OSError as error:
-                cure = "Name another with --out, or free disk space and check its permissions."
-                got = f"{self.path} ({reason_of(error)})"
-                bad_value(self._option, "a folder that can be written to", got, cure)
+                self._refuse_place(reason_of(error))
             stack.callback(shutil.rmtree, self._staging, ignore_errors=True)
             self._stack = stack.pop_all()
         return self
@@ -229,6 +227,10 @@ class OutFolder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
+
+    def _refuse_place(self, reason: str) -> NoReturn:
+        cure = "Name another with --out, or free disk space and check its permissions."
+        bad_value(self._option, "a folder that can be written to", f"{self.path} ({reason})", cure)
 
     def _refuse_inputs(self) -> None:
         """Refuse a folder with an input of this run among the files that it replaces or deletes."""
