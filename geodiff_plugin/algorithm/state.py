@@ -108,11 +108,6 @@ class Trajectory:
     def affine(self, moved: AffineState) -> None:
         self._affine = moved
 
-    @property
-    def has_scale(self) -> bool:
-        """Whether a search, or the frame before, has set scale and shift."""
-        return self._affine is not None
-
     def prepare(self, x: Tensor, z0: Tensor) -> None:
         """What an estimate decides before it is corrected or compared: scale, which matches to believe.
 
