@@ -39,7 +39,7 @@ class Schedule:
 
     def moves_at(self, step: int) -> bool:
         """Whether the step differs from the prior's own."""
-        return self.moves and bool(self.steps[step])
+        return self.moves and any(r.corrects or r.updates for r in self.steps[step])
 
     def __str__(self) -> str:
         return "\n".join(self._lines())
