@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 
-def promised(evidence: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
+def promised(evidence: np.ndarray, coefficients: Sequence[float] | np.ndarray) -> np.ndarray:
     """Probability ``(N,)`` of evidence ``(N, F)`` under coefficients ``(F,)``."""
     return expit(evidence @ np.asarray(coefficients, np.float64))
 
@@ -153,10 +153,11 @@ def observe_emulated(sample: StereoSample, strengths: Sequence[str]) -> list[Obs
     """
     if sample.valid.mean() < DENSE:
         return []
-    prior, settings = EmulatedPrior(), Settings(steps=4, resolution=384)
+    resolution = 384
+    prior, settings = EmulatedPrior(), Settings(steps=4, resolution=resolution)
     priors, found = EmulatedPriors(prior), []
     for name in strengths:
-        prior.answer(sample, STRENGTHS[name], settings.resolution, settings.seed)
+        prior.answer(sample, STRENGTHS[name], resolution, settings.seed)
         found.append(observe_depth(sample, settings, priors))
     return found
 

@@ -131,13 +131,14 @@ class _Denoiser(ModelMixin, ConfigMixin):
         self._last: Tensor | None = None
 
     def forward(self, sample: Tensor, timestep: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor]:
+        assert self.code is not None  # set by ``EmulatedPrior.answer``
         z_t = sample[:, -self.code.shape[1] :].float()
         level = noise_level(self.scheduler, timestep)
         own = self.code.expand_as(z_t)
         starts = self._last is None or timestep >= self._last  # a schedule falls, so this one is new
         self._last = timestep
         z0 = own
-        if not starts:
+        if not starts and self._noise is not None:
             implied = (z_t - level.sigma * self._noise) / level.alpha
             z0 = (1.0 - self.config.follow) * own + self.config.follow * implied
         self._noise = (z_t - level.alpha * z0) / level.sigma  # what its input holds beside that

@@ -220,12 +220,12 @@ def confidence_deciles(
     error = np.abs(pred_m[used] - truth_m[used]) / truth_m[used]
     promised = confidence[used]
     decile = np.minimum((promised * 10).astype(int), 9)
-    found = []
+    found: list[dict[str, float | None]] = []
     for k in range(10):
         own = decile == k
         values = {"promised": promised, "kept": error < within, "abs_rel": error}
         means = {name: float(np.mean(v[own])) if own.any() else None for name, v in values.items()}
-        found.append({"share": float(own.mean()) if own.size else 0.0} | means)
+        found.append({"share": float(own.mean()) if own.size else 0.0, **means})
     return found
 
 
@@ -246,10 +246,10 @@ def to_space(depth_m: np.ndarray, space: str) -> np.ndarray:
 def _from_space(values: np.ndarray, space: str) -> np.ndarray:
     """Metres of values in a space; where values fall with depth, none is less than that of a kilometre."""
     kind, metre = SPACES[space], torch.ones((), dtype=torch.float64)
-    values = torch.from_numpy(np.asarray(values, np.float64))
+    x = torch.from_numpy(np.asarray(values, np.float64))
     if not kind.grows_with_depth:
-        values = values.clamp_min(float(kind.inverse(metre / MIN_DISPARITY)))
-    return kind.forward(values, metre).numpy()
+        x = x.clamp_min(float(kind.inverse(metre / MIN_DISPARITY)))
+    return kind.forward(x, metre).numpy()
 
 
 def least_squares(values: np.ndarray, target: np.ndarray, mask: np.ndarray) -> tuple[float, float]:

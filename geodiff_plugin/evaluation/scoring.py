@@ -6,6 +6,7 @@ Paper: S5.1 (metrics, raw and aligned).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -116,7 +117,7 @@ def regions(sample: StereoSample) -> dict[str, np.ndarray]:
     return masks
 
 
-def _plain(scores: dict[str, float | None]) -> dict[str, float | None]:
+def _plain(scores: Mapping[str, float | None]) -> dict[str, float | None]:
     """Rounded to 7 digits; NaN becomes ``None``, which JSON has a word for."""
     return {k: None if v is None or math.isnan(v) else float(f"{v:.7g}") for k, v in scores.items()}
 
@@ -129,8 +130,9 @@ def _split(depth_m: np.ndarray, sample: StereoSample, cap_m: float | None) -> di
     return _plain(scores)
 
 
-def _positive(depth_m: np.ndarray) -> np.ndarray:
+def _positive(depth_m: np.ndarray | None) -> np.ndarray:
     """The map with NaN where it is not a positive number."""
+    assert depth_m is not None  # a prediction has metres where it has no relative map
     return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
 
 

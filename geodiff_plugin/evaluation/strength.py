@@ -68,7 +68,8 @@ def strength_tables(records: Sequence[Record]) -> tuple[Table, ...]:
 def _table(title: str, records: Sequence[Record]) -> Table:
     strengths = list(dict.fromkeys(record["strength"] for record in records))
     methods = list(dict.fromkeys(record["method"] for record in records))
-    rows, rules = [], []
+    rows: list[tuple[str, ...]] = []
+    rules: list[int] = []
     for strength in strengths:
         rules.append(len(rows))
         for method in methods:
@@ -192,6 +193,7 @@ class _Bench:
             bad_value("--methods", "methods that work on every pair", got)
         if prediction.depth_m is not None:
             return prediction.depth_m
+        assert prediction.relative is not None
         return align(prediction.relative, sample.depth_m, sample.valid, prediction.space)
 
     def pictures(self, sample: StereoSample) -> dict[str, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -90,8 +91,9 @@ def per_pair_table(
 
 def _summary_cells(scores: Sequence[dict[str, float | None]]) -> tuple[str, ...]:
     """Mean and interval of every metric, then the mean coverage."""
-    means = [mean_with_interval([s[metric] for s in scores if s[metric] is not None]) for metric in _SUMMARY]
-    coverage = mean_with_interval([s["coverage"] for s in scores])
+    there = {name: [v for s in scores if (v := s[name]) is not None] for name in (*_SUMMARY, "coverage")}
+    means = [mean_with_interval(there[metric]) for metric in _SUMMARY]
+    coverage = mean_with_interval(there["coverage"])
     return (*(interval_cell(mean) for mean in means), cell(coverage.value))
 
 
@@ -201,7 +203,8 @@ def _columns_table(
 ) -> Table:
     """A row per method, a column per quantity: the mean over the pairs that have it; no rows for no value."""
     values: dict[str, Values] = {
-        name: by_method(records, lambda record, name=name: value_of(record, name)) for name in columns
+        name: by_method(records, partial(lambda name, record: value_of(record, name), name))
+        for name in columns
     }
     header = []
     for name, heading in columns.items():
@@ -314,7 +317,8 @@ def sorting_table(records: Sequence[Record]) -> Table:
 def confidence_table(records: Sequence[dict[str, Any]]) -> Table:
     """What the confidence of each method promises by decile, and what it keeps; pairs weigh the same."""
     rows = []
-    for method, own in by_method(records, lambda record: record.get("confidence")).items():
+    deciles_of: Any = by_method(records, lambda record: record.get("confidence"))
+    for method, own in deciles_of.items():
         pairs = [deciles for deciles in own.values() if deciles]
         for k in range(10):
             filled = [deciles[k] for deciles in pairs if deciles[k]["share"]]
@@ -386,7 +390,8 @@ def spread_table(
     """
     values = by_method(records, value_of)
     families = {name: family for name, family in _families(records).items() if len(family) > 1}
-    rows, rules = [], []
+    rows: list[tuple[str, ...]] = []
+    rules: list[int] = []
     for name, family in families.items():
         seeds, title = [values[one] for one in family], find_method(name).title
         own = [_spread_row(title, group, members, seeds) for group, members in groups.items()]

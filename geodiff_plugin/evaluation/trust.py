@@ -85,7 +85,7 @@ def _judged(record: Record) -> Record:
     """The record with what today's verdict makes of its signs."""
     if record["status"] == "refused":
         return record
-    signs = {name: math.nan if value is None else value for name, value in record["signs"].items()}
+    signs: dict[str, Any] = {n: math.nan if value is None else value for n, value in record["signs"].items()}
     verdict = judge(Indicators(**signs | {"mistakes": tuple(signs["mistakes"])}))
     status = "trusted" if verdict.trusted else "not trusted"
     return record | {"status": status, "said": [*record["said"], *verdict.reasons, *verdict.remarks]}
@@ -131,8 +131,8 @@ def _table(group: str, records: Sequence[dict[str, Any]], kinds: Sequence[str]) 
         )
     rows += [[name, "", "", "", _share(*count)] for name, count in counted.items()]
     head = ["given as", "median error", "not trusted", "anything said", f"said, of those > {OFF:.0%} off"]
-    count = len({record["sample"] for record in records})
-    title = f"Wrong calibrations detected, right ones not trusted: {count_of_pairs(count, f'{group} ')}"
+    pairs = count_of_pairs(len({record["sample"] for record in records}), f"{group} ")
+    title = f"Wrong calibrations detected, right ones not trusted: {pairs}"
     return Table(title, tuple(head), tuple(map(tuple, rows)), NOTE)
 
 

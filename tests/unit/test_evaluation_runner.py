@@ -271,6 +271,8 @@ def test_tables_hold_pairs_means_and_differences(bench):
         "All metrics, 1 posed pair",
         "AbsRel by region and material",
         "Disparity, rectified pairs",
+        "Disparity by region, rectified pairs",
+        "Boundaries, dense truth",
     ]
     assert [row[0] for row in summaries[0].rows] == ["exact", "exact, aligned", "double", "double, aligned"]
 

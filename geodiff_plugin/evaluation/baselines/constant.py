@@ -171,7 +171,7 @@ def _photometric_updates(right: Any, K: Any, E: Any, **changes: Any) -> Geometry
     The paper names a rate of 1e-2 and no optimiser. A plain step of that size moves no pixel, because the
     gradient of a mean over all pixels is tiny in each; Adam's do.
     """
-    preset = {"weights": PAPER.weights, "inner_steps": ITERATIONS, "step_latents": 0.01}
+    preset: dict[str, Any] = {"weights": PAPER.weights, "inner_steps": ITERATIONS, "step_latents": 0.01}
     preset |= {"correct": False, "refine": False}
     return GeometryGuidance(right, K, E, **(preset | changes))
 

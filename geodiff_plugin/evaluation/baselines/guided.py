@@ -204,13 +204,13 @@ GUIDED_METHODS = (
                 "photometric-only",
                 "photometric",
                 "the default preset without matches",
-                _changed(weights=DEFAULT.weights | {"matches": 0.0}),
+                _changed(weights={**DEFAULT.weights, "matches": 0.0}),
             ),
             (
                 "matches-only",
                 "matches",
                 "the default preset without the photometric error",
-                _changed(weights=DEFAULT.weights | {"photometric": 0.0}),
+                _changed(weights={**DEFAULT.weights, "photometric": 0.0}),
             ),
         )
     ),

@@ -14,6 +14,7 @@ from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Pred
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.matching import CostVolume, build_cost_volume, find_matches
+from geodiff_plugin.types import CameraView
 
 __all__ = ["STEREO_METHODS", "fill_background", "native_depth", "sgbm_shift", "sweep"]
 
@@ -60,7 +61,8 @@ def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
 
     given = ((sample.right, sample.K_right, sample.E), *sample.extra_views)[: views - 1]
     rights = [
-        (as_image_01(image, "right").to(device), moved(K), moved(np.linalg.inv(E))) for image, K, E in given
+        CameraView(as_image_01(image, "right").to(device), moved(K), moved(np.linalg.inv(E)))
+        for image, K, E in given
     ]
     return build_cost_volume(as_image_01(sample.left, "left").to(device), rights, moved(sample.K_left))
 
@@ -115,7 +117,7 @@ def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
     # Depth at infinity has the disparity cx_left - cx_right, which is 0 but for Middlebury's doffs.
     lowest = int(np.floor(sample.K_left[0, 2] - sample.K_right[0, 2]))
     count = 16 * int(np.ceil(MAX_SHIFT * width / 16))
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         minDisparity=lowest,
         numDisparities=count,
         P1=8 * 3 * block**2,
@@ -131,10 +133,11 @@ def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
     raw = matcher.compute(left, right)
     if wls:
-        smoother = cv2.ximgproc.createDisparityWLSFilter(matcher)
+        ximgproc: Any = cv2.ximgproc  # type: ignore[attr-defined]
+        smoother = ximgproc.createDisparityWLSFilter(matcher)
         smoother.setLambda(WLS_LAMBDA)
         smoother.setSigmaColor(WLS_SIGMA)
-        opposite = cv2.ximgproc.createRightMatcher(matcher).compute(right, left)
+        opposite = ximgproc.createRightMatcher(matcher).compute(right, left)
         raw = smoother.filter(raw, left, disparity_map_right=opposite)
     raw = raw[:, pad:]
     shift = raw.astype(np.float32) / 16.0 + np.float32(sample.K_right[0, 2] - sample.K_left[0, 2])

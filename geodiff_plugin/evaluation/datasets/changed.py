@@ -137,11 +137,11 @@ def perturbed_pose(
     """
     axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     turn = axis * np.radians(degrees) * rng.uniform(LEAST, 1.0)
-    baseline = np.linalg.norm(E[:3, 3])
+    baseline = float(np.linalg.norm(E[:3, 3]))
     shift = way * share * baseline * rng.uniform(LEAST, 1.0)
     if rng.random() < 0.5:
         shift = -np.cross(turn, (0.0, 0.0, depth_m))
-        shift *= min(1.0, share * baseline / max(np.linalg.norm(shift), 1e-12))
+        shift *= min(1.0, share * baseline / max(float(np.linalg.norm(shift)), 1e-12))
     wrong = E.copy()
     wrong[:3, :3] = E[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
     moved = E[:3, 3] + E[:3, :3] @ shift
@@ -164,8 +164,10 @@ def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: st
         bad_value(f"the truth of {sample.label}", "known for at least one pixel", "none")
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     depth_m = float(np.median(sample.depth_m[sample.valid]))
-    E = perturbed_pose(sample.E, *change, depth_m, rng)
+    degrees, share = change
+    E = perturbed_pose(sample.E, degrees, share, depth_m, rng)
     extra = tuple(
-        (image, K, perturbed_pose(other, *change, depth_m, rng)) for image, K, other in sample.extra_views
+        (image, K, perturbed_pose(other, degrees, share, depth_m, rng))
+        for image, K, other in sample.extra_views
     )
     return replace(sample, name=name, E=E, E_true=sample.E_scored, extra_views=extra)

@@ -78,10 +78,16 @@ def sources_of(path: Path) -> dict[int, list[int]]:
 
 def pair_files(
     group: Path, left: int, right: int, others: list[int], pixel_centre: float, truth: Path
-) -> dict[str, Path | int | float | tuple[int, ...]]:
+) -> dict[str, Any]:
     """``files`` of a posed reference; of ``others``, further views, the first four are read with it."""
     further = tuple([view for view in others if view not in (left, right)][:MOST_OTHERS])
-    files = {"group": group, "left": left, "right": right, "others": further, "pixel_centre": pixel_centre}
+    files: dict[str, Any] = {
+        "group": group,
+        "left": left,
+        "right": right,
+        "others": further,
+        "pixel_centre": pixel_centre,
+    }
     # The loader needs no more; the key of a result is made of what these files hold.
     read = {f"{kind} {v}": p for v in (left, right, *further) for kind, p in _view_files(group, v).items()}
     return files | read | {"truth": truth}

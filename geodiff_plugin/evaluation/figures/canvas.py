@@ -97,6 +97,7 @@ def depths_of(sample: StereoSample, name: str, settings: Settings, priors: Prior
         return MethodDepth(f"{method.title}:\n{reason}", None, None)
     depth_m = prediction.depth_m
     if depth_m is None:
+        assert prediction.relative is not None
         depth_m = align(prediction.relative, sample.depth_m, sample.valid, prediction.space)
     abs_rel = evaluate_depth(depth_m, sample.depth_m, sample.valid)["abs_rel"]
     return MethodDepth(method.title, depth_m, None if math.isnan(abs_rel) else abs_rel)

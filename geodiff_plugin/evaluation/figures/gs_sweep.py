@@ -81,8 +81,8 @@ def sweep_g_s(sample: StereoSample, relative: np.ndarray, space: str, largest_m:
     (docs/reference/paper-map.md, E8).
     """
     left, right = (as_image_01(image, "image")[None] for image in (sample.left, sample.right))
-    cameras = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
-    cameras = [torch.as_tensor(matrix, dtype=torch.float32)[None] for matrix in cameras]
+    matrices = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
+    K_left, K_right, T = (torch.as_tensor(matrix, dtype=torch.float32)[None] for matrix in matrices)
     x = smooth_floor(torch.from_numpy(np.asarray(relative, np.float32))[None, None])
     candidates = torch.from_numpy(np.geomspace(1.0, largest_m, CANDIDATES).astype(np.float32))
     scale, shift = torch.ones(1), torch.zeros(1)
@@ -92,7 +92,7 @@ def sweep_g_s(sample: StereoSample, relative: np.ndarray, space: str, largest_m:
 
     def at(g_s: torch.Tensor) -> tuple[torch.Tensor, Any]:
         depth_m = SPACES[space].forward(scale * x + shift, g_s)
-        return depth_m, warp_right_to_left(right, depth_m, *cameras)
+        return depth_m, warp_right_to_left(right, depth_m, K_left, K_right, T)
 
     for g_s in candidates:
         depth_m, warped = at(g_s)
@@ -139,6 +139,7 @@ def draw_gs_sweep(options: FigureOptions) -> Drawing:
     largest = check_number(options.max, "max", 1.01, 1e6)
     sample, priors = samples(options)[0], PriorCache()
     prior = METHODS["prior-aligned"].run(sample, options.settings, priors)
+    assert prior.relative is not None
     sweep = sweep_g_s(sample, prior.relative, prior.space, largest)
     figure = new_figure(8.6, 4.9)
     upper, lower = figure.subfigures(2, 1, height_ratios=[2.0, 1.0])

@@ -147,7 +147,7 @@ class TermByTerm(NamedTuple):
 
 def _followed(
     pipe: Any, left: Image.Image, guidance: GeometryGuidance, settings: Settings
-) -> tuple[Any, list]:
+) -> tuple[Any, list[Tensor]]:
     """Output of a guided call, and the metric depth ``(1, 1, h', w')`` after each step that has one."""
     seen: list[Tensor] = []
 
@@ -165,7 +165,7 @@ def _hidden(guidance: GeometryGuidance, depth_m: Tensor) -> Tensor:
     reached = clear = torch.zeros_like(depth_m, dtype=torch.bool)
     for image, K_right, T in further:
         cameras = (K_left[None], K_right[None], T[None])
-        covered = hidden_in_right(depth_m, *cameras, tuple(image.shape[-2:]))
+        covered = hidden_in_right(depth_m, *cameras, (image.shape[-2], image.shape[-1]))
         visible = warp_right_to_left(image[None], depth_m, *cameras).visible
         reached, clear = reached | visible, clear | (visible & ~covered)
     return reached & ~clear
@@ -202,6 +202,7 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
     trajectory.prepare(relative, relative)
     first_m = trajectory.metric(relative, trajectory.affine)
     matches, usable = trajectory.matches, trajectory.usable_matches
+    assert matches is not None and usable is not None  # two views always have some
     there = (matches.confidence > 0) & (matches.inverse_depth > 0)
     final_m = torch.from_numpy(out.prediction).permute(0, 3, 1, 2).float()
     inverse_m = 1.0 / _resized(final_m, matches.size)
