@@ -209,13 +209,13 @@ class DepthOptions(RunOptions):
         if self.right is None:
             self._check_alone()
         poses = 0 if self.estimate_pose else len(self.view)
-        for option, given, counts in (
-            ("--view-E", self.view_e, {poses}),
-            ("--view-K", self.view_k, {0, len(self.view)}),
-            ("--view-distortion", self.view_distortion, {0, len(self.view)}),
+        for option, count, counts in (
+            ("--view-E", len(self.view_e), {poses}),
+            ("--view-K", len(self.view_k), {0, len(self.view)}),
+            ("--view-distortion", len(self.view_distortion), {0, len(self.view)}),
         ):
-            if len(given) not in counts:
-                bad_value(option, f"given once for each of {len(self.view)} --view", f"{len(given)} times")
+            if count not in counts:
+                bad_value(option, f"given once for each of {len(self.view)} --view", f"{count} times")
 
     def _check_alone(self) -> None:
         """LEFT without RIGHT: known points, and nothing that is of a second camera."""
@@ -233,8 +233,15 @@ class DepthOptions(RunOptions):
 def demo_options(out: Path, overwrite: bool, quiet: bool) -> DepthOptions:
     """``geodiff depth`` on the pair that ships with the package (``bundled.demo_pair``)."""
     pair = Path(__file__).resolve().parents[1] / "bundled" / "pair"
-    views = {"left": pair / "left.png", "right": pair / "right.png", "calib": (pair / "calib.txt",)}
-    return DepthOptions(**views, device="cpu", out=out, overwrite=overwrite, quiet=quiet)
+    return DepthOptions(
+        left=pair / "left.png",
+        right=pair / "right.png",
+        calib=(pair / "calib.txt",),
+        device="cpu",
+        out=out,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
 
 
 def calibration_way(options: DepthOptions) -> str:
