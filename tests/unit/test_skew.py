@@ -52,7 +52,7 @@ HAND_ON = {
     "matching.build.pilot_volume",
     "runtime.confidence.reprojection",  # to warp_right_to_left
     "cli.inputs.pinhole",  # to OpenCV
-    "cli.inputs.read_known",
+    "cli.inputs._read_known",
     "formats.exif.warn_of_other_lens",  # the focal length alone
     "app.measure.read_pixel",
     "formats.distortion.undistorted",
