@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
+import cv2
 import numpy as np
 import torch
 
@@ -15,6 +16,7 @@ from geodiff_plugin._threads import available_cores
 from geodiff_plugin.capture.neighbours import choose_neighbours
 from geodiff_plugin.capture.options import NEIGHBOURS
 from geodiff_plugin.formats.captures import CaptureFiles, CaptureFrame, read_capture
+from geodiff_plugin.formats.depth import read_depth_mm_png
 from geodiff_plugin.formats.distortion import undistorted
 from geodiff_plugin.formats.images import read_image
 from geodiff_plugin.formats.video import VideoReader
@@ -23,6 +25,9 @@ from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["Capture"]
+
+#: Points of a model that fewer images see, or that lie further off, are no known depths.
+FEWEST_VIEWS, MOST_ERROR_PX = 3, 1.5
 
 
 class Capture:
@@ -140,7 +145,9 @@ class Capture:
         """
         check_number(factor, "metres per unit", 1e-12, 1e12)
         frames = tuple(replace(f, E=None if f.E is None else _longer(f.E, factor)) for f in self.files.frames)
-        self.files = replace(self.files, frames=frames, unit="m")
+        model = self.files.points
+        model = None if model is None else replace(model, xyz=model.xyz * factor)
+        self.files = replace(self.files, frames=frames, unit="m", points=model)
         self.unit = "m"
         if self._solved is not None:
             s = self._solved
@@ -205,6 +212,33 @@ class Capture:
             [first, *views], left_size=self.frame(name).size, unit=self.unit, **settings | knobs
         )
 
+    def known_depths(self, name: str, points: str) -> np.ndarray | None:
+        """Known depths of a frame, as ``GeometryGuidance(points=...)`` takes them; ``None`` for none.
+
+        Raises:
+            InputError: another word; a capture without such points, or without a unit.
+        """
+        check_choice(points, "points", ("none", "model", "depth"))
+        frame = self.frame(name)
+        if points == "none":
+            return None
+        if self.unit is None:
+            cure = "Give --metres-per-unit, --known-length or --distance."
+            bad_value("points", "of a capture whose scale is known", "one without a unit", cure)
+        if points == "depth":
+            if frame.depth is None:
+                bad_value("points", "depth maps that the capture names", f"none for {name}")
+            depth_m, known = read_depth_mm_png(frame.depth, f"the depth map of {name}")
+            depth_m = np.where(known, depth_m, 0.0).astype(np.float32)
+            return cv2.resize(depth_m, frame.size, interpolation=cv2.INTER_NEAREST)
+        model = self.files.points
+        if model is None or frame.E is None:
+            bad_value("points", "of a COLMAP model", f"a capture of {self.files.kind}, which has none")
+        rows = model.seen.get(name, np.zeros(0, int))
+        rows = rows[(model.tracks[rows] >= FEWEST_VIEWS) & (model.error_px[rows] <= MOST_ERROR_PX)]
+        T = np.linalg.inv(frame.E)
+        return (model.xyz[rows] @ T[:3, :3].T + T[:3, 3]).astype(np.float32) if len(rows) else None
+
     def depth(
         self,
         pipe: Any,
@@ -212,6 +246,7 @@ class Capture:
         neighbours: Sequence[str] | int = NEIGHBOURS,
         *,
         seed: int = 0,
+        points: str = "none",
         knobs: dict[str, Any] | None = None,
         **call: Any,
     ) -> MetricDepthOutput:
@@ -222,10 +257,14 @@ class Capture:
             name: of the frame.
             neighbours: names, or how many are chosen.
             seed: of the noise.
+            points: known depths, ``"none"``, ``"model"`` (points of a COLMAP model) or ``"depth"`` (the map
+                that the capture names for the frame).
             knobs: further arguments of ``GeometryGuidance``.
             **call: further arguments of the pipeline's call.
         """
-        guidance = self.guidance(name, neighbours, **knobs or {})
+        measured = self.known_depths(name, points)
+        given = {} if measured is None else {"points": measured}
+        guidance = self.guidance(name, neighbours, **given | (knobs or {}))
         generator = torch.Generator("cpu").manual_seed(seed)
         return pipe(self.image(name), guidance=guidance, generator=generator, **call)
 

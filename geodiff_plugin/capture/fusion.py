@@ -20,6 +20,8 @@ __all__ = ["fuse", "normals_of", "write_colmap_maps", "write_mesh", "write_norma
 CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
 #: Points of one frame at most; more would not show in a cloud of many frames.
 MOST_POINTS = 200_000
+#: Frames after which their points are merged, so that a long capture fits the memory.
+MERGED_AFTER = 20
 VERTEX = np.dtype(
     [(n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")] + [(n, "u1") for n in ("red", "green", "blue")]
 )
@@ -57,21 +59,27 @@ def fuse(frames: Sequence[DepthFrame], image: Callable[[str], np.ndarray]) -> tu
         The cloud, and ``(N, 3)`` normals.
     """
     cell = CELL_SHARE * float(np.median([np.median(frame.depth) for frame in frames]))
-    parts = []
-    for frame in frames:
-        v, u = np.nonzero(kept(frame))
-        every = max(1, len(u) // MOST_POINTS)
-        v, u = v[::every], u[::every]
-        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame.K).T
-        R, t = frame.E[:3, :3], frame.E[:3, 3]
-        points = rays * frame.depth[v, u][:, None] @ R.T + t
-        colours = image(frame.name)[v, u] * 255
-        normals = normals_of(frame.depth, frame.K)[v, u] @ R.T
-        parts.append(_thinned(np.hstack([points, normals, colours]), cell))
-    every_point = _thinned(np.concatenate(parts), cell)
+    every_point = np.zeros((0, 9))
+    parts: list[np.ndarray] = []
+    for number, frame in enumerate(frames, 1):
+        parts.append(_points(frame, image(frame.name), cell))
+        if number % MERGED_AFTER == 0 or number == len(frames):
+            every_point, parts = _thinned(np.concatenate([every_point, *parts]), cell), []
     normals = every_point[:, 3:6]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return Cloud(every_point[:, :3], np.rint(every_point[:, 6:]).astype(np.uint8)), normals
+
+
+def _points(frame: DepthFrame, image: np.ndarray, cell: float) -> np.ndarray:
+    """``(N, 9)`` places, normals and colours of one frame, in the world's frame."""
+    v, u = np.nonzero(kept(frame))
+    every = max(1, len(u) // MOST_POINTS)
+    v, u = v[::every], u[::every]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame.K).T
+    R, t = frame.E[:3, :3], frame.E[:3, 3]
+    points = rays * frame.depth[v, u][:, None] @ R.T + t
+    normals = normals_of(frame.depth, frame.K)[v, u] @ R.T
+    return _thinned(np.hstack([points, normals, image[v, u] * 255]), cell)
 
 
 def _thinned(rows: np.ndarray, cell: float) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from geodiff_plugin.pose.capture import SolvedCapture
@@ -18,7 +20,9 @@ LEAST_SHARE = 0.15
 FEWEST_SHARED = 12
 
 
-def choose_neighbours(solved: SolvedCapture, frame: int, most: int) -> list[int]:
+def choose_neighbours(
+    solved: SolvedCapture, frame: int, most: int, among: Collection[int] | None = None
+) -> list[int]:
     """Neighbours of a frame, the best first.
 
     Every shared point counts by the angle of its two rays, as in COLMAP's and MVSNet's view selection, and
@@ -28,6 +32,7 @@ def choose_neighbours(solved: SolvedCapture, frame: int, most: int) -> list[int]
         solved: poses and points.
         frame: number of the frame.
         most: neighbours wanted, >= 1.
+        among: frames to choose from; ``None`` for all.
 
     Returns:
         At most ``most`` numbers; those nearest by position where the frame shares no points.
@@ -39,6 +44,7 @@ def choose_neighbours(solved: SolvedCapture, frame: int, most: int) -> list[int]
     first = 0.0
     left = np.ones(values.shape[1])
     shared = (values > 0).sum(1)
+    shared[[i for i in range(len(shared)) if among is not None and i not in among]] = 0
     while len(chosen) < most:
         gains = values @ left
         gains[chosen], gains[shared < FEWEST_SHARED] = -1.0, -1.0
@@ -48,7 +54,7 @@ def choose_neighbours(solved: SolvedCapture, frame: int, most: int) -> list[int]
         first = first or float(gains[best])
         chosen.append(best)
         left = left * np.where(values[best] > 0, SEEN_AGAIN, 1.0)
-    return chosen or _nearest(solved, frame, most)
+    return chosen if chosen or among is not None else _nearest(solved, frame, most)
 
 
 def _values(solved: SolvedCapture, frame: int) -> np.ndarray:

@@ -56,6 +56,9 @@ class CaptureOptions:
     seed: int = declare(0, "Seed of the noise.")
     device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
     processes: int | None = declare(None, "Processes that share the frames; by default one a core.")
+    export: tuple[str, ...] = declare(
+        (), "colmap: a dense workspace; mesh: by TSDF (extra mesh); repeatable.", panel=OUTPUT
+    )
     overwrite: bool = declare(
         False, "Write into a folder that holds files; do finished frames anew.", panel=OUTPUT
     )

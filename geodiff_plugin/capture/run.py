@@ -24,11 +24,12 @@ from geodiff_plugin._checks import InputError, bad_value, check_choice, check_nu
 from geodiff_plugin._threads import available_cores
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.capture.options import CaptureOptions
+from geodiff_plugin.capture.results import ALONE, write_agreement, write_results
 from geodiff_plugin.capture.store import load_solved, save_solved
 from geodiff_plugin.formats.files import read_matrix
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.priors import load_prior
-from geodiff_plugin.runner import Item, Journal, Runner, this_process
+from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, this_process
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import MetricDepthOutput
@@ -164,11 +165,16 @@ def _frame(item: Item) -> dict[str, Any]:
     neighbours = capture.neighbours(name, options.neighbours)
     call = {} if options.steps is None else {"num_inference_steps": options.steps}
     with torch.no_grad():
-        output = capture.depth(pipe, name, neighbours, seed=options.seed, **call)
+        output = capture.depth(pipe, name, neighbours, seed=options.seed, points=options.points, **call)
     image = capture.image(name)
     report = frame_report(capture, name, neighbours, output)
     with _replacing(options.out / name) as folder:
         report["files"] = write(folder, output, image)
+        depth = np.asarray(output.prediction)[0, ..., 0]
+        sure = output.confidence
+        confidence = np.full_like(depth, 0.5) if sure is None else np.asarray(sure)[0, ..., 0]
+        for file, values in zip(ALONE, (depth, confidence), strict=True):
+            np.save(folder / file, values.astype(np.float32))
         report["seconds"] = round(time.perf_counter() - started, 2)
         _write_json(folder / REPORT, report)
     return report
@@ -339,6 +345,9 @@ def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], Non
         OSError, InputError: bad input, before any depth is computed where it can be seen that early.
     """
     check_choice(options.poses, "--poses", ("refined", "given"))
+    check_choice(options.points, "--points", ("none", "model", "depth"))
+    for kind in options.export:
+        check_choice(kind, "--export", ("colmap", "mesh"))
     check_number(options.neighbours, "--neighbours", 1, 32, integer=True)
     started = time.perf_counter()
     capture = open_capture(options)
@@ -357,6 +366,10 @@ def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], Non
         say(f"warning: {note}")
     frames = run_frames(capture, options, names, write)
     seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
+    done = [report["frame"] for report in frames if report.get("status") != BROKEN]
+    agreement = write_agreement(capture, options.out, done)
+    files = write_results(capture, options.out, done, options.export)
+    seconds["agreement and cloud"] = round(time.perf_counter() - started - sum(seconds.values()), 1)
     report = {
         "version": __version__,
         "path": str(options.path),
@@ -364,6 +377,8 @@ def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], Non
         "unit": capture.unit,
         "poses": pose_report(capture),
         "seconds": seconds,
+        "files": files,
+        "agreement": agreement,
         "frames": frames,
     }
     _write_json(options.out / "capture.json", report)

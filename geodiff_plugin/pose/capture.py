@@ -45,8 +45,8 @@ LEAST_GAIN = 0.9
 SCALE_FLOOR_TRAJECTORY, SCALE_FLOOR_DEPTH = 0.02, 0.015
 #: Both scales are called in disagreement beyond this.
 DISAGREES = 0.1
-#: Another convention of the given poses is taken where it leaves this share of the residual at most.
-CONVENTION_GAIN = 0.25
+#: Another convention of the given poses is taken where it leaves this share of their misfit at most.
+CONVENTION_GAIN = 0.5
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -287,8 +287,9 @@ class _Base:
     def K(self, model: Any) -> np.ndarray:
         """``(N, 3, 3)`` of a model, pixels of the frames."""
         K = self.K_given.copy()
+        params = {number: np.array(camera.params) for number, camera in model.cameras.items()}
         for i in range(len(self)):
-            fx, fy, cx, cy = np.asarray(model.cameras[self.camera_of[i]].params) / self.factors[i]
+            fx, fy, cx, cy = params[self.camera_of[i]] / self.factors[i]
             K[i, [0, 1, 0, 1], [0, 1, 2, 2]] = fx, fy, cx - 0.5, cy - 0.5
         return K
 
@@ -343,14 +344,32 @@ def _in_convention(base: _Base, E: np.ndarray) -> tuple[np.ndarray, list[str]]:
     }
     if not matches:
         return E, ["No two frames match: are they of one scene, and sharp? The poses were not checked."]
-    left = {name: float(np.median(_sampson_px(form, base.K_given, matches))) for name, form in forms.items()}
-    best = min(left, key=lambda name: left[name])
-    if left[best] < CONVENTION_GAIN * left["as given"] and left["as given"] > 2.0:
+    misfit = {name: _misfit(form, base.K_given, matches) for name, form in forms.items()}
+    best = min(misfit, key=lambda name: misfit[name])
+    if misfit[best] < CONVENTION_GAIN * misfit["as given"]:
         return forms[best], [
-            f"The given poses are {best}: as read, matches lie {left['as given']:.1f} px off their epipolar "
-            f"lines in the median, so understood {left[best]:.1f} px."
+            f"The poses are read as {best}: as they stand, the matches contradict them, by residual or by "
+            "points behind the cameras."
         ]
     return E, []
+
+
+def _misfit(
+    E: np.ndarray, K: np.ndarray, matches: Sequence[tuple[int, int, np.ndarray, np.ndarray]]
+) -> float:
+    """Median residual of matches under poses, pixels, over the share of points in front of both cameras."""
+    ahead, count = 0, 0
+    for i, j, px_i, px_j in matches:
+        T = np.linalg.inv(E[j]) @ E[i]
+        a, b = (np.linalg.solve(k, np.c_[px, np.ones(len(px))].T).T for k, px in ((K[i], px_i), (K[j], px_j)))
+        a = a @ T[:3, :3].T
+        # z_j b = z_i a + t, in the least squares sense, for both depths.
+        aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
+        at, bt = a @ T[:3, 3], b @ T[:3, 3]
+        below = aa * bb - ab**2
+        ahead += int(((ab * bt - bb * at > 0) & (aa * bt - ab * at > 0) & (below > 0)).sum())
+        count += len(a)
+    return float(np.median(_sampson_px(E, K, matches))) / max(ahead / max(count, 1), 0.05)
 
 
 def _from_given(base: _Base, given: np.ndarray, notes: list[str], work: Path, refine: bool) -> SolvedCapture:
@@ -359,7 +378,7 @@ def _from_given(base: _Base, given: np.ndarray, notes: list[str], work: Path, re
     before = float(np.median(_sampson_px(given, base.K_given, matches))) if matches else math.nan
     start = _triangulated(base, base.model(given), ROUNDS[0][0], work)
     if not refine or not matches or not start.num_points3D():
-        return _noted(_found(base, start, "given", given, (before, before)), notes)
+        return _noted(replace(_found(base, start, "given", given, (before, before)), E=given), notes)
     model = start
     by_given = _depths(base, start)
     for number, (error_px, loss_px) in enumerate(ROUNDS):
@@ -371,7 +390,7 @@ def _from_given(base: _Base, given: np.ndarray, notes: list[str], work: Path, re
     if not after < LEAST_GAIN * before:
         notes.append(f"The given poses fit as well as any ({before:.2f} px) and are kept.")
         start = _triangulated(base, base.model(given), ROUNDS[0][0], work)
-        return _noted(_found(base, start, "kept", given, (before, before)), notes)
+        return _noted(replace(_found(base, start, "kept", given, (before, before)), E=given), notes)
     found = _found(base, model, "solved", given, (before, after))
     return _noted(_scaled(found, by_given, _depths(base, model)), notes)
 
@@ -571,9 +590,10 @@ def _found(
     base: _Base, model: Any, status: str, given: np.ndarray | None, residuals: tuple[float, float]
 ) -> SolvedCapture:
     """What a model says, in its own world."""
-    E, numbers = _poses(base, model), sorted(model.points3D)
+    by_number = dict(model.points3D.items())  # every access of the property copies all points
+    E, numbers = _poses(base, model), sorted(by_number)
     rows = {number: row for row, number in enumerate(numbers)}
-    points = [model.points3D[number] for number in numbers]
+    points = [by_number[number] for number in numbers]
     seen = []
     for i in range(len(base)):
         image = model.image(i + 1) if model.exists_image(i + 1) else None

@@ -138,3 +138,9 @@ def test_rig_video_of_files(prior, pair, textured_plane, tmp_path, monkeypatch, 
     Path(pair[2]).write_text(Path(pair[2]).read_text().replace("width=", "width=1"))
     with pytest.raises(ValueError, match="as the left view"):
         load(EXAMPLES / "rig_video.py").main(arguments)
+
+
+def test_capture_folder(prior, capsys):
+    pytest.importorskip("pycolmap")
+    load(EXAMPLES / "capture_folder.py").main(["--size", "96", "128", "--steps", "1", "--prior", str(prior)])
+    assert "AbsRel" in capsys.readouterr().out

@@ -1,0 +1,229 @@
+"""Readers of captures: every layout gives the same frames, and bad input a sentence."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin import InputError
+from geodiff_plugin.formats.captures import CaptureFiles, read_capture
+from tests.unit.capture_room import SIZE, K, render, walk, write_transforms
+
+TRUE = walk(4)
+IMAGES = [render(E)[0] for E in TRUE]
+
+
+def save(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(path)
+
+
+def quaternion(R: np.ndarray) -> tuple[float, ...]:
+    x, y, z, w = Rotation.from_matrix(R).as_quat()
+    return w, x, y, z
+
+
+def transforms(folder: Path) -> Path:
+    return write_transforms(folder, TRUE, TRUE)
+
+
+def colmap_text(folder: Path) -> Path:
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
+    (model / "cameras.txt").write_text(f"1 PINHOLE {SIZE[0]} {SIZE[1]} {fx} {fy} {cx} {cy}\n")
+    lines = ["# Image list with two lines of data per image:"]
+    for i, (E, image) in enumerate(zip(TRUE, IMAGES, strict=True), 1):
+        T = np.linalg.inv(E)
+        numbers = " ".join(map(repr, map(float, (*quaternion(T[:3, :3]), *T[:3, 3]))))
+        lines += [f"{i} {numbers} 1 f{i - 1:02d}.png", "10.5 20.5 1"]
+        save(folder / "images" / f"f{i - 1:02d}.png", image)
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    (model / "points3D.txt").write_text("1 0.5 0.25 2.6 9 9 9 0.7 1 0 2 0 4 0\n")
+    return folder
+
+
+def colmap_binary(folder: Path) -> Path:
+    colmap_text(folder)
+    model = folder / "sparse" / "0"
+    numbers = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
+    (model / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 1, 1, *SIZE, *numbers))
+    data = struct.pack("<Q", len(TRUE))
+    for i, E in enumerate(TRUE, 1):
+        T = np.linalg.inv(E)
+        data += struct.pack("<I7dI", i, *quaternion(T[:3, :3]), *T[:3, 3], 1)
+        data += f"f{i - 1:02d}.png".encode() + b"\0" + struct.pack("<Q2dq", 1, 10.5, 20.5, 1)
+    (model / "images.bin").write_bytes(data)
+    point = struct.pack("<QQ3d3BdQ6I", 1, 1, 0.5, 0.25, 2.6, 9, 9, 9, 0.7, 3, 1, 0, 2, 0, 4, 0)
+    (model / "points3D.bin").write_bytes(point)
+    for name in ("cameras", "images", "points3D"):
+        (model / f"{name}.txt").unlink()
+    return folder
+
+
+def seven_scenes(folder: Path) -> Path:
+    for i, (E, image) in enumerate(zip(TRUE, IMAGES, strict=True)):
+        save(folder / f"frame-{i:06d}.color.png", image)
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", E, fmt="%.9f")
+    np.savetxt(folder / "intrinsics.txt", K)
+    return folder
+
+
+def scannet(folder: Path) -> Path:
+    for name in ("pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
+    for i, (E, image) in enumerate(zip(TRUE, IMAGES, strict=True)):
+        save(folder / "color" / f"{10 * i}.png", image)  # 30 comes after 0, 10, 20
+        np.savetxt(folder / "pose" / f"{10 * i}.txt", E, fmt="%.9f")
+    four = np.eye(4)
+    four[:3, :3] = K
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", four)
+    return folder
+
+
+def trajectory(E: np.ndarray, times: np.ndarray) -> str:
+    turns = Rotation.from_matrix(E[:, :3, :3]).as_quat()
+    lines = [" ".join(f"{v:.9f}" for v in row) for row in np.c_[times, E[:, :3, 3], turns]]
+    return "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""])
+
+
+def tum(folder: Path) -> Path:
+    for i, image in enumerate(IMAGES):
+        save(folder / "rgb" / f"{i}.png", image)
+    (folder / "rgb.txt").write_text(
+        "# timestamp filename\n" + "".join(f"{i}.5 rgb/{i}.png\n" for i in range(4))
+    )
+    (folder / "groundtruth.txt").write_text(trajectory(TRUE, np.arange(4) + 0.5))
+    np.savetxt(folder / "K.txt", K)
+    return folder
+
+
+LAYOUTS = [transforms, colmap_text, colmap_binary, seven_scenes, scannet, tum]
+
+
+@pytest.mark.parametrize("write", LAYOUTS, ids=lambda write: write.__name__)
+def test_every_layout_gives_the_same_frames(write, tmp_path):
+    files = read_capture(write(tmp_path / "scan"))
+    assert len(files.frames) == 4 and not files.notes
+    for frame, E in zip(files.frames, TRUE, strict=True):
+        np.testing.assert_allclose(frame.E, E, atol=1e-6)
+        np.testing.assert_allclose(frame.K, K, atol=1e-9)
+        assert frame.size == SIZE and frame.lens is None and frame.image.is_file()
+    assert files.unit == (None if "colmap" in write.__name__ else "m")
+
+
+@pytest.mark.parametrize("write", [colmap_text, colmap_binary])
+def test_points_of_a_model_come_with_their_tracks(write, tmp_path):
+    points = read_capture(write(tmp_path)).points
+    assert points is not None and points.xyz.tolist() == [[0.5, 0.25, 2.6]]
+    assert points.tracks.tolist() == [3] and points.error_px.tolist() == [0.7]
+    assert [len(points.seen[f"f{i:02d}"]) for i in range(4)] == [1, 1, 0, 1]
+
+
+def test_a_video_takes_its_poses_from_a_trajectory(tmp_path):
+    writer = cv2.VideoWriter(str(tmp_path / "v.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, SIZE)
+    for image in IMAGES:
+        writer.write(image[..., ::-1])
+    writer.release()
+    (tmp_path / "t.txt").write_text(trajectory(TRUE[:3], np.arange(3) / 10))
+    np.savetxt(tmp_path / "K.txt", K)
+    files = read_capture(tmp_path / "v.mp4", K=K, trajectory=tmp_path / "t.txt")
+    assert [frame.index for frame in files.frames] == [0, 1, 2] and "000003" in files.notes[0]
+    np.testing.assert_allclose([frame.E for frame in files.frames], TRUE[:3], atol=1e-6)
+    with pytest.raises(InputError, match="--fov"):
+        read_capture(tmp_path / "v.mp4")
+
+
+def test_images_without_poses_take_a_field_of_view(tmp_path):
+    for i, image in enumerate(IMAGES):
+        save(tmp_path / f"i{i}.png", image)
+    files = read_capture(tmp_path, fov=60.0)
+    assert all(frame.E is None for frame in files.frames) and files.unit is None
+    np.testing.assert_allclose(files.frames[0].K[0, 0], 120 / np.tan(np.radians(30)))
+    with pytest.raises(InputError, match="K"):
+        read_capture(tmp_path)
+
+
+def test_units_and_lenses_of_transforms(tmp_path):
+    folder = write_transforms(tmp_path, TRUE, TRUE, k1=-0.1)
+    assert read_capture(folder).frames[0].lens.coefficients[0] == -0.1
+    data = json.loads((folder / "transforms.json").read_text())
+    data["frames"][0]["colmap_im_id"] = 1
+    (folder / "transforms.json").write_text(json.dumps(data))
+    assert read_capture(folder).unit is None
+    assert read_capture(folder).frames[0].depth == folder / "depth/f00.png"
+
+
+def test_smaller_images_have_their_K(tmp_path):
+    folder = write_transforms(tmp_path, TRUE, TRUE)
+    for path in (folder / "images").iterdir():
+        Image.open(path).resize((SIZE[0] // 2, SIZE[1] // 2)).save(path)
+    small = read_capture(folder).frames[0].K
+    np.testing.assert_allclose(small[0, 2] + 0.5, (K[0, 2] + 0.5) / 2)
+    np.testing.assert_allclose(small[1, 1], K[1, 1] / 2)
+
+
+def without(*names: str):
+    def change(files: Path) -> None:
+        for name in names:
+            (files / name).unlink()
+
+    return change
+
+
+def edited(change):
+    def edit(folder: Path) -> None:
+        path = folder / "transforms.json"
+        data = json.loads(path.read_text())
+        change(data)
+        path.write_text(json.dumps(data))
+
+    return edit
+
+
+def cropped(folder: Path) -> None:
+    Image.fromarray(IMAGES[0][:90]).save(folder / "images/f00.png")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (without("images/f00.png", "images/f01.png", "images/f02.png"), "at least two frames"),
+        (edited(lambda data: data["frames"].clear()), "at least two frames"),
+        (edited(lambda data: data.pop("fl_x") and data.pop("fl_y")), "fl_x"),
+        (
+            edited(lambda data: data["frames"][1].update(transform_matrix=[[1, 2]])),
+            "transform_matrix",
+        ),
+        (edited(lambda data: data.update(camera_model="FOV")), "FOV"),
+        (cropped, "crop"),
+    ],
+)
+def test_bad_captures_get_a_sentence(change, words, tmp_path):
+    folder = write_transforms(tmp_path, TRUE, TRUE)
+    change(folder)
+    with pytest.raises(InputError, match=words):
+        read_capture(folder)
+
+
+def test_missing_images_and_lost_poses_are_named(tmp_path):
+    folder = write_transforms(tmp_path / "a", TRUE, TRUE)
+    (folder / "images/f01.png").unlink()
+    files: CaptureFiles = read_capture(folder)
+    assert len(files.frames) == 3 and "f01" in files.notes[0]
+    lost = seven_scenes(tmp_path / "b")
+    (lost / "frame-000002.pose.txt").write_text("-inf " * 16)
+    files = read_capture(lost)
+    assert len(files.frames) == 3 and "frame-000002" in files.notes[0]
+    with pytest.raises(FileNotFoundError):
+        read_capture(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="none of these"):
+        read_capture(tmp_path / "empty")
