@@ -171,8 +171,8 @@ def run_capture_eval(options: CaptureEvalOptions) -> Page:
     header += ("within 3 %", "within 25 %", "F 5 cm", "TAE %")
     note = (
         "AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its "
-        "median. Scale: median of depth over truth. F: of the fused cloud beside that of the true depth under "
-        "the same poses. TAE: of frames one after the other, as chosen."
+        "median. Scale: median of depth over truth. F: of the fused cloud beside that of the true depth "
+        "under the same poses. TAE: of frames one after the other, as chosen."
     )
     title = f"{options.data.name}, {len(names)} frames"
     page = Page("Captures", run_facts(options.command), (Table(title, header, tuple(rows), note),), ())
