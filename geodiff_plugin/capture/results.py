@@ -17,9 +17,7 @@ from geodiff_plugin.capture.neighbours import choose_neighbours
 from geodiff_plugin.formats.clouds import write_glb
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
 from geodiff_plugin.formats.out import atomic_path
-from geodiff_plugin.plotting.figures import depth_figure
-from geodiff_plugin.plotting.sheets import grid
-from geodiff_plugin.plotting.video import depth_frames, write_depth_video
+from geodiff_plugin.plotting import depth_figure, depth_frames, grid, write_depth_video
 
 __all__ = ["ALONE", "write_agreement", "write_results"]
 

@@ -36,6 +36,7 @@ from geodiff_plugin.cli.terminal import (
 )
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import OutFolder, atomic_path, reason_of
+from geodiff_plugin.formats.reading import has_pose_per_image
 from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.options import flag_of
@@ -299,6 +300,23 @@ def _row(report: dict[str, Any]) -> Row:
     }
 
 
+def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
+    """Refuse one distance for all pairs of a model, whose cameras are differently far from each other.
+
+    Raises:
+        InputError: ``--baseline`` with a calibration that has a pose for each image.
+    """
+    if options.baseline is None or len(refs) < 2:
+        return
+    for calib in dict.fromkeys(options_of(ref, options).calib for ref in refs):
+        if calib and has_pose_per_image(calib if len(calib) > 1 else calib[0]):
+            cure = (
+                "Every pair of such a model has another distance. Give the model's scale: geodiff capture "
+                "MODEL with --distance, --known-length or --metres-per-unit."
+            )
+            bad_value("--baseline", "left out with many pairs of one model", str(calib[0]), cure)
+
+
 def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     """Run the command on all pairs, answer on stdout, and leave with a code if one of them failed.
 
@@ -311,6 +329,7 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
             is computed, and nothing written; all pairs fail for one reason; the disk is full.
     """
     assert options.out is not None
+    _refuse_one_length(options, refs)
     device, _ = pick_device(options.device), options.config()
     there: dict[str, Row] = {}
     if not options.overwrite:
