@@ -207,8 +207,9 @@ class GuidanceConfig:
             it if they do not fit there; a step with neither correction nor updates is left to the prior, and
             is not decoded.
         refine: the result is fitted to its matches and points once more, at full resolution.
-        sharpen: before the result is refined, pixels that hang in the air between a near and a far surface
-            get the depth of one of them, the weighted median of their neighbours (after Ma et al. 2013).
+        crisp: depth edges of the result follow the matches, the image's colours and, as far as it is right,
+            the prior: pixels that hang in the air between two surfaces get the depth of one of them, and then
+            the neighbours of every pixel vote on its refined depth (weighted medians, after Ma et al. 2013).
         smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
             long, for a prior that is wrong by 5 %; it falls with the fourth power of that error.
         match_noise: relative error of a perfect match: below it one match is as good as another.
@@ -260,7 +261,7 @@ class GuidanceConfig:
     correct: bool = _flag(True)
     corrections: int = _integer(2, 1, 10_000, paper="-")
     refine: bool = _flag(True)
-    sharpen: bool = _flag(True, paper="-")
+    crisp: bool = _flag(True, paper="-")
     smoothness: float = _number(40.0, TINY, 1e6, paper="-")
     match_noise: float = _number(0.02, TINY, 1e3, paper="-")
     outlier_width: float = _number(3.0, TINY, 1e6, paper="-")
@@ -386,7 +387,13 @@ FORMER: dict[str, Any] = {
     **{"reflection_least_spread": 0.05, "reflection_gone": 1.6, "reflection_limit": 1.5},
     **{"reflection_sure": 0.3},
     **{"correction_scale": 1.0, "ramp_step": 0.02, "ramp_contrast": 2.0, "ramp_slope": 0.04},
-    **{"sharpen_colour": 0.12, "sharpen_reach": 1.5, "correction_cauchy": 2.5, "stiffness_power": 4.0},
+    **{
+        "sharpen": True,
+        "sharpen_colour": 0.12,
+        "sharpen_reach": 1.5,
+        "correction_cauchy": 2.5,
+        "stiffness_power": 4.0,
+    },
     **{"loosest": 0.03, "stiffest": 100.0, "inertia": 0.015, "least_inertia": 5e-4, "most_inertia": 0.03},
     **{"broad_smoothness": 50.0, "broad_inertia": 1e-4, "passes": 3, "stiff_smoothness": 400.0},
     **{"stiff_inertia": 1.3e-3, "block": 0.08, "least_error": 0.01, "most_error": 0.5},

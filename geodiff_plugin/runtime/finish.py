@@ -1,4 +1,4 @@
-"""From decoded maps to the result: ensembles reduced, edges sharpened, matches fitted once more.
+"""From decoded maps to the result: ensembles reduced, matches fitted once more, edges made crisp.
 
 Ensembles are of metric maps (S5.1): median and median absolute deviation, without alignment. Marigold's own
 ``ensemble_depth`` renormalises to [0, 1], which would lose the metres.
@@ -16,9 +16,9 @@ from torch import Tensor
 from geodiff_plugin._checks import check_choice
 from geodiff_plugin.algorithm.correction import correction_target, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence
-from geodiff_plugin.algorithm.sharpening import sharpen_edges
+from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.geometry.cameras import image_size
+from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.runtime.run import GuidedRun
 
@@ -36,10 +36,10 @@ def finish(
     spacing: int,
     config: GuidanceConfig,
 ) -> tuple[Tensor, Tensor] | None:
-    """One decoded depth map as it is given out: edges sharpened, then fitted to matches and points.
+    """One decoded depth map as it is given out: fitted to matches and points, with crisp edges.
 
-    Edges first: a fit that finds them steep does not carry the depth of one surface over to the other, and
-    the fit takes back what a poor prior's edges get wrong.
+    Ramps first: a fit that finds edges steep does not carry the depth of one surface over to the other. Then
+    the fit, and the votes of matches, colours and the fitted map.
 
     Args:
         depth_m: ``(1, 1, H, W)`` metres on the grid of the output.
@@ -56,12 +56,18 @@ def finish(
         none.
     """
     matches, points = Matches.stack([evidence.sweep_matches]), Matches.stack([evidence.sweep_points])
-    if config.sharpen and (matches is not None or points is not None):
+    if config.crisp and (matches is not None or points is not None):
         depth_m = sharpen_edges(depth_m, left, spacing)
     target = correction_target(matches, points, kept, error, depth_m)
     if target is None or error is None:
         return None
-    return refine_depth(depth_m, target, evidence.native_left[None], error, config)[:2]
+    fitted_m, support, _ = refine_depth(depth_m, target, evidence.native_left[None], error, config)
+    if config.crisp and matches is not None:
+        target = correction_target(matches, points, kept, error, fitted_m)
+        assert target is not None
+        K = resize_intrinsics(evidence.K_left[None], image_size(evidence.left_01), image_size(left))[0]
+        fitted_m = vote_depth(fitted_m, left, target, error, evidence.native, K)
+    return fitted_m, support
 
 
 def finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tensor, Tensor | None]:
