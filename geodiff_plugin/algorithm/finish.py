@@ -37,6 +37,8 @@ BRIGHTNESS, REACH = 0.1, 1.5
 #: inverse depth from a pixel on a ramp to each of two opposite neighbours; how many times steeper than the
 #: surfaces on both sides it must be there; the slope in log depth at which a neighbour counts half.
 BESIDE, STEP, STEEPER, SLOPE = 3, 0.02, 2.0, 0.04
+#: Difference in brightness at which a neighbour's weight falls to a third, at ramps.
+RAMP_BRIGHTNESS = 0.12
 #: Two opposite neighbours: across, down, and both diagonals.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 #: Pixels on ramps whose windows are in memory at once; pixels of a strip whose votes stay in a CPU's cache.
@@ -48,7 +50,7 @@ MOST_PIXELS = 600_000
 MEDIAN_STEP, MEAN_STEP, REGION = 3.0, 2.0, 9
 #: Vote of the map itself, as a share of a window full of sure matches, for a prior whose measured error is
 #: ``WEAK`` or more. It grows as the square of a smaller one: a good prior knows where edges are.
-MAP_VOTE, WEAK = 0.01, 0.2
+MAP_VOTE, WEAK = 0.03, 0.2
 #: A match counts for a quarter where it differs from the map by this many errors of the prior; a larger error
 #: than the second number counts as that.
 DIFFERS, MOST_ERROR = 1.5, 0.1
@@ -135,7 +137,7 @@ class _Strip:
         centre = (v + self.halo) * width + u + self.halo
         window = centre[:, None] + self.spacing * (down * width + right)  # (n, samples), into flat maps
         image = self.image.flatten(1)
-        unlike = (image[:, window] - image[:, centre, None]).abs().mean(0) / BRIGHTNESS
+        unlike = (image[:, window] - image[:, centre, None]).abs().mean(0) / RAMP_BRIGHTNESS
         away = (down**2 + right**2).float() / (2.0 * REACH**2)
         flat = 1.0 / (1.0 + (self._slope.flatten()[window] / SLOPE) ** 2)
         return weighted_quantile(self.depth_m.flatten()[window], flat * torch.exp(-unlike - away), 0.5)

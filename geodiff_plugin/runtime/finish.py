@@ -56,7 +56,7 @@ def finish(
         none.
     """
     matches, points = Matches.stack([evidence.sweep_matches]), Matches.stack([evidence.sweep_points])
-    if config.crisp and (matches is not None or points is not None):
+    if config.sharpen and (matches is not None or points is not None):
         depth_m = sharpen_edges(depth_m, left, spacing)
     target = correction_target(matches, points, kept, error, depth_m)
     if target is None or error is None:
