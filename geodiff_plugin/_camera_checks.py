@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin._checks import bad_type, bad_value, warn
 
 __all__ = [
     "FAR_SCENE_M",
@@ -18,6 +17,7 @@ __all__ = [
     "check_intrinsics_fit",
     "check_pose",
     "check_size_of",
+    "warn_of_far_points",
     "warn_of_long_baseline",
     "warn_of_other_size",
 ]
@@ -26,6 +26,9 @@ __all__ = [
 LONG_BASELINE_M = 20.0
 #: A scene all of which lies further away than this may be one in centimetres or millimetres.
 FAR_SCENE_M = 200.0
+#: Known depths all of which are further than this, or that are whole numbers of such a size, may be
+#: millimetres.
+FAR_POINTS_M = 100.0
 #: A principal point in the outer fifth of an image is rather that of an image of another size.
 NEAR_BORDER = 0.2
 #: A principal point this far off the middle, in shares of the image, by nearly the same share both ways, is
@@ -102,20 +105,22 @@ def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image:
     """Warn of a principal point such as an image of another size has, and of a mistyped focal length."""
     shares = (K[0, 2] / width, K[1, 2] / height)
     if min(shares) < NEAR_BORDER or max(shares) > 1.0 - NEAR_BORDER:
-        warnings.warn(
+        warn(
             f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) near the border of {image} of "
             f"{width}x{height} pixels. If it is for another resolution, {SCALED_K}.",
+            doubt=True,
             stacklevel=3,
         )
     elif _off_alike(*shares):
-        warnings.warn(
+        warn(
             f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) where that of an image "
             f"{sum(shares):.2g} times the size of {image} would be. If it is for another resolution, "
             f"{SCALED_K}.",
+            doubt=True,
             stacklevel=3,
         )
     if max(K[0, 0] / K[1, 1], K[1, 1] / K[0, 0]) > STRETCHED:
-        warnings.warn(
+        warn(
             f"{name} has fx {K[0, 0]:.5g} and fy {K[1, 1]:.5g}; pixels are about square, so one of them may "
             "be mistyped.",
             stacklevel=3,
@@ -179,8 +184,27 @@ def warn_of_long_baseline(E: np.ndarray, name: str) -> None:
     """
     baseline = float(np.linalg.norm(E[:3, 3]))
     if baseline > LONG_BASELINE_M:
-        warnings.warn(
+        warn(
             f"{name} has a baseline of {baseline:.4g} m. "
             "If that is millimetres, divide the translation, or baseline_m (--baseline), by 1000.",
+            doubt=True,
+            stacklevel=3,
+        )
+
+
+def warn_of_far_points(points: np.ndarray, name: str) -> None:
+    """Warn of known depths, ``(H, W)`` or ``(N, 3)``, that look like millimetres."""
+    depths = points[:, 2] if points.shape[1] == 3 else points
+    depths = depths[np.isfinite(depths) & (depths > 0)]
+    if not len(depths):
+        return
+    nearest, median = float(depths.min()), float(np.median(depths))
+    whole = median > FAR_POINTS_M and bool((depths == np.rint(depths)).all())
+    if nearest > FAR_POINTS_M or whole:
+        kind = "only whole numbers" if whole else "none nearer"
+        warn(
+            f"{name} has depths of {nearest:.4g} m and more, {kind}. If they are millimetres, divide them by "
+            "1000, or give --points-scale 1000 (scale=1000) with a file.",
+            doubt=True,
             stacklevel=3,
         )

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -24,12 +28,16 @@ __all__ = [
     "check_number",
     "check_range",
     "check_size",
+    "noted",
     "quoted",
     "refuse",
+    "warn",
 ]
 
 #: The most characters of the given value that a message quotes; it may be a whole file.
 LONGEST_GOT = 400
+#: What ``warn`` says goes to the innermost ``noted`` block too.
+_NOTED: ContextVar[dict[str, bool] | None] = ContextVar("noted", default=None)
 
 
 class InputError(ValueError):
@@ -86,6 +94,34 @@ def _short(value: object) -> str:
     if isinstance(value, int) and value.bit_length() > 128:
         return "a whole number of more than 128 bits"
     return str(value)
+
+
+def warn(sentence: str, *, doubt: bool = False, stacklevel: int = 2) -> None:
+    """Warn, and tell the ``noted`` block that this runs in.
+
+    Args:
+        sentence: for the user.
+        doubt: a result with this warning is not to be trusted.
+        stacklevel: as of ``warnings.warn``, counted from the caller.
+    """
+    said = _NOTED.get()
+    if said is not None:
+        said[sentence] = said.get(sentence, False) or doubt
+    warnings.warn(sentence, stacklevel=stacklevel + 1)
+
+
+@contextmanager
+def noted() -> Iterator[dict[str, bool]]:
+    """Every sentence that ``warn`` says inside, and whether it is a doubt; blocks may be nested."""
+    said: dict[str, bool] = {}
+    outer = _NOTED.get()
+    token = _NOTED.set(said)
+    try:
+        yield said
+    finally:
+        _NOTED.reset(token)
+        if outer is not None:
+            outer.update(said)
 
 
 def check_metres(array: np.ndarray, name: str, got: str = "") -> None:

@@ -184,7 +184,9 @@ class MetricDepthOutput(BaseOutput):
         scale_spread: relative spread of that scale over matches or the prior's map; ``None`` if unknown.
         rescaled: factor from the lengths of ``GeometryGuidance`` to metres, if only the prior knows the unit;
             else 1.
-        warnings: sentences for the user about this result, including those of the verdicts.
+        warnings: sentences for the user about this result, including those of the verdicts and those that
+            the guidance gave when it was made.
+        assumed: sentences on what nobody gave, such as the right camera's principal point.
     """
 
     prediction: np.ndarray | torch.Tensor
@@ -211,3 +213,23 @@ class MetricDepthOutput(BaseOutput):
     extras: dict[str, np.ndarray | torch.Tensor] = field(default_factory=dict)
     verdicts: list[Any] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    assumed: list[str] = field(default_factory=list)
+
+    @property
+    def verdict(self) -> Any:
+        """The verdict on all images: the first that is not trusted, else not judged, else trusted."""
+        if not self.verdicts:
+            raise AttributeError("This output has no verdict: no guided call made it.")
+        return min(self.verdicts, key=lambda v: ("not trusted", "not judged", "trusted").index(v.status))
+
+    def __repr__(self) -> str:
+        """Sizes, range and verdict in a few lines, and no array."""
+        depth = (
+            self.prediction if isinstance(self.prediction, np.ndarray) else self.prediction.numpy(force=True)
+        )
+        unit = "" if self.unit is None else f" {self.unit}"
+        lines = [f"depth {depth.shape}, {np.nanmin(depth):.3g} to {np.nanmax(depth):.3g}{unit}"]
+        for verdict in self.verdicts:
+            lines.append(": ".join([verdict.status, *verdict.reasons[:1]]))
+        lines += [f"{len(self.warnings)} warnings", f"{len(self.assumed)} assumptions"]
+        return "MetricDepthOutput(" + "\n  ".join(lines) + ")"

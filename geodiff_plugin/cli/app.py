@@ -34,7 +34,7 @@ class CommandGroup(TyperGroup):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            say("geodiff: interrupted")
+            say("geodiff: interrupted; the same command resumes")
             sys.exit(EXIT_INTERRUPTED)
         except InputError as error:  # any other is a defect, and keeps its traceback
             say(f"geodiff: {error}")

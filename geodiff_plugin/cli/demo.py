@@ -56,3 +56,4 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
     except OSError as error:  # the result itself is safe
         say(f"geodiff: comparison.png could not be written ({error.strerror or error}).")
     print(summary_line(report, f"{out.path}/"))
+    print(f"Open {out.path / 'comparison.png'} first: prior, guided depth and truth side by side.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from geodiff_plugin._camera_checks import (
     check_intrinsics_fit,
     check_pose,
 )
-from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin._checks import bad_value, check_number, warn
 from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, calibration_way, intrinsics_way
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.config import GuidanceConfig
@@ -119,7 +118,7 @@ def read_inputs(
 def _read_view(path: Path, name: str) -> np.ndarray:
     image, notes = read_image(path, name if name in ("LEFT", "RIGHT") else f"--view {path}")
     for note in notes:
-        warnings.warn(note, stacklevel=2)
+        warn(note, stacklevel=2)
     return image
 
 

@@ -253,7 +253,7 @@ def finished_row(options: DepthOptions) -> Row | None:
     assert options.out is not None
     try:
         report = json.loads((options.out / "report.json").read_text(encoding="utf-8"))
-        names, made = report["files"]["names"], report["arguments"]
+        names, made, _ = report["files"]["names"], report["arguments"], report["verdict"]
         whole = all((options.out / name).stat().st_size > 0 for name in names)
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -287,16 +287,16 @@ def _as_typed(name: str, value: Any) -> str:
 
 def _row(report: dict[str, Any]) -> Row:
     """What the table says of a pair, and why it is not to be trusted."""
-    depth, judgement = report["depth"], report["judgement"]
+    depth, verdict = report["depth"], report["verdict"]
     return {
         "near_m": depth["min_m"],
         "median_m": depth["median_m"],
         "far_m": depth["max_m"],
-        "trusted": judgement["trusted"],
-        "confidence": judgement["signs"]["confidence"],
+        "verdict": verdict["status"],
+        "confidence": verdict["signs"]["confidence"] if verdict["status"] == "trusted" else None,
         "seconds": round(sum(report["seconds"].values()), 3),
         "message": " ".join(report["warnings"]) or None,
-        "reasons": " ".join(judgement["reasons"]),
+        "reasons": " ".join(verdict["reasons"]),
     }
 
 
@@ -417,9 +417,9 @@ def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:
     row |= {"pair": record["key"], "result": "there" if there else "done"}
     if record.get("status") == BROKEN:
         row |= {"result": "failed", "message": record["error"]}
-    elif options.strict and record["trusted"] is False:
+    elif options.strict and record["verdict"] != "trusted":
         assert options.out is not None
-        reason = f"The depth in {options.out / row['pair']} is not to be trusted: {record['reasons']}"
+        reason = f"The depth in {options.out / row['pair']} is {record['verdict']}: {record['reasons']}"
         say(f"geodiff: {row['pair']}: {reason}")
         row = dict.fromkeys(COLUMNS) | {"pair": row["pair"], "result": "failed", "message": reason}
     return row
@@ -445,20 +445,20 @@ def _answer(rows: Sequence[Row], options: DepthOptions) -> None:
 
 def _print(rows: Sequence[Row], out: Path) -> None:
     """The table and what it comes to."""
-    shown = [row for row in rows if row["result"] == "failed" or row["trusted"] is False]
+    shown = [row for row in rows if row["result"] == "failed" or row["verdict"] not in (None, "trusted")]
     shown = list(rows) if len(rows) <= MOST_ROWS else shown
     if shown:
         table = new_table(("pair", "result", "near m", "median m", "far m", "confidence", "s"))
         for row in shown:
             numbers = [row[name] for name in ("near_m", "median_m", "far_m", "confidence", "seconds")]
-            result = "not to be trusted" if row["trusted"] is False else row["result"]
+            result = row["result"] if row["verdict"] in (None, "trusted") else row["verdict"]
             table.add_row(row["pair"], result, *("-" if v is None else f"{v:.2f}" for v in numbers))
         show(table)
     counts = {kind: sum(row["result"] == kind for row in rows) for kind in ("done", "there", "failed")}
-    doubtful = sum(row["trusted"] is False for row in rows)
+    doubtful = sum(row["verdict"] not in (None, "trusted") for row in rows)
     number = "1 pair" if len(rows) == 1 else f"{len(rows)} pairs"
     totals = [f"{number}: {counts['done']} done, {counts['there']} there already"]
-    totals.append(f"{counts['failed']} failed, {doubtful} not to be trusted -> {out}/")
+    totals.append(f"{counts['failed']} failed, {doubtful} not trusted -> {out}/")
     show(Text(", ".join(totals)))
     for row in shown:
         if row["result"] == "failed":

@@ -26,7 +26,7 @@ __all__ = ["COLUMNS", "SUMMARY", "PairRef", "assumption", "find_pairs", "is_many
 
 #: The table of a run, and its columns.
 SUMMARY = "pairs.csv"
-COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "trusted", "confidence", "seconds", "message")
+COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "verdict", "confidence", "seconds", "message")
 LISTS = (".csv", ".tsv", ".txt")
 #: A list's heading, which is no pair, begins with this.
 HEADING = "left"

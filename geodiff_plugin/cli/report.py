@@ -131,7 +131,8 @@ def build_report(
         )
     report = {
         "depth": depth_summary(depth_m, visible),
-        "judgement": _judgement(output.verdicts[0]),
+        "verdict": _verdict(output.verdict),
+        "assumed": output.assumed,
         "photometric_error_mean": error_mean,
         "uncertainty_median_m": None
         if output.uncertainty is None
@@ -175,19 +176,18 @@ def build_report(
     return _plain(report)
 
 
-def _judgement(verdict: Verdict) -> dict[str, Any]:
+def _verdict(verdict: Verdict) -> dict[str, Any]:
     """JSON values of a verdict; the file has its indicators under ``signs``."""
     values = asdict(verdict)
     return values | {"signs": values.pop("indicators")}
 
 
-def _quality(judgement: dict[str, Any]) -> str:
-    """What the judgement rests on, in a few words."""
-    signs = judgement["signs"]
+def _quality(signs: dict[str, Any]) -> str:
+    """What a trusted depth rests on, in a few words."""
     said = [] if signs["confidence"] is None else [f"confidence {signs['confidence']:.2f}"]
     said += [] if signs["matched"] is None else [f"{100 * signs['matched']:.0f} % matched"]
     said += [] if not signs["points"] else [f"{signs['points']} known depths"]
-    return ("" if judgement["trusted"] else "DO NOT TRUST THIS, ") + (", ".join(said) or "not judged")
+    return ", ".join(["trusted", *said])
 
 
 def _length(value: float, unit: str | None) -> str:
@@ -197,7 +197,7 @@ def _length(value: float, unit: str | None) -> str:
 
 
 def summary_line(report: dict[str, Any], where: str) -> str:
-    """One line for people: near, far, median, how far to trust them, how far off a metric prior was."""
+    """One line for people: near, far, median and what they rest on; where not trusted, the verdict first."""
     depth, seconds = report["depth"], sum(report["seconds"].values())
     if depth["median_m"] is None:
         return f"no valid depth; {seconds:.1f} s -> {where}"
@@ -208,5 +208,8 @@ def summary_line(report: dict[str, Any], where: str) -> str:
         of = "the calibration's lengths" if report.get("estimated_pose") is None else "baselines"
         lengths = f", in {of} (no unit)"
     near, far, median = (_length(depth[name], unit) for name in ("min_m", "max_m", "median_m"))
-    quality = _quality(report["judgement"])
-    return f"{near} to {far}, median {median}{lengths}; {quality}{said}; {seconds:.1f} s -> {where}"
+    verdict, metres = report["verdict"], f"{near} to {far}, median {median}{lengths}"
+    if verdict["status"] == "trusted":
+        return f"{metres}; {_quality(verdict['signs'])}{said}; {seconds:.1f} s -> {where}"
+    reason = verdict["reasons"][0] if verdict["reasons"] else "neither matches nor known depths test it."
+    return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {seconds:.1f} s -> {where})"

@@ -86,9 +86,9 @@ def _judged(record: Record) -> Record:
     if record["status"] == "refused":
         return record
     signs: dict[str, Any] = {n: math.nan if value is None else value for n, value in record["signs"].items()}
-    verdict = judge(Indicators(**signs | {"mistakes": tuple(signs["mistakes"])}))
-    status = "trusted" if verdict.trusted else "not trusted"
-    return record | {"status": status, "said": [*record["said"], *verdict.reasons, *verdict.remarks]}
+    sentences = {name: tuple(signs.get(name, ())) for name in ("doubts", "mistakes")}
+    verdict = judge(Indicators(**signs | sentences))
+    return record | {"status": verdict.status, "said": [*record["said"], *verdict.reasons, *verdict.remarks]}
 
 
 def _beyond_views(record: dict[str, Any]) -> bool:

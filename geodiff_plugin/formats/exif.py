@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from geodiff_plugin._checks import InputError, bad_value, check_number
+from geodiff_plugin._checks import InputError, bad_value, check_number, warn
 from geodiff_plugin.formats.images import open_image
 from geodiff_plugin.formats.rigs import intrinsics
 
@@ -82,7 +81,7 @@ def warn_of_other_lens(source: str | os.PathLike[str] | Image.Image, K: np.ndarr
     factor = K[0, 0] / found[0, 0]
     if len(notes) > 1 or max(factor, 1 / factor) < _OTHER_LENS:
         return
-    warnings.warn(
+    warn(
         f"K has a focal length of {K[0, 0]:.0f} px for {name}, {factor:.2f} times the {found[0, 0]:.0f} px "
         "of its EXIF: is K for an image of another size? If it is, all metres are off by that factor.",
         stacklevel=3,

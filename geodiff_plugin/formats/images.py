@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from geodiff_plugin._checks import InputError, bad_type, bad_value
+from geodiff_plugin._checks import InputError, bad_type, bad_value, warn
 from geodiff_plugin.formats.files import check_file
 
 __all__ = ["MIN_SIDE", "as_image_01", "open_image", "picture_size", "read_image"]
@@ -262,22 +262,22 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
     deep = _has_16_bits(raw)
     if isinstance(raw, Image.Image):
         if raw.getexif().get(EXIF_ORIENTATION) in TURNS:
-            warnings.warn(
+            warn(
                 f"{name} carries an EXIF orientation that is not applied; "
                 "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image.",
                 stacklevel=3,
             )
         for note in _frame_notes(raw, name):
-            warnings.warn(note, stacklevel=3)
+            warn(note, stacklevel=3)
         if _has_alpha(raw):
-            warnings.warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
+            warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
         hwc = _pil_to_array(raw, name)
     else:
         if raw.shape[-1] == 4:
-            warnings.warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
+            warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
             raw = raw[..., :3]
         hwc = _scaled(raw, name)
     for note in _dark_notes(raw, name) if deep else ():
-        warnings.warn(note, stacklevel=3)
+        warn(note, stacklevel=3)
     hwc = np.repeat(hwc, 3, axis=-1) if hwc.shape[-1] == 1 else hwc
     return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))

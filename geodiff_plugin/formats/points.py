@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
-from geodiff_plugin._camera_checks import FAR_SCENE_M
-from geodiff_plugin._checks import bad_value, check_metres, check_number
+from geodiff_plugin._checks import bad_value, check_metres, check_number, warn
 from geodiff_plugin.formats.depth import read_depth_png, read_pfm
 from geodiff_plugin.formats.files import check_file, read_npy, read_text, refuse_decimal_commas
 from geodiff_plugin.formats.kitti import read_velodyne
@@ -115,25 +113,13 @@ def _png_scale(path: Path, scale: float | None) -> float:
     if scale is not None:
         return scale
     if KITTI_FOLDERS.search(str(path.parent)):
-        warnings.warn(
+        warn(
             f"{path} is read in KITTI's units of 1/256 m, as its folder's name says; "
             "give --points-scale 1000 (scale=1000) if it is in millimetres.",
             stacklevel=4,
         )
         return KITTI_UNITS
     return MILLIMETRES
-
-
-def _warn_of_far(values: np.ndarray, path: Path) -> None:
-    """Warn of known depths all of which are so large that they look like millimetres."""
-    depths = values[:, 2] if values.shape[1] == 3 else values
-    nearest = float(np.min(depths, where=depths > 0, initial=np.inf))
-    if FAR_SCENE_M < nearest < np.inf:
-        warnings.warn(
-            f"{path} has no known depth nearer than {nearest:.4g} m. "
-            "If its numbers are millimetres, give --points-scale 1000 (scale=1000).",
-            stacklevel=3,
-        )
 
 
 def read_points(
@@ -193,8 +179,6 @@ def read_points(
     with np.errstate(over="ignore"):
         values = (values / (scale or 1.0)).astype(np.float32)
     values = values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
-    if scale is None:
-        _warn_of_far(values, found)
     return values
 
 

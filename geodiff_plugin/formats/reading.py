@@ -6,14 +6,13 @@ A new format is a new file and one line in the table (docs/reference/calibration
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import FolderError, InputError, bad_type, bad_value, check_number, refuse
+from geodiff_plugin._checks import FolderError, InputError, bad_type, bad_value, check_number, refuse, warn
 from geodiff_plugin.formats.colmap import COLMAP, model_files, model_text
 from geodiff_plugin.formats.files import check_file, read_text
 from geodiff_plugin.formats.kalibr import EUROC, KALIBR
@@ -110,7 +109,7 @@ def _read(texts: dict[Path, str], name: str, choice: CameraChoice) -> Rig:
         )
         bad_value(source, f"a whole {calibration.summary}", got, "Is the file cut off?")
     for note in raw.notes:
-        warnings.warn(f"{source}: {note}", stacklevel=3)
+        warn(f"{source}: {note}", stacklevel=3)
     return rig
 
 
@@ -131,7 +130,7 @@ def _in_metres(rig: Rig, baseline_m: float | None, name: str) -> Rig:
     """The rig with its cameras ``baseline_m`` apart; a warning where nothing says what its unit is."""
     if baseline_m is None:
         if not CALIBRATION_FORMATS[name].has_unit:
-            warnings.warn(
+            warn(
                 f"{rig.source} has no unit: depth comes out in the model's own. Give the measured "
                 "distance of the two cameras as baseline_m (--baseline) to get metres.",
                 stacklevel=3,

@@ -5,7 +5,8 @@ S3.3, S4.2, S5.1; ``preset="paper"`` is Algorithm 1 with its printed numbers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from geodiff_plugin._camera_checks import check_calibrated_size, check_size_of
-from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, check_size, refuse
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, check_size, noted, refuse
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.gradients import RULES
@@ -26,7 +27,29 @@ from geodiff_plugin.guidance.inputs import read_inputs, split_views
 from geodiff_plugin.guidance.photographs import EstimatedRig, estimate_rig
 from geodiff_plugin.types import MetricDepthOutput, Rig
 
-__all__ = ["GeometryGuidance"]
+__all__ = ["SAME_CENTRE", "GeometryGuidance"]
+
+#: What is assumed of a rectified pair whose right camera has no K of its own.
+SAME_CENTRE = (
+    "The right camera's cx is assumed to be the left one's. If it is not, every depth is off: each pixel of "
+    "difference (doffs) shifts all disparities by one. Give K=(K_left, K_right); on the command line --K, "
+    "--K-right and --E."
+)
+#: Cosine of the angle below which two cameras count as parallel.
+PARALLEL = 0.9999
+
+
+def _remembers_warnings(make: Callable[..., Any]) -> Any:
+    """Let a constructor keep what is warned of before it calls ``__init__``, too."""
+
+    @functools.wraps(make)
+    def made(*args: Any, **kwargs: Any) -> Any:
+        with noted() as said:
+            guidance = make(*args, **kwargs)
+        guidance.warned = said
+        return guidance
+
+    return made
 
 
 class GeometryGuidance:
@@ -68,6 +91,8 @@ class GeometryGuidance:
         unit: as the argument.
         evidence_store: cache of cost volumes and matches for further calls with the same images, cameras and
             settings; ``None``, the default, for no cache.
+        warned: every warning of the construction, and whether a result with it is not to be trusted.
+        assumed: sentences on what nobody gave.
         previous: as the argument; it may be set before every call.
         measured_baseline: likewise.
 
@@ -112,7 +137,11 @@ class GeometryGuidance:
             )
         self.config, self.unit = config.changed(**knobs), unit
         _check_names(self.config)
-        self.inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
+        with noted() as self.warned:
+            self.inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
+        parallel = [np.trace(rig.E[:3, :3]) > 1.0 + 2.0 * PARALLEL for rig in self.rigs]
+        typed_once = not isinstance(K, tuple) and bool(parallel) and all(parallel)
+        self.assumed = [SAME_CENTRE] if typed_once else []
         self.measured_baseline = measured_baseline
         self.evidence_store: EvidenceStore | None = None
         self.previous = previous
@@ -137,6 +166,7 @@ class GeometryGuidance:
         return cls(right, K if K_right is None else (K, K_right), E, **{"measured_baseline": True} | knobs)
 
     @classmethod
+    @_remembers_warnings
     def from_calibration(
         cls,
         right: Any,
@@ -174,6 +204,7 @@ class GeometryGuidance:
         return guidance
 
     @classmethod
+    @_remembers_warnings
     def from_views(cls, views: Sequence[tuple[Any, Any, Any]], **knobs: Any) -> Self:
         """Two or more posed views of one scene, the left (reference) view first.
 
@@ -201,6 +232,7 @@ class GeometryGuidance:
         return cls(None, K, None, points=points, **knobs)
 
     @classmethod
+    @_remembers_warnings
     def from_photographs(
         cls,
         left: Any,
@@ -251,6 +283,8 @@ class GeometryGuidance:
         more = {"points": points if unit else None, "cropped": cropped, "unit": unit} | lengths
         guidance = cls.from_views(list(views), **more, **knobs)
         guidance.estimated = rig
+        if K_right is None and np.trace(rig.Es[0][:3, :3]) > 1.0 + 2.0 * PARALLEL:
+            guidance.assumed = [SAME_CENTRE]
         return guidance
 
     @classmethod

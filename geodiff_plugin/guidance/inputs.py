@@ -20,6 +20,7 @@ from geodiff_plugin._camera_checks import (
     check_intrinsics_fit,
     check_pose,
     check_size_of,
+    warn_of_far_points,
     warn_of_long_baseline,
 )
 from geodiff_plugin._checks import bad_type, bad_value, check_metres
@@ -111,6 +112,8 @@ def _read_one(right: Any, K: Any, E: Any, points: Any, label: str, cropped: bool
     matrices = [(torch.from_numpy(rig.K_right), torch.from_numpy(rig.T_right_from_left)) for rig in rigs]
     views = tuple(CameraView(x, K.float(), T.float()) for x, (K, T) in zip(images, matrices, strict=True))
     points = None if points is None else as_points(points, label.format("points"))
+    if points is not None and unit == "m":
+        warn_of_far_points(points.numpy(), label.format("points"))
     return Inputs(K_left, views, rigs, points, unit)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -16,7 +17,7 @@ from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.priors.pipelines.base import RESAMPLING
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 
-__all__ = ["check_arguments", "check_guidable", "check_left_images", "needs_network"]
+__all__ = ["check_arguments", "check_guidable", "check_left_images", "check_named_arguments", "needs_network"]
 
 #: What every stock pipeline's call takes, whatever the prior.
 STOCK_ARGUMENTS = (
@@ -28,6 +29,22 @@ STOCK_MODES = ("L", "RGB", "I;16")
 STOCK_TYPES = (np.uint8, np.uint16, np.float16, np.float32, np.float64)
 #: More than any call asks for, of steps, pixels or members.
 MOST = 1 << 20
+
+
+def check_named_arguments(pipeline: type) -> None:
+    """Refuse a subclass whose ``__call__`` does not name the arguments of the stock pipeline.
+
+    Raises:
+        ValueError: naming those that it hides.
+    """
+    named = inspect.signature(pipeline.__call__).parameters
+    missing = [name for name in STOCK_ARGUMENTS if name not in named]
+    if missing:
+        refuse(
+            f"The __call__ of {pipeline.__name__} must name the arguments of the stock pipeline that it "
+            f"overrides; it has no {', '.join(missing)}. A **kwargs that hands them on hides them: "
+            "write them out."
+        )
 
 
 def check_arguments(call: Mapping[str, Any], images: int) -> None:
@@ -45,12 +62,6 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
             that does not exist; no generator, or a list of another number than that of all members; latents
             that are not finite.
     """
-    missing = [name for name in STOCK_ARGUMENTS if name not in call]
-    if missing:
-        refuse(
-            f"The pipeline's __call__ must name the arguments of the stock pipeline that it overrides; "
-            f"it has no {', '.join(missing)}. A **kwargs that hands them on hides them: write them out."
-        )
     check_choice(call["output_type"], "output_type", ("np", "pt"))
     check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
     if call["resample_method_output"] is not None:

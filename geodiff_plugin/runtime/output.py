@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -13,14 +14,17 @@ import torch.nn.functional as F
 from diffusers.pipelines.marigold import MarigoldDepthOutput
 from torch import Tensor
 
+from geodiff_plugin._checks import InputError
 from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.matching import find_matches
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.scale import NO_UNIT
 from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
 from geodiff_plugin.runtime.finish import finish_images, median, spread_of_members
 from geodiff_plugin.runtime.run import GuidedRun
-from geodiff_plugin.runtime.verdict import Verdict, judge, points_agreement, read_indicators
+from geodiff_plugin.runtime.verdict import Indicators, Verdict, judge, points_agreement, read_indicators
+from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["assemble_output"]
@@ -36,6 +40,7 @@ def assemble_output(
     run: GuidedRun,
     guidance: GeometryGuidance,
     call: Mapping[str, Any],
+    said: Mapping[str, bool],
 ) -> MetricDepthOutput:
     """Everything of ``MetricDepthOutput`` but ``latent``.
 
@@ -44,6 +49,7 @@ def assemble_output(
         run: the finished run.
         guidance: what was configured.
         call: arguments of the stock call by name.
+        said: what was warned of so far, and whether it forbids trust.
     """
     lefts_01 = _native_lefts(run)
     count, size = lefts_01.shape[0], image_size(lefts_01)
@@ -70,12 +76,24 @@ def assemble_output(
     own_ratios = [math.nan] * count
     if over_own is not None and guidance.unit is not None:
         own_ratios = over_own.reshape(count, -1).median(1).values.tolist()
-    verdicts = [_verdict(run, i, K_lefts[i], confidence, own_ratios[i], guidance) for i in range(count)]
+    relative = torch.cat(run.relative)
+    relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
+    doubts = [sentence for sentence, forbids in said.items() if forbids]
+    verdicts = [
+        judge(
+            _indicators(
+                *(run, i, K_lefts[i], depth_m[i], relative[i : i + 1]),
+                confidence=None if confidence is None else confidence[i],
+                own_ratio=own_ratios[i],
+                doubts=doubts,
+                has_unit=guidance.unit is not None,
+            )
+        )
+        for i in range(count)
+    ]
     if confidence is not None:
         agreement = confidence.new_tensor([points_agreement(verdict.indicators) for verdict in verdicts])
         confidence = confidence * agreement.view(-1, 1, 1, 1)
-    relative = torch.cat(run.relative)
-    relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
     if call["match_input_resolution"]:
         relative = F.interpolate(relative, size, mode="bilinear", align_corners=False)
 
@@ -106,7 +124,12 @@ def assemble_output(
         extras=getattr(stock, "extras", {}),
         verdicts=verdicts,
         unit=guidance.unit,
-        warnings=_warnings(run, visible, verdicts) + list([] if estimated is None else estimated.warnings),
+        warnings=[
+            *_warnings(run, visible, verdicts),
+            *(() if estimated is None else estimated.warnings),
+            *(sentence for sentence, forbids in said.items() if not forbids),  # doubts are reasons already
+        ],
+        assumed=list(guidance.assumed),
         scale_from=None if estimated is None else estimated.scale.source,
         scale_spread=None if estimated is None else estimated.scale.spread,
     )
@@ -170,28 +193,34 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_own: Tensor) -> Metric
     return output
 
 
-def _verdict(
-    run: GuidedRun,
-    image: int,
-    K_left: Tensor,
-    confidence: Tensor | None,
-    own_ratio: float,
-    guidance: GeometryGuidance,
-) -> Verdict:
-    """The verdict on one image's run."""
+def _indicators(
+    run: GuidedRun, image: int, K_left: Tensor, depth_m: Tensor, relative: Tensor, **more: Any
+) -> Indicators:
+    """What the run of one image tells; where it used no matches, they are made here, to judge it by."""
     samples = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
-    order = torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean()
-    indicators = read_indicators(
-        run.evidence[image],
+    evidence = run.evidence[image]
+    order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())
+    if evidence.sweep_matches is None and evidence.native:
+        with suppress(InputError):  # views without overlap: not judged
+            matches = find_matches(
+                evidence.native_left,
+                evidence.native,
+                K_left,
+                volume=evidence.volume,
+                depth_range=run.config.depth_range,
+                config=run.config,
+            )
+            evidence = replace(evidence, sweep_matches=matches, sweep_points=None)
+            order = float(order_agreement(relative, matches, run.prior.space))
+    return read_indicators(
+        evidence,
         K_left,
-        order=float(order),
-        confidence=None if confidence is None else confidence[image],
+        order=order,
+        depth_m=depth_m,
         on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in samples),
         range_given=run.config.depth_range is not None,
-        own_ratio=own_ratio,
-        has_unit=guidance.unit is not None,
+        **more,
     )
-    return judge(indicators)
 
 
 def _native_lefts(run: GuidedRun) -> Tensor:
@@ -210,7 +239,7 @@ def _as_maps(values: Any) -> Tensor:
 def _warnings(run: GuidedRun, visible: Tensor | None, verdicts: Sequence[Verdict]) -> list[str]:
     warnings = []
     for i, verdict in enumerate(verdicts):
-        sentences = [verdict.sentence] if verdict.reasons else []
+        sentences = [] if verdict.trusted else [verdict.sentence]
         sentences += verdict.remarks
         share = 1.0 if visible is None else visible[i].float().mean().item()
         if share < LITTLE_OVERLAP:

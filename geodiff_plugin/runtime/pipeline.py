@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
-import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -18,13 +17,18 @@ from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImage
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from geodiff_plugin._checks import bad_type, bad_value, refuse
+from geodiff_plugin._checks import bad_type, bad_value, noted, refuse, warn
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
 from geodiff_plugin.priors.tiny import tiny_autoencoder
-from geodiff_plugin.runtime.checks import check_arguments, check_guidable, check_left_images
+from geodiff_plugin.runtime.checks import (
+    check_arguments,
+    check_guidable,
+    check_left_images,
+    check_named_arguments,
+)
 from geodiff_plugin.runtime.estimate import ProcessingGrid
 from geodiff_plugin.runtime.finish import ensemble_metric
 from geodiff_plugin.runtime.hooks import Exclusive, exclusive_call
@@ -73,7 +77,7 @@ class GuidedCall(_Stock):
             callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
                 ``latents`` in what it returns replace the pipeline's. The others are those of the last step
                 that was corrected or updated, and ``None`` before the first.
-            strict: a depth that is not to be trusted (``output.verdicts``) is an error.
+            strict: a depth that is not trusted, or not judged (``output.verdict``), is an error.
             **kwargs: as the stock call takes them.
 
         Returns:
@@ -84,8 +88,8 @@ class GuidedCall(_Stock):
             TypeError: ``guidance`` is no ``GeometryGuidance``; a scheduler that cannot be guided.
             ValueError: an image that the right one could not be either; inputs that do not fit each other;
                 offloading that forbids guidance.
-            RuntimeError: called inside ``torch.inference_mode()``, or by a hook of a guided call's own
-                networks. From ``callback_on_step_end`` the pipeline may be called, guided or not: there it
+            RuntimeError: updates inside ``torch.inference_mode()``, or a call by a hook of the networks of a
+                guided call. From ``callback_on_step_end`` the pipeline may be called, guided or not: there it
                 is as the user left it. A call in another thread waits.
         """
         if guidance is None and callback_on_step_end is not None:
@@ -100,12 +104,15 @@ class GuidedCall(_Stock):
                 return super().__call__(image, *args, **kwargs)
             stock_call = super().__call__
             extra = (guidance, callback_on_step_end, strict)
-            return self._call_guided(stock_call, held, *extra, image, *args, **kwargs)
+            _check_guided_call(guidance, callback_on_step_end)
+            with torch.inference_mode(False), torch.no_grad(), noted() as said:
+                return self._call_guided(stock_call, held, said, *extra, image, *args, **kwargs)
 
     def _call_guided(
         self,
         stock_call: Callable[..., Any],
         held: Exclusive,
+        said: dict[str, bool],
         guidance: GeometryGuidance,
         callback: StepCallback | None,
         strict: bool,
@@ -113,7 +120,6 @@ class GuidedCall(_Stock):
         *args: Any,
         **kwargs: Any,
     ) -> Any:
-        _check_guided_call(guidance, callback)
         image, count = check_left_images(image)
         call, prior = _bind(stock_call, image, *args, **kwargs), find_adapter(self)(self)
         check_arguments(call, count)
@@ -160,10 +166,9 @@ class GuidedCall(_Stock):
             run.release()
         run.check_finite()
         with torch.autocast(device.type, enabled=False):
-            output = assemble_output(stock, run, guidance, call)
-        for verdict in output.verdicts if strict else ():
-            if not verdict.trusted:
-                refuse(verdict.sentence)
+            output = assemble_output(stock, run, guidance, call, guidance.warned | said)
+        if strict and not output.verdict.trusted:
+            refuse(output.verdict.sentence)
         output.latent = stock.latent if wants_latent else None
         return output if wants_dict else (output.prediction, output.uncertainty, output.latent)
 
@@ -242,9 +247,9 @@ def _check_guided_call(guidance: Any, callback: Any) -> None:
         bad_type("guidance", "a GeometryGuidance", guidance, "GeometryGuidance(right, K, E)")
     if callback is not None and not callable(callback):
         bad_type("callback_on_step_end", "a function", callback)
-    if torch.is_inference_mode_enabled():
+    if torch.is_inference_mode_enabled() and guidance.updates.inner_steps > 0:
         raise RuntimeError(
-            "A guided call needs gradients, which torch.inference_mode() forbids; "
+            "Gradient updates (inner_steps) are not possible under torch.inference_mode(); "
             "use torch.no_grad() or nothing."
         )
 
@@ -256,7 +261,7 @@ def _one_member(call: dict[str, Any]) -> dict[str, Any]:
     for name, kind in (("generator", list), ("latents", Tensor)):
         if isinstance(call[name], kind):
             changed[name] = call[name][first]
-    warnings.warn(
+    warn(
         "This prior gives the same map every time: of the ensemble one member runs.",
         stacklevel=5,
     )
@@ -300,8 +305,10 @@ def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
 
     Raises:
         TypeError: no adapter understands it.
+        ValueError: its ``__call__`` hides the stock arguments behind ``**kwargs``.
     """
     find_adapter(pipe)
+    check_named_arguments(_stock_class(type(pipe)) if isinstance(pipe, GuidedCall) else type(pipe))
     if not isinstance(pipe, GuidedCall):
         pipe.__class__ = _guided_class(pipe.__class__)
     return pipe

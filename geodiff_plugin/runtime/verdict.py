@@ -7,6 +7,7 @@ a factor that a rig might have, matches as well as a right one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +31,8 @@ SAME, SAME_SHARE = 1.5 / 255, 0.05
 #: Points that are compared with matches: at least so many, each with matches this near, pixels of the grid.
 FEWEST_COMPARED, REACH_PX = 12, 3
 FEWEST_MATCHES = 40
+#: Median difference of the depth from what both views match, a log, from which it is not to be trusted.
+OFF_MATCHES = math.log(1.2)
 #: Log of the ratio of the 95 % and the 5 % quantile of depth below which a scene may be one plane.
 FLAT = 0.2
 #: Below these a run is not to be trusted: mean confidence, share matched; and a rank correlation of near and
@@ -91,6 +94,9 @@ class Indicators:
         own_ratio: of the depth over a metric prior's own, median.
         epipolar_px: how far matches lie beside their epipolar lines, pixels, with the poses as used; of the
             worst right view.
+        off_matches: median of the absolute log of the depth over the matched depth, where matches are
+            confident.
+        doubts: warnings about the input, each of which forbids trust.
         mistakes: sentences on mistakes of a given pose that would explain its misfit (``pose.mistakes``).
         flat: all confident matches lie within two planes of the sweep, and near enough for that to mean
         something.
@@ -110,6 +116,8 @@ class Indicators:
     view_deg: float = math.nan
     own_ratio: float = math.nan
     epipolar_px: float = math.nan
+    off_matches: float = math.nan
+    doubts: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
     flat: bool = False
     same: bool = False
@@ -122,13 +130,14 @@ class Verdict:
     """Whether one image's depth can be trusted.
 
     Attributes:
-        trusted: whether no indicator speaks against it.
+        status: ``"trusted"``, no indicator speaks against it; ``"not trusted"``; or ``"not judged"``, nothing
+            was there to hold it against.
         reasons: sentences on those that do, the likeliest cause first; empty where it is trusted.
         remarks: sentences on what is unusual but may be right.
         indicators: the numbers behind it.
     """
 
-    trusted: bool
+    status: str
     reasons: tuple[str, ...]
     remarks: tuple[str, ...]
     indicators: Indicators
@@ -136,7 +145,14 @@ class Verdict:
     @property
     def sentence(self) -> str:
         """One line for people; empty where it is trusted."""
+        if self.status == "not judged":
+            return "This depth was not judged: neither matches of two views nor known depths test it."
         return "" if self.trusted else f"Do not trust this depth: {' '.join(self.reasons)}"
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the status is ``"trusted"``."""
+        return self.status == "trusted"
 
 
 def _alike(image_01: Tensor, left_01: Tensor) -> bool:
@@ -181,6 +197,15 @@ def _of_matches(matches: Matches, planes: Tensor | None) -> dict[str, Any]:
     return numbers
 
 
+def _off_matches(matches: Matches, depth_m: Tensor) -> float:
+    """How far the depth lies from confident matches; NaN for too few."""
+    at = (matches.confidence > CONFIDENT) & (matches.inverse_depth > matches.plane_step)
+    if int(at.sum()) < FEWEST_MATCHES:
+        return math.nan
+    resized = F.interpolate(depth_m[None].float(), matches.size, mode="nearest-exact")[0]
+    return float((resized * matches.inverse_depth)[at].log().abs().median())
+
+
 def _of_pose(pose: PoseReport) -> dict[str, Any]:
     """How the poses fit, and mistakes that explain why they do not, but for the inverse pose."""
     residuals = [px for px in pose.residual_px if not math.isnan(px)]
@@ -197,6 +222,8 @@ def read_indicators(
     order: float,
     confidence: Tensor | None,
     on_edge: bool,
+    depth_m: Tensor | None = None,
+    doubts: Sequence[str] = (),
     range_given: bool = False,
     own_ratio: float = math.nan,
     has_unit: bool = True,
@@ -209,6 +236,8 @@ def read_indicators(
         order: rank correlation, NaN where unknown.
         confidence: ``(1, H, W)``, or ``None``.
         on_edge: whether the search for the scale ended on the edge of its range.
+        depth_m: ``(1, H, W)`` the result, in the unit of the poses.
+        doubts: warnings about the input that forbid trust.
         range_given: whether that range was given by the user.
         own_ratio: of the depth over a metric prior's own, NaN for a relative prior.
         has_unit: whether lengths are in metres, so that the length of a baseline means something.
@@ -219,6 +248,8 @@ def read_indicators(
     if matches is not None:
         swept = range_given and evidence.volume is not None
         numbers = _of_matches(matches, evidence.volume.inverse_depth if swept else None)
+        if depth_m is not None:
+            numbers["off_matches"] = _off_matches(matches, depth_m)
         if points is not None:
             numbers["points_ratio"] = _points_ratio(matches, points)
     if evidence.pose is not None:
@@ -231,6 +262,7 @@ def read_indicators(
         baseline_m=float(rights[0].T_right_from_left[:3, 3].norm()) if rights and has_unit else 0.0,
         view_deg=2.0 * math.degrees(math.atan(0.5 * left_01.shape[-1] / float(K_left[0, 0]))),
         own_ratio=own_ratio,
+        doubts=tuple(doubts),
         same=any(_alike(view.image_01, left_01) for view in rights),
         inverse_fits=INVERSE in evidence.warnings,
         on_edge=on_edge,
@@ -284,8 +316,9 @@ def _why_matches(run: Indicators) -> str | None:
     ]
     if not (few or run.confidence < LEAST_CONFIDENCE or sum(weak) > 1):
         return None
-    shares = [f"{100 * run.matched:.0f} % of the left image is matched"]
-    shares += [] if math.isnan(run.confidence) else [f"mean confidence is {run.confidence:.2f}"]
+    shares = [f"{100 * run.matched:.0f} % of the left image is matched"] if few or weak[0] else []
+    shares += [f"mean confidence is {run.confidence:.2f}"] if weak[1] else []
+    shares += [f"rank correlation with the prior is {run.order:.2f}"] if weak[2] and not shares else []
     cause = (
         "Likely causes: E along the wrong axis or with a wrong rotation, images that are not rectified or "
         "whose lens is not corrected, K of another size, a mirrored image, or views of different scenes or "
@@ -306,7 +339,16 @@ def _why_lines(run: Indicators) -> str | None:
 def _reasons(run: Indicators) -> list[str]:
     if run.same:
         return ["The left and a right view are the same picture, pixel by pixel; two places are needed."]
-    reasons = list(run.mistakes)
+    order, reasons = _why_order(run), list(run.doubts)
+    if 0 < run.baseline_m < LEAST_BASELINE_M:
+        reasons.append(
+            f"The baseline is {1000 * run.baseline_m:.3g} mm: was it divided by 1000 once too often? "
+            "Baselines and poses are in metres."
+        )
+    if run.inverse_fits and order is not None:  # explains what the pose's other mistakes only describe
+        reasons.append(order)
+        order = None
+    reasons += run.mistakes
     if run.flat:
         reasons.append(
             "All matches have one depth: the right image looks like a shifted copy of the left one. (Of a "
@@ -324,7 +366,11 @@ def _reasons(run: Indicators) -> list[str]:
         reasons.append(
             f"Too few known depths to fix both scale and shift, {run.points}; give at least {LEAST_POINTS}."
         )
-    order = _why_order(run)
+    if run.off_matches > OFF_MATCHES and not run.points:
+        reasons.append(
+            f"The depth differs by {100 * math.expm1(run.off_matches):.0f} %, in the median, from what both "
+            "views match: the scale or the shift was not found."
+        )
     lines = _why_lines(run) if run.epipolar_px > EPIPOLAR_WRONG else None
     matches = _why_matches(run)
     return reasons + [sentence for sentence in (order, lines, matches) if sentence is not None]
@@ -332,11 +378,6 @@ def _reasons(run: Indicators) -> list[str]:
 
 def _remarks(run: Indicators, trusted: bool) -> list[str]:
     remarks = []
-    if 0 < run.baseline_m < LEAST_BASELINE_M:
-        remarks.append(
-            f"The baseline is {1000 * run.baseline_m:.3g} mm: was it divided by 1000 once too often? "
-            "Baselines and poses are in metres."
-        )
     if run.view_deg < VIEWS_DEG[0] or VIEWS_DEG[1] < run.view_deg <= TOO_WIDE_DEG:
         remarks.append(
             f"K gives the left image a field of view of {run.view_deg:.0f} degrees: is it for an image of "
@@ -364,6 +405,8 @@ def _remarks(run: Indicators, trusted: bool) -> list[str]:
 
 
 def judge(run: Indicators) -> Verdict:
-    """The verdict on one image's run: untrusted where any indicator is bad, or two are weak."""
+    """The verdict on one image's run: not trusted where any indicator is bad, or two are weak."""
     reasons = _reasons(run)
-    return Verdict(not reasons, tuple(reasons), tuple(_remarks(run, not reasons)), run)
+    judged = not math.isnan(run.matched) or run.points >= LEAST_POINTS
+    status = "not trusted" if reasons else "trusted" if judged else "not judged"
+    return Verdict(status, tuple(reasons), tuple(_remarks(run, not reasons)), run)

@@ -155,7 +155,7 @@ def abs_rel(folder: Path, size: tuple[int, int]) -> float:
 def is_trusted(folder: Path) -> bool:
     """What the judgement said, by ``out/report.json``."""
     report = json.loads((folder / "out" / "report.json").read_text(encoding="utf-8"))
-    return bool(report["judgement"]["trusted"])
+    return bool(report["verdict"]["status"] == "trusted")
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -217,7 +217,9 @@ def test_interrupt_of_a_running_process(command, pair_files):
     process.send_signal(signal.SIGINT)
     rest = process.communicate(timeout=60)[1]
     assert process.returncode == 130, heard + rest
-    assert b"Traceback" not in rest and rest.rstrip().endswith(b"geodiff: interrupted")
+    assert b"Traceback" not in rest and rest.rstrip().endswith(
+        b"geodiff: interrupted; the same command resumes"
+    )
     assert sorted(path.name for path in pair_files.folder.iterdir()) == before
 
 
@@ -283,7 +285,7 @@ def test_points_without_a_right_image(geodiff, pair_files, prior):
     report = json.loads(answer.out)
     names = {path.name for path in (pair_files.folder / "geodiff-out").iterdir()}
     assert names == FILES - {"visible.png", "photometric_error.npy"} | CONFIDENCE
-    assert report["judgement"]["signs"]["points"] == 192 and report["depth"]["visible_fraction"] == 0
+    assert report["verdict"]["signs"]["points"] == 192 and report["depth"]["visible_fraction"] == 0
     one = np.zeros((48, 64), np.float32)
     one[20, 30] = 2.0
     np.save(pair_files.folder / "lidar.npy", one)

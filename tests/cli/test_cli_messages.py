@@ -64,7 +64,11 @@ def test_ctrl_c(monkeypatch, geodiff, pair_files):
     monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", stop)
     before = sorted(pair_files.folder.iterdir())
     answer = geodiff(*pair_files.command)
-    assert (answer.code, answer.out, answer.err) == (130, "", "geodiff: interrupted\n")
+    assert (answer.code, answer.out, answer.err) == (
+        130,
+        "",
+        "geodiff: interrupted; the same command resumes\n",
+    )
     assert sorted(pair_files.folder.iterdir()) == before
 
 
@@ -77,7 +81,7 @@ def test_warnings_are_sentences(monkeypatch, geodiff, pair_files):
     Image.open(pair_files.right).save(pair_files.right, exif=exif)
     camera = ["--fx", 60, "--fy", 60, "--cx", 31.5, "--cy", 23.5, "--baseline", 120]
     lines = geodiff(*pair_files.images, *camera).err.splitlines()
-    assert len(lines) == 4 and lines[-1] == "geodiff: interrupted"
+    assert len(lines) == 4 and lines[-1] == "geodiff: interrupted; the same command resumes"
     assert all(line.startswith("warning: ") for line in lines[:-1])
     assert [word in line for word, line in zip(("LEFT", "RIGHT", "millimetres"), lines, strict=False)] == [
         True
@@ -92,7 +96,7 @@ def test_millimetres_of_a_further_view_are_told_once(monkeypatch, geodiff, pair_
     Image.new("RGB", (64, 48)).save(third)
     warned, interrupted = geodiff(*pair_files.command, "--view", third, "--view-E", pose).err.splitlines()
     assert warned.startswith("warning: E[right view 2] has a baseline of 100 m.")
-    assert interrupted == "geodiff: interrupted"
+    assert interrupted == "geodiff: interrupted; the same command resumes"
 
 
 def test_a_focal_length_that_the_exif_of_a_photograph_contradicts(monkeypatch, geodiff, pair_files):
@@ -103,7 +107,7 @@ def test_a_focal_length_that_the_exif_of_a_photograph_contradicts(monkeypatch, g
     Image.open(pair_files.left).save(pair_files.left, exif=exif)
     warned, interrupted = geodiff(*pair_files.command).err.splitlines()
     assert warned.startswith("warning: K has a focal length of 60 px for LEFT, 0.50 times the 120 px")
-    assert interrupted == "geodiff: interrupted"
+    assert interrupted == "geodiff: interrupted; the same command resumes"
 
 
 def test_names_beyond_the_terminals_encoding(monkeypatch, tmp_path):
@@ -155,10 +159,13 @@ def test_summary():
     summary = depth_summary(depth, np.array([[True, True], [True, False]]))
     assert summary["invalid_pixels"] == 1 and summary["median_m"] == 2.0
     signs = {"confidence": 0.876, "matched": 0.7, "points": 0}
-    judgement = {"trusted": True, "signs": signs}
-    report = {"depth": summary, "judgement": judgement, "seconds": {"load": 1.0, "write": 0.5}}
+    verdict = {"status": "trusted", "reasons": [], "signs": signs}
+    report = {"depth": summary, "verdict": verdict, "seconds": {"load": 1.0, "write": 0.5}}
     report |= {"unit": "m", "own_scale": None}
-    head = "1.00 m to 4.00 m, median 2.00 m; "
-    assert summary_line(report, "out/") == head + "confidence 0.88, 70 % matched; 1.5 s -> out/"
-    judgement["trusted"] = False
-    assert summary_line(report, "out/").startswith(head + "DO NOT TRUST THIS, confidence 0.88")
+    metres = "1.00 m to 4.00 m, median 2.00 m"
+    assert summary_line(report, "out/") == f"{metres}; trusted, confidence 0.88, 70 % matched; 1.5 s -> out/"
+    verdict |= {"status": "not trusted", "reasons": ["E is wrong.", "So is K."]}
+    said = f"NOT TRUSTED: E is wrong. (Unconfirmed: {metres}; 1.5 s -> out/)"
+    assert summary_line(report, "out/") == said, "the verdict first, and no confidence"
+    verdict |= {"status": "not judged", "reasons": []}
+    assert summary_line(report, "out/").startswith("NOT JUDGED: ")

@@ -249,16 +249,16 @@ def test_results_of_files_that_changed_are_not_taken_for_these(geodiff, folders,
 def test_a_finished_pair_is_judged_with_strict(geodiff, folders):
     root, command = folders
     assert geodiff(*command, "-q").code == 0
-    for name, trusted in (("a", True), ("b", False), ("c", True)):
+    for name, status in (("a", "trusted"), ("b", "not trusted"), ("c", "trusted")):
         path = root / "out" / name / "report.json"
         report = json.loads(path.read_text())
-        report["judgement"] |= {"trusted": trusted, "reasons": ["E is wrong."]}
+        report["verdict"] |= {"status": status, "reasons": ["E is wrong."]}
         path.write_text(json.dumps(report))
     answer = geodiff(*command)
-    assert answer.code == 0 and "3 there already, 0 failed, 1 not to be trusted" in answer.out
+    assert answer.code == 0 and "3 there already, 0 failed, 1 not trusted" in answer.out
     answer = geodiff(*command, "--strict")
     assert answer.code == 4 and "2 there already, 1 failed" in answer.out
-    said = f"b: The depth in {Path('out', 'b')} is not to be trusted: E is wrong."
+    said = f"b: The depth in {Path('out', 'b')} is not trusted: E is wrong."
     assert f"geodiff: {said}" in answer.err
     assert [row["result"] for row in rows_of(root / "out")] == ["there", "failed", "there"]
 

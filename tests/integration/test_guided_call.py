@@ -411,10 +411,13 @@ def test_saved_while_enabled_it_is_a_stock_pipeline(make_pipeline, tmp_path, lef
     assert isinstance(guided, GuidedMarigoldDepthPipeline)
 
 
-def test_inference_mode_is_refused(make_pipeline, textured_plane, left):
+def test_inference_mode_forbids_updates_alone(make_pipeline, textured_plane, left):
     pipe = enable_geometry_guidance(make_pipeline())
-    with torch.inference_mode(), pytest.raises(RuntimeError, match="inference_mode"):
-        pipe(left, guidance=guidance_for(textured_plane))
+    with torch.inference_mode():
+        with pytest.raises(RuntimeError, match="inference_mode"):
+            pipe(left, guidance=guidance_for(textured_plane))
+        without = guidance_for(textured_plane, inner_steps=0)
+        assert np.isfinite(pipe(left, guidance=without, num_inference_steps=1).prediction).all()
 
 
 def test_guidance_of_the_wrong_type(make_pipeline, left):

@@ -61,7 +61,7 @@ def test_the_summary_names_the_factor_of_a_metric_prior_alone():
     depth = {"min_m": 1.0, "median_m": 2.0, "max_m": 3.0, "visible_fraction": 1.0}
     signs = {"confidence": 0.9, "matched": 0.5, "points": 0}
     report = {"depth": depth, "seconds": {"all": 1.0}, "own_scale": [[1.2]], "unit": "m"}
-    report["judgement"] = {"trusted": True, "signs": signs}
+    report["verdict"] = {"status": "trusted", "reasons": [], "signs": signs}
     assert "prior's own metres x 1.20" in summary_line(report, "out/")
     assert "own metres" not in summary_line(report | {"own_scale": None}, "out/")
 

@@ -193,11 +193,12 @@ def test_millimetres_that_look_like_metres(tmp_path):
     (tmp_path / "points.txt").write_text("0 0 1800\n100 0 2500\n0 0 -1\n")
     np.save(tmp_path / "map.npy", 1000 * MAP)
     for name, nearest in (("points.txt", 1800), ("map.npy", 1250)):
-        said = f"{name} has no known depth nearer than {nearest} m. .*millimetres, give --points-scale 1000"
-        with pytest.warns(UserWarning, match=said):
-            read_points(tmp_path / name)
-        for scale in (1, 1000):
-            read_points(tmp_path / name, scale=scale)
+        for scale in (None, 1):
+            with pytest.warns(
+                UserWarning, match=f"points has depths of {nearest} m and more.*--points-scale 1000"
+            ):
+                GeometryGuidance.from_points(read_points(tmp_path / name, scale=scale), np.eye(3))
+        GeometryGuidance.from_points(read_points(tmp_path / name, scale=1000), np.eye(3))
     (tmp_path / "points.txt").write_text("0 0 1800\n0 0 180\n")  # a mountain behind a house
     read_points(tmp_path / "points.txt")
     (tmp_path / "points.txt").write_text("0 0 -1800\n")  # another mistake, which is told elsewhere

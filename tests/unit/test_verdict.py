@@ -27,7 +27,9 @@ def test_a_good_run_is_trusted_in_silence():
     verdict = judge(GOOD)
     assert verdict.trusted and not verdict.reasons and not verdict.remarks and verdict.sentence == ""
     assert judge(replace(GOOD, own_ratio=1.4, view_deg=21.0)).remarks == ()
-    assert judge(Indicators()).trusted  # nothing is known, as of a search without matches
+    nothing = judge(Indicators())
+    assert nothing.status == "not judged" and not nothing.trusted and "not judged" in nothing.sentence
+    assert judge(Indicators(points=9)).trusted
 
 
 @pytest.mark.parametrize(
@@ -54,6 +56,9 @@ def test_a_good_run_is_trusted_in_silence():
             "Too few known depths to fix both scale and shift, 1;",
         ),
         ({"view_deg": 179.0}, "179 degrees of view"),
+        ({"baseline_m": 0.00012}, "0.12 mm"),
+        ({"doubts": ("K is for another image.",)}, "another image"),
+        ({"off_matches": 0.4}, "differs by 49 %"),
     ],
 )
 def test_reasons(signs, words):
@@ -65,7 +70,6 @@ def test_reasons(signs, words):
 @pytest.mark.parametrize(
     ("signs", "words"),
     [
-        ({"baseline_m": 0.00012}, "0.12 mm"),
         ({"view_deg": 12.0}, "12 degrees"),
         ({"view_deg": 125.0}, "125 degrees"),
         ({"own_ratio": 2.1}, "2.1 times the prior's own metres"),
@@ -84,6 +88,16 @@ def test_remarks(signs, words):
 def test_a_residual_alone_that_is_a_pixel_is_no_fault():
     verdict = judge(replace(GOOD, epipolar_px=1.5))
     assert verdict.trusted and not verdict.remarks
+
+
+def test_the_likeliest_reason_comes_first_and_figures_do_not_contradict():
+    swapped = judge(replace(GOOD, inverse_fits=True, mistakes=("K may be for an image 2 times as large.",)))
+    assert "swapped" in swapped.reasons[0] and "2 times" in swapped.reasons[1]
+    assert "another image" in judge(replace(GOOD, order=-0.9, doubts=("K is for another image.",))).reasons[0]
+    assert (
+        judge(replace(GOOD, same=True, matched=1.0, confidence=1.0)).reasons[0].startswith("The left and a")
+    )
+    assert "100 %" not in judge(replace(GOOD, matched=1.0, confidence=0.3)).sentence
 
 
 def signs_of(pose) -> Indicators:
@@ -168,7 +182,8 @@ def run(scene, make_oracle):
     pipe = enable_geometry_guidance(make_oracle(relative, "disparity"))
 
     def call(left=left, right=right, K=K, E=E, strict=False, **options):
-        guidance = GeometryGuidance(right, K, E, inner_steps=0, **options)
+        options = {"inner_steps": 0} | options
+        guidance = GeometryGuidance(right, K, E, **options)
         return pipe(left, guidance=guidance, strict=strict)
 
     return call
@@ -203,7 +218,7 @@ def test_nearly_black_views_are_not_one_picture(run, scene):
 
 
 def test_units_of_the_baseline(run, scene):
-    """Each mistake is told once, by a warning when it is given or by a remark on the result."""
+    """Each mistake is told once by the result, as a reason not to trust it."""
     E = scene[3]
     for factor, word in ((1e-3, "once too often"), (1e3, "millimetres")):
         scaled = E.copy()
@@ -212,10 +227,11 @@ def test_units_of_the_baseline(run, scene):
             warnings.simplefilter("always", UserWarning)
             out = run(E=scaled)
         lines = [*(str(warning.message) for warning in caught), *out.warnings]
-        assert out.verdicts[0].trusted
-        assert sum(word in line for line in lines) == 1, (factor, lines)
+        assert out.verdict.status == "not trusted" and word in out.verdict.reasons[0]
+        assert sum(word in line for line in out.warnings) == 1, (factor, lines)
 
 
+@pytest.mark.filterwarnings("ignore:points has depths")
 @pytest.mark.parametrize(
     ("factor", "words"), [(0.256, "1/256"), (1000.0, "millimetres"), (3.0, "times as far")]
 )
@@ -228,3 +244,41 @@ def test_points_that_contradict_the_views(run, scene, factor, words):
     wrong = run(points=factor * known)
     assert not wrong.verdicts[0].trusted and words in said(wrong)
     assert wrong.confidence.mean() < 0.45 * right.confidence.mean()
+
+
+@pytest.mark.filterwarnings("ignore:K has its principal point")
+@pytest.mark.parametrize("times", [0.5, 2.0])
+def test_a_warning_of_the_constructor_forbids_trust(run, scene, times):
+    K = scene[2].copy()
+    K[:2, 2] = (K[:2, 2] + 0.5) * times - 0.5
+    out = run(K=K)
+    assert not out.verdict.trusted and "principal point" in out.verdict.reasons[0]
+    assert "principal point" in said(out)
+
+
+@pytest.mark.filterwarnings("ignore:points has depths")
+def test_millimetres_as_known_depths(make_oracle, scene):
+    left, _, K, _, depth = scene
+    pipe = enable_geometry_guidance(make_oracle((1 / depth - (1 / depth).min()), "disparity"))
+    for known in (1000.0 * depth, np.rint(depth * 1000.0)):
+        out = pipe(left, guidance=GeometryGuidance.from_points(known, K, inner_steps=0))
+        assert out.verdict.status == "not trusted" and "millimetres" in out.verdict.reasons[0]
+    metres = pipe(left, guidance=GeometryGuidance.from_points(depth, K, inner_steps=0))
+    assert metres.verdict.trusted and metres.warnings == []
+
+
+def test_the_paper_preset_is_judged_by_the_same_signs(run, scene):
+    left, right, _, E, _ = scene
+    for views in ({}, {"left": right, "right": left}):
+        out = run(**views, preset="paper")
+        signs = out.verdict.indicators
+        assert signs.matched > 0 and out.verdict.status != "not judged"
+        assert out.verdict.trusted == (signs.off_matches < 0.18 and not views)
+
+
+def test_what_is_assumed_of_the_right_camera(run, scene):
+    K, E = scene[2:4]
+    assert "cx is assumed" in run().assumed[0] and "K_right" in run().assumed[0]
+    assert run(K=(K, K)).assumed == []
+    text = repr(run())
+    assert "trusted" in text and len(text.splitlines()) < 8
