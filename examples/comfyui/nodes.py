@@ -57,13 +57,14 @@ class GeoDiffCalibration:
                 "cy": ("FLOAT", number | {"tooltip": "Principal point, pixels."}),
                 "baseline_m": ("FLOAT", number | {"tooltip": "Distance of the cameras, metres."}),
                 "image": ("IMAGE", {"tooltip": "Left image, for files with several resolutions."}),
+                "cx_right": ("FLOAT", number | {"tooltip": "cx of the right image; 0: taken as cx."}),
             },
         }
 
-    def read(self, file, fx=0.0, cx=0.0, cy=0.0, baseline_m=0.0, image=None):
+    def read(self, file, fx=0.0, cx=0.0, cy=0.0, baseline_m=0.0, image=None, cx_right=0.0):
         """Read the file, or make a rectified rig of the numbers."""
         if not file:
-            return (rig_from_parameters(fx, fx, cx, cy, baseline_m),)
+            return (rig_from_parameters(fx, fx, cx, cy, baseline_m, cx_right=cx_right or None),)
         size = None if image is None else (image.shape[2], image.shape[1])
         path = Path(folder_paths.get_input_directory()) / file
         return (read_calibration(path, image_size=size, baseline_m=baseline_m or None),)
@@ -73,8 +74,8 @@ class GeoDiffDepth:
     """Depth in metres of the left image, guided by the right one."""
 
     CATEGORY, FUNCTION = CATEGORY, "estimate"
-    RETURN_TYPES = ("GEODIFF_DEPTH", "IMAGE", "IMAGE", "MASK")
-    RETURN_NAMES = ("depth", "coloured", "near_is_white", "confidence")
+    RETURN_TYPES = ("GEODIFF_DEPTH", "IMAGE", "IMAGE", "MASK", "STRING")
+    RETURN_NAMES = ("depth", "coloured", "near_is_white", "confidence", "verdict")
 
     @classmethod
     def INPUT_TYPES(cls):  # noqa: D102, N802
@@ -126,7 +127,8 @@ class GeoDiffDepth:
         sure = np.ones_like(depth_m) if out.confidence is None else out.confidence[..., 0].astype(np.float32)
         found["confidence"] = sure
         coloured = np.stack([colour_depth(each) for each in depth_m]).astype(np.float32) / 255.0
-        return found, torch.from_numpy(coloured), _near_is_white(depth_m), torch.from_numpy(sure)
+        verdict = " ".join([out.verdict.status, *out.warnings, *out.assumed])
+        return found, torch.from_numpy(coloured), _near_is_white(depth_m), torch.from_numpy(sure), verdict
 
 
 def _near_is_white(depth_m: np.ndarray) -> torch.Tensor:

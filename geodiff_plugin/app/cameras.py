@@ -18,7 +18,7 @@ from geodiff_plugin._camera_checks import check_calibrated_size
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import read_calibration, rig_from_parameters
 from geodiff_plugin.formats.exif import warn_of_other_lens
-from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance, assume_same_centre
 from geodiff_plugin.types import Rig
 
 __all__ = ["CAMERA_WAYS", "CameraFields", "CameraWay", "Views"]
@@ -35,6 +35,7 @@ class CameraFields:
         fy: the same for y; empty means ``fx``.
         cx: principal point, pixels; empty means the middle of the image.
         cy: likewise.
+        cx_right: the right image's cx; empty means that it is the left one's.
         baseline_m: distance of the cameras, metres.
         third_pose: the third camera's pose in the left camera's frame, 12 or 16 numbers in rows.
     """
@@ -45,6 +46,7 @@ class CameraFields:
     fy: float | None = None
     cx: float | None = None
     cy: float | None = None
+    cx_right: float | None = None
     baseline_m: float | None = None
     third_pose: str | None = None
 
@@ -146,8 +148,11 @@ def _from_numbers(views: Views, fields: CameraFields, knobs: dict[str, Any]) -> 
     if missing:
         bad_value(" and ".join(missing), "given", "nothing", "fx is in pixels, the baseline in metres.")
     K = _intrinsics(views, fields)
-    rig = rig_from_parameters(K[0, 0], K[1, 1], K[0, 2], K[1, 2], fields.baseline_m)
-    return _guidance_of_rig(views, rig, fields, knobs)
+    rig = rig_from_parameters(K[0, 0], K[1, 1], K[0, 2], K[1, 2], fields.baseline_m, cx_right=fields.cx_right)
+    guidance = _guidance_of_rig(views, rig, fields, knobs)
+    if fields.cx_right is None:
+        assume_same_centre(guidance)
+    return guidance
 
 
 def _from_photographs(views: Views, fields: CameraFields, knobs: dict[str, Any]) -> GeometryGuidance:
@@ -159,12 +164,14 @@ def _from_photographs(views: Views, fields: CameraFields, knobs: dict[str, Any])
     K = None  # of the EXIF of the photographs
     if fields.fx is not None:
         K = _intrinsics(views, fields)
+    if K is not None and fields.cx_right is not None:
+        knobs = knobs | {"K_right": np.array([[K[0, 0], 0, fields.cx_right], K[1], K[2]])}
     names = views.names if views.third_name is None else (*views.names, views.third_name)
     photographs = [ImageOps.exif_transpose(Image.open(name)) for name in names]
     return GeometryGuidance.from_photographs(photographs, baseline_m=fields.baseline_m, K=K, **knobs)
 
 
-NUMBERS = ("fx", "fy", "cx", "cy", "baseline_m")
+NUMBERS = ("fx", "fy", "cx", "cy", "cx_right", "baseline_m")
 #: Every way by name, in the order of the page.
 CAMERA_WAYS: dict[str, CameraWay] = {
     "file": CameraWay(

@@ -27,6 +27,7 @@ NUMBERS = {
     "fy": "fy, px",
     "cx": "cx, px",
     "cy": "cy, px",
+    "cx_right": "Right camera's cx, px",
     "baseline_m": "Distance of the cameras, m",
     "near": "Nearest depth, m",
     "far": "Farthest depth, m",
@@ -114,6 +115,7 @@ def _cameras() -> dict[str, Any]:
     with gr.Row(visible=False) as lens:
         for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
             found[name] = _optional(name, placeholder)
+        found["cx_right"] = _optional("cx_right", "assumed as cx")
     found["baseline_m"] = _optional("baseline_m", "as the calibration file says")
 
     def show(chosen: str) -> tuple[Any, Any]:

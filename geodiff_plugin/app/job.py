@@ -23,6 +23,7 @@ from geodiff_plugin.cli.terminal import collected_warnings
 from geodiff_plugin.formats import read_image
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.options import PRESETS, RunOptions
+from geodiff_plugin.runtime.verdict import Verdict
 from geodiff_plugin.types import MetricDepthOutput
 
 __all__ = ["PRESETS", "Request", "Result", "Stopped", "run_job"]
@@ -89,7 +90,8 @@ class Result:
         uncertainty_m: metres, or ``None``.
         error: photometric error, [0, 1], or ``None``.
         visible: bool, or ``None``.
-        warnings: sentences.
+        verdict: of the call: ``trusted``, ``status`` and ``reasons``.
+        warnings: sentences, what was assumed among them.
         seconds: by stage.
         request: what was asked.
     """
@@ -104,6 +106,7 @@ class Result:
     uncertainty_m: np.ndarray | None
     error: np.ndarray | None
     visible: np.ndarray | None
+    verdict: Verdict
     warnings: list[str]
     seconds: dict[str, float]
     request: Request
@@ -196,6 +199,7 @@ def _result(
         uncertainty_m=_map_if_any(output.uncertainty),
         error=_map_if_any(output.photometric_error),
         visible=_map_if_any(output.visible),
+        verdict=output.verdict,
         warnings=warnings,
         seconds=seconds,
         request=request,
@@ -250,5 +254,5 @@ def run_job(request: Request, priors: Priors, stop: threading.Event, report: Rep
             prior_map = _map(_call(pipe, request, views).prediction).astype(np.float32)
             seconds["prior alone"] = time.perf_counter() - started - sum(seconds.values())
         stage(0.95, "Drawing")
-    sentences = list(dict.fromkeys([*notes, *warnings, *output.warnings]))
+    sentences = list(dict.fromkeys([*notes, *warnings, *output.warnings, *output.assumed]))
     return _result(request, views, guidance, output, prior_map, sentences, seconds)

@@ -66,10 +66,14 @@ def stopped() -> str:
     return '<div class="say say-quiet">Stopped.</div>'
 
 
-def finished(figures: Sequence[tuple[str, str]], warnings: Sequence[str]) -> str:
-    """A box of numbers with their names, and warnings under them."""
+def finished(status: str, figures: Sequence[tuple[str, str]], warnings: Sequence[str]) -> str:
+    """A box of the verdict, numbers with their names, and warnings under them."""
     cells = "".join(
         f"<div><b>{html.escape(value)}</b><span>{html.escape(name)}</span></div>" for value, name in figures
     )
     items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in warnings)
-    return f'<div class="say"><div class="figures">{cells}</div>{f"<ul>{items}</ul>" if items else ""}</div>'
+    numbers, notes = f'<div class="figures">{cells}</div>', f"<ul>{items}</ul>" if items else ""
+    if status != "trusted":  # the reasons come before the numbers
+        bad = "say say-bad" if status == "not trusted" else "say"
+        return f'<div class="{bad}" role="alert"><b>{status.capitalize()}</b>{notes}{numbers}</div>'
+    return f'<div class="say"><b>Trusted</b>{numbers}{notes}</div>'

@@ -136,11 +136,17 @@ def _figures(shown: Shown) -> list[tuple[str, str]]:
         (f"{depth['min_m']:.2f} m to {depth['max_m']:.2f} m", "nearest and farthest"),
         (f"{depth['median_m']:.2f} m", "median depth"),
     ]
+    if not result.verdict.trusted:  # what is not trusted is not praised
+        return [(f"{figures[1][0]}, unconfirmed", "median depth"), *_seconds(shown)]
     if result.visible is not None:
         figures.append((f"{100 * depth['visible_fraction']:.0f} %", "seen by both cameras"))
     if result.confidence is not None:
         figures.append((f"{100 * depth['median_confidence']:.0f} %", "median confidence"))
-    return [*figures, (f"{sum(result.seconds.values()):.1f} s", "computing")]
+    return [*figures, *_seconds(shown)]
+
+
+def _seconds(shown: Shown) -> list[tuple[str, str]]:
+    return [(f"{sum(shown.result.seconds.values()):.1f} s", "computing")]
 
 
 def everything(panels: Panels, shown: Shown, beside: str, under: str) -> dict[Any, Any]:
@@ -151,7 +157,7 @@ def everything(panels: Panels, shown: Shown, beside: str, under: str) -> dict[An
     sure = "probability that a depth is within 10 % of the truth"
     differ = "difference between the photograph and the other view brought to it; dark where they agree"
     values: dict[Any, Any] = {
-        panels.status: look.finished(_figures(shown), result.warnings),
+        panels.status: look.finished(result.verdict.status, _figures(shown), result.warnings),
         panels.slider: comparison(shown, beside),
         panels.depth_legend: legend,
         panels.picture: picture,

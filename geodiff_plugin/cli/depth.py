@@ -138,6 +138,8 @@ def estimate_and_write(
         with watch.stage("calibration"):
             inputs = read_inputs(options, config)
             check_image_names(options, inputs)
+        for sentence in () if options.quiet else inputs.guidance.assumed:
+            say(f"assumed: {sentence}")
         with watch.stage("load"):
             pipe = load_guided_prior(options, device)
         with watch.stage("guided call"):

@@ -30,7 +30,7 @@ from geodiff_plugin.formats.distortion import (
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov, warn_of_other_lens
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.guidance.evidence import cleaned
-from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance, assume_same_centre
 from geodiff_plugin.options import check_positive
 from geodiff_plugin.types import Distortion, Rig
 
@@ -112,6 +112,8 @@ def read_inputs(
         guidance = GeometryGuidance.from_views(
             posed, points=points, cropped=cropped, **lengths, config=config
         )
+    if options.k_right is None and calibration_way(options) in ("parameters", "matrices"):
+        assume_same_centre(guidance)
     return Inputs(images[0], rig, guidance, any(lens is not None for lens in lenses))
 
 

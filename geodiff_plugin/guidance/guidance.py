@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 from torch import Tensor
@@ -27,7 +27,7 @@ from geodiff_plugin.guidance.inputs import read_inputs, split_views
 from geodiff_plugin.guidance.photographs import EstimatedRig, estimate_rig
 from geodiff_plugin.types import MetricDepthOutput, Rig
 
-__all__ = ["SAME_CENTRE", "GeometryGuidance"]
+__all__ = ["GeometryGuidance", "assume_same_centre"]
 
 #: What is assumed of a rectified pair whose right camera has no K of its own.
 SAME_CENTRE = (
@@ -39,7 +39,7 @@ SAME_CENTRE = (
 PARALLEL = 0.9999
 
 
-def _remembers_warnings(make: Callable[..., Any]) -> Any:
+def _remembers_warnings[F: Callable[..., Any]](make: F) -> F:
     """Let a constructor keep what is warned of before it calls ``__init__``, too."""
 
     @functools.wraps(make)
@@ -49,7 +49,7 @@ def _remembers_warnings(make: Callable[..., Any]) -> Any:
         guidance.warned = said
         return guidance
 
-    return made
+    return cast(F, made)
 
 
 class GeometryGuidance:
@@ -139,9 +139,9 @@ class GeometryGuidance:
         _check_names(self.config)
         with noted() as self.warned:
             self.inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
-        parallel = [np.trace(rig.E[:3, :3]) > 1.0 + 2.0 * PARALLEL for rig in self.rigs]
-        typed_once = not isinstance(K, tuple) and bool(parallel) and all(parallel)
-        self.assumed = [SAME_CENTRE] if typed_once else []
+        self.assumed: list[str] = []
+        if not isinstance(K, (tuple, list)):
+            assume_same_centre(self)
         self.measured_baseline = measured_baseline
         self.evidence_store: EvidenceStore | None = None
         self.previous = previous
@@ -283,8 +283,8 @@ class GeometryGuidance:
         more = {"points": points if unit else None, "cropped": cropped, "unit": unit} | lengths
         guidance = cls.from_views(list(views), **more, **knobs)
         guidance.estimated = rig
-        if K_right is None and np.trace(rig.Es[0][:3, :3]) > 1.0 + 2.0 * PARALLEL:
-            guidance.assumed = [SAME_CENTRE]
+        if K_right is None:
+            assume_same_centre(guidance)
         return guidance
 
     @classmethod
@@ -368,6 +368,12 @@ class GeometryGuidance:
             with WithinCores():  # here too, for calls outside of a guided one
                 evidence.append(make(left_01, given, self.config, needs_matches, self.measured_baseline))
         return evidence
+
+
+def assume_same_centre(guidance: GeometryGuidance) -> None:
+    """Note that the right camera's K was not given, where the pair is rectified: there it matters most."""
+    if any(np.trace(rig.E[:3, :3]) > 1.0 + 2.0 * PARALLEL for rig in guidance.rigs):
+        guidance.assumed = [SAME_CENTRE]
 
 
 def _check_names(config: GuidanceConfig) -> None:

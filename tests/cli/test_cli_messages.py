@@ -81,8 +81,9 @@ def test_warnings_are_sentences(monkeypatch, geodiff, pair_files):
     Image.open(pair_files.right).save(pair_files.right, exif=exif)
     camera = ["--fx", 60, "--fy", 60, "--cx", 31.5, "--cy", 23.5, "--baseline", 120]
     lines = geodiff(*pair_files.images, *camera).err.splitlines()
-    assert len(lines) == 4 and lines[-1] == "geodiff: interrupted; the same command resumes"
-    assert all(line.startswith("warning: ") for line in lines[:-1])
+    assert len(lines) == 5 and lines[-2].startswith("assumed: The right camera's cx")
+    assert lines[-1] == "geodiff: interrupted; the same command resumes"
+    assert all(line.startswith("warning: ") for line in lines[:-2])
     assert [word in line for word, line in zip(("LEFT", "RIGHT", "millimetres"), lines, strict=False)] == [
         True
     ] * 3

@@ -141,9 +141,10 @@ def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plan
     with torch.inference_mode():  # as the host does
         (rig,) = classes["GeoDiffCalibration"]().read("K.txt", image=left)
         assert isinstance(rig, Rig) and rig.E[0, 3] == pytest.approx(0.12)
-        depth, coloured, near_is_white, confidence = classes["GeoDiffDepth"]().estimate(
+        depth, coloured, near_is_white, confidence, verdict = classes["GeoDiffDepth"]().estimate(
             left.repeat(2, 1, 1, 1), right.repeat(2, 1, 1, 1), rig, prior, 2, 1, "default", 2**64 - 1
         )
+    assert verdict.startswith(("trusted", "not trusted Do not trust"))
     size = textured_plane.depth_m.shape
     assert depth["depth_m"].shape == (2, *size) and (depth["depth_m"] > 0).all()
     assert coloured.shape == near_is_white.shape == (2, *size, 3) and coloured.dtype == torch.float32
@@ -159,8 +160,10 @@ def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plan
 
 
 def test_numbers_make_a_rig(pack):
-    (rig,) = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"]().read("", 700.0, 320.0, 240.0, 0.12)
-    assert rig.E[0, 3] == pytest.approx(0.12) and rig.K_left[0, 0] == 700
+    (rig,) = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"]().read(
+        "", 700.0, 320.0, 240.0, 0.12, cx_right=330.0
+    )
+    assert rig.E[0, 3] == pytest.approx(0.12) and rig.K_left[0, 0] == 700 and rig.K_right[0, 2] == 330
 
 
 def test_the_host_can_interrupt(pack, pair, prior, host):
