@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 from torch import Tensor
@@ -37,9 +37,10 @@ SAME_CENTRE = (
 )
 #: Cosine of the angle below which two cameras count as parallel.
 PARALLEL = 0.9999
+F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _remembers_warnings[F: Callable[..., Any]](make: F) -> F:
+def _remembers_warnings(make: F) -> F:
     """Let a constructor keep what is warned of before it calls ``__init__``, too."""
 
     @functools.wraps(make)
