@@ -15,7 +15,7 @@ from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.scale.points import weighted_quantile
 
-__all__ = ["correction_target", "off_edges", "prior_error", "refine_depth"]
+__all__ = ["correction_target", "local_error", "off_edges", "prior_error", "refine_depth"]
 
 #: Longer side in pixels of the grid that ``smoothness``, ``IMAGE_EDGE`` and ``DEPTH_EDGE`` are numbers of; on
 #: another one they are scaled, so that a correction reaches the same share of the image.
@@ -95,8 +95,34 @@ def _links(guide: Tensor, log_depth: Tensor, axis: int) -> Tensor:
 
 
 def _times(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Tensor]:
-    """Links of the smoothness ``(B, 1, 1, 1)`` of every sample."""
+    """Links of the smoothness ``(B, 1, 1, 1)`` of every sample, or ``(B, 1, h, w)``, the lower of two."""
+    if smoothness.shape[-2:] != (1, 1):
+        across = torch.minimum(smoothness[..., 1:], smoothness[..., :-1])
+        down = torch.minimum(smoothness[..., 1:, :], smoothness[..., :-1, :])
+        return across * links[0], down * links[1]
     return smoothness * links[0], smoothness * links[1]
+
+
+def local_error(error: Tensor | None, known: Tensor | None) -> Tensor | None:
+    """The error of a prior where it says something, and the largest elsewhere.
+
+    Args:
+        error: ``(B, 1, 1, 1)``, as ``prior_error`` gives it, or ``None``.
+        known: ``(B, 1, H, W)``, above 0 where the prior says something; ``None`` for everywhere.
+
+    Returns:
+        ``(B, 1, H, W)``; ``error`` where nothing is unknown.
+    """
+    if error is None or known is None:
+        return error
+    return torch.where(known > 0, error, torch.full_like(error, MOST_ERROR))
+
+
+def _on_grid(error: Tensor, size: tuple[int, int]) -> Tensor:
+    """A ``local_error`` on another grid; one number a sample as it is."""
+    if image_size(error) in ((1, 1), size):
+        return error
+    return F.interpolate(error, size, mode="nearest-exact")
 
 
 def correction_target(
@@ -113,7 +139,7 @@ def correction_target(
         points: on the same grid, or ``None``.
         kept: ``(B, 1, h', w')`` in [0, 1], the share of each match's confidence that remains once reflections
             are rejected; without it no match is used.
-        error: ``(B, 1, 1, 1)`` of the prior, or ``None`` before it is measured.
+        error: of the prior, as ``refine_depth`` takes it, or ``None`` before it is measured.
         depth_m: ``(B, 1, H, W)`` metres, the estimate.
 
     Returns:
@@ -138,14 +164,14 @@ def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
     Args:
         target: matches, not known points: those are measured on their own ray.
         depth_m: ``(B, 1, H, W)`` metres, at any resolution.
-        error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it; one above ``EDGE_ERROR`` has its
+        error: of the prior, as ``refine_depth`` takes it; one above ``EDGE_ERROR`` has its
             edges elsewhere than the scene.
     """
     size = image_size(target.confidence)
     log_depth = _log_depth(depth_m, size)
     reach = max(1, round(EDGE_REACH * max(size)))
     span = _highest(log_depth, reach) + _highest(-log_depth, reach)
-    width = EDGE_STEP * (error / EDGE_ERROR).clamp_min(1.0) ** 3
+    width = EDGE_STEP * (_on_grid(error, size) / EDGE_ERROR).clamp_min(1.0) ** 3
     return replace(target, confidence=target.confidence / (1.0 + (span / width) ** 2))
 
 
@@ -238,8 +264,8 @@ def refine_depth(
         depth_m: ``(B, 1, H, W)`` metres, at any resolution.
         target: matches or known points of the same images, on any grid.
         left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
-        error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it: a good prior is bent over wide
-            regions only, and its matches are doubted where it contradicts them.
+        error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it, or a ``local_error`` on any grid: a
+            good prior is bent over wide regions only, and its matches are doubted where it contradicts them.
         config: the fit's numbers; it solves a fixed number of times, so that no device is waited for.
 
     Returns:
@@ -254,6 +280,7 @@ def refine_depth(
     what the broad passes say of its region.
     """
     observed = _observations(depth_m, target, left_01, config)
+    error = _on_grid(error, target.size)
     broad = _stiff(observed, observed.weight, error, config)
     trusted = observed.weight * _robust(broad - observed.residual, observed.noise, error, config)
 

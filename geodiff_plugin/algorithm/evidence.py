@@ -7,7 +7,7 @@ Source: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -35,6 +35,7 @@ __all__ = [
     "chunk_views",
     "prepare_evidence",
     "resize_long_edge",
+    "within",
 ]
 
 
@@ -71,6 +72,23 @@ class Evidence:
     native: tuple[CameraView, ...] = ()
     pose: PoseReport | None = None
     warnings: tuple[str, ...] = ()
+
+
+def within(evidence: Evidence, known: Tensor) -> Evidence:
+    """Only those matches and points that lie where the prior says something, to find its scale by.
+
+    Args:
+        evidence: of an image.
+        known: ``(1, H, W)`` bool, where the prior says something, on any grid.
+
+    Returns:
+        The same with confidence 0 elsewhere; points stay as they are if none of them is left.
+    """
+    matches, points = (m and m.within(known) for m in (evidence.matches, evidence.points))
+    if points is not None and not bool(points.confidence.any()):
+        points = evidence.points
+    sure = None if matches is None else reliable_matches(matches)
+    return replace(evidence, matches=matches, points=points, sure=sure)
 
 
 def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tensor, Tensor]:

@@ -31,6 +31,7 @@ def settle_ends(
     config: GuidanceConfig,
     current: tuple[Tensor, Tensor] | None,
     on_edge: Tensor | None,
+    known: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Near and far jointly, by lookup, or by a fit to points where there is no right view.
 
@@ -42,6 +43,7 @@ def settle_ends(
         config: hyperparameters.
         current: metres ``(B,)`` of both ends in use, which stay unless a better basin shows up.
         on_edge: ``(B,)`` bool of the search before, ``None`` at the first.
+        known: ``(B, 1, H, W)`` bool, where the maps say something; ``None`` for everywhere.
 
     Returns:
         Metres ``(B,)`` of the nearest and the farthest end, and ``(B,)`` bool, whether they lie on the edge
@@ -55,7 +57,8 @@ def settle_ends(
         members = slice(first, first + owners.count(image))
         before = None if current is None else (current[0][members], current[1][members])
         edge = None if on_edge is None else on_edge[members]
-        results.append(_ends_of_image(x[members], evidence[first], metric, config, before, edge))
+        where = None if known is None else known[first : first + 1]
+        results.append(_ends_of_image(x[members], evidence[first], metric, config, before, edge, where))
     near, far, edges = (torch.cat(parts) for parts in zip(*results, strict=True))
     return near, far, edges
 
@@ -67,6 +70,7 @@ def _ends_of_image(
     config: GuidanceConfig,
     current: tuple[Tensor, Tensor] | None,
     on_edge: Tensor | None,
+    known: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``settle_ends`` of one image. Points have the last word: they are measured, matches inferred."""
     space, floored = metric.space, smooth_floor(x)
@@ -80,7 +84,7 @@ def _ends_of_image(
         near_far = current
     else:
         search = search_scale(
-            evidence.volume, floored, space, depth_range=config.depth_range, current=current
+            evidence.volume, floored, space, depth_range=config.depth_range, current=current, known=known
         )
         near_far, on_edge = (search.near_m, search.far_m), search.on_edge
     if confident is not None and evidence.matches is not None:

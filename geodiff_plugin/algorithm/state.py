@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.correction import correction_target, prior_error, refine_depth
-from geodiff_plugin.algorithm.evidence import Evidence, chunk_views
+from geodiff_plugin.algorithm.correction import correction_target, local_error, prior_error, refine_depth
+from geodiff_plugin.algorithm.evidence import Evidence, chunk_views, within
 from geodiff_plugin.algorithm.gradients import RULES, FiniteWatch
 from geodiff_plugin.algorithm.objective import Loss, Objective
 from geodiff_plugin.algorithm.settling import settle_ends, span_of_points
@@ -37,6 +37,8 @@ class Trajectory:
             the search starts; ``None`` for a relative one.
         start_range: metres ``(B,)`` of the nearest and of the farthest end that another frame's call ended
             with; they take the place of the first search.
+        known: ``(B, 1, h, w)`` bool, where the prior says something; ``None`` for everywhere. Elsewhere its
+            map has no part in the scale, and matches alone decide.
 
     Attributes:
         history: one ``StepReport`` a round.
@@ -63,9 +65,13 @@ class Trajectory:
         step_latents: float = 0.0,
         own_range: tuple[Tensor, Tensor] | None = None,
         start_range: tuple[Tensor, Tensor] | None = None,
+        known: Tensor | None = None,
     ) -> None:
         self.config, self.owners = config, list(owners)
         self.evidence = [evidence[i] for i in owners]  # of every sample
+        self.known, self._of_prior = known, self.evidence  # what the prior is held against
+        if known is not None:
+            self._of_prior = [within(e, k) for e, k in zip(self.evidence, known, strict=True)]
         self.metric = MetricMap(space, config.positive)
         self.objective = Objective(chunk_views(self.evidence), self.metric, config)
         self.matches = Matches.stack([e.matches for e in self.evidence])
@@ -129,7 +135,7 @@ class Trajectory:
         if self.config.search == "volume":
             ends = self._start_range if self._affine is None else self.metric.range_of(self._affine)
             near, far, self.on_edge = settle_ends(
-                x, self.owners, self.evidence, self.metric, self.config, ends, self.on_edge
+                x, self.owners, self._of_prior, self.metric, self.config, ends, self.on_edge, self.known
             )
             self._affine = self._start = self.metric.from_range(near, far)
         elif self._affine is None:
@@ -160,7 +166,7 @@ class Trajectory:
     def _order(self, x: Tensor) -> Tensor:
         """How far the prior alone agrees with matches or points on near and far; NaN where neither tells."""
         order = x.new_full((x.shape[0],), torch.nan)
-        for i, evidence in enumerate(self.evidence):
+        for i, evidence in enumerate(self._of_prior):
             target = evidence.matches or evidence.points
             if target is not None:
                 order[i] = order_agreement(x[i : i + 1], target, self.metric.space)
@@ -174,10 +180,17 @@ class Trajectory:
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         if self.matches is not None and self.kept is None:
             rejects = config.reject_reflections
-            self.kept = reject_reflections(self.matches, depth_m) if rejects else torch.ones_like(depth_m)
+            self.kept = torch.ones_like(depth_m)
+            if rejects and self.known is None:
+                self.kept = reject_reflections(self.matches, depth_m)
+            elif rejects:  # nothing lies behind a surface that the prior does not know
+                kept = reject_reflections(self.matches.within(self.known), depth_m)
+                inside = F.interpolate(self.known.float(), kept.shape[-2:], mode="nearest-exact")
+                self.kept = torch.where(inside > 0, kept, self.kept)
         if config.correct or config.refine:
             target = self._target(depth_m)
             assert target is not None  # there are matches or points
+            target = target if self.known is None else target.within(self.known)
             self.error = prior_error(depth_m, target, left_01, config)
 
     @property
@@ -187,8 +200,12 @@ class Trajectory:
             return None
         return replace(self.matches, confidence=self.kept * self.matches.confidence)
 
+    @property
+    def _local_error(self) -> Tensor | None:
+        return local_error(self.error, self.known)
+
     def _target(self, depth_m: Tensor) -> Matches | None:
-        return correction_target(self.matches, self.points, self.kept, self.error, depth_m)
+        return correction_target(self.matches, self.points, self.kept, self._local_error, depth_m)
 
     def find_hidden(self, x: Tensor) -> None:
         """Find what an estimate hides from the right cameras; it holds for the updates of the round.
@@ -211,10 +228,10 @@ class Trajectory:
             ``(B, 1, h, w)``; ``x`` where there are neither.
         """
         depth_m = self.objective.metric_depth(x, self.affine)
-        target = self._target(depth_m)
-        if target is None or self.error is None:
+        target, error = self._target(depth_m), self._local_error
+        if target is None or error is None:
             return x
-        _, _, field = refine_depth(depth_m, target, self.objective.views.left_01, self.error, self.config)
+        _, _, field = refine_depth(depth_m, target, self.objective.views.left_01, error, self.config)
         # A factor, not a difference of maps: interpolated over an edge the latter is an error on either side.
         field = F.interpolate(field, x.shape[-2:], mode="bilinear", antialias=True)
         return self.metric.relative(self.metric(x, self.affine) * torch.exp(-field), self.affine)

@@ -60,6 +60,11 @@ class Matches:
         """``(H, W)`` of the grid."""
         return self.confidence.shape[-2], self.confidence.shape[-1]
 
+    def within(self, known: Tensor) -> Self:
+        """The same with confidence 0 outside of ``known (1, h, w)`` or ``(B, 1, h, w)`` bool, on any grid."""
+        inside = F.interpolate(known.view(-1, 1, *known.shape[-2:]).float(), self.size, mode="nearest-exact")
+        return replace(self, confidence=self.confidence * inside.view_as(self.confidence))
+
     def above(self, confidence: float) -> Tensor:
         """``(P,)`` flat indices of the pixels of one image with more confidence than that.
 

@@ -30,6 +30,7 @@ from geodiff_plugin.priors.folders import (
 from geodiff_plugin.priors.geowizard import GeoWizardPrior
 from geodiff_plugin.priors.loading import check_device
 from geodiff_plugin.priors.lotus import LotusPrior
+from geodiff_plugin.priors.map import MAP_LAYOUT, DepthMapPrior
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Prior
 from geodiff_plugin.priors.ppd import PPDPrior
@@ -56,6 +57,7 @@ PRIORS: dict[str, type[DepthPrior]] = {
     "depthfm": DepthFMPrior,
     "ppd": PPDPrior,
     "transformers": TransformersDepthPrior,
+    "map": DepthMapPrior,
     "e2e-ft": E2EFTPrior,
     "marigold": MarigoldPrior,
 }
@@ -119,7 +121,7 @@ def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> Foun
     """Find a prior and tell which it is, by the configs of its components.
 
     Args:
-        name: ``"bundled"``, a folder, or a hub id; with a key of ``PRIORS`` and a colon before it
+        name: ``"bundled"``, ``"map"``, a folder, or a hub id; with a key of ``PRIORS`` and a colon before it
             (``"e2e-ft:folder"``) it is taken for that.
         variant: of the weight files, such as ``"fp16"``.
         **hub: for the download (``revision``, ``token``, ``cache_dir``, ``local_files_only``).
@@ -128,6 +130,8 @@ def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> Foun
         ValueError: it does not exist, is neither cached nor reachable, is refused, or is of no known kind.
     """
     key, typed = None, str(name)
+    if typed == MAP_LAYOUT.name:
+        return FoundPrior("map", MAP_LAYOUT)
     prefix, colon, rest = typed.partition(":")
     if colon and prefix in PRIORS:
         key, typed = prefix, rest
@@ -164,10 +168,12 @@ def load_prior(
     """Load a pipeline that can be guided.
 
     Args:
-        name: ``"bundled"``, a folder, or a hub id (``prs-eth/marigold-depth-v1-1``), see ``find_prior``.
+        name: ``"bundled"``, a folder, or a hub id (``prs-eth/marigold-depth-v1-1``), see ``find_prior``; or
+            ``"map"``, whose call takes the ``depth_map`` of another model.
         device: where to, CPU for ``None``.
         dtype: of the networks.
-        space: what the prior's map is affine in, key of ``SPACES``; ``None`` for what the folder says.
+        space: what the prior's map is affine in, key of ``SPACES``; ``None`` for what the folder says, and of
+            ``"map"`` for depth.
         **kwargs: for ``find_prior`` (``variant``, ``revision``, ``token``, ``local_files_only``, ...).
 
     Raises:

@@ -83,6 +83,16 @@ class DepthPrior(Protocol):
             Depths of ``x = 0`` and of ``x = 1``, ``(B,)`` metres each; ``None`` for a relative prior.
         """
 
+    def known(self, samples: slice) -> Tensor | None:
+        """Where the prior says anything; what it gives elsewhere is no evidence of its scale or quality.
+
+        Args:
+            samples: as in ``metric_range``.
+
+        Returns:
+            ``(B, 1, H, W)`` bool on the processing grid; ``None`` for everywhere.
+        """
+
 
 class OwnPipelinePrior:
     """Adapter of a ``DepthDiffusionPipeline``, which says of itself what guidance must know.
@@ -134,4 +144,8 @@ class OwnPipelinePrior:
 
     def metric_range(self, samples: slice) -> tuple[Tensor, Tensor] | None:
         """A relative prior has none."""
+        return None
+
+    def known(self, samples: slice) -> Tensor | None:
+        """A network says something everywhere."""
         return None

@@ -97,3 +97,7 @@ class MarigoldPrior:
     def metric_range(self, samples: slice) -> None:
         """None: its depth is relative."""
         return None
+
+    def known(self, samples: slice) -> None:
+        """None: it says something everywhere."""
+        return None

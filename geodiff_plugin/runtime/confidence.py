@@ -81,7 +81,7 @@ def depth_confidence(
         visible: ``(B, 1, H, W)`` bool, whether a right camera sees the pixel.
         spread: ``(B, 1, H, W)`` relative spread of the ensemble's members, >= 0, or ``None`` for one member.
         prior_error: ``(B, 1, 1, 1)`` of the prior in log depth, as ``algorithm.correction.prior_error``
-            measures it; ``None`` where it is not known, which counts as useless.
+            measures it, or ``(B, 1, H, W)`` of every pixel; ``None`` where it is not known, which counts as useless.
 
     Returns:
         ``(B, 1, H, W)`` in (0, 1).
@@ -90,7 +90,10 @@ def depth_confidence(
     confidence = torch.empty_like(support)
     for rows in row_strips(*support.shape[-2:]):  # evidence is five times as large as what it says
         maps = (part[:, :, rows] for part in (support, error, visible))
-        evidence = depth_evidence(*maps, None if spread is None else spread[:, :, rows], prior_error)
+        of_rows = prior_error
+        if prior_error is not None and prior_error.shape[-1] > 1:
+            of_rows = prior_error[:, :, rows]
+        evidence = depth_evidence(*maps, None if spread is None else spread[:, :, rows], of_rows)
         confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
     return confidence
 

@@ -71,7 +71,7 @@ def assemble_output(
         spread = None if uncertainty is None else uncertainty / depth_m
         nowhere = torch.zeros_like(depth_m)
         shown = nowhere if error is None else error, nowhere.bool() if visible is None else visible
-        confidence = depth_confidence(support, *shown, spread, prior_error)
+        confidence = depth_confidence(support, *shown, spread, run.prior_error(grid))
     over_own = _over_own(run, depth_m)
     own_ratios = [math.nan] * count
     if over_own is not None and guidance.unit is not None:

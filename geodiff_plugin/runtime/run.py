@@ -7,10 +7,12 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin.algorithm.correction import local_error
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.schedule import make_schedule
 from geodiff_plugin.algorithm.state import Trajectory
@@ -185,21 +187,34 @@ class GuidedRun:
 
         Returns:
             ``(1, 1, h, w)`` on the grid of the losses, the share of each match's confidence that remains once
-            reflections are rejected; and ``(1, 1, 1, 1)``, the prior's error in log depth. ``None`` where it
-            was not measured.
+            reflections are rejected; and the prior's error in log depth, ``(1, 1, 1, 1)``, or a
+            ``correction.local_error`` of a prior that does not know every pixel. ``None`` where it was not
+            measured.
         """
+        kept, error, known = (self._mean(name, image, member) for name in ("kept", "error", "known"))
+        return kept, local_error(error, known)
+
+    def _mean(self, name: str, image: int, member: int | None = None) -> Tensor | None:
+        """An attribute of the trajectories, averaged over the samples of an image or of its member."""
         samples = [(t, i) for t in self.trajectories for i, owner in enumerate(t.owners) if owner == image]
         chosen = samples if member is None else samples[member : member + 1]
+        values = [value[i].float() for t, i in chosen if (value := getattr(t, name)) is not None]
+        return torch.stack(values).mean(0, keepdim=True) if values else None
 
-        def mean(name: str) -> Tensor | None:
-            values = [value[i] for t, i in chosen if (value := getattr(t, name)) is not None]
-            return torch.stack(values).mean(0, keepdim=True) if values else None
+    def prior_error(self, size: tuple[int, int] | None = None) -> Tensor | None:
+        """Error of the prior in log depth of every image, ``None`` if it is not known of all.
 
-        return mean("kept"), mean("error")
+        Args:
+            size: of the grid on which pixels that the prior does not know have the largest error.
 
-    def prior_error(self) -> Tensor | None:
-        """``(N, 1, 1, 1)`` error of the prior in log depth, ``None`` if it is not known of every image."""
-        errors = [error for i in range(len(self.evidence)) if (error := self.of_prior(i)[1]) is not None]
+        Returns:
+            ``(N, 1, 1, 1)``; ``(N, 1, H, W)`` with ``size`` and a prior that does not know every pixel.
+        """
+        if size is not None and any(t.known is not None for t in self.trajectories):
+            maps = [m for i in range(len(self.evidence)) if (m := self.of_prior(i)[1]) is not None]
+            maps = [F.interpolate(m, size, mode="nearest-exact") for m in maps]
+            return torch.cat(maps) if len(maps) == len(self.evidence) else None
+        errors = [error for i in range(len(self.evidence)) if (error := self._mean("error", i)) is not None]
         return torch.cat(errors) if len(errors) == len(self.evidence) else None
 
     def check_finite(self) -> None:
@@ -218,7 +233,7 @@ class GuidedRun:
         self.trajectories.append(
             Trajectory(
                 *(self.config, self.evidence, self.owners[chunk], self.prior.space, self._plan.step_latents),
-                *(self.prior.metric_range(chunk), start),
+                *(self.prior.metric_range(chunk), start, self.prior.known(chunk)),
             )
         )
         self._results.append(None)

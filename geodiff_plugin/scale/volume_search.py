@@ -88,6 +88,7 @@ def search_scale(
     *,
     depth_range: tuple[float, float] | None = None,
     current: tuple[Tensor, Tensor] | None = None,
+    known: Tensor | None = None,
 ) -> ScaleSearch:
     """Depths of the two ends of a relative map that the two views agree on best.
 
@@ -98,6 +99,7 @@ def search_scale(
         depth_range: ``(near, far)`` metres, bounds of the search; by default from the volume's nearest
             plane to where the shift is 0.3 px.
         current: nearest and farthest depth in use, ``(B,)`` each, to be kept unless a better basin shows up.
+        known: ``(1, 1, H, W)`` bool, the pixels of the maps that count; ``None`` for all.
 
     Returns:
         ``ScaleSearch``. 1128 pairs (near, far), log-spaced, then two finer grids around the best.
@@ -107,6 +109,9 @@ def search_scale(
     low, high = volume.reach_m if depth_range is None else depth_range
     height, width = volume.size
     at = _sample_positions(height, width, SAMPLES, x.device)
+    if known is not None:
+        inside = F.interpolate(known.float(), (height, width), mode="nearest-exact").flatten()[at] > 0
+        at = at[inside] if bool(inside.any()) else at
     cost, in_view = volume.at_pixels(at)
     least = IN_VIEW_RECTIFIED if volume.rectified else IN_VIEW_POSED
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]

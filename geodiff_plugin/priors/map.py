@@ -1,0 +1,213 @@
+"""A depth map from any other model as a prior: one step, no network, the map is the estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin.algorithm.sharpening import sharpen_edges
+from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
+from geodiff_plugin.geometry.cameras import image_size
+from geodiff_plugin.priors.base import OwnPipelinePrior
+from geodiff_plugin.priors.folders import Layout
+from geodiff_plugin.priors.loading import build_pipeline
+from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+from geodiff_plugin.priors.transformers_depth import range_of
+
+__all__ = ["MAP_LAYOUT", "DepthMapPipeline", "DepthMapPrior"]
+
+#: What ``load_prior("map")`` loads: no folder is there, and none is needed.
+MAP_LAYOUT = Layout(Path(__file__).with_suffix(""), "map")
+#: Weight of a known pixel against its links in the fill of holes, and conjugate-gradient steps per grid.
+FIRM, FILL_STEPS = 100.0, 20
+#: Where a resized map mixes in less than this of a hole, its value is the map's.
+ALL_KNOWN = 0.999
+#: Image pixels to a pixel of the map from which its edges are made steep again after enlargement.
+ENLARGED = 1.5
+#: Offset that makes a map in [0, 1] a stand-in for inverse depth, in which edges are relative steps.
+OFFSET = 0.25
+
+Maps = np.ndarray | Tensor | Sequence[np.ndarray | Tensor]
+
+
+class DepthMapPipeline(DepthDiffusionPipeline):
+    """Takes ``depth_map=`` in the call in place of a network; what guidance moves is the map itself.
+
+    Args:
+        scheduler: one step whose result is what it is given.
+        prediction_type: what the values of the maps are affine in, key of ``scale.space.SPACES``.
+        default_denoising_steps: 1.
+        default_processing_resolution: longer side of the map that is guided, 0 for the image's own.
+
+    Attributes:
+        known: ``(N * E, 1, H, W)`` bool, where the maps of the latest call have values; ``None`` for
+            everywhere.
+    """
+
+    max_steps = 1
+    deterministic = True
+    sees_latents = False
+
+    def __init__(
+        self,
+        scheduler: DirectScheduler,
+        prediction_type: str = "depth",
+        default_denoising_steps: int = 1,
+        default_processing_resolution: int = 0,
+    ) -> None:
+        super().__init__()
+        self.known: Tensor | None = None
+        self._place = torch.nn.Module()  # of the pipeline, which has no weights that would tell
+        self._place.register_buffer("at", torch.empty(0))
+        self.register_prior(
+            {"scheduler": scheduler},
+            prediction_type,
+            default_denoising_steps,
+            default_processing_resolution,
+            image_processor=1,
+        )
+
+    @property
+    def device(self) -> torch.device:
+        """Where calls run."""
+        return self._place.at.device
+
+    def to(self, *args: Any, **kwargs: Any) -> DepthMapPipeline:
+        """As ``DiffusionPipeline.to``; maps stay in float32."""
+        targets = (*args, *kwargs.values())
+        self._place.to(*(t for t in targets if isinstance(t, (str, int, torch.device))))
+        return self
+
+    def prepare_condition(
+        self,
+        image: Tensor,
+        ensemble_size: int,
+        batch_size: int,
+        generator: Generators,
+        depth_map: Maps | None = None,
+    ) -> Condition:
+        """The maps on the image's grid, from 0 to about 1, holes filled smoothly.
+
+        Args:
+            image: as in the base class.
+            ensemble_size: as there.
+            batch_size: as there.
+            generator: as there.
+            depth_map: of every image a map ``(h, w)`` of any size and unit that covers the same view, ``(N,
+                h, w)`` or a list; not finite where nothing is known.
+
+        Raises:
+            TypeError, ValueError: no map, another number of them, or one without two different values.
+        """
+        maps = _as_list(depth_map)
+        if len(maps) != len(image):
+            bad_value("depth_map", f"one map (h, w) for each of {len(image)} images", f"{len(maps)}")
+        size, prepared = image_size(image), []
+        for values, view in zip(maps, image.float().split(1), strict=True):
+            filled, known = _filled(values.to(view.device))
+            prepared.append((_resized(filled, view / 2 + 0.5), _resized_mask(known, size)))
+        relative, known = (torch.cat(part).repeat_interleave(ensemble_size, dim=0) for part in zip(*prepared))
+        self.known = None if bool(known.all()) else known
+        return {"relative": relative}
+
+    def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
+        """Zeros; nothing reads them."""
+        return torch.zeros_like(condition["relative"])
+
+    def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
+        """The given map, whatever the latents are."""
+        return condition["relative"]
+
+    def decode_relative(self, z0: Tensor) -> Tensor:
+        """The latent is the map."""
+        return z0
+
+    def encode_relative(self, x: Tensor) -> Tensor:
+        """The map is the latent."""
+        return x
+
+
+def _as_list(given: Any) -> list[Tensor]:
+    """``depth_map`` as maps ``(1, 1, h, w)`` float32, NaN where unknown."""
+    if given is None:
+        cure = "pipe(left, depth_map=array, guidance=...), or --prior-map FILE."
+        bad_value("depth_map", "given with the prior 'map'", "nothing", cure)
+    if isinstance(given, (np.ndarray, Tensor)):
+        given = [given] if given.ndim == 2 else list(given)
+    if not isinstance(given, (list, tuple)) or not all(isinstance(m, (np.ndarray, Tensor)) for m in given):
+        bad_type("depth_map", "an array (h, w) or (N, h, w), or a list of arrays (h, w)", given)
+    maps = []
+    for each in given:
+        values = torch.as_tensor(np.ascontiguousarray(each) if isinstance(each, np.ndarray) else each)
+        if values.ndim != 2 or min(values.shape) < 2 or values.is_complex():
+            bad_value("depth_map", "a map (h, w) of 2 x 2 pixels or more", f"shape {tuple(values.shape)}")
+        values = values.double()
+        inside = values.isfinite()
+        if not inside.any() or values[inside].min() == values[inside].max():
+            cure = "Not finite means unknown; a map must tell near from far somewhere."
+            bad_value("depth_map", "a map with two different finite values", "none", cure)
+        low = values[inside].min()  # before float32, which would round a small range far from 0
+        maps.append(torch.where(inside, values - low, values.new_tensor(torch.nan)).float()[None, None])
+    return maps
+
+
+def _filled(values: Tensor) -> tuple[Tensor, Tensor]:
+    """A map with its least value at 0 and its 98 % quantile at 1, holes filled, and where it is known."""
+    known = values.isfinite()
+    low, high = range_of(values[known][None, None, None])
+    if high <= low:  # nearly all of it is flat
+        high = values[known].max()[None]
+    values = torch.where(known, (values - low) / (high - low), torch.zeros_like(values))
+    if bool(known.all()):
+        return values, known
+    weight, links = FIRM * known.float(), torch.ones_like(values)
+    system = FieldSystem(weight, weight * values, links[..., 1:], links[..., 1:, :])
+    return torch.where(known, values, solve_field(system, FILL_STEPS)), known
+
+
+def _resized(values: Tensor, left_01: Tensor) -> Tensor:
+    """A map ``(1, 1, h, w)`` at the size of its image; edges that enlargement makes oblique are made steep."""
+    size = image_size(left_01)
+    if image_size(values) == size:
+        return values
+    resized = F.interpolate(values, size, mode="bilinear", antialias=True)
+    ratio = max(new / old for new, old in zip(size, image_size(values), strict=True))
+    if ratio < ENLARGED:
+        return resized
+    return 1.0 / sharpen_edges(1.0 / (resized + OFFSET), left_01, round(ratio)) - OFFSET
+
+
+def _resized_mask(known: Tensor, size: tuple[int, int]) -> Tensor:
+    return F.interpolate(known.float(), size, mode="bilinear", antialias=True) > ALL_KNOWN
+
+
+class DepthMapPrior(OwnPipelinePrior):
+    """Adapter of ``DepthMapPipeline``: scale, shift and a residual per pixel can be guided."""
+
+    pipeline_class = DepthMapPipeline
+    licence = {"map": "that of the model which made the map"}
+
+    def known(self, samples: slice) -> Tensor | None:
+        """Where the maps of the running call have values."""
+        return None if self._pipe.known is None else self._pipe.known[samples]
+
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """A pipeline that consists of a ``DirectScheduler`` alone."""
+        parts = [name for name, value in layout.index.items() if isinstance(value, list)]
+        return parts == ["scheduler"] and layout.index["scheduler"][1] == DirectScheduler.__name__
+
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> DepthMapPipeline:
+        """A pipeline without weights; of ``"map"`` the values are depth unless ``space`` says otherwise."""
+        if layout == MAP_LAYOUT:
+            return cls.pipeline_class(DirectScheduler(timestep=0), space or "depth")
+        return build_pipeline(cls.pipeline_class, layout, dtype, prediction_type=space)
