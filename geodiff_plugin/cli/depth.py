@@ -102,6 +102,8 @@ def guided_call(pipe: Any, inputs: Inputs, options: DepthOptions, **further: Any
             not to be trusted.
     """
     call = options.call() | {"generator": torch.Generator("cpu").manual_seed(options.seed)} | further
+    if inputs.prior_map is not None:
+        call["depth_map"] = inputs.prior_map
     pipe.set_progress_bar_config(disable=options.quiet, file=sys.stderr, leave=False)
     try:
         return pipe(inputs.left, guidance=inputs.guidance, strict=options.strict, **call)

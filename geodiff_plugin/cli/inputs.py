@@ -21,6 +21,7 @@ from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, calibration_way
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
+from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.distortion import (
     distortion_from_text,
     undistorted,
@@ -51,12 +52,14 @@ class Inputs:
         rig: cameras of both, in pixels of these images; the left one's twice where there is no right one.
         guidance: the right view, and those beside it, with the settings of the preset.
         undistorted: whether lens distortion was taken out of the images.
+        prior_map: ``(h, w)`` of ``--prior-map``, NaN where unknown; or ``None``.
     """
 
     left: np.ndarray
     rig: Rig
     guidance: GeometryGuidance
     undistorted: bool = False
+    prior_map: np.ndarray | None = None
 
 
 def read_inputs(
@@ -114,7 +117,11 @@ def read_inputs(
         )
     if options.k_right is None and calibration_way(options) in ("parameters", "matrices"):
         assume_same_centre(guidance)
-    return Inputs(images[0], rig, guidance, any(lens is not None for lens in lenses))
+    prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
+    if prior_map is not None and lenses[0] is not None:
+        cure = "Run the other model on undistorted.png, and give that image and its map."
+        bad_value("--prior-map", "of an image without lens distortion", "a lens with distortion", cure)
+    return Inputs(images[0], rig, guidance, any(lens is not None for lens in lenses), prior_map)
 
 
 def _read_view(path: Path, name: str) -> np.ndarray:

@@ -226,7 +226,7 @@ def _is_full(error: BaseException | None) -> bool:
 
 def _file_digests(options: DepthOptions) -> dict[str, str]:
     """SHA-256 by path of the readable files that a pair is made from; of a COLMAP model, of its texts."""
-    paths: list[Path] = [options.left, *([options.right] if options.right else [])]
+    paths = [path for path in (options.left, options.right, options.prior_map) if path is not None]
     for name in CAMERA_FILES:
         value = getattr(options, name)
         for path in value if isinstance(value, tuple) else (value,):

@@ -105,6 +105,11 @@ class DepthOptions(RunOptions):
         (), "Lens of each --view, 0,0,0,0 for none; LEFT's if not given."
     )
     cropped: bool = _camera(False, "The principal point may lie outside: the images are crops.")
+    prior_map: Path | None = declare(
+        None,
+        "Depth map of LEFT by another model in place of --prior, of any size, unit and --space: .npy, .npz, "
+        ".pfm, 16-bit .png. Or a folder of maps with the images' names.",
+    )
     points: Path | None = declare(
         None, "Known depths: a map of LEFT (PNG, PFM, .npy) or points (.npy, text, .ply, .bin)."
     )
@@ -136,6 +141,10 @@ class DepthOptions(RunOptions):
     quiet: bool = _output(False, "No progress bar, no summary.", "--quiet", "-q")
     json: bool = _output(False, "Print the report instead of the summary.")
 
+    def __post_init__(self) -> None:
+        if self.prior_map is not None and self.prior == "bundled":  # the default, which the map replaces
+            object.__setattr__(self, "prior", "map")
+
     def photographs(self) -> dict[str, Path]:
         """Paths of the views of one pair by the name of their option, the left one first."""
         further = {f"--view {number}": path for number, path in enumerate(self.view, 1)}
@@ -144,7 +153,8 @@ class DepthOptions(RunOptions):
     def other_files(self) -> list[tuple[str, Path]]:
         """Name and path of every input that is no photograph."""
         named = [("calibration" if name == "calib" else name, getattr(self, name)) for name in CAMERA_FILES]
-        named += [(name, getattr(self, name)) for name in ("view_k", "view_e", "points", "points_calib")]
+        others = ("view_k", "view_e", "points", "points_calib", "prior_map")
+        named += [(name, getattr(self, name)) for name in others]
         flags = {field.name: flag_of(field) for field in fields(self)}
         return [
             (flags.get(name, name), path)
@@ -204,6 +214,9 @@ class DepthOptions(RunOptions):
         if not self.estimate_pose:
             names = ("fov", "known_length", "matcher")
             self.refuse(names, "given together with --estimate-pose", "no --estimate-pose")
+        if (self.prior == "map") != (self.prior_map is not None):
+            beside = "no --prior-map" if self.prior_map is None else "--prior-map"
+            bad_value("--prior-map", "given in place of a --prior", f"--prior {self.prior} and {beside}")
         if self.points is None:
             self.refuse(["points_scale", "points_calib"], "given with --points", "no --points")
         if self.right is None:

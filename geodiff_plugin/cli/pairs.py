@@ -28,6 +28,8 @@ __all__ = ["COLUMNS", "SUMMARY", "PairRef", "assumption", "find_pairs", "is_many
 SUMMARY = "pairs.csv"
 COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "verdict", "confidence", "seconds", "message")
 LISTS = (".csv", ".tsv", ".txt")
+#: Files of maps, the first of a name is taken.
+MAPS = (".npy", ".npz", ".pfm", ".png")
 #: A list's heading, which is no pair, begins with this.
 HEADING = "left"
 #: A comment in a line of a list, unless its mark is within quotes, which stay.
@@ -70,6 +72,8 @@ def start_many(options: DepthOptions) -> list[PairRef]:
     names = ("show", "points", "view", "known_length")
     options.refuse(names, "left out with many pairs", "given", "It is of one pair.")
     refs = find_pairs(options)
+    for ref in refs if options.prior_map is not None else ():
+        options_of(ref, options)  # every pair has its map
     if refs[0].frame is not None:
         cure = "Extract some frames, and try it there."
         options.refuse(["estimate_pose"], "left out with a video", "given", cure)
@@ -83,7 +87,7 @@ def start_many(options: DepthOptions) -> list[PairRef]:
         intrinsics_way(first)
     elif all(ref.calib is None for ref in refs):
         calibration_way(first)
-    check_files(options, photographs=False)
+    check_files(replace(options, prior_map=first.prior_map), photographs=False)
     _check_summary(options)
     return refs
 
@@ -159,9 +163,22 @@ def assumption(refs: Sequence[PairRef], options: DepthOptions) -> str | None:
 
 
 def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
-    """What ``geodiff depth`` would have been asked for this pair alone."""
+    """What ``geodiff depth`` would have been asked for this pair alone.
+
+    Raises:
+        InputError: no map for it in the folder of ``--prior-map``.
+    """
     calib = options.calib if ref.calib is None else (ref.calib,)
-    return replace(options, left=ref.left, right=ref.right, calib=calib, out=options.out / ref.name)
+    folder, prior_map = options.prior_map, None
+    if folder is not None:
+        stem = ref.left.stem if ref.frame is None else ref.name
+        paths = [folder / f"{stem}{suffix}" for suffix in MAPS]
+        prior_map = next((path for path in paths if path.is_file()), None)
+        if prior_map is None:
+            got = f"{folder} without {stem}{{{','.join(MAPS)}}}"
+            bad_value("--prior-map", "a folder with a map for each left image, of its name", got)
+    of_pair = {"calib": calib, "out": options.out / ref.name, "prior_map": prior_map}
+    return replace(options, left=ref.left, right=ref.right, **of_pair)
 
 
 def _photographs(folder: Path) -> list[Path]:

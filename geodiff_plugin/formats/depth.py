@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import zipfile
 import zlib
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.files import check_file, read_npy
 from geodiff_plugin.formats.out import atomic_path
 
 __all__ = [
@@ -19,6 +21,7 @@ __all__ = [
     "read_depth_mm_png",
     "read_depth_png",
     "read_disparity_kitti_png",
+    "read_map",
     "read_pfm",
     "row_strips",
     "write_depth_mm",
@@ -205,3 +208,40 @@ def read_disparity_kitti_png(path: PathLike, name: str = "disparity") -> tuple[n
 def read_depth_mm_png(path: PathLike, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
     """Read a 16-bit PNG of millimetres, as metres; otherwise as ``read_depth_png``."""
     return read_depth_png(path, 1000.0, name)
+
+
+#: What depth models are read from.
+MAP_FILES = "a map (H, W) as .npy, .npz, .pfm or 16-bit .png"
+
+
+def read_map(path: PathLike, name: str = "map") -> np.ndarray:
+    """Read the map of a depth model, in whatever unit and space it is.
+
+    Args:
+        path: ``.npy``; ``.npz`` with ``depth``, or a single array; ``.pfm``; or a 16-bit ``.png``. Axes of
+            length 1 are dropped.
+        name: the argument that it came in, for messages.
+
+    Returns:
+        ``(H, W)`` as in the file; NaN where it is not finite, and where a PNG has 0.
+
+    Raises:
+        OSError, ValueError: no readable file, another kind of it, or more than one map.
+    """
+    found = check_file(path, name, MAP_FILES)
+    kind = found.suffix.lower()
+    if kind == ".png":
+        values, known = read_depth_png(found, 1.0, name)
+        values = np.where(known, values, np.nan)
+    elif kind == ".npz":
+        try:
+            with np.load(found, allow_pickle=False) as archive:
+                values = archive["depth" if "depth" in archive.files else " ".join(archive.files)]
+        except (OSError, ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
+            bad_value(name, "an .npz with 'depth' or a single array", f"{found} ({error})")
+    else:
+        values = (read_pfm if kind == ".pfm" else partial(read_npy, expected=MAP_FILES))(found, name)
+    values = np.squeeze(values)
+    if values.ndim != 2 or values.dtype.kind not in "fiu":
+        bad_value(name, MAP_FILES, f"{found} of shape {values.shape}", "Save one map of the left image.")
+    return np.where(np.isfinite(values), values, np.nan)

@@ -12,13 +12,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value
-from geodiff_plugin.algorithm.sharpening import sharpen_edges
+from geodiff_plugin.algorithm.finish import sharpen_edges
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.priors.base import OwnPipelinePrior
 from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipelines.base import Condition, DirectMapPipeline, Generators
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from geodiff_plugin.priors.transformers_depth import range_of
 
@@ -35,10 +35,8 @@ ENLARGED = 1.5
 #: Offset that makes a map in [0, 1] a stand-in for inverse depth, in which edges are relative steps.
 OFFSET = 0.25
 
-Maps = np.ndarray | Tensor | Sequence[np.ndarray | Tensor]
 
-
-class DepthMapPipeline(DepthDiffusionPipeline):
+class DepthMapPipeline(DirectMapPipeline):
     """Takes ``depth_map=`` in the call in place of a network; what guidance moves is the map itself.
 
     Args:
@@ -51,10 +49,6 @@ class DepthMapPipeline(DepthDiffusionPipeline):
         known: ``(N * E, 1, H, W)`` bool, where the maps of the latest call have values; ``None`` for
             everywhere.
     """
-
-    max_steps = 1
-    deterministic = True
-    sees_latents = False
 
     def __init__(
         self,
@@ -92,7 +86,7 @@ class DepthMapPipeline(DepthDiffusionPipeline):
         ensemble_size: int,
         batch_size: int,
         generator: Generators,
-        depth_map: Maps | None = None,
+        depth_map: np.ndarray | Tensor | Sequence[np.ndarray | Tensor] | None = None,
     ) -> Condition:
         """The maps on the image's grid, from 0 to about 1, holes filled smoothly.
 
@@ -113,30 +107,17 @@ class DepthMapPipeline(DepthDiffusionPipeline):
         size, prepared = image_size(image), []
         for values, view in zip(maps, image.float().split(1), strict=True):
             filled, known = _filled(values.to(view.device))
-            prepared.append((_resized(filled, view / 2 + 0.5), _resized_mask(known, size)))
-        relative, known = (torch.cat(part).repeat_interleave(ensemble_size, dim=0) for part in zip(*prepared))
+            inside = F.interpolate(known.float(), size, mode="bilinear", antialias=True) > ALL_KNOWN
+            prepared.append((_resized(filled, view / 2 + 0.5), inside))
+        relative, known = (
+            torch.cat(part).repeat_interleave(ensemble_size, dim=0) for part in zip(*prepared, strict=True)
+        )
         self.known = None if bool(known.all()) else known
         return {"relative": relative}
 
-    def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
-        """Zeros; nothing reads them."""
-        return torch.zeros_like(condition["relative"])
-
-    def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The given map, whatever the latents are."""
-        return condition["relative"]
-
-    def decode_relative(self, z0: Tensor) -> Tensor:
-        """The latent is the map."""
-        return z0
-
-    def encode_relative(self, x: Tensor) -> Tensor:
-        """The map is the latent."""
-        return x
-
 
 def _as_list(given: Any) -> list[Tensor]:
-    """``depth_map`` as maps ``(1, 1, h, w)`` float32, NaN where unknown."""
+    """``depth_map`` as maps ``(1, 1, h, w)`` float32 from 0, NaN where unknown."""
     if given is None:
         cure = "pipe(left, depth_map=array, guidance=...), or --prior-map FILE."
         bad_value("depth_map", "given with the prior 'map'", "nothing", cure)
@@ -174,7 +155,7 @@ def _filled(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _resized(values: Tensor, left_01: Tensor) -> Tensor:
-    """A map ``(1, 1, h, w)`` at the size of its image; edges that enlargement makes oblique are made steep."""
+    """A map ``(1, 1, h, w)`` at the size of its image, its edges steep again after enlargement."""
     size = image_size(left_01)
     if image_size(values) == size:
         return values
@@ -183,10 +164,6 @@ def _resized(values: Tensor, left_01: Tensor) -> Tensor:
     if ratio < ENLARGED:
         return resized
     return 1.0 / sharpen_edges(1.0 / (resized + OFFSET), left_01, round(ratio)) - OFFSET
-
-
-def _resized_mask(known: Tensor, size: tuple[int, int]) -> Tensor:
-    return F.interpolate(known.float(), size, mode="bilinear", antialias=True) > ALL_KNOWN
 
 
 class DepthMapPrior(OwnPipelinePrior):

@@ -13,7 +13,7 @@ from geodiff_plugin.priors.base import OwnPipelinePrior
 from geodiff_plugin.priors.folders import Layout
 from geodiff_plugin.priors.hf_model import DEPTH_ARCHITECTURES, DepthMap, HFDepthModel, Preparation, output_of
 from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipelines.base import Condition, DirectMapPipeline, Generators
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 
 __all__ = ["TransformersDepthPipeline", "TransformersDepthPrior", "range_of", "unit_range"]
@@ -39,7 +39,7 @@ def unit_range(values: Tensor) -> Tensor:
     return (values - low.view(-1, 1, 1, 1)) / span.view(-1, 1, 1, 1)
 
 
-class TransformersDepthPipeline(DepthDiffusionPipeline):
+class TransformersDepthPipeline(DirectMapPipeline):
     """Every model that ``AutoModelForDepthEstimation`` loads, but that of canopy height.
 
     There are no latents to speak of: what guidance moves beside scale and shift is the map itself, pixel by
@@ -60,9 +60,6 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
     """
 
     model_cpu_offload_seq = "model"
-    max_steps = 1
-    deterministic = True
-    sees_latents = False
 
     def __init__(
         self,
@@ -120,22 +117,6 @@ class TransformersDepthPipeline(DepthDiffusionPipeline):
         self.own_range = _own_range(maps, ensemble_size)
         values = torch.cat([found.values for found in maps])
         return {"relative": unit_range(values).repeat_interleave(ensemble_size, dim=0)}
-
-    def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
-        """Zeros; nothing reads them."""
-        return torch.zeros_like(condition["relative"])
-
-    def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The map that the network gave, whatever the latents are."""
-        return condition["relative"]
-
-    def decode_relative(self, z0: Tensor) -> Tensor:
-        """The latent is the map."""
-        return z0
-
-    def encode_relative(self, x: Tensor) -> Tensor:
-        """The map is the latent."""
-        return x
 
 
 def _space_of(model: PreTrainedModel) -> str | None:

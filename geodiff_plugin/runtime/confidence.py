@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.evidence import as_fine_as
@@ -81,19 +82,20 @@ def depth_confidence(
         visible: ``(B, 1, H, W)`` bool, whether a right camera sees the pixel.
         spread: ``(B, 1, H, W)`` relative spread of the ensemble's members, >= 0, or ``None`` for one member.
         prior_error: ``(B, 1, 1, 1)`` of the prior in log depth, as ``algorithm.correction.prior_error``
-            measures it, or ``(B, 1, H, W)`` of every pixel; ``None`` where it is not known, which counts as useless.
+            measures it, or a ``local_error`` on any grid; ``None`` where unknown, which counts as useless.
 
     Returns:
         ``(B, 1, H, W)`` in (0, 1).
     """
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
+    everywhere = prior_error is None or prior_error.shape[-1] == 1
+    if prior_error is not None and not everywhere:
+        prior_error = F.interpolate(prior_error, support.shape[-2:], mode="nearest-exact")
     for rows in row_strips(*support.shape[-2:]):  # evidence is five times as large as what it says
         maps = (part[:, :, rows] for part in (support, error, visible))
-        of_rows = prior_error
-        if prior_error is not None and prior_error.shape[-1] > 1:
-            of_rows = prior_error[:, :, rows]
-        evidence = depth_evidence(*maps, None if spread is None else spread[:, :, rows], of_rows)
+        of_prior = prior_error if everywhere else prior_error[:, :, rows]
+        evidence = depth_evidence(*maps, None if spread is None else spread[:, :, rows], of_prior)
         confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
     return confidence
 

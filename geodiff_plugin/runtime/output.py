@@ -65,13 +65,13 @@ def assemble_output(
     )
     K = resize_intrinsics(K_lefts, size, grid)
     visible, error = _reprojected(run, depth_m, lefts, K)
-    prior_error = run.prior_error()  # (N, 1, 1, 1)
+    prior_error = run.prior_error()  # (N, 1, 1, 1), or of every pixel with the measured one as the least
     confidence = None
     if support is not None:
         spread = None if uncertainty is None else uncertainty / depth_m
         nowhere = torch.zeros_like(depth_m)
         shown = nowhere if error is None else error, nowhere.bool() if visible is None else visible
-        confidence = depth_confidence(support, *shown, spread, run.prior_error(grid))
+        confidence = depth_confidence(support, *shown, spread, prior_error)
     over_own = _over_own(run, depth_m)
     own_ratios = [math.nan] * count
     if over_own is not None and guidance.unit is not None:
@@ -117,7 +117,7 @@ def assemble_output(
         photometric_error=out(error),
         confidence=out(confidence),
         support=out(support),
-        prior_error=None if prior_error is None else prior_error.flatten().cpu(),
+        prior_error=None if prior_error is None else prior_error.amin((1, 2, 3)).cpu(),
         K=K if call["output_type"] == "pt" else K.cpu().numpy(),
         history=[report for t in run.trajectories for report in t.history],
         poses=[evidence.pose for evidence in run.evidence if evidence.pose is not None],

@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -187,34 +186,21 @@ class GuidedRun:
 
         Returns:
             ``(1, 1, h, w)`` on the grid of the losses, the share of each match's confidence that remains once
-            reflections are rejected; and the prior's error in log depth, ``(1, 1, 1, 1)``, or a
-            ``correction.local_error`` of a prior that does not know every pixel. ``None`` where it was not
-            measured.
+            reflections are rejected; and the prior's error in log depth, as ``correction.local_error`` gives
+            it. ``None`` where it was not measured.
         """
-        kept, error, known = (self._mean(name, image, member) for name in ("kept", "error", "known"))
-        return kept, local_error(error, known)
-
-    def _mean(self, name: str, image: int, member: int | None = None) -> Tensor | None:
-        """An attribute of the trajectories, averaged over the samples of an image or of its member."""
         samples = [(t, i) for t in self.trajectories for i, owner in enumerate(t.owners) if owner == image]
         chosen = samples if member is None else samples[member : member + 1]
-        values = [value[i].float() for t, i in chosen if (value := getattr(t, name)) is not None]
-        return torch.stack(values).mean(0, keepdim=True) if values else None
 
-    def prior_error(self, size: tuple[int, int] | None = None) -> Tensor | None:
-        """Error of the prior in log depth of every image, ``None`` if it is not known of all.
+        def mean(name: str) -> Tensor | None:
+            values = [value[i].float() for t, i in chosen if (value := getattr(t, name)) is not None]
+            return torch.stack(values).mean(0, keepdim=True) if values else None
 
-        Args:
-            size: of the grid on which pixels that the prior does not know have the largest error.
+        return mean("kept"), local_error(mean("error"), mean("known"))
 
-        Returns:
-            ``(N, 1, 1, 1)``; ``(N, 1, H, W)`` with ``size`` and a prior that does not know every pixel.
-        """
-        if size is not None and any(t.known is not None for t in self.trajectories):
-            maps = [m for i in range(len(self.evidence)) if (m := self.of_prior(i)[1]) is not None]
-            maps = [F.interpolate(m, size, mode="nearest-exact") for m in maps]
-            return torch.cat(maps) if len(maps) == len(self.evidence) else None
-        errors = [error for i in range(len(self.evidence)) if (error := self._mean("error", i)) is not None]
+    def prior_error(self) -> Tensor | None:
+        """Error of the prior in log depth, as ``of_prior``; ``None`` if it is not known of every image."""
+        errors = [error for i in range(len(self.evidence)) if (error := self.of_prior(i)[1]) is not None]
         return torch.cat(errors) if len(errors) == len(self.evidence) else None
 
     def check_finite(self) -> None:

@@ -15,8 +15,9 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance, disable_geometry_guidance, enable_geometry_guidance
 from geodiff_plugin.algorithm.gradients import RULES, Adam
 from geodiff_plugin.priors import PRIORS, find_adapter, find_prior
+from geodiff_plugin.priors.map import DepthMapPipeline
 from geodiff_plugin.scale.space import SPACES
-from tests.contracts.tiny_priors import TINY
+from tests.contracts.tiny_priors import CALL, TINY
 
 FAST = {"inner_steps": 3, "min_steps": 2, "loss_resolution": 64, "weights": {"photometric": 1.0}}
 
@@ -37,7 +38,9 @@ def prior_of(key: str):
 
 
 def run(pipe, image, **kwargs):
-    return pipe(image, generator=torch.Generator().manual_seed(0), output_latent=True, **kwargs)
+    key = "map" if isinstance(pipe, DepthMapPipeline) else ""
+    kwargs |= {"generator": torch.Generator().manual_seed(0), **CALL.get(key, {})}
+    return pipe(image, output_latent=True, **kwargs)
 
 
 def guidance_for(pair, **kwargs):

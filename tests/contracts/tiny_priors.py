@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from diffusers import DDIMScheduler, MarigoldDepthPipeline
+import numpy as np
+from diffusers import DDIMScheduler, DiffusionPipeline, MarigoldDepthPipeline
 from transformers import CLIPTokenizer
 
 from examples.marigold_v2 import tiny_marigold_v2
+from geodiff_plugin.priors import load_prior
 from geodiff_plugin.priors.e2e_ft import E2EFTPipeline
 from tests.conftest import SCHEDULER, make_text_encoder, make_unet, make_vae
 from tests.contracts.tiny_depthfm import make_depthfm
@@ -49,6 +51,13 @@ def make_e2e_ft() -> E2EFTPipeline:
     return pipe
 
 
+def make_map() -> DiffusionPipeline:
+    """Needs ``CALL["map"]`` in its call."""
+    pipe = load_prior("map")
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
 TINY = {
     "marigold-v2": tiny_marigold_v2,
     "marigold": make_marigold,
@@ -59,4 +68,10 @@ TINY = {
     "depthfm": make_depthfm,
     "ppd": make_ppd,
     "transformers": make_transformers,
+    "map": make_map,
 }
+
+_MAP = np.add.outer(np.linspace(3.0, 1.0, 21), 0.2 * np.sin(np.arange(33.0)))
+_MAP[5:9, 20:25] = np.nan
+#: What a call of a prior must be given beside the image.
+CALL: dict[str, dict[str, np.ndarray]] = {"map": {"depth_map": _MAP}}

@@ -23,7 +23,7 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from tests.conftest import plane_pair
-from tests.contracts.tiny_priors import TINY
+from tests.contracts.tiny_priors import CALL, TINY
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
@@ -258,7 +258,8 @@ def half_precision() -> Result:
 def _tiny_prior(key: str) -> Callable[[], Result]:
     def run() -> Result:
         left, right, K, E, _ = small()
-        return maps_of(call(enable_geometry_guidance(TINY[key]()), left, GeometryGuidance(right, K, E)))
+        pipe, further = enable_geometry_guidance(TINY[key]()), CALL.get(key, {})
+        return maps_of(call(pipe, left, GeometryGuidance(right, K, E), **further))
 
     return run
 

@@ -239,7 +239,7 @@ def test_families_are_not_taken_for_methods_with_a_prior(tmp_path):
     own = bound.own_settings(Settings(seed=1, ensemble=2))
     assert own == Settings("org/other", seed=3, ensemble=2)
     assert find_method("guided@folder#a").prior == "folder#a"
-    assert set(FAMILIES) == {"guided", "paper", "hf", "files"}
+    assert set(FAMILIES) == {"guided", "paper", "hf", "files", "prior-map"}
 
 
 class OnePipe(PriorCache):

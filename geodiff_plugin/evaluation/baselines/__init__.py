@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
@@ -36,10 +37,11 @@ FAMILIES: dict[str, Callable[[str], Method]] = {
     "paper": paper_variant,
     "hf": hf_method,
     "files": files_method,
+    "prior-map": partial(files_method, guided=True),
 }
 """Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter."""
 
-PRIORLESS = ("hf", "files")
+PRIORLESS = ("hf", "files", "prior-map")
 """Families that use no prior, so that an @ in their parameter is part of it."""
 
 

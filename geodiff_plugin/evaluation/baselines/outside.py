@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,15 @@ from geodiff_plugin.evaluation.baselines.base import (
     Settings,
     folder_fingerprint,
 )
+from geodiff_plugin.evaluation.baselines.guided import (
+    call_arguments,
+    guided_configuration,
+    guided_prediction,
+    posed_views,
+)
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth, read_depth_m, read_npy
 from geodiff_plugin.formats import read_disparity_kitti_png, read_pfm
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 
 __all__ = ["KINDS", "files_method", "hf_method", "map_name"]
 
@@ -111,13 +119,14 @@ def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Predicti
     return Prediction(np.where(depth_m > 0, depth_m, np.nan), space="disparity")
 
 
-def files_method(text: str) -> Method:
-    """Maps that were made elsewhere, in a folder: files:DIR or files:KIND:DIR.
+def files_method(text: str, guided: bool = False) -> Method:
+    """Maps that were made elsewhere, in a folder: files:DIR or files:KIND:DIR; prior-map:DIR guides them.
 
     Args:
         text: ``DIR`` or ``KIND:DIR`` with a key of ``KINDS``. The map of a sample is
             ``DIR/<dataset>_<sample>`` with the suffix .npy, .pfm or .png (16 bit: millimetres for depth,
             pixels * 256 for disparity), of any size; 0 and what is not finite is unknown.
+        guided: the maps are the prior of the default preset.
 
     Returns:
         The method, titled by the folder's name; it does not apply to samples without a file.
@@ -139,11 +148,20 @@ def files_method(text: str) -> Method:
         path = next((path for path in candidates if path.is_file()), None)
         if path is None:
             raise NotApplicable("no map in the folder")
-        return _prediction(_read(path, kind), sample, kind)
+        values = _read(path, kind)
+        if not guided:
+            return _prediction(values, sample, kind)
+        pipe = priors.get(replace(settings, prior="map", space=kind.removeprefix("relative-")))
+        guidance = GeometryGuidance(*posed_views(sample, settings.views))
+        guidance.measured_baseline = guidance.measured_baseline or sample.measured_baseline
+        call = call_arguments(replace(settings, steps=None, ensemble=1)) | {"depth_map": values}
+        return guided_prediction(pipe, sample, guidance, call)
 
     def configuration(settings: Settings) -> dict[str, Any]:
-        return {"kind": kind, "files": folder_fingerprint(folder)}
+        maps = {"kind": kind, "files": folder_fingerprint(folder)}
+        return maps | (guided_configuration(GeometryGuidance, settings) if guided else {})
 
-    title = folder.resolve().name
-    summary = f"maps of {title} ({KINDS[kind]})"
-    return Method(f"files:{text}", title, summary, run, configuration, uses_prior=False)
+    title = f"guided {folder.resolve().name}" if guided else folder.resolve().name
+    summary = f"maps of {folder.resolve().name} ({KINDS[kind]})" + (", guided" if guided else "")
+    name = f"{'prior-map' if guided else 'files'}:{text}"
+    return Method(name, title, summary, run, configuration, uses_prior=False)

@@ -26,6 +26,7 @@ __all__ = [
     "Condition",
     "DepthDiffusionPipeline",
     "DepthOutput",
+    "DirectMapPipeline",
     "Generators",
     "PriorHooks",
     "RESAMPLING",
@@ -414,3 +415,27 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
         ]
         depths, spreads = zip(*pairs, strict=True)
         return torch.cat(depths), torch.cat(spreads) if output_uncertainty else None
+
+
+class DirectMapPipeline(DepthDiffusionPipeline):
+    """One step that gives ``condition["relative"]``, ``(N * E, 1, H, W)``; what guidance moves is the map."""
+
+    max_steps = 1
+    deterministic = True
+    sees_latents = False
+
+    def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
+        """Zeros; nothing reads them."""
+        return torch.zeros_like(condition["relative"])
+
+    def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
+        """The map, whatever the latents are."""
+        return condition["relative"]
+
+    def decode_relative(self, z0: Tensor) -> Tensor:
+        """The latent is the map."""
+        return z0
+
+    def encode_relative(self, x: Tensor) -> Tensor:
+        """The map is the latent."""
+        return x
