@@ -235,7 +235,7 @@ def read_map(path: PathLike, name: str = "map") -> np.ndarray:
         values = np.where(known, values, np.nan)
     elif kind == ".npz":
         try:
-            with np.load(found, allow_pickle=False) as archive:
+            with open(found, "rb") as file, np.load(file, allow_pickle=False) as archive:
                 values = archive["depth" if "depth" in archive.files else " ".join(archive.files)]
         except (OSError, ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
             bad_value(name, "an .npz with 'depth' or a single array", f"{found} ({error})")
