@@ -46,7 +46,7 @@ def finish(
         evidence: of the image.
         kept: ``(1, 1, h, w)``, the share of each match's confidence that remains once reflections are
         rejected.
-        error: ``(1, 1, 1, 1)`` of the prior, in log depth.
+        error: of the prior, in log depth, as ``correction.local_error`` gives it.
         left: ``(1, 3, H, W)`` in [0, 1], the left image on that grid.
         spacing: pixels of that grid to one that was decoded, >= 1.
         config: hyperparameters.
@@ -66,7 +66,8 @@ def finish(
         target = correction_target(matches, points, kept, error, fitted_m)
         assert target is not None
         K = resize_intrinsics(evidence.K_left[None], image_size(evidence.left_01), image_size(left))[0]
-        fitted_m = vote_depth(fitted_m, left, target, error, evidence.native, K)
+        measured = error.amin((2, 3), keepdim=True)  # where the prior says something
+        fitted_m = vote_depth(fitted_m, left, target, measured, evidence.native, K)
     return fitted_m, support
 
 
