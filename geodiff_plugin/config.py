@@ -210,7 +210,7 @@ class GuidanceConfig:
         sharpen: before the result is refined, pixels that hang in the air between a near and a far surface
             get the depth of one of them, the weighted median of their neighbours (after Ma et al. 2013).
         crisp: after the refinement, matches, the image's colours and the refined map vote on every depth:
-            fewer pixels off by a pixel of disparity, most of all at edges, for a fifth more time.
+            fewer pixels off by a pixel of disparity, most of all at edges.
         smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
             long, for a prior that is wrong by 5 %; it falls with the fourth power of that error.
         match_noise: relative error of a perfect match: below it one match is as good as another.
@@ -263,7 +263,7 @@ class GuidanceConfig:
     corrections: int = _integer(2, 1, 10_000, paper="-")
     refine: bool = _flag(True)
     sharpen: bool = _flag(True, paper="-")
-    crisp: bool = _flag(False, paper="-")
+    crisp: bool = _flag(True, paper="-")
     smoothness: float = _number(40.0, TINY, 1e6, paper="-")
     match_noise: float = _number(0.02, TINY, 1e3, paper="-")
     outlier_width: float = _number(3.0, TINY, 1e6, paper="-")

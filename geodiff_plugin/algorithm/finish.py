@@ -49,7 +49,7 @@ MOST_PIXELS = 600_000
 #: the window there whose mean confidence a match's vote is multiplied with, so that a speckle has none.
 MEDIAN_STEP, MEAN_STEP, REGION = 3.0, 2.0, 9
 #: Vote of the map itself, as a share of a window full of sure matches, for a prior whose measured error is
-#: ``WEAK`` or more. It grows as the square of a smaller one: a good prior knows where edges are.
+#: ``WEAK`` or more. It grows as the cube of a smaller one: a good prior knows where edges are.
 MAP_VOTE, WEAK = 0.03, 0.2
 #: A match counts for a quarter where it differs from the map by this many errors of the prior; a larger error
 #: than the second number counts as that.
@@ -188,7 +188,7 @@ def vote_depth(
         )
     log_map, left = -small[0][0, 0].log(), small[1][0]
     matches, weight = _ballots(log_map, left, target, error, views, K_left, full)
-    strength = (WEAK / error.flatten()[0]).clamp_min(1.0) ** 2
+    strength = (WEAK / error.flatten()[0]).clamp_min(1.0) ** 3
     spacing = max(size) / max(image_size(target.confidence))
     noise = target.plane_step.flatten()[0] * NEAR_PLANES
     chosen = _median(
@@ -269,7 +269,7 @@ def _placed(inverse_depth: Tensor, left: Tensor, views: Sequence[CameraView], K_
     return (inverse_depth + offset * step).clamp_min(1e-9)
 
 
-def weighted_median(values: Tensor, weight: Tensor, rounds: int = 9) -> Tensor:
+def weighted_median(values: Tensor, weight: Tensor, rounds: int = 7) -> Tensor:
     """Weighted median over the first axis, to within ``2**-rounds`` of the values' range, by bisection.
 
     Args:
