@@ -72,12 +72,13 @@ class DepthMapPipeline(DirectMapPipeline):
     @property
     def device(self) -> torch.device:
         """Where calls run."""
-        return self._place.at.device
+        return next(self._place.buffers()).device
 
     def to(self, *args: Any, **kwargs: Any) -> DepthMapPipeline:
         """As ``DiffusionPipeline.to``; maps stay in float32."""
         targets = (*args, *kwargs.values())
-        self._place.to(*(t for t in targets if isinstance(t, (str, int, torch.device))))
+        for device in (t for t in targets if isinstance(t, (str, int, torch.device))):
+            self._place.to(device)
         return self
 
     def prepare_condition(

@@ -90,11 +90,11 @@ def depth_confidence(
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
     everywhere = prior_error is None or prior_error.shape[-1] == 1
-    if prior_error is not None and not everywhere:
+    if prior_error is not None and prior_error.shape[-1] > 1:
         prior_error = F.interpolate(prior_error, support.shape[-2:], mode="nearest-exact")
     for rows in row_strips(*support.shape[-2:]):  # evidence is five times as large as what it says
         maps = (part[:, :, rows] for part in (support, error, visible))
-        of_prior = prior_error if everywhere else prior_error[:, :, rows]
+        of_prior = prior_error if prior_error is None or everywhere else prior_error[:, :, rows]
         evidence = depth_evidence(*maps, None if spread is None else spread[:, :, rows], of_prior)
         confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
     return confidence
