@@ -96,7 +96,7 @@ def test_constraints_pin_every_dependency():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     needed = project["dependencies"] + [
         package
-        for extra in ("test", "eval", "train", "app", "test-app", "docs")
+        for extra in ("test", "train", "app", "test-app", "docs")
         for package in project["optional-dependencies"][extra]
     ]
     pinned = {
