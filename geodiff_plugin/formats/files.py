@@ -9,8 +9,7 @@ import re
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from geodiff_plugin._checks import (
     FolderError,
@@ -20,6 +19,9 @@ from geodiff_plugin._checks import (
     bad_value,
     quoted,
 )
+
+if TYPE_CHECKING:  # `geodiff --help` reads this module and starts without numpy
+    import numpy as np
 
 __all__ = ["check_file", "file_digest", "read_matrix", "read_npy", "read_text", "refuse_decimal_commas"]
 
@@ -142,6 +144,8 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
     Raises:
         ValueError: numpy cannot load it, or it holds something else.
     """
+    import numpy as np
+
     reason: str | None = None
     try:
         value = np.load(path, allow_pickle=False)
@@ -158,6 +162,8 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
 
 
 def _from_text(path: Path, name: str) -> np.ndarray:
+    import numpy as np
+
     lines = [line.split("#")[0].strip() for line in read_text(path, name, MATRIX).splitlines()]
     refuse_decimal_commas(lines, path, name)
     rows = [words for line in lines if (words := line.translate(BETWEEN).split())]
@@ -192,6 +198,8 @@ def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarra
         FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
         ValueError: no matrix of such a shape, not finite, or with decimal commas.
     """
+    import numpy as np
+
     file = check_file(path, name, MATRIX)
     is_npy = file.suffix.lower() == ".npy"
     matrix = read_npy(file, name, MATRIX).astype(np.float64) if is_npy else _from_text(file, name)

@@ -26,6 +26,7 @@ from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.pairs import start_many
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.runner import Item, Journal, Runner
+from geodiff_plugin.runtime.machine import pick_device
 from tests.scenes import render_pair
 
 __all__ = ["WAYS", "ManyPairs", "main"]
@@ -79,7 +80,7 @@ class ManyPairs:
 
     def __init__(self, options: DepthOptions) -> None:
         self._options, self._refs = options, start_many(options)
-        self._device = torch.device(options.device)
+        self._device = pick_device(options.device)
         self._pipe = load_guided_prior(options, self._device)
 
     def seconds(self, most: int, shared: bool) -> tuple[float, float]:

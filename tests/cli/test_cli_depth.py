@@ -81,7 +81,7 @@ def test_knobs_reach_the_guidance(geodiff, command, pair_files):
     answer = geodiff(*command, "--steps", 1, *knobs, "-q")
     assert answer.code == 0, answer.err
     guidance = json.loads((pair_files.folder / "geodiff-out" / "report.json").read_text())["guidance"]
-    assert guidance["updates"]["inner_steps"] == 0 and guidance["search"]["search"] == "volume"
+    assert guidance["inner_steps"] == 0 and guidance["search"] == "volume"
     assert guidance["weights"]["photometric"] == 0.5 and guidance["weights"]["matches"] == 1.0
 
 
@@ -158,7 +158,7 @@ def test_presets_and_range(geodiff, command, pair_files, preset):
     answer = geodiff(*command, "--quiet", "--json", "--steps", 1, "--preset", preset, "--near", 1, "--far", 5)
     guidance = json.loads(answer.out)["guidance"]
     assert guidance["gradient"] == ("full" if preset == "paper" else "denoised")
-    searched = guidance["search"]["g_s_range"] if preset == "paper" else guidance["depth_range"]
+    searched = guidance["g_s_range"] if preset == "paper" else guidance["depth_range"]
     assert searched == [1.0, 5.0]
 
 

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
 from geodiff_plugin.guidance.evidence import pose_views
+from geodiff_plugin.types import CameraView
 from tests.scenes import render_pair
 
 
@@ -27,8 +28,8 @@ def drifted(seed: int, size: tuple[int, int]):
 def test_rows_agree_again(seed: int) -> None:
     rig, off = drifted(seed, (240, 320))
     T = torch.from_numpy(np.linalg.inv(rig.E.numpy())).float()
-    rights = [(off.right.image_01.float(), rig.K_right.float(), T)]
-    report = pose_views(off.left.image_01.float(), rights, rig.K_left.float()).report
+    rights = [CameraView(off.right.image_01.float(), rig.K_right.float(), T)]
+    _, report = pose_views(off.left.image_01.float(), rights, rig.K_left.float(), measured=True)
     assert report.status == "refined"
     assert report.residual_px[0] < 0.3 < 0.45 < report.residual_px_given[0]
     assert np.linalg.norm(report.E[0][:3, 3]) == pytest.approx(float(rig.E[0, 3]), rel=0.03)

@@ -44,7 +44,7 @@ def pair(textured_plane, tmp_path) -> list[str]:
 
 def test_every_example_is_tested():
     source = Path(__file__).read_text(encoding="utf-8")
-    for path in EXAMPLES.glob("*.py"):
+    for path in set(EXAMPLES.glob("*.py")) - {EXAMPLES / "fitted_lora.py"}:  # tests/unit/test_fitted_lora.py
         assert f'load(EXAMPLES / "{path.name}").main(' in source
 
 

@@ -95,7 +95,9 @@ def test_evidence_outside_of_a_call_stays_within_the_cores(textured_plane, monke
     torch.set_num_threads(MORE)
     seen, make = [], guidance_module.make_evidence
     monkeypatch.setattr(
-        guidance_module, "make_evidence", lambda given: (seen.append(torch.get_num_threads()), make(given))[1]
+        guidance_module,
+        "make_evidence",
+        lambda *given: (seen.append(torch.get_num_threads()), make(*given))[1],
     )
     pair = textured_plane
     left = torch.from_numpy(pair.left).permute(2, 0, 1)[None].float()

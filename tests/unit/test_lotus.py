@@ -169,7 +169,7 @@ def test_sides_are_rounded_as_the_authors_do():
 def test_d_is_guided_on_an_image_of_odd_size(textured_plane):
     pair, losses = textured_plane, []
     pipe = enable_geometry_guidance(make_lotus("d"))
-    fast = {"inner_steps": 3, "min_steps": 2, "loss_resolution": 64, "refine": False}
+    fast = {"inner_steps": 3, "min_steps": 2, "loss_resolution": 64, "refine": False, "correct": False}
     for steps in ({"step_latents": 0.0, "step_affine": 0.0}, {}):
         guidance = GeometryGuidance(pair.right[:45], pair.K, pair.E, **fast, **steps)
         out = pipe(pair.left[:45], guidance=guidance, generator=seeded(0))

@@ -50,6 +50,9 @@ HAND_ON = {
     "matching.build.mirrored_pose_preferred",
     "matching.build.find_matches",
     "matching.build.pilot_volume",
+    "capture.fusion.normals_of",  # by unproject
+    "formats.captures.read_capture",  # for images that come without
+    "pose.capture.solve_capture",  # to pycolmap
     "runtime.confidence.reprojection",  # to warp_right_to_left
     "cli.inputs.pinhole",  # to OpenCV
     "cli.inputs._read_known",
