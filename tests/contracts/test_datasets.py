@@ -524,7 +524,8 @@ def test_folder_without_depth_says_what_it_lacks(tmp_path):
     folder(tmp_path)
     (tmp_path / "mine" / "depth.npy").unlink()
     sample = one(tmp_path, "folder")
-    said = f"at least one pixel; got none (no depth.npy, depth.pfm, depth.png or depth_mm.png in {tmp_path / 'mine'})"
+    names = "depth.npy, depth.pfm, depth.png or depth_mm.png"
+    said = f"at least one pixel; got none (no {names} in {tmp_path / 'mine'})"
     with pytest.raises(ValueError, match=re.escape(said)):
         score(sample, Prediction(depth_m=np.ones((HEIGHT, WIDTH))), None)
 

@@ -50,6 +50,7 @@ HAND_ON = {
     "matching.build.mirrored_pose_preferred",
     "matching.build.find_matches",
     "matching.build.pilot_volume",
+    "algorithm.finish.vote_depth",  # by plane_rays
     "capture.fusion.normals_of",  # by unproject
     "formats.captures.read_capture",  # for images that come without
     "pose.capture.solve_capture",  # to pycolmap
