@@ -4,7 +4,7 @@ Give the folder of a phone's scan (transforms.json), a COLMAP model or any other
 capture` takes. Without one, a scene is rendered from a moving camera, with poses as inexact as a tracker's,
 so that the error can be printed. Needs the extra `capture`. Runs offline:
 
-    python examples/capture_folder.py [scan/ --frames 0:100:10]
+    python -m examples.capture_folder [scan/ --frames 0:100:10]
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Without arguments it runs offline, on the rendered pair and the small prior of the package:
 
-    python examples/depth_from_stereo.py
-    python examples/depth_from_stereo.py left.png right.png calib.txt --prior prs-eth/marigold-depth-v1-1
+    python -m examples.depth_from_stereo
+    python -m examples.depth_from_stereo left.png right.png calib.txt --prior prs-eth/marigold-depth-v1-1
 """
 
 from __future__ import annotations

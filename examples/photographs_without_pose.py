@@ -4,8 +4,8 @@ Needs the extra ``pose``: ``pip install -c constraints.txt -e ".[pose]"``. Photo
 scale, so give the distance between the two cameras. K comes from the field of view, or else from the EXIF
 data of the photographs. Without arguments the script runs offline, on a rendered pair:
 
-    python examples/photographs_without_pose.py
-    python examples/photographs_without_pose.py left.jpg right.jpg --baseline 0.12 --fov 69
+    python -m examples.photographs_without_pose
+    python -m examples.photographs_without_pose left.jpg right.jpg --baseline 0.12 --fov 69
 """
 
 from __future__ import annotations

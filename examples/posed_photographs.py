@@ -4,7 +4,7 @@ A scene is rendered from two camera-to-world poses, in metres, so the truth is k
 printed. (COLMAP writes world-to-camera poses without a unit; docs/reference/calibration.md turns them into
 these.) Runs offline:
 
-    python examples/posed_photographs.py --seed 7 --angle 8
+    python -m examples.posed_photographs --seed 7 --angle 8
 """
 
 from __future__ import annotations

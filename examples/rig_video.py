@@ -3,8 +3,8 @@
 LEFT and RIGHT are two videos of the same length. Without arguments the script runs offline, on a rendered
 rig that moves through a scene:
 
-    python examples/rig_video.py
-    python examples/rig_video.py left.mp4 right.mp4 calib.txt --frames 50 --out depth.mp4
+    python -m examples.rig_video
+    python -m examples.rig_video left.mp4 right.mp4 calib.txt --frames 50 --out depth.mp4
 
 ``geodiff depth left.mp4 right.mp4`` does the same with several frames in progress and resumes where it was
 interrupted (docs/how-to/sequences.md).

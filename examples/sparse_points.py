@@ -4,8 +4,8 @@ POINTS is a ``.npy`` file: ``(N, 3)`` points in the camera's frame, or a sparse 
 the depth is unknown, in metres. K is a text file of 3 x 3 numbers, in pixels. Without arguments the script
 runs offline and completes 500 depths of the rendered pair that ships with the package:
 
-    python examples/sparse_points.py
-    python examples/sparse_points.py image.png points.npy K.txt
+    python -m examples.sparse_points
+    python -m examples.sparse_points image.png points.npy K.txt
 """
 
 from __future__ import annotations

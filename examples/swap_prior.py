@@ -3,8 +3,8 @@
 The guidance does not change, only the name of the prior does. Without arguments it runs offline, with the
 small prior of the package alone:
 
-    python examples/swap_prior.py
-    python examples/swap_prior.py left.png right.png calib.txt --prior bundled \
+    python -m examples.swap_prior
+    python -m examples.swap_prior left.png right.png calib.txt --prior bundled \
         --prior prs-eth/marigold-depth-v1-1 --prior jingheya/lotus-depth-g-v2-1-disparity \
         --prior depth-anything/Depth-Anything-V2-Small-hf
 """
