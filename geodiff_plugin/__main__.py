@@ -1,8 +1,4 @@
-"""``python -m geodiff_plugin`` is the ``geodiff`` command (for ``accelerate launch`` and ``torchrun``).
-
-Data flow: argv -> ``geodiff_plugin.cli.app.main``.
-Paper: none.
-"""
+"""``python -m geodiff_plugin`` is the ``geodiff`` command (for ``accelerate launch`` and ``torchrun``)."""
 
 from geodiff_plugin.cli.app import main
 

@@ -1,6 +1,5 @@
 """Ways to give the cameras on the page: a calibration file, numbers, or photographs alone.
 
-Data flow: fields of the page -> ``GeometryGuidance``.
 Paper: S3.3 (two views with known cameras).
 """
 

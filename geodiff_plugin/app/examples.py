@@ -1,8 +1,4 @@
-"""Pairs to try the page with; ``python -m tests.scenes.make_examples`` renders them anew.
-
-Data flow: seeds -> ``app/pairs/<name>/`` with two images and a calibration.
-Paper: none; they stand in for the photographs of S5, which may not be shipped.
-"""
+"""Pairs to try the page with; ``python -m tests.scenes.make_examples`` renders them anew."""
 
 from __future__ import annotations
 

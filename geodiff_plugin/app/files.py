@@ -1,8 +1,4 @@
-"""Files that the page offers for download.
-
-Data flow: ``Result`` -> a folder with depth, cloud and report.
-Paper: none.
-"""
+"""Files that the page offers for download."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Input fields of the page.
-
-Data flow: gradio components -> ``Request``.
-Paper: none.
-"""
+"""Input fields of the page."""
 
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 """One job of the page: a visitor's request, run through the public API, to everything that is shown.
 
-Data flow: ``Request`` -> images, ``GeometryGuidance``, prior -> ``Result``.
 Paper: Algorithm 1, run by the pipeline.
 """
 

@@ -1,8 +1,4 @@
-"""``geodiff app``: serves the page, without any request to another host.
-
-Data flow: options -> a server on this machine.
-Paper: none.
-"""
+"""``geodiff app``: serves the page, without any request to another host."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Texts and style sheet of the page.
-
-Data flow: -> HTML and CSS; no script, no font and no picture comes from elsewhere.
-Paper: none.
-"""
+"""Texts and style sheet of the page."""
 
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 """Measuring in a depth map: the 3D point of a pixel, the distance of two, and their uncertainty.
 
-Data flow: a pixel -> ``Reading`` (point in metres, spread, confidence) -> distance of two.
 Paper: Eq. 9 (unprojection).
 """
 

@@ -1,8 +1,4 @@
-"""The page: layout, and what happens on every click.
-
-Data flow: a visitor's clicks -> ``Request`` -> ``run_job`` -> panels.
-Paper: none.
-"""
+"""The page: layout, and what happens on every click."""
 
 from __future__ import annotations
 

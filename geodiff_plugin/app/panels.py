@@ -1,8 +1,4 @@
-"""Components of the page's result side, tab by tab.
-
-Data flow: -> ``Panels``, which ``results`` fills.
-Paper: none.
-"""
+"""Components of the page's result side, tab by tab."""
 
 from __future__ import annotations
 

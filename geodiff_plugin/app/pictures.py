@@ -1,8 +1,4 @@
-"""Pictures of a result for the page: coloured maps with legends, and marks on a photograph.
-
-Data flow: maps, readings -> RGB arrays of the left photograph's size, legends as HTML.
-Paper: none.
-"""
+"""Pictures of a result for the page: coloured maps with legends, and marks on a photograph."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The priors that a page offers, loaded once for all its visitors.
-
-Data flow: name -> live pipeline with guidance enabled.
-Paper: none.
-"""
+"""The priors that a page offers, loaded once for all its visitors."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Contents of the result panels of the page.
-
-Data flow: ``Result`` -> values of gradio components.
-Paper: none.
-"""
+"""Contents of the result panels of the page."""
 
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 """The small prior and the stereo pair that ship with the package.
 
-Data flow: package data ``bundled/prior`` -> stock ``MarigoldDepthPipeline``.
 Paper: S3.1 (the prior); this one is ours, so that everything works without a download.
 """
 

@@ -1,8 +1,4 @@
-"""The stereo pair of ``geodiff demo``: rendered by this package, with exact depth.
-
-Data flow: ``bundled/pair/`` -> images, ``Rig``, depth.
-Paper: none; it stands in for the photographs of S5, which may not be shipped.
-"""
+"""The stereo pair of ``geodiff demo``: rendered by this package, with exact depth."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Loads the folder of the bundled prior, or of one trained like it, without progress bars.
-
-Data flow: folder on disk -> ``MarigoldDepthPipeline``.
-Paper: none.
-"""
+"""Loads the folder of the bundled prior, or of one trained like it, without progress bars."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""``geodiff eval list``: data sets, whether they are there and how to obtain them, and methods.
-
-Data flow: ``DATASETS``, ``METHODS``, ``FAMILIES`` and a folder -> lines on standard output.
-Paper: none.
-"""
+"""``geodiff eval list``: data sets, whether they are there and how to obtain them, and methods."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""A page of the evaluation as rich tables on the terminal.
-
-Data flow: ``Page`` -> rich tables on standard output; the Markdown file has the same cells.
-Paper: none.
-"""
+"""A page of the evaluation as rich tables on the terminal."""
 
 from __future__ import annotations
 
