@@ -264,7 +264,7 @@ def _placed(inverse_depth: Tensor, left: Tensor, views: Sequence[CameraView], K_
         costs = F.avg_pool2d(costs[None], window, 1, padding, count_include_pad=False)[0]
     near, middle, far = costs[0] + LEAST_GAIN, costs[1], costs[2] + LEAST_GAIN
     offset = (0.5 * (near - far) / (near + far - 2.0 * middle).clamp_min(1e-3)).clamp(-0.5, 0.5)
-    beyond = torch.where(near < far, -1.0, 1.0)
+    beyond = torch.where(near < far, -torch.ones_like(near), torch.ones_like(near))
     offset = torch.where(torch.minimum(near, far) < middle, beyond, offset)
     return (inverse_depth + offset * step).clamp_min(1e-9)
 
@@ -354,11 +354,12 @@ def _enlarged(voted: Tensor, left: Tensor, whole: Tensor, noise: Tensor) -> Tens
     """``(H, W)`` votes at the size of ``whole (3, H, W)``, from the nine around that look like the pixel."""
     (height, width), (rows, columns) = image_size(whole), image_size(left)
     out = voted.new_empty(height, width)
-    x = (torch.arange(width, device=voted.device) + 0.5) * (columns / width) - 0.5
+    x = (torch.arange(width, device=voted.device, dtype=voted.dtype) + 0.5) * (columns / width) - 0.5
     count = max(1, STRIP // width)
     for first in range(0, height, count):
         part = slice(first, min(height, first + count))
-        y = (torch.arange(part.start, part.stop, device=voted.device) + 0.5) * (rows / height) - 0.5
+        y = torch.arange(part.start, part.stop, device=voted.device, dtype=voted.dtype) + 0.5
+        y = y * (rows / height) - 0.5
         votes, weights = [], []
         for down in (-1, 0, 1):
             for right in (-1, 0, 1):

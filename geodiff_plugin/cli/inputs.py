@@ -115,7 +115,8 @@ def read_inputs(
         guidance = GeometryGuidance.from_views(
             posed, points=points, cropped=cropped, **lengths, config=config
         )
-    if options.k_right is None and calibration_way(options) in ("parameters", "matrices"):
+    typed = not options.estimate_pose and calibration_way(options) in ("parameters", "matrices")
+    if typed and options.k_right is None:
         assume_same_centre(guidance)
     prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
     if prior_map is not None and lenses[0] is not None:

@@ -13,6 +13,8 @@ from tests.benchmarks.full_sizes import UNET, VAE
 from tests.benchmarks.matrix import deviation
 from tests.benchmarks.random_marigold import narrowed
 
+pytestmark = pytest.mark.slow
+
 
 def test_calls_of_every_way():
     made = operations.calls_of_all(operations.Size(steps=3, dc_steps=2))

@@ -13,7 +13,7 @@ from accelerate import cpu_offload
 from accelerate.hooks import ModelHook, add_hook_to_module
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from tests.contracts.tiny_priors import TINY
+from tests.contracts.tiny_priors import CALL, TINY
 
 
 class BroughtWhenCalled(ModelHook):
@@ -37,7 +37,9 @@ def test_a_guided_call_is_what_it_is_without(key, textured_plane):
 
     def depth_m():
         guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, inner_steps=1)
-        return pipe(textured_plane.left, guidance=guidance, generator=torch.manual_seed(0)).prediction
+        return pipe(
+            textured_plane.left, guidance=guidance, generator=torch.manual_seed(0), **CALL.get(key, {})
+        ).prediction
 
     expected = depth_m()
     pipe.empty_text_embedding = None  # Marigold keeps it
@@ -52,7 +54,7 @@ def test_so_is_a_plain_call_with_sequential_offloading(key, textured_plane):
     pipe = TINY[key]()
 
     def relative():
-        return pipe(textured_plane.left, generator=torch.manual_seed(0)).prediction
+        return pipe(textured_plane.left, generator=torch.manual_seed(0), **CALL.get(key, {})).prediction
 
     expected = relative()
     pipe.empty_text_embedding = None

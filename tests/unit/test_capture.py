@@ -101,6 +101,7 @@ def test_a_frame_without_texture_keeps_its_pose_and_is_told():
     np.testing.assert_allclose(found.pose(4, 5), np.linalg.inv(GIVEN[4]) @ GIVEN[5], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_from_nothing_up_to_a_similarity():
     found = solve(None)
     assert found.status == "estimated" and found.connected.sum() >= COUNT - 1
@@ -217,6 +218,7 @@ def test_rescaling_moves_everything_alike(tmp_path):
     assert capture.unit == "m"
 
 
+@pytest.mark.slow
 def test_the_command_writes_every_frame_and_goes_on(tmp_path, capsys):
     from geodiff_plugin.cli.app import main
 
