@@ -136,7 +136,8 @@ def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
 
 def check_number(value: Any, name: str, low: float, high: float, *, integer: bool = False) -> Any:
     """A finite number in ``[low, high]``, returned as it came."""
-    if isinstance(value, bool) or not isinstance(value, Integral if integer else Real):
+    kind: Any = Integral if integer else Real
+    if isinstance(value, bool) or not isinstance(value, kind):
         bad_type(name, "an integer" if integer else "a number", value)
     # Whole numbers may be longer than any float: compared, not converted. NaN is not within anything.
     if not low <= value <= high or value in (float("inf"), float("-inf")):

@@ -335,7 +335,7 @@ class GuidanceConfig:
                 bad_value("a name in the configuration", "a knob", repr(name), close_names(name, KNOBS))
         config = cls().changed(**{name: value for name, value in flat.items() if name in KNOBS})
         plans = [config.plan_updates(given).updates_from for given in (False, True)]
-        same = {"affine_rule": [config.rule], "updates_from": [None, *plans]}
+        same: dict[str, list[Any]] = {"affine_rule": [config.rule], "updates_from": [None, *plans]}
         dropped = [
             f"{name}={value}"
             for name, value in flat.items()

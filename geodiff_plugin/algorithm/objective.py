@@ -94,8 +94,16 @@ class Objective:
             warped_01, in_view = self._warp(depth_m)
         visible = in_view if hidden is None else in_view & ~hidden
         compared = Compared(
-            *(depth_m, self.views.left_01, warped_01, visible),
-            *(affine, affine_start, z0, z0_prior, matches, points),
+            depth_m,
+            self.views.left_01,
+            warped_01,
+            visible,
+            affine,
+            affine_start,
+            z0,
+            z0_prior,
+            matches,
+            points,
         )
         visible_fraction = in_view.any(1).float().flatten(1).mean(1)
         total, values = torch.zeros_like(visible_fraction), {}

@@ -183,7 +183,7 @@ class Trajectory:
             self.kept = torch.ones_like(depth_m)
             if rejects and self.known is None:
                 self.kept = reject_reflections(self.matches, depth_m)
-            elif rejects:  # nothing lies behind a surface that the prior does not know
+            elif rejects and self.known is not None:  # nothing lies behind what the prior does not know
                 kept = reject_reflections(self.matches.within(self.known), depth_m)
                 inside = F.interpolate(self.known.float(), kept.shape[-2:], mode="nearest-exact")
                 self.kept = torch.where(inside > 0, kept, self.kept)

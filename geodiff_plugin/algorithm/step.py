@@ -158,6 +158,7 @@ def guided_step(
                 x = estimate.decode(z0).detach()
                 state.prepare(x, z0)
                 state.find_hidden(x)
+            assert x is not None  # corrected, or decoded just now
             losses.append(state.loss(x, state.affine, z0, anchor))
         state.report(losses[0])
     assert x is not None  # there is one round at least

@@ -60,7 +60,8 @@ def choose_neighbours(
 def _values(solved: SolvedCapture, frame: int) -> np.ndarray:
     """``(N, P)`` worth of the frame's points to every other frame, 0 where it does not see them."""
     own = solved.seen[frame].point
-    centres = (solved.E if np.isfinite(solved.E[frame]).all() else solved.E_given)[:, :3, 3]
+    lost = solved.E_given is not None and not np.isfinite(solved.E[frame]).all()
+    centres = (solved.E_given if lost and solved.E_given is not None else solved.E)[:, :3, 3]
     xyz = solved.points[own]
     row = np.full(len(solved.points), -1)
     row[own] = np.arange(len(own))

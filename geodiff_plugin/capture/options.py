@@ -67,6 +67,6 @@ class CaptureOptions:
 
     def key(self, names: Sequence[str], *of: str) -> str:
         """A digest of the settings ``of`` and the frames that a result depends on."""
-        said = {name: str(value) for name, value in asdict(self).items() if name in of}
+        said: dict[str, object] = {name: str(value) for name, value in asdict(self).items() if name in of}
         said |= {"version": __version__, "names": list(names), "path": str(self.path.resolve())}
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]

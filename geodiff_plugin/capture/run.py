@@ -163,7 +163,7 @@ def _frame(item: Item) -> dict[str, Any]:
     capture, pipe, options, write = _worker
     name, started = item.key, time.perf_counter()
     neighbours = capture.neighbours(name, options.neighbours)
-    call = {} if options.steps is None else {"num_inference_steps": options.steps}
+    call: dict[str, Any] = {} if options.steps is None else {"num_inference_steps": options.steps}
     with torch.no_grad():
         output = capture.depth(pipe, name, neighbours, seed=options.seed, points=options.points, **call)
     image = capture.image(name)

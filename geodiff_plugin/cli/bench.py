@@ -101,8 +101,9 @@ def command_seconds(device_name: str) -> dict[str, float]:
     """
     with tempfile.TemporaryDirectory() as folder:
         pair = [DEMO_PAIR_FOLDER / name for name in ("left.png", "right.png", "calib.txt")]
-        words = ["depth", *pair[:2], "--calib", pair[2], "--device", device_name, "--json", "--quiet"]
-        words = [sys.executable, "-m", "geodiff_plugin", *map(str, words), "--out", f"{folder}/out"]
+        left, right, calib = map(str, pair)
+        words = ["depth", left, right, "--calib", calib, "--device", device_name, "--json", "--quiet"]
+        words = [sys.executable, "-m", "geodiff_plugin", *words, "--out", f"{folder}/out"]
         started = time.perf_counter()
         answer = subprocess.run(words, check=True, capture_output=True, text=True)
         whole = time.perf_counter() - started

@@ -17,7 +17,8 @@ __all__ = ["add_command"]
 
 def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
     """An option or argument of typer for a field of a dataclass of options."""
-    rules, default = field.metadata, field.default
+    rules = field.metadata
+    default: Any = field.default
     flags = rules["flags"] or (flag_of(field),)
     if get_origin(kind) is tuple:
         if rules["split"]:

@@ -419,7 +419,7 @@ def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:
         row |= {"result": "failed", "message": record["error"]}
     elif options.strict and record["verdict"] != "trusted":
         assert options.out is not None
-        reason = f"The depth in {options.out / row['pair']} is {record['verdict']}: {record['reasons']}"
+        reason = f"The depth in {options.out / record['key']} is {record['verdict']}: {record['reasons']}"
         say(f"geodiff: {row['pair']}: {reason}")
         row = dict.fromkeys(COLUMNS) | {"pair": row["pair"], "result": "failed", "message": reason}
     return row

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Any
 
 from PIL import Image
 
@@ -177,7 +178,8 @@ def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
         if prior_map is None:
             got = f"{folder} without {stem}{{{','.join(MAPS)}}}"
             bad_value("--prior-map", "a folder with a map for each left image, of its name", got)
-    of_pair = {"calib": calib, "out": options.out / ref.name, "prior_map": prior_map}
+    assert options.out is not None  # a run over pairs has a folder
+    of_pair: dict[str, Any] = {"calib": calib, "out": options.out / ref.name, "prior_map": prior_map}
     return replace(options, left=ref.left, right=ref.right, **of_pair)
 
 

@@ -167,8 +167,10 @@ def run_capture_eval(options: CaptureEvalOptions) -> Page:
         rows.append(_row(captures[ROWS[row][1]], ROWS[row][0], count, own, folder))
     if "refined" in captures:
         rows.append(_row_of_points(captures["refined"], names))
-    header = ("poses", "views", "AbsRel", "worst", "scaled", "scale")
-    header += ("within 3 %", "within 25 %", "F 5 cm", "TAE %")
+    header = (
+        *("poses", "views", "AbsRel", "worst", "scaled", "scale"),
+        *("within 3 %", "within 25 %", "F 5 cm", "TAE %"),
+    )
     note = (
         "AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its "
         "median. Scale: median of depth over truth. F: of the fused cloud beside that of the true depth "

@@ -127,7 +127,7 @@ def read_capture(
     source = Path(path)
     if not source.exists():
         raise MissingFileError(f"PATH must be a capture; there is no {source}.")
-    typed = None if K is None else (np.asarray(K, dtype=np.float64), None)
+    typed: Typed = None if K is None else (np.asarray(K, dtype=np.float64), None)
     typed = (None, float(fov)) if fov is not None else typed
     for recognised, read in READERS:
         found = recognised(source)
@@ -221,7 +221,8 @@ def _find_transforms(path: Path) -> Path | None:
 
 
 def _read_transforms(file: Path, typed: Typed, _: object) -> CaptureFiles:
-    frames, unit = [], "m"
+    frames: list[CaptureFrame] = []
+    unit: str | None = "m"
     for name, entries in nerf_frames(read_text(file, "PATH")).items():
         image = _named_image(file.parent, name)
         camera = nerf_camera(entries, _size(image) if image.is_file() else None)
@@ -315,7 +316,7 @@ def _read_scannet(folder: Path, typed: Typed, _: object) -> CaptureFiles:
 
 
 def _natural(name: str) -> list[object]:
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]  # type: ignore[misc]
+    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]
 
 
 def _file_camera(

@@ -80,11 +80,11 @@ def read_inputs(
     inputs = []
     for i in range(count):
         label = "{}" if count == 1 else f"{{}}[{i}]"
-        entries = (
+        right_i, K_i, E_i, points_i = (
             _entry(x, name, i, count)
             for x, name in ((right, "right"), (K, "K"), (E, "E"), (points, "points"))
         )
-        inputs.append(_read_one(*entries, label, cropped, unit))
+        inputs.append(_read_one(right_i, K_i, E_i, points_i, label, cropped, unit))
     for name, given in (
         ("right", [bool(entry.views) for entry in inputs]),
         ("points", [entry.points is not None for entry in inputs]),

@@ -303,7 +303,7 @@ def _features(image: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]
     if factor < 1:
         size = round(image.shape[1] * factor), round(image.shape[0] * factor)
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    sift = cv2.SIFT_create(nfeatures=MOST_FEATURES, contrastThreshold=0.02)
+    sift = cv2.SIFT.create(nfeatures=MOST_FEATURES, contrastThreshold=0.02)
     points, descriptors = sift.detectAndCompute(image, None)
     if not points or descriptors is None:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)

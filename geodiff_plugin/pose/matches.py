@@ -201,8 +201,11 @@ def dense_tracks(views: GreyViews, depth_m: Tensor, Ts: np.ndarray) -> Tracks:
     right_px = np.zeros((len(Ts), len(centres), 2))
     seen = np.zeros((len(Ts), len(centres)), bool)
     for v, (image, K, T) in enumerate(zip(views.rights, views.K_rights, Ts, strict=True)):
-        cameras = (torch.as_tensor(m, dtype=torch.float32, device="cpu")[None] for m in (views.K_left, K, T))
-        uv, z = (part[0].numpy() for part in project_rays(depth_m, plane_rays(*cameras, (size[0], size[1]))))
+        K_left, K_right, T_right = (
+            torch.as_tensor(m, dtype=torch.float32, device="cpu")[None] for m in (views.K_left, K, T)
+        )
+        rays = plane_rays(K_left, K_right, T_right, (size[0], size[1]))
+        uv, z = (part[0].numpy() for part in project_rays(depth_m, rays))
         visible = (uv >= 0).all(-1) & (uv <= np.array(image.shape[::-1]) - 1).all(-1) & (z > 0)
         right_px[v], seen[v] = _dense_matches(views.left, image, uv, visible, centres)
     return Tracks(centres.astype(np.float64), right_px, seen, views.K_left, views.K_rights).seen_anywhere()
@@ -256,8 +259,9 @@ def _entries(file: Path) -> dict[str, Any]:
 
 def _size(folder: Path) -> tuple[int, int]:
     size = _entries(folder / "preprocessor_config.json").get("size")
-    sides = [size.get(side) for side in ("height", "width")] if isinstance(size, dict) else []
-    if not sides or not all(isinstance(side, int) for side in sides):
+    named = [size.get(side) for side in ("height", "width")] if isinstance(size, dict) else []
+    sides = [side for side in named if isinstance(side, int)]
+    if len(sides) != 2:
         return _SIZE
     height, width = (min(max(side, 16), 4096) for side in sides)
     return height, width

@@ -44,10 +44,8 @@ __all__ = [
     "native_images",
 ]
 
-if TYPE_CHECKING:  # mixed in before a class that has all of a stock pipeline
-    _Stock = MarigoldDepthPipeline
-else:
-    _Stock = object
+# Mixed in before a class that has all of a stock pipeline.
+_Stock: Any = MarigoldDepthPipeline if TYPE_CHECKING else object
 
 
 class GuidedCall(_Stock):

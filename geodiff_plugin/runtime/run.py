@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.correction import local_error
 from geodiff_plugin.algorithm.evidence import Evidence
-from geodiff_plugin.algorithm.schedule import make_schedule
+from geodiff_plugin.algorithm.schedule import Schedule, make_schedule
 from geodiff_plugin.algorithm.state import Trajectory
 from geodiff_plugin.algorithm.step import guided_step
 from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -79,7 +79,8 @@ class GuidedRun:
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
         self.owners = [i for i in range(len(evidence)) for _ in range(ensemble_size)]
-        self.batch_size, self.grid, self.schedule = batch_size, grid, None
+        self.batch_size, self.grid = batch_size, grid
+        self.schedule: Schedule | None = None
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
         self.members: list[Tensor] = []
@@ -87,7 +88,8 @@ class GuidedRun:
         self._callback, self._held = callback, held
         self._reads_latents = wants_latents or callback is not None
         self._codec = MapCodec(pipe, prior, grid, tiny)
-        self._step, self._timesteps = 0, []
+        self._step = 0
+        self._timesteps: list[float] = []
         self._shown: Tensor | None = None  # relative map of the chunk's latest evaluation
         self._results: list[Tensor | None] = []  # of every chunk, the map that its output starts from
         self._ends_m: list[tuple[Tensor, Tensor]] = []  # nearest and farthest of the final maps of a chunk

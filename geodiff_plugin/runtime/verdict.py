@@ -246,8 +246,8 @@ def read_indicators(
     left_01, rights = evidence.native_left, evidence.native
     numbers: dict[str, Any] = {}
     if matches is not None:
-        swept = range_given and evidence.volume is not None
-        numbers = _of_matches(matches, evidence.volume.inverse_depth if swept else None)
+        volume = evidence.volume if range_given else None
+        numbers = _of_matches(matches, None if volume is None else volume.inverse_depth)
         if depth_m is not None:
             numbers["off_matches"] = _off_matches(matches, depth_m)
         if points is not None:
