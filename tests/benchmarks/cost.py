@@ -183,7 +183,8 @@ def _extrapolated(size: Size) -> list[str]:
     for way, counts in calls.items():
         total = sum(n * operations[kind] for kind, n in counts.items()) / 1e12
         plain = plain or total
-        lines.append(f"| {way} | {total:.1f} | {total / plain:.2f} | {PAIRS * total / SUSTAINED / 86400:.2f} |")
+        days = PAIRS * total / SUSTAINED / 86400
+        lines.append(f"| {way} | {total:.1f} | {total / plain:.2f} | {days:.2f} |")
     pixels = size.resolution * round(0.75 * size.resolution)
     written = PAIRS * pixels * BYTES_A_PIXEL / 1e12
     amount = f"{PAIRS:,} pairs of {pixels / 1e6:.2f} megapixels"
