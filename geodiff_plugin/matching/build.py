@@ -34,8 +34,10 @@ PLANE_STEP_PX = 0.75
 SWEEP_SIDE = 828
 # The coarse sweep that finds how near the planes must reach: pixels, planes, and the median step of one, px.
 PILOT_PIXELS, PILOT_PLANES, PILOT_STEP_PX = 20_000, 160, 1.0
-# Shift of the nearest depth that it looks at, in image widths.
-PILOT_SHIFT = 0.4
+# Shift of the nearest depth that it looks at, in image widths, of the view that moves least: a near surface
+# leaves the view that moves most while others still show it. It looks no more than so many times nearer than
+# that depth of the view that moves most.
+PILOT_SHIFT, MOST_NEARER = 0.4, 3.0
 # Its matches above this confidence count; this quantile of their inverse depths is taken for the nearest,
 # unless they are less than this share of the pixels: then the planes reach as near as the sweep looked.
 PILOT_CONFIDENCE, PILOT_QUANTILE, PILOT_LEAST_SHARE = 0.8, 0.995, 0.03
@@ -116,7 +118,8 @@ def pilot_volume(
     views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
     left, small, K = _to_grid(grey(left_01), views, K_left.float(), pixels, pixels)
     size = image_size(left)
-    limit = _at_shift(small, K, size, PILOT_SHIFT)
+    each = _at_shift(small, K, size, PILOT_SHIFT)
+    limit = torch.minimum(each.amax(), MOST_NEARER * each.amin())
     span = (torch.zeros_like(limit), limit)
     planes = _even_planes(span, size, small, K, PILOT_STEP_PX, PILOT_PLANES)
     return sweep_planes(left, small, K, planes)
@@ -125,13 +128,13 @@ def pilot_volume(
 def _at_shift(
     rights: Sequence[CameraView], K: torch.Tensor, size: tuple[int, int], fraction: float
 ) -> torch.Tensor:
-    """Inverse depth at which the view that moves most has moved by this fraction of the width."""
+    """``(V,)`` inverse depths at which each view has moved by this fraction of the width."""
     nearest = []
     for v, (_, K_r, T) in enumerate(rights, 1):
         name = "E" if len(rights) == 1 else f"E of right view {v}"
         rays = plane_rays(K[None], K_r[None], T[None], size)
         nearest.append(inverse_depth_at_shift(rays, fraction * size[1], name))
-    return torch.stack(nearest).amin()
+    return torch.stack(nearest)
 
 
 def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
@@ -139,7 +142,7 @@ def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
     matches = match_volume(pilot)
     reliable, limit = matches.confidence > PILOT_CONFIDENCE, pilot.inverse_depth[-1]
     inverse_depth = torch.where(reliable, matches.inverse_depth, torch.nan)
-    least = _at_shift(pilot.rights, pilot.K, pilot.size, LEAST_SHIFT)
+    least = _at_shift(pilot.rights, pilot.K, pilot.size, LEAST_SHIFT).amin()
     nearest = (HEADROOM * torch.nanquantile(inverse_depth, PILOT_QUANTILE)).clamp(least, limit)
     # With little to go by, the search must see everything.
     return torch.where(reliable.float().mean() < PILOT_LEAST_SHARE, limit, nearest)
