@@ -1,4 +1,4 @@
-"""Frames checked against each other's depth, and averaged where they agree, as in the fusion of MVS."""
+"""Frames checked against each other's depth: averaged where they agree, outvoted where others agree."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-__all__ = ["DepthFrame", "agreed"]
+__all__ = ["DepthFrame", "agreed", "seen_in"]
 
 #: Two depths of one point agree within this share; a point that comes back further off is another surface.
 SAME_SHARE, MOST_OFF_PX = 0.06, 2.0
-#: A frame's own depth counts so many times that of another frame, whose pixels are resampled.
+#: A frame's depth counts so many times that of another frame, whose pixels are resampled.
 OWN_WEIGHT = 2.0
+#: Every depth counts a little, however low its confidence.
+LEAST_WEIGHT = 0.05
 #: Confidence that one agreeing frame adds, as a share of what is missing to 1 and of its own confidence.
 RISES = 0.4
-Camera = tuple[np.ndarray, np.ndarray]
+#: So many other frames must agree with each other to replace a depth that none of them confirms.
+OUTVOTES = 2
+Maps = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,75 +44,127 @@ class DepthFrame:
     confirmed: np.ndarray | None = None
     asked: np.ndarray | None = None
 
+    def world(self, mask: np.ndarray | None = None) -> np.ndarray:
+        """``(N, 3)`` points of the pixels of a mask, by default of all, in the world's frame."""
+        v, u = np.nonzero(np.ones(self.depth.shape, bool) if mask is None else mask)
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(self.K).T
+        return rays * self.depth[v, u][:, None] @ self.E[:3, :3].T + self.E[:3, 3]
+
+
+def seen_in(frame: DepthFrame, other: DepthFrame) -> Maps:
+    """Where another frame's camera sees the points of a frame.
+
+    Returns:
+        ``(H, W)`` each: rows and columns of the nearest pixels of the other frame (0 where it does not see
+        the point), depth of the point in its camera, whether it is inside of the picture.
+    """
+    T = np.linalg.inv(other.E)
+    points = (frame.world() @ T[:3, :3].T + T[:3, 3]) @ other.K.T
+    z = points[:, 2].reshape(frame.depth.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = (points[:, axis].reshape(z.shape) / z for axis in (0, 1))
+        inside = (z > 1e-6) & (u > -0.5) & (v > -0.5)
+        inside &= (u < other.depth.shape[1] - 0.5) & (v < other.depth.shape[0] - 0.5)
+    row, column = (np.rint(np.where(inside, at, 0)).astype(int) for at in (v, u))
+    return row, column, z, inside
+
 
 def agreed(frame: DepthFrame, others: Sequence[DepthFrame]) -> DepthFrame:
     """A frame's depth averaged with that of other frames where they agree.
+
+    A depth that no other frame confirms gives way to one on which several others agree and which together
+    count more.
 
     Args:
         frame: as it came from its own run.
         others: frames that see the same, likewise.
 
     Returns:
-        The frame with ``confirmed`` and ``asked``; depth is a mean over inverse depths weighted by
-        confidence, and never leaves what the frames agree on.
+        The frame with ``confirmed`` and ``asked``. Depth is a mean over inverse depths weighted by
+        confidence, and never leaves what frames agree on.
+
+    Source: Merrell et al. 2007, S4: depth maps rendered into one view, supported by those that agree.
     """
-    inverse, confidence = 1.0 / frame.depth, frame.confidence
-    weight = OWN_WEIGHT * (0.05 + confidence)
-    total, above = weight.copy(), weight * inverse
-    confirmed, asked = np.zeros(frame.depth.shape, np.uint8), np.zeros(frame.depth.shape, np.uint8)
-    missing = 1.0 - confidence
+    weight = OWN_WEIGHT * (LEAST_WEIGHT + frame.confidence)
+    total, above = weight.copy(), weight / frame.depth
+    confirmed, asked = (np.zeros(frame.depth.shape, np.uint8) for _ in range(2))
+    missing = 1.0 - frame.confidence
     for other in others:
-        depth, sure, seen, same = _seen_from(frame, other)
+        depth, sure, seen, same = _depth_by(other, frame)
         asked += seen
         confirmed += same
-        more = np.where(same, 0.05 + sure, 0.0)
+        more = np.where(same, LEAST_WEIGHT + sure, 0.0)
         total += more
         above += more / np.where(same, depth, 1.0)
         missing = missing * np.where(same, 1.0 - RISES * sure, 1.0)
+    inverse, confidence = above / total, 1.0 - missing
+    alone = confirmed == 0
+    if len(others) >= OUTVOTES and alone.any():
+        votes, share, new, new_confidence = _vote([_rendered(other, frame) for other in others], alone)
+        lost = (votes >= OUTVOTES) & (share > weight[alone])
+        at = np.flatnonzero(alone)[lost]
+        for values, by_others in ((inverse, new), (confidence, new_confidence), (confirmed, votes)):
+            values.flat[at] = by_others[lost]
     return replace(
         frame,
-        depth=(total / above).astype(np.float32),
-        confidence=(1.0 - missing).astype(np.float32),
+        depth=(1.0 / inverse).astype(np.float32),
+        confidence=confidence.astype(np.float32),
         confirmed=confirmed,
-        asked=asked,
+        asked=np.maximum(asked, confirmed),
     )
 
 
-def _seen_from(frame: DepthFrame, other: DepthFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Another frame's depth brought into a frame's view at every pixel.
+def _depth_by(other: DepthFrame, frame: DepthFrame) -> Maps:
+    """What another frame says of the depth of every pixel of a frame, at the point where that puts it.
 
     Returns:
-        ``(H, W)`` each: the depth that the other frame gives, its confidence there, whether it sees the
-        point, and whether both mean the same point.
+        ``(H, W)`` each: its depth, brought into the frame's view, its confidence, whether it sees the point,
+        and whether both mean the same point.
     """
-    height, width = frame.depth.shape
-    v, u = np.mgrid[:height, :width].astype(np.float64)
-    T = np.linalg.inv(other.E) @ frame.E
-    x, y, z = _moved(u, v, frame.depth, frame.K, T)
-    uo, vo = (
-        (other.K[0, 0] * x + other.K[0, 1] * y) / z + other.K[0, 2],
-        other.K[1, 1] * y / z + other.K[1, 2],
-    )
-    rows, columns = other.depth.shape
-    seen = (z > 1e-6) & (uo > 0) & (vo > 0) & (uo < columns - 1) & (vo < rows - 1)
-    ui, vi = (np.rint(np.where(seen, a, 0)).astype(int) for a in (uo, vo))
-    there = other.depth[vi, ui].astype(np.float64)
-    sure = other.confidence[vi, ui]
-    # The other frame's point at the very place that ours falls on, back in our view.
-    bx, by, bz = _moved(np.where(seen, uo, 0), np.where(seen, vo, 0), there, other.K, np.linalg.inv(T))
-    bz = np.where(np.abs(bz) < 1e-6, 1e-6, bz)
-    off = np.hypot(frame.K[0, 0] * bx / bz + frame.K[0, 2] - u, frame.K[1, 1] * by / bz + frame.K[1, 2] - v)
-    same = seen & (np.abs(bz / frame.depth - 1) < SAME_SHARE) & (off < MOST_OFF_PX * width / 640)
+    row, column, z, seen = seen_in(frame, other)
+    there = other.depth[row, column].astype(np.float64)
+    moved = np.linalg.inv(frame.E) @ other.E
+    rays = np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(other.K).T
+    points = (rays * there[..., None]) @ moved[:3, :3].T + moved[:3, 3]
+    depth = np.where(np.abs(points[..., 2]) < 1e-6, 1e-6, points[..., 2])
+    # Its own pixel lies up to half a pixel beside the point, which moves it here: only depth counts then.
+    same = seen & (np.abs(there / z - 1) < SAME_SHARE) & (np.abs(depth / frame.depth - 1) < SAME_SHARE)
     # A point behind what the other frame sees is hidden from it, which says nothing against ours.
-    seen &= there > (1 - SAME_SHARE) * z
-    return bz, sure, seen, same
+    return depth, other.confidence[row, column], seen & (there > (1 - SAME_SHARE) * z), same
 
 
-def _moved(
-    u: np.ndarray, v: np.ndarray, depth: np.ndarray, K: np.ndarray, T: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of pixels at their depth, in another camera's frame."""
-    y = (v - K[1, 2]) / K[1, 1]
-    x = (u - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    points = np.stack([x * depth, y * depth, depth], -1) @ T[:3, :3].T + T[:3, 3]
-    return points[..., 0], points[..., 1], points[..., 2]
+def _rendered(other: DepthFrame, frame: DepthFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Another frame's depth and confidence as a frame's camera sees them, 0 where no pixel falls."""
+    row, column, z, inside = seen_in(other, frame)
+    order = np.argsort(-z[inside])  # the nearest is written last
+    at = (row[inside] * frame.depth.shape[1] + column[inside])[order]
+    maps = []
+    for values in (z, other.confidence):
+        maps.append(np.zeros(frame.depth.size))
+        maps[-1][at] = values[inside][order]
+    return maps[0], maps[1]
+
+
+def _vote(rendered: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -> Maps:
+    """The depth that most of the other frames agree on, at the ``n`` pixels of a mask.
+
+    Returns:
+        ``(n,)`` each: how many agree, their weight, their mean inverse depth and joint confidence.
+    """
+    depths, sures = (np.stack([maps[k][mask.ravel()] for maps in rendered]) for k in (0, 1))
+    weights = np.where(depths > 0, LEAST_WEIGHT + sures, 0.0)
+    inverse = 1.0 / np.where(depths > 0, depths, 1.0)
+    best = [np.zeros(depths.shape[1]) for _ in range(4)]
+    for candidate in range(len(depths)):
+        same = (
+            (np.abs(inverse / inverse[candidate] - 1) < SAME_SHARE) & (depths > 0) & (depths[candidate] > 0)
+        )
+        weight = (weights * same).sum(0)
+        better = weight > best[1]
+        mean = (weights * same * inverse).sum(0) / np.maximum(weight, 1e-9)
+        sure = 1.0 - np.where(same, 1.0 - RISES * sures, 1.0).prod(0)
+        best = [
+            np.where(better, new, old)
+            for new, old in zip((same.sum(0), weight, mean, sure), best, strict=True)
+        ]
+    return best[0].astype(np.uint8), best[1], best[2], best[3]

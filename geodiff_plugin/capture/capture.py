@@ -126,11 +126,10 @@ class Capture:
         """
         check_choice(poses, "poses", ("refined", "given"))
         if self._solved is None:
-            frames = self.files.frames
-            K = np.stack([frame.K for frame in frames])
-            sizes = [frame.size for frame in frames]
+            K = np.stack([frame.K for frame in self.files.frames])
+            sizes, how = [frame.size for frame in self.files.frames], {"names": self.names, "poses": poses}
             threads = threads or available_cores()
-            self._solved = solve_capture(self._greys(), K, self.poses, sizes, poses=poses, threads=threads)
+            self._solved = solve_capture(self._greys(), K, self.poses, sizes, threads=threads, **how)
         return self._solved
 
     def adopt(self, solved: SolvedCapture) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.agreement import DepthFrame
@@ -72,14 +73,10 @@ def fuse(frames: Sequence[DepthFrame], image: Callable[[str], np.ndarray]) -> tu
 
 def _points(frame: DepthFrame, image: np.ndarray, cell: float) -> np.ndarray:
     """``(N, 9)`` places, normals and colours of one frame, in the world's frame."""
-    v, u = np.nonzero(kept(frame))
-    every = max(1, len(u) // MOST_POINTS)
-    v, u = v[::every], u[::every]
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame.K).T
-    R, t = frame.E[:3, :3], frame.E[:3, 3]
-    points = rays * frame.depth[v, u][:, None] @ R.T + t
-    normals = normals_of(frame.depth, frame.K)[v, u] @ R.T
-    return _thinned(np.hstack([points, normals, image[v, u] * 255]), cell)
+    mask = kept(frame)
+    every = max(1, int(mask.sum()) // MOST_POINTS)
+    normals = normals_of(frame.depth, frame.K)[mask] @ frame.E[:3, :3].T
+    return _thinned(np.hstack([frame.world(mask), normals, image[mask] * 255])[::every], cell)
 
 
 def _thinned(rows: np.ndarray, cell: float) -> np.ndarray:
@@ -153,41 +150,32 @@ def write_mesh(path: Path, frames: Sequence[DepthFrame], image: Callable[[str], 
 
 
 def write_colmap_maps(
-    folder: Path,
-    frames: Sequence[DepthFrame],
-    files: dict[str, str],
-    cloud: Cloud,
-    image: Callable[[str], Any],
+    folder: Path, frames: Sequence[DepthFrame], cloud: Cloud, image: Callable[[str], Any]
 ) -> None:
     """Write a dense workspace of COLMAP: images, sparse model, depth and normal maps.
 
     Args:
         folder: to appear.
         frames: agreed; maps have depth only where frames are kept.
-        files: file name of a frame's image by the frame's name.
         cloud: points of the sparse model.
         image: a frame's name -> ``(H, W, 3)`` in [0, 1].
 
     Convention:
         ``colmap stereo_fusion --workspace_path FOLDER --input_type geometric --output_path fused.ply``
     """
-    from PIL import Image
-
     for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    views = []
+    views, maps = [], folder / "stereo"
     for frame in frames:
-        file, depth = files[frame.name], np.where(kept(frame), frame.depth, 0).astype(np.float32)
+        file, depth = f"{frame.name}.png", np.where(kept(frame), frame.depth, 0).astype(np.float32)
         Image.fromarray(np.rint(image(frame.name) * 255).astype(np.uint8)).save(folder / "images" / file)
-        normals = normals_of(frame.depth, frame.K)
-        write_map(folder / "stereo/depth_maps" / f"{file}.geometric.bin", depth[..., None])
-        write_map(folder / "stereo/normal_maps" / f"{file}.geometric.bin", normals)
+        write_map(maps / "depth_maps" / f"{file}.geometric.bin", depth[..., None])
+        write_map(maps / "normal_maps" / f"{file}.geometric.bin", normals_of(frame.depth, frame.K))
         views.append((file, frame.K, frame.E, depth.shape[::-1]))
     write_colmap(folder / "sparse", views, cloud)
-    names = "".join(f"{files[frame.name]}\n" for frame in frames)
-    (folder / "stereo" / "fusion.cfg").write_text(names, encoding="utf-8")
-    pairs = "".join(f"{files[frame.name]}\n__auto__, 20\n" for frame in frames)
-    (folder / "stereo" / "patch-match.cfg").write_text(pairs, encoding="utf-8")
+    (maps / "fusion.cfg").write_text("".join(f"{file}\n" for file, *_ in views), encoding="utf-8")
+    pairs = "".join(f"{file}\n__auto__, 20\n" for file, *_ in views)
+    (maps / "patch-match.cfg").write_text(pairs, encoding="utf-8")
 
 
 def write_map(path: Path, values: np.ndarray) -> None:

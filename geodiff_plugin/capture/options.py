@@ -9,7 +9,8 @@ from dataclasses import MISSING, asdict, dataclass
 from pathlib import Path
 
 from geodiff_plugin import __version__
-from geodiff_plugin.options import CAMERAS, OUTPUT, declare
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.options import CAMERAS, OUTPUT, SPACES, check_options, declare
 
 __all__ = ["NEIGHBOURS", "CaptureOptions"]
 
@@ -34,14 +35,21 @@ class CaptureOptions:
     frames: str | None = declare(
         None, "Which frames get depth: NAME,NAME by file stem, or FIRST:LAST:STEP; all by default."
     )
-    neighbours: int = declare(NEIGHBOURS, "Right views of a frame, at most.")
+    neighbours: int = declare(NEIGHBOURS, "Right views of a frame, at most.", low=1, high=32)
     poses: str = declare(
-        "refined", "refined: solved together over the capture; given: as they are.", panel=CAMERAS
+        "refined",
+        "refined: solved together over the capture; given: as they are.",
+        panel=CAMERAS,
+        choices=("refined", "given"),
     )
     points: str = declare(
-        "none", "Known depths: none, model (points of a COLMAP model), depth (maps it names)."
+        "none",
+        "Known depths: none, model (points of a COLMAP model), depth (maps it names).",
+        choices=("none", "model", "depth"),
     )
-    metres_per_unit: float | None = declare(None, "Length of one unit of the poses, metres.", panel=CAMERAS)
+    metres_per_unit: float | None = declare(
+        None, "Length of one unit of the poses, metres.", panel=CAMERAS, above_0="metres"
+    )
     known_length: str | None = declare(
         None, "A distance in the scene, NAME:X1,Y1,X2,Y2,METRES by pixels of a frame.", panel=CAMERAS
     )
@@ -52,18 +60,39 @@ class CaptureOptions:
         None, "Of a video: lines of seconds tx ty tz qx qy qz qw, camera-to-world.", panel=CAMERAS
     )
     prior: str = declare("bundled", "'bundled', a hub id or a folder.")
-    steps: int | None = declare(None, "Denoising steps; by default the prior's own, at least 4.")
+    prior_map: Path | None = declare(
+        None, "Folder of depth maps of another model, NAME.npy or another map a frame, in place of a prior."
+    )
+    space: str | None = declare(
+        None, "Space in which the prior's map is affine, if its folder does not say.", choices=SPACES
+    )
+    steps: int | None = declare(
+        None, "Denoising steps; by default the prior's own, at least 4.", low=1, high=1000
+    )
     seed: int = declare(0, "Seed of the noise.")
     device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
-    processes: int | None = declare(None, "Processes that share the frames; by default one a core.")
+    processes: int | None = declare(
+        None, "Processes that share the frames; by default one a core.", low=1, high=1024
+    )
     export: tuple[str, ...] = declare(
-        (), "colmap: a dense workspace; mesh: by TSDF (extra mesh); repeatable.", panel=OUTPUT
+        (),
+        "colmap: a dense workspace; mesh: by TSDF (extra mesh); repeatable.",
+        panel=OUTPUT,
+        choices=("colmap", "mesh"),
     )
     overwrite: bool = declare(
         False, "Write into a folder that holds files; do finished frames anew.", panel=OUTPUT
     )
     quiet: bool = declare(False, "No progress bar.", "--quiet", "-q", panel=OUTPUT)
     json: bool = declare(False, "Print the report instead of a summary.", panel=OUTPUT)
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        ways = [self.metres_per_unit, self.known_length, self.distance]
+        if sum(way is not None for way in ways) > 1:
+            bad_value(
+                "the scale", "given in one way", "more of --metres-per-unit, --known-length, --distance"
+            )
 
     def key(self, names: Sequence[str], *of: str) -> str:
         """A digest of the settings ``of`` and the frames that a result depends on."""

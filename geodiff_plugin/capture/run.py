@@ -6,28 +6,27 @@ import json
 import math
 import multiprocessing
 import os
-import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from diffusers.utils import logging as of_diffusers
-from transformers.utils import logging as of_transformers
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import InputError, bad_value, check_choice, check_number
+from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin._threads import available_cores
+from geodiff_plugin.bundled.loading import no_bars
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.capture.results import ALONE, write_agreement, write_results
 from geodiff_plugin.capture.store import load_solved, save_solved
+from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import read_matrix
-from geodiff_plugin.formats.out import atomic_path
+from geodiff_plugin.formats.out import OutFolder, atomic_path
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, this_process
 from geodiff_plugin.runtime.machine import pick_device
@@ -40,10 +39,16 @@ __all__ = ["Writer", "open_capture", "run_capture", "run_frames", "solved_poses"
 Writer = Callable[[Path, MetricDepthOutput, np.ndarray], dict[str, Any]]
 
 POSES_FILE, SCALE_FILE, JOURNAL, REPORT = "poses.npz", "scale.json", "frames.jsonl", "report.json"
+#: What the poses depend on, and beside them the depth of a frame.
+OF_POSES = ("poses", "k", "fov", "trajectory")
+OF_FRAME = ("neighbours", "points", "metres_per_unit", "known_length", "distance", "prior", "prior_map")
+OF_FRAME += ("space", "steps", "seed")
 #: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
 PROCESS_BYTES = 1.5e9
-#: Captures with more frames are told how long they will take.
-MANY = 300
+#: Captures with more frames are told how long they will take: seconds of a core and bytes a frame.
+MANY, POSE_S, DEPTH_S, POSE_BYTES = 300, 1.0, 12.0, 4e5
+#: Depth maps of other models, in the order in which they are looked for.
+MAPS = (".npy", ".npz", ".pfm", ".png")
 
 
 def open_capture(options: CaptureOptions) -> Capture:
@@ -55,154 +60,142 @@ def open_capture(options: CaptureOptions) -> Capture:
     return capture
 
 
-def _cores() -> int:
-    return max(1, available_cores())
-
-
 def solved_poses(capture: Capture, options: CaptureOptions) -> None:
     """Solve for the poses, or take those that an earlier run of the same capture left; then set the scale."""
-    path = options.out / POSES_FILE
-    key = options.key(capture.names, "poses", "k", "fov", "trajectory")
+    path, key = options.out / POSES_FILE, options.key(capture.names, *OF_POSES)
     solved = None if options.overwrite else load_solved(path, key)
     if solved is None:
-        solved = capture.solve(options.poses, threads=_cores())
+        solved = capture.solve(options.poses, threads=available_cores())
         save_solved(path, solved, key)
     capture.adopt(solved)
-    factor = _factor(capture, options, key)
+    factor = options.metres_per_unit
+    if options.distance is not None:
+        factor = _factor_of_pair(capture, options.distance)
+    elif options.known_length is not None:
+        factor = _factor_of_length(capture, options, key)
     if factor is not None:
         capture.rescale(factor)
 
 
-def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None:
-    """Metres per unit of the poses, by the one option that gives them; ``None`` without."""
-    ways = [options.metres_per_unit, options.known_length, options.distance]
-    if sum(way is not None for way in ways) > 1:
-        bad_value("the scale", "given in one way", "more of --metres-per-unit, --known-length, --distance")
-    if options.metres_per_unit is not None:
-        return options.metres_per_unit
-    if options.distance is not None:
-        return _factor_of_pair(capture, options.distance)
-    if options.known_length is None:
-        return None
-    path, asked = options.out / SCALE_FILE, f"{key} {options.known_length}"
+def _numbers(words: Sequence[str], option: str, typed: str) -> list[float]:
+    """Numbers of an option, the last one a length above 0."""
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        bad_value(option, "with numbers", repr(typed))
+    if not 0 < numbers[-1] < math.inf:
+        bad_value(option, "a length above 0", repr(typed))
+    return numbers
+
+
+def _factor_of_pair(capture: Capture, text: str) -> float:
+    """Metres per unit of ``--distance``."""
+    *names, metres = (part.strip() for part in text.split(","))
+    if len(names) != 2:
+        bad_value("--distance", "NAME,NAME,METRES", repr(text))
+    (length,) = _numbers([metres], "--distance", text)
+    numbers = [capture.names.index(capture.frame(name).name) for name in names]
+    apart = float(np.linalg.norm(np.diff(capture.solve().E[numbers, :3, 3], axis=0)))
+    if not apart > 0:
+        bad_value("--distance", "of two frames with different positions", repr(text))
+    return length / apart
+
+
+def _factor_of_length(capture: Capture, options: CaptureOptions, key: str) -> float:
+    """Metres per unit of ``--known-length``: by the depth of that frame in the poses' unit, found once."""
+    text = options.known_length or ""
+    name, _, rest = text.rpartition(":")
+    words = rest.split(",")
+    if not name or len(words) != 5:
+        bad_value("--known-length", "NAME:X1,Y1,X2,Y2,METRES", repr(text))
+    *px, metres = _numbers(words, "--known-length", text)
+    frame, ends = capture.frame(name), np.array(px).reshape(2, 2)
+    if not ((ends >= 0) & (ends <= np.array(frame.size) - 1)).all():
+        bad_value("--known-length", f"pixels of {frame.size[0]}x{frame.size[1]}", repr(text))
+    path, asked = options.out / SCALE_FILE, f"{key} {text}"
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))
-        if saved["of"] == asked:
+        if saved["of"] == asked and not options.overwrite:
             return float(saved["metres_per_unit"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    factor = _factor_of_length(capture, options.known_length, options)
+    depth = np.asarray(_depth(capture, _pipe(options), name, options).prediction)[0, ..., 0]
+    rays = np.linalg.solve(capture.solve().K[capture.names.index(name)], np.c_[ends, np.ones(2)].T).T
+    points = rays * depth[tuple(np.rint(ends).astype(int).T[::-1])][:, None]
+    factor = metres / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
     _write_json(path, {"metres_per_unit": factor, "of": asked})
     return factor
 
 
-def _factor_of_pair(capture: Capture, text: str) -> float:
-    parts = [part.strip() for part in text.split(",")]
-    metres = _positive(parts[-1], "--distance", text)
-    if len(parts) != 3:
-        bad_value("--distance", "NAME,NAME,METRES", repr(text))
-    numbers = [capture.names.index(capture.frame(name).name) for name in parts[:2]]
-    apart = float(np.linalg.norm(np.diff(capture.solve().E[numbers, :3, 3], axis=0)))
-    if not apart > 0:
-        bad_value("--distance", "of two frames with different positions", repr(text))
-    return metres / apart
-
-
-def _factor_of_length(capture: Capture, text: str, options: CaptureOptions) -> float:
-    """The length of the scene at its depth in the poses' own unit, found by a call of that frame."""
-    name, _, rest = text.rpartition(":")
-    numbers = rest.split(",")
-    if not name or len(numbers) != 5:
-        bad_value("--known-length", "NAME:X1,Y1,X2,Y2,METRES", repr(text))
-    metres = _positive(numbers[-1], "--known-length", text)
-    frame = capture.frame(name)
-    px = np.array([_number(n, "--known-length", text) for n in numbers[:4]]).reshape(2, 2)
-    if not ((px >= 0) & (px <= np.array(frame.size) - 1)).all():
-        bad_value("--known-length", f"pixels of {frame.size[0]}x{frame.size[1]}", repr(text))
-    pipe = _pipe(options, pick_device(options.device))
-    with torch.no_grad():
-        depth = np.asarray(capture.depth(pipe, name, options.neighbours).prediction)[0, ..., 0]
-    K = capture.solve().K[capture.names.index(name)]
-    rays = np.linalg.solve(K, np.c_[px, np.ones(2)].T).T
-    ends = rays * depth[tuple(np.rint(px).astype(int).T[::-1])][:, None]
-    return metres / float(np.linalg.norm(ends[1] - ends[0]))
-
-
-def _number(text: str, option: str, typed: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        bad_value(option, "with numbers", repr(typed))
-
-
-def _positive(text: str, option: str, typed: str) -> float:
-    value = _number(text, option, typed)
-    return value if 0 < value < math.inf else bad_value(option, "a length above 0", repr(typed))
-
-
-def _pipe(options: CaptureOptions, device: torch.device) -> Any:
-    bars = [library for library in (of_diffusers, of_transformers) if library.is_progress_bar_enabled()]
-    for library in bars:
-        library.disable_progress_bar()
-    try:
-        pipe = enable_geometry_guidance(load_prior(options.prior).to(device))
-    finally:
-        for library in bars:
-            library.enable_progress_bar()
+def _pipe(options: CaptureOptions) -> Any:
+    with no_bars():
+        prior = "map" if options.prior_map is not None else options.prior
+        said = {} if options.space is None else {"space": options.space}
+        pipe = enable_geometry_guidance(load_prior(prior, **said).to(pick_device(options.device)))
     pipe.set_progress_bar_config(disable=True)
     return pipe
 
 
-#: What a process works with: the capture, the prior, the options, the writer.
-_worker: tuple[Capture, Any, CaptureOptions, Writer] | None = None
-
-
-def _frame(item: Item) -> dict[str, Any]:
-    """One frame: its files, and its report."""
-    assert _worker is not None
-    capture, pipe, options, write = _worker
-    name, started = item.key, time.perf_counter()
-    neighbours = capture.neighbours(name, options.neighbours)
+def _depth(
+    capture: Capture,
+    pipe: Any,
+    name: str,
+    options: CaptureOptions,
+    points: str = "none",
+) -> MetricDepthOutput:
+    """Depth of one frame as the options say."""
     call: dict[str, Any] = {} if options.steps is None else {"num_inference_steps": options.steps}
+    if options.prior_map is not None:
+        paths = [options.prior_map / f"{name}{suffix}" for suffix in MAPS]
+        path = next((path for path in paths if path.is_file()), paths[0])
+        call["depth_map"] = read_map(path, f"--prior-map of {name}")
     with torch.no_grad():
-        output = capture.depth(pipe, name, neighbours, seed=options.seed, points=options.points, **call)
-    image = capture.image(name)
-    report = frame_report(capture, name, neighbours, output)
-    with _replacing(options.out / name) as folder:
-        report["files"] = write(folder, output, image)
-        depth = np.asarray(output.prediction)[0, ..., 0]
-        sure = output.confidence
+        return capture.depth(pipe, name, options.neighbours, seed=options.seed, points=points, **call)
+
+
+@dataclass(eq=False)
+class _Work:
+    """What a process needs for frames; the prior is loaded with the first."""
+
+    capture: Capture
+    options: CaptureOptions
+    write: Writer
+    pipe: Any = None
+
+    def __call__(self, item: Item) -> dict[str, Any]:
+        """One frame: its files, and its report."""
+        self.pipe = _pipe(self.options) if self.pipe is None else self.pipe
+        name, started = item.key, time.perf_counter()
+        output = _depth(self.capture, self.pipe, name, self.options, self.options.points)
+        depth, sure = np.asarray(output.prediction)[0, ..., 0], output.confidence
         confidence = np.full_like(depth, 0.5) if sure is None else np.asarray(sure)[0, ..., 0]
-        for file, values in zip(ALONE, (depth, confidence), strict=True):
-            np.save(folder / file, values.astype(np.float32))
-        report["seconds"] = round(time.perf_counter() - started, 2)
-        _write_json(folder / REPORT, report)
-    return report
+        report = _frame_report(self.capture, name, self.options.neighbours, output)
+
+        def fill(folder: Path) -> None:
+            report["files"] = self.write(folder, output, self.capture.image(name))
+            for file, values in zip(ALONE, (depth, confidence), strict=True):
+                np.save(folder / f"{file}.npy", values.astype(np.float32))
+            report["seconds"] = round(time.perf_counter() - started, 2)
+            _write_json(folder / REPORT, report)
+
+        with OutFolder(self.options.out / name, overwrite=True) as out:
+            out.write(fill)
+        return report
 
 
-def frame_key(capture: Capture, options: CaptureOptions) -> str:
-    """Of everything that a frame's depth depends on."""
-    of = "poses neighbours points metres_per_unit known_length distance k fov trajectory prior steps seed"
-    return options.key(capture.names, *of.split())
-
-
-def frame_report(
-    capture: Capture, name: str, neighbours: Sequence[str], output: MetricDepthOutput
-) -> dict[str, Any]:
+def _frame_report(capture: Capture, name: str, neighbours: int, output: MetricDepthOutput) -> dict[str, Any]:
     """What ``report.json`` of a frame says."""
     solved, number = capture.solve(), capture.names.index(name)
-    depth = np.asarray(output.prediction)[0, ..., 0]
-    low, middle, high = (float(v) for v in np.percentile(depth, (2, 50, 98)))
-    spread = solved.scale_spread
+    low, middle, high = (float(v) for v in np.percentile(np.asarray(output.prediction), (2, 50, 98)))
     return {
         "version": __version__,
         "frame": name,
-        "neighbours": list(neighbours),
+        "neighbours": capture.neighbours(name, neighbours),
         "unit": output.unit,
         "K": np.asarray(output.K)[0].tolist(),
         "T_world_from_camera": solved.E[number].tolist(),
         "connected": bool(solved.connected[number]),
-        "scale_spread": None if math.isnan(spread) else round(spread, 4),
+        "scale_spread": _rounded(solved.scale_spread),
         "depth": {"p02": low, "median": middle, "p98": high},
         "poses": [pose.status for pose in output.poses],
         "trusted": [bool(verdict.trusted) for verdict in output.verdicts],
@@ -210,23 +203,8 @@ def frame_report(
     }
 
 
-class _replacing:  # noqa: N801
-    """A folder filled beside its place, which it takes when the block ends well."""
-
-    def __init__(self, target: Path) -> None:
-        self.target = target
-        self.folder = target.with_name(f".{target.name}.{os.getpid()}")
-
-    def __enter__(self) -> Path:
-        self.folder.mkdir(parents=True)
-        return self.folder
-
-    def __exit__(self, kind: Any, *_: object) -> None:
-        if kind is None:
-            shutil.rmtree(self.target, ignore_errors=True)
-            os.replace(self.folder, self.target)
-        else:
-            shutil.rmtree(self.folder, ignore_errors=True)
+def _rounded(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
 
 
 def _write_json(path: Path, data: Any) -> None:
@@ -257,7 +235,7 @@ def run_frames(
             journal.forget(item)
     left = sum(journal.get(item) is None for item in items)
     on_cpu = pick_device(options.device).type == "cpu"
-    wanted = options.processes or (min(_cores(), _memory_processes()) if on_cpu else 1)
+    wanted = options.processes or (min(available_cores(), _memory_processes()) if on_cpu else 1)
     count = max(1, min(wanted, left)) if this_process().count == 1 else 1
     options = replace(options, processes=count)
     context = multiprocessing.get_context("spawn")
@@ -269,7 +247,7 @@ def run_frames(
         helper.start()
     threads = torch.get_num_threads()
     try:
-        return _work(capture, options, names, write, journal, items)
+        return _work(capture, options, write, journal, items)
     finally:
         torch.set_num_threads(threads)
         for helper in helpers:
@@ -278,38 +256,28 @@ def run_frames(
 
 
 def _job(capture: Capture, options: CaptureOptions, names: Sequence[str]) -> tuple[Journal, list[Item]]:
-    key = frame_key(capture, options)
+    key = options.key(capture.names, *OF_POSES, *OF_FRAME)
     return Journal(options.out / JOURNAL), [Item(name, inputs=key) for name in names]
 
 
 def _work(
-    capture: Capture,
-    options: CaptureOptions,
-    names: Sequence[str],
-    write: Writer,
-    journal: Journal,
-    items: list[Item],
+    capture: Capture, options: CaptureOptions, write: Writer, journal: Journal, items: list[Item]
 ) -> list[dict[str, Any]]:
     """This process's part of the frames."""
-    global _worker
-    torch.set_num_threads(1 if (options.processes or 1) > 1 else _cores())
-    survives = (InputError, OSError, ValueError, RuntimeError)
-    quiet = options.quiet
+    torch.set_num_threads(1 if (options.processes or 1) > 1 else max(1, available_cores()))
     runner = Runner(
         items,
         journal,
         noun="frame",
-        survives=survives,
-        progress=not quiet,
+        survives=(InputError, OSError, ValueError, RuntimeError),
+        progress=not options.quiet,
         whole=partial(_whole, options.out),
     )
-    if any(journal.get(item) is None for item in items):
-        _worker = capture, _pipe(options, pick_device(options.device)), options, write
-    return runner.run(_frame)
+    return runner.run(_Work(capture, options, write))
 
 
 def _whole(out: Path, item: Item, record: dict[str, Any]) -> bool:
-    return (out / item.key / "depth.npy").is_file()
+    return all((out / item.key / f"{file}.npy").is_file() for file in ALONE)
 
 
 def _help(options: CaptureOptions, names: Sequence[str], write: Writer, index: int, count: int) -> None:
@@ -318,7 +286,7 @@ def _help(options: CaptureOptions, names: Sequence[str], write: Writer, index: i
     options = replace(options, overwrite=False, quiet=True)
     capture = open_capture(options)
     solved_poses(capture, options)
-    _work(capture, options, names, write, *_job(capture, options, names))
+    _work(capture, options, write, *_job(capture, options, names))
 
 
 def _memory_processes() -> int:
@@ -344,11 +312,6 @@ def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], Non
     Raises:
         OSError, InputError: bad input, before any depth is computed where it can be seen that early.
     """
-    check_choice(options.poses, "--poses", ("refined", "given"))
-    check_choice(options.points, "--points", ("none", "model", "depth"))
-    for kind in options.export:
-        check_choice(kind, "--export", ("colmap", "mesh"))
-    check_number(options.neighbours, "--neighbours", 1, 32, integer=True)
     started = time.perf_counter()
     capture = open_capture(options)
     names = capture.choose(options.frames)
@@ -358,11 +321,10 @@ def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], Non
         say(_forecast(capture, len(names)))
     options.out.mkdir(parents=True, exist_ok=True)
     solved_poses(capture, options)
-    solved = capture.solve()
     seconds = {"poses": round(time.perf_counter() - started, 1)}
     if not options.quiet:
         say(pose_line(capture))
-    for note in solved.notes:
+    for note in capture.solve().notes:
         say(f"warning: {note}")
     frames = run_frames(capture, options, names, write)
     seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
@@ -388,11 +350,12 @@ def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], Non
 def _forecast(capture: Capture, chosen: int) -> str:
     """How long a large capture will take, before it begins."""
     width, height = capture.files.frames[0].size
-    megapixels = width * height / 1e6
-    hours = (len(capture) * 1.0 + chosen * 12 * max(1.0, megapixels / 0.3) ** 0.5) / _cores() / 3600
+    of_size = max(1.0, width * height / 3e5) ** 0.5
+    hours = (len(capture) * POSE_S + chosen * DEPTH_S * of_size) / available_cores() / 3600
     return (
-        f"{len(capture)} frames, depth of {chosen}: about {hours:.1f} h on {_cores()} cores with the bundled "
-        f"prior, {len(capture) * 0.4 / 1000:.1f} GB for features. --frames FIRST:LAST:STEP chooses fewer."
+        f"{len(capture)} frames, depth of {chosen}: about {hours:.1f} h on {available_cores()} cores with "
+        f"the bundled prior, {len(capture) * POSE_BYTES / 1e9:.1f} GB for features. --frames FIRST:LAST:STEP "
+        "chooses fewer."
     )
 
 
@@ -422,12 +385,11 @@ def pose_report(capture: Capture) -> dict[str, Any]:
         "scale_by_depth": solved.scale_depth[0],
         "scale_spread": solved.scale_spread,
     }
+    each = zip(capture.names, solved.connected, solved.moved, solved.turned_deg, strict=True)
     frames = {
         name: {"connected": bool(c), "moved": round(float(m), 5), "turned_deg": round(float(t), 3)}
-        for name, c, m, t in zip(
-            capture.names, solved.connected, solved.moved, solved.turned_deg, strict=True
-        )
+        for name, c, m, t in each
         if math.isfinite(m)
     }
-    shown = {name: round(v, 4) if math.isfinite(v) else None for name, v in numbers.items()}
+    shown = {name: _rounded(value) for name, value in numbers.items()}
     return {"status": solved.status, **shown, "notes": list(solved.notes), "frames": frames}

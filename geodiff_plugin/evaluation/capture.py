@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,17 +12,18 @@ from scipy.spatial import cKDTree
 
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.capture.agreement import DepthFrame
+from geodiff_plugin.capture.agreement import DepthFrame, agreed, seen_in
 from geodiff_plugin.capture.capture import Capture
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page
+from geodiff_plugin.evaluation.baselines import PriorCache
+from geodiff_plugin.evaluation.experiment import Experiment
+from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.options import CaptureEvalOptions, command_line
+from geodiff_plugin.evaluation.report import Page
 from geodiff_plugin.evaluation.table import Table
 from geodiff_plugin.formats.depth import read_depth_mm_png
-from geodiff_plugin.priors import load_prior
-from geodiff_plugin.runner import Item, Journal, Runner, fingerprint
-from geodiff_plugin.runtime.machine import pick_device
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.runner import Item, Record, fingerprint
 
-__all__ = ["ROWS", "CaptureEvalOptions", "f_score", "run_capture_eval", "temporal_error"]
+__all__ = ["ROWS", "f_score", "run_capture_eval", "temporal_error"]
 
 #: Rows: title, poses of the capture, knob ``pose`` of every call.
 ROWS = {
@@ -33,37 +33,16 @@ ROWS = {
 }
 #: Distance within which a point of a cloud counts as right, metres, and the clouds' grid.
 RIGHT_M, CELL_M = 0.05, 0.02
-
-
-@dataclass(frozen=True)
-class CaptureEvalOptions:
-    """What to measure.
-
-    Attributes:
-        command: as typed, for the page.
-        data: a capture that names depth maps in millimetres.
-        frames: ``NAME,NAME`` or ``FIRST:LAST:STEP``.
-        neighbours: numbers of right views, a column each.
-        rows: keys of ``ROWS``.
-        prior: ``"bundled"``, a hub id or a folder.
-        seed: of the noise.
-        device: as ``--device``.
-        out: folder of the records; a run goes on where it was stopped.
-        results: where the Markdown page is written as well.
-        quiet: no progress bar.
-    """
-
-    command: str
-    data: Path
-    frames: str | None = None
-    neighbours: tuple[int, ...] = (2, 3, 5)
-    rows: tuple[str, ...] = tuple(ROWS)
-    prior: str = "bundled"
-    seed: int = 0
-    device: str = "auto"
-    out: Path = Path("geodiff-eval")
-    results: Path | None = None
-    quiet: bool = False
+#: A point that the next frame sees this much nearer or further is hidden there.
+HIDDEN_SHARE = 0.3
+HEADER = ("poses", "views", "AbsRel", "worst", "scaled", "scale", "within 3 %", "within 25 %", "agreed")
+HEADER += ("F 5 cm", "TAE %")
+NOTE = (
+    "AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its median. "
+    "Scale: median of depth over truth. Agreed: AbsRel after the frames of the table were checked against "
+    "each other. F: of the fused cloud beside that of the true depth under the same poses. TAE: of frames "
+    "one after the other, as chosen."
+)
 
 
 def f_score(points: np.ndarray, truth: np.ndarray, right_m: float = RIGHT_M) -> tuple[float, float, float]:
@@ -88,98 +67,45 @@ def temporal_error(frames: Sequence[DepthFrame]) -> float:
 
     Source: Chen et al. 2025 (Video Depth Anything), S4.1; both directions, AbsRel over what both see.
     """
-    errors = [_moved_error(a, b) for a, b in zip(frames, frames[1:], strict=False)]
-    errors += [_moved_error(b, a) for a, b in zip(frames, frames[1:], strict=False)]
+    errors = []
+    for pair in zip(frames, frames[1:], strict=False):
+        for frame, other in (pair, pair[::-1]):
+            row, column, z, inside = seen_in(frame, other)
+            off = np.abs(z[inside] / other.depth[row, column][inside] - 1)
+            errors.append(off[off < HIDDEN_SHARE].mean() if (off < HIDDEN_SHARE).sum() >= 100 else np.nan)
     return 100 * float(np.nanmean(errors)) if errors and not np.isnan(errors).all() else float("nan")
 
 
-def _moved_error(frame: DepthFrame, other: DepthFrame) -> float:
-    points = world_points(frame, np.ones(frame.depth.shape, bool))
-    T = np.linalg.inv(other.E)
-    x, y, z = _project(points, T, other.K)
-    height, width = other.depth.shape
-    u, v = np.rint(x).astype(int), np.rint(y).astype(int)
-    seen = (z > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    if seen.sum() < 100:
-        return float("nan")
-    there = other.depth[v[seen], u[seen]]
-    off = np.abs(z[seen] / there - 1)
-    return float(off[off < 0.3].mean())  # beyond it another surface hides the point
-
-
-def _project(points: np.ndarray, T: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    at = points @ T[:3, :3].T + T[:3, 3]
-    z = np.where(np.abs(at[:, 2]) < 1e-9, 1e-9, at[:, 2])
-    return K[0, 0] * at[:, 0] / z + K[0, 2], K[1, 1] * at[:, 1] / z + K[1, 2], at[:, 2]
-
-
-def world_points(frame: DepthFrame, mask: np.ndarray) -> np.ndarray:
-    """``(N, 3)`` points of a frame in the world."""
-    v, u = np.nonzero(mask)
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame.K).T
-    return rays * frame.depth[v, u][:, None] @ frame.E[:3, :3].T + frame.E[:3, 3]
-
-
-def _thin(points: np.ndarray) -> np.ndarray:
-    return points[np.unique(np.floor(points / CELL_M).astype(np.int64), axis=0, return_index=True)[1]]
-
-
-def run_capture_eval(options: CaptureEvalOptions) -> Page:
+def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
     """Measure every row and number of neighbours, and write the page.
 
     Raises:
         InputError: a capture without depth maps, bad options.
         OSError: missing or unreadable files.
     """
-    captures = {poses: Capture.open(options.data) for _, poses, _ in (ROWS[row] for row in options.rows)}
-    names = next(iter(captures.values())).choose(options.frames)
-    if any(next(iter(captures.values())).frame(name).depth is None for name in names):
+    captures = {poses: Capture.open(options.data) for poses in ("given", "refined")}
+    names = captures["given"].choose(options.frames)
+    if any(captures["given"].frame(frame).depth is None for frame in names):
         bad_value("DIR", "a capture that names depth maps of its frames", f"{options.data}")
-    for poses, capture in captures.items():
-        capture.solve(poses)
-    device = pick_device(options.device)
-    pipe = enable_geometry_guidance(load_prior(options.prior).to(device))
-    pipe.set_progress_bar_config(disable=True)
-    asked = fingerprint(__version__, str(options.data.resolve()), options.prior, options.seed, names)
-    cells = [(row, count) for row in options.rows for count in options.neighbours]
-    items = [
-        Item(f"{row} {count} {name}", (row, count, name), asked) for row, count in cells for name in names
+    priors, settings = PriorCache(), options.settings
+    pipe, prior = priors.get(settings), priors.fingerprint(settings)
+    how = (str(options.data.resolve()), names, options.prior, prior, options.seed, options.steps, __version__)
+    cells = [
+        Item(
+            fingerprint(row, count, *how),
+            partial(_measure, captures[ROWS[row][1]], pipe, row, count, names, options),
+            name=f"{ROWS[row][0]}, {1 + count} views",
+            head={"row": ROWS[row][0], "views": str(1 + count)},
+        )
+        for row in options.rows
+        for count in options.neighbours
     ]
-
-    def work(item: Item) -> dict[str, Any]:
-        row, count, name = item.payload
-        _, poses, pose = ROWS[row]
-        capture = captures[poses]
-        with torch.no_grad():
-            out = capture.depth(pipe, name, count, seed=options.seed, knobs={"pose": pose})
-        depth = np.asarray(out.prediction)[0, ..., 0]
-        file = options.out / "depth" / row / str(count) / f"{name}.npy"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        np.save(file, depth.astype(np.float32))
-        return {"row": row, "neighbours": count, "frame": name, **_scores(depth, *_truth(capture, name))}
-
-    journal = Journal(options.out / "capture.jsonl")
-    records = Runner(items, journal, noun="frame", progress=not options.quiet).run(work)
-    rows = []
-    for row, count in cells:
-        own = [r for r in records if (r["row"], r["neighbours"]) == (row, count)]
-        folder = options.out / "depth" / row / str(count)
-        rows.append(_row(captures[ROWS[row][1]], ROWS[row][0], count, own, folder))
-    if "refined" in captures:
-        rows.append(_row_of_points(captures["refined"], names))
-    header = (
-        *("poses", "views", "AbsRel", "worst", "scaled", "scale"),
-        *("within 3 %", "within 25 %", "F 5 cm", "TAE %"),
-    )
-    note = (
-        "AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its "
-        "median. Scale: median of depth over truth. F: of the fused cloud beside that of the true depth "
-        "under the same poses. TAE: of frames one after the other, as chosen."
-    )
+    work = partial(_of_points, captures["refined"], names)
+    head = {"row": "COLMAP's sparse points", "views": "all"}
+    cells.append(Item(fingerprint("points", *how), work, name="sparse points", head=head))
     title = f"{options.data.name}, {len(names)} frames"
-    page = Page("Captures", run_facts(options.command), (Table(title, header, tuple(rows), note),), ())
-    write_page(page, options.out, "capture", options.results)
-    return page
+    experiment = Experiment(name, "Captures", cells, lambda records: [_table(title, records)])
+    return experiment.run(options, command_line(name, options))
 
 
 def _truth(capture: Capture, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -188,42 +114,44 @@ def _truth(capture: Capture, name: str) -> tuple[np.ndarray, np.ndarray]:
     return read_depth_mm_png(file, f"the depth map of {name}")
 
 
-def _scores(depth: np.ndarray, truth: np.ndarray, known: np.ndarray) -> dict[str, float]:
-    d, t = depth[known], truth[known]
-    ratio, factor = np.maximum(d / t, t / d), float(np.median(t / d))
-    return {
-        "abs_rel": float(np.mean(np.abs(d / t - 1))),
-        "scaled": float(np.mean(np.abs(factor * d / t - 1))),
-        "scale": 1 / factor,
-        "delta_103": float((ratio < 1.03).mean()),
-        "delta_125": float((ratio < 1.25).mean()),
-    }
+def _measure(
+    capture: Capture, pipe: Any, row: str, count: int, names: Sequence[str], options: CaptureEvalOptions
+) -> Record:
+    """Depth of every frame by one row and number of neighbours, and its scores."""
+    solved, call = capture.solve(ROWS[row][1]), {}
+    if options.steps is not None:
+        call = {"num_inference_steps": options.steps}
+    frames, true_frames, known = [], [], []
+    for name in names:
+        with torch.no_grad():
+            knobs = {"pose": ROWS[row][2]}
+            out = capture.depth(pipe, name, count, seed=options.seed, knobs=knobs, **call)
+        i, depth = capture.names.index(name), np.asarray(out.prediction)[0, ..., 0]
+        confidence = np.ones_like(depth) if out.confidence is None else np.asarray(out.confidence)[0, ..., 0]
+        truth, valid = _truth(capture, name)
+        frames.append(DepthFrame(name, depth, confidence, solved.K[i], solved.E[i]))
+        true_frames.append(DepthFrame(name, truth, np.ones_like(depth), solved.K[i], solved.E[i]))
+        known.append(valid)
+    together = [agreed(frame, [other for other in frames if other is not frame]) for frame in frames]
+    both = [_thin(kind, known) for kind in (together, true_frames)]
+    scores = [
+        _scores(frame.depth, true.depth, mask)
+        for frame, true, mask in zip(frames, true_frames, known, strict=True)
+    ]
+    off = [
+        _scores(frame.depth, true.depth, mask)["abs_rel"]
+        for frame, true, mask in zip(together, true_frames, known, strict=True)
+    ]
+    more = {"agreed": float(np.mean(off)), "f": f_score(*both)[2], "tae": temporal_error(together)}
+    return _means(scores) | more
 
 
-def _row(
-    capture: Capture, title: str, count: int, records: Sequence[dict[str, Any]], folder: Path
-) -> tuple[str, ...]:
-    solved = capture.solve()
-    frames, points, true_points = [], [], []
-    for record in records:
-        i = capture.names.index(record["frame"])
-        truth, known = _truth(capture, record["frame"])
-        depth = np.load(folder / f"{record['frame']}.npy")
-        frames.append(DepthFrame(record["frame"], depth, np.ones_like(depth), solved.K[i], solved.E[i]))
-        points.append(_thin(world_points(frames[-1], known)))
-        true = DepthFrame(record["frame"], truth, np.ones_like(depth), solved.K[i], solved.E[i])
-        true_points.append(_thin(world_points(true, known)))
-    score = f_score(_thin(np.concatenate(points)), _thin(np.concatenate(true_points)))[2]
-    means = {
-        n: float(np.mean([r[n] for r in records])) for n in records[0] if isinstance(records[0][n], float)
-    }
-    worst = max(record["abs_rel"] for record in records)
-    shown = [f"{v:.4f}" for v in (means["abs_rel"], worst, means["scaled"])]
-    shown += [f"{v:.3f}" for v in (means["scale"], means["delta_103"], means["delta_125"], score)]
-    return (title, str(1 + count), *shown, f"{temporal_error(frames):.2f}")
+def _thin(frames: Sequence[DepthFrame], known: Sequence[np.ndarray]) -> np.ndarray:
+    points = np.concatenate([frame.world(mask) for frame, mask in zip(frames, known, strict=True)])
+    return points[np.unique(np.floor(points / CELL_M).astype(np.int64), axis=0, return_index=True)[1]]
 
 
-def _row_of_points(capture: Capture, names: Sequence[str]) -> tuple[str, ...]:
+def _of_points(capture: Capture, names: Sequence[str]) -> Record:
     """The solve's own sparse points, at their pixels."""
     solved, scores = capture.solve(), []
     for name in names:
@@ -234,11 +162,29 @@ def _row_of_points(capture: Capture, names: Sequence[str]) -> tuple[str, ...]:
         u, v = np.rint(seen.px).astype(int).T.clip(0, np.array(truth.shape[::-1])[:, None] - 1)
         there = known[v, u] & (z > 0)
         if there.any():
-            scores.append(_scores(z[there], truth[v, u][there], np.ones(int(there.sum()), bool)))
-    if not scores:
-        return ("COLMAP's sparse points", *["-"] * 9)
-    means = {n: float(np.mean([s[n] for s in scores])) for n in scores[0]}
-    worst = max(s["abs_rel"] for s in scores)
-    shown = [f"{v:.4f}" for v in (means["abs_rel"], worst, means["scaled"])]
-    shown += [f"{v:.3f}" for v in (means["scale"], means["delta_103"], means["delta_125"])]
-    return ("COLMAP's sparse points", "all", *shown, "-", "-")
+            scores.append(_scores(z[None], truth[v, u][None], there[None]))
+    return _means(scores) if scores else {}
+
+
+def _scores(depth: np.ndarray, truth: np.ndarray, known: np.ndarray) -> dict[str, float]:
+    scores = evaluate_depth(depth, truth, known)
+    ratio = depth[known] / truth[known]
+    scale = float(np.median(ratio))
+    scaled = {"scaled": float(np.mean(np.abs(ratio / scale - 1))), "scale": scale}
+    within = {"delta_103": float((np.maximum(ratio, 1 / ratio) < 1.03).mean()), "delta_125": scores["delta1"]}
+    return {"abs_rel": scores["abs_rel"]} | scaled | within
+
+
+def _means(scores: Sequence[dict[str, float]]) -> Record:
+    worst = {"worst": max(each["abs_rel"] for each in scores)}
+    return {name: float(np.mean([each[name] for each in scores])) for name in scores[0]} | worst
+
+
+def _table(title: str, records: Sequence[Record]) -> Table:
+    digits = {"abs_rel": 4, "worst": 4, "scaled": 4, "scale": 3, "delta_103": 3, "delta_125": 3, "agreed": 4}
+    digits |= {"f": 3, "tae": 2}
+    rows = [
+        (r["row"], r["views"], *(f"{r[key]:.{n}f}" if key in r else "-" for key, n in digits.items()))
+        for r in records
+    ]
+    return Table(title, HEADER, tuple(rows), NOTE)

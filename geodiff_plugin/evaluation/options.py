@@ -22,9 +22,11 @@ if TYPE_CHECKING:
     from geodiff_plugin.evaluation.datasets.sample import SampleRef
 
 __all__ = [
+    "CAPTURE_ROWS",
     "COMMANDS",
     "PAIRS_METHODS",
     "POSES",
+    "CaptureEvalOptions",
     "Command",
     "DirOptions",
     "EvalOptions",
@@ -47,6 +49,8 @@ PAIRS_METHODS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 CROPS = ("none", "garg", "eigen", "benchmark")
 POSES = ("refine", "given", "estimated")
 """Where ``guided`` has poses from: refined, as given, or withheld but for the baseline's length."""
+CAPTURE_ROWS = ("given", "pairs", "capture")
+"""Poses of a capture: as given, refined pair by pair, solved together."""
 DTYPES = ("float32", "float16", "bfloat16")
 #: Fields that are those of ``Settings``.
 SETTINGS = ("ensemble", "seed", "steps", "resolution", "dtype", "space", "views")
@@ -285,6 +289,22 @@ class PosesOptions(EvalOptions):
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class CaptureEvalOptions(EvalOptions):
+    """``geodiff eval capture DIR``."""
+
+    data: Path = declare(
+        MISSING, "A capture that names depth maps (16-bit PNG, millimetres).", "", metavar="DIR"
+    )
+    frames: str | None = declare(None, "NAME,NAME or FIRST:LAST:STEP; all by default.")
+    neighbours: tuple[int, ...] = declare(
+        (2, 3, 5), "Comma-separated numbers of right views.", split=True, low=1, high=32
+    )
+    rows: tuple[str, ...] = declare(
+        CAPTURE_ROWS, "Comma-separated: given, pairs, capture.", split=True, choices=CAPTURE_ROWS
+    )
+
+
 class Command(NamedTuple):
     """A command of ``geodiff eval``: its options, what it does, and ``module:function`` in this package."""
 
@@ -350,6 +370,11 @@ COMMANDS: dict[str, Command] = {
         PosesOptions,
         "Accuracy with poses as given, perturbed, refined and estimated, and of rigs that have drifted.",
         "poses:run_poses",
+    ),
+    "capture": Command(
+        CaptureEvalOptions,
+        "Depth of a capture with its poses as given, refined by pairs, and solved together (extra capture).",
+        "capture:run_capture_eval",
     ),
 }
 """Every command but ``list``, by name."""

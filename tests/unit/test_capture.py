@@ -149,24 +149,24 @@ def depth_frame(i: int, factor: float = 1.0, confidence: float = 0.6) -> DepthFr
     return DepthFrame(f"f{i}", depth * np.float32(factor), np.full_like(depth, confidence), K, TRUE[i])
 
 
-def test_agreement_averages_within_the_error_and_marks_the_rest():
-    truth = depth_frame(4)
-    wrong = depth_frame(4, 1.03)
+def test_agreement_averages_within_the_error_marks_what_is_alone_and_outvotes_it():
+    truth, wrong = depth_frame(4), depth_frame(4, 1.03)
     wrong.depth[60:90, 80:110] *= 0.7  # an error of this frame alone
-    checked = agreed(wrong, [depth_frame(3, 0.99), depth_frame(5, 1.01), depth_frame(6)])
-    middle = np.zeros(truth.depth.shape, bool)
-    middle[20:-20, 40:-40] = True
-    hole = np.zeros_like(middle)
-    hole[62:88, 82:108] = True
-    off = np.abs(checked.depth / truth.depth - 1)
-    assert np.median(off[middle & ~hole]) < 0.02  # from 0.03
-    assert (checked.confirmed[middle & ~hole] > 0).mean() > 0.9
-    assert (checked.confirmed[hole] == 0).mean() > 0.95 and (checked.asked[hole] > 0).mean() > 0.95
-    np.testing.assert_allclose(checked.depth[hole], wrong.depth[hole], rtol=1e-5)
-    assert np.median(checked.confidence[middle & ~hole]) > 0.6 + 0.1
-    np.testing.assert_allclose(checked.confidence[hole], 0.6, atol=1e-6)
-    alone = agreed(wrong, [])
-    np.testing.assert_allclose(alone.depth, wrong.depth, rtol=1e-6)
+    middle, hole = (np.zeros(truth.depth.shape, bool) for _ in range(2))
+    middle[20:-20, 40:-40] = hole[62:88, 82:108] = True
+    one = agreed(wrong, [depth_frame(5)])
+    assert (one.confirmed[hole] == 0).mean() > 0.95 and (one.asked[hole] > 0).mean() > 0.95
+    np.testing.assert_allclose(one.depth[hole], wrong.depth[hole], rtol=1e-5)
+    np.testing.assert_allclose(one.confidence[hole], 0.6, atol=1e-6)
+    three = agreed(wrong, [depth_frame(3, 0.99), depth_frame(5, 1.01), depth_frame(6)])
+    off = np.abs(three.depth / truth.depth - 1)
+    assert np.median(off[middle & ~hole]) < 0.02 and np.median(off[hole]) < 0.02
+    assert (three.confirmed[middle] > 0).mean() > 0.9 and (three.confirmed[hole] > 1).mean() > 0.9
+    assert np.median(three.confidence[middle & ~hole]) > 0.6 + 0.1
+    sure = replace(wrong, confidence=np.ones_like(wrong.depth))
+    doubtful = [depth_frame(i, confidence=0.1) for i in (3, 5)]
+    np.testing.assert_allclose(agreed(sure, doubtful).depth[hole], wrong.depth[hole], rtol=1e-5)
+    np.testing.assert_allclose(agreed(wrong, []).depth, wrong.depth, rtol=1e-6)
 
 
 def test_the_cloud_lies_on_the_walls_and_its_normals_look_inside():

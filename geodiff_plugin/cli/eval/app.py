@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import typer
 
 from geodiff_plugin.cli.commands import add_command
-from geodiff_plugin.cli.eval.capture import add_capture
 from geodiff_plugin.evaluation.options import COMMANDS
 from geodiff_plugin.formats.out import check_out
 
@@ -42,7 +41,6 @@ def _run(name: str, options: Any) -> None:
 
 for _name, _command in COMMANDS.items():
     add_command(eval_app, _name, _command.options, partial(_run, _name), _command.about)
-add_capture(eval_app)
 
 
 @eval_app.command("list")
