@@ -37,6 +37,7 @@ OFF_MIDDLE, NEARLY_ALIKE = 0.12, 0.08
 #: Pixels are about square; a stretched image has them up to 16:9, and a mistyped digit beyond.
 STRETCHED = 2.0
 SCALED_K = "with s = new size / old size take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy"
+POSE = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t], [0, 1]], t in metres."
 
 
 def _as_matrix(value: Any, name: str, cure: str, *shapes: tuple[int, int]) -> np.ndarray:
@@ -133,16 +134,15 @@ def _off_alike(x: float, y: float) -> bool:
     return least > OFF_MIDDLE and abs(x - y) < NEARLY_ALIKE
 
 
-def check_pose(E: Any, name: str = "E") -> np.ndarray:
+def check_pose(E: Any, name: str = "E", cure: str = POSE) -> np.ndarray:
     """A ``(4, 4)`` float64 rigid transform; a rotation off by at most 1e-2 is projected to the nearest one.
 
-    A 3x4 gets the row 0 0 0 1.
+    A 3x4 gets the row 0 0 0 1; ``cure`` ends the messages.
 
     Raises:
         TypeError, ValueError: neither 4x4 nor 3x4, not finite, last row not (0, 0, 0, 1), no rotation,
             mirrored.
     """
-    cure = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t], [0, 1]], t in metres."
     E = _as_matrix(E, name, cure, (4, 4), (3, 4))
     if len(E) == 3:
         E = np.vstack([E, (0.0, 0.0, 0.0, 1.0)])

@@ -9,7 +9,6 @@ import itertools
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +42,12 @@ LEAST_ERROR = 0.05
 VIDEO_SUFFIXES = (".mp4", ".webp", ".gif")
 #: Of a frame with its photograph, pixels.
 MOST_VIDEO_WIDTH = 960
-DPI = 100
+#: A power of two: figures in inches are whole pixels again.
+DPI = 128
+POINTS_PER_PIXEL = 72 / DPI
+
+#: Shares of a colour bar with the text beside them.
+Marks = tuple[tuple[float, str], ...]
 
 
 def _as_map(values: Any, name: str = "depth_m") -> np.ndarray:
@@ -71,11 +75,8 @@ def depth_range(
 ) -> tuple[float, float]:
     """The depths at the two ends of the colours, ``0 < near < far`` in metres.
 
-    Args:
-        depth_m: ``(H, W)`` metres, numpy or torch.
-        valid: ``(H, W)`` boolean; pixels that are not finite or not above 0 never count.
-        near: nearest depth in metres, > 0; ``None`` takes the 2nd percentile.
-        far: farthest depth in metres; ``None`` takes the 98th percentile.
+    ``depth_m`` is ``(H, W)`` metres, numpy or torch; pixels that are not finite, not above 0 or not ``valid``
+    never count. Without ``near`` and ``far`` the ends are the 2nd and the 98th percentile.
 
     Raises:
         ValueError: ``near`` or ``far`` not above 0 and finite, or ``near >= far`` when both are given.
@@ -151,67 +152,57 @@ def colour_share(values: np.ndarray, top: float = 1.0) -> np.ndarray:
     return _coloured(values, np.isfinite(values), lambda v: v / top, SHARE_COLOURS)
 
 
-def _drawn(width: int, height: int, draw: Callable[[Any], None]) -> np.ndarray:
-    """``(height, width, 3)`` uint8 of what is drawn into a white figure of matplotlib."""
+def _drawn(picture: np.ndarray, draw: Callable[[Any], None]) -> Image.Image:
+    """A picture ``(H, W, 3)`` of uint8 with what matplotlib draws over it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(picture.shape[1] / DPI, picture.shape[0] / DPI), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
+    figure.figimage(picture, zorder=-1)  # below the axes
     draw(figure)
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[:height, :width, :3]
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
-def _points(pixels: float) -> float:
-    return pixels * 72 / DPI
-
-
-Marks = tuple[tuple[float, str], ...]
-
-
-@lru_cache(maxsize=8)
-def _bar(
-    height: int, colours: str, label: str, marks: tuple[tuple[float, str], ...], unknown: bool
-) -> np.ndarray:
-    """Colour bar with marks at shares of it, and where pixels are unknown a grey key."""
-    size = max(12, height // 26)
-    gap, bar = size // 2, max(14, height // 24)
-    width, low, high = gap + bar + 5 * size, size * (3 if unknown else 1), height - 2 * size
-    letters = {"fontsize": _points(size), "color": "black"}
+def _figure(
+    picture: np.ndarray, colours: str, label: str, marks: Marks, unknown: bool, title: str | None = None
+) -> Image.Image:
+    """A picture beside its colour bar with marks, and where pixels are unknown a grey key."""
+    factor = math.ceil(FIGURE_MIN_HEIGHT / len(picture))  # a whole one, so that pixels stay squares
+    picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
+    size = max(12, len(picture) // 26)
+    gap, bar, head = size // 2, max(14, len(picture) // 24), 0 if title is None else 2 * size
+    sheet = np.pad(picture, ((head, 0), (0, gap + bar + 5 * size), (0, 0)), constant_values=255)
+    high, wide = sheet.shape[:2]
+    x, thick, letters = (picture.shape[1] + gap) / wide, bar / wide, {"fontsize": size * POINTS_PER_PIXEL}
 
     def draw(figure: Any) -> None:
-        axes = figure.add_axes((gap / width, low / height, bar / width, (high - low) / height))
-        axes.imshow(
-            np.linspace(0, 1, 512)[:, None], cmap=colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1)
-        )
+        low = size * (3 if unknown else 1)
+        axes = figure.add_axes((x, low / high, thick, (len(picture) - 2 * size - low) / high))
+        ramp = np.linspace(0, 1, 512)[:, None]
+        axes.imshow(ramp, cmap=colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1))
         axes.set_xticks([])
         axes.yaxis.tick_right()
         axes.set_yticks([share for share, _ in marks], [text for _, text in marks], **letters)
-        axes.tick_params(length=_points(size / 3), pad=_points(size / 4))
-        figure.text(gap / width, 1 - 0.9 * size / height, label, va="center", **letters)
+        axes.tick_params(length=size * POINTS_PER_PIXEL / 3, pad=size * POINTS_PER_PIXEL / 4)
+        figure.text(x, (len(picture) - 0.9 * size) / high, label, va="center", **letters)
         if unknown:
-            key = figure.add_axes(
-                (gap / width, size / height, bar / width, size / height), facecolor=str(GREY / 255)
-            )
+            key = figure.add_axes((x, size / high, thick, size / high), facecolor=str(GREY / 255))
             key.set(xticks=[], yticks=[])
-            figure.text((gap + bar + size / 2) / width, 1.5 * size / height, "none", va="center", **letters)
+            figure.text(x + thick + size / 2 / wide, 1.5 * size / high, "none", va="center", **letters)
+        if title is not None:
+            _write(figure, title, (wide / 2, head / 2), size, wide)
 
-    return _drawn(width, height, draw)
-
-
-def _enlarged(picture: np.ndarray) -> np.ndarray:
-    """Small maps by a whole factor, so that pixels stay squares."""
-    factor = math.ceil(FIGURE_MIN_HEIGHT / len(picture))
-    return picture.repeat(factor, axis=0).repeat(factor, axis=1)
+    return _drawn(sheet, draw)
 
 
-def _title(text: str, width: int, height: int, size: float) -> np.ndarray:
-    """A centred line of text, smaller where it is too long."""
-    size = min(size, 1.7 * width / max(1, len(text)))
-    return _drawn(width, height, lambda figure: figure.text(
-        0.5, 0.5, text, ha="center", va="center", fontsize=_points(size), parse_math=False
-    ))  # fmt: skip
+def _write(figure: Any, text: str, at: tuple[float, float], size: float, width: float) -> None:
+    """A line of text centred at a pixel, counted from the top left, smaller where it is too long."""
+    wide, high = (side * DPI for side in figure.get_size_inches())
+    size = min(size, 1.7 * width / max(1, len(text))) * POINTS_PER_PIXEL
+    place = {"ha": "center", "va": "center"}
+    figure.text(at[0] / wide, 1 - at[1] / high, text, fontsize=size, parse_math=False, **place)
 
 
 def depth_figure(
@@ -224,32 +215,22 @@ def depth_figure(
 ) -> Image.Image:
     """A coloured depth map beside a colour bar, far on top; small maps are enlarged by a whole factor.
 
-    Args:
-        depth_m: as in ``colour_depth``, likewise ``valid``, ``near``, ``far`` and the errors.
-        valid: likewise.
-        near: likewise.
-        far: likewise.
-        title: a line above it.
-        unit: ``"m"``, or ``None`` for a depth without one, as the legend then says.
+    The map and the ends of the colours, and errors, are as for ``depth_range``. ``title`` is a line above it;
+    ``unit`` is ``"m"``, or ``None`` for a depth without one, as the legend then says.
     """
     near, far = depth_range(depth_m, valid, near, far)
-    picture = _enlarged(colour_depth(depth_m, valid, near, far))
     marks = tuple((math.log(z / near) / math.log(far / near), f"{z:g}") for z in ticks(near, far))
     unknown = not _usable(_as_map(depth_m), valid).all()
     label = "no unit" if unit is None else f"depth, {unit}"
-    figure = np.hstack([picture, _bar(len(picture), f"{DEPTH_COLOURS}_r", label, marks, unknown)])
-    if title is not None:
-        head = 2 * max(12, len(picture) // 26)
-        figure = np.vstack([_title(title, figure.shape[1], head, head / 2), figure])
-    return Image.fromarray(figure)
+    picture = colour_depth(depth_m, valid, near, far)
+    return _figure(picture, f"{DEPTH_COLOURS}_r", label, marks, unknown, title)
 
 
 def share_figure(values: np.ndarray, label: str, top: float) -> Image.Image:
     """A map ``(H, W)`` of something from 0 to ``top`` (> 0), beside a colour bar under its ``label``."""
-    picture = _enlarged(colour_share(values, top))
     marks = tuple((share, f"{share * top:.2g}") for share in (0.0, 0.25, 0.5, 0.75, 1.0))
     unknown = not np.isfinite(values).all()
-    return Image.fromarray(np.hstack([picture, _bar(len(picture), SHARE_COLOURS, label, marks, unknown)]))
+    return _figure(colour_share(values, top), SHARE_COLOURS, label, marks, unknown)
 
 
 def _as_picture(image: Any) -> Image.Image:
@@ -273,11 +254,8 @@ def grid(
 ) -> Image.Image:
     """A contact sheet: pictures side by side, each under its title.
 
-    Args:
-        images: PIL images, or ``(H, W)`` or ``(H, W, 3)`` arrays of uint8, bool or floats in [0, 1].
-        titles: one a picture; ``None`` leaves no room for them.
-        columns: pictures in a row; ``None`` takes all, up to 4.
-        cell_width: pixels that each is scaled to; heights follow, and a row is as high as its highest.
+    Pictures are PIL images, or ``(H, W)`` or ``(H, W, 3)`` arrays of uint8, bool or floats in [0, 1]. Each is
+    scaled to ``cell_width`` pixels; a row, of ``columns`` (all, up to 4), is as high as its highest.
 
     Raises:
         ValueError: no pictures, another number of titles, an array that is no picture, no columns.
@@ -291,18 +269,22 @@ def grid(
         bad_value("columns", "at least 1", columns)
     columns, gap, head = columns or min(len(pictures), 4), 6, 0 if titles is None else 24
     cells = [p.resize((cell_width, max(1, round(p.height * cell_width / p.width)))) for p in pictures]
-    rows = [range(start, min(start + columns, len(cells))) for start in range(0, len(cells), columns)]
-    heights = [head + max(cells[i].height for i in row) for row in rows]
-    size = gap + columns * (cell_width + gap), gap + sum(height + gap for height in heights)
-    sheet, top = Image.new("RGB", size, "white"), gap
-    for row, height in zip(rows, heights, strict=True):
-        for column, index in enumerate(row):
-            left = gap + column * (cell_width + gap)
-            sheet.paste(cells[index], (left, top + head))
-            if titles is not None:
-                sheet.paste(Image.fromarray(_title(titles[index], cell_width, head, 15)), (left, top))
-        top += height + gap
-    return sheet
+    rows = [cells[start : start + columns] for start in range(0, len(cells), columns)]
+    heights = [head + gap + max(cell.height for cell in row) for row in rows]
+    sheet = Image.new("RGB", (gap + columns * (cell_width + gap), gap + sum(heights)), "white")
+    places = [
+        (gap + column * (cell_width + gap), gap + sum(heights[:row]))
+        for row, cells_of_row in enumerate(rows)
+        for column in range(len(cells_of_row))
+    ]
+    for cell, (left, top) in zip(cells, places, strict=True):
+        sheet.paste(cell, (left, top + head))
+
+    def draw(figure: Any) -> None:
+        for title, (left, top) in zip(titles or (), places, strict=True):
+            _write(figure, title, (left + cell_width / 2, top + head / 2), 15, cell_width)
+
+    return sheet if titles is None else _drawn(np.asarray(sheet), draw)
 
 
 def overview(
@@ -314,17 +296,12 @@ def overview(
 ) -> Image.Image:
     """Left image, depth with legend, and where there are any confidence and photometric error, two a row.
 
-    Args:
-        left_01: ``(H, W, 3)`` in [0, 1].
-        depth_m: ``(H, W)`` metres.
-        confidence: ``(H, W)`` in [0, 1], or ``None``.
-        error: ``(H, W)`` in [0, 1], not finite where no right view sees the pixel, or ``None``.
-        unit: of the depth, as in ``depth_figure``.
+    ``left_01`` is ``(H, W, 3)`` in [0, 1], ``depth_m`` ``(H, W)`` in ``unit``; ``confidence`` and ``error``
+    are ``(H, W)`` in [0, 1], the latter not finite where no right view sees the pixel.
     """
     every = max(1, depth_m.shape[1] // (2 * CELL_WIDTH))
-    left_01, depth_m = left_01[::every, ::every], depth_m[::every, ::every]
-    depth = depth_figure(depth_m, unit=unit)
-    left = _as_picture(left_01.astype(np.float32))
+    depth = depth_figure(depth_m[::every, ::every], unit=unit)
+    left = _as_picture(left_01[::every, ::every].astype(np.float32))
     beside = Image.new("RGB", depth.size, "white")  # as wide as a map with its bar: all have one scale
     beside.paste(left.resize((round(left.width * depth.height / left.height), depth.height)), (0, 0))
     cells, titles = [beside, depth], ["left image", "depth"]
@@ -349,12 +326,8 @@ def depth_frames(
 ) -> Iterator[Image.Image]:
     """One picture a depth map, all of one size and in the same colours; each is drawn when it is asked for.
 
-    Args:
-        depths_m: ``(H, W)`` metres each, of one shape.
-        photographs: one a map, shown on its left; each is taken when its picture is drawn.
-        near: depth of the last colour, metres; ``None`` takes the 2nd percentile over all maps.
-        far: depth of the first colour, metres; ``None`` takes the 98th.
-        unit: of all maps, as in ``depth_figure``.
+    The maps are ``(H, W)`` metres (or of no ``unit``); a photograph for each, taken when it is drawn, stands
+    on its left. ``near`` and ``far`` are as in ``depth_range``, over all maps.
 
     Raises:
         ValueError: no maps, or maps of several shapes; at the last picture: another number of photographs.
@@ -387,44 +360,41 @@ def _beside(photograph: Image.Image, figure: Image.Image, shape: float) -> Image
 def check_video(path: str | os.PathLike[str], fps: float) -> None:
     """Refuse a video that could not be written, before its frames are drawn.
 
-    Args:
-        path: the video to appear.
-        fps: frames a second, in [0.1, 120].
-
     Raises:
-        ValueError: another ending than ``VIDEO_SUFFIXES``, a folder, no folder to write into, or ``fps``.
+        ValueError: another ending than ``VIDEO_SUFFIXES``, a folder, no folder to write into, or ``fps``
+            outside [0.1, 120].
     """
     path = Path(path)
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         bad_value("the video", f"a file that ends in {', '.join(VIDEO_SUFFIXES)}", path.name)
-    if os.path.isdir(path):
+    if path.is_dir():
         bad_value("the video", "a file", f"the folder {path}", "Name a file inside of it.")
-    if not os.path.isdir(path.parent):
+    if not path.parent.is_dir():
         bad_value("the video", "in an existing folder", path, f"Make the folder {path.parent} first.")
     check_number(fps, "fps", 0.1, 120)
 
 
-def _write_mp4(path: Path, size: tuple[int, int], frames: Iterable[Image.Image], fps: float) -> None:
-    width, height = (side // 2 * 2 for side in size)  # H.264 and its like want even sides
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
-    if not writer.isOpened():
-        raise InputFileError(f"the video must be one that OpenCV can write; got {path.suffix}.")
+def _write_mp4(path: Path, frames: Iterable[Image.Image], fps: float) -> None:
+    """Frame by frame; H.264 and its like want even sides."""
+    writer = None
     try:
         for frame in frames:
+            width, height = (side // 2 * 2 for side in frame.size)
+            writer = writer or cv2.VideoWriter(
+                str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height)
+            )
+            if not writer.isOpened():
+                raise InputFileError("the video must be one that OpenCV can write; got .mp4.")
             writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))
     finally:  # an open file can be neither renamed nor removed on Windows
-        writer.release()
+        if writer is not None:
+            writer.release()
 
 
 def write_depth_video(path: str | os.PathLike[str], frames: Iterable[Image.Image], fps: float = 10.0) -> None:
-    """Write frames as a video, of the kind that the file's name ends in; whole or not at all.
+    """Write frames, all of one size, as .mp4 (by OpenCV), .webp or .gif; whole or not at all.
 
     An MP4 is written frame by frame; all frames of the others are in memory, as Pillow wants them.
-
-    Args:
-        path: ends in .mp4 (OpenCV writes it), .webp or .gif.
-        frames: of one size.
-        fps: frames a second, in [0.1, 120].
 
     Raises:
         ValueError: as ``check_video``; no frames.
@@ -437,19 +407,18 @@ def write_depth_video(path: str | os.PathLike[str], frames: Iterable[Image.Image
     if first is None:
         bad_value("frames", "at least one picture", "none")
     kind = path.suffix.lower()
+    more: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0}
+    more |= {"quality": 85} if kind == ".webp" else {}
     try:
         with atomic_path(path) as temporary:
             if kind == ".mp4":
-                _write_mp4(temporary, first.size, itertools.chain([first], rest), fps)
+                _write_mp4(temporary, itertools.chain([first], rest), fps)
                 return
-            more: dict[str, Any] = {"quality": 85} if kind == ".webp" else {}
-            more |= {"duration": round(1000 / fps), "loop": 0}
             with open(temporary, "wb") as file:  # Pillow leaves its own open file behind after a Ctrl-C
                 first.save(file, kind[1:], save_all=True, append_images=rest, **more)
     except InputError:  # of a photograph, or of the file, which it names
         raise
     except OSError as error:
         reason = error.strerror or error
-        raise InputFileError(
-            f"the video must be a file that can be written; got {path} ({reason})."
-        ) from error
+        said = f"the video must be a file that can be written; got {path} ({reason})."
+        raise InputFileError(said) from error

@@ -24,16 +24,21 @@ RELATIVE_STEP = 0.04
 #: A corner of a flat surface has three neighbours on it, a one-pixel ramp along an edge has two.
 FEWEST_NEIGHBOURS = 3
 AXES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
-VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
-
+VERTEX = np.dtype([(axis, "<f4") for axis in AXES] + [(channel, "u1") for channel in CHANNELS])
+#: Of binary glTF: the marks of its head and chunks, and the types of numbers by numpy's.
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
-ARRAY_BUFFER, ELEMENT_BUFFER, FLOAT, UNSIGNED_BYTE, UNSIGNED_INT = 34962, 34963, 5126, 5121, 5125
+COMPONENTS = {"f": 5126, "B": 5121, "I": 5125}
 POINTS, LINES = 0, 1
 #: A camera's pyramid is drawn to this share of the cloud's median depth.
 PYRAMID_SHARE = 0.08
 CAMERA_COLOURS = ((255, 255, 255), (255, 170, 0), (0, 200, 255), (160, 255, 120))
 #: Centre to the four corners, and around them.
 EDGES = np.array([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1], dtype=np.uint32)
+
+
+def _usable(depth_m: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
+    use = np.isfinite(depth_m) & (depth_m > 0)
+    return use if valid is None else use & np.asarray(valid, dtype=bool)
 
 
 def flying_points(
@@ -43,25 +48,20 @@ def flying_points(
     relative_step: float = RELATIVE_STEP,
     reach: int = 1,
 ) -> np.ndarray:
-    """Points that hang in the air between a near and a far surface.
+    """Points that hang in the air between a near and a far surface, ``(H, W)`` boolean.
 
     A pixel flies when fewer than three of its eight neighbours have its depth, within ``relative_step`` of
     the nearer of the two. Both sides of a clean edge stay. Things one pixel wide and surfaces seen at a
-    grazing angle (a road near the horizon) go too. A map that was enlarged has wider ramps: give the
-    enlargement as ``reach``.
+    grazing angle (a road near the horizon) go too.
 
     Args:
         depth_m: ``(H, W)`` metres.
-        valid: ``(H, W)`` boolean; pixels that are not valid or not above 0 support no neighbour.
+        valid: ``(H, W)`` boolean; what is not valid or not above 0 supports no neighbour and never flies.
         relative_step: allowed depth change between neighbours, > 0.
-        reach: distance of the eight neighbours in pixels, >= 1.
-
-    Returns:
-        ``(H, W)`` boolean, True where a valid pixel flies.
+        reach: distance of the eight neighbours in pixels, >= 1: by how much a map was enlarged.
     """
     depth_m = np.asarray(depth_m, dtype=np.float32)
-    use = np.isfinite(depth_m) & (depth_m > 0)
-    use = use if valid is None else use & np.asarray(valid, dtype=bool)
+    use = _usable(depth_m, valid)
     height, width = depth_m.shape
     # NaN compares false with everything, so what is unknown or outside the image supports nobody.
     padded = np.pad(np.where(use, depth_m, np.nan), reach, constant_values=np.nan)
@@ -119,9 +119,7 @@ def make_cloud(
         A pixel on the principal point at 2 m is (0, 0, 2).
     """
     parts = list(_cloud_strips(depth_m, image_01, K, valid))
-    return Cloud(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("points_m", "colours"))
-    )
+    return Cloud(np.concatenate([p.points_m for p in parts]), np.concatenate([p.colours for p in parts]))
 
 
 def _cloud_strips(
@@ -134,8 +132,7 @@ def _cloud_strips(
     unproject = np.linalg.inv(check_intrinsics(K)).T
     for rows in row_strips(*depth_m.shape):
         z = depth_m[rows].astype(np.float64)
-        use = np.isfinite(z) & (z > 0)
-        use = use if valid is None else use & np.asarray(valid[rows], dtype=bool)
+        use = _usable(z, None if valid is None else valid[rows])
         v, u = np.nonzero(use)
         points = np.stack([u, v + rows.start, np.ones_like(u)], axis=-1) @ unproject * z[use][:, None]
         yield Cloud(points, np.rint(np.clip(image_01[rows][use], 0.0, 1.0) * 255.0).astype(np.uint8))
@@ -149,46 +146,15 @@ def write_ply(
     valid: np.ndarray | None = None,
     unit: str | None = "m",
 ) -> int:
-    """Write a coloured point cloud as binary little-endian PLY, whole or not at all.
+    """Write the points of ``make_cloud`` as binary little-endian PLY, whole or not at all; returns how many.
 
-    Args:
-        path: the file.
-        depth_m: ``(H, W)`` metres, z of the left camera.
-        image_01: ``(H, W, 3)`` in [0, 1], the colours.
-        K: ``(3, 3)`` pixels of this grid.
-        valid: ``(H, W)`` boolean; only these become points (``valid & ~flying_points(depth_m)``).
-        unit: ``"m"``, or ``None`` for a depth without one; a comment of the file says which.
-
-    Returns:
-        How many points were written.
+    ``unit`` is ``"m"``, or ``None`` for a depth without one; a comment of the file says which, and the frame.
 
     Raises:
         ValueError: as in ``make_cloud``.
         OSError: the folder does not exist or is not writable.
-
-    Convention:
-        x right, y down, z forward, metres: a pixel on the principal point at 2 m is (0, 0, 2).
     """
-    depth_m = np.asarray(depth_m)
-    use = np.isfinite(depth_m) & (depth_m > 0)
-    count = int(np.count_nonzero(use if valid is None else use & np.asarray(valid, dtype=bool)))
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(_ply_head(count, unit))
-        for cloud in _cloud_strips(depth_m, image_01, K, valid):
-            file.write(_vertices(cloud).tobytes())
-    return count
-
-
-def _vertices(cloud: Cloud) -> np.ndarray:
-    """``(N,)`` of ``VERTEX``."""
-    vertices = np.empty(len(cloud.points_m), dtype=VERTEX)
-    for columns, names in ((cloud.points_m, AXES), (cloud.colours, CHANNELS)):
-        for column, name in enumerate(names):
-            vertices[name] = columns[:, column]
-    return vertices
-
-
-def _ply_head(count: int, unit: str | None) -> bytes:
+    count = int(np.count_nonzero(_usable(np.asarray(depth_m), valid)))
     lines = [
         "ply",
         "format binary_little_endian 1.0",
@@ -196,54 +162,54 @@ def _ply_head(count: int, unit: str | None) -> bytes:
         f"element vertex {count}",
         *(f"property float {name}" for name in AXES),
         *(f"property uchar {name}" for name in CHANNELS),
-        "end_header",
+        "end_header\n",
     ]
-    return ("\n".join(lines) + "\n").encode("ascii")
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write("\n".join(lines).encode("ascii"))
+        for cloud in _cloud_strips(depth_m, image_01, K, valid):
+            vertices = np.empty(len(cloud.points_m), dtype=VERTEX)
+            for columns, names in ((cloud.points_m, AXES), (cloud.colours, CHANNELS)):
+                for column, name in enumerate(names):
+                    vertices[name] = columns[:, column]
+            file.write(vertices.tobytes())
+    return count
 
 
 class _Buffer:
-    """The binary chunk while it grows, with the accessors into it."""
+    """The binary chunk of a GLB while it grows, with the accessors into it."""
 
     def __init__(self) -> None:
         self.data = bytearray()
         self.views: list[dict[str, int]] = []
         self.accessors: list[dict[str, object]] = []
 
-    def add(self, array: np.ndarray, kind: str, component: int, target: int, **more: object) -> int:
+    def add(self, array: np.ndarray, kind: str, **more: object) -> int:
         """Append an array; returns the number of its accessor."""
-        self.views.append(
-            {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes, "target": target}
-        )
-        self.data += array.tobytes()
-        self.data += b"\0" * (-len(self.data) % 4)
-        self.accessors.append(
-            {
-                "bufferView": len(self.views) - 1,
-                "componentType": component,
-                "count": len(array),
-                "type": kind,
-                **more,
-            }
-        )
+        target = 34963 if kind == "SCALAR" else 34962  # indices, attributes
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes, "target": target}
+        component = COMPONENTS[array.dtype.char]
+        entry = {"bufferView": len(self.views), "componentType": component, "count": len(array), "type": kind}
+        self.data += array.tobytes() + b"\0" * (-array.nbytes % 4)
+        self.views.append(view)
+        self.accessors.append(entry | more)
         return len(self.accessors) - 1
 
     def vertices(self, points_m: np.ndarray, colours: np.ndarray) -> dict[str, int]:
         """Attributes of coloured vertices given in the left camera's frame."""
         positions = (points_m @ OPENGL_FROM_OPENCV[:3, :3]).astype("<f4")
-        opaque = np.full((len(colours), 1), 255, dtype=np.uint8)
+        rgba = np.pad(colours.astype(np.uint8), ((0, 0), (0, 1)), constant_values=255)
         bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
-        rgba = np.ascontiguousarray(np.hstack([colours.astype(np.uint8), opaque]))
         return {
-            "POSITION": self.add(positions, "VEC3", FLOAT, ARRAY_BUFFER, **bounds),
-            "COLOR_0": self.add(rgba, "VEC4", UNSIGNED_BYTE, ARRAY_BUFFER, normalized=True),
+            "POSITION": self.add(positions, "VEC3", **bounds),
+            "COLOR_0": self.add(rgba, "VEC4", normalized=True),
         }
 
 
 def _pyramid(K: np.ndarray, E: np.ndarray, size: tuple[int, int], length_m: float) -> np.ndarray:
     """``(5, 3)`` centre and corners of a camera's view at ``length_m``, in the left camera's frame."""
-    (width, height), inverse = size, np.linalg.inv(K)
-    corners = [(-0.5, -0.5), (width - 0.5, -0.5), (width - 0.5, height - 0.5), (-0.5, height - 0.5)]
-    rays = np.array([inverse @ (u, v, 1.0) for u, v in corners]) * length_m
+    right, bottom = (side - 0.5 for side in size)
+    corners = [(-0.5, -0.5), (right, -0.5), (right, bottom), (-0.5, bottom)]
+    rays = np.array([(u, v, 1.0) for u, v in corners]) @ np.linalg.inv(K).T * length_m
     return np.vstack([np.zeros(3), rays]) @ E[:3, :3].T + E[:3, 3]
 
 
@@ -266,17 +232,16 @@ def write_glb(
         glTF's axes, in metres: a point 1 m to the right of, above and before the camera is (1, 1, -1).
     """
     buffer, meshes = _Buffer(), []
-    unlit = {"material": 0}
     if len(cloud.points_m):
-        attributes = buffer.vertices(cloud.points_m, cloud.colours)
-        meshes.append({"name": "cloud", "primitives": [{"attributes": attributes, "mode": POINTS, **unlit}]})
+        primitive = {"attributes": buffer.vertices(cloud.points_m, cloud.colours), "mode": POINTS}
+        meshes.append({"name": "cloud", "primitives": [primitive | {"material": 0}]})
     length_m = PYRAMID_SHARE * float(np.median(cloud.points_m[:, 2])) if len(cloud.points_m) else 1.0
     for number, (K, E, size) in enumerate(cameras):
         colour = np.tile(np.array(CAMERA_COLOURS[number % len(CAMERA_COLOURS)], dtype=np.uint8), (5, 1))
-        attributes = buffer.vertices(_pyramid(np.asarray(K), np.asarray(E), size, length_m), colour)
-        edges = buffer.add(EDGES, "SCALAR", UNSIGNED_INT, ELEMENT_BUFFER)
-        lines = {"attributes": attributes, "indices": edges, "mode": LINES, **unlit}
-        meshes.append({"name": f"camera {number}", "primitives": [lines]})
+        corners = _pyramid(np.asarray(K), np.asarray(E), size, length_m)
+        primitive = {"attributes": buffer.vertices(corners, colour), "mode": LINES}
+        primitive |= {"indices": buffer.add(EDGES, "SCALAR"), "material": 0}
+        meshes.append({"name": f"camera {number}", "primitives": [primitive]})
     scene = {
         "asset": {"version": "2.0", "generator": "geodiff-plugin"},
         "extensionsUsed": ["KHR_materials_unlit"],
@@ -292,15 +257,11 @@ def write_glb(
             "bufferViews": buffer.views,
             "accessors": buffer.accessors,
         }
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(_container(scene, bytes(buffer.data)))
-
-
-def _container(scene: dict[str, object], data: bytes) -> bytes:
-    """Header and chunks, each padded to 4 bytes: JSON with blanks, binary with zeros."""
+    # Each chunk is padded to 4 bytes: JSON with blanks, binary with zeros.
     text = json.dumps(scene, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), JSON_CHUNK) + text
-    if data:
-        chunks += struct.pack("<II", len(data), BINARY_CHUNK) + data
-    return struct.pack("<III", MAGIC, VERSION, 12 + len(chunks)) + chunks
+    if buffer.data:
+        chunks += struct.pack("<II", len(buffer.data), BINARY_CHUNK) + buffer.data
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(struct.pack("<III", MAGIC, VERSION, 12 + len(chunks)) + chunks)

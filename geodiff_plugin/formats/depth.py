@@ -6,7 +6,6 @@ import os
 import zipfile
 import zlib
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 from PIL import Image
@@ -16,32 +15,20 @@ from geodiff_plugin.formats.files import check_file, read_npy
 from geodiff_plugin.formats.out import atomic_path
 
 __all__ = [
-    "STRIP_PIXELS",
-    "depth_mm",
-    "read_depth_mm_png",
-    "read_depth_png",
-    "read_disparity_kitti_png",
-    "read_map",
-    "read_pfm",
-    "row_strips",
-    "write_depth_mm",
-    "write_depth_mm",
-    "write_depth_npy",
-    "write_pfm",
+    *("STRIP_PIXELS", "depth_mm", "read_depth_mm_png", "read_depth_png", "read_disparity_kitti_png"),
+    *("read_map", "read_pfm", "row_strips", "write_depth_mm", "write_depth_npy", "write_pfm"),
 ]
 
 PathLike = str | os.PathLike[str]
-KITTI_STEP = 256.0
 LARGEST_MM = 65535
 #: Pixels of a strip: a map of float64 of so many is 8 MB.
 STRIP_PIXELS = 1 << 20
+#: What depth models are read from.
+MAP_FILES = "a map (H, W) as .npy, .npz, .pfm or 16-bit .png"
 
 
 def row_strips(height: int, width: int) -> Iterator[slice]:
-    """Slices that cover all rows in order, each of at most ``STRIP_PIXELS`` pixels or of one row.
-
-    They keep the temporary arrays of a large map small.
-    """
+    """Slices of at most ``STRIP_PIXELS`` pixels, or one row, that cover all rows: arrays stay small."""
     rows = max(1, STRIP_PIXELS // max(1, width))
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
@@ -50,43 +37,30 @@ def row_strips(height: int, width: int) -> Iterator[slice]:
 def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
     """Read a portable float map.
 
-    Args:
-        path: the file.
-        name: the argument that it came in, for messages.
-
     Returns:
         ``(H, W)`` or ``(H, W, 3)`` float32, top row first (the file has the bottom row first); infinity and
         0, which data sets use for "unknown", stay as they are.
 
     Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: not a PFM, or cut off.
+        OSError, ValueError: no readable file, not a PFM, or cut off; ``name`` is the argument in the message.
     """
-    found = check_file(path, name, "a PFM file")
-    with open(found, "rb") as file:
-        kind = file.readline(8).strip()
+    file = check_file(path, name, "a PFM file")
+    with open(file, "rb") as stream:
+        kind = stream.readline(8).strip()
         try:
-            width, height = (int(word) for word in file.readline(64).split())
-            scale = float(file.readline(64))
+            width, height = (int(word) for word in stream.readline(64).split())
+            scale = float(stream.readline(64))
         except ValueError:
-            kind = b""
-        data = file.read()
+            kind, width, height, scale = b"", 0, 0, 0.0
+        data = stream.read()
     if kind not in (b"Pf", b"PF") or min(width, height) < 1:
-        bad_value(
-            name,
-            "a PFM file (Pf or PF, size, scale)",
-            f"{found}, whose head is another",
-            "Is it a PNG or npy?",
-        )
+        expected = "a PFM file (Pf or PF, size, scale)"
+        bad_value(name, expected, f"{file}, whose head is another", "Is it a PNG or npy?")
     shape = (height, width) if kind == b"Pf" else (height, width, 3)
     count = int(np.prod(shape))
     if len(data) < 4 * count:
-        bad_value(
-            name,
-            f"a whole PFM file of {4 * count} bytes of data",
-            f"{found} with {len(data)}",
-            "Is it cut off?",
-        )
+        expected = f"a whole PFM file of {4 * count} bytes of data"
+        bad_value(name, expected, f"{file} with {len(data)}", "Is it cut off?")
     values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4", count=count)
     return np.flipud(values.reshape(shape)).astype(np.float32)
 
@@ -130,12 +104,8 @@ def write_depth_npy(path: PathLike, depth_m: np.ndarray) -> None:
 def depth_mm(depth_m: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
     """Depth as whole millimetres of 16 bits, as ROS' ``16UC1`` images and RGB-D data sets have it.
 
-    Args:
-        depth_m: ``(H, W)`` metres.
-        valid: ``(H, W)`` boolean; ``None`` means everywhere.
-
-    Returns:
-        ``(H, W)`` uint16; 0 where not valid, not finite, under half a millimetre or beyond 65.535 m.
+    ``depth_m`` is ``(H, W)`` metres, ``valid`` boolean of that shape; the result is ``(H, W)`` uint16, 0
+    where not valid, not finite, under half a millimetre or beyond 65.535 m.
 
     Raises:
         ValueError: another shape.
@@ -151,15 +121,7 @@ def depth_mm(depth_m: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray
 
 
 def write_depth_mm(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None = None) -> int:
-    """Write depth as a 16-bit PNG in whole millimetres (``16UC1``), whole or not at all.
-
-    Args:
-        path: the file.
-        depth_m: as in ``depth_mm``.
-        valid: likewise.
-
-    Returns:
-        How many pixels are 0 in the file.
+    """Write ``depth_mm`` as a 16-bit PNG, whole or not at all; returns how many of its pixels are 0.
 
     Raises:
         ValueError: another shape.
@@ -172,19 +134,13 @@ def write_depth_mm(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None
 
 
 def read_depth_png(path: PathLike, units_per_m: float, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
-    """Read a 16-bit PNG of depth (or disparity) in any unit.
-
-    Args:
-        path: the file.
-        units_per_m: 1000 for millimetres, 256 for KITTI's.
-        name: the argument that it came in, for messages.
+    """Read a 16-bit PNG of depth or disparity with so many units in a metre or pixel (KITTI has 256).
 
     Returns:
         ``(H, W)`` float32 metres (or pixels), and the ``(H, W)`` boolean mask of where it is known (not 0).
 
     Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: not a 16-bit PNG, or cut off.
+        OSError, ValueError: no readable file, not a 16-bit PNG, or cut off.
     """
     file = check_file(path, name, "a 16-bit PNG file")
     try:
@@ -202,16 +158,12 @@ def read_depth_png(path: PathLike, units_per_m: float, name: str = "depth") -> t
 
 def read_disparity_kitti_png(path: PathLike, name: str = "disparity") -> tuple[np.ndarray, np.ndarray]:
     """Read KITTI's 16-bit PNG of disparity * 256, in pixels; otherwise as ``read_depth_png``."""
-    return read_depth_png(path, KITTI_STEP, name)
+    return read_depth_png(path, 256.0, name)
 
 
 def read_depth_mm_png(path: PathLike, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
     """Read a 16-bit PNG of millimetres, as metres; otherwise as ``read_depth_png``."""
     return read_depth_png(path, 1000.0, name)
-
-
-#: What depth models are read from.
-MAP_FILES = "a map (H, W) as .npy, .npz, .pfm or 16-bit .png"
 
 
 def read_map(path: PathLike, name: str = "map") -> np.ndarray:
@@ -228,20 +180,20 @@ def read_map(path: PathLike, name: str = "map") -> np.ndarray:
     Raises:
         OSError, ValueError: no readable file, another kind of it, or more than one map.
     """
-    found = check_file(path, name, MAP_FILES)
-    kind = found.suffix.lower()
+    file = check_file(path, name, MAP_FILES)
+    kind = file.suffix.lower()
     if kind == ".png":
-        values, known = read_depth_png(found, 1.0, name)
-        values = np.where(known, values, np.nan)
+        values, valid = read_depth_png(file, 1.0, name)
+        values = np.where(valid, values, np.nan)
     elif kind == ".npz":
         try:
-            with open(found, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
                 values = archive["depth" if "depth" in archive.files else " ".join(archive.files)]
         except (OSError, ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
-            bad_value(name, "an .npz with 'depth' or a single array", f"{found} ({error})")
+            bad_value(name, "an .npz with 'depth' or a single array", f"{file} ({error})")
     else:
-        values = (read_pfm if kind == ".pfm" else partial(read_npy, expected=MAP_FILES))(found, name)
+        values = read_pfm(file, name) if kind == ".pfm" else read_npy(file, name, MAP_FILES)
     values = np.squeeze(values)
     if values.ndim != 2 or values.dtype.kind not in "fiu":
-        bad_value(name, MAP_FILES, f"{found} of shape {values.shape}", "Save one map of the left image.")
+        bad_value(name, MAP_FILES, f"{file} of shape {values.shape}", "Save one map of the left image.")
     return np.where(np.isfinite(values), values, np.nan)

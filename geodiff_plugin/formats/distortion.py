@@ -38,16 +38,7 @@ def distortion_from_text(text: str, name: str = "--distortion") -> Distortion:
 
 
 def undistorted(image_01: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
-    """The image of a pinhole camera with the same K and size.
-
-    Args:
-        image_01: ``(H, W, 3)`` float32 in [0, 1].
-        K: ``(3, 3)`` pixels, of the image as it was taken and of the result.
-        distortion: of the lens.
-
-    Returns:
-        ``(H, W, 3)`` float32; black where the lens saw nothing.
-    """
+    """The image ``(H, W, 3)`` in [0, 1] of a pinhole camera with the same K and size; black without a ray."""
     coefficients, K = np.asarray(distortion.coefficients, np.float64), np.asarray(K, np.float64)
     if distortion.model == "fisheye":
         straight = cv2.fisheye.undistortImage(image_01, K, coefficients, Knew=K)
@@ -67,13 +58,8 @@ def _as_taken(straight_px: np.ndarray, K: np.ndarray, distortion: Distortion) ->
 def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
     """Where pixels of the image as it was taken lie in the image that ``undistorted`` makes of it.
 
-    Args:
-        pixels: ``(N, 2)`` x and y, the centre of the first pixel at (0, 0).
-        K: ``(3, 3)`` pixels, of both images.
-        distortion: of the lens.
-
-    Returns:
-        ``(N, 2)`` float64, also outside of the image; NaN where the lens model sends no ray to the pixel.
+    ``pixels`` are ``(N, 2)`` x and y, the centre of the first pixel at (0, 0), ``K`` is of both images. The
+    result is ``(N, 2)`` float64, also outside of the image; NaN where the model sends no ray to a pixel.
     """
     taken, K = np.asarray(pixels, np.float64).reshape(-1, 1, 2), np.asarray(K, np.float64)
     straight, found = taken.copy(), np.zeros(len(taken), bool)
@@ -102,14 +88,8 @@ def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion
 def undistorted_points(depth_m: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
     """The known depths of an image as it was taken, as points; no two are mixed, and none is rounded.
 
-    Args:
-        depth_m: ``(H, W)`` metres along the optical axis, 0 or not finite where unknown.
-        K: ``(3, 3)`` pixels of the image.
-        distortion: of the lens.
-
-    Returns:
-        ``(N, 3)`` float32 metres in the camera's frame; those that no ray of the lens model belongs to are
-        left out.
+    ``depth_m`` is ``(H, W)`` metres along the optical axis, 0 or not finite where unknown. The result is
+    ``(N, 3)`` float32 metres in the camera's frame, without those that no ray of the lens model belongs to.
     """
     rows, columns = np.nonzero(np.isfinite(depth_m) & (depth_m > 0))
     straight = undistorted_pixels(np.stack([columns, rows], axis=1), K, distortion)

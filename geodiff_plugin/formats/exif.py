@@ -29,12 +29,7 @@ CURES = "Give K (--fx --fy --cx --cy or --K), a field of view (--fov), or photog
 
 
 def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
-    """K of a camera with square pixels and its principal point in the middle.
-
-    Args:
-        fov_deg: horizontal field of view, degrees, in [1, 170].
-        size: ``(width, height)``.
-    """
+    """K of a camera with square pixels and its principal point in the middle; ``fov_deg`` is horizontal."""
     check_number(fov_deg, "fov", 1.0, 170.0)
     focal = size[0] / 2 / math.tan(math.radians(fov_deg) / 2)
     return intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
@@ -47,10 +42,6 @@ def intrinsics_from_exif(
 
     A focal length in 35 mm equivalent is taken by the diagonal; else a focal length in mm with the resolution
     of the sensor. Both are known to a few per cent.
-
-    Args:
-        source: a file, or an image that still carries its EXIF.
-        name: the argument, for messages.
 
     Returns:
         ``(3, 3)`` float64, pixels, and sentences about what was assumed.
@@ -68,21 +59,17 @@ def warn_of_other_lens(source: str | os.PathLike[str] | Image.Image, K: np.ndarr
     """Warn of a focal length that contradicts the image's own EXIF, which two rectified views cannot tell.
 
     Nothing is said of an image without a focal length, or one that was cropped or zoomed digitally.
-
-    Args:
-        source: a file, or an image that still carries its EXIF.
-        K: ``(3, 3)`` pixels of that image.
-        name: the image, for the message.
+    ``source`` is as for ``intrinsics_from_exif``; ``K`` is in pixels of that image, ``name`` in the message.
     """
     try:
-        found, notes = intrinsics_from_exif(source, name)
+        theirs, notes = intrinsics_from_exif(source, name)
     except InputError:
         return
-    factor = K[0, 0] / found[0, 0]
+    factor = K[0, 0] / theirs[0, 0]
     if len(notes) > 1 or max(factor, 1 / factor) < _OTHER_LENS:
         return
     warn(
-        f"K has a focal length of {K[0, 0]:.0f} px for {name}, {factor:.2f} times the {found[0, 0]:.0f} px "
+        f"K has a focal length of {K[0, 0]:.0f} px for {name}, {factor:.2f} times the {theirs[0, 0]:.0f} px "
         "of its EXIF: is K for an image of another size? If it is, all metres are off by that factor.",
         stacklevel=3,
     )
@@ -104,32 +91,27 @@ def _of(image: Image.Image, name: str, turned: bool) -> tuple[np.ndarray, list[s
     if all(taken):
         shapes = [(taken[0] / taken[1]) / shape for shape in (width / height, height / width)]
         if min(max(ratio, 1 / ratio) for ratio in shapes) > 1 + _SAME_SHAPE:
-            bad_value(
-                f"EXIF of {name}",
-                f"of an image of {width}x{height}",
-                f"one of {taken[0]:.0f}x{taken[1]:.0f}: it was cropped since it was taken",
-                f"Give the image as it was taken. {CURES}",
-            )
+            got = f"one of {taken[0]:.0f}x{taken[1]:.0f}: it was cropped since it was taken"
+            cure = f"Give the image as it was taken. {CURES}"
+            bad_value(f"EXIF of {name}", f"of an image of {width}x{height}", got, cure)
     focal_35, focal_mm = _number(entries, _FOCAL_35), _number(entries, _FOCAL)
     per_unit = _MM_PER_UNIT.get(int(_number(entries, _UNIT) or 2), 25.4)
-    pitch_mm = [
+    pitch_x, pitch_y = (
         per_unit / r if r else 0.0 for r in (_number(entries, t) for t in (_X_RESOLUTION, _Y_RESOLUTION))
-    ]
-    zoom, notes = _number(entries, _ZOOM), []
+    )
+    zoom = _number(entries, _ZOOM)
     if focal_35:
         fx = fy = focal_35 * math.hypot(width, height) / _DIAGONAL_35_MM
-        notes.append(f"K of {name}: {focal_35:g} mm in 35 mm equivalent by its EXIF, {fx:.0f} px.")
-    elif focal_mm and pitch_mm[0] and taken[0]:
-        resized = max(width, height) / max(taken)
-        fx = focal_mm / pitch_mm[0] * resized * max(zoom, 1.0)
-        fy = fx * pitch_mm[0] / (pitch_mm[1] or pitch_mm[0])
-        notes.append(f"K of {name}: {focal_mm:g} mm on its sensor by its EXIF, {fx:.0f} px.")
+        notes = [f"K of {name}: {focal_35:g} mm in 35 mm equivalent by its EXIF, {fx:.0f} px."]
+    elif focal_mm and pitch_x and taken[0]:
+        fx = focal_mm / pitch_x * (max(width, height) / max(taken)) * max(zoom, 1.0)
+        fy = fx * pitch_x / (pitch_y or pitch_x)
+        notes = [f"K of {name}: {focal_mm:g} mm on its sensor by its EXIF, {fx:.0f} px."]
     else:
         bad_value(f"K of {name}", "known", "no focal length in its EXIF", CURES)
     if zoom > 1.01:
-        notes.append(
-            f"{name} was zoomed digitally by {zoom:g}; not every camera says whether that is counted in."
-        )
+        said = "not every camera says whether that is counted in"
+        notes.append(f"{name} was zoomed digitally by {zoom:g}; {said}.")
     if turned:
         (width, height), (fx, fy) = (height, width), (fy, fx)
     return intrinsics(fx, fy, (width - 1) / 2, (height - 1) / 2), notes

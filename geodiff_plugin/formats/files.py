@@ -6,24 +6,17 @@ import codecs
 import hashlib
 import os
 import re
-from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geodiff_plugin._checks import (
-    FolderError,
-    ForbiddenFileError,
-    MissingFileError,
-    bad_type,
-    bad_value,
-    quoted,
-)
+from geodiff_plugin import _checks
+from geodiff_plugin._checks import bad_type, bad_value, quoted
 
 if TYPE_CHECKING:  # `geodiff --help` reads this module and starts without numpy
     import numpy as np
 
-__all__ = ["check_file", "file_digest", "read_matrix", "read_npy", "read_text", "refuse_decimal_commas"]
+__all__ = ["check_file", "file_digest", "read_matrix", "read_npy", "read_rows", "read_text"]
 
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
@@ -31,47 +24,34 @@ DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.
 #: No calibration file is near this size; a larger one is something else.
 LARGEST_TEXT_BYTES = 16_000_000
 
-SHAPES = ((3, 3), (4, 4))
+#: Shape of a matrix that is written in one row, by the count of its numbers.
 FLAT = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
-#: What may stand around and between numbers: commas, semicolons, the brackets of Python and JSON.
-BETWEEN = str.maketrans(dict.fromkeys(",;[]()", " "))
 MATRIX = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
 
 
 def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") -> Path:
-    """An existing, readable, non-empty file.
+    """The path of an existing, readable, non-empty file.
 
-    Args:
-        path: where the user says it is.
-        name: the argument that it came in, for the message.
-        what: what is expected there, for the message (``"an image file"``).
-
-    Returns:
-        The path.
+    ``name`` is the argument that it came in and ``what`` what is expected there, for the message.
 
     Raises:
         TypeError: not a path.
-        FileNotFoundError: nothing there.
-        IsADirectoryError: a folder.
-        PermissionError: not readable.
+        FileNotFoundError, IsADirectoryError, PermissionError: nothing there, a folder, not readable.
         ValueError: empty, or a pipe or a device.
     """
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
-    file = Path(path)
-    shown = quoted(file)
+    file, shown = Path(path), quoted(path)
     if os.path.isdir(file):
-        raise FolderError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
+        raise _checks.FolderError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
     if not os.path.exists(file):  # Path.exists() raises on a name that is too long
-        raise MissingFileError(
-            f"{name} must be {what}; got {shown}, which does not exist. Check the spelling."
-        )
+        said = f"{name} must be {what}; got {shown}, which does not exist. Check the spelling."
+        raise _checks.MissingFileError(said)
     if not file.is_file():
         bad_value(name, what, f"{shown}, which is a pipe or a device", "Save what it gives as a file first.")
     if not os.access(file, os.R_OK):
-        raise ForbiddenFileError(
-            f"{name} must be {what} that you may read; got {shown}. Check its permissions."
-        )
+        said = f"{name} must be {what} that you may read; got {shown}. Check its permissions."
+        raise _checks.ForbiddenFileError(said)
     if file.stat().st_size == 0:
         bad_value(name, what, f"{shown}, which is empty", "Was its download or copy cut off? Fetch it again.")
     return file
@@ -99,19 +79,25 @@ def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file"
     return text
 
 
-def refuse_decimal_commas(lines: Iterable[str], path: str | os.PathLike[str], name: str) -> None:
-    """Refuse ``1,5 2,5 3,0`` and ``1,5;2,5;3,0``, which would be read as six numbers.
+def read_rows(path: str | os.PathLike[str], name: str, what: str) -> list[list[str]]:
+    """The words of every line of a text that has any, without remarks behind ``#`` and ``//``.
 
-    ``1,2`` alone in a line may be two columns.
+    Blanks, commas, semicolons and quotes stand between words.
 
     Raises:
-        ValueError: a line of several numbers, one of them with a decimal comma.
+        OSError, ValueError: as ``read_text``; a line of several numbers, one of them with a decimal comma:
+            ``1,5 2,5 3,0`` would be read as six. ``1,2`` alone in a line may be two columns.
     """
-    for line in lines:
+    rows = []
+    for line in read_text(path, name, what).replace('"', "").splitlines():
+        line = re.split("#|//", line)[0].strip(" \t,;")
         comma = DECIMAL_COMMA.search(line)
         if comma and comma.group() != line:
             cure = "Write points for commas, as 1.5 for 1,5."
             bad_value(name, "numbers with a decimal point", f"{path} with {comma.group()}", cure)
+        if line:
+            rows.append(re.split(r"[\s,;]+", line))
+    return rows
 
 
 def file_digest(path: Path) -> str:
@@ -131,18 +117,10 @@ def _digest(path: Path, size: int, changed_ns: int) -> str:
 
 
 def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
-    """The array of a file.
-
-    Args:
-        path: an existing file.
-        name: the argument that it came in, for messages.
-        expected: what it should hold, for messages.
-
-    Returns:
-        Of real numbers, in the file's own type.
+    """The array of real numbers of an existing file, in the file's own type; nothing is unpickled.
 
     Raises:
-        ValueError: numpy cannot load it, or it holds something else.
+        ValueError: numpy cannot load it, or it holds something else than ``expected``.
     """
     import numpy as np
 
@@ -161,38 +139,11 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
     return value
 
 
-def _from_text(path: Path, name: str) -> np.ndarray:
-    import numpy as np
-
-    lines = [line.split("#")[0].strip() for line in read_text(path, name, MATRIX).splitlines()]
-    refuse_decimal_commas(lines, path, name)
-    rows = [words for line in lines if (words := line.translate(BETWEEN).split())]
-    try:
-        numbers = [[float(word) for word in words] for words in rows]
-    except ValueError:
-        bad_value(name, MATRIX, f"{path} with words in it", "A calibration file with words goes to --calib.")
-    if not rows:
-        bad_value(name, MATRIX, f"{path} without numbers")
-    if len({len(row) for row in numbers}) > 1:
-        bad_value(
-            name, MATRIX, f"{path} with rows of {[len(row) for row in numbers]} numbers", "Is it cut off?"
-        )
-    return np.array(numbers, dtype=np.float64)
-
-
 def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarray:
-    """A camera matrix or a pose from a file.
+    """A camera matrix or a pose from a file, ``(3, 3)`` or ``(4, 4)`` float64.
 
-    Rows of numbers, or all 9, 12 or 16 in one row; commas, semicolons and brackets count as blanks, what
-    follows ``#`` is left out. A 3x4 pose gets the row 0 0 0 1. Whether the matrix is a K or an E is checked
-    where it is used.
-
-    Args:
-        path: a text file, or ``.npy`` (never unpickled).
-        name: the argument that it came in, for the message.
-
-    Returns:
-        ``(3, 3)`` or ``(4, 4)`` float64.
+    The file is ``.npy`` or text: rows of numbers, or all 9, 12 or 16 in one row, in brackets or not. A 3x4
+    pose gets the row 0 0 0 1. Whether the matrix is a K or an E is checked where it is used.
 
     Raises:
         FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
@@ -201,14 +152,27 @@ def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarra
     import numpy as np
 
     file = check_file(path, name, MATRIX)
-    is_npy = file.suffix.lower() == ".npy"
-    matrix = read_npy(file, name, MATRIX).astype(np.float64) if is_npy else _from_text(file, name)
+    if file.suffix.lower() == ".npy":
+        matrix = read_npy(file, name, MATRIX).astype(np.float64)
+    else:
+        rows = [
+            [number for word in row if (number := word.strip("[]()"))]  # brackets of Python and JSON
+            for row in read_rows(file, name, MATRIX)
+        ]
+        lengths = [len(row) for row in rows]
+        if len(set(lengths)) != 1:
+            bad_value(name, MATRIX, f"{path} with rows of {lengths or 'no'} numbers", "Is it cut off?")
+        try:
+            matrix = np.array([[float(word) for word in row] for row in rows])
+        except ValueError:
+            cure = "A calibration file with words goes to --calib."
+            bad_value(name, MATRIX, f"{path} with words in it", cure)
     matrix = np.squeeze(matrix)
     if matrix.ndim == 1 and matrix.size in FLAT:
         matrix = matrix.reshape(FLAT[matrix.size])
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
-    if matrix.shape not in SHAPES:
+    if matrix.shape not in ((3, 3), (4, 4)):
         bad_value(name, MATRIX, f"{path} of shape {matrix.shape}")
     if not np.isfinite(matrix).all():
         bad_value(name, "finite", f"NaN or infinity in {path}")

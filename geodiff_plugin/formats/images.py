@@ -21,7 +21,6 @@ MIN_SIDE = 32
 #: Resampling may overshoot [0, 1] by a little; more than this is another range.
 OVERSHOOT = 1e-3
 EXIF_ORIENTATION = 0x0112
-UPRIGHT = 1
 TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",
@@ -33,71 +32,11 @@ TURNS = {
 }
 #: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
 DARK_16_BITS = 8192
-ALPHA_DROPPED = "{name} has an alpha channel; it is dropped."
-#: Formats of Pillow whose files may hold several frames or pages that are pictures of their own.
+#: Formats of Pillow whose files may hold several frames or pages that are pictures of their own; what goes
+#: with a phone's JPEG is none.
 MANY_FRAMES = ("GIF", "PNG", "TIFF", "WEBP")
 HEIC = (".heic", ".heif")
 DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, zlib.error)
-
-
-def _has_alpha(image: Image.Image) -> bool:
-    return image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
-
-
-def _pil_to_array(image: Image.Image, name: str) -> np.ndarray:
-    """``(H, W, 3)`` float32 in [0, 1] of an upright image in any mode that Pillow has."""
-    if image.mode.startswith("I"):  # 16-bit grey: I;16, I;16B, or I in files that Pillow widens
-        grey = np.asarray(image).astype(np.float32)
-        if grey.min() < 0 or grey.max() > 65535:
-            bad_value(name, "an image of 8 or 16 bits", f"values from {grey.min():g} to {grey.max():g}")
-        return np.repeat(grey[..., None] / 65535.0, 3, axis=-1)
-    if image.mode == "F":
-        grey = np.asarray(image, dtype=np.float32)
-        return np.repeat(_check_floats(grey, name)[..., None], 3, axis=-1)
-    if _has_alpha(image):
-        image = image.convert("RGBA")
-    return np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
-
-
-def _check_floats(values: np.ndarray, name: str) -> np.ndarray:
-    if not np.isfinite(values).all():
-        bad_value(name, "finite", "NaN or infinity in it", "Mask or fill those pixels first.")
-    low, high = float(values.min()), float(values.max())
-    if low < -OVERSHOOT or high > 1 + OVERSHOOT:
-        cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
-        bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
-    return values.astype(np.float32, copy=False).clip(0.0, 1.0)
-
-
-def _has_16_bits(image: Image.Image | np.ndarray) -> bool:
-    """Whether an image has 16 bits; of a coloured one Pillow loads the upper 8, and tells only before."""
-    if isinstance(image, np.ndarray):
-        return image.dtype == np.uint16
-    raw_modes = (str(tile[3]) for tile in getattr(image, "tile", ()))
-    return image.mode.startswith("I") or any(";16" in mode for mode in raw_modes)
-
-
-def _dark_notes(image: Image.Image | np.ndarray, name: str) -> list[str]:
-    """A sentence if a camera of 10 or 12 bits filled the lowest of an image's 16; else nothing."""
-    if isinstance(image, Image.Image):
-        image = np.asarray(image if image.mode.startswith("I") else image.convert("RGB"))
-    most = int(image.max()) * (257 if image.dtype == np.uint8 else 1)
-    if most >= DARK_16_BITS:
-        return []
-    return [
-        f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
-        "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
-    ]
-
-
-def _check_sides(height: int, width: int, name: str) -> None:
-    if min(height, width) < MIN_SIDE:
-        bad_value(
-            name,
-            f"at least {MIN_SIDE} pixels a side",
-            f"{width}x{height}",
-            "Is this a thumbnail or a latent?",
-        )
 
 
 def open_image(path: str | os.PathLike[str], name: str) -> Image.Image:
@@ -134,10 +73,53 @@ def _refuse_damaged(name: str, path: object, error: Exception) -> NoReturn:
     bad_value(name, "a whole image file", f"{path}, which does not decode ({error})", cure)
 
 
+def _check_sides(width: int, height: int, name: str) -> None:
+    if min(height, width) < MIN_SIDE:
+        expected = f"at least {MIN_SIDE} pixels a side"
+        bad_value(name, expected, f"{width}x{height}", "Is this a thumbnail or a latent?")
+
+
+def _has_16_bits(image: Image.Image) -> bool:
+    """Whether an image has 16 bits; of a coloured one Pillow loads the upper 8, and tells only before."""
+    raw_modes = (str(tile[3]) for tile in getattr(image, "tile", ()))
+    return image.mode.startswith("I") or any(";16" in mode for mode in raw_modes)
+
+
 def _frame_notes(image: Image.Image, name: str) -> list[str]:
-    """A sentence for an animation or a file of several pages; nothing for what goes with a phone's JPEG."""
     frames = getattr(image, "n_frames", 1) if image.format in MANY_FRAMES else 1
     return [f"{name} holds {frames} frames or pages; only the first is taken."] if frames > 1 else []
+
+
+def _dark_notes(most: int, name: str) -> list[str]:
+    """A sentence if a camera of 10 or 12 bits filled the lowest of an image's 16; else nothing."""
+    if most >= DARK_16_BITS:
+        return []
+    return [
+        f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
+        "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
+    ]
+
+
+def _alpha_notes(has_alpha: bool, name: str) -> list[str]:
+    return [f"{name} has an alpha channel; it is dropped."] if has_alpha else []
+
+
+def _of_pillow(image: Image.Image, name: str, deep: bool) -> tuple[np.ndarray, list[str]]:
+    """``(H, W, 3)`` float32 in [0, 1] of an image in any mode that Pillow has, and what to say of it."""
+    _check_sides(*image.size, name)
+    if image.mode == "F":
+        grey = _checked_floats(np.asarray(image, dtype=np.float32), name)
+        return np.repeat(grey[..., None], 3, axis=-1), []
+    if image.mode.startswith("I"):  # 16-bit grey: I;16, I;16B, or I in files that Pillow widens
+        grey = np.asarray(image).astype(np.float32)
+        if grey.min() < 0 or grey.max() > 65535:
+            bad_value(name, "an image of 8 or 16 bits", f"values from {grey.min():g} to {grey.max():g}")
+        notes = _dark_notes(int(grey.max()), name) if deep else []
+        return np.repeat(grey[..., None] / 65535.0, 3, axis=-1), notes
+    alpha = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+    rgb = np.asarray((image.convert("RGBA") if alpha else image).convert("RGB"))
+    notes = _alpha_notes(alpha, name) + (_dark_notes(int(rgb.max()) * 257, name) if deep else [])
+    return rgb.astype(np.float32) / 255.0, notes
 
 
 def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.ndarray, list[str]]:
@@ -145,88 +127,85 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
 
     Grey, palette, 16-bit and CMYK images work; alpha is dropped; of several frames the first is taken.
 
-    Args:
-        path: the file.
-        name: the argument that it came in, for messages.
-
     Returns:
         ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it: alpha dropped, or turned
         as the EXIF orientation says (K must belong to the turned image), 16 bits of which few are used, or
-        only the first of several frames taken.
+        only the first of several frames taken. They call the image ``name``.
 
     Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: not an image, cut off, or a side under 32 pixels.
+        OSError, ValueError: no readable file; not an image, cut off, or a side under 32 pixels.
     """
     try:
         with open_image(path, name) as image:
             deep, notes = _has_16_bits(image), _frame_notes(image, name)
             image.seek(0)
             image.load()
-            turn = TURNS.get(image.getexif().get(EXIF_ORIENTATION, UPRIGHT))
+            turn = TURNS.get(image.getexif().get(EXIF_ORIENTATION, 1))
             upright = ImageOps.exif_transpose(image)
-            alpha = _has_alpha(image)
     except InputError:
         raise
     except DECODE_ERRORS as error:
         _refuse_damaged(name, path, error)
-    _check_sides(upright.height, upright.width, name)
-    notes += [ALPHA_DROPPED.format(name=name)] if alpha else []
-    notes += _dark_notes(upright, name) if deep else []
+    image_01, more = _of_pillow(upright, name, deep)
     if turn is not None:
-        notes.append(
+        more.append(
             f"{name} was {turn} to {upright.width}x{upright.height}, as its EXIF orientation says; "
             "K must belong to the turned image."
         )
-    return _pil_to_array(upright, name), notes
+    return image_01, notes + more
 
 
-def _hwc(value: np.ndarray | torch.Tensor, name: str) -> np.ndarray:
+def _checked_floats(values: np.ndarray, name: str) -> np.ndarray:
+    if not np.isfinite(values).all():
+        bad_value(name, "finite", "NaN or infinity in it", "Mask or fill those pixels first.")
+    low, high = float(values.min()), float(values.max())
+    if low < -OVERSHOOT or high > 1 + OVERSHOOT:
+        cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
+        bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
+    return values.astype(np.float32, copy=False).clip(0.0, 1.0)
+
+
+def _hwc(value: Any, name: str) -> np.ndarray:
     """``(H, W, C)``, C of 1, 3 or 4, of an array with channels last or a tensor with channels first."""
     if isinstance(value, torch.Tensor):
         batch, flat = "Take one image of the batch: value[0].", "Add a channel axis: value[None]."
         first, last, shape, place = 0, -1, "(3, H, W)", "first"
         turn = "torch images start with channels: value.permute(2, 0, 1)."
-    else:
+    elif isinstance(value, np.ndarray):
         batch, flat = "Take one image of the batch.", ""
         first, last, shape, place = -1, 0, "(H, W, 3) or (H, W)", "last"
         turn = "numpy images end in channels: value.transpose(1, 2, 0)."
         value = value[..., None] if value.ndim == 2 else value
+    else:
+        bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
     if value.ndim != 3:
         cure = batch if value.ndim == 4 else flat
         bad_value(name, f"an image of shape {shape}", f"shape {tuple(value.shape)}", cure)
     if value.shape[first] not in (1, 3, 4):
         cure = turn if value.shape[last] in (1, 3, 4) else ""
         bad_value(name, f"an image with 1, 3 or 4 channels {place}", f"shape {tuple(value.shape)}", cure)
-    if isinstance(value, np.ndarray):
-        return value
-    value = value.detach().cpu()
-    value = value.float() if value.dtype == torch.bfloat16 else value  # numpy has no bfloat16
-    return value.permute(1, 2, 0).numpy()
-
-
-def _scaled(value: np.ndarray, name: str) -> np.ndarray:
-    """Floats in [0, 1] of uint8, uint16 or floats."""
-    if value.dtype in (np.uint8, np.uint16):
-        return value.astype(np.float32) / np.iinfo(value.dtype).max
-    if value.dtype.kind == "f":
-        return _check_floats(value, name)
-    times = " * 255" if value.dtype == bool else ""
-    cure = f"Convert it with astype('uint8'){times}."
-    bad_value(name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", cure)
-
-
-def _raw(value: Any, name: str) -> Image.Image | np.ndarray:
-    """A PIL image as it is, or an array ``(H, W, C)`` with 1, 3 or 4 channels; large enough."""
-    if isinstance(value, Image.Image):
-        _check_sides(value.height, value.width, name)
-        return value
-    if not isinstance(value, (np.ndarray, torch.Tensor)):
-        bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
-    raw = _hwc(value, name)
-    _check_sides(raw.shape[0], raw.shape[1], name)
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu()
+        value = value.float() if value.dtype == torch.bfloat16 else value  # numpy has no bfloat16
+        value = value.permute(1, 2, 0).numpy()
+    _check_sides(value.shape[1], value.shape[0], name)
     # Readers of TIFF and PGM leave the file's byte order, which says nothing about the values.
-    return raw.astype(raw.dtype.newbyteorder("="), copy=False)
+    return value.astype(value.dtype.newbyteorder("="), copy=False)
+
+
+def _of_array(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
+    """``(H, W, 3)`` float32 in [0, 1] of ``(H, W, C)`` uint8, uint16 or floats, and what to say of it."""
+    notes = _alpha_notes(value.shape[-1] == 4, name)
+    value = value[..., :3]
+    notes += _dark_notes(int(value.max()), name) if value.dtype == np.uint16 else []
+    if value.dtype in (np.uint8, np.uint16):
+        scaled = value.astype(np.float32) / np.iinfo(value.dtype).max
+    elif value.dtype.kind == "f":
+        scaled = _checked_floats(value, name)
+    else:
+        cure = f"Convert it with astype('uint8'){' * 255' if value.dtype == bool else ''}."
+        bad_value(name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", cure)
+    return np.repeat(scaled, 3, axis=-1) if scaled.shape[-1] == 1 else scaled, notes
 
 
 def picture_size(value: Any, name: str) -> tuple[int, int]:
@@ -235,8 +214,11 @@ def picture_size(value: Any, name: str) -> tuple[int, int]:
     Raises:
         TypeError, ValueError: no image by its type or shape, or a side under 32 pixels.
     """
-    raw = _raw(value, name)
-    return raw.size if isinstance(raw, Image.Image) else (raw.shape[1], raw.shape[0])
+    if isinstance(value, Image.Image):
+        _check_sides(*value.size, name)
+        return value.size
+    height, width, _ = _hwc(value, name).shape
+    return width, height
 
 
 def as_image_01(value: Any, name: str) -> torch.Tensor:
@@ -258,26 +240,17 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         TypeError: none of these types.
         ValueError: wrong rank or channels, NaN or infinity, floats outside [0, 1], a side under 32 pixels.
     """
-    raw = _raw(value, name)
-    deep = _has_16_bits(raw)
-    if isinstance(raw, Image.Image):
-        if raw.getexif().get(EXIF_ORIENTATION) in TURNS:
-            warn(
+    if isinstance(value, Image.Image):
+        deep, notes = _has_16_bits(value), _frame_notes(value, name)
+        if value.getexif().get(EXIF_ORIENTATION) in TURNS:
+            notes.append(
                 f"{name} carries an EXIF orientation that is not applied; "
-                "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image.",
-                stacklevel=3,
+                "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image."
             )
-        for note in _frame_notes(raw, name):
-            warn(note, stacklevel=3)
-        if _has_alpha(raw):
-            warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
-        hwc = _pil_to_array(raw, name)
+        hwc, more = _of_pillow(value, name, deep)
+        notes += more
     else:
-        if raw.shape[-1] == 4:
-            warn(ALPHA_DROPPED.format(name=name), stacklevel=3)
-            raw = raw[..., :3]
-        hwc = _scaled(raw, name)
-    for note in _dark_notes(raw, name) if deep else ():
+        hwc, notes = _of_array(_hwc(value, name), name)
+    for note in notes:
         warn(note, stacklevel=3)
-    hwc = np.repeat(hwc, 3, axis=-1) if hwc.shape[-1] == 1 else hwc
     return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))

@@ -9,7 +9,6 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.rigs import (
-    CalibrationFormat,
     Camera,
     CameraChoice,
     RawRig,
@@ -23,15 +22,10 @@ from geodiff_plugin.formats.rigs import (
 from geodiff_plugin.formats.structured import parse_json
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 
-__all__ = ["NERF", "nerf_camera", "nerf_frames", "nerf_pose"]
+__all__ = ["nerf_camera", "nerf_frames", "nerf_pose", "read_nerf"]
 
 #: What ``Camera.model`` calls the lenses of ``camera_model``.
-MODELS = {
-    "OPENCV": "opencv",
-    "PINHOLE": "opencv",
-    "SIMPLE_PINHOLE": "opencv",
-    "OPENCV_FISHEYE": "fisheye",
-}
+MODELS = {"OPENCV": "opencv", "PINHOLE": "opencv", "SIMPLE_PINHOLE": "opencv", "OPENCV_FISHEYE": "fisheye"}
 #: Keys by which instant-ngp says that a lens is none of these.
 FOREIGN = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
 #: Coefficients in OpenCV's order, and those that OpenCV's model does not have.
@@ -100,9 +94,7 @@ def _focal_px(frame: Frame, axis: str, side: float) -> float | None:
 def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Camera:
     """The camera of a frame, with K as this package has it (first pixel's centre at 0).
 
-    Args:
-        frame: of ``nerf_frames``.
-        image_size: ``(width, height)`` of its image, for files without ``w`` and ``h``.
+    ``image_size`` is ``(width, height)`` of its image, for files without ``w`` and ``h``.
 
     Raises:
         ValueError: no size, no focal length, or a lens with coefficients that OpenCV's model has not.
@@ -118,9 +110,8 @@ def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Came
         expected = "one with an entry 'fl_x' or 'camera_angle_x'"
         bad_value("the file", expected, "none", "Is this the right file?")
     # As COLMAP, both programs put the centre of the first pixel at (0.5, 0.5).
-    cx, cy = (
-        number(frame.get(key, side / 2), key) - 0.5 for key, side in zip(("cx", "cy"), sides, strict=True)
-    )
+    keyed = zip(("cx", "cy"), sides, strict=True)
+    cx, cy = (number(frame.get(key, side / 2), key) - 0.5 for key, side in keyed)
     model, coefficients = _lens(frame)
     return Camera(intrinsics(given[0], given[-1], cx, cy), size, coefficients, model)
 
@@ -139,7 +130,7 @@ def nerf_pose(frame: Frame) -> np.ndarray:
     return pose
 
 
-def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_nerf(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     """The two images of ``choice.image_names``; a frame's entries go before the file's.
 
     Lengths keep the unit of the poses; ``applied_transform`` turns the world and changes no relative pose.
@@ -154,12 +145,3 @@ def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     left, right = (nerf_camera(frame, choice.image_size) for frame in pair)
     E_left, E_right = (nerf_pose(frame) for frame in pair)
     return RawRig(left, right, np.linalg.inv(E_left) @ E_right)
-
-
-NERF = CalibrationFormat(
-    "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
-    lambda text: text.lstrip().startswith("{") and '"frames"' in text and '"transform_matrix"' in text,
-    _read,
-    has_unit=False,
-    by_image=True,
-)

@@ -2,48 +2,39 @@
 
 from __future__ import annotations
 
-from typing import Any
+import re
 
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.kalibr import EUROC
-from geodiff_plugin.formats.middlebury import BOOSTER
-from geodiff_plugin.formats.orb_slam import ORB_SLAM
-from geodiff_plugin.formats.rigs import CalibrationFormat, Camera, CameraChoice, RawRig, projected, rigid
-from geodiff_plugin.formats.structured import is_storage, parse_storage
+from geodiff_plugin.formats.rigs import Camera, CameraChoice, RawRig, projected, rigid
+from geodiff_plugin.formats.structured import parse_storage
 
-__all__ = ["OPENCV"]
-
-#: How a camera is told in a name, behind its word or (where it is a whole word) before it.
-LEFT, RIGHT = ("1", "l", "left"), ("2", "r", "right")
-K_WORDS = ("m", "k", "mtx", "cameramatrix", "intrinsic", "intrinsics", "intrinsicmatrix")
-D_WORDS = (
-    *("d", "dis", "dist", "distcoef", "distcoefs", "distcoeff", "distcoeffs", "distort", "distortion"),
-    *("distortioncoefficients", "distortioncoeffs"),
-)
-P_WORDS = ("p", "projection", "projectionmatrix", "projmat", "projmatrix")
+__all__ = ["read_opencv"]
 
 
-def _of(words: tuple[str, ...], camera: tuple[str, ...]) -> frozenset[str]:
-    behind = {word + side for word in words for side in camera}
-    return frozenset(behind | {camera[-1] + word for word in words})
+def _of(words: str, number: str, side: str) -> str:
+    """Names of a matrix of one camera: its number, letter or side behind a word, or the side before it."""
+    return f"(?:{words})(?:{number}|{side[0]}|{side})|{side}(?:{words})"
 
 
+K = "m|k|mtx|cameramatrix|intrinsics?|intrinsicmatrix"
+D = "d|dis|dist|distcoeffs?|distcoefs?|distort|distortion|distortioncoefficients|distortioncoeffs"
+P = "p|projection|projectionmatrix|projmat|projmatrix"
 #: Name in OpenCV's samples -> names in use for the same thing, in small letters without "_" and ".": the
 #: arguments of stereoCalibrate, what tutorials call them, ORB-SLAM's ``LEFT.P``.
 NAMES = {
-    "M1": _of(K_WORDS, LEFT),
-    "M2": _of(K_WORDS, RIGHT),
-    "D1": _of(D_WORDS, LEFT),
-    "D2": _of(D_WORDS, RIGHT),
-    "P1": _of(P_WORDS, LEFT),
-    "P2": _of(P_WORDS, RIGHT),
-    "R": frozenset({"r", "rot", "rotation", "rotationmatrix"}),
-    "T": frozenset({"t", "trans", "translation", "translationmatrix", "translationvector"}),
-    "image_size": frozenset({"imagesize", "imgres", "imgsize", "size"}),
-    "image_width": frozenset({"imagewidth", "leftwidth"}),
-    "image_height": frozenset({"imageheight", "leftheight"}),
+    "M1": _of(K, "1", "left"),
+    "M2": _of(K, "2", "right"),
+    "D1": _of(D, "1", "left"),
+    "D2": _of(D, "2", "right"),
+    "P1": _of(P, "1", "left"),
+    "P2": _of(P, "2", "right"),
+    "R": "r|rot|rotation|rotationmatrix",
+    "T": "t|trans|translation|translationmatrix|translationvector",
+    "image_size": "imagesize|imgres|imgsize|size",
+    "image_width": "imagewidth|leftwidth",
+    "image_height": "imageheight|leftheight",
 }
 #: Those that are one number; what else is a number, such as a coefficient ``k1``, is none of the matrices.
 NUMBERS = ("image_width", "image_height")
@@ -51,19 +42,16 @@ NUMBERS = ("image_width", "image_height")
 Entries = dict[str, np.ndarray]
 
 
-def _plain(key: str) -> str:
-    return key.replace("_", "").replace(".", "")
-
-
-def _can_be(name: str, value: np.ndarray) -> bool:
-    return value.size == 1 if name in NUMBERS else value.shape != (1,)  # a matrix has two axes
+def _can_be(name: str, key: str, value: np.ndarray) -> bool:
+    fits = value.size == 1 if name in NUMBERS else value.shape != (1,)  # a matrix has two axes
+    return fits and re.fullmatch(NAMES[name], re.sub("[_.]", "", key)) is not None
 
 
 def _named(entries: Entries) -> Entries:
-    """What ``NAMES`` knows of the entries, by its names; entries that differ under one name are refused."""
+    """What ``NAMES`` has of the entries, by its names; entries that differ under one name are refused."""
     named: Entries = {}
-    for name, names in NAMES.items():
-        keys = [key for key, value in entries.items() if _plain(key) in names and _can_be(name, value)]
+    for name in NAMES:
+        keys = [key for key, value in entries.items() if _can_be(name, key, value)]
         if any(not np.array_equal(entries[key].ravel(), entries[keys[0]].ravel()) for key in keys[1:]):
             cure = "Keep those that belong to R and T."
             bad_value(name, "there once", f"{', '.join(keys)}, which differ", cure)
@@ -96,59 +84,35 @@ def _size(named: Entries) -> list[float] | None:
 
 def _of_shape(named: Entries, name: str, *shapes: tuple[int, ...]) -> np.ndarray:
     if named[name].shape not in shapes:
-        bad_value(
-            name, f"of shape {shapes[0]}", f"{named[name].shape}", "Was this file written by stereoRectify?"
-        )
+        cure = "Was this file written by stereoRectify?"
+        bad_value(name, f"of shape {shapes[0]}", f"{named[name].shape}", cure)
     return named[name]
 
 
-def _check_no_other_lens(entries: Entries, named: Entries) -> None:
-    """Refuse a lens distortion whose name is not known: without it the images would pass for a pinhole's."""
-    listed = NAMES["D1"] | NAMES["D2"]
-    others = [
-        key
-        for key, value in entries.items()
-        if "dist" in key and _plain(key) not in listed and _can_be("D1", value)
-    ]
-    if others and not named.keys() >= {"D1", "D2"}:
+def _lenses(entries: Entries, named: Entries) -> tuple[list[np.ndarray | None], tuple[str, ...]]:
+    """``D1`` and ``D2``, and a note where one is missing: two lenses of a rig are rarely that unlike.
+
+    A lens distortion by an unknown name is refused: without it the images would pass for a pinhole's.
+    """
+    lenses = [named.get(name) for name in ("D1", "D2")]
+    given = [lens for lens in lenses if lens is not None]
+    if len(given) == 2:
+        return lenses, ()
+    taken = [id(lens) for lens in given]
+    others = [k for k, v in entries.items() if "dist" in k and v.shape != (1,) and id(v) not in taken]
+    if others:
         cure = "Rename what is lens distortion to D1 and D2, and what is not."
         bad_value("the lens distortion", "called D1, D2", ", ".join(others), cure)
-
-
-def _note_of_one_lens(lenses: list[Any]) -> tuple[str, ...]:
-    """A note on distortion that is there for one camera alone: two lenses of a rig are rarely that unlike."""
-    if (lenses[0] is None) == (lenses[1] is None) or not np.any(
-        [lens for lens in lenses if lens is not None]
-    ):
-        return ()
+    if not given or not np.any(given):
+        return lenses, ()
     there, missing, side = ("D1", "D2", "right") if lenses[1] is None else ("D2", "D1", "left")
-    return (
+    return lenses, (
         f"it has the lens distortion {there} and no {missing}: the {side} image is taken for one without "
         f"distortion. Add {missing} to the file, zeros if that lens has none.",
     )
 
 
-def _as_taken(entries: Entries, named: Entries) -> RawRig:
-    missing = [name for name in ("M1", "M2", "R", "T") if name not in named]
-    if missing:
-        expected = "an OpenCV calibration with P1, P2, or with M1, M2, R, T"
-        cure = "Where intrinsics and extrinsics are two files, give both; rename what has other names."
-        bad_value("the file", expected, f"no {', '.join(missing)}", cure)
-    K_left, K_right, R = (_of_shape(named, name, (3, 3)) for name in ("M1", "M2", "R"))
-    T_right_from_left = np.eye(4)
-    T_right_from_left[:3, :3] = R
-    T_right_from_left[:3, 3] = _of_shape(named, "T", (3, 1), (1, 3), (3,)).ravel()
-    _check_no_other_lens(entries, named)
-    lenses, size = [named.get(name) for name in ("D1", "D2")], _size(named)
-    left, right = (
-        Camera(K, size, () if lens is None else lens.ravel())
-        for K, lens in zip((K_left, K_right), lenses, strict=True)
-    )
-    E = np.linalg.inv(rigid(T_right_from_left, "R, T"))
-    return RawRig(left, right, E, notes=_note_of_one_lens(lenses))
-
-
-def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     """One file, or ``intrinsics`` and ``extrinsics`` in any order.
 
     ``P1, P2`` stand for the rectified images and come first, whatever the lens distortion before them was.
@@ -158,15 +122,19 @@ def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     """
     entries = _merged(texts)
     named = _named(entries)
+    size = _size(named)
     if named.keys() >= {"P1", "P2"}:
-        P_left, P_right = (_of_shape(named, name, (3, 4)) for name in ("P1", "P2"))
-        return projected(P_left, P_right, _size(named), _size(named))
-    return _as_taken(entries, named)
-
-
-OPENCV = CalibrationFormat(
-    "OpenCV stereoRectify YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
-    lambda text: is_storage(text) and not any(other.matches(text) for other in (BOOSTER, EUROC, ORB_SLAM)),
-    _read,
-    file_counts=(1, 2),
-)
+        return projected(*(_of_shape(named, name, (3, 4)) for name in ("P1", "P2")), size, size)
+    missing = [name for name in ("M1", "M2", "R", "T") if name not in named]
+    if missing:
+        expected = "an OpenCV calibration with P1, P2, or with M1, M2, R, T"
+        cure = "Where intrinsics and extrinsics are two files, give both; rename what has other names."
+        bad_value("the file", expected, f"no {', '.join(missing)}", cure)
+    K_left, K_right, R = (_of_shape(named, name, (3, 3)) for name in ("M1", "M2", "R"))
+    T = np.hstack([R, _of_shape(named, "T", (3, 1), (1, 3), (3,)).reshape(3, 1)])
+    lenses, notes = _lenses(entries, named)
+    left, right = (
+        Camera(matrix, size, () if lens is None else lens.ravel())
+        for matrix, lens in zip((K_left, K_right), lenses, strict=True)
+    )
+    return RawRig(left, right, np.linalg.inv(rigid(T, "R, T")), notes=notes)

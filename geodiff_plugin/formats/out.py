@@ -48,15 +48,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     suffix, from which writers guess the format. On any error, Ctrl-C included, it is removed and an older
     file at ``path`` stays as it was.
 
-    Args:
-        path: the file to appear.
-
-    Yields:
-        The path to write to.
-
     Raises:
-        FileNotFoundError: the folder does not exist.
-        IsADirectoryError: ``path`` is a folder.
+        FileNotFoundError, IsADirectoryError: no folder to write into, or ``path`` is one.
     """
     target = Path(path)
     if os.path.isdir(target):
@@ -96,11 +89,7 @@ def _absolute(path: Path, name: str) -> Path:
 
 
 def check_out(path: Path, name: str = "--out") -> Path:
-    """The place that an output folder has or will have, links followed.
-
-    Args:
-        path: as typed.
-        name: the option, for messages.
+    """The place that an output folder has or will have, links followed; messages call it ``name``.
 
     Raises:
         ValueError: a file, a link to nothing, below a file, or a name that the file system refuses.

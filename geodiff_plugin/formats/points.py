@@ -1,4 +1,4 @@
-"""Known depths from files: a sparse depth map, or a list of points, PLY among them."""
+"""Known depths from files: a sparse depth map, a list of points, PLY, KITTI's velodyne scans."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
 from geodiff_plugin._checks import bad_value, check_metres, check_number, warn
+from geodiff_plugin.formats.benchmarks import KITTI_ROW
 from geodiff_plugin.formats.depth import read_depth_png, read_pfm
-from geodiff_plugin.formats.files import check_file, read_npy, read_text, refuse_decimal_commas
-from geodiff_plugin.formats.kitti import read_velodyne
+from geodiff_plugin.formats.files import check_file, read_npy, read_rows, read_text
 
 __all__ = ["read_ply_points", "read_points"]
 
@@ -27,11 +26,9 @@ KITTI_UNITS, MILLIMETRES = 256.0, 1000.0
 KITTI_FOLDERS = re.compile(r"(^|[\\/])(proj_depth|groundtruth|groundtruth_depth|velodyne_raw)([\\/]|$)")
 #: Columns of points: x y z, with an intensity, or with a colour.
 COLUMNS = (3, 4, 6)
-#: What known depths come in as well, and is not read.
-PICTURES, CLOUDS = (
-    (".jpg", ".jpeg", ".tif", ".tiff", ".exr"),
-    (".pcd", ".las", ".laz", ".obj", ".off", ".e57"),
-)
+#: What known depths come in as well and is not read, and what to save it as.
+UNREAD = dict.fromkeys((".jpg", ".jpeg", ".tif", ".tiff", ".exr"), "Save it as .npy or PFM in metres.")
+UNREAD |= dict.fromkeys((".pcd", ".las", ".laz", ".obj", ".off", ".e57"), "Save the cloud as .ply.")
 #: How COLMAP opens its list of points, its name for the file, and the fewest numbers of its lines.
 COLMAP_MARK, COLMAP_STEM, COLMAP_COLUMNS = "# 3D point list with", "points3d", 8
 MOST_POINTS = 50_000_000
@@ -44,82 +41,7 @@ PLY_TYPES = {
 PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 #: A head is text; none is near this size.
 LONGEST_HEAD = 65_536
-
-
-def _rows(path: Path, name: str) -> np.ndarray:
-    """Numbers of a text, one row a line: blanks, tabs, commas or semicolons between.
-
-    A first line of words is a heading, and tells which columns are x, y and z if it has one word a column;
-    ``#`` and ``//`` start a remark, anywhere in a line.
-    """
-    text = read_text(path, name, KINDS).replace('"', "")
-    lines = [re.split(r"#|//", line)[0].strip(" \t,;") for line in text.splitlines()]
-    refuse_decimal_commas(lines, path, name)
-    rows = [re.split(r"[\s,;]+", line) for line in lines if line]
-    named = path.stem.lower() == COLMAP_STEM and rows and len(rows[0]) >= COLMAP_COLUMNS
-    if named or COLMAP_MARK in text:
-        _refuse_colmap(path, name)
-    heading = rows.pop(0) if rows and not _is_number(rows[0][0]) else []
-    columns = _columns(heading, len(rows[0]), path, name) if rows else None
-    try:
-        values = [[float(word) for word in (row if columns is None else _of(row, columns))] for row in rows]
-    except ValueError:
-        bad_value(name, "rows of numbers, below one heading at most", f"{path} with words among them")
-    if not values or len({len(row) for row in rows}) > 1:
-        lengths = sorted({len(row) for row in rows})
-        bad_value(name, "points in metres, one a line", f"{path} with rows of {lengths or 'no'} numbers")
-    return np.array(values)
-
-
-def _refuse_colmap(path: Path, name: str) -> NoReturn:
-    """Refuse the points of a COLMAP model, whose first three numbers are no x, y and z.
-
-    They cannot be read: they are in the frame and unit of the model, and the file tells neither.
-    """
-    bad_value(
-        name,
-        "points in metres in the left camera's frame, one a line",
-        f"{path}, the points of a COLMAP model, in its frame and unit",
-        "Transform their X, Y and Z by the pose of the left image in images.txt, multiply them by the "
-        "metres in a unit of the model, and save them alone.",
-    )
-
-
-def _of(row: list[str], columns: list[int]) -> list[str]:
-    return [row[column] for column in columns if column < len(row)]
-
-
-def _columns(heading: list[str], count: int, path: Path, name: str) -> list[int] | None:
-    """Where a heading has x, y and z; ``None`` for a title, whose words are not as many as the columns."""
-    if len(heading) != count:
-        return None
-    words = [re.sub(r"([_ ]?m|[_ ]?[\[(]m[\])])$", "", word.lower()) for word in heading]
-    if any(words.count(axis) != 1 for axis in "xyz"):
-        cure = "Write the points as x, y and z of the left camera, or the depths as a map of the left image."
-        got = f"{path} with {', '.join(heading)}"
-        bad_value(name, "points with columns x, y and z, in metres", got, cure)
-    return [words.index(axis) for axis in "xyz"]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _png_scale(path: Path, scale: float | None) -> float:
-    if scale is not None:
-        return scale
-    if KITTI_FOLDERS.search(str(path.parent)):
-        warn(
-            f"{path} is read in KITTI's units of 1/256 m, as its folder's name says; "
-            "give --points-scale 1000 (scale=1000) if it is in millimetres.",
-            stacklevel=4,
-        )
-        return KITTI_UNITS
-    return MILLIMETRES
+VELODYNE = "KITTI's calib/N.txt, or calib_velo_to_cam.txt together with calib_cam_to_cam.txt"
 
 
 def read_points(
@@ -150,36 +72,92 @@ def read_points(
         FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
         ValueError: a file of another kind, or that does not decode.
     """
-    found = check_file(path, name, "a file of known depths")
+    file = check_file(path, name, "a file of known depths")
     if scale is not None:
         check_number(scale, f"{name}-scale", NEAREST, FARTHEST_SCALE)
-    kind = found.suffix.lower()
+    kind = file.suffix.lower()
     if calibration and kind != ".bin":
-        bad_value(f"{name}-calib", "given with a velodyne .bin only", f"{found}")
+        bad_value(f"{name}-calib", "given with a velodyne .bin only", f"{file}")
+    if kind in UNREAD:
+        bad_value(name, KINDS, f"{file}", UNREAD[kind])
     if kind == ".png":
-        return read_depth_png(found, _png_scale(found, scale), name)[0]
-    if kind in PICTURES:
-        bad_value(name, KINDS, f"{found}", "Save it as .npy or PFM in metres.")
-    if kind in CLOUDS:
-        bad_value(name, KINDS, f"{found}", "Save the cloud as .ply.")
-    if kind == ".pfm":
-        values = read_pfm(found, name)
-    elif kind == ".ply":
-        values = read_ply_points(found, name)
-    elif kind == ".bin":
-        values = read_velodyne(found, calibration, name)
+        return read_depth_png(file, _png_scale(file, scale), name)[0]
+    if kind == ".bin":
+        values = _velodyne(file, calibration, name)
+    elif kind == ".npy":
+        values = read_npy(file, name, KINDS)
     else:
-        values = read_npy(found, name, KINDS) if kind == ".npy" else _rows(found, name)
+        values = {".pfm": read_pfm, ".ply": read_ply_points}.get(kind, _table)(file, name)
     if values.ndim != 2 or 0 in values.shape or values.size > MOST_POINTS:
-        bad_value(name, "a map (H, W) or points (N, 3) of numbers", f"{found} of shape {values.shape}")
+        bad_value(name, "a map (H, W) or points (N, 3) of numbers", f"{file} of shape {values.shape}")
     if values.shape[1] in COLUMNS:
         values = values[:, :3]
     if scale is None:
-        check_metres(values, name, f"{found} of {values.dtype}")
+        check_metres(values, name, f"{file} of {values.dtype}")
     with np.errstate(over="ignore"):
         values = (values / (scale or 1.0)).astype(np.float32)
-    values = values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
-    return values
+    return values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
+
+
+def _png_scale(path: Path, scale: float | None) -> float:
+    if scale is not None:
+        return scale
+    if not KITTI_FOLDERS.search(str(path.parent)):
+        return MILLIMETRES
+    warn(
+        f"{path} is read in KITTI's units of 1/256 m, as its folder's name says; "
+        "give --points-scale 1000 (scale=1000) if it is in millimetres.",
+        stacklevel=4,
+    )
+    return KITTI_UNITS
+
+
+def _table(path: Path, name: str) -> np.ndarray:
+    """Numbers of a text, one row a line, below one heading at most.
+
+    The heading tells which columns are x, y and z if it has one word a column. The points of a COLMAP model
+    are refused: they are in the frame and unit of the model, and the file tells neither.
+    """
+    rows = read_rows(path, name, KINDS)
+    named = path.stem.lower() == COLMAP_STEM and rows and len(rows[0]) >= COLMAP_COLUMNS
+    if named or COLMAP_MARK in read_text(path, name, KINDS):
+        bad_value(
+            name,
+            "points in metres in the left camera's frame, one a line",
+            f"{path}, the points of a COLMAP model, in its frame and unit",
+            "Transform their X, Y and Z by the pose of the left image in images.txt, multiply them by the "
+            "metres in a unit of the model, and save them alone.",
+        )
+    heading = rows.pop(0) if rows and not _is_number(rows[0][0]) else []
+    lengths = sorted({len(row) for row in rows})
+    if len(lengths) != 1:
+        expected = "points in metres, one a line"
+        bad_value(name, expected, f"{path} with rows of {lengths or 'no'} numbers")
+    columns = _columns(heading, lengths[0], path, name)
+    try:
+        return np.array([[float(row[column]) for column in columns] for row in rows])
+    except ValueError:
+        bad_value(name, "rows of numbers, below one heading at most", f"{path} with words among them")
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _columns(heading: list[str], count: int, path: Path, name: str) -> Sequence[int]:
+    """Where a heading has x, y and z; all columns below a title, whose words are not as many as they are."""
+    if len(heading) != count:
+        return range(count)
+    words = [re.sub(r"([_ ]?m|[_ ]?[\[(]m[\])])$", "", word.lower()) for word in heading]
+    if any(words.count(axis) != 1 for axis in "xyz"):
+        cure = "Write the points as x, y and z of the left camera, or the depths as a map of the left image."
+        got = f"{path} with {', '.join(heading)}"
+        bad_value(name, "points with columns x, y and z, in metres", got, cure)
+    return [words.index(axis) for axis in "xyz"]
 
 
 def _ply_head(data: bytes, path: Path, name: str) -> tuple[str, int, list[tuple[str, str]], int]:
@@ -188,28 +166,22 @@ def _ply_head(data: bytes, path: Path, name: str) -> tuple[str, int, list[tuple[
     begin = data.find(b"\n", end) + 1
     if not data.startswith(b"ply") or end < 0 or begin == 0:
         bad_value(name, "a PLY file", f"{path} without a PLY head", "Is it cut off, or another format?")
-    kind, count, properties, element = "", None, [], ""
+    kind, count, properties, element = "", 0, [], ""
     for line in data[:end].decode("latin-1").splitlines():
-        words = line.split()
-        if words[:1] == ["format"] and len(words) > 1:
-            kind = words[1]
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
-            if words[1] == "vertex":
-                count = int(words[2][:12])
-            elif count is None:
-                bad_value(name, "a PLY file whose first element is vertex", f"{path} with {words[1]!r} first")
-            element = words[1]
-        elif words[:1] == ["property"] and element == "vertex":
-            if len(words) != 3 or words[1] not in PLY_TYPES:
+        match line.split():
+            case ["format", kind, *_]:
+                pass
+            case ["element", element, number] if element == "vertex" and number.isdecimal():
+                count = int(number[:12])
+            case ["element", element, *_] if not count:
+                bad_value(name, "a PLY file whose first element is vertex", f"{path} with {element!r} first")
+            case ["property", of, axis] if element == "vertex" and of in PLY_TYPES:
+                properties.append((axis, PLY_TYPES[of]))
+            case ["property", *_] if element == "vertex":
                 bad_value(name, "a PLY file whose points have plain properties", f"{path} with {line!r}")
-            properties.append((words[2], PLY_TYPES[words[1]]))
     names = [key for key, _ in properties]
-    if (
-        kind not in PLY_ORDERS
-        or not count
-        or not {"x", "y", "z"} <= set(names)
-        or len(set(names)) < len(names)
-    ):
+    plain = {"x", "y", "z"} <= set(names) and len(set(names)) == len(names)
+    if kind not in PLY_ORDERS or not count or not plain:
         bad_value(name, "a PLY file with points (element vertex with x, y, z)", f"{path}, which has none")
     if count > MOST_POINTS:
         bad_value(name, f"at most {MOST_POINTS} points", f"{path} with {count}")
@@ -217,14 +189,7 @@ def _ply_head(data: bytes, path: Path, name: str) -> tuple[str, int, list[tuple[
 
 
 def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
-    """The points of a PLY file.
-
-    Args:
-        path: an existing file.
-        name: the argument that it came in, for messages.
-
-    Returns:
-        ``(N, 3)`` float64, in the file's unit and frame.
+    """The points ``(N, 3)`` float64 of a PLY file, ASCII or binary, in the file's unit and frame.
 
     Raises:
         ValueError: not PLY, no x, y, z, or cut off.
@@ -239,8 +204,8 @@ def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
         except ValueError:
             table = np.empty(0)
         if table.shape != (count, len(columns)):
-            cure = "Is it cut off?"
-            bad_value(name, f"{count} points of {len(columns)} numbers", f"{path} with others", cure)
+            expected = f"{count} points of {len(columns)} numbers"
+            bad_value(name, expected, f"{path} with others", "Is it cut off?")
         return table[:, [columns.index(axis) for axis in "xyz"]]
     row = np.dtype([(key, PLY_ORDERS[kind] + code) for key, code in properties])
     if len(data) - begin < count * row.itemsize:
@@ -248,3 +213,52 @@ def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
         bad_value(name, f"{count} points of {row.itemsize} bytes", got, "Is it cut off?")
     table = np.frombuffer(data, dtype=row, count=count, offset=begin)
     return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+
+
+def _camera_from_velodyne(paths: Sequence[PathLike], name: str) -> np.ndarray:
+    """``(4, 4)``: from the scanner's frame to that of the rectified left colour camera, which is camera 2."""
+    rows: dict[str, np.ndarray] = {}
+    for path in paths:
+        for key, words in KITTI_ROW.findall(read_text(path, name, VELODYNE)):
+            if all(_is_number(word) for word in words.split()):
+                rows[key] = np.array(words.split(), dtype=np.float64)
+
+    def matrix(keys: tuple[str, ...], height: int, width: int) -> np.ndarray:
+        row = next((rows[key] for key in keys if key in rows), None)
+        if row is None or row.size != height * width or not np.isfinite(row).all():
+            bad_value(name, VELODYNE, f"files without {' or '.join(keys)} of {height * width} numbers")
+        T = np.eye(4)
+        T[:height, :width] = row.reshape(height, width)
+        return T
+
+    rectify = matrix(("R0_rect", "R_rect_00", "R_rect"), 3, 3)
+    projection = matrix(("P2", "P_rect_02"), 3, 4)
+    if "R" in rows and "T" in rows:
+        moved = matrix(("R",), 3, 3)
+        moved[:3, 3] = matrix(("T",), 3, 1)[:3, 0]
+    else:
+        moved = matrix(("Tr_velo_to_cam", "Tr_velo_cam"), 3, 4)
+    beside = np.eye(4)  # camera 2 stands beside camera 0, in whose frame the rest is
+    try:
+        beside[:3, 3] = np.linalg.solve(projection[:3, :3], projection[:3, 3])
+    except np.linalg.LinAlgError:
+        bad_value(name, VELODYNE, "a P2 that is no projection")
+    return beside @ rectify @ moved
+
+
+def _velodyne(path: Path, calibration: Sequence[PathLike], name: str) -> np.ndarray:
+    """The points of a scan (float32 x, y, z, reflectance) before the left camera, ``(N, 3)`` metres."""
+    if not calibration:
+        cure = "The scanner has a frame of its own: x forward, y left, z up."
+        bad_value(f"{name}-calib", f"given with a .bin ({VELODYNE})", "nothing", cure)
+    data = path.read_bytes()
+    if len(data) % 16:
+        expected = "a velodyne .bin of whole points (4 float32 each)"
+        bad_value(name, expected, f"{path} of {len(data)} bytes", "Is it cut off?")
+    scan = np.frombuffer(data, dtype="<f4").reshape(-1, 4)[:, :3].astype(np.float64)
+    T = _camera_from_velodyne(calibration, f"{name}-calib")
+    points = scan @ T[:3, :3].T + T[:3, 3]
+    points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)]
+    if not len(points):
+        bad_value(name, "a scan with points before the camera", f"{path} with none")
+    return points

@@ -1,59 +1,125 @@
-"""Reading of calibration files, whose format is recognised from their content (S3.3).
-
-A new format is a new file and one line in the table (docs/reference/calibration.md).
-"""
+"""Reading of calibration files: the table of formats, recognised from their content (S3.3)."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from geodiff_plugin._checks import FolderError, InputError, bad_type, bad_value, check_number, refuse, warn
+from geodiff_plugin.formats import benchmarks, devices, nerf, opencv, robots
 from geodiff_plugin.formats.colmap import COLMAP, model_files, model_text
 from geodiff_plugin.formats.files import check_file, read_text
-from geodiff_plugin.formats.kalibr import EUROC, KALIBR
-from geodiff_plugin.formats.kitti import KITTI_CAM_TO_CAM, KITTI_PROJECTIONS
-from geodiff_plugin.formats.middlebury import BOOSTER, FOUNDATION_STEREO, MIDDLEBURY, STEREODEMO
-from geodiff_plugin.formats.mvsnet import MVSNET
-from geodiff_plugin.formats.nerf import NERF
-from geodiff_plugin.formats.oak import OAK
-from geodiff_plugin.formats.opencv import OPENCV
-from geodiff_plugin.formats.orb_slam import ORB_SLAM
-from geodiff_plugin.formats.realsense import REALSENSE
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, check_no_distortion, make_rig
-from geodiff_plugin.formats.ros import ROS
-from geodiff_plugin.formats.zed import ZED
 from geodiff_plugin.types import Rig
 
 __all__ = ["CALIBRATION_FORMATS", "has_pose_per_image", "read_calibration"]
 
-#: Every format by name; exactly one recognises a well-formed file.
+
+def _line(pattern: str) -> Callable[[str], object]:
+    """Whether a line of a text begins so."""
+    return re.compile(rf"^{pattern}", re.MULTILINE).search
+
+
+def _json(*keys: str) -> Callable[[str], object]:
+    """Whether a text is JSON that has these keys."""
+    return lambda text: text.lstrip().startswith(("{", "[")) and all(f'"{key}"' in text for key in keys)
+
+
+#: Every format by name. The first that recognises a file reads it: formats that others contain come first.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
-    "middlebury": MIDDLEBURY,
-    "kitti_cam_to_cam": KITTI_CAM_TO_CAM,
-    "kitti_projections": KITTI_PROJECTIONS,
-    "foundation_stereo": FOUNDATION_STEREO,
-    "stereodemo": STEREODEMO,
-    "opencv": OPENCV,
-    "booster": BOOSTER,
-    "mvsnet": MVSNET,
-    "zed": ZED,
-    "realsense": REALSENSE,
-    "oak": OAK,
-    "ros": ROS,
-    "kalibr": KALIBR,
-    "euroc": EUROC,
-    "orb_slam": ORB_SLAM,
+    "middlebury": CalibrationFormat(
+        "Middlebury, MiddEval3 or ETH3D calib.txt (cam0=[...])",
+        _line(r"\s*cam0\s*=\s*\["),
+        benchmarks.read_middlebury,
+    ),
+    "kitti_cam_to_cam": CalibrationFormat(
+        "KITTI calib_cam_to_cam (P_rect_02: ...)",
+        _line(r"\s*P_rect_\d+\s*:"),
+        benchmarks.read_kitti,
+        uses_cameras=True,
+    ),
+    # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" out.
+    "kitti_projections": CalibrationFormat(
+        "KITTI projections (P0: ... to P3: ...)",
+        _line(r"\s*P[0-3]\s*:\s*[-+.\d]"),
+        benchmarks.read_kitti,
+        uses_cameras=True,
+    ),
+    "foundation_stereo": CalibrationFormat(
+        "K.txt of FoundationStereo (9 numbers, baseline in metres)",
+        re.compile(r"(?:[-+.\de\s,]|nan|inf)+", re.IGNORECASE).fullmatch,
+        benchmarks.read_foundation_stereo,
+    ),
+    "booster": CalibrationFormat(
+        "Booster xml (proj_matL, proj_matR, baselineLR)",
+        re.compile("<opencv_storage(?s:.*)proj_matL").search,
+        benchmarks.read_booster,
+    ),
+    "mvsnet": CalibrationFormat(
+        "a pair of MVSNet cam.txt (extrinsic, intrinsic)",
+        _line(r"\s*extrinsic\s*$"),
+        benchmarks.read_mvsnet,
+        file_counts=(2,),
+    ),
+    "zed": CalibrationFormat(
+        "ZED factory calibration SN*.conf ([LEFT_CAM_HD], [STEREO])",
+        _line(r"\s*\[(LEFT|RIGHT)_CAM_\w+\]"),
+        devices.read_zed,
+    ),
+    "realsense": CalibrationFormat(
+        "RealSense intrinsics and extrinsics (rs-enumerate-devices -c, or rs2 as JSON)",
+        lambda text: devices.RS_PRINTED.search(text) or _json("ppx")(text),
+        devices.read_realsense,
+    ),
+    "oak": CalibrationFormat(
+        "OAK-D calibration JSON (cameraData)", _json("cameraData"), devices.read_oak, uses_cameras=True
+    ),
+    "nerf": CalibrationFormat(
+        "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
+        _json("frames", "transform_matrix"),
+        nerf.read_nerf,
+        has_unit=False,
+        by_image=True,
+    ),
+    "kalibr": CalibrationFormat(
+        "Kalibr camchain.yaml (cam0, cam1)",
+        _line(r"cam\d+:\s*(?:#.*)?$"),
+        robots.read_kalibr,
+        uses_cameras=True,
+    ),
+    "euroc": CalibrationFormat(
+        "a pair of EuRoC sensor.yaml (T_BS)", _line(r"T_BS\s*:"), robots.read_euroc, file_counts=(2,)
+    ),
+    # Older settings describe the rectification too, and OpenCV's reader has these names.
+    "orb_slam": CalibrationFormat(
+        "ORB-SLAM's stereo settings (Camera1.fx, Camera.bf)",
+        re.compile(r"(?ms)\A(?!.*^LEFT\.P[ \t]*:).*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:").search,
+        robots.read_orb_slam,
+    ),
+    "opencv": CalibrationFormat(
+        "OpenCV stereoRectify YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
+        re.compile('!!opencv-matrix|<opencv_storage|"opencv-matrix"').search,
+        opencv.read_opencv,
+        file_counts=(1, 2),
+    ),
+    "ros": CalibrationFormat(
+        "a pair of ROS camera_info (projection_matrix)",
+        _line(r"(projection_matrix|distortion_model|rectification_matrix)\s*:"),
+        robots.read_ros,
+        file_counts=(2,),
+    ),
+    "stereodemo": CalibrationFormat(
+        "stereodemo JSON (fx, fy, cx0, cx1, cy, baseline_meters)", _json("fx"), benchmarks.read_stereodemo
+    ),
     "colmap": COLMAP,
-    "nerf": NERF,
 }
 
 PathLike = str | os.PathLike[str]
-
 
 #: What a reader that takes a whole file for granted raises on one that is not.
 UNFINISHED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError)
@@ -82,10 +148,6 @@ def _text(path: Path) -> str:
     return read_text(path, "calibration", "a calibration file") if text is None else text
 
 
-def _source(texts: dict[Path, str]) -> str:
-    return " and ".join(map(str, texts))
-
-
 def _recognise(text: str, path: Path) -> str:
     name = next((name for name, entry in CALIBRATION_FORMATS.items() if entry.matches(text)), None)
     if name is None:
@@ -95,54 +157,64 @@ def _recognise(text: str, path: Path) -> str:
     return name
 
 
-def _read(texts: dict[Path, str], name: str, choice: CameraChoice) -> Rig:
+def _one_format(texts: dict[Path, str]) -> str:
+    """The name of the format that all files have, as many as it needs."""
+    names = [_recognise(text, path) for path, text in texts.items()]
+    if len(set(names)) > 1:
+        bad_value("calibration", "two files of one format", " and ".join(names))
+    calibration = CALIBRATION_FORMATS[names[0]]
+    if len(texts) not in calibration.file_counts:
+        count, cure = "one file", "It describes both cameras; give it once."
+        if len(texts) == 1:
+            count, cure = "two files", "Give --calib twice, for the left and the right view."
+        got = " and ".join(map(str, texts))
+        bad_value("calibration", f"{count} ({calibration.summary})", got, cure)
+    return names[0]
+
+
+def _read(texts: dict[Path, str], calibration: CalibrationFormat, choice: CameraChoice) -> Rig:
     """The rig of files of one format; whatever is wrong in them becomes a sentence with their names."""
-    source, calibration = _source(texts), CALIBRATION_FORMATS[name]
+    source = " and ".join(map(str, texts))
     try:
         raw = calibration.read(tuple(texts.values()), choice)
         rig = make_rig(raw, source)
     except InputError as error:
         refuse(f"{source}: {error}")
     except UNFINISHED as error:
-        got = (
-            f"no {error}" if isinstance(error, KeyError) else str(error).partition("\n")[0] or "other entries"
-        )
+        said = str(error).partition("\n")[0] or "other entries"
+        got = f"no {error}" if isinstance(error, KeyError) else said
         bad_value(source, f"a whole {calibration.summary}", got, "Is the file cut off?")
     for note in raw.notes:
         warn(f"{source}: {note}", stacklevel=3)
     return rig
 
 
-def _check_cameras(cameras: tuple[int, int] | None, name: str) -> None:
+def _check_cameras(cameras: tuple[int, int] | None, calibration: CalibrationFormat) -> None:
     if cameras is None:
         return
-    if not CALIBRATION_FORMATS[name].uses_cameras:
+    if not calibration.uses_cameras:
         bad_value("cameras", "left out for a file of two cameras", cameras, "It chooses among more than two.")
-    if (
-        not isinstance(cameras, (tuple, list))
-        or len(cameras) != 2
-        or not all(type(c) is int for c in cameras)
-    ):
+    pair = isinstance(cameras, (tuple, list)) and len(cameras) == 2
+    if not pair or not all(type(camera) is int for camera in cameras):
         bad_value("cameras", "a pair of camera numbers, as (2, 3)", repr(cameras))
 
 
-def _in_metres(rig: Rig, baseline_m: float | None, name: str) -> Rig:
+def _in_metres(rig: Rig, baseline_m: float | None, has_unit: bool) -> Rig:
     """The rig with its cameras ``baseline_m`` apart; a warning where nothing says what its unit is."""
     if baseline_m is None:
-        if not CALIBRATION_FORMATS[name].has_unit:
-            warn(
-                f"{rig.source} has no unit: depth comes out in the model's own. Give the measured "
-                "distance of the two cameras as baseline_m (--baseline) to get metres.",
-                stacklevel=3,
-            )
-            return replace(rig, unit=None, measured=False)
-        return rig
+        if has_unit:
+            return rig
+        warn(
+            f"{rig.source} has no unit: depth comes out in the model's own. Give the measured "
+            "distance of the two cameras as baseline_m (--baseline) to get metres.",
+            stacklevel=3,
+        )
+        return replace(rig, unit=None, measured=False)
     check_number(baseline_m, "baseline_m", float(np.finfo(np.float64).tiny), 1e9)
     length = float(np.linalg.norm(rig.E[:3, 3]))
     if length == 0:
-        bad_value(
-            "baseline_m", f"left out for {rig.source}", baseline_m, "Both its cameras are at one place."
-        )
+        cure = "Both its cameras are at one place."
+        bad_value("baseline_m", f"left out for {rig.source}", baseline_m, cure)
     E = rig.E.copy()
     E[:3, 3] *= baseline_m / length
     return replace(rig, E=E)
@@ -184,19 +256,19 @@ def read_calibration(
         A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
     """
     texts = _texts(path)
-    name = _one_format(texts)
-    _check_cameras(cameras, name)
+    calibration = CALIBRATION_FORMATS[_one_format(texts)]
+    _check_cameras(cameras, calibration)
     choice = CameraChoice(
         (cameras[0], cameras[1]) if cameras else None,
         None if image_folder_hint is None else str(image_folder_hint),
         None if image_names is None else (str(image_names[0]), str(image_names[1])),
         None if image_size is None else (int(image_size[0]), int(image_size[1])),
     )
-    rig = _read(texts, name, choice)
+    rig = _read(texts, calibration, choice)
     if not distorted:
         for side, lens in zip(("left", "right"), rig.distortion, strict=True):
             check_no_distortion(lens, f"Lens distortion of the {side} camera in {rig.source}")
-    return _in_metres(rig, baseline_m, name)
+    return _in_metres(rig, baseline_m, calibration.has_unit)
 
 
 def has_pose_per_image(path: PathLike | Sequence[PathLike]) -> bool:
@@ -209,17 +281,3 @@ def has_pose_per_image(path: PathLike | Sequence[PathLike]) -> bool:
         OSError, TypeError, ValueError: as ``read_calibration``, where no format is recognised.
     """
     return CALIBRATION_FORMATS[_one_format(_texts(path))].by_image
-
-
-def _one_format(texts: dict[Path, str]) -> str:
-    """The name of the format that all files have, as many as it needs."""
-    names = [_recognise(text, path) for path, text in texts.items()]
-    if len(set(names)) > 1:
-        bad_value("calibration", "two files of one format", " and ".join(names))
-    calibration = CALIBRATION_FORMATS[names[0]]
-    if len(texts) not in calibration.file_counts:
-        count, cure = "one file", "It describes both cameras; give it once."
-        if len(texts) == 1:
-            count, cure = "two files", "Give --calib twice, for the left and the right view."
-        bad_value("calibration", f"{count} ({calibration.summary})", _source(texts), cure)
-    return names[0]

@@ -1,47 +1,30 @@
-"""What the readers of calibrations share: raw numbers of two cameras, and ``make_rig``, which checks them."""
+"""Two cameras as a calibration file describes them, and ``make_rig``, which checks and builds."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-import torch
 
-from geodiff_plugin._camera_checks import check_intrinsics
+from geodiff_plugin._camera_checks import check_intrinsics, check_pose
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.geometry import nearest_rotation
 from geodiff_plugin.types import Distortion, Rig
 
 __all__ = [
-    "COEFFICIENT_COUNTS",
-    "CalibrationFormat",
-    "Camera",
-    "CameraChoice",
-    "RawRig",
-    "array_of",
-    "check_no_distortion",
-    "intrinsics",
-    "is_distorted",
-    "make_rig",
-    "names_of_pair",
-    "number",
-    "projected",
-    "rig_from_parameters",
-    "rigid",
-    "size_of",
-    "two_cameras",
+    *("COEFFICIENT_COUNTS", "CalibrationFormat", "Camera", "CameraChoice", "RawRig", "array_of"),
+    *("check_no_distortion", "intrinsics", "is_distorted", "make_rig", "names_of_pair", "number", "of_size"),
+    *("projected", "rig_from_parameters", "rigid", "size_of", "two_cameras"),
 ]
 
 Size = tuple[int, int]
+Entry = TypeVar("Entry")
 
 #: Coefficients below this move no pixel of a 12 megapixel image by a tenth of a pixel.
 DISTORTION_TOLERANCE = 1e-6
-#: How far a file's rotation may be from orthogonal; what is left is rounding in print.
-ROTATION_TOLERANCE = 1e-2
 #: How many coefficients OpenCV's functions take, by the model's name in ``Distortion``.
 COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
 CHECK_FILE = "Check the calibration file."
@@ -107,7 +90,7 @@ class CalibrationFormat:
 
     Attributes:
         summary: the format and its mark, for messages.
-        matches: whether a text is of this format; looks at nothing else.
+        matches: whether a text is of this format, given that no format before it in the table matches.
         read: ``(texts, choice) -> RawRig``. It may raise whatever a missing entry raises, which
             ``read_calibration`` turns into a sentence with the file's name.
         file_counts: how many files may describe one pair.
@@ -117,7 +100,7 @@ class CalibrationFormat:
     """
 
     summary: str
-    matches: Callable[[str], bool]
+    matches: Callable[[str], object]
     read: Callable[[tuple[str, ...], CameraChoice], RawRig]
     file_counts: tuple[int, ...] = (1,)
     uses_cameras: bool = False
@@ -125,12 +108,11 @@ class CalibrationFormat:
     by_image: bool = False
 
 
-def number(value: Any, name: str) -> float:
-    """A finite number, as float; text of one is taken, a truth value is not.
+# What readers share. Each raises ValueError with the name of the entry.
 
-    Raises:
-        ValueError: it is not.
-    """
+
+def number(value: Any, name: str) -> float:
+    """A finite number, as float; text of one is taken, a truth value is not."""
     try:
         result = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):  # a whole number of any length is JSON
@@ -141,11 +123,7 @@ def number(value: Any, name: str) -> float:
 
 
 def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Finite numbers as a float64 array; flat lists are brought to ``shape``, ``(-1,)`` takes any count.
-
-    Raises:
-        ValueError: other things than finite numbers, or another count of them.
-    """
+    """Finite numbers as a float64 array; flat lists are brought to ``shape``, ``(-1,)`` takes any count."""
     count = math.prod(shape)
     expected = "numbers" if count < 0 else f"{count} numbers"
     try:
@@ -160,46 +138,23 @@ def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def intrinsics(fx: Any, fy: Any, cx: Any, cy: Any) -> np.ndarray:
-    """The ``(3, 3)`` float64 camera matrix of four numbers in pixels.
-
-    Raises:
-        ValueError: one of them is no finite number.
-    """
+    """The ``(3, 3)`` float64 camera matrix of four numbers in pixels."""
     fx, fy, cx, cy = (number(value, name) for value, name in ((fx, "fx"), (fy, "fy"), (cx, "cx"), (cy, "cy")))
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
 
-def size_of(entries: Any, width: str = "width", height: str = "height") -> tuple[Any, Any] | None:
+def size_of(entries: Mapping[str, Any], width: str = "width", height: str = "height") -> Any:
     """The raw ``(width, height)`` of a mapping; ``None`` where it has neither."""
     pair = entries.get(width), entries.get(height)
     return None if pair == (None, None) else pair
 
 
 def rigid(matrix: Any, name: str) -> np.ndarray:
-    """A ``(4, 4)`` float64 transform of 12 or 16 numbers, its rotation projected to the nearest one.
-
-    Raises:
-        ValueError: not finite, last row not (0, 0, 0, 1), mirrored, or not orthogonal within 1e-2.
-    """
+    """A ``(4, 4)`` float64 transform of 12 or 16 numbers, its rotation projected to the nearest one."""
     numbers = array_of(matrix, (-1,), name)
-    if numbers.size == 12:
-        numbers = np.append(numbers, (0.0, 0.0, 0.0, 1.0))
-    T = array_of(numbers, (4, 4), name).copy()
-    if not np.allclose(T[3], (0, 0, 0, 1), atol=1e-6):
-        bad_value(
-            name, "a rigid transform with last row 0 0 0 1", f"last row {T[3].tolist()}", "Is it transposed?"
-        )
-    R = T[:3, :3]
-    off = float(np.abs(R @ R.T - np.eye(3)).max())
-    if off > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-        bad_value(
-            name,
-            f"a rigid transform, its upper left 3x3 a rotation (within {ROTATION_TOLERANCE})",
-            f"determinant {np.linalg.det(R):.4f}, |R R^T - I| up to {off:.4f}",
-            "Check that rows and columns are not swapped and that no scale is multiplied in.",
-        )
-    T[:3, :3] = nearest_rotation(torch.from_numpy(R.copy())).numpy()
-    return T
+    shape = (3, 4) if numbers.size == 12 else (4, 4)
+    cure = "Check that rows and columns are not swapped and that no scale is multiplied in."
+    return check_pose(array_of(numbers, shape, name), name, cure)
 
 
 def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> RawRig:
@@ -214,150 +169,30 @@ def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any 
     )
     E = np.eye(4)
     E[:3, 3] = t_left - t_right
-    left, right = (
-        Camera(matrix[:, :3], size) for matrix, size in zip(P, (size_left, size_right), strict=True)
-    )
-    return RawRig(left, right, E, rectified=True)
+    return RawRig(Camera(P[0][:, :3], size_left), Camera(P[1][:, :3], size_right), E, rectified=True)
 
 
 def _sides(left: Any, right: Any) -> tuple[tuple[str, Any], tuple[str, Any]]:
     return ("left", left), ("right", right)
 
 
-def is_distorted(lens: Distortion | None) -> bool:
-    """Whether a lens moves any pixel; a fisheye does with coefficients of zero as well."""
-    if lens is None:
-        return False
-    return lens.model == "fisheye" or np.abs(lens.coefficients).max(initial=0.0) > DISTORTION_TOLERANCE
-
-
-def check_no_distortion(lens: Distortion | None, name: str) -> None:
-    """Refuse lens distortion: every formula here is of a pinhole camera.
-
-    Raises:
-        ValueError: a lens that moves pixels.
-    """
-    if lens is None or not is_distorted(lens):
-        return
-    numbers = np.array2string(lens.coefficients, precision=4, separator=", ")
-    bad_value(
-        name,
-        "zero (images of a pinhole camera)",
-        f"fisheye {numbers}" if lens.model == "fisheye" else numbers,
-        "Undistort or rectify both images first (OpenCV: stereoRectify, initUndistortRectifyMap, remap) "
-        "and give the calibration of the result (P1, P2), or use geodiff depth, which undistorts them.",
-    )
-
-
-def _lens(camera: Camera, side: str) -> Distortion | None:
-    """The lens, or ``None`` where it moves no pixel."""
-    if camera.model not in COEFFICIENT_COUNTS:
-        cure = "OpenCV does not have this model: undistort or rectify both images to a pinhole first."
-        expected = f"one of {', '.join(COEFFICIENT_COUNTS)}"
-        bad_value(f"the lens model of the {side} camera", expected, repr(camera.model), cure)
-    name = f"Lens distortion of the {side} camera"
-    lens = Distortion(camera.model, array_of(camera.coefficients, (-1,), name))
-    if not is_distorted(lens):
-        return None
-    counts = COEFFICIENT_COUNTS[camera.model]
-    if lens.coefficients.size not in counts:
-        expected = f"{', '.join(map(str, counts))} coefficients in OpenCV's order ({camera.model})"
-        got = np.array2string(lens.coefficients, precision=4, separator=", ")
-        bad_value(name, expected, f"{lens.coefficients.size}: {got}", CHECK_FILE)
-    return lens
-
-
-def _pixels(size: Any, side: str) -> Size | None:
-    if size is None:
-        return None
-    cure = "The images are checked against it; leave out both sides where they are not known."
-    pair = []
-    for name, value in zip(("width", "height"), size, strict=True):
-        name = f"the {name} of the {side} image"
-        if value is None:
-            bad_value(name, "a whole number of pixels above 0", "none", cure)
-        pixels = number(value, name)
-        if pixels < 1 or pixels % 1:
-            bad_value(name, "a whole number of pixels above 0", repr(value), cure)
-        pair.append(int(pixels))
-    return pair[0], pair[1]
-
-
-def make_rig(raw: RawRig, source: str | Path) -> Rig:
-    """A ``Rig`` of raw numbers: finite, in the right form, with whole pixels and lenses that OpenCV has.
-
-    Args:
-        raw: as a reader found it.
-        source: the file, for later messages.
-
-    Raises:
-        ValueError: what is wrong with which camera, or with the pose.
-    """
-    pose = raw.pose
-    if np.ndim(pose) == 0:
-        pose, baseline_m = np.eye(4), number(pose, "the baseline")
-        if baseline_m <= 0:
-            bad_value("the baseline", "above 0", baseline_m, CHECK_FILE)
-        pose[0, 3] = baseline_m
-    cameras = _sides(raw.left, raw.right)
-    K_left, K_right = (check_intrinsics(camera.K, f"K of the {side} camera") for side, camera in cameras)
-    size_left, size_right = (_pixels(camera.size, side) for side, camera in cameras)
-    lens_left, lens_right = (_lens(camera, side) for side, camera in cameras)
-    return Rig(
-        K_left=K_left,
-        K_right=K_right,
-        E=array_of(pose, (4, 4), "the pose"),
-        size_left=size_left,
-        size_right=size_right,
-        source=str(source),
-        distortion=(lens_left, lens_right),
-        rectified=raw.rectified,
-    )
-
-
-def rig_from_parameters(
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    baseline_m: float,
-    *,
-    cx_right: float | None = None,
-    size: Size | None = None,
-) -> Rig:
-    """A rectified rig from the numbers that a data sheet gives.
-
-    Args:
-        fx: focal length in pixels, > 0.
-        fy: focal length in pixels, > 0.
-        cx: principal point of the left image, pixels, centre of the first pixel at 0.
-        cy: likewise, both images.
-        baseline_m: distance of the cameras in metres, > 0; the right one stands to the right.
-        cx_right: principal point of the right image; ``None`` means ``cx`` (no ``doffs``).
-        size: ``(width, height)`` that these belong to, where known.
-
-    Raises:
-        TypeError, ValueError: not finite numbers, or not above 0 where they must be.
-    """
-    tiny = float(np.finfo(np.float64).tiny)
-    cx_right = cx if cx_right is None else cx_right
-    for name, value in (("fx", fx), ("fy", fy), ("baseline", baseline_m)):
-        check_number(value, name, tiny, np.finfo(np.float64).max)
-    for name, value in (("cx", cx), ("cy", cy), ("cx_right", cx_right)):
-        check_number(value, name, -1e9, 1e9)
-    left, right = (Camera(intrinsics(fx, fy, x, cy), size) for x in (cx, cx_right))
-    return make_rig(RawRig(left, right, float(baseline_m)), "arguments")
+def of_size(by_size: Mapping[Size, Entry], choice: CameraChoice) -> Entry:
+    """What a file has for images of ``choice.image_size``, or all that it has where that is one."""
+    if choice.image_size is None and len(by_size) == 1:
+        return next(iter(by_size.values()))
+    if choice.image_size not in by_size:
+        sizes = ", ".join("{}x{}".format(*size) for size in sorted(by_size)) or "none"
+        got = "no image" if choice.image_size is None else "{}x{}".format(*choice.image_size)
+        cure = "A side-by-side image is two."
+        bad_value("the left image", f"of one of the file's sizes ({sizes})", got, cure)
+    return by_size[choice.image_size]
 
 
 def two_cameras(choice: CameraChoice, available: Collection[int]) -> tuple[int, int]:
-    """``choice.cameras``, which must be given, as two different ones of those that a file has.
-
-    Raises:
-        ValueError: they are not.
-    """
-    have = ", ".join(map(str, sorted(available))) or "none"
+    """``choice.cameras``, which must be given, as two different ones of those that a file has."""
     left, right = choice.cameras or (0, 0)
     if left == right or not {left, right} <= set(available):
+        have = ", ".join(map(str, sorted(available))) or "none"
         bad_value("cameras", f"two different cameras of the file ({have})", f"{left},{right}")
     return left, right
 
@@ -365,12 +200,8 @@ def two_cameras(choice: CameraChoice, available: Collection[int]) -> tuple[int, 
 def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, str]:
     """The names in a file of ``choice.image_names``.
 
-    A path fits a name that it ends with, or that ends with it; of several the one with the most folders in
-    common is taken.
-
-    Args:
-        names: of all images in the file; they may hold folders, and may lack the suffix.
-        choice: its ``image_names`` are names or paths.
+    Names of the file may hold folders, and may lack the suffix. A path fits a name that it ends with, or that
+    ends with it; of several the one with the most folders in common is taken.
 
     Raises:
         ValueError: no names, no such image, several that fit as well, or one image for both.
@@ -404,14 +235,118 @@ def _named(names: Collection[str], wanted: str) -> str:
     fitting = sorted(name for name, count in agreeing.items() if count == most)
     if most == 0:
         some = ", ".join(sorted(names)[:3])
-        bad_value(
-            "the image", f"one of the {len(names)} in the file ({some}, ...)", wanted, "Check its name."
-        )
+        expected = f"one of the {len(names)} in the file ({some}, ...)"
+        bad_value("the image", expected, wanted, "Check its name.")
     if len(fitting) > 1:
-        bad_value(
-            "the image",
-            "one image of the file",
-            f"{wanted}, which may be {' and '.join(fitting[:2])}",
-            "Add its folder.",
-        )
+        got = f"{wanted}, which may be {' and '.join(fitting[:2])}"
+        bad_value("the image", "one image of the file", got, "Add its folder.")
     return fitting[0]
+
+
+# From raw numbers to the rig.
+
+
+def is_distorted(lens: Distortion | None) -> bool:
+    """Whether a lens moves any pixel; a fisheye does with coefficients of zero as well."""
+    if lens is None:
+        return False
+    return lens.model == "fisheye" or np.abs(lens.coefficients).max(initial=0.0) > DISTORTION_TOLERANCE
+
+
+def _printed(lens: Distortion) -> str:
+    numbers = np.array2string(lens.coefficients, precision=4, separator=", ")
+    return f"fisheye {numbers}" if lens.model == "fisheye" else numbers
+
+
+def check_no_distortion(lens: Distortion | None, name: str) -> None:
+    """Refuse a lens that moves pixels: every formula here is of a pinhole camera."""
+    if lens is not None and is_distorted(lens):
+        cure = (
+            "Undistort or rectify both images first and give the calibration of the result (P1, P2), "
+            "or use geodiff depth, which undistorts them."
+        )
+        bad_value(name, "zero (images of a pinhole camera)", _printed(lens), cure)
+
+
+def _lens(camera: Camera, side: str) -> Distortion | None:
+    """The lens, or ``None`` where it moves no pixel."""
+    counts = COEFFICIENT_COUNTS.get(camera.model)
+    if counts is None:
+        cure = "OpenCV does not have this model: undistort or rectify both images to a pinhole first."
+        expected = f"one of {', '.join(COEFFICIENT_COUNTS)}"
+        bad_value(f"the lens model of the {side} camera", expected, repr(camera.model), cure)
+    name = f"Lens distortion of the {side} camera"
+    lens = Distortion(camera.model, array_of(camera.coefficients, (-1,), name))
+    if not is_distorted(lens):
+        return None
+    if lens.coefficients.size not in counts:
+        expected = f"{', '.join(map(str, counts))} coefficients in OpenCV's order ({camera.model})"
+        bad_value(name, expected, f"{lens.coefficients.size}: {_printed(lens)}", CHECK_FILE)
+    return lens
+
+
+def _pixels(size: Any, side: str) -> Size | None:
+    if size is None:
+        return None
+    pair = []
+    for name, value in zip(("width", "height"), size, strict=True):
+        pixels = number(value, f"the {name} of the {side} image")
+        if pixels < 1 or pixels % 1:
+            expected = "a whole number of pixels above 0"
+            bad_value(f"the {name} of the {side} image", expected, repr(value), CHECK_FILE)
+        pair.append(int(pixels))
+    return pair[0], pair[1]
+
+
+def make_rig(raw: RawRig, source: str | Path) -> Rig:
+    """A ``Rig`` of raw numbers: finite, in the right form, with whole pixels and lenses that OpenCV has.
+
+    Args:
+        raw: as a reader returns it.
+        source: the file, for later messages.
+
+    Raises:
+        ValueError: what is wrong with which camera, or with the pose.
+    """
+    pose = raw.pose
+    if np.ndim(pose) == 0:
+        pose, baseline_m = np.eye(4), number(pose, "the baseline")
+        if baseline_m <= 0:
+            bad_value("the baseline", "above 0", baseline_m, CHECK_FILE)
+        pose[0, 3] = baseline_m
+    cameras = _sides(raw.left, raw.right)
+    K_left, K_right = (check_intrinsics(camera.K, f"K of the {side} camera") for side, camera in cameras)
+    size_left, size_right = (_pixels(camera.size, side) for side, camera in cameras)
+    lens_left, lens_right = (_lens(camera, side) for side, camera in cameras)
+    E = array_of(pose, (4, 4), "the pose")
+    lenses = lens_left, lens_right
+    return Rig(K_left, K_right, E, size_left, size_right, str(source), lenses, raw.rectified)
+
+
+def rig_from_parameters(
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    baseline_m: float,
+    *,
+    cx_right: float | None = None,
+    size: Size | None = None,
+) -> Rig:
+    """A rectified rig from the numbers that a data sheet gives.
+
+    ``fx``, ``fy``, ``cx``, ``cy`` are in pixels, the centre of the first pixel at 0, of both images; the
+    right one has ``cx_right`` where that is given (``doffs``). The right camera stands ``baseline_m``
+    metres to the right. ``size`` is the ``(width, height)`` that these belong to, where known.
+
+    Raises:
+        TypeError, ValueError: not finite numbers, or not above 0 where they must be.
+    """
+    tiny = float(np.finfo(np.float64).tiny)
+    cx_right = cx if cx_right is None else cx_right
+    for name, value in (("fx", fx), ("fy", fy), ("baseline", baseline_m)):
+        check_number(value, name, tiny, np.finfo(np.float64).max)
+    for name, value in (("cx", cx), ("cy", cy), ("cx_right", cx_right)):
+        check_number(value, name, -1e9, 1e9)
+    left, right = (Camera(intrinsics(fx, fy, x, cy), size) for x in (cx, cx_right))
+    return make_rig(RawRig(left, right, float(baseline_m)), "arguments")

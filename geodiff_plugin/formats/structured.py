@@ -1,10 +1,12 @@
-"""JSON, YAML and OpenCV's FileStorage of calibration files as dicts, lists and arrays.
+"""JSON, YAML, INI and OpenCV's FileStorage of calibration files as dicts, lists and arrays.
 
 OpenCV's own reader is not used: a damaged file can corrupt its memory, and calibrations come from strangers.
+Errors are ``ValueError`` and name the line where there is one.
 """
 
 from __future__ import annotations
 
+import configparser
 import json
 import math
 import re
@@ -16,7 +18,7 @@ import yaml
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["is_storage", "parse_json", "parse_storage", "parse_yaml"]
+__all__ = ["parse_ini", "parse_json", "parse_storage", "parse_yaml"]
 
 CUT_OFF = "Is the file cut off?"
 #: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
@@ -40,35 +42,23 @@ for _kind in KINDS:
 
 
 def parse_json(text: str) -> Any:
-    """What a JSON text holds.
-
-    Raises:
-        ValueError: not JSON, naming the line.
-    """
+    """What a JSON text holds."""
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
         bad_value("the file", "JSON", f"{error.msg} in line {error.lineno}", CUT_OFF)
-    except RecursionError:
-        bad_value("the file", "a JSON object of numbers", "lists within lists without end")
-    except ValueError:
-        bad_value("the file", "a JSON object of numbers", "a whole number of thousands of digits")
+    except (RecursionError, ValueError):  # lists within lists without end, a number of thousands of digits
+        bad_value("the file", "a JSON object of numbers", "lists too deep or thousands of digits")
 
 
 def parse_yaml(text: str) -> dict[str, Any]:
-    """The mapping that the first YAML document holds; later documents (``rostopic echo``) are left out.
-
-    Raises:
-        ValueError: not YAML, or no mapping.
-    """
+    """The mapping that the first YAML document holds; later documents (``rostopic echo``) are left out."""
     try:
         content = next(yaml.load_all(OPENCV_HEAD.sub("", text), _Loader), None)  # noqa: S506  (a safe one)
     except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         where = "" if mark is None else f" in line {mark.line + 1}"
-        bad_value(
-            "the file", "YAML", f"{getattr(error, 'problem', None) or 'something else'}{where}", CUT_OFF
-        )
+        bad_value("the file", "YAML", f"{problem or 'something else'}{where}", CUT_OFF)
     except (RecursionError, ValueError):  # a date that is none, a number of thousands of digits
         bad_value("the file", "a YAML file of numbers", "something else", CUT_OFF)
     if not isinstance(content, dict):
@@ -76,9 +66,14 @@ def parse_yaml(text: str) -> dict[str, Any]:
     return content
 
 
-def is_storage(text: str) -> bool:
-    """Whether the text is written as OpenCV's FileStorage does it, in YAML, XML or JSON."""
-    return any(mark in text for mark in ("!!opencv-matrix", "<opencv_storage", '"opencv-matrix"'))
+def parse_ini(text: str) -> configparser.ConfigParser:
+    """Sections of ``key=value``."""
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    try:
+        parser.read_string(text)
+    except configparser.Error as error:
+        bad_value("the file", "sections of key=value", str(error).splitlines()[0], CUT_OFF)
+    return parser
 
 
 def parse_storage(text: str) -> dict[str, Any]:
@@ -87,9 +82,6 @@ def parse_storage(text: str) -> dict[str, Any]:
     Returns:
         By key in small letters: matrices as float64 arrays with the axes that they were written with and one
         for their channels, numbers and lists of numbers as float64 arrays of one axis, and strings.
-
-    Raises:
-        ValueError: cut off or malformed.
     """
     # JSON is YAML; older versions of OpenCV write 1. and .Nan into it, which JSON itself does not know.
     content = _parse_xml(text) if "<opencv_storage" in text else parse_yaml(text)
@@ -130,19 +122,11 @@ def _flat(content: dict[str, Any], deepest: int) -> dict[str, Any]:
 def _numbers(value: Any) -> np.ndarray | None:
     """A number or a flat list of numbers, some of which may be text; ``None`` for other things."""
     words = value if isinstance(value, list) else [value]
-    try:
-        return np.array([_number(word) for word in words], np.float64)
+    try:  # OpenCV writes .Nan and .Inf, which Python reads without the dot
+        words = [re.sub(r"\.(nan|inf)", r"\1", w.lower()) if isinstance(w, str) else w for w in words]
+        return None if any(isinstance(w, bool) for w in words) else np.array([float(w) for w in words])
     except (TypeError, ValueError, OverflowError):
         return None
-
-
-def _number(word: Any) -> float:
-    if isinstance(word, bool):
-        raise TypeError
-    # OpenCV writes .Nan and .Inf, which Python reads without the dot.
-    return float(
-        word.lower().replace(".nan", "nan").replace(".inf", "inf") if isinstance(word, str) else word
-    )
 
 
 def _matrix(value: dict[str, Any], key: str) -> np.ndarray:

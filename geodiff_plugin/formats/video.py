@@ -49,12 +49,7 @@ def count_frames(path: Path, name: str = "video") -> int:
 
 
 class VideoReader:
-    """Frames of a video, cheapest in order; a context manager.
-
-    Args:
-        path: the file.
-        name: the argument that it came in, for messages.
-    """
+    """Frames of a video file, cheapest in order; a context manager."""
 
     def __init__(self, path: Path, name: str = "video") -> None:
         self._path, self._name = path, name
@@ -67,10 +62,7 @@ class VideoReader:
         self._capture.release()
 
     def read(self, frame: int) -> np.ndarray:
-        """One frame, ``(H, W, 3)`` float32 in [0, 1], RGB.
-
-        Args:
-            frame: its number, from 0; what lies before it is passed over.
+        """One frame, ``(H, W, 3)`` float32 in [0, 1], RGB, by its number from 0, passing over what is before.
 
         Raises:
             OSError: there is no such frame, or it does not decode.
@@ -90,11 +82,7 @@ class VideoReader:
 
 
 def both_halves(image_01: np.ndarray, name: str = "video") -> tuple[np.ndarray, np.ndarray]:
-    """Left and right view of a frame that has them side by side, left one first.
-
-    Args:
-        image_01: ``(H, 2 W, 3)``.
-        name: the argument that it came in, for messages.
+    """Left and right view of a frame ``(H, 2 W, 3)`` that has them side by side, left one first.
 
     Raises:
         ValueError: an odd width.

@@ -189,10 +189,10 @@ def test_every_format_has_a_sample():
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
-def test_exactly_one_format_recognises_it(sample):
+def test_the_first_format_that_recognises_it_is_its_own(sample):
     name, texts = SAMPLES[sample]
     for text in texts:
-        assert [n for n, entry in CALIBRATION_FORMATS.items() if entry.matches(text)] == [name]
+        assert next(n for n, entry in CALIBRATION_FORMATS.items() if entry.matches(text)) == name
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
