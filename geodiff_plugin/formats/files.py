@@ -10,8 +10,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geodiff_plugin import _checks
-from geodiff_plugin._checks import bad_type, bad_value, quoted
+from geodiff_plugin._checks import (
+    FolderError,
+    ForbiddenFileError,
+    MissingFileError,
+    bad_type,
+    bad_value,
+    quoted,
+)
 
 if TYPE_CHECKING:  # `geodiff --help` reads this module and starts without numpy
     import numpy as np
@@ -43,15 +49,15 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
         bad_type(name, f"the path of {what}", path)
     file, shown = Path(path), quoted(path)
     if os.path.isdir(file):
-        raise _checks.FolderError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
+        raise FolderError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
     if not os.path.exists(file):  # Path.exists() raises on a name that is too long
         said = f"{name} must be {what}; got {shown}, which does not exist. Check the spelling."
-        raise _checks.MissingFileError(said)
+        raise MissingFileError(said)
     if not file.is_file():
         bad_value(name, what, f"{shown}, which is a pipe or a device", "Save what it gives as a file first.")
     if not os.access(file, os.R_OK):
         said = f"{name} must be {what} that you may read; got {shown}. Check its permissions."
-        raise _checks.ForbiddenFileError(said)
+        raise ForbiddenFileError(said)
     if file.stat().st_size == 0:
         bad_value(name, what, f"{shown}, which is empty", "Was its download or copy cut off? Fetch it again.")
     return file
