@@ -8,20 +8,6 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_type, bad_value, warn
 
-__all__ = [
-    "FAR_SCENE_M",
-    "LONG_BASELINE_M",
-    "check_baseline",
-    "check_calibrated_size",
-    "check_intrinsics",
-    "check_intrinsics_fit",
-    "check_pose",
-    "check_size_of",
-    "warn_of_far_points",
-    "warn_of_long_baseline",
-    "warn_of_other_size",
-]
-
 #: A baseline longer than this is taken for millimetres that were meant as metres (with a warning).
 LONG_BASELINE_M = 20.0
 #: A scene all of which lies further away than this may be one in centimetres or millimetres.

@@ -13,27 +13,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 if TYPE_CHECKING:  # numpy takes longer to import than a wrong option to be said
     import numpy as np
 
-__all__ = [
-    "FolderError",
-    "ForbiddenFileError",
-    "InputError",
-    "InputFileError",
-    "InputTypeError",
-    "MissingFileError",
-    "bad_type",
-    "bad_value",
-    "check_choice",
-    "check_flag",
-    "check_metres",
-    "check_number",
-    "check_range",
-    "check_size",
-    "noted",
-    "quoted",
-    "refuse",
-    "warn",
-]
-
 #: The most characters of the given value that a message quotes; it may be a whole file.
 LONGEST_GOT = 400
 #: What ``warn`` says goes to the innermost ``noted`` block too.

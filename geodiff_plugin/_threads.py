@@ -16,8 +16,6 @@ import os
 import cv2
 import torch
 
-__all__ = ["WithinCores", "available_cores"]
-
 
 def available_cores() -> int:
     """Cores that this process may use, >= 1: what is there, within its affinity and its cgroup's quota."""

@@ -17,10 +17,6 @@ from typing import Any, NamedTuple, Self
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_flag, check_number, check_range
 
-__all__ = ["DEFAULT", "DEFAULT_WEIGHTS", "KNOBS", "MARIGOLD_DC", "PAPER", "PRESETS", "PRIOR_FIT"]
-__all__ += ["SEARCH_ONLY", "GuidanceConfig", "Knob", "UpdatePlan", "close_names", "config_from_text"]
-__all__ += ["knob_lines", "sentences", "shown", "value_of"]
-
 #: Weights of the default preset.
 DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
 #: The least value where 0 is not allowed.
@@ -389,12 +385,7 @@ FORMER: dict[str, Any] = {
     **{"reflection_least_spread": 0.05, "reflection_gone": 1.6, "reflection_limit": 1.5},
     **{"reflection_sure": 0.3},
     **{"correction_scale": 1.0, "ramp_step": 0.02, "ramp_contrast": 2.0, "ramp_slope": 0.04},
-    **{
-        "sharpen_colour": 0.12,
-        "sharpen_reach": 1.5,
-        "correction_cauchy": 2.5,
-        "stiffness_power": 4.0,
-    },
+    **{"sharpen_colour": 0.12, "sharpen_reach": 1.5, "correction_cauchy": 2.5, "stiffness_power": 4.0},
     **{"loosest": 0.03, "stiffest": 100.0, "inertia": 0.015, "least_inertia": 5e-4, "most_inertia": 0.03},
     **{"broad_smoothness": 50.0, "broad_inertia": 1e-4, "passes": 3, "stiff_smoothness": 400.0},
     **{"stiff_inertia": 1.3e-3, "block": 0.08, "least_error": 0.01, "most_error": 0.5},

@@ -9,8 +9,6 @@ import numpy as np
 import torch
 from diffusers.utils import BaseOutput
 
-__all__ = ["CameraView", "Distortion", "MetricDepthOutput", "PoseReport", "Rig", "StepReport"]
-
 
 @dataclass(frozen=True, eq=False)
 class Distortion:

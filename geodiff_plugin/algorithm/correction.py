@@ -15,8 +15,6 @@ from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.scale.points import weighted_quantile
 
-__all__ = ["correction_target", "local_error", "off_edges", "prior_error", "refine_depth"]
-
 #: Longer side in pixels of the grid that ``smoothness``, ``IMAGE_EDGE`` and ``DEPTH_EDGE`` are numbers of; on
 #: another one they are scaled, so that a correction reaches the same share of the image.
 REFERENCE_SIDE = 512.0
@@ -193,13 +191,7 @@ def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: Guid
 
     rounds, inertia = REWEIGHTINGS + 1, STIFF_INERTIA * stiff
     return solve_robust(
-        _times(observed.links, stiff),
-        observed.residual,
-        inertia,
-        trusted,
-        robust,
-        rounds,
-        SOLVER_STEPS,
+        _times(observed.links, stiff), observed.residual, inertia, trusted, robust, rounds, SOLVER_STEPS
     )[0]
 
 
@@ -252,11 +244,7 @@ def _bounded(error: Tensor) -> Tensor:
 
 @torch.no_grad()
 def refine_depth(
-    depth_m: Tensor,
-    target: Matches,
-    left_01: Tensor,
-    error: Tensor,
-    config: GuidanceConfig = DEFAULT,
+    depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, config: GuidanceConfig = DEFAULT
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Least-squares correction of log depth that follows matches and stops at edges.
 

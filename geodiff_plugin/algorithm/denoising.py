@@ -13,8 +13,6 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["PREDICTION_TYPES", "NoiseLevel", "noise_from", "output_from", "z0_from"]
-
 PREDICTION_TYPES = ("epsilon", "sample", "v_prediction", "flow_prediction")
 
 

@@ -28,16 +28,6 @@ from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from geodiff_plugin.types import CameraView, PoseReport
 
-__all__ = [
-    "Evidence",
-    "Views",
-    "as_fine_as",
-    "chunk_views",
-    "prepare_evidence",
-    "resize_long_edge",
-    "within",
-]
-
 
 @dataclass(frozen=True)
 class Evidence:

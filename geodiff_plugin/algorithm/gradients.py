@@ -16,8 +16,6 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["RULES", "Adam", "FiniteWatch", "NormMatched", "Plain", "Rule", "pull_back"]
-
 
 def pull_back(output: Tensor, source: Tensor, gradient: Tensor) -> Tensor:
     """The gradient in ``source`` of a loss whose gradient in ``output`` is known; frees the graph between.
@@ -125,11 +123,7 @@ class Adam:
     """
 
     def __init__(
-        self,
-        rate: float,
-        betas: tuple[float, float] = (0.9, 0.99),
-        eps: float = 1e-10,
-        to_norm: bool = False,
+        self, rate: float, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-10, to_norm: bool = False
     ) -> None:
         self.rate, self.betas, self.eps, self.to_norm = rate, betas, eps, to_norm
         self._count = 0

@@ -19,8 +19,6 @@ from geodiff_plugin.geometry.warping import hidden_in_right, warp_right_to_left
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState, MetricMap
 
-__all__ = ["Loss", "Objective"]
-
 
 class Loss(NamedTuple):
     """One evaluation: ``total (B,)`` with its graph, the unweighted ``terms``, the share in view ``(B,)``.

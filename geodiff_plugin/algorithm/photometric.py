@@ -14,8 +14,6 @@ from torch import Tensor
 
 from geodiff_plugin.config import DEFAULT
 
-__all__ = ["masked_mean", "match_exposure", "photometric", "photometric_map", "ssim"]
-
 #: A pyramid level with a shorter side than this says nothing that its parent does not.
 MIN_SIDE = 24
 #: SSIM's two constants for images in [0, 1], and the 3 taps of its Gaussian window of 1.5 pixels.

@@ -9,8 +9,6 @@ from typing import NamedTuple
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import GuidanceConfig, UpdatePlan
 
-__all__ = ["Round", "Schedule", "count_steps", "make_schedule"]
-
 
 class Round(NamedTuple):
     """A correction or none, then so many gradient updates; with neither, the scale is settled."""

@@ -13,8 +13,6 @@ from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refi
 from geodiff_plugin.scale.space import MetricMap, smooth_floor
 from geodiff_plugin.scale.volume_search import search_scale
 
-__all__ = ["settle_ends", "span_of_points"]
-
 
 def span_of_points(evidence: Sequence[Evidence]) -> tuple[Tensor, Tensor]:
     """Metres ``(B,)`` of the nearest and of the farthest point of every sample, which all have some."""

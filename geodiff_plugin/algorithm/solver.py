@@ -13,8 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["FieldSystem", "solve_field", "solve_robust"]
-
 #: The shorter side, in pixels, of the coarsest grid, and its conjugate-gradient steps: near enough to exact.
 COARSEST_SIDE, COARSEST_STEPS = 24, 80
 

@@ -21,8 +21,6 @@ from geodiff_plugin.scale.space import AffineState, MetricMap
 from geodiff_plugin.scale.volume_search import argmin_over
 from geodiff_plugin.types import StepReport
 
-__all__ = ["Trajectory"]
-
 
 class Trajectory:
     """One chunk of samples along the schedule.

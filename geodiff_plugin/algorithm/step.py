@@ -16,8 +16,6 @@ from geodiff_plugin.algorithm.objective import Loss
 from geodiff_plugin.algorithm.schedule import Round
 from geodiff_plugin.algorithm.state import Trajectory
 
-__all__ = ["Estimate", "corrected_step", "gradient_step", "guided_step"]
-
 
 class Estimate(Protocol):
     """The prior's estimate at one denoising step, and the way between latents and maps.

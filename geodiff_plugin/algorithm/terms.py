@@ -17,8 +17,6 @@ from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState
 
-__all__ = ["TERMS", "Compared", "Term"]
-
 #: Errors at points up to this share of the unit are float32's rounding and pull no more: a rule that gives
 #: every gradient the same length would follow their sign.
 ROUNDING = 1e-3

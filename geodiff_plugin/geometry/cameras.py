@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-__all__ = ["OPENGL_FROM_OPENCV", "image_size", "is_rectified", "nearest_rotation", "resize_intrinsics"]
-
 #: Two cameras count as rectified to a milliradian, and to a baseline that is sideways to 1 %.
 ANGLE_TOLERANCE, SIDEWAYS_TOLERANCE = 1e-3, 0.01
 #: ``(4, 4)``, from a camera's frame with y down and z forward to one with y up and z backward, and back.

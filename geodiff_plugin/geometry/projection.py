@@ -10,17 +10,6 @@ from kornia.geometry.linalg import transform_points
 
 from geodiff_plugin.geometry.cameras import image_size
 
-__all__ = [
-    "NEAREST_M",
-    "PlaneRays",
-    "made_there",
-    "plane_rays",
-    "project",
-    "project_rays",
-    "transform",
-    "unproject",
-]
-
 # Nearer than this a point counts as behind the camera: its pixel would be a division by almost 0.
 NEAREST_M = 1e-4
 # Where such a point is put: finite, and outside of any image.

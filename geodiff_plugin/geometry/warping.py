@@ -10,8 +10,6 @@ import torch.nn.functional as F
 from geodiff_plugin.geometry.cameras import image_size
 from geodiff_plugin.geometry.projection import NEAREST_M, PlaneRays, made_there, plane_rays, project_rays
 
-__all__ = ["Warped", "hidden_in_right", "sample_at", "warp_right_to_left"]
-
 # Rounding of float32 at image edges: the last pixel centre itself must count as inside.
 _EDGE_PX = 1e-2
 

@@ -22,8 +22,6 @@ from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.pose.refine import refine_views, untouched
 from geodiff_plugin.types import CameraView, PoseReport
 
-__all__ = ["EvidenceStore", "cleaned", "coarse_depth", "make_evidence", "pose_views"]
-
 # Windows that spread reliable matches into holes, pixels of the coarse sweep; a wider one counts a hundredth.
 _WINDOWS = (3, 7, 15, 31, 63)
 # Least inverse depth, as a share of the largest.

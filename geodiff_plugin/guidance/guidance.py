@@ -27,8 +27,6 @@ from geodiff_plugin.guidance.inputs import read_inputs, split_views
 from geodiff_plugin.guidance.photographs import EstimatedRig, estimate_rig
 from geodiff_plugin.types import MetricDepthOutput, Rig
 
-__all__ = ["GeometryGuidance", "assume_same_centre"]
-
 #: What is assumed of a rectified pair whose right camera has no K of its own.
 SAME_CENTRE = (
     "The right camera's cx is assumed to be the left one's. If it is not, every depth is off: each pixel of "

@@ -29,8 +29,6 @@ from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.types import CameraView, Rig
 
-__all__ = ["Inputs", "as_points", "read_inputs", "split_views"]
-
 
 @dataclass(frozen=True, eq=False)
 class Inputs:

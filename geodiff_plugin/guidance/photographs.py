@@ -25,8 +25,6 @@ from geodiff_plugin.pose.scale import Scale, find_scale
 from geodiff_plugin.pose.solve import depth_spread, open_pose
 from geodiff_plugin.types import CameraView
 
-__all__ = ["EstimatedRig", "estimate_rig"]
-
 
 @dataclass(frozen=True, eq=False)
 class EstimatedRig:

@@ -9,8 +9,6 @@ import torch
 
 from geodiff_plugin.matching.census import COST_LEVELS
 
-__all__ = ["NEVER", "PATHS", "Room", "aggregate", "cells"]
-
 #: Cost of a step of one plane between neighbouring pixels, in units of the largest matching cost, and of any
 #: larger step where the image is flat; the difference in brightness that halves the latter.
 STEP_PENALTY, JUMP_PENALTY, JUMP_CONTRAST = 0.15, 1.2, 0.1

@@ -13,8 +13,6 @@ import torch
 from geodiff_plugin.geometry import image_size, sample_at
 from geodiff_plugin.matching.census import MARGIN_PX, census, census_cost, grey_levels
 
-__all__ = ["AlignedView", "ComparedView", "align_view"]
-
 # A view that needs no turning to within this is taken as it is.
 _AS_IT_IS_PX = 0.02
 # Planes that come nearer to the right camera's plane than this share of their depth are not seen.

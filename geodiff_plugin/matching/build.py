@@ -15,15 +15,8 @@ from geodiff_plugin.geometry import image_size, plane_rays, resize_intrinsics
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.sweep import (
-    CostVolume,
-    inverse_depth_at_shift,
-    median_shift,
-    sweep_planes,
-)
+from geodiff_plugin.matching.sweep import CostVolume, inverse_depth_at_shift, median_shift, sweep_planes
 from geodiff_plugin.types import CameraView
-
-__all__ = ["build_cost_volume", "find_matches", "mirrored_pose_preferred", "pilot_volume"]
 
 # Fewer planes than this make no parabola worth the name.
 _FEWEST_PLANES = 24
@@ -96,10 +89,7 @@ def _even_planes(
 
 @torch.no_grad()
 def pilot_volume(
-    left_01: torch.Tensor,
-    rights: Sequence[CameraView],
-    K_left: torch.Tensor,
-    pixels: int = PILOT_PIXELS,
+    left_01: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, pixels: int = PILOT_PIXELS
 ) -> CostVolume:
     """A coarse sweep of all depths from infinity to a shift of 40 % of the width.
 
@@ -222,10 +212,7 @@ def find_matches(
 
 @torch.no_grad()
 def mirrored_pose_preferred(
-    left_01: torch.Tensor,
-    rights: Sequence[CameraView],
-    K_left: torch.Tensor,
-    matches: Matches | None = None,
+    left_01: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, matches: Matches | None = None
 ) -> bool:
     """Whether the inverse pose matches clearly more of the image than the pose as given.
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["COST_LEVELS", "MARGIN_PX", "VOTE_LEVELS", "census", "census_cost", "grey", "grey_levels"]
-
 MARGIN_PX = 3
 """Half the window: how far an image must reach beyond the pixels that are described."""
 

@@ -13,8 +13,6 @@ import torch.nn.functional as F
 
 from geodiff_plugin.matching.census import grey
 
-__all__ = ["clean", "find_flaws"]
-
 _SIDE = 8
 _LUMA_STEPS = (
     *(16, 11, 10, 16, 24, 40, 51, 61),

@@ -13,14 +13,6 @@ from geodiff_plugin.matching.census import COST_LEVELS
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import UNSEEN_LEVEL, CostVolume
 
-__all__ = [
-    "LOG_ODDS",
-    "RIGHT_WITHIN_PLANES",
-    "SIGNS",
-    "checked_matches",
-    "match_volume",
-]
-
 #: Planes of the truth within which a match counts as right.
 RIGHT_WITHIN_PLANES = 3.0
 #: Log-odds that a checked match is right, linear in its evidence, by logistic regression on pairs with truth

@@ -13,8 +13,6 @@ from torch import Tensor
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import NEAREST_M, project
 
-__all__ = ["UNIT", "Matches", "points_to_matches", "reject_reflections", "with_points"]
-
 #: The unit in which errors at points are measured, as a share of their median inverse depth.
 UNIT = 0.01
 #: Reflections. Half the side of the window over which matches must agree, in image sides; with a smaller one,
@@ -77,10 +75,7 @@ class Matches:
 
 
 def points_to_matches(
-    points: Tensor,
-    K_left: Tensor,
-    size: tuple[int, int],
-    size_grid: tuple[int, int],
+    points: Tensor, K_left: Tensor, size: tuple[int, int], size_grid: tuple[int, int]
 ) -> tuple[Matches, int]:
     """Put known depths on a grid of the left view; where several fall on one pixel, the nearest wins.
 

@@ -16,15 +16,6 @@ from geodiff_plugin.matching.alignment import AlignedView, ComparedView, align_v
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, census, grey_levels
 from geodiff_plugin.types import CameraView
 
-__all__ = [
-    "UNSEEN_COST",
-    "UNSEEN_LEVEL",
-    "CostVolume",
-    "inverse_depth_at_shift",
-    "median_shift",
-    "sweep_planes",
-]
-
 UNSEEN_LEVEL = 78
 UNSEEN_COST = UNSEEN_LEVEL / COST_LEVELS
 """Cost of a plane on which no right view sees the pixel: that of unrelated texture, neither good nor bad."""

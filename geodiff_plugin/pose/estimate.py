@@ -15,8 +15,6 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.pose.matches import GreyViews, Matcher
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
-__all__ = ["EstimatedPose", "estimate_pose", "estimate_poses", "parallax_deg"]
-
 #: An inlier lies nearer to its epipolar line, or to its place under a simpler motion, than this.
 INLIER_PX = 2.0
 #: Fewer inliers, or a smaller share of the matches, make no pose.

@@ -18,20 +18,6 @@ from geodiff_plugin.geometry import plane_rays, project_rays
 from geodiff_plugin.pose.tracks import Tracks
 from geodiff_plugin.types import CameraView
 
-__all__ = [
-    "LONG_SIDE",
-    "MATCHERS",
-    "FirstDepth",
-    "GreyViews",
-    "Matcher",
-    "dense_tracks",
-    "find_matcher",
-    "grey_views",
-    "match_features",
-    "sift_features",
-    "sparse_tracks",
-]
-
 #: Longer side of the left image that matches are sought on, pixels; residuals are in pixels of this grid.
 LONG_SIDE = 832
 # SIFT. The nearest descriptor must be nearer than this share of the second nearest (Lowe 2004). The number of
@@ -309,9 +295,7 @@ def _learned_pair(
     return left_px, right_px
 
 
-def _joined(
-    pairs: list[tuple[np.ndarray, np.ndarray]],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _joined(pairs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Left points of all pairs, each once, with their places in every right image and where they have one."""
     keys = [np.rint(left_px / _SAME_PX).astype(int) for left_px, _ in pairs]
     unique = np.unique(np.concatenate(keys), axis=0)

@@ -15,8 +15,6 @@ from geodiff_plugin._camera_checks import FAR_SCENE_M, LONG_BASELINE_M
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
-__all__ = ["INVERSE", "find_mistake", "implausible_unit", "pose_change"]
-
 INVERSE = (
     "The inverse pose explains the views better than the given one: are left and right swapped, "
     "is the sign of the baseline wrong, or is E world-to-camera?"

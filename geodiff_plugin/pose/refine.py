@@ -37,19 +37,6 @@ from geodiff_plugin.pose.tracks import (
 )
 from geodiff_plugin.types import CameraView, PoseReport
 
-__all__ = [
-    "FITS_PX",
-    "POSED_FITS_PX",
-    "WARNS_PX",
-    "Displacement",
-    "fit_displacement",
-    "polished",
-    "refine_views",
-    "straightened",
-    "undecided",
-    "untouched",
-]
-
 #: A pose whose matches lie nearer than this to their epipolar lines, in the median, is left as it is: that of
 #: a rectified rig, whose lenses leave as much, and any other, of which a shift may hide most of a wrong turn.
 FITS_PX, POSED_FITS_PX = 0.45, 0.3
@@ -128,9 +115,7 @@ def refine_views(
     Ts, free = settle_poses(tracks, given, near, before, rig)
     after = median_residuals(tracks, Ts)
     report = report.changed(
-        residual_px_given=_numbers(before),
-        residual_px=_numbers(before),
-        matches=_numbers(tracks.seen.sum(1)),
+        residual_px_given=_numbers(before), residual_px=_numbers(before), matches=_numbers(tracks.seen.sum(1))
     )
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
         warnings = _unimproved(before) + undecided(tracks, Ts, free) + units

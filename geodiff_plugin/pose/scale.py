@@ -10,8 +10,6 @@ from scipy.spatial import cKDTree
 from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, residuals_px, solve_inverse_depth
 
-__all__ = ["MOST_SCALE_SPREAD", "NO_UNIT", "Scale", "find_scale", "refined_scale"]
-
 NO_UNIT = (
     "No length is known, so the result has no unit: all depths are in baselines of the first two cameras. "
     "Give their distance (baseline), a known length in the left photograph, or known points."

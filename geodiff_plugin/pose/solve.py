@@ -26,21 +26,6 @@ from geodiff_plugin.pose.tracks import (
     split_residuals,
 )
 
-__all__ = [
-    "FREE_PX",
-    "MOST_SPREAD",
-    "SCALE_PX",
-    "Prior",
-    "Whitened",
-    "depth_spread",
-    "is_rig",
-    "nearby_poses",
-    "open_pose",
-    "settle_poses",
-    "solve_poses",
-    "whitened",
-]
-
 #: Robust scale of a fit whose noise is not known yet, pixels of the right view.
 SCALE_PX = 0.7
 #: A prior as wide as this leaves a pose free, but for the length of its baseline.

@@ -9,20 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = [
-    "FEWEST",
-    "Projected",
-    "Tracks",
-    "across_lines",
-    "blocks",
-    "median_residuals",
-    "merge_tracks",
-    "project_tracks",
-    "residuals_px",
-    "solve_inverse_depth",
-    "split_residuals",
-]
-
 #: Fewer matches than this say nothing about a pose.
 FEWEST = 40
 #: Blocks a row of the left image, for what neighbouring residuals have in common.

@@ -17,8 +17,6 @@ from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.priors.pipelines.base import RESAMPLING
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 
-__all__ = ["check_arguments", "check_guidable", "check_left_images", "check_named_arguments", "needs_network"]
-
 #: What every stock pipeline's call takes, whatever the prior.
 STOCK_ARGUMENTS = (
     *("output_type", "resample_method_input", "resample_method_output", "batch_size", "num_inference_steps"),

@@ -17,8 +17,6 @@ from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.types import CameraView
 
-__all__ = ["BY_EVIDENCE", "RIGHT_WITHIN", "SIGNS", "depth_confidence", "depth_evidence", "reprojection"]
-
 #: What confidence is the probability of: a relative error below this.
 RIGHT_WITHIN = 0.1
 #: Log-odds, by logistic regression on pairs with truth, every pair weighing the same

@@ -18,8 +18,6 @@ from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_fr
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.hooks import DenoiserTap, put_channels
 
-__all__ = ["MapCodec", "ProcessingGrid", "StepEstimate", "StepInputs"]
-
 #: What the scheduler's step is given: network output, noisy latent, and what to add to its result.
 StepInputs = tuple[Tensor, Tensor, Tensor | None]
 

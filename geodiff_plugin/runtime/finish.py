@@ -22,8 +22,6 @@ from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.runtime.run import GuidedRun
 
-__all__ = ["ensemble_metric", "finish", "finish_images", "median", "spread_of_members"]
-
 REDUCTIONS = ("median", "mean")
 
 

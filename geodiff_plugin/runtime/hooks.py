@@ -20,17 +20,6 @@ from torch import Tensor
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.runtime.noise_levels import trailing_timesteps
 
-__all__ = [
-    "DenoiserTap",
-    "Exclusive",
-    "GuidedScheduler",
-    "exclusive_call",
-    "frozen_weights",
-    "images_in_float32",
-    "put_channels",
-    "replaced",
-]
-
 _LOCKS: WeakKeyDictionary[Any, threading.RLock] = WeakKeyDictionary()
 _LOCKS_GUARD = threading.Lock()
 

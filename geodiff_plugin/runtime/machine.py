@@ -13,8 +13,6 @@ import torch
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["PeakMemory", "pick_device", "timed", "versions"]
-
 PACKAGES = ("geodiff-plugin", "torch", "diffusers", "transformers", "accelerate", "kornia", "numpy", "pillow")
 SAMPLING_INTERVAL_S = 0.05
 

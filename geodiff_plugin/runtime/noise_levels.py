@@ -22,8 +22,6 @@ from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.denoising import NoiseLevel
 from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 
-__all__ = ["FAMILIES", "check_scheduler", "noise_level", "trailing_timesteps"]
-
 
 def _clip(scheduler: Any) -> float | None:
     if getattr(scheduler.config, "clip_sample", False):

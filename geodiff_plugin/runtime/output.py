@@ -27,8 +27,6 @@ from geodiff_plugin.runtime.verdict import Indicators, Verdict, judge, points_ag
 from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["assemble_output"]
-
 #: A visible share below this is reported to the user: the scale then rests on few pixels.
 LITTLE_OVERLAP = 0.3
 #: Metres; what a metric prior may say of its nearest pixel is 0.

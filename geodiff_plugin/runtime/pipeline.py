@@ -36,14 +36,6 @@ from geodiff_plugin.runtime.output import assemble_output
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback
 from geodiff_plugin.runtime.start import depth_prompt, plan_warm_start
 
-__all__ = [
-    "GuidedCall",
-    "GuidedMarigoldDepthPipeline",
-    "disable_geometry_guidance",
-    "enable_geometry_guidance",
-    "native_images",
-]
-
 # Mixed in before a class that has all of a stock pipeline.
 _Stock: Any = MarigoldDepthPipeline if TYPE_CHECKING else object
 
@@ -259,10 +251,7 @@ def _one_member(call: dict[str, Any]) -> dict[str, Any]:
     for name, kind in (("generator", list), ("latents", Tensor)):
         if isinstance(call[name], kind):
             changed[name] = call[name][first]
-    warn(
-        "This prior gives the same map every time: of the ensemble one member runs.",
-        stacklevel=5,
-    )
+    warn("This prior gives the same map every time: of the ensemble one member runs.", stacklevel=5)
     return changed
 
 

@@ -31,8 +31,6 @@ from geodiff_plugin.runtime.hooks import (
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.start import WarmStart
 
-__all__ = ["GuidedRun", "StepCallback"]
-
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Tensor] | None]
 
 

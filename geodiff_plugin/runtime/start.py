@@ -29,8 +29,6 @@ from geodiff_plugin.runtime.noise_levels import noise_level, trailing_timesteps
 from geodiff_plugin.scale.space import SPACES
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["PROMPT_LONG_EDGE", "WarmStart", "depth_prompt", "plan_warm_start"]
-
 #: Longer side of the depth prompt, pixels.
 PROMPT_LONG_EDGE = 256
 

@@ -21,8 +21,6 @@ from geodiff_plugin.matching import Matches
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.types import PoseReport
 
-__all__ = ["EPIPOLAR_PX", "Indicators", "Verdict", "judge", "points_agreement", "read_indicators"]
-
 #: Confidence from which a match counts.
 CONFIDENT = 0.5
 #: Two images whose values differ by less, in [0, 1], and by less than this share of their contrast (all

@@ -17,17 +17,6 @@ from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.matches import UNIT
 from geodiff_plugin.scale.space import SPACES, MetricMap, Space
 
-__all__ = [
-    "RELIABLE",
-    "depth_span",
-    "fit_to_points",
-    "order_agreement",
-    "ordered",
-    "refine_to_matches",
-    "reliable_matches",
-    "weighted_quantile",
-]
-
 #: Matches above this confidence are reliable; as few of them make a basin or a quantile.
 RELIABLE, FEWEST_RELIABLE = 0.5, 50
 #: Values of near, and of far, that are tried against reliable matches or points, how far beyond the points'
@@ -67,10 +56,7 @@ def reliable_matches(matches: Matches) -> Matches | None:
 
 @torch.no_grad()
 def fit_to_points(
-    x: Tensor,
-    points: Matches,
-    metric: MetricMap,
-    current: tuple[Tensor, Tensor] | None = None,
+    x: Tensor, points: Matches, metric: MetricMap, current: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
     """Depths of the two ends of a relative map that explain the points best.
 
@@ -178,11 +164,7 @@ class _Fitted(NamedTuple):
 
 
 def _refine_once(
-    form: Space,
-    ends: Tensor,
-    values: Tensor,
-    fitted: _Fitted,
-    bounds: tuple[Tensor, Tensor],
+    form: Space, ends: Tensor, values: Tensor, fitted: _Fitted, bounds: tuple[Tensor, Tensor]
 ) -> Tensor:
     """One reweighted Gauss-Newton step on ``ends (B, 2)``, kept within ``bounds``."""
 

@@ -14,8 +14,6 @@ from torch import Tensor
 
 from geodiff_plugin._checks import check_choice
 
-__all__ = ["SPACES", "AffineState", "MetricMap", "Space", "SquareAffine", "inverse_softplus", "smooth_floor"]
-
 #: Half-width of the smooth floor, in units of the relative map (whose range is about [0, 1]): so small that a
 #: street from 6 to 330 m gains a third of a metre at its nearest point and nothing elsewhere.
 FLOOR_EPS = 0.001

@@ -20,8 +20,6 @@ from torch import Tensor
 from geodiff_plugin.matching import CostVolume
 from geodiff_plugin.scale.space import SPACES
 
-__all__ = ["ScaleSearch", "argmin_over", "search_scale"]
-
 #: Cost beyond which a pixel is an outlier: occluded, mirrored, mistaken by the prior.
 COST_CLAMP = 0.35
 #: Pixels that the search looks at; of these, those that tell basins apart in the coarse grid.
