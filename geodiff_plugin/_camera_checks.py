@@ -43,11 +43,7 @@ def _as_matrix(value: Any, name: str, cure: str, *shapes: tuple[int, int]) -> np
 
 
 def check_intrinsics(K: Any, name: str = "K") -> np.ndarray:
-    """A ``(3, 3)`` float64 camera matrix in pixels.
-
-    Raises:
-        TypeError, ValueError: not 3x3, not finite, zero or negative focal length, last row not (0, 0, 1).
-    """
+    """A ``(3, 3)`` float64 camera matrix in pixels, finite, fx and fy positive, last row (0, 0, 1)."""
     cure = "K is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the image it comes with."
     K = _as_matrix(K, name, cure, (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0:
@@ -64,13 +60,9 @@ def check_intrinsics_fit(
     """Refuse a camera matrix whose principal point lies outside the image that it comes with."""
     cx, cy = K[0, 2], K[1, 2]
     if not (0 <= cx <= width and 0 <= cy <= height):
-        bad_value(
-            name,
-            f"for {image} of {width}x{height} pixels",
-            f"principal point ({cx:.1f}, {cy:.1f}) outside of it",
-            f"It probably belongs to another resolution: {SCALED_K}. "
-            "If it is a crop, say so with cropped=True (--cropped).",
-        )
+        got = f"principal point ({cx:.1f}, {cy:.1f}) outside of it"
+        cure = f"It probably belongs to another resolution: {SCALED_K}. If it is a crop, say so with "
+        bad_value(name, f"for {image} of {width}x{height} pixels", got, cure + "cropped=True (--cropped).")
 
 
 def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -> None:
@@ -91,27 +83,17 @@ def check_calibrated_size(
 def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
     """Warn of a principal point such as an image of another size has, and of a mistyped focal length."""
     shares = (K[0, 2] / width, K[1, 2] / height)
+    at = f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f})"
+    cure = f"If it is for another resolution, {SCALED_K}."
     if min(shares) < NEAR_BORDER or max(shares) > 1.0 - NEAR_BORDER:
-        warn(
-            f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) near the border of {image} of "
-            f"{width}x{height} pixels. If it is for another resolution, {SCALED_K}.",
-            doubt=True,
-            stacklevel=3,
-        )
+        place = f"near the border of {image} of {width}x{height} pixels"
+        warn(f"{at} {place}. {cure}", doubt=True, stacklevel=3)
     elif _off_alike(*shares):
-        warn(
-            f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) where that of an image "
-            f"{sum(shares):.2g} times the size of {image} would be. If it is for another resolution, "
-            f"{SCALED_K}.",
-            doubt=True,
-            stacklevel=3,
-        )
+        place = f"where that of an image {sum(shares):.2g} times the size of {image} would be"
+        warn(f"{at} {place}. {cure}", doubt=True, stacklevel=3)
     if max(K[0, 0] / K[1, 1], K[1, 1] / K[0, 0]) > STRETCHED:
-        warn(
-            f"{name} has fx {K[0, 0]:.5g} and fy {K[1, 1]:.5g}; pixels are about square, so one of them may "
-            "be mistyped.",
-            stacklevel=3,
-        )
+        numbers = f"{name} has fx {K[0, 0]:.5g} and fy {K[1, 1]:.5g}"
+        warn(f"{numbers}; pixels are about square, so one of them may be mistyped.", stacklevel=3)
 
 
 def _off_alike(x: float, y: float) -> bool:
@@ -123,27 +105,20 @@ def _off_alike(x: float, y: float) -> bool:
 def check_pose(E: Any, name: str = "E", cure: str = POSE) -> np.ndarray:
     """A ``(4, 4)`` float64 rigid transform; a rotation off by at most 1e-2 is projected to the nearest one.
 
-    A 3x4 gets the row 0 0 0 1; ``cure`` ends the messages.
-
-    Raises:
-        TypeError, ValueError: neither 4x4 nor 3x4, not finite, last row not (0, 0, 0, 1), no rotation,
-            mirrored.
+    A 3x4 gets the row 0 0 0 1; what is not finite, no rotation or mirrored is refused, with ``cure`` at the end.
     """
     E = _as_matrix(E, name, cure, (4, 4), (3, 4))
     if len(E) == 3:
         E = np.vstack([E, (0.0, 0.0, 0.0, 1.0)])
     if not np.allclose(E[3], (0, 0, 0, 1), atol=1e-6):
-        bad_value(
-            name, "rigid with last row (0, 0, 0, 1)", f"last row {E[3].tolist()}", cure + " Is it transposed?"
-        )
+        got = f"last row {E[3].tolist()}"
+        bad_value(name, "rigid with last row (0, 0, 0, 1)", got, cure + " Is it transposed?")
     R = E[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
-        bad_value(
-            name,
-            "rigid: its upper left 3x3 a rotation (orthogonal within 1e-2, determinant +1)",
-            f"determinant {np.linalg.det(R):.4f}, |R R^T - I| up to {np.abs(R @ R.T - np.eye(3)).max():.4f}",
-            cure,
-        )
+    apart, determinant = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.det(R)
+    if apart > 1e-2 or determinant < 0:
+        expected = "rigid: its upper left 3x3 a rotation (orthogonal within 1e-2, determinant +1)"
+        got = f"determinant {determinant:.4f}, |R R^T - I| up to {apart:.4f}"
+        bad_value(name, expected, got, cure)
     U, _, Vt = np.linalg.svd(R)
     E = E.copy()
     E[:3, :3] = U @ Vt
@@ -154,28 +129,17 @@ def check_baseline(E: np.ndarray, name: str = "E") -> None:
     """Refuse a relative pose without translation."""
     baseline = float(np.linalg.norm(E[:3, 3]))
     if baseline < 1e-6:
-        bad_value(
-            name,
-            "a pose whose camera centre differs from the left one's (a baseline)",
-            f"a translation of {baseline:.1g} m",
-            "Without a baseline two views do not tell the scale; "
-            "give the distance between the cameras in metres.",
-        )
+        expected = "a pose whose camera centre differs from the left one's (a baseline)"
+        cure = "Without a baseline two views do not tell the scale; give the distance between the cameras in "
+        bad_value(name, expected, f"a translation of {baseline:.1g} m", cure + "metres.")
 
 
 def warn_of_long_baseline(E: np.ndarray, name: str) -> None:
-    """Warn of a relative pose whose translation looks like millimetres.
-
-    It is said here, before anything is computed, and nowhere else.
-    """
+    """Warn of a relative pose whose translation looks like millimetres, before anything is computed."""
     baseline = float(np.linalg.norm(E[:3, 3]))
     if baseline > LONG_BASELINE_M:
-        warn(
-            f"{name} has a baseline of {baseline:.4g} m. "
-            "If that is millimetres, divide the translation, or baseline_m (--baseline), by 1000.",
-            doubt=True,
-            stacklevel=3,
-        )
+        cure = "If that is millimetres, divide the translation, or baseline_m (--baseline), by 1000."
+        warn(f"{name} has a baseline of {baseline:.4g} m. {cure}", doubt=True, stacklevel=3)
 
 
 def warn_of_far_points(points: np.ndarray, name: str) -> None:
@@ -188,9 +152,6 @@ def warn_of_far_points(points: np.ndarray, name: str) -> None:
     whole = median > FAR_POINTS_M and bool((depths == np.rint(depths)).all())
     if nearest > FAR_POINTS_M or whole:
         kind = "only whole numbers" if whole else "none nearer"
-        warn(
-            f"{name} has depths of {nearest:.4g} m and more, {kind}. If they are millimetres, divide them by "
-            "1000, or give --points-scale 1000 (scale=1000) with a file.",
-            doubt=True,
-            stacklevel=3,
-        )
+        cure = "divide them by 1000, or give --points-scale 1000 (scale=1000) with a file."
+        depths_are = f"{name} has depths of {nearest:.4g} m and more, {kind}"
+        warn(f"{depths_are}. If they are millimetres, {cure}", doubt=True, stacklevel=3)

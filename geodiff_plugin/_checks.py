@@ -78,10 +78,8 @@ def _short(value: object) -> str:
 def warn(sentence: str, *, doubt: bool = False, stacklevel: int = 2) -> None:
     """Warn, and tell the ``noted`` block that this runs in.
 
-    Args:
-        sentence: for the user.
-        doubt: a result with this warning is not to be trusted.
-        stacklevel: as of ``warnings.warn``, counted from the caller.
+    A result with a ``doubt`` is not to be trusted. ``stacklevel`` is that of ``warnings.warn``, from the
+    caller.
     """
     said = _NOTED.get()
     if said is not None:
@@ -146,7 +144,7 @@ def check_size(value: Any, name: str) -> tuple[int, int] | None:
 def check_choice(value: Any, name: str, choices: Any) -> Any:
     """One of ``choices``, returned as it came."""
     # What came may have no hash, and an array is equal to a word element by element.
-    if not any(isinstance(value, type(known)) and value == known for known in choices):
+    if not any(isinstance(value, type(choice)) and value == choice for choice in choices):
         bad_value(name, "one of " + ", ".join(sorted(map(str, choices))), repr(value))
     return value
 

@@ -34,7 +34,7 @@ class WithinCores:
         among: parts of a program that work at the same time and share the cores, >= 1.
     """
 
-    _found: int | None = None
+    _before: int | None = None
     _capped = 0
 
     def __init__(self, among: int = 1) -> None:
@@ -43,10 +43,10 @@ class WithinCores:
     def __enter__(self) -> None:
         threads, cores = torch.get_num_threads(), max(1, available_cores() // self._among)
         if threads > cores:
-            self._found, self._capped = threads, cores
+            self._before, self._capped = threads, cores
             torch.set_num_threads(cores)
 
     def __exit__(self, *exc: object) -> None:
-        found, self._found = self._found, None
-        if found is not None and torch.get_num_threads() == self._capped:
-            torch.set_num_threads(found)
+        before, self._before = self._before, None
+        if before is not None and torch.get_num_threads() == self._capped:
+            torch.set_num_threads(before)

@@ -62,27 +62,21 @@ class _FrozenDict(dict[str, Any]):
 def _knob(default: Any, values: str, check: Callable[[Any, str], Any], **more: str) -> Any:
     knob = Knob(values, check, **more)
     if knob.unset:
-        knob = knob._replace(
-            values=f"{values}, or `None`",
-            check=lambda value, name: None if value is None else check(value, name),
-        )
+        checked: Callable[[Any, str], Any] = lambda v, name: None if v is None else check(v, name)  # noqa: E731
+        knob = knob._replace(values=f"{values}, or `None`", check=checked)
     return field(default=default, metadata={"knob": knob})
 
 
 def _number(default: float | None, low: float, high: float, **more: str) -> Any:
     """A finite number in ``[low, high]``."""
-    return _knob(
-        default, f"[{low:g}, {high:g}]", lambda v, name: float(check_number(v, name, low, high)), **more
-    )
+    values = f"[{low:g}, {high:g}]"
+    return _knob(default, values, lambda v, name: float(check_number(v, name, low, high)), **more)
 
 
 def _integer(default: int | None, low: int, high: int, **more: str) -> Any:
     """A whole number in ``[low, high]``."""
-
-    def check(value: Any, name: str) -> int:
-        return int(check_number(value, name, low, high, integer=True))
-
-    return _knob(default, f"integer, [{low:g}, {high:g}]", check, **more)
+    values = f"integer, [{low:g}, {high:g}]"
+    return _knob(default, values, lambda v, name: int(check_number(v, name, low, high, integer=True)), **more)
 
 
 def _flag(default: bool, **more: str) -> Any:
@@ -115,29 +109,29 @@ def _pair(default: tuple[float, float] | None, **more: str) -> Any:
     return _knob(default, "pair with 0 < low < high, m", check, **more)
 
 
+def _mapping(value: Any, name: str) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else bad_type(name, "a dict of values by name", value)
+
+
 def _weights(default: Mapping[str, float]) -> Any:
     """A dict of weights >= 0 by the name of a term."""
 
     def check(value: Any, name: str) -> _FrozenDict:
-        if not isinstance(value, Mapping):
-            bad_type(name, "a dict, term -> >= 0", value)
-        for key in value:
+        weights = {}
+        for key, weight in _mapping(value, name).items():
             if not isinstance(key, str):
                 bad_value(f"a key of {name}", "a text", repr(key))
-        return _FrozenDict(
-            {k: float(check_number(v, f"{name}[{k!r}]", 0.0, float("inf"))) for k, v in value.items()}
-        )
+            weights[key] = float(check_number(weight, f"{name}[{key!r}]", 0.0, float("inf")))
+        return _FrozenDict(weights)
 
     return _knob(_FrozenDict(default), "term -> >= 0", check)
 
 
 class UpdatePlan(NamedTuple):
-    """Number, start and size of the gradient updates of a call, with automatic choices resolved.
+    """Gradient updates of a call, with automatic choices resolved.
 
-    Attributes:
-        inner_steps: updates in each denoising step that makes any.
-        updates_from: fraction of the schedule; steps that end by it make no updates.
-        step_latents: step size of the rule.
+    ``inner_steps`` in each denoising step that makes any; none in steps that end by the fraction
+    ``updates_from`` of the schedule; ``step_latents`` is the step size of the rule.
     """
 
     inner_steps: int
@@ -279,11 +273,7 @@ class GuidanceConfig:
         check_number(self.start, "start", 0.0, self.stop)
 
     def plan_updates(self, points_given: bool) -> UpdatePlan:
-        """The updates of a call; what is left open depends on the rest of the configuration.
-
-        Args:
-            points_given: whether points come with the guidance.
-        """
+        """The updates of a call, with points or without; what is left open depends on the other knobs."""
         # Matches and points that can be encoded bring the latent close; else the gradient has the whole way.
         encoded = self.weights.get("matches") or (self.weights.get("points") and points_given)
         near = self.correct and encoded and self.optimize_latents and self.gradient == "denoised"
@@ -296,11 +286,7 @@ class GuidanceConfig:
         )
 
     def changed(self, **knobs: Any) -> Self:
-        """This configuration with some knobs set otherwise.
-
-        Raises:
-            InputError: no such knob, or a value that it cannot have.
-        """
+        """This configuration with some knobs set otherwise; ``InputError`` for no such knob, or its value."""
         for name in knobs:
             if name not in KNOBS:
                 bad_value("a knob", "one that exists", repr(name), close_names(name, KNOBS))
@@ -338,9 +324,8 @@ class GuidanceConfig:
             if name in FORMER and _plain(value) not in same.get(name, [_plain(FORMER[name])])
         ]
         if dropped:
-            said = (
-                f"The configuration sets numbers that are fixed now, and are left out: {', '.join(dropped)}."
-            )
+            names = ", ".join(dropped)
+            said = f"The configuration sets numbers that are fixed now, and are left out: {names}."
             warnings.warn(said, stacklevel=2)
         return config
 
@@ -350,11 +335,7 @@ class GuidanceConfig:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what ``save`` wrote, also that of former versions.
-
-        Raises:
-            OSError, InputError: no such file, no JSON, or as ``from_dict``.
-        """
+        """Read what ``save`` wrote, also in former versions; ``InputError`` as ``from_dict``."""
         try:
             values = json.loads(Path(path).read_text(encoding="utf-8"))
         except ValueError as error:
@@ -463,10 +444,6 @@ def close_names(name: str, names: Iterable[str]) -> str:
     return f"{hint}There are: {', '.join(names)}."
 
 
-def _mapping(value: Any, name: str) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else bad_type(name, "a dict of values by name", value)
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return dict(value)
@@ -474,18 +451,10 @@ def _plain(value: Any) -> Any:
 
 
 def config_from_text(entries: Iterable[str], base: GuidanceConfig, name: str) -> GuidanceConfig:
-    """A configuration with knobs set otherwise, as they are written on a command line.
+    """``base`` with knobs set otherwise, as they are written on a command line, by the option ``name``.
 
-    Args:
-        entries: ``KNOB=VALUE`` each; ``weights.TERM=VALUE`` changes one weight.
-        base: what they change.
-        name: the option, for messages.
-
-    Returns:
-        The configuration; a value is JSON, or text where it is none.
-
-    Raises:
-        InputError: another form, a knob that does not exist, a value that it cannot have.
+    ``KNOB=VALUE`` each, where a value is JSON, or text where it is none; ``weights.TERM=VALUE`` changes one
+    weight. ``InputError`` for another form, a knob that does not exist, a value that it cannot have.
     """
     changes: dict[str, Any] = {}
     for entry in entries:
@@ -505,9 +474,7 @@ def config_from_text(entries: Iterable[str], base: GuidanceConfig, name: str) ->
 def value_of(name: str, config: GuidanceConfig) -> Any:
     """A knob's value, or that of ``weights.TERM``; automatic choices as they are settled with matches.
 
-    Raises:
-        InputError: no such knob.
-        KeyError: no such term.
+    ``InputError`` for no such knob, ``KeyError`` for no such term.
     """
     knob, _, term = name.partition(".")
     if knob not in KNOBS:
@@ -531,8 +498,8 @@ SECTIONS = {
 def sentences() -> dict[str, str]:
     """What every knob does, from the docstring of ``GuidanceConfig``."""
     lines = inspect.cleandoc(GuidanceConfig.__doc__ or "").partition("Attributes:\n")[2]
-    found = re.findall(r"^    (\w+): (.*(?:\n     +.*)*)", lines, re.MULTILINE)
-    return {name: " ".join(text.split()).rstrip(".") for name, text in found}
+    entries = re.findall(r"^    (\w+): (.*(?:\n     +.*)*)", lines, re.MULTILINE)
+    return {name: " ".join(text.split()).rstrip(".") for name, text in entries}
 
 
 def shown(value: Any) -> str:

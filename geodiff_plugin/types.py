@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Self
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,9 +14,8 @@ from diffusers.utils import BaseOutput
 class Distortion:
     """Lens distortion of one camera.
 
-    Attributes:
-        model: ``"opencv"`` (k1, k2, p1, p2, k3 and so on) or ``"fisheye"`` (k1 to k4).
-        coefficients: in OpenCV's order.
+    ``model`` is ``"opencv"`` (k1, k2, p1, p2, k3 and so on) or ``"fisheye"`` (k1 to k4), ``coefficients`` are
+    in OpenCV's order.
     """
 
     model: str
@@ -65,18 +64,18 @@ class Rig:
 class PoseReport:
     """Poses of one image's right views: as given, as used, and how well they fit the matches.
 
-    Residuals are in pixels of the right images, resized to the left one's pixels per radian; the left one is
-    at most 832 wide.
+    Residuals are in pixels of the right images, resized to the left image's pixels per radian; the left image
+    is at most 832 wide.
 
     Attributes:
         status: ``"given"`` (not checked, by configuration), ``"fits"``, ``"refined"``, ``"kept"`` (no better
-            pose nearby), ``"mistaken"`` (a known mistake explains the misfit; the pose is used as given) or
+            pose nearby), ``"mistaken"`` (a usual mistake explains the misfit; the pose is used as given) or
             ``"not checked"``.
         E_given: ``(4, 4)`` each, metres, pose of every right camera in the left camera's frame, as given.
         E: the same as used.
-        residual_px_given: median distance of the matches from their epipolar lines, one per right view.
+        residual_px_given: median distance of the matches from their epipolar lines, for each right view.
         residual_px: the same with the poses, and images, as used.
-        matches: number of matches, one per right view.
+        matches: number of matches of each right view.
         straightened_px: root mean square displacement applied to the right images; 0 for none.
         scale_spread: relative standard deviation of the scale of refined poses, and with it of the depth;
             ``None`` where the length of the baseline is measured, and where the poses are used as given.
@@ -92,10 +91,6 @@ class PoseReport:
     straightened_px: tuple[float, ...] = ()
     scale_spread: float | None = None
     warnings: tuple[str, ...] = ()
-
-    def changed(self, **fields: Any) -> Self:
-        """The same report with other entries."""
-        return replace(self, **fields)
 
 
 class CameraView(NamedTuple):
@@ -222,12 +217,10 @@ class MetricDepthOutput(BaseOutput):
 
     def __repr__(self) -> str:
         """Sizes, range and verdict in a few lines, and no array."""
-        depth = (
-            self.prediction if isinstance(self.prediction, np.ndarray) else self.prediction.numpy(force=True)
-        )
+        depth = self.prediction
+        depth = depth if isinstance(depth, np.ndarray) else depth.numpy(force=True)
         unit = "" if self.unit is None else f" {self.unit}"
         lines = [f"depth {depth.shape}, {np.nanmin(depth):.3g} to {np.nanmax(depth):.3g}{unit}"]
-        for verdict in self.verdicts:
-            lines.append(": ".join([verdict.status, *verdict.reasons[:1]]))
+        lines += [": ".join([verdict.status, *verdict.reasons[:1]]) for verdict in self.verdicts]
         lines += [f"{len(self.warnings)} warnings", f"{len(self.assumed)} assumptions"]
         return "MetricDepthOutput(" + "\n  ".join(lines) + ")"

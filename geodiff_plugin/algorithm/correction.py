@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -67,7 +67,7 @@ class _Observations(NamedTuple):
 
 
 def _observations(depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig) -> _Observations:
-    size = image_size(target.inverse_depth)
+    size = target.size
     guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
     log_depth = _log_depth(depth_m, size)
     matched, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
@@ -101,23 +101,19 @@ def _times(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Te
     return smoothness * links[0], smoothness * links[1]
 
 
-def local_error(error: Tensor | None, known: Tensor | None) -> Tensor | None:
-    """The error of a prior where it says something, and the largest elsewhere.
+def local_error(error: Tensor | None, valid: Tensor | None) -> Tensor | None:
+    """The error of a prior where it says something, and the largest elsewhere, ``(B, 1, H, W)``.
 
-    Args:
-        error: ``(B, 1, 1, 1)``, as ``prior_error`` gives it, or ``None``.
-        known: ``(B, 1, H, W)``, above 0 where the prior says something; ``None`` for everywhere.
-
-    Returns:
-        ``(B, 1, H, W)``; ``error`` where nothing is unknown.
+    ``error (B, 1, 1, 1)`` is that of ``prior_error``; ``valid (B, 1, H, W)`` is above 0 where the prior says
+    something, ``None`` for everywhere: then ``error`` itself is returned.
     """
-    if error is None or known is None:
+    if error is None or valid is None:
         return error
-    return torch.where(known > 0, error, torch.full_like(error, MOST_ERROR))
+    return torch.where(valid > 0, error, torch.full_like(error, MOST_ERROR))
 
 
 def _on_grid(error: Tensor, size: tuple[int, int]) -> Tensor:
-    """A ``local_error`` on another grid; one number a sample as it is."""
+    """A ``local_error`` on another grid; a single number per sample stays as it is."""
     if image_size(error) in ((1, 1), size):
         return error
     return F.interpolate(error, size, mode="nearest-exact")
@@ -157,15 +153,11 @@ def correction_target(
 def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
     """Matches with less confidence near the depth edges of a map, as far as the map knows where they are.
 
-    A window of the matching that lies across an edge takes the nearer surface's depth for both.
-
-    Args:
-        target: matches, not known points: those are measured on their own ray.
-        depth_m: ``(B, 1, H, W)`` metres, at any resolution.
-        error: of the prior, as ``refine_depth`` takes it; one above ``EDGE_ERROR`` has its
-            edges elsewhere than the scene.
+    A window of the matching that lies across an edge takes the nearer surface's depth for both. Known points
+    are measured on their own ray and do not belong here. ``depth_m (B, 1, H, W)`` metres may have any
+    resolution; a prior whose ``error`` is above ``EDGE_ERROR`` has its edges elsewhere than the scene.
     """
-    size = image_size(target.confidence)
+    size = target.size
     log_depth = _log_depth(depth_m, size)
     reach = max(1, round(EDGE_REACH * max(size)))
     span = _highest(log_depth, reach) + _highest(-log_depth, reach)
@@ -248,24 +240,24 @@ def refine_depth(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Least-squares correction of log depth that follows matches and stops at edges.
 
+    With ``u`` the correction and ``r`` what each match asks of it, less the result of earlier passes, a pass
+    is the minimiser of ``sum w (u - r)^2 + a sum g |grad u|^2 + b sum u^2``: ``w`` is the confidence over the
+    match's relative variance, robustly reweighted, and ``g`` falls at edges of the image and of the given
+    depth. Passes go from a broad ``a`` to that of the prior's error: a pixel that no match is near keeps what
+    the broad passes say of its region. The number of solves is fixed, so that no device is waited for.
+
     Args:
         depth_m: ``(B, 1, H, W)`` metres, at any resolution.
         target: matches or known points of the same images, on any grid.
         left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
         error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it, or a ``local_error`` on any grid: a
             good prior is bent over wide regions only, and its matches are doubted where it contradicts them.
-        config: the fit's numbers; it solves a fixed number of times, so that no device is waited for.
+        config: the fit's numbers.
 
     Returns:
         The fitted depth ``(B, 1, H, W)`` metres; its support ``(B, 1, H, W)`` in [0, 1], how far matches, at
-        the pixel or near on the same surface, decided it (0 where it is the depth given); and the field ``(B,
-        1, h, w)`` on the grid of the matches, log of the factor on inverse depth.
-
-    With ``u`` that field and ``r`` what each match asks of it, less the result of earlier passes, a pass is
-    the minimiser of ``sum w (u - r)^2 + a sum g |grad u|^2 + b sum u^2``: ``w`` is the confidence over the
-    match's relative variance, robustly reweighted, and ``g`` falls at edges of the image and of the given
-    depth. Passes go from a broad ``a`` to the one of the prior's error: a pixel that no match is near keeps
-    what the broad passes say of its region.
+        the pixel or near on the same surface, decided it; and the field ``u (B, 1, h, w)`` on the grid of the
+        matches, log of the factor on inverse depth.
     """
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)
@@ -285,13 +277,9 @@ def refine_depth(
         links = _times(observed.links, smoothness)
         part, weights = solve_robust(links, data, inertia, weights, robust, REWEIGHTINGS, SOLVER_STEPS)
         total, decided = total + part[:, :1], part[:, 1:]
-    size = tuple(depth_m.shape[-2:])
-    change, support = (
-        F.interpolate(
-            field, size, mode="bilinear", align_corners=False, antialias=size < tuple(field.shape[-2:])
-        )
-        for field in (total, decided)
-    )
+    size = image_size(depth_m)
+    options: dict[str, Any] = {"mode": "bilinear", "align_corners": False, "antialias": size < target.size}
+    change, support = (F.interpolate(field, size, **options) for field in (total, decided))
     refined_m = depth_m.float() * torch.exp(-change)
     return refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), total
 

@@ -1,8 +1,8 @@
 """The arithmetic between a network's output, the clean latent and the noise, for every prediction type.
 
 The Tweedie line of Algorithm 1, Eq. 6 (eq:tweedie), divides by sqrt(alpha_bar), which is 0 at the first step
-of a zero-terminal-SNR schedule, and its sign fits a score, not a noise prediction; this is the schedulers'
-own arithmetic.
+of a zero-terminal-SNR schedule, and its sign fits a score, not a noise prediction. These are the formulas of
+the schedulers.
 """
 
 from __future__ import annotations
@@ -34,21 +34,14 @@ class NoiseLevel:
 
     def __post_init__(self) -> None:
         if self.prediction_type not in PREDICTION_TYPES:
-            bad_value(
-                "the scheduler's prediction_type", f"one of {PREDICTION_TYPES}", repr(self.prediction_type)
-            )
+            expected, got = f"one of {PREDICTION_TYPES}", repr(self.prediction_type)
+            bad_value("the scheduler's prediction_type", expected, got)
 
 
 def z0_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
     """The clean latent that a network output implies, as the scheduler computes it.
 
-    Args:
-        output: ``(B, C, h, w)`` network output.
-        z_t: ``(B, C, h, w)`` noisy latent.
-        level: noise level and prediction type.
-
-    Returns:
-        ``(B, C, h, w)`` of their dtype; differentiable in both tensors (not where the scheduler clips).
+    All latents are ``(B, C, h, w)``; differentiable in both tensors, except where the scheduler clips.
     """
     if level.prediction_type == "sample":
         z0 = output
@@ -75,16 +68,8 @@ def noise_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
 def output_from(z0: Tensor, eps: Tensor, level: NoiseLevel) -> tuple[Tensor, Tensor]:
     """The network output and noisy latent whose clean latent is ``z0`` and whose noise is ``eps``.
 
-    Handing both to the scheduler's own ``step`` moves the clean latent in any of them, multistep
-    history and stochastic ones included, without a second formula for z_{t-1}.
-
-    Args:
-        z0: ``(B, C, h, w)`` clean latent.
-        eps: ``(B, C, h, w)`` noise.
-        level: noise level and prediction type.
-
-    Returns:
-        ``(output, z_t)``, both ``(B, C, h, w)``, inverse of ``z0_from`` and ``noise_from``.
+    The inverse of ``z0_from`` and ``noise_from``. Given both, the scheduler's ``step`` moves the clean latent
+    in any scheduler, multistep and stochastic ones included, without a second formula for z_{t-1}.
     """
     z_t = level.alpha * z0 + level.sigma * eps
     if level.prediction_type == "epsilon":

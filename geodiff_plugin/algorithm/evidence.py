@@ -14,8 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
-from geodiff_plugin.geometry.projection import PlaneRays, plane_rays
+from geodiff_plugin.geometry import PlaneRays, image_size, plane_rays, resize_image
 from geodiff_plugin.matching import (
     CostVolume,
     Matches,
@@ -43,7 +42,7 @@ class Evidence:
         sweep_matches: the same on the grid of the sweep, which is finer for wide images.
         points: depths that the user knows, in the form of matches, or ``None``.
         sweep_points: the same on the grid of ``sweep_matches``, where there are any.
-        sure: ``matches`` as points for the search, where enough are confident; else ``None``.
+        reliable: ``matches`` as points for the search, where enough are reliable; else ``None``.
         native: the further views as everything downstream sees them, at their native sizes.
         pose: how their poses fit; ``None`` where only points are known.
         warnings: sentences for the user.
@@ -58,47 +57,38 @@ class Evidence:
     sweep_matches: Matches | None
     points: Matches | None = None
     sweep_points: Matches | None = None
-    sure: Matches | None = None
+    reliable: Matches | None = None
     native: tuple[CameraView, ...] = ()
     pose: PoseReport | None = None
     warnings: tuple[str, ...] = ()
 
 
-def within(evidence: Evidence, known: Tensor) -> Evidence:
-    """Only those matches and points that lie where the prior says something, to find its scale by.
+def within(evidence: Evidence, valid: Tensor) -> Evidence:
+    """Evidence with confidence 0 where the prior says nothing, by ``valid (1, H, W)`` bool on any grid.
 
-    Args:
-        evidence: of an image.
-        known: ``(1, H, W)`` bool, where the prior says something, on any grid.
-
-    Returns:
-        The same with confidence 0 elsewhere; points stay as they are if none of them is left.
+    The prior's scale is found by the rest. Points stay as they are if none of them is left.
     """
-    matches, points = (m and m.within(known) for m in (evidence.matches, evidence.points))
+    matches, points = (m and m.within(valid) for m in (evidence.matches, evidence.points))
     if points is not None and not bool(points.confidence.any()):
         points = evidence.points
-    sure = None if matches is None else reliable_matches(matches)
-    return replace(evidence, matches=matches, points=points, sure=sure)
+    reliable = None if matches is None else reliable_matches(matches)
+    return replace(evidence, matches=matches, points=points, reliable=reliable)
 
 
 def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tensor, Tensor]:
-    """Shrink an image, antialiased, so that its longer side is at most ``long_edge`` pixels.
+    """An image ``(C, H, W)`` whose longer side is at most ``long_edge`` pixels, and the K of it."""
+    height, width = image_size(image_01)
+    factor = min(1.0, long_edge / max(height, width))
+    return resize_image(image_01, K, (max(1, round(height * factor)), max(1, round(width * factor))))
 
-    Args:
-        image_01: ``(3, H, W)``.
-        K: ``(3, 3)`` pixels of it.
-        long_edge: pixels; a smaller image is returned as it is.
 
-    Returns:
-        image and the camera matrix that belongs to it.
+def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
+    """A right image, ``(C, H, W)``, at no more pixels per radian than the left one, and the K of it.
+
+    Neither then aliases in the other.
     """
-    height, width = image_01.shape[-2:]
-    factor = long_edge / max(height, width)
-    if factor >= 1.0:
-        return image_01, K
-    size = (max(1, round(height * factor)), max(1, round(width * factor)))
-    small = F.interpolate(image_01[None], size, mode="bilinear", align_corners=False, antialias=True)[0]
-    return small, resize_intrinsics(K[None], (height, width), size)[0]
+    ratio = float(K_left[0, 0] / K_right[0, 0])
+    return resize_long_edge(right_01, K_right, round(max(right_01.shape[-2:]) * min(1.0, ratio)))
 
 
 def prepare_evidence(
@@ -142,8 +132,8 @@ def prepare_evidence(
         sweep_targets, _ = points_to_matches(points, K_left, size, sweep_size)
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
-    sure = None if matches is None else reliable_matches(matches)
-    _read_back_once(volume, (matches, targets, sure))
+    reliable = None if matches is None else reliable_matches(matches)
+    _read_back_once(volume, (matches, targets, reliable))
     return Evidence(
         left,
         left_01,
@@ -154,7 +144,7 @@ def prepare_evidence(
         sweep_matches,
         targets,
         sweep_targets,
-        sure,
+        reliable,
         tuple(views),
         pose,
         tuple(dict.fromkeys(warnings)),  # the same mistake may show in two ways
@@ -168,15 +158,6 @@ def _read_back_once(volume: CostVolume | None, targets: Sequence[Matches | None]
     for target in targets:
         if target is not None:
             _ = target.above(0.0), target.above(RELIABLE)
-
-
-def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
-    """A right image, ``(3, H, W)``, at no more pixels per radian than the left one, and the K of it.
-
-    Neither then aliases in the other.
-    """
-    ratio = float(K_left[0, 0] / K_right[0, 0])
-    return resize_long_edge(right_01, K_right, round(max(right_01.shape[-2:]) * min(1.0, ratio)))
 
 
 def _on_grid(matches: Matches, size: tuple[int, int]) -> Matches:
@@ -215,37 +196,19 @@ class Views:
 
 
 def chunk_views(evidence: Sequence[Evidence]) -> Views:
-    """Stack the views of a chunk of samples.
+    """Stack the views of a chunk of samples, one entry each.
 
-    Args:
-        evidence: one entry per sample.
-
-    Returns:
-        Views with ``B = len(evidence)``. Further images of different sizes are brought to the largest one,
-        their K with them. An image with fewer views than another repeats its first: the terms take the best
-        view of each pixel, which a repetition does not change.
+    Further images of different sizes are brought to the largest one, their K with them. An image with fewer
+    views than another repeats its first: the terms take the best view of each pixel, which a repetition does
+    not change.
     """
     left = torch.stack([image.left_01 for image in evidence])
     K_left = torch.stack([image.K_left for image in evidence])
-    count = max(len(image.views) for image in evidence)
-    further = tuple(
-        _stack([image.views[v if v < len(image.views) else 0] for image in evidence]) for v in range(count)
-    )
+    further = []
+    for v in range(max(len(image.views) for image in evidence)):
+        views = [image.views[v if v < len(image.views) else 0] for image in evidence]
+        height, width = (max(view.image_01.shape[axis] for view in views) for axis in (-2, -1))
+        sized = [CameraView(*resize_image(image, K, (height, width)), T) for image, K, T in views]
+        further.append(CameraView(*map(torch.stack, zip(*sized, strict=True))))
     rays = tuple(plane_rays(K_left, K, T, image_size(left)) for _, K, T in further)
-    return Views(left, K_left, further, rays)
-
-
-def _stack(views: Sequence[CameraView]) -> CameraView:
-    """One further view of every sample; smaller images are brought to the largest one, their K with them."""
-    height, width = (max(view.image_01.shape[axis] for view in views) for axis in (-2, -1))
-    images, Ks = [], []
-    for image, K, _ in views:
-        size = image_size(image)
-        if size != (height, width):
-            image = F.interpolate(image[None], (height, width), mode="bilinear", align_corners=False)[0]
-            K = resize_intrinsics(K[None], size, (height, width))[0]
-        images.append(image)
-        Ks.append(K)
-    return CameraView(
-        torch.stack(images), torch.stack(Ks), torch.stack([view.T_right_from_left for view in views])
-    )
+    return Views(left, K_left, tuple(further), rays)

@@ -1,7 +1,5 @@
 """Gradients: pulled back through networks of half precision, checked to be finite, and turned into steps.
 
-The loss is a mean, so a gradient in one pixel may be below float16's least number (a mean over a whole image)
-or, scaled by any constant that lifts it, above its greatest (a mean over a handful of known points).
 Source: Algorithm 1 (plain step), Eq. 15 (eq:final_score), S5.1 (learning rate 1e-2, no optimiser).
 """
 
@@ -18,16 +16,12 @@ from geodiff_plugin._checks import bad_value
 
 
 def pull_back(output: Tensor, source: Tensor, gradient: Tensor) -> Tensor:
-    """The gradient in ``source`` of a loss whose gradient in ``output`` is known; frees the graph between.
+    """The gradient in ``source`` of a loss whose gradient in ``output`` is given; frees the graph between.
 
-    Args:
-        output: ``(B, ...)`` with its graph to ``source``.
-        source: ``(B, ...)`` float32 or wider, requires a gradient.
-        gradient: as ``output``, float32 or wider.
-
-    Returns:
-        As ``source``. Between the two, the largest entry of every sample is between 1/2 and 1. The factor is
-        a power of two, so that in float32 the result is what it would be without it.
+    Both tensors are ``(B, ...)``, ``source`` in float32 or wider. Inside the graph the largest entry of every
+    sample is between 1/2 and 1: the loss is a mean, so that a gradient in one pixel may be below float16's
+    least number, or above its greatest if any constant lifted it. The factor is a power of two, so in float32
+    the result is what it would be without it.
     """
     largest = gradient.detach().abs().flatten(1).amax(1)
     unit = torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent)
@@ -44,25 +38,12 @@ class FiniteWatch:
         self._finite: list[Tensor] = []
 
     def note(self, name: str, step: int, tensor: Tensor) -> None:
-        """Look at a tensor; nothing waits for the device.
-
-        Args:
-            name: what it is, for the message.
-            step: index of the denoising step.
-            tensor: any.
-        """
+        """Look at a tensor of a step without waiting for its device; ``name`` is for the message."""
         self._names.append((name, step))
         self._finite.append(torch.isfinite(tensor.detach()).all())
 
     def check(self, dtype: torch.dtype) -> None:
-        """Name the first tensor that was not finite.
-
-        Args:
-            dtype: of the prior's networks, for the message.
-
-        Raises:
-            ValueError: there is one.
-        """
+        """Raise ``InputError`` on the first tensor that was not finite; ``dtype`` is the prior's."""
         if not self._finite:
             return
         finite = torch.stack(self._finite).cpu()
@@ -80,7 +61,7 @@ class Rule(Protocol):
     """How far one gradient moves a tensor; made anew for every trajectory."""
 
     def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
-        """What to add, for ``gradient`` (B, ...); ``reference`` (B, ...) is there for rules that need it."""
+        """What to add, for ``gradient`` (B, ...); ``reference`` (B, ...) is for rules that need it."""
 
 
 def _per_sample_norm(x: Tensor) -> Tensor:
@@ -114,12 +95,8 @@ class NormMatched:
 class Adam:
     """Adam with bias correction, element-wise, so that samples of a batch do not see each other.
 
-    Args:
-        rate: step size.
-        betas: decay of the two moments.
-        eps: least denominator.
-        to_norm: scale each sample's gradient to the norm of the reference first, which weighs the steps of
-            a schedule against each other in the moments.
+    ``to_norm`` scales each sample's gradient to the norm of the reference first, which weighs the steps of a
+    schedule against each other in the moments.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Photometric error between the left image and the right ones seen through an estimate.
 
-Source: S4.2, Eq. 14 (eq:geo-loss). Deviations: masked to visible pixels, differences in exposure are taken
-out, and an image pyramid.
+Source: S4.2, Eq. 14 (eq:geo-loss). Deviations: only visible pixels count, differences in exposure are taken
+out, and the error is averaged over an image pyramid.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.config import DEFAULT
+from geodiff_plugin.config import GuidanceConfig
 
 #: A pyramid level with a shorter side than this says nothing that its parent does not.
 MIN_SIDE = 24
@@ -32,15 +32,10 @@ CELLS, CELL_PRIOR = (4, 5), 0.2
 
 
 def masked_mean(value: Tensor, weight: Tensor) -> Tensor:
-    """Weighted mean per sample.
+    """Weighted mean ``(B,)`` of ``value (B, C, H, W)`` by ``weight (B, 1, H, W)``, bool or float >= 0.
 
-    Args:
-        value: ``(B, C, H, W)``.
-        weight: ``(B, 1, H, W)`` bool or float >= 0.
-
-    Returns:
-        ``(B,)``; 0 (and no gradient) for a sample whose weights are all zero. Whoever must not go on
-        without a valid pixel checks the visible fraction first.
+    It is 0, without a gradient, for a sample whose weights are all zero. Whoever must not go on without a
+    valid pixel checks the visible fraction first.
     """
     weight = weight.to(value.dtype)
     total = (value.mean(1, keepdim=True) * weight).flatten(1).sum(1)
@@ -48,15 +43,7 @@ def masked_mean(value: Tensor, weight: Tensor) -> Tensor:
 
 
 def photometric_map(left_01: Tensor, warped_01: Tensor, eta: float) -> Tensor:
-    """Per-pixel ``eta (1 - SSIM) / 2 + (1 - eta) L1``.
-
-    Args:
-        left_01: ``(B, 3, H, W)`` in [0, 1].
-        warped_01: ``(B, 3, H, W)`` in [0, 1].
-        eta: weight of SSIM, [0, 1].
-
-    Returns:
-        ``(B, 3, H, W)`` in [0, 1].
+    """Per-pixel ``eta (1 - SSIM) / 2 + (1 - eta) L1`` of two images ``(B, 3, H, W)``, in [0, 1] as they are.
 
     Source: Eq. 14 (eq:geo-loss). The paper gives no window; 3x3 follows the works it cites.
     """
@@ -69,13 +56,8 @@ def photometric_map(left_01: Tensor, warped_01: Tensor, eta: float) -> Tensor:
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Structural similarity of every pixel, in a Gaussian window of 3x3 pixels, reflected at the border.
 
-    Args:
-        a: ``(B, C, H, W)`` in [0, 1].
-        b: the same.
-
-    Returns:
-        ``(B, C, H, W)`` in [-1, 1]; as ``kornia.metrics.ssim(a, b, 3)``, which makes its window of a list at
-        every call, and so waits for the device.
+    Both images are ``(B, C, H, W)`` in [0, 1], the result is in [-1, 1]; as ``kornia.metrics.ssim(a, b, 3)``,
+    which makes its window of a list at every call, and so waits for the device.
 
     Source: Wang et al. 2004, "Image quality assessment", Eq. 13.
     """
@@ -97,11 +79,11 @@ def _moments(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def match_exposure(warped_01: Tensor, left_01: Tensor, visible: Tensor) -> Tensor:
-    """Bring the warped right image to the left one's gain and bias per channel, and to its slow shading.
+    """Bring warped right images to the left one's gain and bias per channel, and to its slow shading.
 
     In closed form: gain and bias make mean and spread over the visible pixels agree. A least-squares fit
     pixel by pixel would take every wrong depth for a lower gain. What remains of the difference in a coarse
-    grid of cells is added as a smooth field.
+    grid of cells is added as a smooth field. Beyond the paper, which names illumination as a limit.
 
     Args:
         warped_01: ``(B, 3, H, W)`` in [0, 1].
@@ -110,8 +92,6 @@ def match_exposure(warped_01: Tensor, left_01: Tensor, visible: Tensor) -> Tenso
 
     Returns:
         ``(B, 3, H, W)``, about [0, 1]; differentiable in ``warped_01``.
-
-    Source: beyond the paper, which names illumination as a limit and takes both images as they are.
     """
     weight = visible.to(left_01.dtype)
     mean_left, spread_left = _moments(left_01, weight)
@@ -123,15 +103,7 @@ def match_exposure(warped_01: Tensor, left_01: Tensor, visible: Tensor) -> Tenso
     return matched + F.interpolate(field, left_01.shape[-2:], mode="bilinear", align_corners=False)
 
 
-def photometric(
-    left_01: Tensor,
-    warped_01: Tensor,
-    visible: Tensor,
-    *,
-    eta: float = DEFAULT.eta,
-    pyramid_levels: int = DEFAULT.pyramid_levels,
-    exposure: bool = DEFAULT.exposure,
-) -> Tensor:
+def photometric(left_01: Tensor, warped_01: Tensor, visible: Tensor, config: GuidanceConfig) -> Tensor:
     """Mean photometric error over the visible pixels, averaged over an image pyramid.
 
     With several right views each pixel takes the one that explains it best among those that see it: a view
@@ -141,25 +113,24 @@ def photometric(
         left_01: ``(B, 3, H, W)`` in [0, 1].
         warped_01: ``(B, V, 3, H, W)`` every right image seen from the left.
         visible: ``(B, V, 1, H, W)`` bool, what is compared.
-        eta: weight of SSIM against L1.
-        pyramid_levels: 1 is the paper's; coarser levels widen the basin of attraction.
-        exposure: compare in the left image's exposure (``match_exposure``).
+        config: ``eta``, ``pyramid_levels`` (1 is the paper's; coarser levels widen the basin of attraction)
+            and ``exposure``.
 
     Returns:
         ``(B,)`` float in [0, 1]; differentiable in the depth through ``warped_01`` (bilinear, so the gradient
         is zero where the right image is constant and jumps where a sample crosses a pixel centre).
 
-    Source: Eq. 14 (eq:geo-loss). Deviation: masked to visible pixels (the paper's mean over all
-    pixels rewards depths that push pixels out of the right image), and the pyramid. Minimum over views:
-    Godard et al. 2019, "Digging into self-supervised monocular depth estimation", Eq. 4.
+    Source: Eq. 14 (eq:geo-loss). Deviation: the mask (the paper's mean over all pixels rewards depths that
+    push pixels out of the right image) and the pyramid. Minimum over views: Godard et al. 2019, "Digging into
+    self-supervised monocular depth estimation", Eq. 4.
     """
     views = warped_01.shape[1]
     left = left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), a view's pixels by themselves
     warped, mask = warped_01.flatten(0, 1), visible.flatten(0, 1).to(left.dtype)
-    if exposure:
+    if config.exposure:
         warped = match_exposure(warped, left, mask)
     total, levels = left.new_zeros(()), 0
-    for level in range(pyramid_levels):
+    for level in range(config.pyramid_levels):
         if level:
             if min(left.shape[-2:]) < 2 * MIN_SIDE:
                 break
@@ -168,7 +139,7 @@ def photometric(
             left = F.avg_pool2d(left * mask, 2) / seen.clamp_min(1e-6)
             warped = F.avg_pool2d(warped * mask, 2) / seen.clamp_min(1e-6)
             mask = (seen > 0.5).to(left.dtype)
-        total = total + masked_mean(*_best_explained(photometric_map(left, warped, eta), mask, views))
+        total = total + masked_mean(*_best_explained(photometric_map(left, warped, config.eta), mask, views))
         levels += 1
     return total / levels
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -40,11 +39,9 @@ class Schedule:
         return self.moves and any(r.corrects or r.updates for r in self.steps[step])
 
     def __str__(self) -> str:
-        return "\n".join(self._lines())
-
-    def _lines(self) -> Iterator[str]:
-        for i in range(self.skipped):
-            yield f"step {i + 1}: skipped, as the call starts from the previous frame"
+        lines = [
+            f"step {i + 1}: skipped, as the call starts from the previous frame" for i in range(self.skipped)
+        ]
         for i, rounds in enumerate(self.steps):
             actions = [
                 " and ".join(
@@ -54,22 +51,16 @@ class Schedule:
                 for r in rounds
             ]
             last = ", last" if self.is_last(i) else ""
-            yield f"step {self.skipped + i + 1}: {'; '.join(actions) or 'leave'}{last}"
+            lines.append(f"step {self.skipped + i + 1}: {'; '.join(actions) or 'leave'}{last}")
+        return "\n".join(lines)
 
 
 def count_steps(wanted: int, requested: int | None, most: int | None) -> tuple[int, int]:
     """Denoising steps of a guided call, and rounds in each.
 
-    A prior that can only take fewer steps than guidance wants makes the rounds of all of them in those that
-    it has, each with a search of its own, as a step would have.
-
-    Args:
-        wanted: steps that guidance wants.
-        requested: ``num_inference_steps`` of the call.
-        most: steps that make sense with the prior, or ``None``.
-
-    Raises:
-        ValueError: more steps are requested than the prior has.
+    A prior that takes at most ``most`` steps, fewer than the ``wanted``, makes the rounds of all of them in
+    those that it has, each with a search of its own, as a step would have. To request more of such a prior
+    raises ``InputError``.
     """
     if most is None or wanted <= most:
         return wanted, 1
@@ -93,13 +84,13 @@ def make_schedule(
     Early estimates are vague, and later corrections replace what earlier ones did. So the last active round
     is corrected, and the others are spread over the second half of the active rounds, or over more of them if
     they do not fit there. An estimate that was corrected in a round without updates is not corrected again in
-    the same step: it would be brought to the same matches, which only follows their noise.
+    the same step: it would be fitted to the same matches, which only follows their noise.
 
     Args:
         config: hyperparameters.
         plan: number and start of the updates.
-        steps: denoising steps that run.
-        rounds: in each of them.
+        steps: denoising steps that run, ``rounds`` in each.
+        rounds: as ``count_steps`` gives them.
         skipped: steps before them that a warm start leaves out; they count in fractions of the schedule.
         encodes: whether corrected maps can be encoded: not where guidance moves z_t.
     """

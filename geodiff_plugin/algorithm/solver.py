@@ -56,8 +56,7 @@ class FieldSystem:
         height, width = (-(-side // 2) for side in self.weight.shape[-2:])
         across = _cells(self.across[..., 1::2], height, None, (height, width - 1))
         down = _cells(self.down[..., 1::2, :], None, width, (height - 1, width))
-        sums = (_cells(part, height, width, (height, width)) for part in (self.weight, self.pull))
-        weight, pull = sums
+        weight, pull = (_cells(part, height, width, (height, width)) for part in (self.weight, self.pull))
         return FieldSystem(weight, pull, 0.5 * across, 0.5 * down)
 
 
@@ -69,15 +68,12 @@ def _cells(x: Tensor, height: int | None, width: int | None, size: tuple[int, in
 
 
 def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) -> Tensor:
-    """The field of a system; a fixed amount of work, so that no device is waited for.
+    """The field ``(B, C, H, W)`` of a system; a fixed amount of work, so that no device is waited for.
 
     Args:
         system: of any size.
         steps: conjugate-gradient steps on every grid but the coarsest.
-        start: ``(B, C, H, W)`` a field that is near already; without one the coarser grids give it.
-
-    Returns:
-        ``(B, C, H, W)``.
+        start: a field that is near already; without one the coarser grids give it.
     """
     height, width = system.weight.shape[-2:]
     if start is not None:

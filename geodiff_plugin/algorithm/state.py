@@ -12,13 +12,12 @@ from torch import Tensor
 from geodiff_plugin.algorithm.correction import correction_target, local_error, prior_error, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence, chunk_views, within
 from geodiff_plugin.algorithm.gradients import RULES, FiniteWatch
-from geodiff_plugin.algorithm.objective import Loss, Objective
-from geodiff_plugin.algorithm.settling import settle_ends, span_of_points
+from geodiff_plugin.algorithm.settling import search_one_number, settle_ends, span_of_points
+from geodiff_plugin.algorithm.terms import Loss, Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.matching import Matches, reject_reflections
 from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.scale.space import AffineState, MetricMap
-from geodiff_plugin.scale.volume_search import argmin_over
 from geodiff_plugin.types import StepReport
 
 
@@ -31,28 +30,30 @@ class Trajectory:
         owners: for every sample of the chunk the image that it belongs to; those of an image side by side.
         space: what the prior's output is affine in.
         step_latents: step size of the latent's rule.
-        own_range: metres ``(B,)`` of ``x = 0`` and of ``x = 1`` that a metric prior says itself, from which
-            the search starts; ``None`` for a relative one.
+        prior_range: metres ``(B,)`` of ``x = 0`` and of ``x = 1`` by a metric prior, from which the search
+            starts; ``None`` for a relative one.
         start_range: metres ``(B,)`` of the nearest and of the farthest end that another frame's call ended
             with; they take the place of the first search.
-        known: ``(B, 1, h, w)`` bool, where the prior says something; ``None`` for everywhere. Elsewhere its
+        valid: ``(B, 1, h, w)`` bool, where the prior says something; ``None`` for everywhere. Elsewhere its
             map has no part in the scale, and matches alone decide.
 
     Attributes:
         history: one ``StepReport`` a round.
+        step: index and timestep of the current denoising step, for reports and messages.
         watch: whether what the steps computed was finite.
+        affine: scale, shift and g_s of the latest update, once ``settle_scale`` was called.
         matches: of the views, on the grid of the losses, or ``None``.
         points: depths that the user knows, on the same grid, or ``None``.
         kept: ``(B, 1, H, W)`` in [0, 1], the share of each match's confidence that remains once reflections
-        are
-            rejected; ``None`` before the prior's first estimate.
+            are rejected; ``None`` before the prior's first estimate.
         error: ``(B, 1, 1, 1)`` of that estimate in log depth, as ``correction.prior_error`` measures it.
         hidden: ``(B, V, 1, H, W)`` bool, what the estimate hides from the right cameras, or ``None``.
-        order: ``(B,)`` in [-1, 1], rank correlation of the prior's first map and matches or points, or
-        ``None``.
+        order: ``(B,)`` in [-1, 1], rank correlation of the prior's first map and matches or points.
         on_edge: ``(B,)`` bool, whether the last search ended on the edge of its range.
-        own_depth: ``(B, 1, h, w)`` metres, the prior's own of its first estimate, or ``None``.
+        prior_depth: ``(B, 1, h, w)`` metres, a metric prior's first estimate, or ``None``.
     """
+
+    affine: AffineState
 
     def __init__(
         self,
@@ -61,56 +62,40 @@ class Trajectory:
         owners: Sequence[int],
         space: str,
         step_latents: float = 0.0,
-        own_range: tuple[Tensor, Tensor] | None = None,
+        prior_range: tuple[Tensor, Tensor] | None = None,
         start_range: tuple[Tensor, Tensor] | None = None,
-        known: Tensor | None = None,
+        valid: Tensor | None = None,
     ) -> None:
-        self.config, self.owners = config, list(owners)
-        self.evidence = [evidence[i] for i in owners]  # of every sample
-        self.known, self._of_prior = known, self.evidence  # what the prior is held against
-        if known is not None:
-            self._of_prior = [within(e, k) for e, k in zip(self.evidence, known, strict=True)]
+        self.config, self.owners, self.valid = config, list(owners), valid
+        samples = self._samples = [evidence[i] for i in owners]
+        self._evidence = samples  # what the prior is held against
+        if valid is not None:
+            self._evidence = [within(e, v) for e, v in zip(samples, valid, strict=True)]
         self.metric = MetricMap(space, config.positive)
-        self.objective = Objective(chunk_views(self.evidence), self.metric, config)
-        self.matches = Matches.stack([e.matches for e in self.evidence])
-        self.points = Matches.stack([e.points for e in self.evidence])
+        self.objective = Objective(chunk_views(samples), self.metric, config)
+        self.matches = Matches.stack([e.matches for e in samples])
+        self.points = Matches.stack([e.points for e in samples])
         self.latent_rule = RULES[config.rule](step_latents)
-        self.scale_rule = RULES[config.rule](config.step_affine)
-        self.shift_rule = RULES[config.rule](config.step_affine)
+        self.scale_rule, self.shift_rule = (RULES[config.rule](config.step_affine) for _ in range(2))
         # Of a disparity, x = 1 is the nearest end.
-        self._own_range = None if own_range is None else tuple(torch.stack(own_range).sort(0).values)
-        self._start_range = self._own_range if start_range is None else start_range
-        self._affine: AffineState | None = None
-        self._start: AffineState | None = None  # what the search gave, which the loss pulls towards
+        self._prior_range = None if prior_range is None else tuple(torch.stack(prior_range).sort(0).values)
+        self._start_range = self._prior_range if start_range is None else start_range
+        self._affine_start: AffineState | None = None  # what the search gave, which the loss pulls towards
         self.kept: Tensor | None = None
         self.error: Tensor | None = None
         self.hidden: Tensor | None = None
         self.order: Tensor | None = None
-        self.own_depth: Tensor | None = None
+        self.prior_depth: Tensor | None = None
         self.on_edge: Tensor | None = None
         if start_range is not None:  # the frame before has searched
             self.on_edge = torch.zeros_like(start_range[0], dtype=torch.bool)
         self.history: list[StepReport] = []
         self.watch = FiniteWatch()
-        self._step, self._timestep = 0, 0.0
-
-    def begin_step(self, step: int, timestep: float) -> None:
-        """Reports and messages now name this step of the schedule, and its timestep."""
-        self._step, self._timestep = step, timestep
+        self.step: tuple[int, float] = (0, 0.0)
 
     def note(self, name: str, tensor: Tensor) -> None:
         """Remember whether a tensor of this step is finite."""
-        self.watch.note(name, self._step, tensor)
-
-    @property
-    def affine(self) -> AffineState:
-        """Scale, shift and g_s of the latest update; ``settle_scale`` comes first."""
-        assert self._affine is not None
-        return self._affine
-
-    @affine.setter
-    def affine(self, moved: AffineState) -> None:
-        self._affine = moved
+        self.watch.note(name, self.step[0], tensor)
 
     def prepare(self, x: Tensor, z0: Tensor) -> None:
         """What an estimate decides before it is corrected or compared: scale, which matches to believe.
@@ -121,8 +106,8 @@ class Trajectory:
         """
         self.note("the network's clean latent", z0)
         self.note("the decoded map", x)
-        if self._own_range is not None and self.own_depth is None:
-            self.own_depth = self.metric(x, self.metric.from_range(*self._own_range))
+        if self._prior_range is not None and self.prior_depth is None:
+            self.prior_depth = self.metric(x, self.metric.from_range(*self._prior_range))
         if self.order is None:
             self.order = self._order(x)
         self.settle_scale(x)
@@ -130,41 +115,25 @@ class Trajectory:
 
     def settle_scale(self, x: Tensor) -> None:
         """Find g_s and the start of scale and shift for a relative map (S7.3), or better ones than before."""
+        is_first = self._affine_start is None
         if self.config.search == "volume":
-            ends = self._start_range if self._affine is None else self.metric.range_of(self._affine)
+            ends = self._start_range if is_first else self.metric.range_of(self.affine)
             near, far, self.on_edge = settle_ends(
-                x, self.owners, self._of_prior, self.metric, self.config, ends, self.on_edge, self.known
+                x, self.owners, self._evidence, self.metric, self.config, ends, self.on_edge, self.valid
             )
-            self._affine = self._start = self.metric.from_range(near, far)
-        elif self._affine is None:
+            self.affine = self._affine_start = self.metric.from_range(near, far)
+        elif is_first:
             if self.config.search == "one-number":
-                state, self.on_edge = self._search_one_number(x)
+                start, self.on_edge = search_one_number(x, self.objective)
             else:
-                state = self.metric.from_range(*span_of_points(self.evidence))
+                start = self.metric.from_range(*span_of_points(self._samples))
                 self.on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
-            self._affine = self._start = state
-
-    def _search_one_number(self, x: Tensor) -> tuple[AffineState, Tensor]:
-        """The paper's: s_hat = t_hat = 0, and the g_s of least photometric loss (S7.3)."""
-        zero = x.new_zeros(x.shape[0])
-        low, high = self.config.g_s_range
-        count = self.config.g_s_candidates
-        candidates = torch.linspace(low, high, count, dtype=torch.float32, device=x.device)
-
-        def cost(g_s: Tensor) -> Tensor:
-            affine = AffineState(zero, zero, g_s.expand_as(zero))
-            loss = self.objective(x, affine, affine, zero.view(-1, 1), zero.view(-1, 1), None)
-            # What no right camera sees costs nothing, and must not win for that.
-            shown = (loss.visible_fraction > 0) & (loss.visible_fraction >= self.config.min_visible)
-            return loss.terms["photometric"].where(shown, torch.inf)
-
-        best, on_edge = argmin_over(candidates, cost)
-        return AffineState(zero, zero, best), on_edge
+            self.affine = self._affine_start = start
 
     def _order(self, x: Tensor) -> Tensor:
         """How far the prior alone agrees with matches or points on near and far; NaN where neither tells."""
         order = x.new_full((x.shape[0],), torch.nan)
-        for i, evidence in enumerate(self._of_prior):
+        for i, evidence in enumerate(self._evidence):
             target = evidence.matches or evidence.points
             if target is not None:
                 order[i] = order_agreement(x[i : i + 1], target, self.metric.space)
@@ -174,22 +143,20 @@ class Trajectory:
         """Which matches look like reflections, and how wrong the prior is, by its first estimate alone."""
         if self.error is not None or (self.matches is None and self.points is None):
             return
-        config, left_01 = self.config, self.objective.views.left_01
-        depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
+        config, depth_m = self.config, self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         if self.matches is not None and self.kept is None:
-            rejects = config.reject_reflections
             self.kept = torch.ones_like(depth_m)
-            if rejects and self.known is None:
+            if config.reject_reflections and self.valid is None:
                 self.kept = reject_reflections(self.matches, depth_m)
-            elif rejects and self.known is not None:  # nothing lies behind what the prior does not know
-                kept = reject_reflections(self.matches.within(self.known), depth_m)
-                inside = F.interpolate(self.known.float(), kept.shape[-2:], mode="nearest-exact")
+            elif config.reject_reflections and self.valid is not None:  # nothing is behind what is not there
+                kept = reject_reflections(self.matches.within(self.valid), depth_m)
+                inside = F.interpolate(self.valid.float(), kept.shape[-2:], mode="nearest-exact")
                 self.kept = torch.where(inside > 0, kept, self.kept)
         if config.correct or config.refine:
             target = self._target(depth_m)
             assert target is not None  # there are matches or points
-            target = target if self.known is None else target.within(self.known)
-            self.error = prior_error(depth_m, target, left_01, config)
+            target = target if self.valid is None else target.within(self.valid)
+            self.error = prior_error(depth_m, target, self.objective.views.left_01, config)
 
     @property
     def usable_matches(self) -> Matches | None:
@@ -198,35 +165,21 @@ class Trajectory:
             return None
         return replace(self.matches, confidence=self.kept * self.matches.confidence)
 
-    @property
-    def _local_error(self) -> Tensor | None:
-        return local_error(self.error, self.known)
-
     def _target(self, depth_m: Tensor) -> Matches | None:
-        return correction_target(self.matches, self.points, self.kept, self._local_error, depth_m)
+        error = local_error(self.error, self.valid)
+        return correction_target(self.matches, self.points, self.kept, error, depth_m)
 
     def find_hidden(self, x: Tensor) -> None:
-        """Find what an estimate hides from the right cameras; it holds for the updates of the round.
-
-        Args:
-            x: ``(B, 1, h, w)`` float32 relative map that the updates start from, its scale settled.
-        """
+        """Find what a map ``x (B, 1, h, w)`` hides from the right cameras; it holds for a round's updates."""
         compared = self.config.weights.get("photometric") and self.objective.views.further
         if self.config.z_test and compared:
             self.hidden = self.objective.hidden(x, self.affine)
 
     @torch.no_grad()
     def corrected(self, x: Tensor) -> Tensor:
-        """A relative map fitted to matches and points.
-
-        Args:
-            x: ``(B, 1, h, w)`` float32 relative map, ``prepare`` was called for.
-
-        Returns:
-            ``(B, 1, h, w)``; ``x`` where there are neither.
-        """
+        """A relative map ``x (B, 1, h, w)`` fitted to matches and points; ``x`` where there are neither."""
         depth_m = self.objective.metric_depth(x, self.affine)
-        target, error = self._target(depth_m), self._local_error
+        target, error = self._target(depth_m), local_error(self.error, self.valid)
         if target is None or error is None:
             return x
         _, _, field = refine_depth(depth_m, target, self.objective.views.left_01, error, self.config)
@@ -236,22 +189,13 @@ class Trajectory:
 
     def loss(self, x: Tensor, affine: AffineState, z0: Tensor, anchor: Tensor) -> Loss:
         """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""
-        assert self._start is not None  # as in ``affine``
-        return self.objective(
-            x, affine, self._start, z0, anchor, self.usable_matches, self.points, self.hidden
-        )
+        assert self._affine_start is not None  # the scale is settled
+        matches, points = self.usable_matches, self.points
+        return self.objective(x, affine, self._affine_start, z0, anchor, matches, points, self.hidden)
 
     def report(self, loss: Loss) -> None:
         """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
-        self.history.append(
-            StepReport(
-                self._step,
-                self._timestep,
-                loss.total.detach(),
-                {name: value.detach() for name, value in loss.terms.items()},
-                self.affine.s_hat,
-                self.affine.t_hat,
-                self.affine.g_s,
-                loss.visible_fraction,
-            )
-        )
+        terms = {name: value.detach() for name, value in loss.terms.items()}
+        numbers = self.affine.s_hat, self.affine.t_hat, self.affine.g_s
+        report = StepReport(*self.step, loss.total.detach(), terms, *numbers, loss.visible_fraction)
+        self.history.append(report)

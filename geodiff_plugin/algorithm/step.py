@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from geodiff_plugin.algorithm.gradients import pull_back
-from geodiff_plugin.algorithm.objective import Loss
 from geodiff_plugin.algorithm.schedule import Round
 from geodiff_plugin.algorithm.state import Trajectory
+from geodiff_plugin.algorithm.terms import Loss
 
 
 class Estimate(Protocol):
@@ -23,7 +23,7 @@ class Estimate(Protocol):
     Attributes:
         latent: ``(B, C, h, w)`` float32, what guidance moves: z_t ("full") or z0_hat ("denoised").
         eps: ``(B, C, h, w)`` the predicted noise, the yardstick of the norm-matched rule.
-        latent_is_read: whether anyone reads the latent after this step; the last one's map is the result.
+        latent_is_read: whether anyone reads the latent after this step; the last map itself is the result.
     """
 
     latent: Tensor
@@ -95,12 +95,11 @@ def corrected_step(
     every step, and a map that needs no correction leaves the latent as it is.
 
     Args:
-        state: its scale is settled; the fit is that of its matches and points.
+        state: holds the matches and points, and the scale, which is settled here.
         estimate: of this denoising step.
         z0: ``(B, C, h, w)`` clean latent.
         is_result: no round follows. The map is then left to the refinement of the output, if there is one:
-            brought to the matches twice it would follow their noise. It is encoded only if the latent is
-            read.
+            fitted to the matches twice it would follow their noise. It is encoded only if the latent is read.
 
     Returns:
         The clean latent, and the map that stands for it, ``(B, 1, h', w')``.
@@ -124,13 +123,7 @@ def corrected_step(
 def guided_step(
     state: Trajectory, estimate: Estimate, rounds: tuple[Round, ...], is_last: bool
 ) -> tuple[Tensor, Tensor, bool]:
-    """The rounds of one denoising step.
-
-    Args:
-        state: of the chunk; its scale, shift and history are advanced.
-        estimate: what the denoising step gives.
-        rounds: of the schedule, at least one.
-        is_last: no denoising step follows.
+    """The rounds of one denoising step, at least one.
 
     Returns:
         ``(B, C, h, w)`` float32, what to add to the latent; the relative map of the latest evaluation; and

@@ -1,21 +1,24 @@
-"""Guidance terms: functions from what an estimate is compared with to one number per sample, and their table.
+"""Guidance terms, their table, and their weighted sum: the loss of a relative map.
 
-A new term is a function and one line in ``TERMS``. ``photometric`` and ``prior_pull`` are Eq. 14
-(eq:geo-loss) and Eq. 17; the others go beyond the paper.
+Source: ``photometric`` and ``prior_pull`` are Eq. 14 (eq:geo-loss) and Eq. 17, on the metric depth of Eq. 16.
+The other terms go beyond the paper. A new term is a function and one line in ``TERMS``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin.algorithm.evidence import Views
 from geodiff_plugin.algorithm.photometric import masked_mean, photometric
-from geodiff_plugin.config import DEFAULT
+from geodiff_plugin.config import DEFAULT, GuidanceConfig
+from geodiff_plugin.geometry import hidden_in_right, image_size, warp_right_to_left
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.scale.space import AffineState
+from geodiff_plugin.scale.space import AffineState, MetricMap
 
 #: Errors at points up to this share of the unit are float32's rounding and pull no more: a rule that gives
 #: every gradient the same length would follow their sign.
@@ -27,21 +30,21 @@ CAUCHY = 5.0
 ANCHOR_FLOOR = 0.05
 
 
-@dataclass(frozen=True)
-class Compared:
+class Compared(NamedTuple):
     """One metric estimate on the loss grid, and what the terms compare it with.
 
     Attributes:
         depth_m: ``(B, 1, H, W)`` metres, carries the graph.
         left_01: ``(B, 3, H, W)`` the left image.
         warped_01: ``(B, V, 3, H, W)`` every right image seen from the left through ``depth_m``.
-        visible: ``(B, V, 1, H, W)`` bool: in view of that camera, and not known to be hidden from it.
+        visible: ``(B, V, 1, H, W)`` bool: in view of that camera, and not hidden from it as far as we know.
         affine: current scale, shift, g_s; carries the graph.
         affine_start: where the search put them; no graph.
         z0: ``(B, C, h, w)`` current clean latent, carries the graph.
         z0_prior: ``(B, C, h, w)`` the network's own clean latent of this step; no graph.
         matches: those that are believed, or ``None``.
         points: depths that the user knows, or ``None``.
+        config: the terms' numbers.
     """
 
     depth_m: Tensor
@@ -54,25 +57,17 @@ class Compared:
     z0_prior: Tensor
     matches: Matches | None
     points: Matches | None = None
+    config: GuidanceConfig = DEFAULT
 
 
-@dataclass(frozen=True)
-class Term:
-    """One entry of ``TERMS``: a term whose input a call lacks is left out.
+class Term(NamedTuple):
+    """A function from ``Compared`` to ``(B,)``, and the input without which it is left out.
 
-    Attributes:
-        function: ``Compared`` -> ``(B,)``.
-        options: fields of the configuration that it takes as keywords.
-        needs_warp: it reads ``warped_01``.
-        needs_matches: it reads ``matches``.
-        needs_points: it reads ``points``.
+    ``needs`` is ``"views"``, ``"matches"``, ``"points"``, or empty for what every call has.
     """
 
-    function: Callable[..., Tensor]
-    options: tuple[str, ...] = ()
-    needs_warp: bool = False
-    needs_matches: bool = False
-    needs_points: bool = False
+    function: Callable[[Compared], Tensor]
+    needs: str = ""
 
 
 def cauchy(e: Tensor, width: float) -> Tensor:
@@ -85,56 +80,32 @@ def _relative_error(depth_m: Tensor, target: Matches) -> Tensor:
     return (1.0 / depth_m - target.inverse_depth) / target.plane_step.view(-1, 1, 1, 1)
 
 
-def photometric_term(
-    compared: Compared,
-    *,
-    eta: float = DEFAULT.eta,
-    pyramid_levels: int = DEFAULT.pyramid_levels,
-    exposure: bool = DEFAULT.exposure,
-) -> Tensor:
+def photometric_term(compared: Compared) -> Tensor:
     """``photometric`` of the right images seen from the left, over the pixels that some right camera sees."""
-    return photometric(
-        compared.left_01,
-        compared.warped_01,
-        compared.visible,
-        eta=eta,
-        pyramid_levels=pyramid_levels,
-        exposure=exposure,
-    )
+    return photometric(compared.left_01, compared.warped_01, compared.visible, compared.config)
 
 
 def matches_term(compared: Compared) -> Tensor:
-    """Robust distance from the matches, in inverse depth, in units of one plane of the sweep.
+    """Robust distance from the matches in inverse depth, ``(B,)``; 0 where a sample has no match.
 
-    Far and near pixels weigh alike, because one plane is one step of shift in the right image.
-
-    Returns:
-        ``(B,)``, confidence-weighted mean; 0 where a sample has no match.
+    In units of one plane of the sweep, which is one step of shift in the right image, so that far and near
+    pixels weigh alike.
     """
     target = compared.matches
-    assert target is not None  # Term.needs_matches
+    assert target is not None  # Term.needs
     return masked_mean(cauchy(_relative_error(compared.depth_m, target), CAUCHY), target.confidence)
 
 
-def points_term(compared: Compared, *, points_loss: str = DEFAULT.points_loss) -> Tensor:
-    """Error at depths that the user knows: lidar, structure from motion, a tape measure.
+def points_term(compared: Compared) -> Tensor:
+    """Error at depths that the user knows (lidar, structure from motion, a tape), ``(B,)``; 0 without any.
 
-    Robust, far and near points weigh alike and a wrong point (seen through a window, from the other side of
-    an edge) does not win against the rest; in metres the far ones decide.
-
-    Args:
-        compared: needs ``depth_m`` and ``points``.
-        points_loss: ``"robust"``: the Cauchy loss of the matches, with 1 % of the points' median inverse
-        depth
-            as the unit; ``"l1l2"``: mean absolute plus mean squared error, metres (Marigold-DC, Viola et al.
-            2024, Eq. 4).
-
-    Returns:
-        ``(B,)``; 0 where a sample has no point on the grid.
+    ``points_loss="robust"`` is the Cauchy loss of the matches: far and near points weigh alike, and a wrong
+    one (seen through a window, or from the other side of an edge) does not win against the rest. ``"l1l2"``,
+    mean absolute plus mean squared error in metres, is that of Marigold-DC (Viola et al. 2024, Eq. 4).
     """
     target = compared.points
-    assert target is not None  # Term.needs_points
-    if points_loss == "robust":
+    assert target is not None  # Term.needs
+    if compared.config.points_loss == "robust":
         e = _relative_error(compared.depth_m, target)
         return masked_mean(cauchy(F.hardshrink(e, ROUNDING), CAUCHY), target.confidence)
     given = target.confidence > 0
@@ -142,37 +113,25 @@ def points_term(compared: Compared, *, points_loss: str = DEFAULT.points_loss) -
     return masked_mean(e + e * e, given)
 
 
-def prior_pull(compared: Compared, *, pull_to: str = DEFAULT.pull_to) -> Tensor:
-    """Squared distance of the raw scale and shift from an anchor, ``||s_hat - s*||^2 + ||t_hat - t*||^2``.
+def prior_pull(compared: Compared) -> Tensor:
+    """``||s_hat - s*||^2 + ||t_hat - t*||^2``, ``(B,)``, to be weighted by gamma.
 
-    Args:
-        compared: needs ``affine`` and ``affine_start``.
-        pull_to: ``"zero"`` is the paper's; ``"start"`` is the search's result.
-
-    Returns:
-        ``(B,)``, to be weighted by gamma.
-
-    Source: Eq. 17. Deviation: ``"start"``, because the paper's pull of the raw values towards 0 makes
-    softplus(0) = 0.693 for both, that is far / near = 2 for every scene.
+    Source: Eq. 17, with ``pull_to="zero"``. Deviation: by default s*, t* are the search's result, because
+    the paper's pull of the raw values towards 0 makes softplus(0) = 0.693 of both: far / near = 2 for every
+    scene.
     """
     s, t = compared.affine.s_hat, compared.affine.t_hat
-    if pull_to == "start":
+    if compared.config.pull_to == "start":
         s = s - compared.affine_start.s_hat
         t = t - compared.affine_start.t_hat
     return s * s + t * t
 
 
 def anchor(compared: Compared) -> Tensor:
-    """Mean squared distance of the clean latent from the network's own, where the views say nothing.
+    """Mean squared distance of the clean latent from the network's own, ``(B,)``, less where matches are.
 
     With several inner updates it keeps unmatched regions with the prior, and leaves matched ones to the
     matches: the proximal form of one diffusion posterior step (S3.2 takes a single gradient step instead).
-
-    Args:
-        compared: needs ``z0`` and ``z0_prior``; with ``matches`` the pull falls as their confidence rises.
-
-    Returns:
-        ``(B,)``.
     """
     square = (compared.z0 - compared.z0_prior).pow(2).mean(1, keepdim=True)  # (B, 1, h, w)
     if compared.matches is not None:
@@ -182,9 +141,99 @@ def anchor(compared: Compared) -> Tensor:
 
 
 TERMS: dict[str, Term] = {
-    "photometric": Term(photometric_term, ("eta", "pyramid_levels", "exposure"), needs_warp=True),
-    "matches": Term(matches_term, needs_matches=True),
-    "points": Term(points_term, ("points_loss",), needs_points=True),
-    "prior_pull": Term(prior_pull, ("pull_to",)),
+    "photometric": Term(photometric_term, "views"),
+    "matches": Term(matches_term, "matches"),
+    "points": Term(points_term, "points"),
+    "prior_pull": Term(prior_pull),
     "anchor": Term(anchor),
 }
+
+
+class Loss(NamedTuple):
+    """One evaluation: ``total (B,)`` with its graph, the unweighted ``terms``, the share in view ``(B,)``.
+
+    A pixel is in view where any further camera has it in its picture.
+    """
+
+    total: Tensor
+    terms: dict[str, Tensor]
+    visible_fraction: Tensor
+
+
+class Objective:
+    """The weighted sum of guidance terms for one chunk of samples.
+
+    Args:
+        views: what the cameras saw.
+        metric: the prior's metric parametrisation.
+        config: weights by name of ``TERMS``, of which one of weight 0 is not computed, the terms' numbers,
+            and ``min_visible``, the share in view below which a sample's photometric term is switched off: a
+            depth that pushes the scene out of the right image leaves nothing to compare and would win.
+    """
+
+    def __init__(self, views: Views, metric: MetricMap, config: GuidanceConfig) -> None:
+        self.views, self.metric, self.config = views, metric, config
+
+    def metric_depth(self, x: Tensor, affine: AffineState) -> Tensor:
+        """``x (B, 1, h, w)`` upsampled to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""
+        x = self.metric.confine(x)
+        if x.shape[-2:] != self.views.size:
+            x = F.interpolate(x, self.views.size, mode="bilinear", align_corners=False)
+        return self.metric(x, affine)
+
+    def __call__(
+        self,
+        x: Tensor,
+        affine: AffineState,
+        affine_start: AffineState,
+        z0: Tensor,
+        z0_prior: Tensor,
+        matches: Matches | None,
+        points: Matches | None = None,
+        hidden: Tensor | None = None,
+    ) -> Loss:
+        """Loss of one estimate; differentiable in ``x``, ``z0`` and the affine state.
+
+        ``x (B, 1, h, w)`` is the unclipped relative map without padding, decoded from ``z0``; ``hidden
+        (B, V, 1, H, W)`` bool are pixels not to be compared. The other arguments are those of ``Compared``.
+        """
+        given = {"": True, "views": self.views.further, "matches": matches, "points": points}
+        active = {name: w for name, w in self.config.weights.items() if w and given[TERMS[name].needs]}
+        depth_m = self.metric_depth(x, affine)
+        warps = any(TERMS[name].needs == "views" for name in active)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and warps):
+            warped_01, in_view = self._warp(depth_m)
+        visible = in_view if hidden is None else in_view & ~hidden
+        left_01, config = self.views.left_01, self.config
+        anchored = affine, affine_start, z0, z0_prior
+        compared = Compared(depth_m, left_01, warped_01, visible, *anchored, matches, points, config)
+        visible_fraction = in_view.any(1).float().flatten(1).mean(1)
+        total, values = torch.zeros_like(visible_fraction), {}
+        for name, weight in active.items():
+            value = TERMS[name].function(compared)
+            if TERMS[name].needs == "views":
+                value = value * (visible_fraction >= config.min_visible)
+            values[name] = value
+            total = total + weight * value
+        return Loss(total, values, visible_fraction)
+
+    def hidden(self, x: Tensor, affine: AffineState) -> Tensor:
+        """``(B, V, 1, H, W)`` bool: what another part of this estimate hides from each right view."""
+        depth_m, v = self.metric_depth(x, affine), self.views
+        hidden = [
+            hidden_in_right(depth_m, v.K_left, K, T, image_size(image), rays=rays)
+            for (image, K, T), rays in zip(v.further, v.rays, strict=True)
+        ]
+        return torch.stack(hidden, 1)
+
+    def _warp(self, depth_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Every further image seen from the left ``(B, V, 3, H, W)``, and where its camera has it in view."""
+        v = self.views
+        warps = [
+            warp_right_to_left(image, depth_m, v.K_left, K, T, rays=rays)
+            for (image, K, T), rays in zip(v.further, v.rays, strict=True)
+        ]
+        if not warps:
+            nothing = v.left_01[:, None][:, :0]
+            return nothing, nothing[:, :, :1].bool()
+        return torch.stack([w.image for w in warps], 1), torch.stack([w.visible for w in warps], 1)

@@ -9,6 +9,7 @@ from geodiff_plugin.geometry.cameras import (
     image_size,
     is_rectified,
     nearest_rotation,
+    resize_image,
     resize_intrinsics,
 )
 from geodiff_plugin.geometry.projection import (
@@ -22,21 +23,6 @@ from geodiff_plugin.geometry.projection import (
 )
 from geodiff_plugin.geometry.warping import Warped, hidden_in_right, sample_at, warp_right_to_left
 
-__all__ = [
-    "NEAREST_M",
-    "OPENGL_FROM_OPENCV",
-    "PlaneRays",
-    "Warped",
-    "hidden_in_right",
-    "image_size",
-    "is_rectified",
-    "nearest_rotation",
-    "plane_rays",
-    "project",
-    "project_rays",
-    "resize_intrinsics",
-    "sample_at",
-    "transform",
-    "unproject",
-    "warp_right_to_left",
-]
+__all__ = ["NEAREST_M", "OPENGL_FROM_OPENCV", "PlaneRays", "Warped", "hidden_in_right", "image_size"]
+__all__ += ["is_rectified", "nearest_rotation", "plane_rays", "project", "project_rays", "resize_image"]
+__all__ += ["resize_intrinsics", "sample_at", "transform", "unproject", "warp_right_to_left"]

@@ -34,18 +34,13 @@ def made_there(like: torch.Tensor, *values: float) -> torch.Tensor:
 
 
 def unproject(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-    """Points of a depth map in the frame of its own camera.
+    """Points ``(B, H, W, 3)`` metres of a depth map ``(B, 1, H, W)`` in its camera's frame; differentiable.
 
-    Args:
-        depth_m: ``(B, 1, H, W)`` float, z in metres.
-        K: ``(B, 3, 3)`` float, pixels of the depth map's grid.
-
-    Returns:
-        ``(B, H, W, 3)`` metres, x right, y down, z forward; differentiable.
+    ``K (B, 3, 3)`` is in pixels of the map's grid. A skew ``K[0, 1]`` is obeyed, here and wherever a K is
+    taken.
 
     Convention:
         The pixel at the principal point has ``x = y = 0``; one focal length to its right has ``x = z``.
-        A skew ``K[0, 1]`` is obeyed, here and everywhere else that a ``K`` is taken.
     """
     return _rays(image_size(depth_m), K.to(depth_m.dtype)) * depth_m[:, 0, ..., None]
 
@@ -58,15 +53,7 @@ def _rays(size: tuple[int, int], K: torch.Tensor) -> torch.Tensor:
 
 
 def transform(points: torch.Tensor, T: torch.Tensor) -> torch.Tensor:
-    """Points in another frame.
-
-    Args:
-        points: ``(B, H, W, 3)`` float, frame b.
-        T: ``(B, 4, 4)`` float, ``T_a_from_b``.
-
-    Returns:
-        ``(B, H, W, 3)``, frame a; differentiable.
-    """
+    """Points ``(B, H, W, 3)`` of frame b in frame a, by ``T (B, 4, 4)``, ``T_a_from_b``; differentiable."""
     return transform_points(T, points.flatten(1, 2)).view_as(points)
 
 
@@ -101,15 +88,14 @@ def plane_rays(
 ) -> PlaneRays:
     """Everything of the left-to-right projection that does not depend on depth.
 
+    The pixel with depth z has the homogeneous right pixel ``z * A + b``, whose third component is its depth
+    in the right view.
+
     Args:
-        K_left: ``(B, 3, 3)`` float, pixels of the left grid.
+        K_left: ``(B, 3, 3)`` float, pixels of the left grid of ``size`` ``(H, W)``.
         K_right: ``(B, 3, 3)``, pixels of the right image.
         T_right_from_left: ``(B, 4, 4)``.
-        size: ``(H, W)`` of the left grid.
-
-    Returns:
-        ``PlaneRays``; the pixel with depth z has the homogeneous right pixel ``z * A + b``, whose third
-        component is its depth in the right view.
+        size: of the left grid.
 
     Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
     """
@@ -123,13 +109,8 @@ def plane_rays(
 def project_rays(depth_m: torch.Tensor, rays: PlaneRays) -> tuple[torch.Tensor, torch.Tensor]:
     """Right-view pixels of a left depth map: ``project(transform(unproject))`` by precomputed rays, cheaper.
 
-    Args:
-        depth_m: ``(B, 1, H, W)`` float, metres.
-        rays: what ``plane_rays`` gave for this grid.
-
-    Returns:
-        ``uv`` ``(B, H, W, 2)`` pixels of the right image and ``z_right`` ``(B, H, W)`` metres; behind the
-        right camera as ``project`` says. Differentiable in ``depth_m``.
+    ``depth_m (B, 1, H, W)`` metres lies on the grid of the rays. Returns ``uv (B, H, W, 2)`` pixels of the
+    right image and ``z_right (B, H, W)`` metres, as ``project``; differentiable in depth.
     """
     height, width = depth_m.shape[-2:]
     p = depth_m.flatten(2) * rays.A + rays.b  # (B, 3, H * W)

@@ -32,18 +32,14 @@ class Warped:
 
 
 def sample_at(image: torch.Tensor, uv: torch.Tensor, *, mode: str = "bilinear") -> torch.Tensor:
-    """Values of an image at pixel coordinates, its edge repeated outside.
+    """Values ``(B, C, h, w)`` of an image ``(B, C, H, W)`` at ``uv (B, h, w, 2)`` pixels, its edge repeated.
 
-    Args:
-        image: ``(B, C, H, W)`` float.
-        uv: ``(B, h, w, 2)`` pixels (column, row); (0, 0) is the centre of the first pixel.
-        mode: ``"bilinear"``, ``"nearest"`` or ``"bicubic"``.
-
-    Returns:
-        ``(B, C, h, w)``; differentiable in ``image`` and, inside the image and bilinear, in ``uv``.
+    Differentiable in the image and, inside of it and for ``mode="bilinear"``, in ``uv``; other modes are
+    ``"nearest"`` and ``"bicubic"``.
 
     Convention:
-        A ``uv`` that grows by 1 in its first component reads one pixel further right.
+        (0, 0) is the centre of the first pixel. A ``uv`` that grows by 1 in its first component reads one
+        pixel further right.
     """
     height, width = image.shape[-2:]
     # align_corners=True: -1 and 1 are the centres of the first and the last pixel, where uv counts from.
@@ -80,8 +76,7 @@ def warp_right_to_left(
         K_left: ``(B, 3, 3)`` float, pixels of the left grid.
         K_right: ``(B, 3, 3)``, pixels of ``right``.
         T_right_from_left: ``(B, 4, 4)``.
-        rays: ``plane_rays(K_left, K_right, T_right_from_left, (H, W))`` computed before, where the same
-            cameras are used again and again; the three matrices are then not read.
+        rays: ``plane_rays`` of these cameras, where they are used again and again.
 
     Returns:
         ``Warped``. ``image`` is differentiable in ``depth_m`` and ``right``; its gradient in depth is zero
@@ -112,22 +107,11 @@ def hidden_in_right(
     margin: float = 0.05,
     rays: PlaneRays | None = None,
 ) -> torch.Tensor:
-    """Left pixels that another part of the left surface hides from the right camera.
+    """Left pixels that another part of the left surface hides from the right camera, ``(B, 1, H, W)``.
 
     The surface is splatted into a depth buffer of the right view; a pixel is hidden when the buffer at its
-    place is nearer than the pixel by more than ``margin``.
-
-    Args:
-        depth_m: ``(B, 1, H, W)`` float, metres, on the left grid.
-        K_left: ``(B, 3, 3)`` float, pixels of the left grid.
-        K_right: ``(B, 3, 3)``, pixels of the right image.
-        T_right_from_left: ``(B, 4, 4)``.
-        size_right: ``(Hr, Wr)`` that ``K_right`` is for.
-        margin: relative difference in depth that still counts as the same surface, > 0.
-        rays: as for ``warp_right_to_left``.
-
-    Returns:
-        ``(B, 1, H, W)`` bool, True where hidden; False outside of the right image. Not differentiable.
+    place is nearer than the pixel by more than the relative ``margin``. False outside of the right image, of
+    ``size_right`` ``(Hr, Wr)``. Other arguments as for ``warp_right_to_left``; not differentiable.
     """
     batch, _, height, width = depth_m.shape
     if rays is None:

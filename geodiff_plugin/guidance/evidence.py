@@ -43,13 +43,7 @@ def pose_views(
 ) -> tuple[tuple[CameraView, ...], PoseReport]:
     """The right views with the poses of the knob ``pose``, and the report on them.
 
-    Args:
-        left_01: ``(3, H, W)`` float32 in [0, 1], native size.
-        rights: as the user gave them.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
-        config: whether they are refined.
-        unit: of the poses' lengths, ``"m"`` or ``None``.
-        measured: whether the lengths of the baselines are measured; see ``Rig``.
+    ``left_01`` has its native size; other arguments as for ``refine_views``.
     """
     if config.pose == "given":
         return untouched(rights)
@@ -63,10 +57,7 @@ def pose_views(
 def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> Tensor:
     """A rough, smooth depth without holes, ``(1, 1, h, w)`` metres: a coarse sweep, its matches spread.
 
-    Args:
-        left_01: ``(3, H, W)`` float32 in [0, 1].
-        rights: with poses that fit roughly.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
+    ``left_01 (3, H, W)`` in [0, 1] with its ``K_left (3, 3)``, and right views with poses that fit roughly.
     """
     matches = match_volume(pilot_volume(left_01, rights, K_left))
     weight = matches.confidence[None] ** 2 + 1e-9
@@ -150,7 +141,7 @@ class EvidenceStore:
         return spared
 
 
-def _equal(one: Tensor | None, other: Tensor | None) -> bool:
-    if one is None or other is None:
-        return one is other
-    return one.device == other.device and one.shape == other.shape and torch.equal(one, other)
+def _equal(a: Tensor | None, b: Tensor | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return a.device == b.device and a.shape == b.shape and torch.equal(a, b)

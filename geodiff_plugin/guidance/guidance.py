@@ -131,11 +131,12 @@ class GeometryGuidance:
         if not isinstance(config, GuidanceConfig):
             bad_type("config", "a GuidanceConfig", config, "GuidanceConfig.load reads a saved one.")
         if unit not in ("m", None):
-            bad_value(
-                "unit", "'m' or None", repr(unit), "Give lengths in metres, or None for any other unit."
-            )
+            cure = "Give lengths in metres, or None for any other unit."
+            bad_value("unit", "'m' or None", repr(unit), cure)
         self.config, self.unit = config.changed(**knobs), unit
-        _check_names(self.config)
+        check_choice(self.config.rule, "rule", RULES)
+        for name in self.config.weights:
+            check_choice(name, "a key of weights", TERMS)
         with noted() as self.warned:
             self.inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
         self.assumed: list[str] = []
@@ -344,9 +345,6 @@ class GeometryGuidance:
         Args:
             lefts_01: ``(N, 3, H, W)`` float32 in [0, 1], native size, on the device to compute on.
 
-        Returns:
-            One entry per image.
-
         Raises:
             InputError: another number of left images than of entries; ``K`` of another image size.
         """
@@ -375,26 +373,15 @@ def assume_same_centre(guidance: GeometryGuidance) -> None:
         guidance.assumed = [SAME_CENTRE]
 
 
-def _check_names(config: GuidanceConfig) -> None:
-    """Refuse names of rules and terms that do not exist, naming those that do."""
-    check_choice(config.rule, "rule", RULES)
-    for name in config.weights:
-        check_choice(name, "a key of weights", TERMS)
-
-
 def _check_sufficient(config: GuidanceConfig, updates: UpdatePlan, *, views: bool, points: bool) -> None:
     """Refuse a configuration whose search, or whose every weighted term, lacks what it works on."""
     if config.search == "one-number" and not (views and config.weights.get("photometric")):
         refuse("search='one-number' needs a right view and a photometric weight; search='volume' does not.")
     if config.search == "points-range" and not points:
         refuse("search='points-range' needs points. search='volume' works without them.")
-    weighted = [TERMS[name] for name, weight in config.weights.items() if weight]
-    idle = [
-        term
-        for term in weighted
-        if ((term.needs_warp or term.needs_matches) and not views) or (term.needs_points and not points)
-    ]
+    given = {"": True, "views": views, "matches": views, "points": points}
+    needs = [TERMS[name].needs for name, weight in config.weights.items() if weight]
     makes_updates = updates.inner_steps or config.inner_steps is None
-    if makes_updates and len(idle) == len(weighted):
+    if makes_updates and not any(given[need] for need in needs):
         cure = "photometric and matches need a right view, points needs points; inner_steps=0 needs none."
         bad_value("weights", "above 0 for a term that can work on what is given", dict(config.weights), cure)

@@ -69,8 +69,9 @@ def read_inputs(
     """
     if right is None and points is None:
         bad_value("right", "an image, or None together with points", "None without points")
-    batch = next((x for x in (right, points) if isinstance(x, list) and not _is_nested_matrix(x)), [None])
-    count = len(batch)
+    count = len(
+        next((x for x in (right, points) if isinstance(x, list) and not _is_nested_matrix(x)), [None])
+    )
     if right is not None and not isinstance(right, list) and count == 1:
         K, E = _as_tuple(K), _as_tuple(E)
     if count == 0:
@@ -78,21 +79,19 @@ def read_inputs(
     inputs = []
     for i in range(count):
         label = "{}" if count == 1 else f"{{}}[{i}]"
-        right_i, K_i, E_i, points_i = (
-            _entry(x, name, i, count)
-            for x, name in ((right, "right"), (K, "K"), (E, "E"), (points, "points"))
-        )
-        inputs.append(_read_one(right_i, K_i, E_i, points_i, label, cropped, unit))
-    for name, given in (
-        ("right", [bool(entry.views) for entry in inputs]),
-        ("points", [entry.points is not None for entry in inputs]),
-    ):
+        arguments = {"right": right, "K": K, "E": E, "points": points}
+        entries = (_entry(value, name, i, count) for name, value in arguments.items())
+        inputs.append(_read_image(*entries, label, cropped, unit))
+    have_points = [entry.points is not None for entry in inputs]
+    for name, given in (("right", [bool(entry.views) for entry in inputs]), ("points", have_points)):
         if any(given) and not all(given):
             bad_value(name, "given for every left image or for none", f"None for {given.index(False)}")
     return inputs
 
 
-def _read_one(right: Any, K: Any, E: Any, points: Any, label: str, cropped: bool, unit: str | None) -> Inputs:
+def _read_image(
+    right: Any, K: Any, E: Any, points: Any, label: str, cropped: bool, unit: str | None
+) -> Inputs:
     """The entry of one left image; ``label`` makes the names in messages."""
     given = right if isinstance(right, tuple) else () if right is None else (right,)
     count, name = len(given), label.format("right")

@@ -43,13 +43,11 @@ class Room:
 
 
 def _scan_rows(cost: torch.Tensor, p1: int, p2: torch.Tensor, total: torch.Tensor) -> None:
-    """Add the path from the first row down and the one from the last row up to ``total``.
+    """Add the path from the first row down and that from the last row up to ``total``.
 
-    Args:
-        cost: ``(D, N, M)`` uint8; paths run along N, side by side over M.
-        p1: penalty of a step of one plane.
-        p2: ``(N, M)`` int16, penalty of any larger step between row n - 1 and row n.
-        total: ``(D, N, M)`` int16, changed in place.
+    ``cost (D, N, M)`` uint8; paths run along N, side by side over M. ``p1`` is the penalty of a step of one
+    plane, ``p2 (N, M)`` int16 that of any larger step between row n - 1 and row n. ``total (D, N, M)`` int16
+    is changed in place.
     """
     planes, count, breadth = cost.shape
     # Both directions advance together, entry 0 down and entry 1 up; a plane more at either end never wins.
@@ -86,7 +84,7 @@ def _limits(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 @torch.no_grad()
 def aggregate(levels: torch.Tensor, grey: torch.Tensor, *, room: Room | None = None) -> torch.Tensor:
-    """Semi-global aggregation along four paths.
+    """Semi-global aggregation along four paths (up, down, left, right); not differentiable.
 
     Args:
         levels: ``(D, H, W)`` uint8, costs of 0 to ``COST_LEVELS``.
@@ -94,9 +92,9 @@ def aggregate(levels: torch.Tensor, grey: torch.Tensor, *, room: Room | None = N
         room: memory to work in, which holds the result until its next use; its own by default.
 
     Returns:
-        ``(D, H, W)`` int16, sum over the four paths, below ``NEVER``; not differentiable.
+        ``(D, H, W)`` int16, sum over the four paths, below ``NEVER``.
 
-    Source: Hirschmueller 2008, Eq. 13 with paths up, down, left, right.
+    Source: Hirschmueller 2008, Eq. 13.
     """
     vertical, horizontal = _limits(grey)
     step = round(COST_LEVELS * STEP_PENALTY)
@@ -106,10 +104,10 @@ def aggregate(levels: torch.Tensor, grey: torch.Tensor, *, room: Room | None = N
     sideways = room.cells("sideways", planes, (width, height), paths)
     total = room.cells("total", planes, (height, width), paths)
     # Plane by plane and from piece to piece: so a transposition goes by blocks, several times as fast.
-    for plane, own in zip(turned, levels, strict=True):
-        plane.copy_(own.contiguous().T.contiguous())
+    for plane, source in zip(turned, levels, strict=True):
+        plane.copy_(source.contiguous().T.contiguous())
     _scan_rows(turned, step, horizontal, sideways.zero_())
-    for plane, own in zip(total, sideways, strict=True):
-        plane.copy_(own.contiguous().T.contiguous())
+    for plane, source in zip(total, sideways, strict=True):
+        plane.copy_(source.contiguous().T.contiguous())
     _scan_rows(levels, step, vertical, total)
     return total

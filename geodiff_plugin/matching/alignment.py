@@ -52,31 +52,25 @@ class AlignedView:
         return self.grey.shape[0], self.grey.shape[1]
 
     def positions(self, count: int, axis: int, margin: int = 0) -> torch.Tensor:
-        """Where the left grid's lines lie.
+        """Where the left grid's ``count`` columns (``axis`` 0) or rows (``axis`` 1) lie.
 
-        Args:
-            count: the left grid's columns (``axis`` 0) or rows (``axis`` 1).
-            axis: 0 for columns, 1 for rows.
-            margin: lines beyond the grid on either side, which repeat its outermost.
-
-        Returns:
-            ``(D, count + 2 * margin)`` float32, canvas pixels, not clipped.
+        ``(D, count + 2 * margin)`` float32, canvas pixels, not clipped; the ``margin`` of lines beyond the
+        grid on either side repeats its outermost.
         """
         lines = torch.arange(-margin, count + margin, **_HERE).clamp_(0, count - 1)
         at = self.scale[:, None] * lines + self.shift[:, axis, None]
         return at.to(self.grey.device, torch.float32)
 
     def sources(self, count: int, axis: int) -> torch.Tensor:
-        """The left line that each line of the canvas shows: the way back of ``positions``, rounded.
+        """The left line that each line of the canvas shows, ``(D, w or h)`` int64; ``count`` for none.
 
-        Returns:
-            ``(D, w or h)`` int64; ``count`` where there is none.
+        The way back of ``positions``, rounded.
         """
         lines = torch.arange(self.size[1 - axis], **_HERE)
         scale = self.scale[:, None]
         at = ((lines - self.shift[:, axis, None]) / scale.clamp_min(1e-9)).round()
-        known = (scale > 0) & (at >= 0) & (at < count)
-        return torch.where(known, at, float(count)).long().to(self.grey.device)
+        seen = (scale > 0) & (at >= 0) & (at < count)
+        return torch.where(seen, at, float(count)).long().to(self.grey.device)
 
     def inside(self, positions: torch.Tensor, axis: int) -> torch.Tensor:
         """Which of the ``positions`` are on the canvas, and not behind the right camera; ``(D, n)`` bool."""
@@ -93,15 +87,14 @@ def align_view(
 ) -> AlignedView:
     """Turn a right view parallel to the left one.
 
+    The canvas covers what the planes see of the right image, at most three times as wide and high as the left
+    grid. A rectified right image is its own canvas.
+
     Args:
         right: ``(grey (1, Hr, Wr), K_right (3, 3), T_right_from_left (4, 4))``.
         K_left: ``(3, 3)`` pixels of the left grid.
         size: ``(H, W)`` of the left grid.
         inverse_depth: ``(D,)`` 1/m, the planes, fronto-parallel in the left view.
-
-    Returns:
-        ``AlignedView``. The canvas covers what the planes see of the right image, at most three times as wide
-        and high as the left grid. A rectified right image is its own canvas.
     """
     image, *matrices = right
     K_r, T, K = (matrix.detach().cpu().double() for matrix in (*matrices, K_left))

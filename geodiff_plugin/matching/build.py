@@ -6,12 +6,11 @@ import math
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from kornia.geometry.linalg import inverse_transformation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import image_size, plane_rays, resize_intrinsics
+from geodiff_plugin.geometry import image_size, plane_rays, resize_image
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -41,32 +40,24 @@ HEADROOM, LEAST_SHIFT = 1.25, 0.03
 _CLEARLY, _INVERSE_PIXELS, _PLAINLY = 1.25, 15_000, 0.4
 
 
-def _shrink(
-    image_01: torch.Tensor, K: torch.Tensor, factors: tuple[float, float]
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Image and K, height and width smaller by ``factors`` < 1 (antialiased); as they are for 1 and above."""
-    size = image_size(image_01)
-    height, width = (max(1, round(side * min(1.0, f))) for side, f in zip(size, factors, strict=True))
-    size_to = (height, width)
-    if size_to == size:
-        return image_01, K
-    small = F.interpolate(image_01[None], size_to, mode="bilinear", align_corners=False, antialias=True)[0]
-    return small, resize_intrinsics(K[None], size, size_to)[0]
-
-
 def _to_grid(
     left: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, side: int, pixels: int
 ) -> tuple[torch.Tensor, tuple[CameraView, ...], torch.Tensor]:
     """Shrink the left view to its bounds, right ones to as many pixels per radian, so that none aliases."""
-    height, width = left.shape[-2:]
-    factor = min(side / max(height, width), (pixels / (height * width)) ** 0.5)
-    left, K = _shrink(left, K_left, (factor, factor))
+    size = image_size(left)
+    factor = min(side / max(size), (pixels / (size[0] * size[1])) ** 0.5)
+    left, K = resize_image(left, K_left, _shrunk(size, factor, factor))
     # Axis by axis: whole pixels round each differently, and a rectified pair must stay one.
-    small = tuple(
-        CameraView(*_shrink(image, K_r, (float(K[1, 1] / K_r[1, 1]), float(K[0, 0] / K_r[0, 0]))), T)
-        for image, K_r, T in rights
-    )
-    return left, small, K
+    small = []
+    for image, K_r, T in rights:
+        smaller = _shrunk(image_size(image), float(K[1, 1] / K_r[1, 1]), float(K[0, 0] / K_r[0, 0]))
+        small.append(CameraView(*resize_image(image, K_r, smaller), T))
+    return left, tuple(small), K
+
+
+def _shrunk(size: tuple[int, int], rows: float, columns: float) -> tuple[int, int]:
+    """``(H, W)`` times two factors, but not larger than it is."""
+    return max(1, round(size[0] * min(1.0, rows))), max(1, round(size[1] * min(1.0, columns)))
 
 
 def _even_planes(
@@ -93,17 +84,7 @@ def pilot_volume(
 ) -> CostVolume:
     """A coarse sweep of all depths from infinity to a shift of 40 % of the width.
 
-    Args:
-        left_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1].
-        rights: as for ``build_cost_volume``.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
-        pixels: upper bound on those of its grid.
-
-    Returns:
-        ``CostVolume``.
-
-    Raises:
-        ValueError: the views do not overlap, or both cameras stand at one place.
+    Its grid has at most ``pixels`` pixels. Other arguments and errors as for ``build_cost_volume``.
     """
     views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
     left, small, K = _to_grid(grey(left_01), views, K_left.float(), pixels, pixels)
@@ -151,20 +132,16 @@ def build_cost_volume(
 
     Args:
         left_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1].
-        rights: one or several ``(image_01, K_right (3, 3), T_right_from_left (4, 4))``, images of any size.
-            Costs are averaged over the views that see a pixel.
+        rights: one or several, images of any size. Costs are averaged over the views that see a pixel.
         K_left: ``(3, 3)`` pixels of ``left_01``.
         depth_range: ``(near, far)`` metres, 0 < near < far, that the planes span. By default they reach from
-            infinity to somewhat nearer than anything that a coarse sweep is sure of, so that a street gets
+            infinity to somewhat nearer than anything that a coarse sweep is certain of, so that a street gets
             finer planes than a table top.
         config: bounds of the grid, to which larger images are shrunk, right ones to as many pixels per
             radian, and of the number of planes.
 
-    Returns:
-        ``CostVolume``; not differentiable.
-
     Raises:
-        ValueError: ``depth_range`` not ascending, the views do not overlap, or both cameras stand at one
+        InputError: ``depth_range`` not ascending, the views do not overlap, or both cameras stand at one
             place.
     """
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
@@ -189,21 +166,10 @@ def find_matches(
     depth_range: tuple[float, float] | None = None,
     config: GuidanceConfig = DEFAULT,
 ) -> Matches:
-    """What the views alone say about depth.
+    """What the views alone say about depth, on the grid of the cost volume.
 
-    Args:
-        left_01: ``(3, H, W)`` float in [0, 1]; not read where ``volume`` is given.
-        rights: as for ``build_cost_volume``.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
-        volume: what ``build_cost_volume`` gave for the same views, if it was called already.
-        depth_range: as for ``build_cost_volume``.
-        config: likewise.
-
-    Returns:
-        ``Matches`` on the volume's grid.
-
-    Raises:
-        ValueError: as ``build_cost_volume``.
+    ``volume`` is what ``build_cost_volume`` gave for the same views, if it was called already; otherwise it
+    is built here. Other arguments and errors as there.
     """
     if volume is None:
         volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range, config=config)
@@ -217,16 +183,9 @@ def mirrored_pose_preferred(
     """Whether the inverse pose matches clearly more of the image than the pose as given.
 
     The inverse is the pose that is true when the two images were swapped, and when a world-to-camera pose was
-    given for a camera-to-world one. For a rectified pair it is the baseline with the other sign.
-
-    Args:
-        left_01: ``(3, H, W)`` float in [0, 1].
-        rights: as for ``build_cost_volume``.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
-        matches: what ``find_matches`` gave for the pose as given, if it was called already.
-
-    Returns:
-        The answer of two coarse sweeps, or of none where the matches leave no doubt.
+    given for a camera-to-world one. For a rectified pair it is the baseline with the other sign. Two coarse
+    sweeps decide, or none where ``matches`` of the pose as given leave no doubt. Other arguments as for
+    ``build_cost_volume``.
     """
     if matches is not None and float(matches.confidence.mean()) > _PLAINLY:
         return False

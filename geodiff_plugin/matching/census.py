@@ -21,13 +21,9 @@ COST_LEVELS = 2 * VOTE_LEVELS * _SIDE * _SIDE
 
 
 def grey(image_01: torch.Tensor) -> torch.Tensor:
-    """Luma of an image; kornia's ``rgb_to_grayscale`` rounds another way (1e-7), which turns single votes.
+    """Luma ``(1, H, W)`` float32 in [0, 1] of an image ``(3, H, W)``, or of what is grey already.
 
-    Args:
-        image_01: ``(3, H, W)`` or already ``(1, H, W)``, float in [0, 1].
-
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
+    kornia's ``rgb_to_grayscale`` rounds another way (1e-7), which turns single votes.
     """
     image_01 = image_01.float()
     if image_01.shape[0] == 1:
@@ -36,13 +32,9 @@ def grey(image_01: torch.Tensor) -> torch.Tensor:
 
 
 def grey_levels(grey_01: torch.Tensor) -> torch.Tensor:
-    """Grey in levels of which ``VOTE_LEVELS`` count as a certain difference, about 1.2 an 8-bit level.
+    """Grey in [0, 1] as int16 levels, of which ``VOTE_LEVELS`` count as a certain difference.
 
-    Args:
-        grey_01: any shape, float in [0, 1].
-
-    Returns:
-        The same shape, int16.
+    About 1.2 of them are an 8-bit level.
     """
     return (grey_01 * (VOTE_LEVELS / _CONTRAST)).round().to(torch.int16)
 
@@ -50,9 +42,8 @@ def grey_levels(grey_01: torch.Tensor) -> torch.Tensor:
 def census(levels: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
     """How the 16 neighbours of every pixel compare with it.
 
-    Args:
-        levels: ``(H + 6, W + 6)`` contiguous, of ``grey_levels``, with a margin of ``MARGIN_PX`` all around.
-        out: ``(16, H, W)`` int16 to write to: to touch fresh memory costs more than the work.
+    ``levels (H + 6, W + 6)``, contiguous, of ``grey_levels``, have a margin of ``MARGIN_PX`` all around.
+    ``out (16, H, W)`` int16 is written to: to touch fresh memory costs more than the work.
 
     Returns:
         ``(16, H, W)`` int16, within plus and minus ``VOTE_LEVELS``; unchanged by an offset in brightness,
@@ -69,16 +60,11 @@ def census(levels: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tenso
 
 
 def census_cost(left: torch.Tensor, right: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-    """Difference between two descriptions.
+    """Difference ``(H, W)`` uint8, 0 to ``COST_LEVELS``, between two results ``(16, H, W)`` of ``census``.
 
-    Args:
-        left: ``(16, H, W)`` of ``census``, int8 or int16.
-        right: the same shape and type.
-        out: the same shape and type, to work in; may be ``left`` where that is not needed any more.
-
-    Returns:
-        ``(H, W)`` uint8, 0 to ``COST_LEVELS``; about 0.35 of that for unrelated natural texture, 0.5 for
-        unrelated noise.
+    Both are int8 or int16. About 0.35 of ``COST_LEVELS`` for unrelated natural texture, 0.5 for unrelated
+    noise. ``out``, of the same shape and type, is worked in; it may be ``left`` where that is not needed any
+    more.
     """
     apart = torch.sub(left, right, out=out).abs_()
     if apart.dtype == torch.int8:

@@ -101,15 +101,11 @@ def _noise(levels: torch.Tensor, basis: torch.Tensor) -> float:
 
 
 def find_flaws(image_01: torch.Tensor) -> tuple[float, float]:
-    """How coarsely a photograph was compressed, and how noisy it is.
+    """How coarsely a photograph was compressed, and how noisy it is; arguments as ``clean``.
 
-    Args:
-        image_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1], at least 32 pixels a side.
-
-    Returns:
-        The steps of the JPEG quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at 80; 0 where
-        no trace of compression remains, as after resampling. And the standard deviation of the noise, grey
-        levels of 255.
+    The steps of the JPEG quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at 80; 0 where no
+    trace of compression remains, as after resampling. And the standard deviation of the noise, grey levels of
+    255.
     """
     levels = grey(image_01)[0] * 255.0
     basis = _basis(levels)

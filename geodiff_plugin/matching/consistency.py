@@ -32,13 +32,9 @@ _PLANES = 1 << 12
 
 
 def _winner(total: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The best plane of sums over the paths, with a parabola through its neighbours.
+    """The best plane of sums over the paths ``(D, H, W)``, with a parabola through its neighbours.
 
-    Args:
-        total: ``(D, H, W)`` of ``aggregate``.
-
-    Returns:
-        Per pixel: the best plane, the position between planes, the ``(3, H, W)`` planes around it, its sum.
+    Per pixel: the best plane, the position between planes, the ``(3, H, W)`` planes around it, its sum.
     """
     keys = torch.full_like(total[0], NEVER, dtype=torch.int32).mul_(_PLANES)
     plane_keys = torch.empty_like(keys)
@@ -74,10 +70,8 @@ def _right_winners(volume: CostVolume, view: AlignedView, room: Room) -> torch.T
 def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
     """Left-right difference ``(H, W)`` in planes; infinite where the right view does not see the match.
 
-    Args:
-        view: the right view.
-        other: its own winners, ``_right_winners``.
-        position: ``(H, W)`` winners of the left view, between planes.
+    ``other`` are the right view's ``_right_winners``, ``position (H, W)`` those of the left view, between
+    planes.
     """
     device = position.device
     scale, shift = view.scale.to(device, torch.float32), view.shift.to(device, torch.float32)
@@ -169,12 +163,8 @@ def checked_matches(volume: CostVolume) -> tuple[torch.Tensor, torch.Tensor, tor
 def match_volume(volume: CostVolume) -> Matches:
     """Matches of a cost volume: aggregate, take the winner, and check it against every right view.
 
-    Args:
-        volume: of any number of right views.
-
-    Returns:
-        ``Matches``; zero confidence where no right view agrees, else about the probability that the match is
-        within ``RIGHT_WITHIN_PLANES`` of the truth, by the right view that is most certain of it.
+    Confidence is 0 where no right view agrees, else about the probability that the match is within
+    ``RIGHT_WITHIN_PLANES`` of the truth, by the right view that is most certain of it.
     """
     inverse_depth, contrast, views = _candidates(volume, volume.aligned)
     confidence = torch.zeros_like(inverse_depth)

@@ -58,9 +58,9 @@ class Matches:
         """``(H, W)`` of the grid."""
         return self.confidence.shape[-2], self.confidence.shape[-1]
 
-    def within(self, known: Tensor) -> Self:
-        """The same with confidence 0 outside of ``known (1, h, w)`` or ``(B, 1, h, w)`` bool, on any grid."""
-        inside = F.interpolate(known.view(-1, 1, *known.shape[-2:]).float(), self.size, mode="nearest-exact")
+    def within(self, valid: Tensor) -> Self:
+        """The same with confidence 0 outside of ``valid (1, h, w)`` or ``(B, 1, h, w)`` bool, on any grid."""
+        inside = F.interpolate(valid.view(-1, 1, *valid.shape[-2:]).float(), self.size, mode="nearest-exact")
         return replace(self, confidence=self.confidence * inside.view_as(self.confidence))
 
     def above(self, confidence: float) -> Tensor:
@@ -91,7 +91,7 @@ def points_to_matches(
         points are left out: behind the camera, or outside the image.
 
     Raises:
-        ValueError: no point is left, or a map is not of the image's size.
+        InputError: no point is left, or a map is not of the image's size.
     """
     if points.shape[1] == 3:
         uv, z = project(points[None, None], K_left[None])
@@ -126,14 +126,9 @@ def points_to_matches(
 def with_points(matches: Matches | None, points: Matches) -> Matches:
     """Matches with known points in their place: what the refinement follows.
 
-    Args:
-        matches: of one image, or of a chunk of samples; ``None`` where there are none.
-        points: of the same, on the same grid.
-
-    Returns:
-        As ``matches`` (or ``points``, without), but that the confidence of a point is the number of pixels
-        that it stands for: few points then decide as much as many, and one that a poor prior contradicts is
-        not taken for an outlier, as a match would be.
+    Both are of one image or of a chunk of samples, on one grid; ``matches`` may be ``None``. The confidence
+    of a point is the number of pixels that it stands for: few points then decide as much as many, and one
+    that a poor prior contradicts is not taken for an outlier, as a match would be.
     """
     given = points.confidence > 0
     share = given.float().mean((-2, -1), keepdim=True)
@@ -152,7 +147,7 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     """What remains of each match, given the depth that the prior saw before any match moved it.
 
     One-sided: a reflection and what is seen through glass lie behind the surface, never before it. A prior
-    that is right to 5 % can name a reflection, one that errs by 30 % cannot.
+    that is right to 5 % can name a reflection, a prior that errs by 30 % cannot.
 
     Args:
         matches: of a chunk of samples, ``(B, 1, H, W)``.

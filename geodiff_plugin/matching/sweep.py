@@ -52,14 +52,7 @@ class CostVolume:
         return self.levels.float() / COST_LEVELS
 
     def at_pixels(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Costs of some pixels.
-
-        Args:
-            index: ``(P,)`` int64, ``row * W + column``.
-
-        Returns:
-            ``cost (D, P)`` float32 in [0, 1] and ``in_view (D, P)`` bool.
-        """
+        """``cost (D, P)`` in [0, 1] and ``in_view (D, P)`` bool of pixels ``(P,)``: ``row * W + column``."""
         row, column = index // self.size[1], index % self.size[1]
         return self.levels[:, row, column].float() / COST_LEVELS, self.in_view[:, row, column]
 
@@ -96,17 +89,16 @@ def _plane_uv(rays: PlaneRays, inverse_depth: torch.Tensor) -> tuple[torch.Tenso
 def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor, name: str = "E") -> torch.Tensor:
     """How far the median pixel lies, in the right view, from where it would be at infinity.
 
+    ``(N,)`` pixels for ``inverse_depth (N,)`` 1/m, >= 0; infinite where the plane passes behind the right
+    camera. Measured from infinity, so that a rotation, which moves all depths alike, does not count.
+
     Args:
         rays: ``plane_rays`` of any grid of left pixels, batch of 1.
-        inverse_depth: ``(N,)`` 1/m, >= 0.
+        inverse_depth: of the planes.
         name: of the pose, for messages.
 
-    Returns:
-        ``(N,)`` pixels of the right view; infinite where the plane passes behind the right camera. Measured
-        from infinity, so that a rotation, which moves all depths alike, does not count.
-
     Raises:
-        ValueError: no pixel's point at infinity is in front of the right camera.
+        InputError: no pixel's point at infinity is in front of the right camera.
     """
     stride = max(1, rays.A.shape[-1] // 1024)
     some = PlaneRays(rays.A[..., ::stride], rays.b)
@@ -121,19 +113,11 @@ def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor, name: str = "E") 
 
 
 def inverse_depth_at_shift(rays: PlaneRays, shift_px: float, name: str = "E") -> torch.Tensor:
-    """The inverse depth at which ``median_shift`` reaches so many pixels.
+    """The inverse depth, ``()`` 1/m within 1 %, at which ``median_shift`` reaches ``shift_px`` > 0.
 
-    Args:
-        rays: ``plane_rays`` of any grid of left pixels, batch of 1.
-        shift_px: pixels of the right view, > 0.
-        name: of the pose, for messages.
-
-    Returns:
-        ``()`` float32, 1/m, within 1 %. A camera that stands behind the other one sees no pixel move further
-        than to the epipole: there, at most the depth at which it has gone half of that way.
-
-    Raises:
-        ValueError: the views do not overlap, or both cameras stand at one place.
+    A camera that stands behind the other one sees no pixel move further than to the epipole: there, at most
+    the depth at which it has gone half of that way. Raises ``InputError`` if the views do not overlap, or
+    both cameras stand at one place.
     """
     exponents = rays.A.new_tensor([-8.0, 5.0])
     most = float(median_shift(rays, 10.0 ** exponents[1:], name))
@@ -155,16 +139,15 @@ def sweep_planes(
 ) -> CostVolume:
     """Compare the left view with the right views on every plane, at the resolution as given.
 
+    Planes go one by one, so memory is that of the result, two bytes a cell, and of what describes the right
+    views. Not differentiable.
+
     Args:
         left_01: ``(1, H, W)`` float32 grey in [0, 1].
-        rights: one or several ``(grey (1, Hr, Wr), K_right (3, 3), T_right_from_left (4, 4))``, of about as
-            many pixels per radian as the left view. Costs are averaged over the views that see a pixel.
+        rights: one or several, grey, of about as many pixels per radian as the left view. Costs are averaged
+            over the views that see a pixel.
         K_left: ``(3, 3)`` pixels of ``left_01``.
         inverse_depth: ``(D,)`` 1/m, ascending, evenly spaced, D >= 2.
-
-    Returns:
-        ``CostVolume``; not differentiable. Planes go one by one, so memory is that of the result, two bytes a
-        cell, and of what describes the right views.
     """
     size = image_size(left_01)
     aligned = tuple(align_view(right, K_left, size, inverse_depth) for right in rights)

@@ -77,31 +77,24 @@ def _right_rays(tracks: Tracks) -> np.ndarray:
 
 
 def parallax_deg(tracks: Tracks, R: np.ndarray) -> np.ndarray:
-    """Angle between the two rays of every track, ``(N,)`` degrees.
-
-    Args:
-        tracks: of one right view.
-        R: ``(3, 3)`` of ``T_right_from_left``.
-    """
+    """Angle ``(N,)`` degrees between the two rays of every track of a view, by ``R (3, 3)`` of its pose."""
     left, right = tracks.rays @ R.T, _right_rays(tracks)
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(left, right), axis=1), (left * right).sum(1)))
 
 
-def estimate_pose(
-    tracks: Tracks, name: str = "the two photographs", mirrored_matches: int = 0
-) -> EstimatedPose:
+def estimate_pose(tracks: Tracks, name: str = "the two photographs", mirrored: int = 0) -> EstimatedPose:
     """Rotation and direction of the baseline of one right view.
 
     Args:
         tracks: of one right view, outliers among them.
         name: what they are of, for messages.
-        mirrored_matches: how many matches there are once the right image is mirrored, for the message.
+        mirrored: how many matches there are once the right image is mirrored, for the message.
 
     Raises:
-        ValueError: PoseLib is not installed; no pose is to be had: too few matches or inliers, a pure
+        InputError: PoseLib is not installed; no pose is to be had: too few matches or inliers, a pure
             rotation, too little parallax, two motions.
     """
-    _check_matches(len(tracks), name, mirrored_matches)
+    _check_matches(len(tracks), name, mirrored)
     T = _five_points(tracks)
     sideways = _rectified(tracks, residuals_px(tracks, T[None])[0] < INLIER_PX)
     T = T if sideways is None else sideways
@@ -111,12 +104,9 @@ def estimate_pose(
     inliers = near & (inverse_depth > 0)
     count, share = int(inliers.sum()), float(inliers.mean())
     if count < FEWEST_INLIERS or share < LEAST_SHARE:
-        bad_value(
-            name,
-            "of one scene that stands still, seen by two cameras",
-            f"{count} matches of {len(tracks)} that one pose explains",
-            "Are they of the same place, taken at the same time, neither mirrored nor edited? Is K right?",
-        )
+        got = f"{count} matches of {len(tracks)} that one pose explains"
+        cure = "Are they of the same place, taken at the same time, neither mirrored nor edited? Is K right?"
+        bad_value(name, "of one scene that stands still, seen by two cameras", got, cure)
     parallax = float(np.median(parallax_deg(tracks, T[:3, :3])[inliers]))
     _check_parallax(tracks, near, parallax, name)
     warnings = _of_second_motion(tracks, T, inliers, name)
@@ -130,17 +120,12 @@ def estimate_pose(
             f"Nearly all matches of {name} lie on one plane: several poses explain them about as well. "
             "Take photographs with things at different depths, or give the pose."
         )
-    return EstimatedPose(
-        T, inliers, parallax, float(np.median(residual[inliers])), sideways is not None, tuple(warnings)
-    )
+    residual_px = float(np.median(residual[inliers]))
+    return EstimatedPose(T, inliers, parallax, residual_px, sideways is not None, tuple(warnings))
 
 
 def estimate_poses(views: GreyViews, matcher: Matcher) -> tuple[Tracks, list[EstimatedPose]]:
     """Poses of the right views of two photographs or more, matched anew.
-
-    Args:
-        views: the photographs, without poses that mean anything.
-        matcher: of distinct points.
 
     Returns:
         The inliers of all views, and the pose of each; the first baseline has length 1.
@@ -153,9 +138,8 @@ def estimate_poses(views: GreyViews, matcher: Matcher) -> tuple[Tracks, list[Est
         name = "the two photographs" if len(views.rights) == 1 else f"the left and right photograph {v + 1}"
         seen_here, mirrored = tracks.view(v), 0
         if len(seen_here) < 30:
-            turned = replace(
-                views, rights=(views.rights[v][:, ::-1].copy(),), K_rights=views.K_rights[v : v + 1]
-            )
+            flipped, K_right = views.rights[v][:, ::-1].copy(), views.K_rights[v : v + 1]
+            turned = replace(views, rights=(flipped,), K_rights=K_right)
             mirrored = len(matcher(turned))
         poses.append(estimate_pose(seen_here, name, mirrored))
     seen = tracks.seen.copy()
@@ -169,21 +153,9 @@ def _same_unit(tracks: Tracks, poses: Sequence[EstimatedPose], v: int) -> Estima
     """Pose ``v`` with its baseline in units of the first one, by the points that both see."""
     both = tracks.kept(tracks.seen[0] & tracks.seen[v])
     if len(both) < 15:
-        bad_value(
-            "photographs", "with points that all of them show", f"{len(both)} of them in view {v + 1} too"
-        )
-    first, other = (
-        solve_inverse_depth(
-            replace(
-                both,
-                right_px=both.right_px[i : i + 1],
-                seen=both.seen[i : i + 1],
-                K_rights=both.K_rights[i : i + 1],
-            ),
-            poses[i].T[None],
-        )
-        for i in (0, v)
-    )
+        got = f"{len(both)} of them in view {v + 1} too"
+        bad_value("photographs", "with points that all of them show", got)
+    first, other = (solve_inverse_depth(both.alone(i), poses[i].T[None]) for i in (0, v))
     T = poses[v].T.copy()
     T[:3, 3] *= np.median(other / np.maximum(first, 1e-9))
     return replace(poses[v], T=T)
@@ -208,8 +180,8 @@ def _five_points(tracks: Tracks) -> np.ndarray:
 def _of_second_motion(tracks: Tracks, T: np.ndarray, inliers: np.ndarray, name: str) -> list[str]:
     """Refuse, or say, that part of the scene moved on its own: a second pose explains what the first leaves.
 
-    Wrong matches are explained by no pose. What moves along its epipolar lines is not seen here, nor by
-    anything else that knows two photographs only; it then lies at a wrong depth.
+    Wrong matches are explained by no pose. What moves along its epipolar lines cannot be seen in two
+    photographs; it then lies at a wrong depth.
     """
     rest = tracks.kept(residuals_px(tracks, T[None])[0] > APART_PX)
     if len(rest) < FEWEST_INLIERS:
@@ -255,15 +227,13 @@ def _check_matches(count: int, name: str, mirrored: int) -> None:
 
 def _check_parallax(tracks: Tracks, near: np.ndarray, parallax: float, name: str) -> None:
     """Refuse a camera that only turned: then every direction of a baseline explains the matches."""
-    turned = _rotation_residuals(tracks)
-    share = float((turned[near] < INLIER_PX).mean())
+    share = float((_rotation_residuals(tracks)[near] < INLIER_PX).mean())
     if share > SIMPLER or parallax < NO_PARALLAX_DEG:
-        bad_value(
-            name,
-            "taken from two places",
-            f"a camera that only turned ({share:.0%} of the matches say so, parallax {parallax:.2f} degrees)",
-            "Without a step to the side two photographs carry no depth.",
+        got = (
+            f"a camera that only turned ({share:.0%} of the matches say so, parallax {parallax:.2f} degrees)"
         )
+        cure = "Without a step to the side two photographs carry no depth."
+        bad_value(name, "taken from two places", got, cure)
 
 
 def _rotation_residuals(tracks: Tracks) -> np.ndarray:

@@ -76,13 +76,7 @@ def _grey(image_01: Tensor, K_image: Tensor, factor: float) -> tuple[np.ndarray,
 
 
 def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> GreyViews:
-    """Images as matches are sought in them.
-
-    Args:
-        left_01: ``(3, H, W)`` in [0, 1].
-        rights: as they were given.
-        K_left: ``(3, 3)``.
-    """
+    """Images as matches are sought in them, of ``left_01 (3, H, W)`` in [0, 1] with its ``K_left (3, 3)``."""
     left, K = _grey(left_01, K_left, min(1.0, LONG_SIDE / max(left_01.shape[-2:])))
     small = []
     for image, K_right, _ in rights:
@@ -92,15 +86,10 @@ def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) ->
 
 
 def sift_features(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of an image, the centre of its first pixel at (0, 0), with RootSIFT descriptors.
+    """Points of a grey image ``(H, W)`` uint8, the centre of its first pixel at (0, 0), with RootSIFT.
 
-    Args:
-        grey: ``(H, W)`` uint8.
-
-    Returns:
-        Pixels ``(N, 2)`` float64, and descriptors ``(N, 128)`` float32 of unit length.
-
-    Source: Arandjelovic and Zisserman 2012.
+    Pixels ``(N, 2)`` float64, and descriptors ``(N, 128)`` float32 of unit length (Arandjelovic and Zisserman
+    2012).
     """
     sift = cv2.SIFT.create(nfeatures=_MOST_POINTS, contrastThreshold=_CONTRAST)
     points, descriptors = sift.detectAndCompute(grey, None)
@@ -111,11 +100,9 @@ def sift_features(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def match_features(left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Indices ``(M, 2)`` of points that are each other's nearest, by the ratio test from the left.
+    """Indices ``(M, 2)`` of points of ``sift_features`` that are each other's nearest.
 
-    Args:
-        left: of ``sift_features``.
-        right: likewise.
+    By the ratio test from the left.
     """
     if min(len(left[0]), len(right[0])) < 2:
         return np.zeros((0, 2), int)
@@ -176,10 +163,8 @@ def _dense_matches(
 def dense_tracks(views: GreyViews, depth_m: Tensor, Ts: np.ndarray) -> Tracks:
     """The centres of the left image's cells with their places by optical flow in the right images.
 
-    Args:
-        views: the images.
-        depth_m: ``(1, 1, H, W)`` rough depth on the left grid, without holes.
-        Ts: ``(V, 4, 4)``, ``T_right_from_left``, that the depth goes with.
+    ``depth_m (1, 1, H, W)`` is rough, on the left grid, without holes; ``Ts (V, 4, 4)``,
+    ``T_right_from_left``, are the poses that it goes with.
     """
     size = views.left.shape
     rows, columns = (np.arange(_CELL_PX // 2, side, _CELL_PX) for side in size)
@@ -200,12 +185,9 @@ def dense_tracks(views: GreyViews, depth_m: Tensor, Ts: np.ndarray) -> Tracks:
 def find_matcher(name: str) -> Matcher:
     """The matcher of a name.
 
-    Args:
-        name: ``"sift"``; ``"lightglue"`` or ``"superglue"`` for weights that the hub's cache holds; or a
-            folder or hub id with weights of either. Nothing is downloaded, and no code of a folder is run.
-
-    Raises:
-        ValueError: no such weights on this machine, or none that fit.
+    ``"sift"``; ``"lightglue"`` or ``"superglue"`` for weights that the hub's cache holds; or a folder or hub
+    id with weights of either. Nothing is downloaded, and no code of a folder is run. Raises ``InputError``
+    where no such weights are on this machine, or none that fit.
     """
     if name == "sift":
         return sparse_tracks
@@ -245,12 +227,10 @@ def _entries(file: Path) -> dict[str, Any]:
 
 def _size(folder: Path) -> tuple[int, int]:
     size = _entries(folder / "preprocessor_config.json").get("size")
-    named = [size.get(side) for side in ("height", "width")] if isinstance(size, dict) else []
-    sides = [side for side in named if isinstance(side, int)]
-    if len(sides) != 2:
+    sides = [size.get(side) for side in ("height", "width")] if isinstance(size, dict) else []
+    if len(sides) != 2 or not all(isinstance(side, int) for side in sides):
         return _SIZE
-    height, width = (min(max(side, 16), 4096) for side in sides)
-    return height, width
+    return min(max(sides[0], 16), 4096), min(max(sides[1], 16), 4096)
 
 
 def _load(folder: Path) -> Any:

@@ -107,14 +107,9 @@ def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np
 
 
 def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far poses lie from the given ones.
+    """How far poses ``Ts (V, 4, 4)`` lie from the given ones: ``(V,)`` turns in degrees, and shifts.
 
-    Args:
-        given: ``(V, 4, 4)``, ``T_right_from_left``.
-        Ts: likewise.
-
-    Returns:
-        ``(V,)`` turns in degrees, and ``(V,)`` shifts as shares of the given baselines.
+    Shifts are shares of the given baselines.
     """
     change = Ts @ np.linalg.inv(given)
     cosines = (np.trace(change[:, :3, :3], axis1=1, axis2=2) - 1) / 2
@@ -139,12 +134,10 @@ def _likeliest(tracks: Tracks, T: np.ndarray) -> tuple[str, _Fit, bool]:
 
 
 def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
-    """A sentence on the mistake that would make the matches fit, or ``None``.
+    """A sentence on the mistake that would make the matches of one right view fit, or ``None``.
 
-    Args:
-        tracks: of one right view.
-        T: ``(4, 4)``, ``T_right_from_left`` as given.
-        near: ``(4, 4)``, the pose near it that fits best: where only that fits, the pose is inexact.
+    ``T (4, 4)`` is ``T_right_from_left`` as given, ``near`` the pose near it that fits best: where only that
+    fits, the pose is inexact.
     """
     given, nearby = _fit(tracks, T)[0], _fit(tracks, near)
     sentence, (shares, median_px), far = _likeliest(tracks, T)
@@ -164,10 +157,6 @@ def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
     Epipolar lines do not know the unit of a translation; only the size of what comes out does. A baseline
     above ``LONG_BASELINE_M`` was warned of when it was given. Nearer scenes are left in peace: from 100 m
     above the ground a drone moves on by as much as centimetres taken for metres would be.
-
-    Args:
-        tracks: of one right view.
-        T: ``(4, 4)``, ``T_right_from_left``, in what is said to be metres.
     """
     baseline = float(np.linalg.norm(T[:3, 3]))
     inverse_depth = solve_inverse_depth(tracks, T[None])

@@ -7,7 +7,7 @@ of K) is taken out of the right image afterwards, by a smooth displacement acros
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -85,7 +85,7 @@ def refine_views(
         rights: as they were given, one or several.
         K_left: ``(3, 3)`` pixels of ``left_01``.
         first_depth: a rough depth by poses that fit roughly; asked only where refinement is due.
-        unit: of the poses' lengths; those in metres are asked about where they seem to be in millimetres.
+        unit: of the poses' lengths; those in metres are questioned where they seem to be in millimetres.
         measured: whether the lengths of the baselines are measured. Refined poses then keep them, as those of
             a rectified rig do; otherwise they are weighed against the scene's depth under the given poses.
 
@@ -99,33 +99,30 @@ def refine_views(
     if counts.max(initial=0) < FEWEST:
         return untouched(rights, "not checked")
     before, poses = median_residuals(sparse, given), _as_E(given)
-    report = PoseReport("fits", poses, poses, _numbers(before), _numbers(before), _numbers(counts))
+    residual_px = tuple(before.tolist())
+    report = PoseReport("fits", poses, poses, residual_px, residual_px, tuple(map(float, counts)))
     rig = is_rig(sparse, given)
     fits_px = FITS_PX if rig else POSED_FITS_PX
     misfit = bool((before > fits_px).any())
     near = nearby_poses(sparse, given, before) if misfit else given
     units = _sentences(sparse, implausible_unit, given) if unit == "m" else ()
     if mistakes := _sentences(sparse, find_mistake, given, near):
-        return tuple(rights), report.changed(status="mistaken", warnings=mistakes)
+        return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
     if not misfit:
-        return tuple(rights), report.changed(warnings=units)
+        return tuple(rights), replace(report, warnings=units)
     depth_m = _on_grid(first_depth(_applied(rights, near)), views.left.shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     before = median_residuals(tracks, given)
     Ts, free = settle_poses(tracks, given, near, before, rig)
     after = median_residuals(tracks, Ts)
-    report = report.changed(
-        residual_px_given=_numbers(before), residual_px=_numbers(before), matches=_numbers(tracks.seen.sum(1))
-    )
-    if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
-        warnings = _unimproved(before) + undecided(tracks, Ts, free) + units
-        return tuple(rights), report.changed(status="kept", warnings=warnings)
-    turned_deg, shifts = pose_change(given, Ts)
-    far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
-    if far.any():
-        warnings = _too_far(before, after, far, turned_deg, shifts) + units
-        return tuple(rights), report.changed(status="kept", warnings=warnings)
+    residual_px, matches = tuple(before.tolist()), tuple(map(float, tracks.seen.sum(1)))
+    report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
     doubts, spread = undecided(tracks, Ts, free), None
+    if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
+        told = _told(before, None, ", and no pose near it leaves clearly less. ")
+        return tuple(rights), replace(report, status="kept", warnings=told + doubts + units)
+    if far := _too_far(before, after, *pose_change(given, Ts)):
+        return tuple(rights), replace(report, status="kept", warnings=(*filter(None, far), *units))
     if not (rig or measured):
         Ts, spread, uncertain = _rescaled(tracks, given, Ts, before)
         doubts += uncertain
@@ -133,12 +130,14 @@ def refine_views(
         None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views.rights[v].shape)
         for v, T in enumerate(Ts)
     ]
-    report = report.changed(
+    worst = int(np.argmax(np.nan_to_num(before)))
+    report = replace(
+        report,
         status="refined",
-        warnings=_improved(before, after) + doubts + units,
+        warnings=_told(before, worst, f", a refined one {after[worst]:.1f} px. ") + doubts + units,
         scale_spread=spread,
         E=_as_E(Ts),
-        residual_px=_numbers(_straight_medians(tracks, Ts, bends)),
+        residual_px=tuple(_straight_medians(tracks, Ts, bends).tolist()),
         straightened_px=tuple(0.0 if bend is None else bend.rms_px for bend in bends),
     )
     return _applied(rights, Ts, bends), report
@@ -149,12 +148,8 @@ def polished(
 ) -> tuple[np.ndarray, Tracks]:
     """Estimated poses fitted once more to all matches, every view's to all that it shares with others.
 
-    Args:
-        left_01: ``(3, H, W)`` float32 in [0, 1].
-        rights: with poses that the sparse tracks gave.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
-        first_depth: as for ``refine_views``.
-        sparse: the inliers of the estimation.
+    ``rights`` have the poses that the ``sparse`` tracks, inliers of the estimation, gave; other arguments as
+    for ``refine_views``.
 
     Returns:
         ``(V, 4, 4)``, ``T_right_from_left``, the lengths of the baselines as they were but for their ratios;
@@ -162,12 +157,7 @@ def polished(
     """
     views, Ts = grey_views(left_01, rights, K_left), _poses(rights)
     tracks = merge_tracks([sparse, dense_tracks(views, _on_grid(first_depth(rights), views.left.shape), Ts)])
-    free = Prior(
-        np.full(len(Ts), FREE_PX),
-        turned_rad=np.radians(3.0),
-        shifted_share=0.3,
-        longer_share=0.02 if len(Ts) == 1 else 0.2,
-    )
+    free = Prior(np.full(len(Ts), FREE_PX), np.radians(3.0), 0.3, 0.02 if len(Ts) == 1 else 0.2)
     solved = Ts
     for scale_px in (SCALE_PX, *_NARROWER_PX):
         solved = solve_poses(tracks, Ts, free, start=solved, scale_px=scale_px)
@@ -243,18 +233,11 @@ def _fit_cubic(basis: np.ndarray, normals: np.ndarray, off: np.ndarray) -> np.nd
 
 
 def fit_displacement(tracks: Tracks, T: np.ndarray, size: tuple[int, int]) -> Displacement | None:
-    """The displacement that brings matches to their epipolar lines, if left-out matches agree.
+    """The displacement that brings matches of one right view to their epipolar lines.
 
-    Only for a refined pose: a residual that depends on depth is a pose's, and bending the image for it ruins
-    it.
-
-    Args:
-        tracks: of one right view.
-        T: ``(4, 4)``, ``T_right_from_left``, refined.
-        size: ``(H, W)`` of the right image.
-
-    Returns:
-        ``None`` where there are few matches or nothing smooth is left.
+    ``None`` where there are few matches, nothing smooth is left, or left-out matches do not agree. Only for a
+    refined pose ``T (4, 4)``: a residual that depends on depth is a pose's, and bending the image, of
+    ``size`` ``(H, W)``, for it ruins it.
     """
     if len(tracks) < _FEWEST_BENT:
         return None
@@ -276,14 +259,9 @@ def fit_displacement(tracks: Tracks, T: np.ndarray, size: tuple[int, int]) -> Di
 
 
 def straightened(image_01: Tensor, displacement: Displacement) -> Tensor:
-    """The right image with every pixel moved as the displacement says.
+    """The right image ``(C, H, W)`` with every pixel moved as a displacement of its own size says.
 
-    Args:
-        image_01: ``(C, H, W)`` float in [0, 1], of any size.
-        displacement: fitted to the image at its own size.
-
-    Returns:
-        ``(C, H, W)``, its edge repeated where nothing is known; not differentiable.
+    Its edge is repeated where nothing is seen; not differentiable.
     """
     height, width = image_01.shape[-2:]
     scale = np.array([displacement.size[1] / width, displacement.size[0] / height])
@@ -309,16 +287,10 @@ def _as_E(Ts: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(np.linalg.inv(T) for T in Ts)
 
 
-def _numbers(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(v) for v in values)
-
-
 def _straight_medians(tracks: Tracks, Ts: np.ndarray, bends: Sequence[Displacement | None]) -> np.ndarray:
-    right_px = np.stack(
-        [px if bend is None else px + bend.at(px) for px, bend in zip(tracks.right_px, bends, strict=True)]
-    )
-    moved = Tracks(tracks.left_px, right_px, tracks.seen, tracks.K_left, tracks.K_rights)
-    return median_residuals(moved, Ts)
+    pairs = zip(tracks.right_px, bends, strict=True)
+    right_px = np.stack([px if bend is None else px + bend.at(px) for px, bend in pairs])
+    return median_residuals(replace(tracks, right_px=right_px), Ts)
 
 
 def _applied(
@@ -333,8 +305,8 @@ def _applied(
 
 def _sentences(tracks: Tracks, ask: Callable[..., str | None], *poses: np.ndarray) -> tuple[str, ...]:
     """What ``ask`` says about every view that has matches, each sentence once."""
-    views = [(tracks.view(v), own) for v, own in enumerate(zip(*poses, strict=True))]
-    said = [ask(view, *own) for view, own in views if len(view) >= FEWEST]
+    views = [(tracks.view(v), *of_view) for v, of_view in enumerate(zip(*poses, strict=True))]
+    said = [ask(*view) for view in views if len(view[0]) >= FEWEST]
     return tuple(dict.fromkeys(sentence for sentence in said if sentence))
 
 
@@ -351,33 +323,26 @@ def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ..
     )
 
 
-def _leaves(before: np.ndarray, v: int) -> str:
+def _told(before: np.ndarray, v: int | None, rest: str) -> tuple[str, ...]:
+    """A sentence on the misfit of view ``v``, or of the worst, where it is large; ``rest`` ends it."""
+    v = int(np.argmax(np.nan_to_num(before))) if v is None else v
+    if not np.nanmax(before) > WARNS_PX:
+        return ()
     pose = "The pose as given" if len(before) == 1 else f"The pose of right view {v + 1} as given"
-    return f"{pose} leaves matches {before[v]:.1f} px off their epipolar lines in the median"
-
-
-def _improved(before: np.ndarray, after: np.ndarray) -> tuple[str, ...]:
-    worst = int(np.argmax(np.nan_to_num(before)))
-    if not before[worst] > WARNS_PX:
-        return ()
-    return (f"{_leaves(before, worst)}, a refined one {after[worst]:.1f} px. {_CAUSES}",)
-
-
-def _unimproved(before: np.ndarray) -> tuple[str, ...]:
-    worst = int(np.argmax(np.nan_to_num(before)))
-    if not before[worst] > WARNS_PX:
-        return ()
-    return (f"{_leaves(before, worst)}, and no pose near it leaves clearly less. {_CAUSES}",)
+    leaves = f"{pose} leaves matches {before[v]:.1f} px off their epipolar lines in the median"
+    return (f"{leaves}{rest}{_CAUSES}",)
 
 
 def _too_far(
-    before: np.ndarray, after: np.ndarray, far: np.ndarray, turned_deg: np.ndarray, shifts: np.ndarray
+    before: np.ndarray, after: np.ndarray, turned_deg: np.ndarray, shifts: np.ndarray
 ) -> tuple[str, ...]:
-    if not np.nanmax(before) > WARNS_PX:
+    """What is said of poses too far from the given ones to be used, or an empty sentence; ``()`` for none."""
+    far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
+    if not far.any():
         return ()
     v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # of those too far, the worst
-    return (
-        f"{_leaves(before, v)}. A pose {turned_deg[v]:.0f} degrees and {100 * shifts[v]:.0f} % of the "
-        f"baseline away fits to {after[v]:.1f} px, but is too far from the given one and was not used. "
-        f"{_CAUSES}",
+    rest = (
+        f". A pose {turned_deg[v]:.0f} degrees and {100 * shifts[v]:.0f} % of the baseline away fits to "
+        f"{after[v]:.1f} px, but is too far from the given one and was not used. "
     )
+    return _told(before, v, rest) or ("",)

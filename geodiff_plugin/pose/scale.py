@@ -47,16 +47,15 @@ class Scale:
         return None if self.source == "none" else "m"
 
 
-def _point_at(
-    px: np.ndarray, tracks: Tracks, inverse_depth: np.ndarray, name: str
-) -> tuple[np.ndarray, float]:
+def _point_at(px: np.ndarray, tracks: Tracks, inverse_depth: np.ndarray) -> tuple[np.ndarray, float]:
     """The point ``(3,)`` of a left pixel in units, and the relative spread of its depth."""
     away = np.linalg.norm(tracks.left_px - px, axis=1)
     near = np.argsort(away)[:8]
     near = near[away[near] < _NEAR_PX]
     if len(near) < 3:
         cure = "Choose ends on something with texture that both photographs show."
-        bad_value(name, "near matched points", f"({px[0]:.0f}, {px[1]:.0f}) with {len(near)} nearby", cure)
+        got = f"({px[0]:.0f}, {px[1]:.0f}) with {len(near)} nearby"
+        bad_value("known length", "near matched points", got, cure)
     w = inverse_depth[near]
     middle = float(np.median(w))
     spread = 1.4826 * float(np.median(np.abs(w / middle - 1)))
@@ -72,7 +71,7 @@ def find_scale(
     known_length: tuple[float, float, float, float, float] | None,
     points: np.ndarray | None,
 ) -> Scale:
-    """Metres a unit, from whichever length is known.
+    """Metres a unit, from whichever length is given.
 
     Args:
         tracks: the matches.
@@ -83,7 +82,7 @@ def find_scale(
         points: ``(N, 3)`` metres in the left camera's frame, or ``None``.
 
     Raises:
-        ValueError: more than one of them, or ends of a length where nothing is matched.
+        InputError: two of the first three, or ends of a length where nothing is matched.
     """
     given = [name for name, v in (("baseline", baseline_m), ("known length", known_length)) if v is not None]
     if len(given) > 1:
@@ -97,11 +96,9 @@ def find_scale(
     if known_length is not None:
         *ends, metres = known_length
         check_number(metres, "known length", 1e-6, 1e6)
-        (one, s1), (other, s2) = (
-            _point_at((np.array(ends[i : i + 2]) + 0.5) * factor - 0.5, tracks, inverse_depth, "known length")
-            for i in (0, 2)
-        )
-        length = float(np.linalg.norm(one - other))
+        pixels = (np.array(ends).reshape(2, 2) + 0.5) * factor - 0.5
+        (first, s1), (second, s2) = (_point_at(px, tracks, inverse_depth) for px in pixels)
+        length = float(np.linalg.norm(first - second))
         if length < 1e-9:
             bad_value("known length", "between two places", "the same place twice")
         return Scale("known length", metres / length, float(np.hypot(s1, s2)))
@@ -150,8 +147,8 @@ def refined_scale(
         depth_spread: the same of the scene's median depth under given poses without a misfit.
 
     Returns:
-        The factor for the translations (1 keeps the baselines, another one the median inverse depth), and
-        its relative standard deviation; NaN for both without matches in front of the cameras.
+        The factor (1 keeps the baselines, another the median inverse depth), and its relative standard
+        deviation; NaN for both without matches in front of the cameras.
     """
     ahead = (refined > 0) & (given > 0)
     if not ahead.any():

@@ -115,28 +115,21 @@ class Whitened:
         return np.maximum(np.linalg.norm(self.by_depth, axis=1), 1e-12)
 
     @cached_property
-    def along(self) -> np.ndarray:
-        """``(N, n)``, direction of ``by_depth``."""
-        return self.by_depth / self.slopes[:, None]
-
-    @cached_property
     def depth_by_pose(self) -> np.ndarray:
         """``(N, 6V)``: what a step does to the inverse depth, times minus ``slopes``."""
-        return np.einsum("nk,nkp->np", self.along, self.by_pose)
+        return np.einsum("nk,nkp->np", self.by_depth / self.slopes[:, None], self.by_pose)
 
     @cached_property
     def left_by_pose(self) -> np.ndarray:
         """``(N, n, 6V)``: what of ``by_pose`` no change of depth makes up for."""
-        return self.by_pose - self.along[..., None] * self.depth_by_pose[:, None]
+        along = self.by_depth / self.slopes[:, None]
+        return self.by_pose - along[..., None] * self.depth_by_pose[:, None]
 
 
 def whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> Whitened:
-    """What the tracks say about the poses near ``Ts``.
+    """What the tracks say about the poses near ``Ts (V, 4, 4)``, ``T_right_from_left``.
 
-    Args:
-        tracks: of V right views.
-        Ts: ``(V, 4, 4)``, ``T_right_from_left``.
-        scale_px: residual from which on an observation counts for less, pixels of the right view.
+    From a residual of ``scale_px``, pixels of the right view, an observation counts for less.
     """
     views = len(Ts)
     w = solve_inverse_depth(tracks, Ts)
@@ -205,7 +198,7 @@ def solve_poses(
     scale_px: float = 1.0,
     trust: float = 1.0,
 ) -> np.ndarray:
-    """The poses that fit the tracks best under the prior.
+    """The poses ``(V, 4, 4)`` that fit the tracks best under the prior.
 
     Args:
         tracks: of V right views.
@@ -214,9 +207,6 @@ def solve_poses(
         start: where to begin; ``None`` for ``given``.
         scale_px: residual from which on an observation counts for less, pixels of the right view.
         trust: what the residuals count against the prior, (0, 1]; see ``tracks.split_residuals``.
-
-    Returns:
-        ``(V, 4, 4)``.
     """
     Ts = np.array(given if start is None else start, dtype=np.float64)
     w_start = np.clip(solve_inverse_depth(tracks, Ts), 0.0, None)
@@ -288,23 +278,18 @@ def settle_poses(
     settled = fitted
     for by in (_SCALE_BY, *(_NARROWER_BY if wrong else ())):
         scale_px = max(by * float(np.nanmean(left)), _LEAST_SCALE_PX)
-        trust = _COUNTS * counting
-        settled = solve_poses(tracks, given, held, start=settled, scale_px=scale_px, trust=trust)
+        how = {"scale_px": scale_px, "trust": _COUNTS * counting}
+        settled = solve_poses(tracks, given, held, start=settled, **how)
     return settled, fitted
 
 
 def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
-    """The relative standard deviation of the depth of a track, in the median, caused by errors of free poses.
+    """The relative standard deviation of a track's depth caused by errors of free poses; 0.05 for 5 %.
 
-    The covariance of the poses is the sandwich of robust statistics (Huber 1967; White 1982), with blocks of
-    the image as what is independent: residuals of neighbours are alike.
-
-    Args:
-        tracks: of V right views, those that the poses explain and some that they do not.
-        Ts: ``(V, 4, 4)``, ``T_right_from_left``, that fit them best; the unit of length is taken as known.
-
-    Returns:
-        0.05 for 5 %; ``inf`` where no track lies in front of the cameras.
+    In the median of the tracks; ``inf`` where none lies in front of the cameras. The covariance of the poses
+    is the sandwich of robust statistics (Huber 1967; White 1982), with blocks of the image as what is
+    independent: residuals of neighbours are alike. ``tracks`` are those that the poses ``Ts (V, 4, 4)``,
+    which fit them best, explain and some that they do not; the unit of length is taken as exact.
     """
     at = whitened(tracks, Ts, SCALE_PX)
     ahead = at.inverse_depth > 0

@@ -44,14 +44,13 @@ class Tracks:
 
     def kept(self, mask: np.ndarray | slice) -> Tracks:
         """The tracks of a boolean mask or an index."""
-        return replace(
-            self, left_px=self.left_px[mask], right_px=self.right_px[:, mask], seen=self.seen[:, mask]
-        )
+        left_px, right_px, seen = self.left_px[mask], self.right_px[:, mask], self.seen[:, mask]
+        return replace(self, left_px=left_px, right_px=right_px, seen=seen)
 
     def alone(self, v: int) -> Tracks:
         """All tracks, with right view ``v`` alone."""
-        one = slice(v, v + 1)
-        return replace(self, right_px=self.right_px[one], seen=self.seen[one], K_rights=self.K_rights[one])
+        kept = slice(v, v + 1)
+        return replace(self, right_px=self.right_px[kept], seen=self.seen[kept], K_rights=self.K_rights[kept])
 
     def view(self, v: int) -> Tracks:
         """The tracks that right view ``v`` sees, of that view alone."""
@@ -91,11 +90,8 @@ class Projected(NamedTuple):
 def project_tracks(rays: np.ndarray, inverse_depth: np.ndarray, K: np.ndarray, T: np.ndarray) -> Projected:
     """Where a right camera sees points on left rays.
 
-    Args:
-        rays: ``(N, 3)`` with z = 1.
-        inverse_depth: ``(N,)``, 1/m; 0 is infinity.
-        K: ``(3, 3)`` of the right view, pixels.
-        T: ``(4, 4)``, ``T_right_from_left``.
+    ``rays (N, 3)`` have z = 1, ``inverse_depth (N,)`` is in 1/m, 0 for infinity; ``K (3, 3)`` pixels of the
+    right view, ``T (4, 4)`` its ``T_right_from_left``.
     """
     scaled = rays @ T[:3, :3].T + inverse_depth[:, None] * T[:3, 3]
     z = scaled[:, 2]
@@ -148,37 +144,24 @@ def solve_inverse_depth(
 
 
 def residuals_px(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
-    """How far every observation lies from where the poses can put it.
+    """How far every observation lies from where the poses ``(V, 4, 4)`` can put it.
 
-    With one right view that is the distance from the epipolar line of the left pixel, as in kornia's
-    ``left_to_right_epipolar_distance``, which knows no point seen in several views.
-
-    Args:
-        tracks: of V right views.
-        Ts: ``(V, 4, 4)``, ``T_right_from_left``.
-
-    Returns:
-        ``(V, N)`` pixels of the right views, NaN where not seen.
+    ``(V, N)`` pixels of the right views, NaN where not seen. With one right view that is the distance from
+    the epipolar line of the left pixel, as in kornia's ``left_to_right_epipolar_distance``, which knows no
+    point seen in several views.
     """
     inverse_depth = solve_inverse_depth(tracks, Ts)
-    off = np.stack(
-        [
-            np.linalg.norm(project_tracks(tracks.rays, inverse_depth, K, T).px - px, axis=1)
-            for px, K, T in zip(tracks.right_px, tracks.K_rights, Ts, strict=True)
-        ]
-    )
-    return np.where(tracks.seen, off, np.nan)
+    off = [
+        np.linalg.norm(project_tracks(tracks.rays, inverse_depth, K, T).px - px, axis=1)
+        for px, K, T in zip(tracks.right_px, tracks.K_rights, Ts, strict=True)
+    ]
+    return np.where(tracks.seen, np.stack(off), np.nan)
 
 
 def median_residuals(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
     """Median distance from the epipolar lines, ``(V,)`` pixels, NaN for a view with too few matches."""
-    views = [tracks.view(v) for v in range(len(Ts))]
-    return np.array(
-        [
-            np.median(residuals_px(view, T[None])) if len(view) >= FEWEST else np.nan
-            for view, T in zip(views, Ts, strict=True)
-        ]
-    )
+    views = [(tracks.view(v), T[None]) for v, T in enumerate(Ts)]
+    return np.array([np.median(residuals_px(*v)) if len(v[0]) >= FEWEST else np.nan for v in views])
 
 
 def blocks(tracks: Tracks) -> np.ndarray:
@@ -189,12 +172,7 @@ def blocks(tracks: Tracks) -> np.ndarray:
 
 
 def across_lines(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signed residuals ``(N,)`` across the epipolar lines, and the lines' normals ``(N, 2)``.
-
-    Args:
-        tracks: of one right view.
-        T: ``(4, 4)``, ``T_right_from_left``.
-    """
+    """Signed residuals ``(N,)`` across a right view's epipolar lines, and the lines' normals ``(N, 2)``."""
     at = project_tracks(tracks.rays, solve_inverse_depth(tracks, T[None]), tracks.K_rights[0], T)
     along = at.by_inverse_depth / np.maximum(np.linalg.norm(at.by_inverse_depth, axis=1, keepdims=True), 1e-9)
     normals = np.stack([-along[:, 1], along[:, 0]], axis=1)

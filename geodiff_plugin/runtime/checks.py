@@ -30,11 +30,7 @@ MOST = 1 << 20
 
 
 def check_named_arguments(pipeline: type) -> None:
-    """Refuse a subclass whose ``__call__`` does not name the arguments of the stock pipeline.
-
-    Raises:
-        ValueError: naming those that it hides.
-    """
+    """Refuse a subclass whose ``__call__`` does not name the arguments of the stock pipeline."""
     named = inspect.signature(pipeline.__call__).parameters
     missing = [name for name in STOCK_ARGUMENTS if name not in named]
     if missing:
@@ -55,10 +51,9 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
         images: number of left images.
 
     Raises:
-        TypeError, ValueError: another output type than ``"np"`` and ``"pt"``; a number of steps, a
-            resolution, a batch or ensemble size that is no whole number or too small; a way of resampling
-            that does not exist; no generator, or a list of another number than that of all members; latents
-            that are not finite.
+        InputError: another output type than ``"np"`` and ``"pt"``; a number of steps, a resolution, a batch
+            or ensemble size that is no whole number or too small; a way of resampling that does not exist; no
+            generator, or a list of another number than that of all members; latents that are not finite.
     """
     check_choice(call["output_type"], "output_type", ("np", "pt"))
     check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
@@ -75,7 +70,7 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
         bad_type("generator", "None, a torch.Generator or a list of them", given)
     if isinstance(given, list) and len(given) != members:
         expected = (
-            f"one torch.Generator, or a list of {members}: one for every image and member of its ensemble"
+            f"a torch.Generator, or a list of {members}: one for every image and member of its ensemble"
         )
         bad_value("generator", expected, f"a list of {len(given)}")
     latents = call["latents"]
@@ -96,8 +91,7 @@ def check_left_images(image: Any) -> tuple[Any, int]:
         a list of them. And the number of images.
 
     Raises:
-        TypeError, ValueError: as ``as_image_01``, naming ``image`` or ``image[i]``; no image, or of several
-            sizes.
+        InputError: as ``as_image_01``, naming ``image`` or ``image[i]``; no image, or of several sizes.
     """
     named = list(_named(image, "image"))
     if not named:
@@ -157,11 +151,7 @@ def _moves_latents(guidance: GeometryGuidance) -> bool:
 
 
 def check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) -> None:
-    """Refuse a pipeline that cannot be guided as configured.
-
-    Raises:
-        TypeError, ValueError: a scheduler, offloading, casting or network that cannot be guided.
-    """
+    """Refuse a pipeline whose scheduler, offloading, casting or network cannot be guided as configured."""
     check_scheduler(pipe.scheduler)
     _check_offloading(pipe, guidance.config.gradient)
     _check_casting(pipe, guidance)
@@ -170,49 +160,40 @@ def check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) -> 
         bad_value("gradient", "'denoised' with this prior", "'full'", cure)
 
 
+def _modules(component: Any) -> Iterator[torch.nn.Module]:
+    return component.modules() if isinstance(component, torch.nn.Module) else iter(())
+
+
 def _check_offloading(pipe: Any, gradient: str) -> None:
     """Refuse offloading that takes weights away before the backward pass needs them."""
     for component in pipe.components.values():
-        for module in component.modules() if isinstance(component, torch.nn.Module) else ():
+        for module in _modules(component):
             hook = getattr(module, "_hf_hook", None)
             hooks = getattr(hook, "hooks", [hook] if hook else [])
             sequential = any(type(h).__name__ == "AlignDevicesHook" for h in hooks) and any(
                 getattr(h, "offload", False) for h in hooks
             )
-            grouped = any("group_offloading" in name for name in _diffusers_hooks(module))
-            if sequential or grouped:
-                bad_value(
-                    "pipe",
-                    "without sequential or group CPU offloading while guided",
-                    f"{type(component).__name__} whose weights leave the device after each forward",
-                    "The backward pass needs them: use pipe.enable_model_cpu_offload() or pipe.to(device).",
-                )
+            if sequential or any("group_offloading" in name for name in _diffusers_hooks(module)):
+                expected = "without sequential or group CPU offloading while guided"
+                got = f"{type(component).__name__} whose weights leave the device after each forward"
+                cure = "The backward pass needs them: use pipe.enable_model_cpu_offload() or pipe.to(device)."
+                bad_value("pipe", expected, got, cure)
     if gradient == "full" and getattr(pipe, "_all_hooks", None):
-        bad_value(
-            "gradient",
-            "'denoised' with enable_model_cpu_offload()",
-            "'full'",
-            "Decoding pushes the U-Net to the CPU before its backward pass; "
-            "use gradient='denoised' or pipe.to(device).",
-        )
+        expected = "'denoised' with enable_model_cpu_offload()"
+        cure = "Decoding pushes the U-Net to the CPU before its backward pass; use gradient='denoised' or "
+        bad_value("gradient", expected, "'full'", cure + "pipe.to(device).")
 
 
 def _check_casting(pipe: Any, guidance: GeometryGuidance) -> None:
     """Refuse layerwise casting of a module that gradients go through: its weights are others by then."""
     if not _moves_latents(guidance):
         return
-    components = (
-        pipe.components.values() if guidance.config.gradient == "full" else [getattr(pipe, "vae", None)]
-    )
-    for component in components:
-        modules = component.modules() if isinstance(component, torch.nn.Module) else ()
-        if any("layerwise_casting" in _diffusers_hooks(module) for module in modules):
-            bad_value(
-                "pipe",
-                "without layerwise casting where gradients go through",
-                f"{type(component).__name__} whose weights are cast after each layer",
-                "Leave inner_steps at 0, or load the pipeline in half precision.",
-            )
+    full = guidance.config.gradient == "full"
+    for component in pipe.components.values() if full else [getattr(pipe, "vae", None)]:
+        if any("layerwise_casting" in _diffusers_hooks(module) for module in _modules(component)):
+            got = f"{type(component).__name__} whose weights are cast after each layer"
+            cure = "Leave inner_steps at 0, or load the pipeline in half precision."
+            bad_value("pipe", "without layerwise casting where gradients go through", got, cure)
 
 
 def _diffusers_hooks(module: torch.nn.Module) -> Mapping[str, Any]:

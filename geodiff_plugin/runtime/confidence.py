@@ -42,9 +42,7 @@ _HALF_KNOWN = 0.1
 def depth_evidence(
     support: Tensor, error: Tensor, visible: Tensor, spread: Tensor | None, prior_error: Tensor | None = None
 ) -> Tensor:
-    """What the log-odds of ``depth_confidence`` are linear in.
-
-    Args are those of ``depth_confidence``.
+    """What the log-odds of ``depth_confidence``, whose arguments these are, are linear in.
 
     Returns:
         ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. The measured error of the prior

@@ -6,7 +6,7 @@ Maps cover the pixels of the image, latents the padded processing grid. ``D`` of
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ StepInputs = tuple[Tensor, Tensor, Tensor | None]
 
 @dataclass(frozen=True)
 class ProcessingGrid:
-    """The grid that a pipeline denoises on, with and without its padding.
+    """The grid that a pipeline denoises on.
 
     Attributes:
         content: ``(H, W)`` without padding.
@@ -67,33 +67,30 @@ class MapCodec:
         self._pipe, self.prior, self.grid, self.tiny = pipe, prior, grid, tiny
 
     @contextmanager
-    def _loop_autoencoder(self) -> Iterator[None]:
-        users = self._pipe.vae if self.tiny is not None else None
-        if self.tiny is not None:  # past ``__setattr__``, which would rewrite the pipeline's config
-            object.__setattr__(self._pipe, "vae", self.tiny)
+    def _autoencoder(self, tiny: Any | None) -> Iterator[None]:
+        if tiny is None:
+            yield
+            return
+        users = self._pipe.vae  # past ``__setattr__``, which would rewrite the pipeline's config
+        object.__setattr__(self._pipe, "vae", tiny)
         try:
             yield
         finally:
-            if self.tiny is not None:
-                object.__setattr__(self._pipe, "vae", users)
+            object.__setattr__(self._pipe, "vae", users)
 
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
-        """Unclipped relative map of a clean latent ``(B, C, h, w)``, differentiable.
+        """Unclipped relative map ``(B, 1, H, W)`` float32 of a clean latent ``(B, C, h, w)``, differentiable.
 
-        Args:
-            z0: depth channels of the latent.
-            final: the map is a result: the pipeline's own autoencoder decodes it.
-
-        Returns:
-            ``(B, 1, H, W)`` float32, without padding.
+        ``z0`` has the depth channels alone; a ``final`` map, a result, is decoded by the pipeline's own
+        autoencoder.
         """
-        with nullcontext() if final else self._loop_autoencoder():
+        with self._autoencoder(None if final else self.tiny):
             x = self.prior.decode(z0).float()  # of a prior in float64 as well: the views are in float32
         return self.grid.cropped(self.grid.padded(x))
 
     def encode(self, x: Tensor) -> Tensor:
         """Clean latent of a relative map ``(B, 1, H, W)``, padded as the image was."""
-        with self._loop_autoencoder():
+        with self._autoencoder(self.tiny):
             return self.prior.encode(self.grid.padded(x))
 
 
@@ -111,7 +108,7 @@ class StepEstimate:
     Attributes:
         latent: ``(B, c, h, w)`` float32, what guidance moves: z_t ("full") or z0_hat ("denoised").
         eps: ``(B, c, h, w)`` float32, the predicted noise.
-        can_encode: whether a corrected map can be encoded: not where z_t is moved.
+        output: ``(B, c, h, w)`` float32, the network's depth channels.
     """
 
     def __init__(
@@ -125,12 +122,10 @@ class StepEstimate:
     ) -> None:
         self._codec, self._level, self._output, self._z_t, self._tap = codec, level, output, z_t, tap
         self._wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
-        channels = codec.prior.latents
-        self.output = output[:, channels].to(self._wide)
-        wide_z_t = z_t[:, channels].to(self._wide)
+        self.output, wide_z_t = (x[:, codec.prior.latents].to(self._wide) for x in (output, z_t))
         self.eps = noise_from(self.output, wide_z_t, level)
         self.latent = z0_from(self.output, wide_z_t, level) if tap is None else tap.leaf
-        self.can_encode, self.latent_is_read = tap is None, latent_is_read
+        self.encode, self.latent_is_read = codec.encode, latent_is_read
 
     def z0(self, latent: Tensor) -> Tensor:
         """The clean latent of a guided one: Tweedie with the network's graph in "full", else the same."""
@@ -143,10 +138,6 @@ class StepEstimate:
         """As ``MapCodec.decode``; a ``final`` map is given out, unless its latent is read."""
         return self._codec.decode(z0, final and not self.latent_is_read)
 
-    def encode(self, x: Tensor) -> Tensor:
-        """As ``MapCodec.encode``."""
-        return self._codec.encode(x)
-
     def step_inputs(self, move: Tensor, from_moved: bool) -> StepInputs:
         """What the scheduler's own step is given once the latent has been moved.
 
@@ -157,9 +148,8 @@ class StepEstimate:
         """
         moved, prior = (self.latent + move).detach(), self._codec.prior
         if self._tap is None:
-            new = output_from(moved, self.eps, self._level)
-            output, z_t = (self._put(*pair) for pair in zip((self._output, self._z_t), new, strict=True))
-            return output, z_t, None
+            output, z_t = output_from(moved, self.eps, self._level)
+            return self._put(self._output, output), self._put(self._z_t, z_t), None
         if prior.max_steps == 1:
             # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
             return self._tap.output_at(moved).detach(), self._put(self._z_t, moved), None

@@ -36,17 +36,17 @@ def finish(
 ) -> tuple[Tensor, Tensor] | None:
     """One decoded depth map as it is given out: fitted to matches and points, with crisp edges.
 
-    Ramps first: a fit that finds edges steep does not carry the depth of one surface over to the other. Then
+    Ramps first: a fit that finds edges steep does not carry the depth of a surface over to the next one. Then
     the fit, and the votes of matches, colours and the fitted map.
 
     Args:
         depth_m: ``(1, 1, H, W)`` metres on the grid of the output.
         evidence: of the image.
         kept: ``(1, 1, h, w)``, the share of each match's confidence that remains once reflections are
-        rejected.
+            rejected.
         error: of the prior, in log depth, as ``correction.local_error`` gives it.
         left: ``(1, 3, H, W)`` in [0, 1], the left image on that grid.
-        spacing: pixels of that grid to one that was decoded, >= 1.
+        spacing: pixels of that grid to a pixel of the decoded map, >= 1.
         config: hyperparameters.
 
     Returns:
@@ -96,13 +96,8 @@ def finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tenso
 def spread_of_members(run: GuidedRun, depth_m: Tensor, lefts: Tensor, call: Mapping[str, Any]) -> Tensor:
     """How far the members of every ensemble, finished one by one, lie from its result: ``(N, 1, H, W)`` m.
 
-    It costs a fit per member: their spread before it is that of a map that is not given out.
-
-    Args:
-        run: the finished run.
-        depth_m: ``(N, 1, H, W)`` metres, the result.
-        lefts: as ``finish_images``.
-        call: arguments of the stock call by name.
+    It costs a fit per member: their spread before it is that of a map that is not given out. Arguments as
+    ``finish_images``; ``call`` has those of the stock call by name.
     """
     size, method = image_size(depth_m), call["resample_method_output"]
     reduction = (call["ensembling_kwargs"] or {}).get("reduction", "median")
@@ -127,17 +122,10 @@ def _spacing(run: GuidedRun, depth_m: Tensor) -> int:
 
 
 def ensemble_metric(depth_m: Tensor, reduction: str = "median") -> tuple[Tensor, Tensor]:
-    """Reduce the members pixel by pixel.
+    """Reduce members ``(E, 1, H, W)`` metres pixel by pixel to a map and its uncertainty, ``(1, 1, H, W)`` m.
 
-    Args:
-        depth_m: ``(E, 1, H, W)`` metres.
-        reduction: ``"median"`` with the median absolute deviation, or ``"mean"`` with the standard deviation.
-
-    Returns:
-        prediction and uncertainty, ``(1, 1, H, W)`` metres each.
-
-    Raises:
-        ValueError: unknown reduction.
+    ``"median"`` has the median absolute deviation, ``"mean"`` the standard deviation; any other ``reduction``
+    is an ``InputError``.
     """
     check_choice(reduction, "ensembling_kwargs['reduction']", REDUCTIONS)
     middle = depth_m.mean(0, keepdim=True) if reduction == "mean" else median(depth_m, 0)[None]

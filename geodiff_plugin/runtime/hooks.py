@@ -69,7 +69,7 @@ def _modules(pipe: Any) -> list[torch.nn.Module]:
 def images_in_float32(processor: Any) -> AbstractContextManager[None]:
     """An image processor's ``preprocess`` reads and resizes in float32, and casts last.
 
-    PyTorch has no kernels for half precision on a CPU, and float16 has no number for the white of a 16-bit
+    PyTorch has no kernels for half precision on a CPU, and float16 cannot represent the white of a 16-bit
     image.
     """
     stock = processor.preprocess
@@ -125,8 +125,8 @@ class Exclusive:
 def exclusive_call(pipe: Any, guided: bool) -> Exclusive:
     """What a call holds: the pipeline, and a guided one also its networks and ``WithinCores``.
 
-    A guided call then changes no pipeline whose stock call runs in another thread, and two pipelines that
-    share networks are not guided at once. Stock calls of other pipelines are not held up.
+    So a guided call changes no pipeline whose stock call runs in another thread, and two pipelines that share
+    networks are not guided at once. Stock calls of other pipelines are not held up.
     """
     return Exclusive([pipe, *_modules(pipe)], WithinCores()) if guided else Exclusive([pipe])
 
@@ -134,15 +134,13 @@ def exclusive_call(pipe: Any, guided: bool) -> Exclusive:
 class DenoiserTap:
     """Runs the network with gradients to its depth latent, and again at another latent.
 
-    Source: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
+    The instance gets an attribute that hides its class's method, so that hooks and compiled forwards below
+    are called as before. Source: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
 
     Args:
         owner: object whose method the loop calls: the U-Net, or a pipeline of ours.
         method: name of the method, ``"forward"`` of a module; its first argument holds the latent.
         channels: which channels of that argument are the depth latent.
-
-    The instance gets an attribute that hides its class's method, so that hooks and compiled forwards below
-    are called as before.
     """
 
     def __init__(self, owner: Any, method: str, channels: slice) -> None:
@@ -217,10 +215,9 @@ class GuidedScheduler:
     """A copy of the scheduler: ``set_timesteps`` starts a trajectory, ``step`` is guided.
 
     A pipeline that shares the scheduler never meets a guided ``step``, and the state of the user's scheduler
-    stays what it was. The copy is of the same class with the same config and attributes. It goes onto the
-    pipeline past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config. A scheduler of
-    which the user replaced one of the two methods on the instance is used itself, since such a method usually
-    holds on to the instance; all its attributes are put back.
+    stays what it was. The copy goes onto the pipeline past ``DiffusionPipeline.__setattr__``, which would
+    rewrite the pipeline's config. A scheduler of which the user replaced a method on the instance is used
+    itself, since such a method usually holds on to the instance; all its attributes are put back.
 
     ``step`` gets the timesteps on the CPU, where diffusers keeps the tables that they index: compared and
     looked up on another device, each would be waited for several times a step.

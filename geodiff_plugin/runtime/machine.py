@@ -19,39 +19,34 @@ SAMPLING_INTERVAL_S = 0.05
 
 def versions() -> dict[str, str]:
     """Version of Python and of every package that a result depends on."""
-    found = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
+    numbers = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
     for name in PACKAGES:
         try:
-            found[name] = version(name)
+            numbers[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            numbers[name] = "not installed"
+    return numbers
 
 
 def pick_device(name: str) -> torch.device:
     """The device of that name; ``"auto"`` takes CUDA, then MPS, then the CPU.
 
-    Raises:
-        ValueError: no such device on this machine.
+    Raises ``InputError`` where this machine has no such device.
     """
+    here = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
     if name == "auto":
-        if torch.cuda.is_available():
-            return torch.device("cuda")
-        return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
-    expected = "auto, cpu, cuda, cuda:N or mps"
+        return torch.device(next(kind for kind, available in here.items() if available))
     try:
         device = torch.device(name)
     except RuntimeError:
-        bad_value("--device", expected, repr(name))
-    here = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+        device = torch.device("meta")
     if device.type not in here:
-        bad_value("--device", expected, repr(name))
+        bad_value("--device", "auto, cpu, cuda, cuda:N or mps", repr(name))
     if not here[device.type]:
         bad_value("--device", "a device of this machine", repr(name), f"PyTorch finds no {device.type} here.")
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        bad_value(
-            "--device", f"one of the {torch.cuda.device_count()} CUDA devices of this machine", repr(name)
-        )
+    count = torch.cuda.device_count()
+    if device.type == "cuda" and (device.index or 0) >= count:
+        bad_value("--device", f"one of the {count} CUDA devices of this machine", repr(name))
     return device
 
 

@@ -39,25 +39,28 @@ def _discrete(scheduler: Any, timestep: Tensor) -> NoiseLevel:
     )
 
 
+def _sigma(scheduler: Any, timestep: Tensor) -> Tensor:
+    """The entry of the scheduler's table of sigmas for its next step."""
+    index = scheduler.step_index
+    return scheduler.sigmas[scheduler.index_for_timestep(timestep) if index is None else index].float()
+
+
 def _sigmas_vp(scheduler: Any, timestep: Tensor) -> NoiseLevel:
     """DPM solvers: sigma / alpha by step index, variance preserving."""
-    index = scheduler.step_index
-    sigma = scheduler.sigmas[scheduler.index_for_timestep(timestep) if index is None else index].float()
-    alpha_t, sigma_t = scheduler._sigma_to_alpha_sigma_t(sigma)
+    alpha_t, sigma_t = scheduler._sigma_to_alpha_sigma_t(_sigma(scheduler, timestep))
     return NoiseLevel(alpha_t, sigma_t, scheduler.config.prediction_type)
 
 
 def _flow(scheduler: Any, timestep: Tensor) -> NoiseLevel:
     """Rectified flow: ``z_t = (1 - sigma) z_0 + sigma eps``."""
-    index = scheduler.step_index
-    sigma = scheduler.sigmas[scheduler.index_for_timestep(timestep) if index is None else index].float()
+    sigma = _sigma(scheduler, timestep)
     return NoiseLevel(1.0 - sigma, sigma, "flow_prediction")
 
 
 def _direct(scheduler: Any, timestep: Tensor) -> NoiseLevel:
     """The output is the clean latent; its difference to the input stands for the noise."""
-    one = torch.ones((), device=timestep.device)
-    return NoiseLevel(one, one, scheduler.config.prediction_type)
+    level = torch.ones((), device=timestep.device)
+    return NoiseLevel(level, level, scheduler.config.prediction_type)
 
 
 FAMILIES: dict[type, Callable[[Any, Tensor], NoiseLevel]] = {
@@ -71,25 +74,16 @@ FAMILIES: dict[type, Callable[[Any, Tensor], NoiseLevel]] = {
 
 
 def noise_level(scheduler: Any, timestep: Tensor) -> NoiseLevel:
-    """Signal and noise level that the scheduler's next ``step`` assumes.
+    """Signal and noise level that the scheduler's next ``step``, of this timestep, assumes.
 
-    Args:
-        scheduler: a member (or subclass) of ``FAMILIES``, before its ``step`` of this timestep.
-        timestep: 0-d tensor out of ``scheduler.timesteps``.
-
-    Raises:
-        TypeError: no family fits.
+    ``timestep`` is a 0-d tensor out of ``scheduler.timesteps``. Raises ``InputTypeError`` if no family fits.
     """
     for cls, family in FAMILIES.items():
         if isinstance(scheduler, cls):
             return family(scheduler, timestep)
     names = ", ".join(cls.__name__ for cls in FAMILIES)
-    bad_type(
-        "pipe.scheduler",
-        f"one of {names}",
-        scheduler,
-        "Use pipe.scheduler = DDIMScheduler.from_config(pipe.scheduler.config).",
-    )
+    cure = "Use pipe.scheduler = DDIMScheduler.from_config(pipe.scheduler.config)."
+    bad_type("pipe.scheduler", f"one of {names}", scheduler, cure)
 
 
 def check_scheduler(scheduler: Any) -> None:
@@ -102,24 +96,16 @@ def check_scheduler(scheduler: Any) -> None:
     """
     if not isinstance(scheduler, tuple(FAMILIES)):
         noise_level(scheduler, torch.tensor(0))
-    if (
-        getattr(scheduler.config, "rescale_betas_zero_snr", False)
-        and scheduler.config.prediction_type == "epsilon"
-    ):
-        bad_value(
-            "pipe.scheduler",
-            "able to tell the clean latent from the network's output at every step",
-            f"{type(scheduler).__name__} with prediction_type='epsilon' and rescale_betas_zero_snr=True",
-            "With no signal left a noise prediction says nothing; "
-            "set rescale_betas_zero_snr=False or use v_prediction.",
-        )
-    if getattr(scheduler.config, "thresholding", False):
-        bad_value(
-            "pipe.scheduler",
-            "without dynamic thresholding, which is for pixels and not for latents",
-            f"{type(scheduler).__name__} with thresholding=True",
-            "pipe.scheduler = type(pipe.scheduler).from_config(pipe.scheduler.config, thresholding=False)",
-        )
+    name, config = type(scheduler).__name__, scheduler.config
+    if getattr(config, "rescale_betas_zero_snr", False) and config.prediction_type == "epsilon":
+        expected = "able to tell the clean latent from the network's output at every step"
+        got = f"{name} with prediction_type='epsilon' and rescale_betas_zero_snr=True"
+        cure = "With no signal left a noise prediction says nothing; set rescale_betas_zero_snr=False or use "
+        bad_value("pipe.scheduler", expected, got, cure + "v_prediction.")
+    if getattr(config, "thresholding", False):
+        expected = "without dynamic thresholding, which is for pixels and not for latents"
+        cure = "pipe.scheduler = type(pipe.scheduler).from_config(pipe.scheduler.config, thresholding=False)"
+        bad_value("pipe.scheduler", expected, f"{name} with thresholding=True", cure)
 
 
 def trailing_timesteps(scheduler: Any, num_inference_steps: int) -> Tensor | None:

@@ -1,8 +1,7 @@
-"""``MetricDepthOutput`` of a finished call: all on the grid of the output, with a verdict."""
+"""The result of a finished call: ``MetricDepthOutput``, all on the grid of the output, with a verdict."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -42,15 +41,14 @@ def assemble_output(
 ) -> MetricDepthOutput:
     """Everything of ``MetricDepthOutput`` but ``latent``.
 
-    Args:
-        stock: output of the stock call, already in metres.
-        run: the finished run.
-        guidance: what was configured.
-        call: arguments of the stock call by name.
-        said: what was warned of so far, and whether it forbids trust.
+    ``stock`` is the output of the stock call, already in metres, and ``call`` its arguments by name; ``said``
+    has what was warned of so far, and whether it forbids trust.
     """
-    lefts_01 = _native_lefts(run)
-    count, size = lefts_01.shape[0], image_size(lefts_01)
+    natives = [evidence.native_left for evidence in run.evidence]
+    lefts_01 = (
+        natives[0][None] if len(natives) == 1 else torch.stack(natives)
+    )  # a large picture is not copied
+    count, size, has_unit = len(natives), image_size(lefts_01), guidance.unit is not None
     depth_m = run.within_range(_as_maps(stock.prediction).to(lefts_01.device))  # or the processing grid
     grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
@@ -58,10 +56,8 @@ def assemble_output(
     uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
     if uncertainty is not None and support is not None:
         uncertainty = spread_of_members(run, depth_m, lefts, call)
-    K_lefts = torch.stack(
-        [torch.as_tensor(i.K_left, dtype=torch.float32, device=depth_m.device) for i in guidance.inputs]
-    )
-    K = resize_intrinsics(K_lefts, size, grid)
+    Ks = [torch.as_tensor(i.K_left, dtype=torch.float32, device=depth_m.device) for i in guidance.inputs]
+    K = resize_intrinsics(torch.stack(Ks), size, grid)
     visible, error = _reprojected(run, depth_m, lefts, K)
     prior_error = run.prior_error()  # (N, 1, 1, 1), or of every pixel with the measured one as the least
     confidence = None
@@ -70,25 +66,18 @@ def assemble_output(
         nowhere = torch.zeros_like(depth_m)
         shown = nowhere if error is None else error, nowhere.bool() if visible is None else visible
         confidence = depth_confidence(support, *shown, spread, prior_error)
-    over_own = _over_own(run, depth_m)
-    own_ratios = [math.nan] * count
-    if over_own is not None and guidance.unit is not None:
-        own_ratios = over_own.reshape(count, -1).median(1).values.tolist()
+    over_prior = _over_prior(run, depth_m)
     relative = torch.cat(run.relative)
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
-    doubts = [sentence for sentence, forbids in said.items() if forbids]
-    verdicts = [
-        judge(
-            _indicators(
-                *(run, i, K_lefts[i], depth_m[i], relative[i : i + 1]),
-                confidence=None if confidence is None else confidence[i],
-                own_ratio=own_ratios[i],
-                doubts=doubts,
-                has_unit=guidance.unit is not None,
-            )
-        )
-        for i in range(count)
-    ]
+    verdicts = []
+    for i, K_left in enumerate(Ks):
+        given: dict[str, Any] = {"doubts": tuple(sentence for sentence, forbids in said.items() if forbids)}
+        if confidence is not None:
+            given["confidence"] = float(confidence[i].mean())
+        if over_prior is not None and has_unit:
+            given["own_ratio"] = float(over_prior.reshape(count, -1)[i].median())
+        result = K_left, depth_m[i], relative[i : i + 1]
+        verdicts.append(judge(_indicators(run, i, *result, has_unit=has_unit, **given)))
     if confidence is not None:
         agreement = confidence.new_tensor([points_agreement(verdict.indicators) for verdict in verdicts])
         confidence = confidence * agreement.view(-1, 1, 1, 1)
@@ -110,7 +99,7 @@ def assemble_output(
         scale=of_members("scale"),
         shift=of_members("shift"),
         global_scale=of_members("g_s"),
-        own_scale=None if over_own is None else over_own.median(1).values.reshape(count, -1).cpu(),
+        own_scale=None if over_prior is None else over_prior.median(1).values.reshape(count, -1).cpu(),
         visible=out(visible),
         photometric_error=out(error),
         confidence=out(confidence),
@@ -131,8 +120,8 @@ def assemble_output(
         scale_from=None if estimated is None else estimated.scale.source,
         scale_spread=None if estimated is None else estimated.scale.spread,
     )
-    if guidance.unit is None and over_own is not None:
-        return _in_the_priors_metres(output, over_own)
+    if not has_unit and over_prior is not None:
+        return _in_the_priors_metres(output, over_prior)
     return output
 
 
@@ -151,9 +140,9 @@ def _reprojected(
     return torch.cat(visible), torch.cat(error)
 
 
-def _over_own(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
+def _over_prior(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
     """``(N * E, h w)`` the depth ``(N, 1, H, W)`` over a metric prior's own, on the prior's grid."""
-    maps = [t.own_depth for t in run.trajectories if t.own_depth is not None]
+    maps = [t.prior_depth for t in run.trajectories if t.prior_depth is not None]
     if len(maps) < len(run.trajectories):
         return None
     priors_m = torch.cat(maps)
@@ -161,14 +150,14 @@ def _over_own(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
     return (resized[run.owners] / priors_m.clamp_min(LEAST_M)).flatten(1)
 
 
-def _in_the_priors_metres(output: MetricDepthOutput, over_own: Tensor) -> MetricDepthOutput:
+def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> MetricDepthOutput:
     """The output of estimated poses without a unit, in the metres of a prior that has some.
 
-    Everything that is a length is multiplied by one number, that which brings the depth to the prior's at
-    half of the pixels; how much it differs from pixel to pixel tells how uncertain it is.
+    Everything that is a length is multiplied by the factor that brings the depth to the prior's at half of
+    the pixels; how much that factor differs from pixel to pixel tells how uncertain it is.
     """
-    factor = 1.0 / float(over_own.median())
-    spread = 1.4826 * float((over_own * factor).clamp_min(1e-9).log().abs().median())
+    factor = 1.0 / float(over_prior.median())
+    spread = 1.4826 * float((over_prior * factor).clamp_min(1e-9).log().abs().median())
 
     def moved(E: np.ndarray) -> np.ndarray:
         return np.block([[E[:3, :3], factor * E[:3, 3:]], [E[3:]]])
@@ -196,35 +185,17 @@ def _indicators(
 ) -> Indicators:
     """What the run of one image tells; where it used no matches, they are made here, to judge it by."""
     samples = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
-    evidence = run.evidence[image]
+    evidence, config = run.evidence[image], run.config
     order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())
     if evidence.sweep_matches is None and evidence.native:
         with suppress(InputError):  # views without overlap: not judged
-            matches = find_matches(
-                evidence.native_left,
-                evidence.native,
-                K_left,
-                volume=evidence.volume,
-                depth_range=run.config.depth_range,
-                config=run.config,
-            )
+            views, how = (evidence.native_left, evidence.native, K_left), {"volume": evidence.volume}
+            matches = find_matches(*views, **how, depth_range=config.depth_range, config=config)
             evidence = replace(evidence, sweep_matches=matches, sweep_points=None)
             order = float(order_agreement(relative, matches, run.prior.space))
-    return read_indicators(
-        evidence,
-        K_left,
-        order=order,
-        depth_m=depth_m,
-        on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in samples),
-        range_given=run.config.depth_range is not None,
-        **more,
-    )
-
-
-def _native_lefts(run: GuidedRun) -> Tensor:
-    """The left images at native size, ``(N, 3, H, W)``, cleaned as the right ones are."""
-    lefts = [evidence.native_left for evidence in run.evidence]
-    return lefts[0][None] if len(lefts) == 1 else torch.stack(lefts)  # one large picture is not copied
+    more["on_edge"] = any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in samples)
+    given = config.depth_range is not None
+    return read_indicators(evidence, K_left, depth_m, range_given=given, order=order, **more)
 
 
 def _as_maps(values: Any) -> Tensor:

@@ -75,9 +75,8 @@ class GuidedCall(_Stock):
             latent).
 
         Raises:
-            TypeError: ``guidance`` is no ``GeometryGuidance``; a scheduler that cannot be guided.
-            ValueError: an image that the right one could not be either; inputs that do not fit each other;
-                offloading that forbids guidance.
+            InputError: ``guidance`` is no ``GeometryGuidance``; a scheduler or offloading that cannot be
+                guided; an image that the right one could not be either; inputs that do not fit each other.
             RuntimeError: updates inside ``torch.inference_mode()``, or a call by a hook of the networks of a
                 guided call. From ``callback_on_step_end`` the pipeline may be called, guided or not: there it
                 is as the user left it. A call in another thread waits.
@@ -121,7 +120,6 @@ class GuidedCall(_Stock):
         tiny = tiny_autoencoder(self, prior, guidance.config.decoder)
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= _one_member(call)
-        wants_dict, wants_latent = call["return_dict"], call["output_latent"]
         device = self._execution_device
         lefts_01 = native_images(image, device)  # (N, 3, H, W)
         grid = self._processing_grid(image, call, device)
@@ -134,21 +132,8 @@ class GuidedCall(_Stock):
             call |= {"latents": warm.latents, "generator": None}  # the latents hold the noise already
         if call["latents"] is not None:
             call["image"] = lefts_01  # beside latents Marigold takes no channels-last image
-        run = GuidedRun(
-            self,
-            prior,
-            guidance,
-            evidence,
-            ensemble_size=call["ensemble_size"],
-            batch_size=call["batch_size"],
-            grid=grid,
-            rounds=rounds,
-            callback=callback,
-            wants_latents=wants_latent,
-            tiny=tiny,
-            held=held,
-            warm=warm,
-        )
+        inputs = self, prior, guidance, evidence, call
+        run = GuidedRun(*inputs, grid, rounds, callback, tiny=tiny, held=held, warm=warm)
         try:
             with run:
                 stock = stock_call(**{**call, "return_dict": True, "output_latent": True})
@@ -159,8 +144,8 @@ class GuidedCall(_Stock):
             output = assemble_output(stock, run, guidance, call, guidance.warned | said)
         if strict and not output.verdict.trusted:
             refuse(output.verdict.sentence)
-        output.latent = stock.latent if wants_latent else None
-        return output if wants_dict else (output.prediction, output.uncertainty, output.latent)
+        output.latent = stock.latent if call["output_latent"] else None
+        return output if call["return_dict"] else (output.prediction, output.uncertainty, output.latent)
 
     def _processing_grid(self, image: Any, call: dict[str, Any], device: torch.device) -> ProcessingGrid:
         """The grid that the stock call will denoise on, found by its own preprocessing."""
@@ -207,15 +192,7 @@ class GuidedCall(_Stock):
 
 
 def native_images(image: Any, device: torch.device) -> Tensor:
-    """Left image(s) in any form that the stock call takes, as they go to ``GeometryGuidance.prepare``.
-
-    Args:
-        image: PIL, numpy or torch, or a list.
-        device: where the call runs.
-
-    Returns:
-        ``(N, 3, H, W)`` float32 in [0, 1], native size.
-    """
+    """Left image(s) in any form that the stock call takes: ``(N, 3, H, W)`` float32 in [0, 1], as large."""
     as_given = MarigoldImageProcessor(vae_scale_factor=1, do_normalize=False)
     return as_given.preprocess(image, 0, device=device, dtype=torch.float32)[0].contiguous()
 
@@ -291,8 +268,8 @@ def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
         The same object, for chaining. Enabling twice is enabling once.
 
     Raises:
-        TypeError: no adapter understands it.
-        ValueError: its ``__call__`` hides the stock arguments behind ``**kwargs``.
+        InputError: no adapter understands it, or its ``__call__`` hides the stock arguments behind
+            ``**kwargs``.
     """
     find_adapter(pipe)
     check_named_arguments(_stock_class(type(pipe)) if isinstance(pipe, GuidedCall) else type(pipe))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import torch
@@ -42,12 +42,10 @@ class GuidedRun:
         prior: its adapter.
         guidance: what the user configured.
         evidence: one entry per image.
-        ensemble_size: members per image.
-        batch_size: samples per chunk, as the pipeline slices them.
+        call: arguments of the stock call by name; its chunks have ``batch_size`` samples.
         grid: the processing grid of the pipeline.
         rounds: of each denoising step, see ``schedule.count_steps``.
         callback: ``callback_on_step_end`` or ``None``.
-        wants_latents: whether the call returns the final latents.
         tiny: autoencoder that is used in the loop; ``None`` for the pipeline's.
         held: lock against calls in other threads, released while the callback runs.
         warm: the start from the previous frame, or ``None``.
@@ -65,26 +63,25 @@ class GuidedRun:
         prior: DepthPrior,
         guidance: GeometryGuidance,
         evidence: list[Evidence],
-        ensemble_size: int,
-        batch_size: int,
+        call: Mapping[str, Any],
         grid: ProcessingGrid,
         rounds: int,
         callback: StepCallback | None,
-        wants_latents: bool,
         tiny: Any | None,
         held: Exclusive,
-        warm: WarmStart | None = None,
+        warm: WarmStart | None,
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
-        self.owners = [i for i in range(len(evidence)) for _ in range(ensemble_size)]
-        self.batch_size, self.grid = batch_size, grid
+        self.owners = [i for i in range(len(evidence)) for _ in range(call["ensemble_size"])]
+        self.batch_size, self.grid = call["batch_size"], grid
         self.schedule: Schedule | None = None
         self.trajectories: list[Trajectory] = []
         self.relative: list[Tensor] = []
         self.members: list[Tensor] = []
         self._plan, self._rounds, self._warm = guidance.updates, rounds, warm
+        self._skipped = 0 if warm is None else warm.skipped
         self._callback, self._held = callback, held
-        self._reads_latents = wants_latents or callback is not None
+        self._reads_latents = call["output_latent"] or callback is not None
         self._codec = MapCodec(pipe, prior, grid, tiny)
         self._step = 0
         self._timesteps: list[float] = []
@@ -95,26 +92,20 @@ class GuidedRun:
         self._tap = None
         if needs_network(guidance) and prior.network_input is not None:
             self._tap = DenoiserTap(*prior.network(), prior.network_input)
-        self._scheduler = GuidedScheduler(
-            *(pipe, self._on_trajectory, self._on_step, self._on_done),
-            *(self.config.respace, 0 if warm is None else warm.skipped),
-        )
+        steps = self._on_trajectory, self._on_step, self._on_done
+        self._scheduler = GuidedScheduler(pipe, *steps, self.config.respace, self._skipped)
 
     def __enter__(self) -> GuidedRun:
         with ExitStack() as stack:
-            for context in self._contexts():
-                stack.enter_context(context)
+            stack.enter_context(frozen_weights(self.pipe))
+            stack.enter_context(images_in_float32(self.pipe.image_processor))
+            if self._tap is not None:
+                stack.enter_context(self._tap.attached())
+            stack.enter_context(self._scheduler.attached())
+            # Its decode and ensembling then know that they are guided.
+            stack.enter_context(replaced(self.pipe, "_guided_run", self))
             self._stack = stack.pop_all()
         return self
-
-    def _contexts(self) -> Iterator[AbstractContextManager[object]]:
-        yield frozen_weights(self.pipe)
-        yield images_in_float32(self.pipe.image_processor)
-        yield nullcontext() if self._tap is None else self._tap.attached()
-        yield self._scheduler.attached()
-        yield replaced(
-            self.pipe, "_guided_run", self
-        )  # its decode and ensembling then know that they are guided
 
     def __exit__(self, *exc: object) -> None:
         self._stack.close()
@@ -142,11 +133,8 @@ class GuidedRun:
     def metric_prediction(self, latents: Tensor) -> Tensor:
         """Metric depth of the next chunk of final latents, instead of the clipping decode.
 
-        Args:
-            latents: ``(B, C, h, w)``, chunks in the order in which they were denoised.
-
-        Returns:
-            ``(B, 1, H, W)`` metres on the padded processing grid, in float32.
+        ``latents (B, C, h, w)`` come in the order in which they were denoised; the result is ``(B, 1, H, W)``
+        metres on the padded processing grid, in float32.
         """
         chunk = len(self.relative)
         trajectory, x = self.trajectories[chunk], self._results[chunk]
@@ -163,12 +151,8 @@ class GuidedRun:
     def within_range(self, depth_m: Tensor, image: int | None = None) -> Tensor:
         """Keep maps brought to another size in the range that they had: bicubic enlargement overshoots.
 
-        Args:
-            depth_m: ``(M, 1, H, W)`` metres: of all images, or of the members of one.
-            image: whose members these are.
-
-        Returns:
-            The same tensor, changed in place.
+        ``depth_m (M, 1, H, W)`` metres, of all images, or of the members of one ``image``, is changed in
+        place.
         """
         samples = [i for i, owner in enumerate(self.owners) if image in (None, owner)]
         near_m, far_m = (
@@ -196,7 +180,7 @@ class GuidedRun:
             values = [value[i].float() for t, i in chosen if (value := getattr(t, name)) is not None]
             return torch.stack(values).mean(0, keepdim=True) if values else None
 
-        return mean("kept"), local_error(mean("error"), mean("known"))
+        return mean("kept"), local_error(mean("error"), mean("valid"))
 
     def prior_error(self) -> Tensor | None:
         """Error of the prior in log depth, as ``of_prior``; ``None`` if it is not known of every image."""
@@ -206,8 +190,7 @@ class GuidedRun:
     def check_finite(self) -> None:
         """Check, once and after the loop, that everything computed in it is finite.
 
-        Raises:
-            ValueError: naming the step, the tensor and the cure.
+        Raises ``InputError`` that names the step, the tensor and the cure.
         """
         for trajectory in self.trajectories:
             trajectory.watch.check(self.pipe.dtype)
@@ -216,21 +199,15 @@ class GuidedRun:
         first = len(self.trajectories) * self.batch_size
         chunk = slice(first, first + self.batch_size)
         start = None if self._warm is None else (self._warm.near_m[chunk], self._warm.far_m[chunk])
-        self.trajectories.append(
-            Trajectory(
-                *(self.config, self.evidence, self.owners[chunk], self.prior.space, self._plan.step_latents),
-                *(self.prior.metric_range(chunk), start, self.prior.known(chunk)),
-            )
-        )
+        plan, prior = self._plan, self.prior
+        samples = self.config, self.evidence, self.owners[chunk], prior.space, plan.step_latents
+        ranges = prior.metric_range(chunk), start, prior.known(chunk)
+        self.trajectories.append(Trajectory(*samples, *ranges))
         self._results.append(None)
         self._step, self._timesteps, self._shown = 0, timesteps.tolist(), None
         if self.schedule is None:
-            self.schedule = make_schedule(
-                *(self.config, self._plan, len(timesteps)),
-                rounds=self._rounds,
-                skipped=0 if self._warm is None else self._warm.skipped,
-                encodes=self._tap is None,
-            )
+            how = {"rounds": self._rounds, "skipped": self._skipped, "encodes": self._tap is None}
+            self.schedule = make_schedule(self.config, plan, len(timesteps), **how)
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
             chunks = -(-len(self.owners) // self.batch_size)
             self._bar = tqdm(total=chunks * len(timesteps), **options)
@@ -238,7 +215,7 @@ class GuidedRun:
     def _on_step(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepInputs:
         trajectory, schedule = self.trajectories[-1], self.schedule
         assert schedule is not None  # of _on_trajectory
-        trajectory.begin_step(self._step, self._timesteps[self._step])
+        trajectory.step = self._step, self._timesteps[self._step]
         level, is_last = noise_level(self.pipe.scheduler, timestep), schedule.is_last(self._step)
         latent_is_read = self._reads_latents or not is_last
         estimate = StepEstimate(self._codec, level, output, z_t, self._tap, latent_is_read)
@@ -293,10 +270,8 @@ class GuidedRun:
 
 def _latents_of(answer: Any, latents: Tensor) -> Tensor:
     """What a callback answered for the latents, checked; ``latents`` where it left them alone."""
-    name, cure = (
-        "the answer of callback_on_step_end",
-        "Return callback_kwargs, or nothing to leave the latents as they are.",
-    )
+    name = "the answer of callback_on_step_end"
+    cure = "Return callback_kwargs, or nothing to leave the latents as they are."
     if answer is None:
         return latents
     if not isinstance(answer, Mapping):

@@ -1,8 +1,7 @@
 """What a call starts from beside noise: the previous frame's latent and scale, or a dense depth prompt.
 
 The start in the middle of the schedule is SDEdit's (Meng et al. 2022), of another frame's result. Depth
-prompts are for priors such as Prompt Depth Anything (arXiv 2412.14015), which takes a phone's lidar of 256 x
-192.
+prompts are for priors such as Prompt Depth Anything (arXiv 2412.14015), which takes a phone's sparse lidar.
 """
 
 from __future__ import annotations
@@ -55,8 +54,8 @@ def plan_warm_start(
 ) -> WarmStart | None:
     """What ``guidance.previous`` gives to a call; ``None`` without one.
 
-    The latent is taken over by a DDIM of two steps or more. Other schedulers, and priors of one step, take
-    over the scale alone.
+    The latent is taken over by a DDIM of two steps or more. Other schedulers, and priors of a single step,
+    take over the scale alone.
 
     Args:
         pipe: the live pipeline.
@@ -66,8 +65,8 @@ def plan_warm_start(
         size: ``(H, W)`` of the padded processing grid.
 
     Raises:
-        TypeError, ValueError: an output of another number of images or members, of a prior of another space,
-            or of another size; ``latents`` of another shape than the output's, or no tensor.
+        InputError: an output of another number of images or members, of a prior of another space, or of
+            another size; ``latents`` of another shape than the output's, or no tensor.
     """
     previous = guidance.previous
     if previous is None:
@@ -134,13 +133,8 @@ def _ends(previous: MetricDepthOutput, space: str) -> tuple[Tensor, Tensor]:
 def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
     """Confident matches and points, spread along surfaces, for priors that take a depth prompt.
 
-    Args:
-        evidence: one entry per image, all of one size.
-        config: how they are spread.
-
-    Returns:
-        ``(N, 1, h, w)`` metres everywhere: the median depth where no match or point is near; ``None`` if some
-        image has neither.
+    ``evidence`` has an entry per image, all of the same size. The result is ``(N, 1, h, w)`` metres, with the
+    median depth where no match or point is near; ``None`` if some image has neither.
     """
     maps = [depth_m for image in evidence if (depth_m := _spread(image, config)) is not None]
     return torch.cat(maps) if len(maps) == len(evidence) else None
@@ -148,7 +142,7 @@ def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor
 
 def _spread(evidence: Evidence, config: GuidanceConfig) -> Tensor | None:
     """``(1, 1, h, w)`` metres: a flat map corrected by matches and points, as a prior's would be."""
-    confident, points = Matches.stack([evidence.sure]), Matches.stack([evidence.points])
+    confident, points = Matches.stack([evidence.reliable]), Matches.stack([evidence.points])
     target = confident if points is None else with_points(confident, points)
     if target is None:
         return None

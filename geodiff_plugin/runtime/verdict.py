@@ -7,7 +7,6 @@ a factor that a rig might have, matches as well as a right one.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,12 +18,11 @@ from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.types import PoseReport
 
 #: Confidence from which a match counts.
 CONFIDENT = 0.5
 #: Two images whose values differ by less, in [0, 1], and by less than this share of their contrast (all
-#: pictures that are nearly black differ by little), are one picture.
+#: pictures that are nearly black differ by little), are the same picture.
 SAME, SAME_SHARE = 1.5 / 255, 0.05
 #: Points that are compared with matches: at least so many, each with matches this near, pixels of the grid.
 FEWEST_COMPARED, REACH_PX = 12, 3
@@ -84,21 +82,18 @@ class Indicators:
         order: rank correlation of the prior's first map with matches or points, [-1, 1].
         spread: of the matched depths, log of their 95 % over their 5 % quantile.
         points_ratio: median of known points over matched depths at the same places.
-        points: known depths within the image, a number of pixels; 0 without any.
-        at_end: share of the confident matches that lie on the first or the last plane of a given range, [0,
-        1].
+        points: number of known depths within the image.
+        at_end: share of the confident matches on the first or the last plane of a given range, [0, 1].
         baseline_m: distance of the first right camera; 0 without one, or where it has no unit.
         view_deg: horizontal field of view that K gives the left image.
         own_ratio: of the depth over a metric prior's own, median.
-        epipolar_px: how far matches lie beside their epipolar lines, pixels, with the poses as used; of the
-            worst right view.
-        off_matches: median of the absolute log of the depth over the matched depth, where matches are
-            confident.
+        epipolar_px: median distance of the matches from their epipolar lines with the poses as used, pixels;
+            of the worst right view.
+        off_matches: median of the absolute log of the depth over the matched depth.
         doubts: warnings about the input, each of which forbids trust.
         mistakes: sentences on mistakes of a given pose that would explain its misfit (``pose.mistakes``).
-        flat: all confident matches lie within two planes of the sweep, and near enough for that to mean
-        something.
-        same: the left and a right view are one picture.
+        flat: all confident matches lie within two planes of the sweep, and near enough to mean something.
+        same: the left and a right view are the same picture.
         inverse_fits: the inverse pose matches clearly more.
         on_edge: the search for the scale ended on the edge of its range.
     """
@@ -178,8 +173,8 @@ def _points_ratio(matches: Matches, points: Matches) -> float:
     return float((mean[at] / points.inverse_depth[at]).median())
 
 
-def _of_matches(matches: Matches, planes: Tensor | None) -> dict[str, Any]:
-    """Share matched, spread of the depths, and how many lie on the ends of a given range."""
+def _of_matches(matches: Matches, depth_m: Tensor | None, planes: Tensor | None) -> dict[str, Any]:
+    """Share matched, spread of the depths, how far the result lies from them, and how many on the ends."""
     confident = matches.confidence > CONFIDENT
     numbers: dict[str, Any] = {"matched": float(confident.float().mean())}
     inverse_depth = matches.inverse_depth[confident & (matches.inverse_depth > 0)]
@@ -192,78 +187,52 @@ def _of_matches(matches: Matches, planes: Tensor | None) -> dict[str, Any]:
         if planes is not None:
             ends = (inverse_depth - planes[[0, -1], None]).abs().amin(0) < 0.75 * matches.plane_step
             numbers["at_end"] = float(ends.float().mean())
-    return numbers
-
-
-def _off_matches(matches: Matches, depth_m: Tensor) -> float:
-    """How far the depth lies from confident matches; NaN for too few."""
-    at = (matches.confidence > CONFIDENT) & (matches.inverse_depth > matches.plane_step)
-    if int(at.sum()) < FEWEST_MATCHES:
-        return math.nan
-    resized = F.interpolate(depth_m[None].float(), matches.size, mode="nearest-exact")[0]
-    return float((resized * matches.inverse_depth)[at].log().abs().median())
-
-
-def _of_pose(pose: PoseReport) -> dict[str, Any]:
-    """How the poses fit, and mistakes that explain why they do not, but for the inverse pose."""
-    residuals = [px for px in pose.residual_px if not math.isnan(px)]
-    numbers: dict[str, Any] = {"epipolar_px": max(residuals)} if residuals else {}
-    if pose.status == "mistaken":
-        numbers["mistakes"] = tuple(sentence for sentence in pose.warnings if sentence != INVERSE)
+    at = confident & (matches.inverse_depth > matches.plane_step)
+    if depth_m is not None and int(at.sum()) >= FEWEST_MATCHES:
+        resized = F.interpolate(depth_m[None].float(), matches.size, mode="nearest-exact")[0]
+        numbers["off_matches"] = float((resized * matches.inverse_depth)[at].log().abs().median())
     return numbers
 
 
 def read_indicators(
     evidence: Evidence,
     K_left: Tensor,
-    *,
-    order: float,
-    confidence: Tensor | None,
-    on_edge: bool,
     depth_m: Tensor | None = None,
-    doubts: Sequence[str] = (),
+    *,
     range_given: bool = False,
-    own_ratio: float = math.nan,
     has_unit: bool = True,
+    **more: Any,
 ) -> Indicators:
     """The indicators of one image.
 
     Args:
         evidence: of it.
         K_left: ``(3, 3)`` pixels of the native left image.
-        order: rank correlation, NaN where unknown.
-        confidence: ``(1, H, W)``, or ``None``.
-        on_edge: whether the search for the scale ended on the edge of its range.
         depth_m: ``(1, H, W)`` the result, in the unit of the poses.
-        doubts: warnings about the input that forbid trust.
-        range_given: whether that range was given by the user.
-        own_ratio: of the depth over a metric prior's own, NaN for a relative prior.
+        range_given: whether the user gave the range of the search.
         has_unit: whether lengths are in metres, so that the length of a baseline means something.
+        **more: indicators that do not follow from these, by name.
     """
-    matches, points = evidence.sweep_matches, evidence.sweep_points
-    left_01, rights = evidence.native_left, evidence.native
-    numbers: dict[str, Any] = {}
+    matches, pose, rights = evidence.sweep_matches, evidence.pose, evidence.native
     if matches is not None:
-        volume = evidence.volume if range_given else None
-        numbers = _of_matches(matches, None if volume is None else volume.inverse_depth)
-        if depth_m is not None:
-            numbers["off_matches"] = _off_matches(matches, depth_m)
-        if points is not None:
-            numbers["points_ratio"] = _points_ratio(matches, points)
-    if evidence.pose is not None:
-        numbers |= _of_pose(evidence.pose)
+        planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
+        more |= _of_matches(matches, depth_m, planes)
+        if evidence.sweep_points is not None:
+            more["points_ratio"] = _points_ratio(matches, evidence.sweep_points)
+    if pose is not None:
+        more["epipolar_px"] = max((px for px in pose.residual_px if not math.isnan(px)), default=math.nan)
+        if pose.status == "mistaken":
+            more["mistakes"] = tuple(sentence for sentence in pose.warnings if sentence != INVERSE)
+    if evidence.points is not None:
+        more["points"] = int((evidence.points.confidence > 0).sum())
+    if rights and has_unit:
+        more["baseline_m"] = float(rights[0].T_right_from_left[:3, 3].norm())
+    width = evidence.native_left.shape[-1]
     return Indicators(
-        **numbers,
-        confidence=math.nan if confidence is None else float(confidence.mean()),
-        order=order,
-        points=0 if evidence.points is None else int((evidence.points.confidence > 0).sum()),
-        baseline_m=float(rights[0].T_right_from_left[:3, 3].norm()) if rights and has_unit else 0.0,
-        view_deg=2.0 * math.degrees(math.atan(0.5 * left_01.shape[-1] / float(K_left[0, 0]))),
-        own_ratio=own_ratio,
-        doubts=tuple(doubts),
-        same=any(_alike(view.image_01, left_01) for view in rights),
+        **more,
+        view_deg=2.0 * math.degrees(math.atan(0.5 * width / float(K_left[0, 0]))),
+        same=any(_alike(view.image_01, evidence.native_left) for view in rights),
         inverse_fits=INVERSE in evidence.warnings,
-        on_edge=on_edge,
     )
 
 
@@ -278,16 +247,17 @@ def points_agreement(run: Indicators) -> float:
     return min(1.0, max(0.25, 1.0 - 0.75 * (off - POINTS_REPORTED) / (POINTS_WRONG - POINTS_REPORTED)))
 
 
-def _why_points(run: Indicators) -> str | None:
+def _why_points(run: Indicators) -> str:
+    """On points that differ from the views; empty where they do not."""
     ratio = run.points_ratio
     if math.isnan(ratio) or abs(math.log(ratio)) < POINTS_REPORTED:
-        return None
+        return ""
     causes = [text for factor, text in FACTORS.items() if abs(math.log(ratio / factor)) < NEARLY]
     cause = causes[0] if causes else "a unit, the baseline or K may be off by that, or the points want a pose"
     return f"The points lie {ratio:.3g} times as far as what both views match: {cause}."
 
 
-def _why_order(run: Indicators) -> str | None:
+def _why_order(run: Indicators) -> str:
     varied = not run.spread < LEAST_SPREAD
     if run.inverse_fits or (run.order < MOST_EXCHANGED and varied):
         return (
@@ -299,35 +269,28 @@ def _why_order(run: Indicators) -> str | None:
             f"The prior and the matches hardly agree on near and far (rank correlation {run.order:+.2f}): "
             "is E or K wrong, is the order of the images, or does the right image show something else?"
         )
-    return None
+    return ""
 
 
-def _why_matches(run: Indicators) -> str | None:
+def _why_matches(run: Indicators) -> str:
     if math.isnan(run.matched):  # known points alone: nothing that a second view could be wrong about
-        return None
+        return ""
     few = run.matched < LEAST_MATCHED
-    weak = [
-        run.matched < WEAK_MATCHED,
-        run.confidence < WEAK_CONFIDENCE,
-        run.order < WEAK_ORDER,
-        run.epipolar_px > EPIPOLAR_WEAK,
-    ]
-    if not (few or run.confidence < LEAST_CONFIDENCE or sum(weak) > 1):
-        return None
+    weak = (run.matched < WEAK_MATCHED, run.confidence < WEAK_CONFIDENCE, run.order < WEAK_ORDER)
+    count = sum(weak) + (run.epipolar_px > EPIPOLAR_WEAK)
+    if not (few or run.confidence < LEAST_CONFIDENCE or count > 1):
+        return ""
     shares = [f"{100 * run.matched:.0f} % of the left image is matched"] if few or weak[0] else []
     shares += [f"mean confidence is {run.confidence:.2f}"] if weak[1] else []
     shares += [f"rank correlation with the prior is {run.order:.2f}"] if weak[2] and not shares else []
-    cause = (
-        "Likely causes: E along the wrong axis or with a wrong rotation, images that are not rectified or "
-        "whose lens is not corrected, K of another size, a mirrored image, or views of different scenes or "
-        "moments."
+    return (
+        f"Only {' and '.join(shares)}. Likely causes: E along the wrong axis or with a wrong rotation, "
+        "images that are not rectified or whose lens is not corrected, K of another size, a mirrored image, "
+        "or views of different scenes or moments."
     )
-    return f"Only {' and '.join(shares)}. {cause}"
 
 
-def _why_lines(run: Indicators) -> str | None:
-    if not run.epipolar_px > EPIPOLAR_PX:
-        return None
+def _lines(run: Indicators) -> str:
     return (
         f"Matches lie {run.epipolar_px:.1f} px beside their epipolar lines, and no pose near the given one "
         "brings them closer: are the images rectified or the poses right, and is K for them?"
@@ -343,9 +306,8 @@ def _reasons(run: Indicators) -> list[str]:
             f"The baseline is {1000 * run.baseline_m:.3g} mm: was it divided by 1000 once too often? "
             "Baselines and poses are in metres."
         )
-    if run.inverse_fits and order is not None:  # explains what the pose's other mistakes only describe
+    if run.inverse_fits:  # explains what the pose's other mistakes only describe
         reasons.append(order)
-        order = None
     reasons += run.mistakes
     if run.flat:
         reasons.append(
@@ -357,9 +319,8 @@ def _reasons(run: Indicators) -> list[str]:
             f"K gives the left image {run.view_deg:.0f} degrees of view, which no lens without distortion "
             "has: K must be in pixels of this image, not normalised by its size."
         )
-    points = _why_points(run)
-    if points is not None and abs(math.log(run.points_ratio)) > POINTS_WRONG:
-        reasons.append(points)
+    if _log(run.points_ratio) > POINTS_WRONG:
+        reasons.append(_why_points(run))
     if 0 < run.points < LEAST_POINTS and math.isnan(run.matched):
         reasons.append(
             f"Too few known depths to fix both scale and shift, {run.points}; give at least {LEAST_POINTS}."
@@ -369,9 +330,13 @@ def _reasons(run: Indicators) -> list[str]:
             f"The depth differs by {100 * math.expm1(run.off_matches):.0f} %, in the median, from what both "
             "views match: the scale or the shift was not found."
         )
-    lines = _why_lines(run) if run.epipolar_px > EPIPOLAR_WRONG else None
-    matches = _why_matches(run)
-    return reasons + [sentence for sentence in (order, lines, matches) if sentence is not None]
+    reasons += ["" if run.inverse_fits else order, _lines(run) if run.epipolar_px > EPIPOLAR_WRONG else ""]
+    return [sentence for sentence in (*reasons, _why_matches(run)) if sentence]
+
+
+def _log(ratio: float) -> float:
+    """Size of the log of a ratio; 0 for NaN or 0."""
+    return abs(math.log(ratio)) if ratio > 0 else 0.0
 
 
 def _remarks(run: Indicators, trusted: bool) -> list[str]:
@@ -381,19 +346,17 @@ def _remarks(run: Indicators, trusted: bool) -> list[str]:
             f"K gives the left image a field of view of {run.view_deg:.0f} degrees: is it for an image of "
             "another size?"
         )
-    if run.own_ratio > 0 and abs(math.log(run.own_ratio)) > OWN_METRES:
+    if _log(run.own_ratio) > OWN_METRES:
         remarks.append(
             f"The depth is {run.own_ratio:.2g} times the prior's own metres: is the baseline in metres, "
             "and K for an image of this size? Or is the scene of a kind that the prior does not know?"
         )
-    points = _why_points(run)
-    if points is not None and abs(math.log(run.points_ratio)) <= POINTS_WRONG:
-        remarks.append(points)
+    if _log(run.points_ratio) <= POINTS_WRONG and (sentence := _why_points(run)):
+        remarks.append(sentence)
     if 0 < run.points < LEAST_POINTS and not math.isnan(run.matched):
         remarks.append(f"Known depths that lie in the image: {run.points}, too few to rely on.")
-    lines = _why_lines(run)
-    if lines is not None and not run.epipolar_px > EPIPOLAR_WRONG:
-        remarks.append(lines)
+    if EPIPOLAR_PX < run.epipolar_px <= EPIPOLAR_WRONG:
+        remarks.append(_lines(run))
     if run.on_edge and (not trusted or run.at_end > MOST_AT_END):
         remarks.append(
             "The search for the scale ended on the edge of its range: the depth may lie beyond it. Check the "

@@ -60,6 +60,9 @@ def fit_to_points(
 ) -> tuple[Tensor, Tensor]:
     """Depths of the two ends of a relative map that explain the points best.
 
+    The best of 1128 log-spaced pairs in mean Cauchy cost of inverse depth, so that some points may be wrong.
+    Coarse: ``refine_to_matches`` does the rest.
+
     Args:
         x: ``(B, 1, h, w)`` relative maps of one image.
         points: of that image.
@@ -67,8 +70,7 @@ def fit_to_points(
         current: ``(near_m, far_m)``, ``(B,)`` each, in use; they stay unless a better basin shows up.
 
     Returns:
-        ``near_m, far_m``, ``(B,)``: the best of 1128 log-spaced pairs in mean Cauchy cost of
-        inverse depth, so that some points may be wrong. Coarse: ``refine_to_matches`` does the rest.
+        ``near_m, far_m``, ``(B,)``.
     """
     at = points.above(0.0)
     at = at[:: max(1, -(-len(at) // BASIN_SAMPLES))]
@@ -101,6 +103,13 @@ def refine_to_matches(
 ) -> tuple[Tensor, Tensor]:
     """Robust fit of the two ends of a relative map to matches, started from the search's result.
 
+    Matches alone have outliers, so they refine what the lookup found and never replace it: far stays within a
+    factor of 2 of the start. Residuals are in the logarithm of inverse depth and the noise of a match
+    together: relative where matches are exact, even for noise of either sign near infinity, where a plain
+    logarithm favours matches that err towards the camera. Each is in units of its match's own noise and of
+    what the map leaves over, which is measured at every iteration: a map that is right is fitted to the noise
+    of its matches, a map that errs as a whole.
+
     Args:
         x: ``(B, 1, h, w)`` relative maps of one image.
         matches: of that image; or known points.
@@ -109,12 +118,7 @@ def refine_to_matches(
         space: as in ``search_scale``.
 
     Returns:
-        ``near_m, far_m``, far within a factor of 2 of the start: matches alone have outliers, so they
-        refine what the lookup found and never replace it. Residuals are in the logarithm of inverse depth and
-        the noise of a match together: relative where matches are exact, even for noise of either sign near
-        infinity, where a plain logarithm favours matches that err towards the camera. Each is in units of its
-        match's own noise and of what the map leaves over, which is measured at every iteration: a map that
-        is right is fitted to the noise of its matches, one that errs as a whole.
+        ``near_m, far_m``, ``(B,)``.
     """
     at = matches.above(0.0)  # points are few: not one may be missed
     if not len(at):
@@ -126,13 +130,12 @@ def refine_to_matches(
     fitted = _Fitted(inverse, confidence, doubt.sqrt(), FIT_NOISE * matches.plane_step)
     values = _values_at(x, matches.size, at)
     form = SPACES[space]
-    start = _ends(form, near_m, far_m)
-    reach = _ends(form, near_m / math.exp(NEAR_REACH), far_m / math.exp(FAR_REACH))
-    other = _ends(form, near_m * math.exp(NEAR_REACH), far_m * math.exp(FAR_REACH))
-    low, high = torch.minimum(reach, other), torch.maximum(reach, other)
-    ends = start
+    ends = _ends(form, near_m, far_m)
+    lower = _ends(form, near_m / math.exp(NEAR_REACH), far_m / math.exp(FAR_REACH))
+    upper = _ends(form, near_m * math.exp(NEAR_REACH), far_m * math.exp(FAR_REACH))
+    bounds = torch.minimum(lower, upper), torch.maximum(lower, upper)
     for _ in range(FIT_ITERATIONS):
-        ends = _refine_once(form, ends, values, fitted, (low, high))
+        ends = _refine_once(form, ends, values, fitted, bounds)
     at_zero, at_one = (form.forward(end, torch.ones_like(end)) for end in ends.unbind(1))
     return ordered(*form.ends(at_zero, at_one))
 
@@ -148,13 +151,9 @@ def ordered(near_m: Tensor, far_m: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Fitted(NamedTuple):
-    """What a map is fitted to, of P matches.
+    """Of P matches, ``(P,)`` each: inverse depth >= 0, confidence, and doubt, a deviation in units of noise.
 
-    Attributes:
-        inverse: ``(P,)`` inverse depth, 1/m, >= 0.
-        trusted: ``(P,)`` confidence.
-        doubt: ``(P,)``, standard deviation in units of ``noise``.
-        noise: ``()``, that of a match of the reference confidence, 1/m.
+    ``noise``, ``()``, is that of a match of the reference confidence, 1/m.
     """
 
     inverse: Tensor
@@ -238,7 +237,7 @@ def _values_at(x: Tensor, size: tuple[int, int], at: Tensor) -> Tensor:
 def weighted_quantile(values: Tensor, weight: Tensor, share: float | Tensor) -> Tensor:
     """``(B,)`` of rows ``(B, P)`` with weights >= 0 of the same shape; ``share`` .5 is the median.
 
-    ``share`` may be ``(B, 1)``, one of each row.
+    ``share`` may be ``(B, 1)``, another for each row.
     """
     values, order = values.sort(dim=1)
     below = weight.gather(1, order).cumsum(1)

@@ -20,17 +20,11 @@ FLOOR_EPS = 0.001
 
 
 def smooth_floor(x: Tensor, eps: float = FLOOR_EPS) -> Tensor:
-    """Keep ``x`` above 0 with a gradient that is never zero.
+    """Keep relative values ``x``, about [0, 1] but unbounded, above 0 with a gradient that is never zero.
 
-    Args:
-        x: any shape, relative values, about [0, 1] but unbounded.
-        eps: value at ``x = 0``; far above 0 the result exceeds ``x`` by ``eps**2 / x``.
-
-    Returns:
-        ``(x + sqrt(x^2 + 4 eps^2)) / 2``, same shape, > 0. Its slope falls only as ``(eps / x)^2``
-        below 0, so that a clipped pixel can still be pulled back (a softplus would underflow).
-
-    Source: not in the paper, which needs ``D(z) >= 0`` for Eq. 13 and never says why it would be.
+    ``(x + sqrt(x^2 + 4 eps^2)) / 2`` is ``eps`` at 0; far above 0 it exceeds ``x`` by ``eps**2 / x``. Its
+    slope falls only as ``(eps / x)^2`` below 0, so that a clipped pixel can still be pulled back (a softplus
+    would underflow). Not in the paper, which needs ``D(z) >= 0`` for Eq. 13 and never says why it would be.
     """
     root = torch.sqrt(x * x + 4.0 * eps * eps)
     # Below 0 the sum would cancel, and neighbouring values become equal in float32.
@@ -71,9 +65,7 @@ class AffineState:
 class SquareAffine(AffineState):
     """Scale and shift as squares that start at 1, as Marigold-DC has them.
 
-    Attributes:
-        unit_scale: ``(B,)`` what a raw scale of 1 stands for.
-        unit_shift: ``(B,)`` the same for the shift.
+    ``unit_scale (B,)`` is what a raw scale of 1 stands for, ``unit_shift (B,)`` the same for the shift.
     """
 
     unit_scale: Tensor
@@ -183,28 +175,18 @@ class MetricMap:
         return x.clamp(0.0, 1.0) if self.positive == SQUARE else x
 
     def __call__(self, x: Tensor, affine: AffineState) -> Tensor:
-        """Metric depth of a relative map.
+        """Metric depth ``(B, 1, H, W)`` of an unclipped relative map ``x (B, 1, H, W)``, metres, > 0.
 
-        Args:
-            x: ``(B, 1, H, W)`` unclipped relative map.
-            affine: per-sample scale, shift and global scale.
-
-        Returns:
-            ``(B, 1, H, W)`` metres, > 0, differentiable in ``x``, ``s_hat`` and ``t_hat``; linear in ``g_s``.
+        Differentiable in ``x``, ``s_hat`` and ``t_hat``; linear in ``g_s``.
         """
         s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
         confined = self.confine(x) if self.positive == SQUARE else smooth_floor(x)
         return SPACES[self.space].forward(s * confined + t, g)
 
     def relative(self, depth_m: Tensor, affine: AffineState) -> Tensor:
-        """The relative map of a metric depth; inverse of the call.
+        """The relative map of a metric depth ``(B, 1, H, W)``; inverse of the call.
 
-        Args:
-            depth_m: ``(B, 1, H, W)`` metres, > 0.
-            affine: per-sample scale, shift and global scale.
-
-        Returns:
-            ``(B, 1, H, W)``; below 0 no further than where the smooth floor has lost half of its height.
+        It is below 0 no further than where the smooth floor has lost half of its height.
         """
         s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
         floored = (SPACES[self.space].inverse(depth_m / g) - t) / s
@@ -214,15 +196,10 @@ class MetricMap:
         return floored - FLOOR_EPS**2 / floored
 
     def from_range(self, near_m: Tensor, far_m: Tensor) -> AffineState:
-        """The affine state under which the two ends of the map have the given depths.
+        """The affine state under which the two ends of a map have the depths, ``(B,)`` metres.
 
-        Args:
-            near_m: ``(B,)`` metres, depth of the nearest end: of ``x = 0`` where the space grows with depth,
-                of ``x = 1`` where it falls.
-            far_m: ``(B,)`` metres, depth of the other end.
-
-        Returns:
-            State with ``g_s`` as ``Space.from_ends`` chooses it.
+        ``near_m`` is that of ``x = 0`` where the space grows with depth, of ``x = 1`` where it falls; ``g_s``
+        is as ``Space.from_ends`` chooses it.
         """
         s, t, g = SPACES[self.space].from_ends(*SPACES[self.space].ends(near_m.float(), far_m.float()))
         tiny = 1e-4  # a flat map is legal; softplus cannot reach 0
@@ -234,5 +211,4 @@ class MetricMap:
     def range_of(self, affine: AffineState) -> tuple[Tensor, Tensor]:
         """Nearest and farthest depth in metres, ``(B,)`` each; inverse of ``from_range``."""
         space, s, t, g = SPACES[self.space], affine.scale, affine.shift, affine.g_s
-        zero, one = torch.zeros_like(s), torch.ones_like(s)
-        return space.ends(space.forward(s * zero + t, g), space.forward(s * one + t, g))
+        return space.ends(space.forward(t, g), space.forward(s + t, g))

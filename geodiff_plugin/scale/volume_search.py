@@ -1,9 +1,8 @@
 """Search for the scale of a relative map, by lookup in a plane-sweep volume.
 
-S7.3 (pre-selection of g_s, "a variant of the traditional Plane Sweep Volume technique").
-
-The paper's one number, x = g_s x_rel, prefers depths at which every pixel leaves the right image;
-(near, far) jointly, on pixels that stay in view, does not (docs/reference/paper-map.md).
+S7.3 (pre-selection of g_s, "a variant of the traditional Plane Sweep Volume technique"). The paper's single
+number, x = g_s x_rel, prefers depths at which every pixel leaves the right image; (near, far) jointly, on
+pixels that stay in view, does not (docs/reference/paper-map.md).
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ def _sample_positions(height: int, width: int, samples: int, device: torch.devic
 
 
 def _lookup(
-    volume_cost: Tensor, in_view: Tensor, inverse_depth: Tensor, depth_m: Tensor, clamp: float
+    volume_cost: Tensor, in_view: Tensor, inverse_depth: Tensor, depth_m: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Mean clamped cost and share in view ``(M,)`` of candidate depths ``(M, P)``, linear between planes."""
     planes = inverse_depth.shape[0]
@@ -70,9 +69,9 @@ def _lookup(
     below = position.floor().clamp_max(planes - 2).long()
     weight = position - below
     cost = torch.lerp(volume_cost.gather(0, below), volume_cost.gather(0, below + 1), weight)
-    cost = cost.clamp_max(clamp)
+    cost = cost.clamp_max(COST_CLAMP)
     # Beyond the nearest plane nothing is known: as bad as an outlier, and not out of view.
-    cost = torch.where(inside, cost, torch.full_like(cost, clamp))
+    cost = torch.where(inside, cost, torch.full_like(cost, COST_CLAMP))
     counted = in_view.gather(0, below) | ~inside
     count = counted.sum(1)
     return (cost * counted).sum(1) / count.clamp_min(1), count / depth_m.shape[1]
@@ -86,9 +85,11 @@ def search_scale(
     *,
     depth_range: tuple[float, float] | None = None,
     current: tuple[Tensor, Tensor] | None = None,
-    known: Tensor | None = None,
+    valid: Tensor | None = None,
 ) -> ScaleSearch:
     """Depths of the two ends of a relative map that the two views agree on best.
+
+    1128 pairs (near, far), log-spaced, then two finer grids around the best.
 
     Args:
         volume: plane-sweep costs of the image.
@@ -97,18 +98,15 @@ def search_scale(
         depth_range: ``(near, far)`` metres, bounds of the search; by default from the volume's nearest
             plane to where the shift is 0.3 px.
         current: nearest and farthest depth in use, ``(B,)`` each, to be kept unless a better basin shows up.
-        known: ``(1, 1, H, W)`` bool, the pixels of the maps that count; ``None`` for all.
-
-    Returns:
-        ``ScaleSearch``. 1128 pairs (near, far), log-spaced, then two finer grids around the best.
+        valid: ``(1, 1, H, W)`` bool, the pixels of the maps that count; ``None`` for all.
 
     Source: S7.3. Deviation: two numbers instead of one, clamped census cost instead of L_geo.
     """
     low, high = volume.reach_m if depth_range is None else depth_range
     height, width = volume.size
     at = _sample_positions(height, width, SAMPLES, x.device)
-    if known is not None:
-        inside = F.interpolate(known.float(), (height, width), mode="nearest-exact").flatten()[at] > 0
+    if valid is not None:
+        inside = F.interpolate(valid.float(), (height, width), mode="nearest-exact").flatten()[at] > 0
         at = at[inside] if bool(inside.any()) else at
     cost, in_view = volume.at_pixels(at)
     least = IN_VIEW_RECTIFIED if volume.rectified else IN_VIEW_POSED
@@ -117,7 +115,7 @@ def search_scale(
     def best_of(row: Tensor, near: Tensor, far: Tensor, every: int = 1) -> tuple[Tensor, Tensor, Tensor]:
         """The best of candidate ends ``(M,)`` for the values of one map, and its cost, ``(1,)`` each."""
         depth = SPACES[space].depth_at(row[None, ::every], near[:, None], far[:, None])
-        mean, share = _lookup(cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth, COST_CLAMP)
+        mean, share = _lookup(cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth)
         mean = mean + (share < least) * 1.0  # only if no pair keeps enough in view does one of these win
         k = mean.argmin(keepdim=True)  # a 0-d index would be read back
         return near[k], far[k], mean[k]
@@ -159,16 +157,9 @@ def _coarse_to_fine(
 
 
 def argmin_over(candidates: Tensor, cost: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """The candidate of least cost per sample, and whether it is the first or the last one.
+    """The candidate ``(M,)`` of least cost per sample ``(B,)``, and whether it is the first or the last.
 
-    Args:
-        candidates: ``(M,)``.
-        cost: one candidate (0-d) -> ``(B,)``.
-
-    Returns:
-        best ``(B,)`` and ``on_edge (B,)`` bool.
-
-    Source: S7.3, ``g_s* = argmin L_geo``.
+    ``cost`` takes a candidate (0-d) and gives ``(B,)``. Source: S7.3, ``g_s* = argmin L_geo``.
     """
     with torch.no_grad():
         index = torch.stack([cost(c) for c in candidates]).argmin(0)

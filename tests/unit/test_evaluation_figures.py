@@ -136,7 +136,7 @@ def test_terms_shows_the_guided_method_and_what_it_started_from(plane_sample, ti
         used.append(estimate.matches.confidence)
         return 0.0 * estimate.z0.flatten(1).mean(1)
 
-    monkeypatch.setitem(TERMS, "spy", Term(spy, needs_matches=True))
+    monkeypatch.setitem(TERMS, "spy", Term(spy, "matches"))
     views = plane_sample.right, (plane_sample.K_left, plane_sample.K_right), plane_sample.E
     priors.get(tiny_settings)(
         Image.fromarray(plane_sample.left),

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from transformers import DPTConfig, DPTForDepthEstimation, GLPNConfig, GLPNForDepthEstimation
 
-from geodiff_plugin.algorithm.objective import Objective
+from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.evaluation.baselines import (
     FAMILIES,
     METHODS,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from geodiff_plugin.algorithm.evidence import chunk_views, prepare_evidence
-from geodiff_plugin.algorithm.objective import Objective
+from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.scale.space import MetricMap

@@ -11,6 +11,7 @@ from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState
 
 photometric = TERMS["photometric"].function
+FLAT = DEFAULT.changed(pyramid_levels=1)
 
 
 def estimate(**changes):
@@ -37,8 +38,7 @@ def estimate(**changes):
 
 @pytest.mark.parametrize("name", [n for n in TERMS if n != "prior_pull"])
 def test_a_perfect_estimate_costs_nothing(name):
-    term = TERMS[name]
-    value = term.function(estimate(), **{key: getattr(DEFAULT, key) for key in term.options})
+    value = TERMS[name].function(estimate())
     torch.testing.assert_close(value, torch.zeros(2), atol=1e-5, rtol=0)
 
 
@@ -47,9 +47,9 @@ def test_photometric_ignores_what_is_not_visible():
     warped[..., 20:] = 0.0
     seen = torch.zeros(2, 1, 1, 32, 40, dtype=torch.bool)
     seen[..., :18] = True  # SSIM looks one pixel around
-    masked = photometric(estimate(warped_01=warped, visible=seen), pyramid_levels=1)
+    masked = photometric(estimate(warped_01=warped, visible=seen, config=FLAT))
     torch.testing.assert_close(masked, torch.zeros(2), atol=1e-5, rtol=0)
-    assert (photometric(estimate(warped_01=warped), pyramid_levels=1) > 0.1).all()
+    assert (photometric(estimate(warped_01=warped, config=FLAT)) > 0.1).all()
 
 
 def test_photometric_takes_the_view_that_explains_a_pixel_best():
@@ -57,10 +57,9 @@ def test_photometric_takes_the_view_that_explains_a_pixel_best():
     good, bad = left.clone(), torch.zeros_like(left)
     first, second = good.clone(), bad.clone()
     first[..., 20:], second[..., 20:] = 0.0, left[..., 20:]
-    both = estimate(
-        warped_01=torch.stack([first, second], 1), visible=torch.ones(2, 2, 1, 32, 40, dtype=torch.bool)
-    )
-    seam = photometric(both, pyramid_levels=1)  # SSIM looks one pixel across the seam
+    seen = torch.ones(2, 2, 1, 32, 40, dtype=torch.bool)
+    both = estimate(warped_01=torch.stack([first, second], 1), visible=seen, config=FLAT)
+    seam = photometric(both)  # SSIM looks one pixel across the seam
     assert (seam < 0.03).all() and (photometric(estimate(warped_01=first[:, None])) > 0.2).all()
     hidden = both.visible.clone()
     hidden[:, 1] = False
@@ -77,7 +76,9 @@ def test_points_robust_and_in_metres():
     c2 = CAUCHY**2
     expected = torch.full((2,), c2 / 2 * float(torch.log1p(torch.tensor(20.0**2 / c2))))
     torch.testing.assert_close(points(off), expected)
-    torch.testing.assert_close(points(off, points_loss="l1l2"), torch.full((2,), 0.5 + 0.25))
+    torch.testing.assert_close(
+        points(off._replace(config=DEFAULT.changed(points_loss="l1l2"))), torch.full((2,), 0.5 + 0.25)
+    )
 
 
 @pytest.mark.parametrize("points_loss", ["robust", "l1l2"])
@@ -90,10 +91,10 @@ def test_points_gradient_in_float64(points_loss):
         known,
         known.new_tensor([0.01]),
     )
-    base = estimate(points=target)
+    base = estimate(points=target, config=DEFAULT.changed(points_loss=points_loss))
 
     def loss(d):
-        return TERMS["points"].function(Compared(**{**base.__dict__, "depth_m": d}), points_loss=points_loss)
+        return TERMS["points"].function(base._replace(depth_m=d))
 
     assert torch.autograd.gradcheck(loss, depth.requires_grad_())
     (grad,) = torch.autograd.grad(loss(depth).sum(), depth)
@@ -111,10 +112,10 @@ def test_photometric_gradient_in_float64():
     left = torch.rand(1, 3, 26, 25, generator=g, dtype=torch.float64)
     warped = torch.rand(1, 2, 3, 26, 25, generator=g, dtype=torch.float64)
     seen = torch.rand(1, 2, 1, 26, 25, generator=g) < 0.8
-    base = estimate(left_01=left, visible=seen)
+    base = estimate(left_01=left, visible=seen, config=DEFAULT.changed(pyramid_levels=2))
 
     def loss(w):
-        return photometric(Compared(**{**base.__dict__, "warped_01": w}), pyramid_levels=2)
+        return photometric(base._replace(warped_01=w))
 
     warped.requires_grad_()
     (grad,) = torch.autograd.grad(loss(warped).sum(), warped)
@@ -150,8 +151,9 @@ def test_no_matches_cost_nothing_and_pull_nothing():
 
 def test_prior_pull_anchors():
     pull = TERMS["prior_pull"].function
-    torch.testing.assert_close(pull(estimate(), pull_to="start"), torch.zeros(2))
-    torch.testing.assert_close(pull(estimate(), pull_to="zero"), torch.tensor([0.09 + 1.0, 4.0 + 0.25]))
+    torch.testing.assert_close(pull(estimate()), torch.zeros(2))
+    to_zero = estimate(config=DEFAULT.changed(pull_to="zero"))
+    torch.testing.assert_close(pull(to_zero), torch.tensor([0.09 + 1.0, 4.0 + 0.25]))
 
 
 def test_anchor_holds_what_no_match_holds():

@@ -106,7 +106,7 @@ def signs_of(pose) -> Indicators:
         sweep_matches=None, sweep_points=None, volume=None, points=None, warnings=(), pose=pose
     )
     evidence.native_left, evidence.native = torch.zeros(3, 8, 8), ()
-    return read_indicators(evidence, torch.eye(3), order=math.nan, confidence=None, on_edge=False)
+    return read_indicators(evidence, torch.eye(3), order=math.nan)
 
 
 def test_signs_of_poses():
@@ -147,7 +147,7 @@ def test_points_are_held_against_matches(textured_plane):
     left = torch.from_numpy(textured_plane.left).permute(2, 0, 1)[None].float() / 255
     (evidence,) = guidance.prepare(left)
     given = (evidence, torch.as_tensor(K).float())
-    known = {"order": 1.0, "confidence": None, "on_edge": False}
+    known = {"order": 1.0}
     assert read_indicators(*given, **known).points_ratio == pytest.approx(3.0, rel=0.1)
 
 
