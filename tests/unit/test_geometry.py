@@ -1,156 +1,137 @@
-"""Cameras, projection, warping: invariants and closed forms."""
+"""Cameras, projection, warping: against ``z (u, v, 1) = K p`` in NumPy, with a skew and in any pose."""
 
 from __future__ import annotations
 
-import math
-
+import numpy as np
 import pytest
 import torch
-from kornia.geometry.linalg import inverse_transformation, relative_transformation
+from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import geometry as g
 
 SIZE = (24, 32)
+K = np.array([[31.0, 7.0, 14.2], [0.0, 28.0, 12.7], [0.0, 0.0, 1.0]])
+K_RIGHT = np.array([[36.0, -4.0, 17.0], [0.0, 33.0, 10.0], [0.0, 0.0, 1.0]])
 
 
-def rotation(axis, angle, dtype=torch.float64):
-    axis = torch.tensor(axis, dtype=dtype)
-    x, y, z = axis / axis.norm()
-    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=dtype)
-    return torch.eye(3, dtype=dtype) + math.sin(angle) * skew + (1 - math.cos(angle)) * (skew @ skew)
+def camera(f=30.0, cx=15.5, cy=11.5) -> np.ndarray:
+    return np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
 
 
-def pose(axis=(0, 1, 0), angle=0.0, at=(0, 0, 0), dtype=torch.float64):
-    E = torch.eye(4, dtype=dtype)
-    E[:3, :3] = rotation(axis, angle, dtype)
-    E[:3, 3] = torch.tensor(at, dtype=dtype)
-    return E[None]
+def T_of(at=(0.0, 0.0, 0.0), axis=(0, 1, 0), angle=0.0) -> np.ndarray:
+    """``T_right_from_left`` of a right camera at a place, turned about an axis."""
+    E = np.eye(4)
+    E[:3, :3] = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix()
+    E[:3, 3] = at
+    return np.linalg.inv(E)
 
 
-def camera(f=30.0, cx=15.5, cy=11.5, fy=None, dtype=torch.float64):
-    return torch.tensor([[[f, 0, cx], [0, fy or f, cy], [0, 0, 1]]], dtype=dtype)
+def tensor(x) -> torch.Tensor:
+    return torch.as_tensor(np.asarray(x), dtype=torch.float64)[None]
 
 
-def depth_map(seed=0, batch=1, size=SIZE, near=1.0, far=4.0):
-    generator = torch.Generator().manual_seed(seed)
-    return near + (far - near) * torch.rand(batch, 1, *size, generator=generator, dtype=torch.float64)
+def pixels(size) -> np.ndarray:
+    """``(3, H, W)`` homogeneous."""
+    v, u = np.mgrid[: size[0], : size[1]].astype(float)
+    return np.stack([u, v, np.ones_like(u)])
 
 
-def pixel_grid(size):
-    v, u = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
-    return torch.stack([u, v], dim=-1).double()[None]
+def points_of(depth_m, K) -> np.ndarray:
+    return np.einsum("ij,jhw->ihw", np.linalg.inv(K), pixels(depth_m.shape)) * depth_m
 
 
-@pytest.mark.parametrize("size_to", [(48, 64), (12, 20), (24, 32), (7, 5)])
-def test_resized_intrinsics_keep_edges_in_place(size_to):
-    K = camera(f=31.0, fy=29.0, cx=14.2, cy=12.7)
-    resized = g.resize_intrinsics(K, SIZE, size_to)
-    sx, sy = size_to[1] / SIZE[1], size_to[0] / SIZE[0]
-    corner = torch.tensor([-0.5, -0.5, 1.0], dtype=torch.float64)
-    far_corner = torch.tensor([SIZE[1] - 0.5, SIZE[0] - 0.5, 1.0], dtype=torch.float64)
-    ray, far_ray = torch.linalg.solve(K[0], corner), torch.linalg.solve(K[0], far_corner)
-    torch.testing.assert_close(resized[0] @ ray, corner)
-    expected = torch.tensor([size_to[1] - 0.5, size_to[0] - 0.5, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(resized[0] @ far_ray, expected)
-    assert resized[0, 0, 0] == pytest.approx(31.0 * sx) and resized[0, 1, 1] == pytest.approx(29.0 * sy)
-    torch.testing.assert_close(g.resize_intrinsics(resized, size_to, SIZE), K)
+def uv_of(points, K) -> np.ndarray:
+    seen = np.einsum("ij,jhw->ihw", K, points)
+    return seen[:2] / seen[2]
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.3, math.pi])
-def test_nearest_rotation_is_proper_and_close(angle):
-    generator = torch.Generator().manual_seed(1)
-    exact = rotation((1, 2, 3), angle)
-    noisy = exact + 1e-3 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
-    nearest = g.nearest_rotation(noisy)
-    torch.testing.assert_close(nearest @ nearest.T, torch.eye(3, dtype=torch.float64))
-    assert torch.linalg.det(nearest) == pytest.approx(1.0)
-    assert (nearest - exact).norm() < 4e-3
-    torch.testing.assert_close(g.nearest_rotation(exact), exact)
+def last(x: torch.Tensor) -> np.ndarray:
+    """``(1, H, W, C)`` as ``(C, H, W)``."""
+    return x[0].permute(2, 0, 1).numpy()
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_project_undoes_unproject(seed):
-    depth = depth_map(seed, batch=2)
-    K = torch.cat([camera(), camera(f=12.0, fy=50.0, cx=3.0, cy=20.0)])
-    uv, z = g.project(g.unproject(depth, K), K)
-    torch.testing.assert_close(uv, pixel_grid(SIZE).expand(2, -1, -1, -1))
-    torch.testing.assert_close(z, depth[:, 0])
+@pytest.mark.parametrize(
+    ("pose", "size_right"),
+    [
+        ({"at": (0.2, -0.05, 0.3)}, (24, 32)),
+        ({"axis": (0.2, 1, 0.1), "angle": 0.15}, (48, 64)),
+        ({}, (30, 20)),
+    ],
+)
+def test_projection_and_warp_are_the_definition(seed, pose, size_right):
+    depth = 1.0 + 3.0 * np.random.default_rng(seed).random(SIZE)
+    T, K_r = T_of(**pose), g.resize_intrinsics(tensor(K_RIGHT), SIZE, size_right)[0].numpy()
+    points = points_of(depth, K)
+    in_right = np.einsum("ij,jhw->ihw", T[:3, :3], points) + T[:3, 3, None, None]
+    expected = uv_of(in_right, K_r)
+    cloud = g.unproject(tensor(depth)[None], tensor(K))
+    np.testing.assert_allclose(last(cloud), points, atol=1e-12)
+    moved = g.transform(cloud, tensor(T))
+    np.testing.assert_allclose(last(moved), in_right, atol=1e-12)
+    rays = g.plane_rays(tensor(K), tensor(K_r), tensor(T), SIZE)
+    for uv, z in (g.project(moved, tensor(K_r)), g.project_rays(tensor(depth)[None], rays)):
+        np.testing.assert_allclose(last(uv), expected, atol=1e-9)
+        np.testing.assert_allclose(z[0], in_right[2], atol=1e-12)
+    # An image that is its own coordinates reads back the right pixel.
+    ramp = tensor(pixels(size_right)[:2])
+    for known in ({}, {"rays": rays}):
+        warped = g.warp_right_to_left(ramp, tensor(depth)[None], tensor(K), tensor(K_r), tensor(T), **known)
+        limits = np.array([size_right[1] - 1, size_right[0] - 1])[:, None, None]
+        inside = ((expected >= 0) & (expected <= limits)).all(0)
+        np.testing.assert_array_equal(warped.visible[0, 0], inside)
+        assert 0.3 < inside.mean()
+        np.testing.assert_allclose(warped.image[0].numpy()[:, inside], expected[:, inside], atol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.15, 2.5])
-def test_rays_equal_unproject_transform_project(angle):
-    depth = depth_map(3)
-    T = relative_transformation(pose((0.2, 1, 0.1), angle, (0.4, -0.1, 0.2)), pose())
-    K_left, K_right = camera(), camera(f=45.0, cx=20.0, cy=9.0)
-    uv, z = g.project(g.transform(g.unproject(depth, K_left), T), K_right)
-    rays = g.plane_rays(K_left, K_right, T, SIZE)
-    uv_rays, z_rays = g.project_rays(depth, rays)
-    torch.testing.assert_close(z_rays, z)
-    torch.testing.assert_close(uv_rays, uv)
+@pytest.mark.parametrize("size_to", [(48, 64), (12, 20), (7, 5)])
+def test_a_resized_image_shows_a_point_where_its_camera_says(size_to):
+    depth = 1.0 + np.random.default_rng(0).random(SIZE)
+    resized = g.resize_intrinsics(tensor(K), SIZE, size_to)
+    scale = np.array([size_to[1] / SIZE[1], size_to[0] / SIZE[0]])[:, None, None]
+    expected = (pixels(SIZE)[:2] + 0.5) * scale - 0.5
+    np.testing.assert_allclose(uv_of(points_of(depth, K), resized[0].numpy()), expected, atol=1e-9)
+    torch.testing.assert_close(g.resize_intrinsics(resized, size_to, SIZE), tensor(K))
+    image = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
+    small, K_small = g.resize_image(image, tensor(K)[0], size_to)
+    assert small.shape == (3, *size_to) and torch.equal(K_small, resized[0])
+    same, K_same = g.resize_image(image, tensor(K)[0], SIZE)
+    assert same is image and torch.equal(K_same, tensor(K)[0])
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, np.pi])
+def test_nearest_rotation_is_that_of_scipy(angle):
+    exact = Rotation.from_rotvec(angle * np.array([1, 2, 3]) / 14**0.5).as_matrix()
+    noisy = exact + 1e-3 * np.random.default_rng(1).normal(size=(3, 3))
+    nearest = g.nearest_rotation(tensor(noisy))[0].numpy()
+    np.testing.assert_allclose(nearest, Rotation.from_matrix(noisy).as_matrix(), atol=2e-3)
+    np.testing.assert_allclose(nearest @ nearest.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(g.nearest_rotation(tensor(exact))[0], exact, atol=1e-12)
 
 
 def test_zero_baseline_is_the_identity():
-    generator = torch.Generator().manual_seed(0)
-    image = torch.rand(2, 3, *SIZE, generator=generator)
-    depth = depth_map(1, batch=2).float()
-    K, T = camera(dtype=torch.float32).expand(2, -1, -1), torch.eye(4).expand(2, -1, -1)
-    warped = g.warp_right_to_left(image, depth, K, K, T)
+    image = torch.rand(2, 3, *SIZE, generator=torch.Generator().manual_seed(0))
+    depth = 1.0 + 3.0 * torch.rand(2, 1, *SIZE, generator=torch.Generator().manual_seed(1))
+    cameras = [tensor(m).float().expand(2, -1, -1) for m in (K, K, np.eye(4))]
+    warped = g.warp_right_to_left(image, depth, *cameras)
     torch.testing.assert_close(warped.image, image, atol=1e-5, rtol=0)
-    assert warped.visible.all()
-    assert not g.hidden_in_right(depth, K, K, T, SIZE).any()
-
-
-@pytest.mark.parametrize("size_right", [(24, 32), (48, 64), (30, 20)])
-def test_own_size_and_intrinsics_of_the_right_view(size_right):
-    """A linear ramp as the right image reads back the analytic right pixel."""
-    K_right = g.resize_intrinsics(camera(f=33.0, cx=17.0, cy=10.0), SIZE, size_right)
-    ramp = pixel_grid(size_right).permute(0, 3, 1, 2)  # (1, 2, Hr, Wr): its own pixel coordinates
-    depth = torch.full((1, 1, *SIZE), 2.5, dtype=torch.float64)
-    T = relative_transformation(pose(at=(0.2, -0.05, 0.3)), pose())
-    warped = g.warp_right_to_left(ramp, depth, camera(), K_right, T)
-    u, v = pixel_grid(SIZE).unbind(-1)
-    x, y, z = (u - 15.5) / 30 * 2.5 - 0.2, (v - 11.5) / 30 * 2.5 + 0.05, 2.5 - 0.3
-    expected_u = K_right[0, 0, 0] * x / z + K_right[0, 0, 2]
-    expected_v = K_right[0, 1, 1] * y / z + K_right[0, 1, 2]
-    torch.testing.assert_close(warped.uv, torch.stack([expected_u, expected_v], dim=-1))
-    inside = (expected_u >= 0) & (expected_u <= size_right[1] - 1)
-    inside &= (expected_v >= 0) & (expected_v <= size_right[0] - 1)
-    assert torch.equal(warped.visible[:, 0], inside) and 0.4 < inside.double().mean() < 1.0
-    read = warped.image.permute(0, 2, 3, 1)[inside]
-    torch.testing.assert_close(read, torch.stack([expected_u, expected_v], dim=-1)[inside])
+    assert warped.visible.all() and not g.hidden_in_right(depth, *cameras, SIZE).any()
 
 
 def test_depth_at_and_behind_the_camera_is_finite_invisible_and_without_gradient():
     values = torch.tensor([2.0, 0.5, 0.25, 0.0, -1.0, 1e-9, 0.25 + 1e-12, 1e9])
     depth = values.repeat(1, 1, 4, 1).double().requires_grad_()
-    T = relative_transformation(
-        pose(at=(0.0, 0.0, 0.25)), pose()
-    )  # the right camera is a quarter metre ahead
-    K = camera(cx=3.5, cy=1.5)
+    camera_8, ahead = tensor(camera(cx=3.5, cy=1.5)), tensor(T_of(at=(0.0, 0.0, 0.25)))
     image = torch.rand(1, 1, 4, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    warped = g.warp_right_to_left(image, depth, K, K, T)
-    points = g.transform(g.unproject(depth, K), T)
-    uv, _ = g.project(points, K)
+    warped = g.warp_right_to_left(image, depth, camera_8, camera_8, ahead)
+    uv, _ = g.project(g.transform(g.unproject(depth, camera_8), ahead), camera_8)
     (gradient,) = torch.autograd.grad(warped.image.sum() + warped.uv.sum() + uv.sum(), depth)
     behind = values <= 0.25 + 1e-6
-    assert torch.isfinite(warped.image).all() and torch.isfinite(warped.uv).all() and torch.isfinite(uv).all()
-    assert torch.isfinite(gradient).all()
+    assert all(torch.isfinite(x).all() for x in (warped.image, warped.uv, uv, gradient))
     assert not warped.visible[..., behind].any() and (gradient[..., behind] == 0).all()
     assert warped.visible[..., 7].all()  # a point at infinity is seen
-
-
-def test_camera_looking_away_sees_nothing():
-    depth = depth_map()
-    T = relative_transformation(pose((0, 1, 0), math.pi), pose())
-    warped = g.warp_right_to_left(torch.rand(1, 3, *SIZE).double(), depth, camera(), camera(), T)
-    assert not warped.visible.any() and torch.isfinite(warped.image).all()
-
-
-def test_rotation_alone_moves_every_depth_alike():
-    T = relative_transformation(pose((0, 1, 0), 0.1), pose())
-    uv_near, _ = g.project_rays(depth_map(1), g.plane_rays(camera(), camera(), T, SIZE))
-    uv_far, _ = g.project_rays(50 * depth_map(2), g.plane_rays(camera(), camera(), T, SIZE))
-    torch.testing.assert_close(uv_near, uv_far)
+    away = tensor(T_of(angle=np.pi))
+    assert not g.warp_right_to_left(image, depth.detach().abs() + 1, camera_8, camera_8, away).visible.any()
 
 
 @pytest.mark.parametrize("size_right", [(40, 60), (80, 120), (20, 30)])
@@ -159,10 +140,9 @@ def test_a_near_square_hides_the_strip_beside_it(size_right):
     size = (40, 60)
     depth = torch.full((1, 1, *size), 4.0)
     depth[..., 10:30, 25:40] = 2.0
-    K = torch.tensor([[[40.0, 0, 29.5], [0, 40.0, 19.5], [0, 0, 1]]])
-    K_right = g.resize_intrinsics(K, size, size_right)
-    T = relative_transformation(pose(at=(0.6, 0, 0), dtype=torch.float32), torch.eye(4)[None])
-    hidden = g.hidden_in_right(depth, K, K_right, T, size_right)[0, 0]
+    wide = tensor(camera(40.0, 29.5, 19.5)).float()
+    K_right = g.resize_intrinsics(wide, size, size_right)
+    hidden = g.hidden_in_right(depth, wide, K_right, tensor(T_of(at=(0.6, 0, 0))).float(), size_right)[0, 0]
     # disparities 12 and 6 px: wall pixels u with u - 6 in [25 - 12, 40 - 12), that is columns 19..24
     expected = torch.zeros(size, dtype=torch.bool)
     expected[10:30, 19:25] = True
@@ -172,45 +152,38 @@ def test_a_near_square_hides_the_strip_beside_it(size_right):
     assert not hidden[12:28, 25 + coarse :].any() and not hidden[:, : 19 - coarse].any()
 
 
-def test_a_slanted_floor_hides_nothing():
-    v = torch.arange(40.0).view(1, 1, 40, 1).expand(1, 1, 40, 60)
-    depth = 60.0 / (v + 5.0)
-    K = torch.tensor([[[40.0, 0, 29.5], [0, 40.0, -5.0], [0, 0, 1]]])
-    T = relative_transformation(
-        pose((1, 0, 0), 0.05, (0.2, 0.1, 0.3), dtype=torch.float32), torch.eye(4)[None]
+def test_a_skew_moves_what_is_hidden_and_a_slanted_floor_hides_nothing():
+    step = tensor(np.where(pixels(SIZE)[0] > 15, 1.0, 3.0))[None]
+    cameras = tensor(K_RIGHT), tensor(T_of(at=(0.12, -0.01, -0.02)))
+    skewed, straight = (
+        g.hidden_in_right(step, tensor(K * own), *cameras, SIZE) for own in (1, np.where(K == 7.0, 0, 1))
     )
-    assert not g.hidden_in_right(depth, K, K, T, (40, 60)).any()
-
-
-def test_functions_keep_the_dtype():
-    for dtype in (torch.float32, torch.float64):
-        K, T = camera(dtype=dtype), pose(dtype=dtype)
-        depth = depth_map().to(dtype)
-        warped = g.warp_right_to_left(torch.rand(1, 3, *SIZE, dtype=dtype), depth, K, K, T)
-        assert {warped.image.dtype, warped.uv.dtype, warped.z_right.dtype} == {dtype}
-        assert g.resize_intrinsics(K, SIZE, (10, 10)).dtype == dtype
-        assert g.unproject(depth, K).dtype == dtype and g.nearest_rotation(K).dtype == dtype
+    assert skewed.any() and not torch.equal(skewed, straight)
+    floor = (60.0 / (torch.arange(40.0) + 5.0)).view(1, 1, 40, 1).expand(1, 1, 40, 60)
+    camera_up, T = (
+        tensor(camera(40.0, 29.5, -5.0)).float(),
+        tensor(T_of((0.2, 0.1, 0.3), (1, 0, 0), 0.05)).float(),
+    )
+    assert not g.hidden_in_right(floor, camera_up, camera_up, T, (40, 60)).any()
 
 
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("pose", "intrinsics", "expected"),
     [
-        ({}, True),
-        ({"at": (0.5, 0.004, 0.004)}, True),
-        ({"at": (0.5, 0.006, 0)}, False),
-        ({"at": (0.5, 0, 0.006)}, False),
-        ({"at": (0, 0, 0)}, False),
-        ({"angle": 5e-4}, True),
-        ({"angle": 2e-3}, False),
-        ({"angle": 2e-3, "axis": (0, 0, 1)}, False),
-        ({"cx": 25.0}, True),  # Middlebury's doffs
-        ({"cy": 11.6}, False),
-        ({"f": 30.1}, False),
+        ({}, {}, True),
+        ({"at": (0.5, 0.004, 0.004)}, {}, True),
+        ({"at": (0.5, 0.006, 0)}, {}, False),
+        ({"at": (0.5, 0, 0.006)}, {}, False),
+        ({"at": (0, 0, 0)}, {}, False),
+        ({"angle": 5e-4}, {}, True),
+        ({"angle": 2e-3}, {}, False),
+        ({"angle": 2e-3, "axis": (0, 0, 1)}, {}, False),
+        ({}, {"cx": 25.0}, True),  # Middlebury's doffs
+        ({}, {"cy": 11.6}, False),
+        ({}, {"f": 30.1}, False),
     ],
 )
-def test_rectified_means_that_rows_are_epipolar_lines(change, expected):
-    K_right = camera(**{name: change[name] for name in ("f", "cx", "cy") if name in change})
-    E = pose(
-        **({"at": (0.5, 0, 0)} | {name: change[name] for name in ("at", "angle", "axis") if name in change})
-    )
-    assert g.is_rectified(camera(), K_right, inverse_transformation(E)).tolist() == [expected]
+def test_rectified_means_that_rows_are_epipolar_lines(pose, intrinsics, expected):
+    T = tensor(T_of(**{"at": (0.5, 0, 0)} | pose))
+    assert g.is_rectified(tensor(camera()), tensor(camera(**intrinsics)), T).tolist() == [expected]
+    assert not g.is_rectified(tensor(K), tensor(camera()), T).any()  # another skew

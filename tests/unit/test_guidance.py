@@ -37,24 +37,6 @@ def said_by(make) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "right",
-    [
-        RIGHT,
-        RIGHT.astype(np.float32) / 255,
-        RIGHT.astype(np.uint16) * 257,
-        Image.fromarray(RIGHT),
-        torch.from_numpy(RIGHT).permute(2, 0, 1),
-        torch.from_numpy(RIGHT).permute(2, 0, 1) / 255,
-    ],
-    ids=["uint8", "float", "uint16", "pil", "torch-uint8", "torch-float"],
-)
-def test_right_image_of_any_kind(right):
-    (image,) = GeometryGuidance(right, K, E).rights
-    assert image.shape == (3, *SIZE) and image.dtype == torch.float32
-    torch.testing.assert_close(image, torch.from_numpy(RIGHT).permute(2, 0, 1) / 255, atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize(
     ("K_given", "E_given"),
     [
         (K.tolist(), E.tolist()),
@@ -74,19 +56,12 @@ def test_right_image_of_any_kind(right):
 def test_forms_of_the_cameras(K_given, E_given):
     given = GeometryGuidance(RIGHT, K_given, E_given)
     (rig,), ((view,),) = given.rigs, [entry.views for entry in given.inputs]
+    assert rig.K_left is not K_given  # the caller may go on to change theirs
     np.testing.assert_allclose(rig.K_left, K, atol=1e-2)
     np.testing.assert_allclose(rig.E, E, atol=1e-3)
     np.testing.assert_allclose(rig.E[:3, :3] @ rig.E[:3, :3].T, np.eye(3), atol=1e-9)
     assert view.K.dtype == view.T_right_from_left.dtype == torch.float32
     np.testing.assert_allclose(view.T_right_from_left.numpy() @ rig.E, I4, atol=1e-6)
-
-
-def test_cameras_are_copied():
-    own_K, own_E = K.copy(), E.copy()
-    guidance = GeometryGuidance(RIGHT, own_K, own_E)
-    own_K[0] *= 2.0
-    own_E[0, 3] = 1.0
-    assert guidance.rigs[0].K_left[0, 0] == 60.0 and guidance.rigs[0].E[0, 3] == 0.12
 
 
 @pytest.mark.parametrize(
@@ -310,12 +285,6 @@ def test_the_left_size_is_asked_for_and_may_be_a_list():
     assert len(GeometryGuidance(RIGHT, K, E, left_size=[64, 48]).prepare(torch.rand(1, 3, *SIZE))) == 1
     with pytest.raises(ValueError, match="right must be a list of 2 images"):
         GeometryGuidance(RIGHT, K, E).prepare(torch.rand(2, 3, *SIZE))
-
-
-def test_baseline_constructor_pins_the_sign():
-    guidance = GeometryGuidance.from_baseline(RIGHT, K, 0.12)
-    assert guidance.rigs[0].E[0, 3] == pytest.approx(0.12)
-    assert guidance.rigs[0].T_right_from_left[0, 3] == pytest.approx(-0.12)
 
 
 def test_from_calibration_picks_the_cameras_and_checks_sizes(tmp_path):

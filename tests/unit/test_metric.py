@@ -7,18 +7,10 @@ from geodiff_plugin.scale.space import (
     SPACES,
     AffineState,
     MetricMap,
-    inverse_softplus,
     smooth_floor,
 )
 
 NEAR, FAR = torch.tensor([0.5, 4.0, 0.8]), torch.tensor([0.9, 80.0, 60.0])
-
-
-@pytest.mark.parametrize("space", SPACES)
-def test_range_round_trip(space):
-    metric = MetricMap(space)
-    back = metric.range_of(metric.from_range(NEAR, FAR))
-    torch.testing.assert_close(back, (NEAR, FAR), rtol=2e-3, atol=0)
 
 
 @pytest.mark.parametrize("space", SPACES)
@@ -85,21 +77,6 @@ def test_floor_never_silences_a_gradient():
     assert (y > 0).all()
     assert (grad > 1e-8).all()
     torch.testing.assert_close(y[3:], x[3:].detach(), atol=3e-6, rtol=0)
-
-
-def test_inverse_softplus():
-    y = torch.tensor([1e-4, 0.1, 1.0, 30.0])
-    torch.testing.assert_close(torch.nn.functional.softplus(inverse_softplus(y)), y)
-
-
-def test_log1p_is_pixel_perfect_depths_own_form_in_metres():
-    near, far = torch.tensor([0.5]), torch.tensor([60.0])
-    affine = MetricMap("log1p").from_range(near, far)
-    a, b = torch.log1p(far) - torch.log1p(near), torch.log1p(near)
-    x = torch.tensor([0.3, 0.9]).view(1, 1, 1, 2)
-    torch.testing.assert_close(
-        MetricMap("log1p")(x, affine), torch.exp(a * smooth_floor(x) + b) - 1, rtol=1e-4, atol=0
-    )
 
 
 def test_unknown_space_names_the_known_ones():

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from kornia.geometry.linalg import relative_transformation
 
-from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
-from geodiff_plugin.scale.points import refine_to_matches
+from geodiff_plugin.matching import Matches
+from geodiff_plugin.scale.points import fit_to_points, refine_to_matches, reliable_matches
+from geodiff_plugin.scale.space import MetricMap
 from geodiff_plugin.scale.volume_search import argmin_over, search_scale
 from tests.benchmarks.matching import textured_pair
 
@@ -79,29 +79,6 @@ def test_each_sample_of_a_batch_has_its_own_answer(scene):
     estimate = metres(squeezed[0], float(alone.near_m), float(alone.far_m), "depth")
     assert ((estimate - depth).abs() / depth).mean() < 0.05
     assert both.near_m[1] < both.near_m[0] and both.far_m[1] > both.far_m[0]
-
-
-def test_map_of_another_size(scene):
-    volume, depth = scene
-    x = torch.nn.functional.interpolate(relative(depth, "depth"), (48, 72), mode="area")
-    found = search_scale(volume, x, "depth")
-    assert float(found.near_m) == pytest.approx(float(depth.min()), rel=0.12)
-
-
-@pytest.mark.parametrize("turn", [0.05, -0.05])
-def test_general_pose(turn):
-    _, (texture, K, _), _, depth = textured_pair(SIZE)
-    E = torch.eye(4)
-    E[0, 0] = E[2, 2] = np.cos(turn)
-    E[0, 2], E[2, 0] = np.sin(turn), -np.sin(turn)
-    E[:3, 3] = torch.tensor([0.25, 0.1, 0.1])
-    T = relative_transformation(E[None], torch.eye(4)[None])
-    left = g.warp_right_to_left(texture[None], depth[None], K[None], K[None], T).image[0]
-    volume = m.build_cost_volume(left, [(texture, K, T[0])], K)
-    x = relative(depth, "disparity")
-    found = search_scale(volume, x, "disparity")
-    estimate = metres(x[0], float(found.near_m), float(found.far_m), "disparity")
-    assert ((estimate - depth).abs() / depth).mean() < 0.05
 
 
 def test_range_that_excludes_the_answer_is_reported(scene):
@@ -221,3 +198,35 @@ def test_search_alone_is_within_5_percent_on_every_real_pair():
         print(f"{pair.label}: {errors[pair.label]:.4f}")
     assert len(errors) >= 13
     assert all(error < 0.05 for error in errors.values()), errors
+
+
+STREET = (40, 60)
+
+
+def matches_of(depth_m: torch.Tensor, confidence: float = 0.9) -> Matches:
+    inverse = 1.0 / depth_m
+    return Matches(inverse, torch.full_like(inverse, confidence), torch.tensor(2e-3))
+
+
+@pytest.fixture
+def street():
+    """Metres of a road, and a relative map of it that errs by 15 %."""
+    x = torch.linspace(0.0, 1.0, STREET[0]).view(1, -1, 1).expand(1, *STREET)
+    depth_m = 1.0 / (1 / 80 + (1 / 6 - 1 / 80) * x)
+    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(0))
+    return depth_m, (x * torch.exp(0.15 * noise)).clamp(0, 1)[None]
+
+
+def test_a_wrong_basin_is_left_and_a_right_one_kept(street):
+    depth_m, x = street
+    reliable = reliable_matches(matches_of(depth_m))
+    metric = MetricMap("disparity")
+    wrong = (torch.tensor([42.0]), torch.tensor([84.0]))
+    near, far = fit_to_points(x, reliable, metric, wrong)
+    assert near.item() == pytest.approx(6.0, rel=0.3) and far.item() > 40.0
+    kept = fit_to_points(x, reliable, metric, (torch.tensor([6.0]), torch.tensor([80.0])))
+    assert [v.item() for v in kept] == pytest.approx([6.0, 80.0])
+
+
+def test_too_few_reliable_matches_say_nothing(street):
+    assert reliable_matches(matches_of(street[0], confidence=0.4)) is None

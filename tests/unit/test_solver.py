@@ -20,13 +20,12 @@ def _system(height: int, width: int, link: float, seed: int = 0) -> FieldSystem:
 def test_a_small_system_is_solved_as_by_a_dense_solver(link):
     system = _system(7, 9, link)
     basis = torch.eye(63).view(63, 1, 7, 9)
-    columns = [system.apply(one[None]).flatten() for one in basis]
+    columns = [system.apply(unit[None]).flatten() for unit in basis]
     expected = torch.linalg.solve(torch.stack(columns, 1), system.pull.flatten())
     torch.testing.assert_close(solve_field(system, 40).flatten(), expected, atol=2e-4, rtol=1e-3)
 
 
-@pytest.mark.parametrize("size", [(60, 83), (240, 331), (481, 640)])
-@pytest.mark.parametrize("link", [1.0, 400.0])
+@pytest.mark.parametrize(("size", "link"), [((60, 83), 1.0), ((240, 331), 400.0), ((481, 640), 400.0)])
 def test_few_steps_are_enough_at_any_size(size, link):
     system = _system(*size, link)
     found = solve_field(system, 12)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.gradients import RULES, Adam, NormMatched, Plain
+from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, NormMatched, Plain, pull_back
 
 
 def test_plain_is_algorithm_1():
@@ -50,3 +50,49 @@ def test_zero_gradient_moves_nothing(name):
 def test_scalars_per_sample(name):
     step = RULES[name](0.1).step(torch.tensor([1.0, -2.0]))
     assert step.shape == (2,) and step[0] < 0 < step[1]
+
+
+def _in_half(z: torch.Tensor) -> torch.Tensor:
+    """A network in float16 between float32 tensors, with a derivative of 3."""
+    return (z.half() * 3.0).float()
+
+
+@pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
+def test_a_gradient_of_any_size_passes_float16_and_comes_out_at_its_own(size):
+    z = torch.randn(2, 4, 3, 3, requires_grad=True)
+    gradient = size * torch.randn(2, 4, 3, 3)
+    pulled = pull_back(_in_half(z), z, gradient)
+    torch.testing.assert_close(pulled, 3.0 * gradient, rtol=2e-3, atol=2e-3 * size)
+
+
+def test_samples_of_different_size_do_not_see_each_other():
+    z = torch.randn(2, 4, 3, 3, requires_grad=True)
+    gradient = torch.randn(2, 4, 3, 3) * torch.tensor([1e-9, 1e9]).view(2, 1, 1, 1)
+    pulled = pull_back(_in_half(z), z, gradient)
+    torch.testing.assert_close(pulled / gradient, torch.full_like(pulled, 3.0), rtol=0.02, atol=0.0)
+
+
+def test_in_float32_it_is_the_gradient_bit_for_bit():
+    z = torch.randn(2, 4, 3, 3, requires_grad=True)
+    gradient = 1e-5 * torch.randn(2, 4, 3, 3)
+    (plain,) = torch.autograd.grad((z**3).sin(), z, gradient)
+    assert torch.equal(pull_back((z**3).sin(), z, gradient), plain)
+
+
+def test_no_gradient_stays_none_and_infinity_is_not_hidden():
+    z = torch.ones(2, 1, requires_grad=True)
+    pulled = pull_back(2.0 * z, z, torch.tensor([[0.0], [torch.inf]]))
+    assert pulled[0] == 0.0 and not torch.isfinite(pulled[1])
+
+
+def test_the_first_that_is_not_finite_is_named_with_its_step_and_the_cure():
+    watch = FiniteWatch()
+    watch.check(torch.float16)
+    watch.note("the decoded map", 0, torch.ones(3))
+    watch.check(torch.float16)
+    watch.note("the encoded correction", 1, torch.tensor([1.0, torch.nan]))
+    watch.note("the decoded map", 1, torch.tensor([torch.inf]))
+    with pytest.raises(ValueError, match=r"encoded correction of denoising step 2 .* float16.*bfloat16"):
+        watch.check(torch.float16)
+    with pytest.raises(ValueError, match="weights"):
+        watch.check(torch.float32)

@@ -12,7 +12,6 @@ import pytest
 import torch
 from PIL import Image
 
-import geodiff_plugin
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.pose.mistakes import INVERSE
@@ -283,14 +282,3 @@ def test_what_is_assumed_of_the_right_camera(run, scene):
     assert run(K=(K, K)).assumed == []
     text = repr(run())
     assert "trusted" in text and len(text.splitlines()) < 8
-
-
-def test_the_page_puts_a_bad_verdict_before_the_numbers():
-    look = pytest.importorskip("geodiff_plugin.app.look", exc_type=ImportError)
-    bad = look.finished("not trusted", [("1.20 m", "median depth")], ["The same picture."])
-    assert bad.index("Not trusted") < bad.index("same picture") < bad.index("1.20 m")
-    assert "Trusted" in look.finished("trusted", [], [])
-
-
-def test_dir_of_the_package_lists_the_public_names():
-    assert dir(geodiff_plugin) == sorted(geodiff_plugin.__all__)
