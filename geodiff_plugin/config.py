@@ -199,6 +199,8 @@ class GuidanceConfig:
         refine: the result is fitted to its matches and points once more, at full resolution.
         sharpen: before the result is refined, pixels that hang in the air between a near and a far surface
             get the depth of one of them, the weighted median of their neighbours (after Ma et al. 2013).
+        even_ensemble: the middle of an even number of ensemble members: the mean of the two middle ones, or
+            the lower of them (Marigold-DC).
         crisp: after the refinement, matches, the image's colours and the refined map vote on every depth:
             fewer pixels off by a pixel of disparity, most of all at edges.
         smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
@@ -253,6 +255,7 @@ class GuidanceConfig:
     corrections: int = _integer(2, 1, 10_000, paper="-")
     refine: bool = _flag(True)
     sharpen: bool = _flag(True, paper="-")
+    even_ensemble: str = _choice("mean", "lower", paper="-")
     crisp: bool = _flag(True, paper="-")
     smoothness: float = _number(40.0, TINY, 1e6, paper="-")
     match_noise: float = _number(0.02, TINY, 1e3, paper="-")
@@ -421,6 +424,7 @@ MARIGOLD_DC = DEFAULT.changed(
     positive="square",
     search="points-range",
     step_from="updated",
+    even_ensemble="lower",
     loss_resolution=1 << 16,
     correct=False,
     refine=False,

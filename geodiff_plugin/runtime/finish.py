@@ -121,14 +121,14 @@ def _spacing(run: GuidedRun, depth_m: Tensor) -> int:
     return max(1, round(max(image_size(depth_m)) / max(run.grid.content)))
 
 
-def ensemble_metric(depth_m: Tensor, reduction: str = "median") -> tuple[Tensor, Tensor]:
+def ensemble_metric(depth_m: Tensor, reduction: str = "median", lower: bool = False) -> tuple[Tensor, Tensor]:
     """Reduce members ``(E, 1, H, W)`` metres pixel by pixel to a map and its uncertainty, ``(1, 1, H, W)`` m.
 
-    ``"median"`` has the median absolute deviation, ``"mean"`` the standard deviation; any other ``reduction``
-    is an ``InputError``.
+    ``"median"`` (as ``median``) has the median absolute deviation, ``"mean"`` the standard deviation; any other
+    ``reduction`` is an ``InputError``.
     """
     check_choice(reduction, "ensembling_kwargs['reduction']", REDUCTIONS)
-    middle = depth_m.mean(0, keepdim=True) if reduction == "mean" else median(depth_m, 0)[None]
+    middle = depth_m.mean(0, keepdim=True) if reduction == "mean" else median(depth_m, 0, lower)[None]
     return middle, spread_around(middle, depth_m, reduction)
 
 
@@ -143,10 +143,12 @@ def spread_around(middle: Tensor, depth_m: Tensor, reduction: str = "median") ->
     return median(away.abs(), 0)[None]
 
 
-def median(x: Tensor, dim: int) -> Tensor:
-    """The median along ``dim``, which is dropped: of an even number the mean of the middle two.
+def median(x: Tensor, dim: int, lower: bool = False) -> Tensor:
+    """The median along ``dim``, which is dropped: of an even number the mean of the middle two, or the lower.
 
-    ``torch.median`` takes the lower one, which makes metres too near, and the spread of two members 0.
+    ``torch.median``, and with it Marigold-DC, takes the lower of the two, which makes metres too near, and the
+    spread of two members 0.
     """
     ordered, count = x.sort(dim=dim).values, x.shape[dim]
-    return 0.5 * (ordered.select(dim, (count - 1) // 2) + ordered.select(dim, count // 2))
+    below = ordered.select(dim, (count - 1) // 2)
+    return below if lower else 0.5 * (below + ordered.select(dim, count // 2))

@@ -172,7 +172,8 @@ class GuidedCall(_Stock):
         if self._guided_run is None:
             return super().ensemble_depth(depth, *args, **kwargs)
         self._guided_run.members.append(depth)
-        return ensemble_metric(depth, kwargs.get("reduction", "median"))
+        lower = self._guided_run.config.even_ensemble == "lower"
+        return ensemble_metric(depth, kwargs.get("reduction", "median"), lower)
 
     def put_together(self, maps: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
         """A prior's own ending of ensembles; while guided, ``ensemble_depth`` for every image."""

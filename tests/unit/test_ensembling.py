@@ -26,6 +26,7 @@ def test_median_of_even_and_odd_numbers(members, middle, deviation):
     assert found.shape == spread.shape == (1, 1, 2, 3)
     assert (found == middle).all() and (spread == deviation).all()
     assert torch.equal(median(depth_m, 0), found[0])
+    torch.testing.assert_close(ensemble_metric(depth_m, lower=True)[0][0], depth_m.median(0).values)
 
 
 def test_mean_and_an_unknown_reduction():
