@@ -124,7 +124,7 @@ def _spacing(run: GuidedRun, depth_m: Tensor) -> int:
 def ensemble_metric(depth_m: Tensor, reduction: str = "median", lower: bool = False) -> tuple[Tensor, Tensor]:
     """Reduce members ``(E, 1, H, W)`` metres pixel by pixel to a map and its uncertainty, ``(1, 1, H, W)`` m.
 
-    ``"median"`` (as ``median``) has the median absolute deviation, ``"mean"`` the standard deviation; any other
+    ``"median"`` (as ``median``) has the median absolute deviation, ``"mean"`` the standard deviation; another
     ``reduction`` is an ``InputError``.
     """
     check_choice(reduction, "ensembling_kwargs['reduction']", REDUCTIONS)
@@ -146,7 +146,7 @@ def spread_around(middle: Tensor, depth_m: Tensor, reduction: str = "median") ->
 def median(x: Tensor, dim: int, lower: bool = False) -> Tensor:
     """The median along ``dim``, which is dropped: of an even number the mean of the middle two, or the lower.
 
-    ``torch.median``, and with it Marigold-DC, takes the lower of the two, which makes metres too near, and the
+    ``torch.median``, and so Marigold-DC, takes the lower of the two, which makes metres too near, and the
     spread of two members 0.
     """
     ordered, count = x.sort(dim=dim).values, x.shape[dim]
