@@ -40,20 +40,19 @@ def noisy(image_01: torch.Tensor, levels: float) -> torch.Tensor:
     return (image_01 + noise * levels / 255).clamp(0, 1)
 
 
-def distance(one: torch.Tensor, other: torch.Tensor) -> float:
-    return float((one - other).square().mean())
+def distance(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float((a - b).square().mean())
 
 
-@pytest.mark.parametrize("quality", [30, 50, 65, 80, 90])
-def test_the_steps_of_a_compression_are_found(pair: SyntheticPair, quality: int) -> None:
+@pytest.mark.parametrize(
+    ("quality", "top", "first"), [(30, 0, 0), (50, 3, 5), (65, 0, 0), (80, 0, 0), (90, 0, 0)]
+)
+def test_the_steps_of_a_compression_are_found(
+    pair: SyntheticPair, quality: int, top: int, first: int
+) -> None:
     expected = (5000 / quality if quality < 50 else 200 - 2 * quality) / 100
-    found = find_flaws(compressed(pair.left.image_01, quality))[0]
+    found = find_flaws(compressed(pair.left.image_01, quality)[:, top:, first:])[0]
     assert found == pytest.approx(expected, rel=0.25)
-
-
-def test_they_are_found_in_a_crop(pair: SyntheticPair) -> None:
-    found = find_flaws(compressed(pair.left.image_01, 50)[:, 3:, 5:])[0]
-    assert found == pytest.approx(1.0, rel=0.25)
 
 
 @pytest.mark.parametrize("levels", [4.0, 8.0])

@@ -15,17 +15,20 @@ def _maps(*values: float) -> torch.Tensor:
 SEEN = torch.ones(1, 1, 1, 3, dtype=torch.bool)
 
 
-def test_rises_with_support():
-    found = depth_confidence(_maps(0.0, 0.95, 1.0), _maps(0.05, 0.05, 0.05), SEEN, None).flatten()
-    assert 0.0 < found[0] < found[1] < found[2] < 1.0
-
-
-def test_falls_with_photometric_error_where_a_camera_sees():
-    support, error = _maps(0.9, 0.9, 0.9), _maps(0.0, 0.05, 0.5)
-    found = depth_confidence(support, error, SEEN, None).flatten()
-    assert found[0] > found[1] > found[2]
-    unseen = depth_confidence(support, error, ~SEEN, None).flatten()
-    assert unseen[0] == unseen[2]
+@pytest.mark.parametrize(
+    ("support", "error", "spread", "way"),
+    [
+        ((0.0, 0.95, 1.0), (0.05,) * 3, None, 1),
+        ((0.9,) * 3, (0.0, 0.05, 0.5), None, -1),
+        ((0.9,) * 3, (0.05,) * 3, (0.0, 0.05, 0.5), -1),
+    ],
+)
+def test_rises_with_support_and_falls_with_error_and_spread(support, error, spread, way):
+    spread = None if spread is None else _maps(*spread)
+    found = depth_confidence(_maps(*support), _maps(*error), SEEN, spread).flatten()
+    assert (way * found.diff() > 0).all() and 0 < found.min() and found.max() < 1
+    unseen = depth_confidence(_maps(*support), _maps(*error), ~SEEN, None).flatten()
+    assert len(set(support)) > 1 or unseen[0] == unseen[2]
 
 
 @pytest.mark.parametrize("support", [0.0, 0.3, 0.9, 0.999])
@@ -38,12 +41,6 @@ def test_not_being_in_view_never_raises_it(support, error):
     signs = torch.tensor(SIGNS).view(1, -1, 1, 1)
     assert bool((signs * (seen - unseen) >= 0).all()) and bool((seen - unseen)[:, 0].eq(0).all())
     assert all(sign * value >= 0 for sign, value in zip(SIGNS, BY_EVIDENCE, strict=True))
-
-
-def test_falls_with_the_spread_of_an_ensemble():
-    support, error = _maps(0.9, 0.9, 0.9), _maps(0.05, 0.05, 0.05)
-    found = depth_confidence(support, error, SEEN, _maps(0.0, 0.05, 0.5)).flatten()
-    assert found[0] > found[1] > found[2]
 
 
 def test_a_good_prior_is_believed_beside_its_matches_and_not_far_from_them():

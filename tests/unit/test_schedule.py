@@ -73,20 +73,6 @@ def test_it_prints_what_happens():
     assert str(schedule(1, SEARCH_ONLY)) == "step 1: settle the scale, last"
 
 
-@pytest.mark.parametrize(
-    ("wanted", "asked", "most", "planned"),
-    [
-        (4, None, None, (4, 1)),
-        (4, None, 1, (1, 4)),
-        (5, None, 2, (2, 3)),
-        (2, 2, 2, (2, 1)),
-        (9, 9, None, (9, 1)),
-    ],
-)
-def test_steps_and_rounds(wanted, asked, most, planned):
-    assert count_steps(wanted, asked, most) == planned
-
-
 def test_more_steps_than_a_prior_has_are_refused():
     with pytest.raises(ValueError, match="num_inference_steps must be at most 1 with this prior; got 4"):
         count_steps(4, 4, 1)
