@@ -105,7 +105,7 @@ def _off_alike(x: float, y: float) -> bool:
 def check_pose(E: Any, name: str = "E", cure: str = POSE) -> np.ndarray:
     """A ``(4, 4)`` float64 rigid transform; a rotation off by at most 1e-2 is projected to the nearest one.
 
-    A 3x4 gets the row 0 0 0 1. What is not finite, no rotation or mirrored is refused; ``cure`` ends the messages.
+    A 3x4 gets the row 0 0 0 1; what is not finite, no rotation or mirrored is refused, with ``cure``.
     """
     E = _as_matrix(E, name, cure, (4, 4), (3, 4))
     if len(E) == 3:
