@@ -78,10 +78,12 @@ def test_projection_and_warp_are_the_definition(seed, pose, size_right):
     for known in ({}, {"rays": rays}):
         warped = g.warp_right_to_left(ramp, tensor(depth)[None], tensor(K), tensor(K_r), tensor(T), **known)
         limits = np.array([size_right[1] - 1, size_right[0] - 1])[:, None, None]
-        inside = ((expected >= 0) & (expected <= limits)).all(0)
+        inside = ((expected >= -0.01) & (expected <= limits + 0.01)).all(0)  # to a hundredth of a pixel
         np.testing.assert_array_equal(warped.visible[0, 0], inside)
         assert 0.3 < inside.mean()
-        np.testing.assert_allclose(warped.image[0].numpy()[:, inside], expected[:, inside], atol=1e-9)
+        np.testing.assert_allclose(
+            warped.image[0].numpy()[:, inside], np.clip(expected, 0, limits)[:, inside], atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("size_to", [(48, 64), (12, 20), (7, 5)])

@@ -329,7 +329,7 @@ def test_aggregation_against_numpy(monkeypatch, step, jump):
     for shape in ((7, 6, 9), (5, 4, 6), (2, 1, 8), (12, 9, 3)):
         levels = rng.integers(0, COST_LEVELS + 1, shape)
         grey = (rng.random(shape[1:]) > 0.6).astype(np.float32) * rng.choice([0.05, 0.4])
-        levels[:, 0, :2], levels[1:, 1] = UNSEEN_LEVEL, COST_LEVELS
+        levels[:, 0, :2], levels[1:, -1, 2:] = UNSEEN_LEVEL, COST_LEVELS
         out = m.aggregate(torch.from_numpy(levels).to(torch.uint8), torch.from_numpy(grey), room=room)
         np.testing.assert_array_equal(out.numpy(), reference_aggregation(levels, grey, *penalties))
         assert out.dtype == torch.int16 and out.max() < NEVER
