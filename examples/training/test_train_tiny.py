@@ -74,6 +74,7 @@ def test_the_student_has_the_teachers_latent(teacher):
     assert count < sum(p.numel() for p in teacher.parameters()) / 5
 
 
+@pytest.mark.slow
 def test_distillation_brings_the_student_to_its_teacher(cache, teacher):
     held_out = maps_of(cache)
 
@@ -96,6 +97,7 @@ def test_an_empty_cache_is_an_error(tmp_path, teacher):
         train_tiny(teacher, tmp_path, seconds=1)
 
 
+@pytest.mark.slow
 def test_what_the_command_writes_decodes_in_a_guided_call(cache, tmp_path, textured_plane):
     folder = tmp_path / "tiny"
     options = ["--prior", str(BUNDLED_FOLDER), "--cache", str(cache), "--out", str(folder)]

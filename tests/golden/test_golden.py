@@ -14,10 +14,14 @@ FROZEN = json.loads(STORED.read_text())
 #: Relative difference of a quantile that another processor may make, and the same of flags and small numbers.
 TOLERANCE, NEAR_ZERO = 0.02, 0.02
 NEEDS_POSELIB = {"estimated_pose"}
+#: One of each way through the method; ``test_parts.py`` guards its numbers closer, and the rest is slow.
+FAST = ("default_bundled_pair", "preset_paper", "preset_marigold_dc", "points_and_view", "three_views")
 
 
 @pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+)
 def test_result_is_the_frozen_one(name: str) -> None:
     if name in NEEDS_DATA and not DATA.is_dir():
         pytest.skip("the real pairs are not here")

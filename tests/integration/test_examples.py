@@ -90,6 +90,7 @@ def test_world_poses_compose_to_the_relative_pose():
     assert not np.allclose(left, np.eye(4))
 
 
+@pytest.mark.slow
 def test_photographs_without_pose(prior, tmp_path, monkeypatch, capsys):
     pytest.importorskip("poselib")
     monkeypatch.chdir(tmp_path)
@@ -113,6 +114,7 @@ def test_sparse_points(prior, pair, textured_plane, tmp_path, monkeypatch, capsy
     assert "where no point was given" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_rig_video(prior, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arguments = ["--frames", "2", "--steps", "1", "--prior", str(prior), "--out", "depth.gif"]
@@ -140,6 +142,7 @@ def test_rig_video_of_files(prior, pair, textured_plane, tmp_path, monkeypatch, 
         load(EXAMPLES / "rig_video.py").main(arguments)
 
 
+@pytest.mark.slow
 def test_capture_folder(prior, capsys):
     pytest.importorskip("pycolmap")
     load(EXAMPLES / "capture_folder.py").main(["--size", "96", "128", "--steps", "1", "--prior", str(prior)])

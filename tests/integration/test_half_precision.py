@@ -11,8 +11,7 @@ from geodiff_plugin.runtime.hooks import images_in_float32
 from tests.contracts.tiny_priors import make_e2e_ft
 
 
-@pytest.mark.parametrize("gradient", ["denoised", "full"])
-@pytest.mark.parametrize("count", [1, 20])
+@pytest.mark.parametrize(("count", "gradient"), [(1, "full"), (20, "denoised")])
 def test_a_handful_of_known_points_is_enough(make_pipeline, textured_plane, count, gradient):
     """The loss is a mean over so few pixels that each one's share is thousands of times an image's."""
     pair, points = textured_plane, np.zeros((48, 64), np.float32)
@@ -51,10 +50,9 @@ def test_an_overflow_of_the_decoder_names_step_tensor_and_cure(make_pipeline, te
         pipe(textured_plane.left, guidance=guidance)
 
 
-@pytest.mark.parametrize("inner_steps", [0, 1])
-def test_a_prior_in_float64_gives_the_same_depth(textured_plane, inner_steps):
+def test_a_prior_in_float64_gives_the_same_depth(textured_plane):
     pipe, pair = enable_geometry_guidance(make_e2e_ft()), textured_plane  # it draws nothing
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, inner_steps=inner_steps)
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, inner_steps=1)
     expected = pipe(pair.left, guidance=guidance).prediction
     found = pipe.to(torch.float64)(pair.left, guidance=guidance).prediction
     np.testing.assert_allclose(found, expected, rtol=1e-4)

@@ -62,8 +62,10 @@ def calls_of(pipe, pair, **knobs):
     )
 
 
-@pytest.mark.parametrize(("name", "gradient"), [("ddim", "full"), ("dpm", "denoised")])
-@pytest.mark.parametrize("other", ["itself", "sharing", "guided"])
+@pytest.mark.parametrize(
+    ("name", "gradient", "other"),
+    [("dpm", "denoised", "itself"), ("ddim", "full", "sharing"), ("ddim", "full", "guided")],
+)
 def test_any_call_from_a_callback_is_what_it_is_alone(make_pipeline, textured_plane, name, gradient, other):
     pipe = enable_geometry_guidance(make_pipeline(SCHEDULERS[name]()))
     stock, guided = calls_of(pipe, textured_plane, gradient=gradient)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -11,6 +12,7 @@ from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER as PAIR
 from geodiff_plugin.formats import flying_points, read_depth_mm_png
 
 
+@pytest.mark.slow
 def test_the_demo_pair_has_fewer_flying_points_with_it():
     truth_m, known = read_depth_mm_png(PAIR / "depth_mm.png")
     pipe = enable_geometry_guidance(load_prior("bundled"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pytest
@@ -61,26 +62,37 @@ def run(pipe, group, guidance, **kwargs):
     )
 
 
+@pytest.fixture(scope="module")
+def of_views(pipe, group):
+    """Results of the first so many views."""
+    return cache(lambda count: run(pipe, group, GeometryGuidance.from_views(views(group, count), **FAST)))
+
+
+@pytest.fixture(scope="module")
+def of_points(pipe, group):
+    return run(pipe, group, GeometryGuidance.from_points(group.sparse, group.K, **FAST))
+
+
 def abs_rel(out, group):
     known = np.isfinite(group.depth_m)
     return np.mean(np.abs(out.prediction[0, ..., 0] / group.depth_m - 1.0)[known])
 
 
-def test_a_third_view_sees_what_the_second_does_not(pipe, group):
-    two, three = (run(pipe, group, GeometryGuidance.from_views(views(group, n), **FAST)) for n in (2, 3))
+def test_a_third_view_sees_what_the_second_does_not(of_views, group):
+    two, three = of_views(2), of_views(3)
     assert three.visible.mean() > two.visible.mean()
     assert abs_rel(three, group) < 0.2 and three.history[0].visible_fraction > two.history[0].visible_fraction
     best = np.where(two.visible, two.photometric_error, 1.0)
     assert three.photometric_error[three.visible].mean() < best[three.visible].mean()
 
 
-def test_a_repeated_view_changes_nothing(pipe, group):
-    once = run(pipe, group, GeometryGuidance.from_views(views(group, 2), **FAST))
+def test_a_repeated_view_changes_nothing(pipe, group, of_views):
     left, right = views(group, 2)
     twice = run(pipe, group, GeometryGuidance.from_views([left, right, right], **FAST))
-    np.testing.assert_allclose(twice.prediction, once.prediction, rtol=1e-3)
+    np.testing.assert_allclose(twice.prediction, of_views(2).prediction, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_batch_of_images_with_two_and_with_three_views(pipe, group):
     noise = torch.randn(1, *_latent_shape(pipe, group), generator=torch.Generator().manual_seed(0))
     first, second, third = views(group, 3)
@@ -103,30 +115,28 @@ def _latent_shape(pipe, group):
     return pipe(image, num_inference_steps=1, output_latent=True).latent.shape[1:]
 
 
-def test_points_instead_of_a_second_view(pipe, group):
-    out = run(pipe, group, GeometryGuidance.from_points(group.sparse, group.K, **FAST))
+def test_points_instead_of_a_second_view(of_points, group):
+    out = of_points
     assert out.visible is None and out.photometric_error is None and not out.warnings
     np.testing.assert_allclose(out.K[0], group.K, rtol=1e-5)
     assert abs_rel(out, group) < 0.2
     assert set(out.history[0].terms) == {"points", "anchor", "prior_pull"}
 
 
-def test_a_cloud_is_the_map_that_it_projects_to(pipe, group):
+def test_a_cloud_is_the_map_that_it_projects_to(pipe, group, of_points):
     rows, columns = group.sparse.nonzero()
     rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(group.K).T
     cloud = np.concatenate([rays * group.sparse[rows, columns, None], [[0.0, 0.0, -1.0]]])
-    as_map = run(pipe, group, GeometryGuidance.from_points(group.sparse, group.K, **FAST))
     as_cloud = run(pipe, group, GeometryGuidance.from_points(cloud, group.K, **FAST))
-    np.testing.assert_allclose(as_cloud.prediction, as_map.prediction, rtol=1e-3)
+    np.testing.assert_allclose(as_cloud.prediction, of_points.prediction, rtol=1e-3)
     assert as_cloud.warnings == ["1 points lie behind the left camera or outside its image: left out."]
 
 
-def test_points_beside_a_second_view(pipe, group):
+def test_points_beside_a_second_view(pipe, group, of_views):
     guidance = GeometryGuidance.from_views(views(group, 2), points=group.sparse, **FAST)
     both = run(pipe, group, guidance)
-    alone = run(pipe, group, GeometryGuidance.from_views(views(group, 2), **FAST))
     assert {"points", "matches", "photometric"} <= set(both.history[0].terms)
-    assert abs_rel(both, group) < abs_rel(alone, group)
+    assert abs_rel(both, group) < abs_rel(of_views(2), group)
     off = np.abs(both.prediction[0, ..., 0] / np.where(group.sparse > 0, group.sparse, np.nan) - 1.0)
     assert np.nanmedian(off) < 0.02
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.algorithm.state import Trajectory
-from tests.pretended_device import Reached, pretended
+from tests.pretended_device import Reached, There, Waits, pretended
 
 #: Read-backs, copies from the device and constants copied to it, from the first step to the last. A copy
 #: either way waits for all that the device was told before.
 ALLOWED = 0
 KNOBS = {
     "default": {},
-    "updates": {"inner_steps": 2},
+    "updates": {"inner_steps": 1},
     "full": {"gradient": "full", "inner_steps": 1},
 }
-STEPS = 3
+STEPS = 2
 
 
 def waits_of(pipe, pair, monkeypatch, points=None, **call):
@@ -27,23 +27,22 @@ def waits_of(pipe, pair, monkeypatch, points=None, **call):
     return waits
 
 
-@pytest.mark.parametrize("name", KNOBS)
+@pytest.mark.parametrize(
+    "name", ["updates", *(pytest.param(n, marks=pytest.mark.slow) for n in ("default", "full"))]
+)
 def test_no_step_waits(make_pipeline, textured_plane, monkeypatch, name):
     waits = waits_of(make_pipeline(), textured_plane, monkeypatch, knobs=KNOBS[name])
     assert sum(waits.found.values()) == ALLOWED, waits.found
 
 
-def test_what_waits_is_found(make_pipeline, textured_plane, monkeypatch):
-    """A read-back, a mask and a list that a step may come to hold."""
-    corrected = Trajectory.corrected
-
-    def careless(self, x):
+def test_what_waits_is_found(monkeypatch):
+    """A read-back, a mask and a copy, as a step may come to hold them."""
+    monkeypatch.setattr(Waits, "_line", staticmethod(lambda: "step"))
+    with Waits() as waits:
+        x = There(torch.rand(4, 4))
+        waits.counts = True
         float(x.mean())
         x[x > 0.5]
         x.cpu()
-        return corrected(self, x)
-
-    monkeypatch.setattr(Trajectory, "corrected", careless)
-    waits = waits_of(make_pipeline(), textured_plane, monkeypatch, knobs={"corrections": 2})
-    assert list(waits.of_kind("read back").values()) == [2]
-    assert list(waits.of_kind("to here").values()) == [1]
+    assert waits.of_kind("read back") == {"step": 2}
+    assert waits.of_kind("to here") == {"step": 1}

@@ -29,7 +29,7 @@ def test_live_bytes_rise_and_fall():
     assert (counted.live, counted.peak) == (0, 8000)
 
 
-@pytest.mark.parametrize("key", ["marigold", "depthmaster"])
+@pytest.mark.parametrize("key", [pytest.param("marigold", marks=pytest.mark.slow), "depthmaster"])
 def test_gradients_cost_memory(key, monkeypatch):
     monkeypatch.setitem(FULL_SIZES, key, TINY[key])
     found, parts = count_memory(key), TINY[key]().components.values()
