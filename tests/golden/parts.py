@@ -1,0 +1,501 @@
+"""Numbers of the method's parts on awkward inputs, one function for each part.
+
+Images of unequal sizes, anisotropic pixels, three views that overlap in part, depths from 3 to 12 m. What is
+kept of an array is coarse (mean, spread, three quantiles), so that it is the same on every machine within a
+few thousandths; a constant of a part that changes by a few per cent shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import torch
+from PIL import Image
+
+from geodiff_plugin.algorithm.correction import (
+    correction_target,
+    local_error,
+    off_edges,
+    prior_error,
+    refine_depth,
+)
+from geodiff_plugin.algorithm.evidence import chunk_views, prepare_evidence
+from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
+from geodiff_plugin.algorithm.gradients import RULES
+from geodiff_plugin.algorithm.photometric import match_exposure, photometric, ssim
+from geodiff_plugin.algorithm.schedule import make_schedule
+from geodiff_plugin.algorithm.terms import Objective
+from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
+from geodiff_plugin.formats.exif import intrinsics_from_exif
+from geodiff_plugin.geometry import hidden_in_right, is_rectified, resize_image, warp_right_to_left
+from geodiff_plugin.matching import build_cost_volume, points_to_matches, with_points
+from geodiff_plugin.matching.build import mirrored_pose_preferred
+from geodiff_plugin.matching.consistency import match_volume
+from geodiff_plugin.matching.matches import Matches, reject_reflections
+from geodiff_plugin.pose.refine import Displacement, fit_displacement, straightened
+from geodiff_plugin.pose.scale import find_scale, refined_scale
+from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
+from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
+from geodiff_plugin.scale.points import (
+    depth_span,
+    fit_to_points,
+    order_agreement,
+    refine_to_matches,
+    reliable_matches,
+)
+from geodiff_plugin.scale.space import SPACES, MetricMap
+from geodiff_plugin.scale.volume_search import search_scale
+from geodiff_plugin.types import CameraView
+from tests.conftest import textured
+
+SIZE, SIZES = (60, 88), ((72, 80), (54, 96))
+#: Normal and offset of two planes; the near one ends at 0.7 m to each side of the axis, 0.5 m up and down.
+SURFACES = (((0.25, -0.35, 1.0), 7.0, np.inf), ((0.05, 0.1, 1.0), 3.4, 0.7))
+
+PARTS: dict[str, Callable[[], dict[str, object]]] = {}
+
+
+def part(function: Callable[[], dict[str, object]]) -> Callable[[], dict[str, object]]:
+    """Register a part under its function's name."""
+    PARTS[function.__name__] = function
+    return function
+
+
+def _camera(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    return np.array([[fx, 0.3, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def _pose(yaw_deg: float, *centre: float) -> np.ndarray:
+    E, angle = np.eye(4), np.radians(yaw_deg)
+    E[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    E[:3, 3] = centre
+    return E
+
+
+def _rendered(K: np.ndarray, E: np.ndarray, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Image ``(3, H, W)`` and depth ``(1, 1, H, W)`` of the two textured planes."""
+    v, u = np.mgrid[: size[0], : size[1]].astype(np.float64)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T @ E[:3, :3].T
+    image, depth = np.zeros((*size, 3)), np.full(size, np.inf)
+    for seed, (normal, offset, reach) in enumerate(SURFACES):
+        z = (offset - np.dot(normal, E[:3, 3])) / (rays @ np.array(normal))
+        points = E[:3, 3] + rays * z[..., None]
+        nearer = (np.abs(points[..., 0]) < reach) & (np.abs(points[..., 1]) < reach * 0.7) & (z < depth)
+        image[nearer], depth[nearer] = textured(points[..., :2], seed)[nearer], z[nearer]
+    return torch.from_numpy(image).permute(2, 0, 1).float(), torch.from_numpy(depth)[None, None].float()
+
+
+@cache
+def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, tuple[CameraView, ...]]:
+    """Left image, its depth and K, and the further views: a rectified one and a turned one."""
+    K = _camera(75, 66, 41, 31)
+    left, depth_m = _rendered(K, np.eye(4), SIZE)
+    views = []
+    for size, K_right, E in (
+        (SIZES[0], _camera(75, 66, 36, 35), _pose(0.0, 0.35, 0.0, 0.0)),
+        (SIZES[1], _camera(88, 80, 50, 26), _pose(-9.0, -0.45, 0.12, 0.05)),
+    ):
+        image, _ = _rendered(K_right, E, size)
+        matrices = (torch.from_numpy(m).float() for m in (K_right, np.linalg.inv(E)))
+        views.append(CameraView((0.8 * image + 0.1).clamp(0, 1), *matrices))
+    return left, depth_m, torch.from_numpy(K).float(), tuple(views)
+
+
+@cache
+def volume(count: int = 2):
+    left, _, K, views = scene()
+    return build_cost_volume(left, views[:count], K)
+
+
+@cache
+def matches() -> Matches:
+    return match_volume(volume())
+
+
+def _noise(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+@cache
+def prior() -> tuple[torch.Tensor, Matches]:
+    """A prior's depth that errs smoothly and at edges, ``(1, 1, H, W)``, and matches as a chunk."""
+    _, depth_m, _, _ = scene()
+    rows, columns = torch.meshgrid(
+        torch.linspace(-1, 1, SIZE[0]), torch.linspace(-1, 1, SIZE[1]), indexing="ij"
+    )
+    wrong = 0.12 * torch.sin(3 * columns + 1) * rows + 0.03 * _noise(1, 1, *SIZE)
+    return depth_m.roll(2, -1) * wrong.exp(), Matches.stack([matches()])
+
+
+def _nearness(depth_m: torch.Tensor) -> torch.Tensor:
+    x = 1.0 / depth_m
+    return 0.05 + 0.9 * (x - x.amin()) / (x.amax() - x.amin())
+
+
+@part
+def cameras() -> dict[str, object]:
+    left, depth_m, K, views = scene()
+    result: dict[str, object] = {}
+    for v, (image, K_right, T) in enumerate(views):
+        given = depth_m, K[None], K_right[None], T[None]
+        warped = warp_right_to_left(image[None], *given)
+        result |= {f"image_{v}": warped.image, f"visible_{v}": warped.visible, f"z_{v}": warped.z_right}
+        result[f"hidden_{v}"] = hidden_in_right(*given, image.shape[-2:])
+        result[f"uv_{v}"] = warped.uv.clamp(-500, 500)
+    small, K_small = resize_image(left, K, (37, 66))
+    return result | {"small": small, "K_small": K_small}
+
+
+@part
+def rectified() -> dict[str, object]:
+    _, _, K, views = scene()
+    T = views[0].T_right_from_left
+    changes = [(0, 0, 0.2), (0, 1, 0.2), (0, 2, 9.0), (1, 1, 0.2), (1, 2, 0.2), (1, 2, 0.05)]
+    K_rights = torch.stack([K] * len(changes))
+    for k, (i, j, by) in enumerate(changes):
+        K_rights[k, i, j] += by
+    shifted = torch.stack([T] * 4)
+    shifted[0, 1, 3], shifted[1, 1, 3], shifted[2, 2, 3] = 0.0033, 0.0037, 0.004
+    shifted[3, 0, 1] = 0.002
+    both = is_rectified(K, K_rights, T), is_rectified(K, K, shifted)
+    return {"intrinsics": str(both[0].tolist()), "poses": str(both[1].tolist())}
+
+
+@part
+def cost_volume() -> dict[str, object]:
+    both, one = volume(), volume(1)
+    near = build_cost_volume(scene()[0], scene()[3], scene()[2], depth_range=(2.0, 20.0))
+    result: dict[str, object] = {}
+    for name, made in (("both", both), ("one", one), ("given", near)):
+        result |= {f"{name}_planes": made.inverse_depth, f"{name}_in_view": made.in_view}
+        for k, share in enumerate((0.0, 0.35, 0.7, 1.0)):
+            result[f"{name}_levels_{k}"] = made.levels[round(share * (len(made.levels) - 1))]
+        result |= {f"{name}_grey": made.left_01, f"{name}_right_0": made.rights[0].image_01}
+        result[f"{name}_rectified"] = str(made.rectified)
+    return result
+
+
+@part
+def matched() -> dict[str, object]:
+    result: dict[str, object] = {}
+    for count in (1, 2):
+        found = match_volume(volume(count))
+        reliable = found.confidence > 0.5
+        right = found.inverse_depth[reliable] * scene()[1][0][reliable]
+        result |= {
+            f"confidence_{count}": found.confidence,
+            f"right_{count}": right,
+            f"step_{count}": found.plane_step,
+        }
+    left, _, K, views = scene()
+    turned = [CameraView(v.image_01, v.K, torch.linalg.inv(v.T_right_from_left)) for v in views]
+    asked = [mirrored_pose_preferred(left, given, K) for given in (views, turned)]
+    return result | {"mirrored": str(asked)}
+
+
+@part
+def searched() -> dict[str, object]:
+    _, depth_m, _, _ = scene()
+    x, valid = _nearness(depth_m), torch.ones(1, 1, *SIZE, dtype=torch.bool)
+    valid[..., :20] = False
+    result: dict[str, object] = {}
+    asked = {
+        "free": {},
+        "given": {"depth_range": (4.0, 8.0)},
+        "valid": {"valid": valid},
+        "kept": {"current": (torch.tensor([3.1]), torch.tensor([13.0]))},
+    }
+    for name, options in asked.items():
+        for space, values in (("disparity", x), ("depth", 1.0 - x), ("log", 1.0 - x)):
+            if space != "disparity" and name != "free":
+                continue
+            found = search_scale(volume(), values, space, **options)
+            result |= {
+                f"{name}_{space}_{key}": value for key, value in found._asdict().items() if key != "on_edge"
+            }
+            result[f"{name}_{space}_on_edge"] = str(found.on_edge.tolist())
+    far = search_scale(volume(1), torch.full_like(x, 0.5) + 0.02 * _noise(1, 1, *SIZE), "disparity")
+    return result | {"flat_cost": far.cost}
+
+
+@part
+def fitted() -> dict[str, object]:
+    x, metric = _nearness(prior()[0]), MetricMap("disparity")
+    found = matches()
+    reliable = reliable_matches(found)
+    assert reliable is not None
+    points, _ = points_to_matches(_points(), scene()[2], SIZE, SIZE)
+    result: dict[str, object] = {"order": order_agreement(x, found, "disparity"), "unit": reliable.plane_step}
+    result["order_depth"] = order_agreement(1 - x, found, "depth")
+    for name, target in (("matches", reliable), ("points", points)):
+        result[f"{name}_span"] = torch.stack(depth_span(target))
+        result[f"{name}_basin"] = torch.stack(fit_to_points(x, target, metric))
+        kept = torch.tensor([3.3]), torch.tensor([11.0])
+        result[f"{name}_kept"] = torch.stack(fit_to_points(x, target, metric, kept))
+    for name, target in (("matches", found), ("points", points)):
+        for start in ((3.0, 11.0), (1.0, 14.0), (3.0, 40.0)):
+            ends = refine_to_matches(x, target, *(torch.tensor([end]) for end in start), "disparity")
+            result[f"{name}_ends_{start[0]:g}_{start[1]:g}"] = torch.stack(ends)
+    return result
+
+
+def _points(count: int = 120) -> torch.Tensor:
+    """Points ``(N, 3)`` of the left view, some of them wrong, one behind the camera."""
+    _, depth_m, K, _ = scene()
+    rng = np.random.default_rng(1)
+    v, u = (torch.from_numpy(rng.integers(0, side, count)) for side in SIZE)
+    z = depth_m[0, 0, v, u] * torch.from_numpy(np.where(rng.random(count) < 0.1, 1.6, 1.0)).float()
+    rays = torch.linalg.solve(K, torch.stack([u + 0.3, v - 0.2, torch.ones(count)]).float()).T
+    return torch.cat([rays * z[:, None], torch.tensor([[0.0, 0.0, -2.0]])])
+
+
+@part
+def known_points() -> dict[str, object]:
+    K, grid = scene()[2], (31, 43)
+    cloud, left_out = points_to_matches(_points(400), K, SIZE, grid)
+    both = with_points(
+        Matches.stack([matches()]), Matches.stack([points_to_matches(_points(), K, SIZE, SIZE)[0]])
+    )
+    weights = both.confidence[both.confidence > 1.5]
+    numbers = {"inverse_depth": cloud.inverse_depth, "confidence": cloud.confidence, "unit": cloud.plane_step}
+    return numbers | {"left_out": str(left_out), "with_matches": both.inverse_depth, "weights": weights}
+
+
+@part
+def correction() -> dict[str, object]:
+    depth_m, target = prior()
+    left = scene()[0][None]
+    error = prior_error(depth_m, target, left)
+    valid = torch.ones(1, 1, *SIZE)
+    valid[..., 50:70] = 0
+    result: dict[str, object] = {"error": error, "error_of_truth": prior_error(scene()[1], target, left)}
+    rough = torch.nn.functional.interpolate(_noise(1, 1, 9, 13, seed=4), SIZE, mode="bicubic")
+    result["error_rough"] = prior_error(depth_m * (0.1 * rough).exp(), target, left)
+    result["error_without"] = prior_error(depth_m, replace(target, confidence=0 * target.confidence), left)
+    for name, of_prior in (("good", 0.02), ("fair", 0.06), ("poor", 0.2), ("local", None)):
+        e = torch.full((1, 1, 1, 1), of_prior or 0.05)
+        e = local_error(e, valid if of_prior is None else None)
+        refined_m, support, field = refine_depth(depth_m, target, left, e)
+        result |= {
+            f"{name}_change": (refined_m / depth_m).log(),
+            f"{name}_support": support,
+            f"{name}_field": field,
+        }
+        result[f"{name}_off_edges"] = off_edges(target, depth_m, e).confidence
+    points = Matches.stack([points_to_matches(_points(), scene()[2], SIZE, SIZE)[0]])
+    kept = torch.linspace(0, 1, 30 * 44).view(1, 1, 30, 44)
+    both = correction_target(target, points, kept, e, depth_m)
+    assert both is not None
+    refined_m, _, _ = refine_depth(depth_m, both, left, torch.full((1, 1, 1, 1), 0.05))
+    return result | {"with_points": refined_m / depth_m, "target": both.confidence.clamp_max(1.0)}
+
+
+@part
+def reflections() -> dict[str, object]:
+    depth_m, target = prior()
+    behind = target.inverse_depth.clone()
+    behind[..., 10:34, 20:50] *= 0.62
+    behind[..., 40:44, 60:64] *= 0.5
+    smoothly = target.inverse_depth * torch.linspace(0.6, 1.1, SIZE[1])
+    return {
+        "region": reject_reflections(replace(target, inverse_depth=behind), depth_m),
+        "slope": reject_reflections(replace(target, inverse_depth=smoothly), depth_m),
+        "none": reject_reflections(target, depth_m),
+    }
+
+
+@part
+def losses() -> dict[str, object]:
+    left, _, K, views = scene()
+    depth_m, metric = prior()[0], MetricMap("disparity")
+    evidence = prepare_evidence(left, views, K, _points(), DEFAULT, needs_matches=True)
+    x = _nearness(depth_m)
+    affine, start = (
+        metric.from_range(*(torch.tensor([end]) for end in ends)) for ends in ((3.0, 11.0), (2.8, 13.0))
+    )
+    z0, anchor = _noise(1, 4, 15, 22), _noise(1, 4, 15, 22, seed=1)
+    stacked = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
+    result: dict[str, object] = {}
+    weights = dict.fromkeys(("photometric", "matches", "points", "prior_pull", "anchor"), 0.5)
+    for name, base in (("default", DEFAULT), ("paper", PAPER), ("dc", MARIGOLD_DC)):
+        objective = Objective(chunk_views([evidence]), metric, replace(base, weights=weights))
+        loss = objective(x, affine, start, z0, anchor, *stacked, hidden=objective.hidden(x, affine))
+        result |= {f"{name}_{key}": value for key, value in loss.terms.items()} | {
+            f"{name}_total": loss.total
+        }
+        result[f"{name}_visible"] = loss.visible_fraction
+    return result
+
+
+@part
+def photometry() -> dict[str, object]:
+    left, depth_m, K, views = scene()
+    warps = [
+        warp_right_to_left(v.image_01[None], depth_m, K[None], v.K[None], v.T_right_from_left[None])
+        for v in views
+    ]
+    warped, visible = torch.stack([w.image for w in warps], 1), torch.stack([w.visible for w in warps], 1)
+    shaded = (warps[0].image * torch.linspace(0.5, 1.2, SIZE[1])).clamp(0, 1)
+    result: dict[str, object] = {"ssim": ssim(left[None], warps[0].image)}
+    result["exposure"] = match_exposure(shaded, left[None], visible[:, 0])
+    result["dark"] = match_exposure(0.05 * shaded, left[None], visible[:, 0])
+    for name, config in (
+        ("default", DEFAULT),
+        ("paper", PAPER),
+        ("plain", replace(DEFAULT, exposure=False, eta=0.3)),
+    ):
+        result[name] = photometric(left[None], warped, visible, config)
+    seen, error = reprojection(views, depth_m, left[None], K[None])
+    return result | {"seen": seen, "error": error}
+
+
+@part
+def confidence() -> dict[str, object]:
+    shape = (1, 1, *SIZE)
+    support, error = (torch.rand(shape, generator=torch.Generator().manual_seed(k)) for k in (0, 1))
+    visible, spread = error > 0.2, 0.1 * support.roll(7, -1)
+    of_prior = {"good": 0.02, "poor": 0.12, "unknown": None}
+    result: dict[str, object] = {}
+    for name, e in of_prior.items():
+        prior_of = None if e is None else torch.full((1, 1, 1, 1), e)
+        result[name] = depth_confidence(support**3, 0.2 * error, visible, None, prior_of)
+        result[f"{name}_spread"] = depth_confidence(support**3, 0.2 * error, visible, spread, prior_of)
+    local = local_error(torch.full((1, 1, 1, 1), 0.03), visible.float())
+    return result | {"local": depth_confidence(support, 0.2 * error, visible, None, local)}
+
+
+@part
+def finished() -> dict[str, object]:
+    depth_m, target = prior()
+    left, true_m, K, views = scene()
+    ramp = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(true_m, (2,) * 4, mode="replicate"), 5, 1)
+    result: dict[str, object] = {"sharpened": (sharpen_edges(ramp, left[None]) / ramp).log()}
+    for e in (0.03, 0.12):
+        error = torch.full((1, 1, 1, 1), e)
+        result[f"alone_{e}"] = (vote_depth(depth_m, left[None], target, error) / depth_m).log()
+        result[f"views_{e}"] = (vote_depth(depth_m, left[None], target, error, views, K) / depth_m).log()
+    return result
+
+
+@part
+def spaces() -> dict[str, object]:
+    x = torch.linspace(-0.05, 1.1, 37).view(1, 1, 1, -1)
+    ends, result = (torch.tensor([1.7]), torch.tensor([23.0])), {}
+    for space in SPACES:
+        for positive in ("softplus", "square"):
+            metric = MetricMap(space, positive)
+            affine = metric.from_range(*ends)
+            depth_m = metric(x, affine)
+            result[f"{space}_{positive}"] = depth_m
+            result[f"{space}_{positive}_back"] = metric.relative(depth_m, affine)
+            result[f"{space}_{positive}_state"] = torch.cat([affine.s_hat, affine.t_hat, affine.g_s])
+    return result
+
+
+@part
+def rules() -> dict[str, object]:
+    result = {}
+    for name, make in RULES.items():
+        rule = make(0.03)
+        steps = [
+            rule.step(_noise(2, 4, 3, 5, seed=k) * 10.0**k, _noise(2, 4, 3, 5, seed=9)) for k in range(3)
+        ]
+        result |= {f"{name}_{k}": step for k, step in enumerate(steps)}
+    return result
+
+
+@part
+def schedules() -> dict[str, object]:
+    result = {}
+    for steps, corrections, updates_from, rounds, skipped in (
+        (4, 1, 0.0, 1, 0),
+        (10, 3, 0.5, 1, 0),
+        (10, 8, 0.9, 1, 4),
+        (2, 3, 0.4, 3, 0),
+        (5, 2, 0.6, 1, 1),
+    ):
+        for start, stop in ((0.0, 1.0), (0.3, 0.7)):
+            config = replace(DEFAULT, corrections=corrections, start=start, stop=stop)
+            plan = UpdatePlan(2, updates_from, 0.03)
+            made = make_schedule(config, plan, steps, rounds=rounds, skipped=skipped)
+            result[f"{steps}_{corrections}_{updates_from}_{rounds}_{skipped}_{start}"] = str(made)
+    return result
+
+
+@cache
+def tracks() -> tuple[Tracks, np.ndarray, np.ndarray]:
+    """Tracks of three views, their poses and inverse depths; a fifth of the observations are missing."""
+    _, depth_m, K, views = scene()
+    rng = np.random.default_rng(2)
+    left_px = rng.uniform([2, 2], [SIZE[1] - 3, SIZE[0] - 3], (300, 2))
+    rows, columns = np.rint(left_px[:, 1]).astype(int), np.rint(left_px[:, 0]).astype(int)
+    w = 1.0 / depth_m[0, 0].double().numpy()[rows, columns]
+    Ts = np.stack([v.T_right_from_left.double().numpy() for v in views])
+    K_rights = np.stack([v.K.double().numpy() for v in views])
+    rays = np.linalg.solve(K.double().numpy(), np.c_[left_px, np.ones(300)].T).T
+    right_px = np.stack([project_tracks(rays, w, *of_view).px for of_view in zip(K_rights, Ts, strict=True)])
+    right_px += rng.normal(0, 0.2, right_px.shape)
+    seen = rng.random((2, 300)) > 0.2
+    seen[0] |= ~seen[1]
+    return Tracks(left_px, right_px, seen, K.double().numpy(), K_rights), Ts, w
+
+
+@part
+def poses() -> dict[str, object]:
+    given, Ts, w = tracks()
+    cloud = given.rays / w[:, None]
+    length = (30.0, 20.0, 66.0, 44.0, 1.7)
+    rng = np.random.default_rng(3)
+    refined, before = w * np.exp(rng.normal(0, 0.02, w.shape)), 0.8 * w
+    result: dict[str, object] = {"inverse_depth": solve_inverse_depth(given, Ts) / w}
+    for name, how in (
+        ("baseline", (0.41, None, None)),
+        ("length", (None, length, None)),
+        ("points", (None, None, cloud)),
+    ):
+        scale = find_scale(given, Ts, 1.3 if name == "length" else 1.0, *how)
+        result[name] = np.array([scale.factor, scale.spread or 0.0])
+    for misfit in (0.0, 0.1):
+        result[f"refined_{misfit}"] = np.array(refined_scale(refined, before, misfit))
+    bent = replace(given.view(0), right_px=given.view(0).right_px + np.array([0.0, 1.5]))
+    found = fit_displacement(bent, Ts[0], SIZES[0])
+    assert found is not None
+    at_other_size = Displacement(found.coefficients, (144, 160), found.most_px, found.rms_px)
+    image = scene()[3][0].image_01
+    result |= {"displacement": found.at(bent.right_px[0]), "bend": np.array([found.most_px, found.rms_px])}
+    return result | {"straight": straightened(image, found), "other_size": straightened(image, at_other_size)}
+
+
+@part
+def exif() -> dict[str, object]:
+    """A resized photograph whose sensor has other pixels across than down, in inches and in centimetres."""
+    result = {}
+    for unit, upright in ((2, True), (3, True), (2, False)):
+        image = Image.new("RGB", (300, 200) if upright else (200, 300))
+        entries = image.getexif()
+        inner = entries.get_ifd(0x8769)
+        inner |= {0x920A: 4.2, 0xA20E: 5000.0, 0xA20F: 5600.0, 0xA210: unit, 0xA002: 3000, 0xA003: 2000}
+        result[f"sensor_{unit}_{upright}"] = intrinsics_from_exif(image, "image")[0]
+    image = Image.new("RGB", (300, 200))
+    image.getexif().get_ifd(0x8769)[0xA405] = 28
+    return result | {"equivalent": intrinsics_from_exif(image, "image")[0]}
+
+
+@part
+def intermediate_images() -> dict[str, object]:
+    """Evidence of a call whose losses are computed on a smaller grid than the sweep's."""
+    left, _, K, views = scene()
+    evidence = prepare_evidence(left, views, K, _points(), replace(DEFAULT, loss_resolution=64), True)
+    assert evidence.matches is not None and evidence.points is not None
+    return {
+        "left": evidence.left_01,
+        "K": evidence.K_left,
+        "right": evidence.views[1].image_01,
+        "K_right": evidence.views[1].K,
+        "confidence": evidence.matches.confidence,
+        "inverse_depth": evidence.matches.inverse_depth[evidence.matches.confidence > 0.5],
+        "points": evidence.points.inverse_depth,
+    }

@@ -1,0 +1,396 @@
+"""Hand-written slips in the method's numbers, and whether the fast tests notice them.
+
+    python -m tests.mutants [WORD ...]
+
+Each mutant is a file of the package, a text that occurs in it once, and another text in its place. It is
+applied in a temporary copy of the checkout, where the fast tests named beside it run until the first fails.
+Printed are the mutants that survive, and those whose text is no longer there. With words, only the mutants of
+files whose path contains one of them run.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+COPIED = ("geodiff_plugin", "tests", "examples", "docs", "pyproject.toml", "constraints.txt", "README.md")
+#: Imported before the copies fork, so that each starts in a second.
+HEAVY = ("cv2", "diffusers", "kornia", "pytest", "scipy.spatial", "torch", "transformers")
+PARTS, REFERENCES = "tests/golden/test_parts.py", "tests/parity/test_numpy_references.py"
+
+
+class Mutant(NamedTuple):
+    """A slip: the file below the package, what is there once, what is put there, and the tests that run."""
+
+    file: str
+    text: str
+    instead: str
+    tests: tuple[str, ...] = ()
+
+
+def of(file: str, *slips: tuple[str, str], tests: tuple[str, ...] = ()) -> list[Mutant]:
+    """Mutants of one file; ``tests`` run behind the parts and the references."""
+    return [Mutant(file, *slip, tests) for slip in slips]
+
+
+UNIT = "tests/unit/test_"
+MUTANTS = [
+    *of(
+        "geometry/cameras.py",
+        ("centre = (K[:, :, 2] + half) * scale - half", "centre = K[:, :, 2] * scale"),
+        (
+            "size_to[1] / size_from[1], size_to[0] / size_from[0]",
+            "size_to[0] / size_from[0], size_to[1] / size_from[1]",
+        ),
+        ("align_corners=False, antialias=True)[0]", "align_corners=False)[0]"),
+        ("[0, 0, 1, 1], [0, 1, 1, 2]", "[0, 0, 1], [0, 1, 1]"),
+        ("sideways = t[..., 1:]", "sideways = t[..., 1:2]"),
+        ("SIDEWAYS_TOLERANCE = 1e-3, 0.01", "SIDEWAYS_TOLERANCE = 1e-3, 0.02"),
+    ),
+    *of(
+        "geometry/projection.py",
+        ("rays[..., :1] - (slant", "rays[..., :1] + (slant"),
+        ("in_front = z > NEAREST_M", "in_front = z.abs() > NEAREST_M"),
+        ("M = K_right @ T", "M = K_left @ T"),
+        ("fx * x + skew * y + cx", "fx * x + cx"),
+        tests=(f"{UNIT}geometry.py", f"{UNIT}skew.py"),
+    ),
+    *of(
+        "geometry/warping.py",
+        ("max(width - 1, 1), max(height - 1, 1)", "max(width, 1), max(height, 1)"),
+        ("in_columns & in_rows & (z > NEAREST_M)", "in_columns & in_rows"),
+        ("u <= size[1] - 1 + _EDGE_PX", "u <= size[1] + _EDGE_PX"),
+        ("cell = (uv + 0.5) * scale - 0.5", "cell = uv * scale"),
+        ("margin: float = 0.05", "margin: float = 0.1"),
+        tests=(f"{UNIT}geometry.py",),
+    ),
+    *of(
+        "matching/census.py",
+        ("[0.299, 0.587, 0.114]", "[0.114, 0.587, 0.299]"),
+        ("_CONTRAST = 6.0 / 255.0", "_CONTRAST = 8.0 / 255.0"),
+        ("(2 * stride, 2, stride, 1)", "(stride, 1, stride, 1)"),
+    ),
+    *of(
+        "matching/aggregation.py",
+        ("JUMP_CONTRAST = 0.15, 1.2, 0.1", "JUMP_CONTRAST = 0.12, 1.2, 0.1"),
+        ("JUMP_CONTRAST = 0.15, 1.2, 0.1", "JUMP_CONTRAST = 0.15, 1.0, 0.1"),
+        ("JUMP_CONTRAST = 0.15, 1.2, 0.1", "JUMP_CONTRAST = 0.15, 1.2, 0.13"),
+        ("torch.stack([p2[1:], p2[1:].flip(0)]", "torch.stack([p2[1:], p2[1:]]"),
+        ("limits[n - 1] + least", "limits[n - 1]"),
+        ("clamp_min(2.0 * STEP_PENALTY)", "clamp_min(STEP_PENALTY)"),
+        ("torch.minimum(before, after, out=step).add_(p1)", "before.add(p1, out=step)"),
+    ),
+    *of(
+        "matching/consistency.py",
+        ("offset = 0.5 * (below - above)", "offset = 0.5 * (above - below)"),
+        ("AGREEMENT_PLANES = 1.5", "AGREEMENT_PLANES = 2.5"),
+        ("LOG_ODDS = (5.8, 0.8, -5.9, -0.62)", "LOG_ODDS = (5.3, 0.8, -5.9, -0.62)"),
+        ("LOG_ODDS = (5.8, 0.8, -5.9, -0.62)", "LOG_ODDS = (5.8, 0.8, -5.9, -0.55)"),
+        ("(margin + 0.03)", "(margin + 0.05)"),
+        ("confidence = torch.maximum(confidence,", "confidence = torch.minimum(confidence + 1.0,"),
+        ("total - UNSEEN_LEVEL * (len(volume.levels) - seen)", "total"),
+        ("LEAST_CONTRAST = 15, 0.03", "LEAST_CONTRAST = 15, 0.06"),
+        ("0.5 * (other[before, column] + other[after, column])", "other[before, column]"),
+        tests=(f"{UNIT}matching.py",),
+    ),
+    *of(
+        "matching/matches.py",
+        ("((uv[inside] + 0.5) * scale).floor()", "(uv[inside] * scale).round()"),
+        ('1.0 / z[inside], "amax"', '1.0 / z[inside], "amin"'),
+        ("UNIT = 0.01", "UNIT = 0.012"),
+        ("confidence = points.confidence / share", "confidence = points.confidence / share.sqrt()"),
+        (
+            "SPREADS, LEAST_DISTANCE, MULTIPLE = 2.0, 0.2, 1.6",
+            "SPREADS, LEAST_DISTANCE, MULTIPLE = 2.0, 0.25, 1.6",
+        ),
+        (
+            "SPREADS, LEAST_DISTANCE, MULTIPLE = 2.0, 0.2, 1.6",
+            "SPREADS, LEAST_DISTANCE, MULTIPLE = 2.0, 0.2, 1.4",
+        ),
+        ("torch.minimum(region, behind)", "region"),
+        ("REGION = 0.08", "REGION = 0.12"),
+    ),
+    *of(
+        "matching/sweep.py",
+        ("total += cost * of_view", "total += cost"),
+        ("count += of_view", "count += 1"),
+        ("UNSEEN_LEVEL = 78", "UNSEEN_LEVEL = 60"),
+        ("torch.where(in_view[plane], cost, unseen)", "cost"),
+        ("0.5 * most)", "most)"),
+        tests=(f"{UNIT}matching.py",),
+    ),
+    *of(
+        "matching/build.py",
+        ("HEADROOM, LEAST_SHIFT = 1.25, 0.03", "HEADROOM, LEAST_SHIFT = 1.1, 0.03"),
+        ("PLANE_STEP_PX = 0.75", "PLANE_STEP_PX = 0.8"),
+        ("float(K[0, 0] / K_r[0, 0])", "float(K[1, 1] / K_r[1, 1])"),
+        (
+            "PILOT_QUANTILE, PILOT_LEAST_SHARE = 0.8, 0.995, 0.03",
+            "PILOT_QUANTILE, PILOT_LEAST_SHARE = 0.8, 0.95, 0.03",
+        ),
+        ("turned > _CLEARLY * given", "turned < _CLEARLY * given"),
+        tests=(f"{UNIT}matching.py",),
+    ),
+    *of("matching/alignment.py", ('mode="bicubic"', 'mode="bilinear"')),
+    *of(
+        "scale/space.py",
+        ("FLOOR_EPS = 0.001", "FLOOR_EPS = 0.01"),
+        ("g = a * 0.9", "g = a * 0.8"),
+        ("g / v**2", "g / v**1.9"),
+        ("floored - FLOOR_EPS**2 / floored", "floored"),
+        ("self.t_hat**2 * self.unit_shift", "self.t_hat * self.unit_shift"),
+    ),
+    *of(
+        "scale/points.py",
+        ("BASIN_CAUCHY, BASIN_KEEP = 32.0, 1.05", "BASIN_CAUCHY, BASIN_KEEP = 8.0, 1.05"),
+        ("BASIN_CAUCHY, BASIN_KEEP = 32.0, 1.05", "BASIN_CAUCHY, BASIN_KEEP = 32.0, 1.5"),
+        ("FIT_CAUCHY = 0.5, 4e-3, 2.0", "FIT_CAUCHY = 0.5, 4e-3, 4.0"),
+        ("FIT_CAUCHY = 0.5, 4e-3, 2.0", "FIT_CAUCHY = 1.0, 4e-3, 2.0"),
+        ("nearness = -values if", "nearness = values if"),
+        ("doubt.sqrt(), FIT_NOISE", "doubt, FIT_NOISE"),
+        ("NEAR_REACH, FAR_REACH = 1.4, 0.7", "NEAR_REACH, FAR_REACH = 0.7, 0.7"),
+        ("share * below[:, -1:]", "0.5 * below[:, -1:]"),
+    ),
+    *of(
+        "scale/volume_search.py",
+        ("COST_CLAMP = 0.35", "COST_CLAMP = 0.4"),
+        ("torch.full_like(cost, COST_CLAMP))", "torch.zeros_like(cost))"),
+        ("in_view.gather(0, below) | ~inside", "in_view.gather(0, below)"),
+        ("weight = position - below", "weight = (position - below).round()"),
+        ('mode="nearest-exact").flatten()', 'mode="bilinear").flatten()'),
+        ("IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.6, 0.25", "IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.95, 0.95"),
+        ("KEEP_MARGIN = 2e-3", "KEEP_MARGIN = 2e-2"),
+        ("far >= high * 0.98", "far >= high * 1.02"),
+        tests=(f"{UNIT}scale_search.py",),
+    ),
+    *of(
+        "algorithm/correction.py",
+        ("STIFFNESS_POWER = 0.05, 4.0", "STIFFNESS_POWER = 0.05, 3.0"),
+        ("STIFFNESS_POWER = 0.05, 4.0", "STIFFNESS_POWER = 0.06, 4.0"),
+        ("(config.match_noise / noise) ** 2", "(config.match_noise / noise)"),
+        ("(step / matched) ** 2 + config.match_noise**2", "config.match_noise**2 + 0.0 * (step / matched)"),
+        ("return scale**2 * torch.exp", "return scale * torch.exp"),
+        (
+            "IMAGE_EDGE, DEPTH_EDGE, LEAST_LINK = 0.1, 0.1, 1e-3",
+            "IMAGE_EDGE, DEPTH_EDGE, LEAST_LINK = 0.12, 0.1, 1e-3",
+        ),
+        (
+            "IMAGE_EDGE, DEPTH_EDGE, LEAST_LINK = 0.1, 0.1, 1e-3",
+            "IMAGE_EDGE, DEPTH_EDGE, LEAST_LINK = 0.1, 0.13, 1e-3",
+        ),
+        ("SHARE, DEVIATIONS = 0.8, 1.2816", "SHARE, DEVIATIONS = 0.8, 1.39"),
+        ("noise**2 / 4.0", "noise**2 / 1.0"),
+        (
+            "torch.where(black > 0, predicted[1], predicted[0])",
+            "torch.where(black > 0, predicted[0], predicted[1])",
+        ),
+        ("STIFF_SMOOTHNESS, STIFF_INERTIA = 400.0", "STIFF_SMOOTHNESS, STIFF_INERTIA = 300.0"),
+        ("BLOCK, LEAST_ERROR, MOST_ERROR = 0.08", "BLOCK, LEAST_ERROR, MOST_ERROR = 0.16"),
+        ("INERTIA, LEAST_INERTIA, MOST_INERTIA = 0.015", "INERTIA, LEAST_INERTIA, MOST_INERTIA = 0.02"),
+        (".clamp_min(1.0) ** 3", ".clamp_min(1.0) ** 2"),
+        (
+            "EDGE_REACH, EDGE_STEP, EDGE_ERROR = 0.006, 0.3, 0.11",
+            "EDGE_REACH, EDGE_STEP, EDGE_ERROR = 0.006, 0.4, 0.11",
+        ),
+        ("across = torch.minimum(smoothness", "across = torch.maximum(smoothness"),
+        ("CAUCHY = 2.5", "CAUCHY = 3.0"),
+        ('F.interpolate(error, size, mode="nearest-exact")', 'F.interpolate(error, size, mode="bilinear")'),
+        ("INERTIA * ratio**4", "INERTIA * ratio**3"),
+        tests=(f"{UNIT}known_grids.py", f"{UNIT}correction.py"),
+    ),
+    *of("algorithm/solver.py", ("0.5 * across, 0.5 * down", "across, down"), tests=(f"{UNIT}solver.py",)),
+    *of(
+        "algorithm/photometric.py",
+        ("eta * ((1.0 - ssim", "(1.0 - eta) * ((1.0 - ssim"),
+        ("C1, C2, LEAST = 0.01**2, 0.03**2", "C1, C2, LEAST = 0.01**2, 0.04**2"),
+        ("math.exp(-0.5 / 1.5**2)", "math.exp(-0.5 / 1.2**2)"),
+        ("GAINS = (0.2, 5.0)", "GAINS = (0.2, 8.0)"),
+        ("CELLS, CELL_PRIOR = (4, 5), 0.2", "CELLS, CELL_PRIOR = (4, 5), 0.4"),
+        ("UNSEEN)).amin(1)", "UNSEEN)).amax(1)"),
+        ("mask = (seen > 0.5)", "mask = (seen > 0.0)"),
+        ("return total / levels", "return total"),
+    ),
+    *of(
+        "algorithm/terms.py",
+        ("ANCHOR_FLOOR = 0.05", "ANCHOR_FLOOR = 0.1"),
+        ("in_view & ~hidden", "in_view"),
+        ("CAUCHY = 5.0", "CAUCHY = 6.0"),
+        ("masked_mean(e + e * e, given)", "masked_mean(e, given)"),
+        ("visible_fraction >= config.min_visible", "visible_fraction >= 0.0"),
+        ("t = t - compared.affine_start.t_hat", "t = t - compared.affine_start.s_hat"),
+        tests=(f"{UNIT}terms.py",),
+    ),
+    *of(
+        "algorithm/gradients.py",
+        ("1 - b2**self._count", "1 - b1**self._count"),
+        ("(0.9, 0.99)", "(0.9, 0.999)"),
+        ("(length / _per_sample_norm(gradient)", "(1.0 / _per_sample_norm(gradient)"),
+    ),
+    *of(
+        "algorithm/denoising.py",
+        ("level.alpha * z_t - level.sigma * output", "level.alpha * z_t + level.sigma * output"),
+        ("level.alpha * output + level.sigma * z_t", "level.sigma * output + level.alpha * z_t"),
+        tests=("tests/parity/test_scheduler_parity.py",),
+    ),
+    *of(
+        "algorithm/schedule.py",
+        ("(i + 1) / count > plan.updates_from", "i / count > plan.updates_from"),
+        ("first = min(len(active) // 2", "first = min(0"),
+        ("config.start <= i / count < config.stop", "config.start <= i / count <= config.stop"),
+    ),
+    *of(
+        "algorithm/finish.py",
+        ("BRIGHTNESS, REACH = 0.1, 1.5", "BRIGHTNESS, REACH = 0.12, 1.5"),
+        ("MAP_VOTE, WEAK = 0.03, 0.2", "MAP_VOTE, WEAK = 0.04, 0.2"),
+        ("clamp_min(1.0) ** 3", "clamp_min(1.0) ** 2"),
+        ("DIFFERS, MOST_ERROR = 1.5, 0.1", "DIFFERS, MOST_ERROR = 2.0, 0.1"),
+        (
+            "BESIDE, STEP, STEEPER, SLOPE = 3, 0.02, 2.0, 0.04",
+            "BESIDE, STEP, STEEPER, SLOPE = 3, 0.02, 1.0, 0.04",
+        ),
+    ),
+    *of(
+        "algorithm/evidence.py",
+        (
+            'F.interpolate(m[None], size, mode="nearest-exact")',
+            'F.interpolate(m[None], size, mode="bilinear")',
+        ),
+        ("round(max(right_01.shape[-2:]) * min(1.0, ratio))", "max(right_01.shape[-2:])"),
+    ),
+    *of(
+        "runtime/confidence.py",
+        ("(-0.228, 0.788, 2.42, 0.0864, -15.0)", "(-0.328, 0.788, 2.42, 0.0864, -15.0)"),
+        ("(-0.228, 0.788, 2.42, 0.0864, -15.0)", "(-0.228, 0.788, 2.42, 0.0864, -12.0)"),
+        ("_HALF_KNOWN = 0.1", "_HALF_KNOWN = 0.12"),
+        ("torch.minimum(best, error), best)", "error, best)"),
+        (
+            "matched = match_exposure(warped[:, layer], left_01[:, layer], seen)",
+            "matched = warped[:, layer].clone()",
+        ),
+        ("K_strip[:, 1, 2] -= rows.start", "K_strip[:, 1, 2] -= 0"),
+        tests=(f"{UNIT}confidence.py", f"{UNIT}large_pictures.py"),
+    ),
+    *of(
+        "runtime/noise_levels.py",
+        ("alpha_bar.sqrt(), (1.0 - alpha_bar).sqrt()", "alpha_bar.sqrt(), 1.0 - alpha_bar.sqrt()"),
+        tests=("tests/parity/test_scheduler_parity.py",),
+    ),
+    *of(
+        "runtime/output.py",
+        ("factor = 1.0 / float(over_prior.median())", "factor = float(over_prior.median())"),
+        ("output.unit, output.scale_from", "_, output.scale_from"),
+        tests=(f"{UNIT}metric_priors.py",),
+    ),
+    *of(
+        "pose/scale.py",
+        ("depth_spread**2 + misfit**2", "depth_spread**2 + misfit"),
+        ("weight = of_length /", "weight = of_depth /"),
+        ("(np.array(ends).reshape(2, 2) + 0.5) * factor - 0.5", "np.array(ends).reshape(2, 2) * factor"),
+        ("LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05", "LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.06"),
+        ("ahead[close, 2] * inverse_depth", "np.linalg.norm(ahead[close], axis=1) * inverse_depth"),
+    ),
+    *of(
+        "pose/refine.py",
+        (
+            "displacement.at((grid + 0.5) * scale - 0.5) / scale",
+            "displacement.at((grid + 0.5) * scale - 0.5)",
+        ),
+        ("displacement.size[1] / width, displacement.size[0] / height", "1.0, 1.0"),
+        (
+            "_BENT_PX, _RIDGE, _FEWEST_BENT, _BLOCK, _LEAST_BENT_GAIN = 0.5, 3.0",
+            "_BENT_PX, _RIDGE, _FEWEST_BENT, _BLOCK, _LEAST_BENT_GAIN = 0.5, 12.0",
+        ),
+    ),
+    *of(
+        "formats/exif.py",
+        ("(pitch_y or pitch_x)", "pitch_x"),
+        ("{2: 25.4, 3: 10.0,", "{2: 25.4, 3: 25.4,"),
+        ("math.hypot(36.0, 24.0)", "36.0"),
+        ("max(width, height) / max(taken)", "1.0"),
+        ("(fx, fy) = (height, width), (fy, fx)", "(fx, fy) = (height, width), (fx, fy)"),
+        tests=(f"{UNIT}formats_lenses.py",),
+    ),
+]
+
+
+def prepared(folder: Path) -> Path:
+    """A copy of the checkout, without what no test of this file reads."""
+    left_out = shutil.ignore_patterns("__pycache__", "*.pyc", "scenes_cache")
+    for name in COPIED:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, ignore=left_out)
+        else:
+            shutil.copy(source, folder / name)
+    return folder
+
+
+def killed(copy: Path, mutant: Mutant | None) -> bool:
+    """Whether the tests of a mutant fail in a process of its own; of ``None``, all parts and references."""
+    child = os.fork()
+    if not child:
+        status = 3
+        try:
+            status = _run(copy, [PARTS, REFERENCES, *(() if mutant is None else mutant.tests)])
+        finally:
+            sys.stdout.flush()
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
+
+
+def _run(copy: Path, tests: list[str]) -> int:
+    import pytest
+
+    with (copy / "log.txt").open("w") as log:
+        for stream in (1, 2):
+            os.dup2(log.fileno(), stream)
+    for name in [name for name in sys.modules if name.split(".")[0] in ("geodiff_plugin", "tests")]:
+        del sys.modules[name]
+    sys.path[:] = [str(copy), *(path for path in sys.path if Path(path).resolve() != ROOT)]
+    os.environ["PYTHONPATH"] = str(copy)
+    os.chdir(copy)
+    return int(pytest.main(["-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]))
+
+
+def main(words: list[str]) -> int:
+    """Run the mutants of files that contain a word, all without any; how many are not killed."""
+    chosen = [m for m in MUTANTS if not words or any(word in m.file for word in words)]
+    for module in HEAVY:
+        __import__(module)
+    survivors, gone = [], []
+    with tempfile.TemporaryDirectory() as name:
+        copy = prepared(Path(name))
+        if killed(copy, None):
+            raise SystemExit(f"The tests fail without any mutant:\n{(copy / 'log.txt').read_text()}")
+        for mutant in chosen:
+            path = copy / "geodiff_plugin" / mutant.file
+            source = path.read_text(encoding="utf-8") if path.is_file() else ""
+            if source.count(mutant.text) != 1:
+                gone.append(mutant)
+                continue
+            start = time.perf_counter()
+            path.write_text(source.replace(mutant.text, mutant.instead), encoding="utf-8")
+            dead = killed(copy, mutant)
+            path.write_text(source, encoding="utf-8")
+            word = "killed" if dead else "SURVIVES"
+            print(
+                f"{word:8} {time.perf_counter() - start:5.1f} s  {mutant.file}: {mutant.instead}", flush=True
+            )
+            if not dead:
+                survivors.append(mutant)
+    ran = len(chosen) - len(gone)
+    print(f"{ran - len(survivors)} of {ran} mutants killed")
+    for title, listed in (("survives", survivors), ("no longer there", gone)):
+        for mutant in listed:
+            print(f"{title}: {mutant.file}: {mutant.text!r} -> {mutant.instead!r}")
+    return len(survivors) + len(gone)
+
+
+if __name__ == "__main__":
+    raise SystemExit(bool(main(sys.argv[1:])))
