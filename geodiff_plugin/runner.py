@@ -1,22 +1,20 @@
 """One runner for long jobs: ``geodiff depth`` over many pairs, captures and the evaluation.
 
 A job is a list of ``Item``; its results are lines of a ``Journal``, a JSONL file. ``Runner.run`` takes every
-item that has no result through the stages of the work and appends one record each::
+item without a result through the stages of the work and appends one record each::
 
-    journal = Journal(out / "samples.jsonl")
     items = [Item(fingerprint(name, settings, path, __version__), path) for ...]
-    records = Runner(items, journal, noun="sample").run(lambda item: {"abs_rel": measure(item.payload)})
+    runner = Runner(items, Journal(out / "samples.jsonl"), noun="sample")
+    records = runner.run(lambda item: {"abs_rel": measure(item.payload)})
 
-- **Resuming.** A key is the fingerprint of all inputs (``fingerprint``: settings, the version, SHA-256 of
-  files), so an item whose inputs did not change has its record already, and one whose inputs did has none.
-  Where a result has a place with a name, such as a folder for each pair, the key is that name, and
+- **Resuming.** A key is the fingerprint of all inputs, so an item whose inputs did not change has its record
+  already. Where a result has a place with a name, such as a folder for each pair, the key is that name, and
   ``Item.inputs`` is the fingerprint.
 - **Several processes**, started by ``torchrun``, ``accelerate launch`` or in two terminals, share a job by
   sharing its journal. Each claims an item before the work, with a lock that the kernel gives back when the
   process ends, however it ends. The first process waits for what others have claimed, takes it over should
   they die, and returns the records of all; the others leave when nothing is left to claim.
-- **Failures** are records too (``status`` ``"broken"``, ``error``), tried again by the next run. Each cause
-  is said once, also when it strikes every item.
+- **Failures** are records too (``status`` ``"broken"``, ``error``), tried again by the next run.
 - **kill -9** loses the items that were on the way. A line goes out in one write; a torn last line is skipped,
   and ended before the next is appended.
 
@@ -51,7 +49,7 @@ except ImportError:  # no flock: processes keep to their shares, and two runs of
 else:
     CAN_LOCK = True
 
-__all__ = ["BROKEN", "Item", "Journal", "Process", "Record", "Runner", "fingerprint", "this_process"]
+__all__ = ["BROKEN", "Item", "Journal", "Record", "Runner", "fingerprint", "this_process"]
 
 Record = dict[str, Any]
 Stage = Callable[[Any], Any]
@@ -91,15 +89,15 @@ def _readable(part: Any) -> Any:
 class Process:
     """Which of how many processes of a launcher this one is, from 0, and its index on its own machine."""
 
-    index: int = 0
-    count: int = 1
-    local: int = 0
+    index: int
+    count: int
+    local: int
 
 
 def this_process() -> Process:
     """What ``torchrun`` or ``accelerate launch`` has put into the environment; one of one without them."""
-    defaults = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0}
-    return Process(*(int(os.environ.get(name, default)) for name, default in defaults.items()))
+    defaults = (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0))
+    return Process(*(int(os.environ.get(name, default)) for name, default in defaults))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +133,8 @@ class Journal:
     Records of failures that the file holds at first do not count, so that they are tried again.
 
     Args:
-        path: the file; its folder is made where it is missing.
+        path: the file; its folder is made where it is missing, and ``ValueError`` says where it cannot be.
         option: what the folder was given as, for messages.
-
-    Raises:
-        ValueError: the folder cannot be made or written to.
     """
 
     def __init__(self, path: Path, option: str = "--out") -> None:
@@ -249,7 +244,7 @@ class Runner:
     """Takes the items of a job through stages, but for those that have a record.
 
     Args:
-        items: in the order in which records are returned.
+        items: in the order in which records are returned; no two of one key.
         journal: of the records.
         noun: what an item is, for the bar and messages.
         survives: exceptions of a stage that fail its item only; every other one ends the run.
@@ -259,9 +254,6 @@ class Runner:
         in_order: an item goes on from the one before, so a process takes items of another's share only when
             no other process works any more.
         say: prints a sentence about failures; by default on stderr.
-
-    Raises:
-        ValueError: two items of one key; several processes on a system without ``flock``.
     """
 
     def __init__(
@@ -316,27 +308,22 @@ class Runner:
                 release(item)
             self.journal.release(item)
 
-        def leave_all() -> None:
+        on_the_way: set[Item] = set()
+        done, total, unit = len(self._records()), len(self.items), f" {self._noun}"
+        work = _in_turn if len(stages) == 1 else _side_by_side
+        bar = tqdm(total=total, initial=done, unit=unit, file=sys.stderr, disable=not self._progress)
+        try:
+            with bar, closing(work(self._todo(on_the_way), stages, self._stop, most)) as results:
+                for item, result in results:
+                    self._record(item, result)
+                    leave(item)
+                    records = self._records()
+                    if self._show is not None:
+                        bar.set_postfix(self._show(records), refresh=False)
+                    bar.update(len(records) - bar.n)
+        finally:
             for item in tuple(on_the_way):
                 leave(item)
-
-        on_the_way: set[Item] = set()
-        records, total, unit = self._records(), len(self.items), f" {self._noun}"
-        with ExitStack() as stack:
-            stack.callback(leave_all)
-            bar = tqdm(
-                total=total, initial=len(records), unit=unit, file=sys.stderr, disable=not self._progress
-            )
-            stack.enter_context(bar)
-            work = _in_turn if len(stages) == 1 else _side_by_side
-            results = stack.enter_context(closing(work(self._todo(on_the_way), stages, self._stop, most)))
-            for item, result in results:
-                self._record(item, result)
-                leave(item)
-                records = self._records()
-                if self._show is not None:
-                    bar.set_postfix(self._show(records), refresh=False)
-                bar.update(len(records) - bar.n)
         self._failures.report()
         return self._records()
 
@@ -418,10 +405,8 @@ def _side_by_side(
 ) -> Results:
     """Every item with what the last stage returned, or ``_Failed``; in order, each stage in its thread.
 
-    Closing the generator lets every stage end what it is at and no more.
-
-    Raises:
-        Exception: what ``items`` itself raised, behind the items before.
+    Closing the generator lets every stage end what it is at and no more. What ``items`` itself raises is
+    raised behind the items before.
     """
     end: Any = object()
     queues: list[SimpleQueue[Any]] = [SimpleQueue() for _ in range(len(stages) + 1)]
@@ -447,9 +432,9 @@ def _side_by_side(
             after.put((item, value))
         after.put(end)
 
+    jobs = zip(stages, queues[:-1], queues[1:], strict=True)
     workers = [threading.Thread(target=feed, daemon=True)]
-    for stage, before, after in zip(stages, queues[:-1], queues[1:], strict=True):
-        workers.append(threading.Thread(target=work, args=(stage, before, after), daemon=True))
+    workers += [threading.Thread(target=work, args=job, daemon=True) for job in jobs]
     for worker in workers:
         worker.start()
     source_error: BaseException | None = None

@@ -15,11 +15,10 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.agreement import DepthFrame, agreed, seen_in
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache
-from geodiff_plugin.evaluation.experiment import Experiment
+from geodiff_plugin.evaluation.experiment import Experiment, Page
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import CaptureEvalOptions, command_line
-from geodiff_plugin.evaluation.report import Page
-from geodiff_plugin.evaluation.table import Table
+from geodiff_plugin.evaluation.tables import Table
 from geodiff_plugin.formats.depth import read_depth_mm_png
 from geodiff_plugin.runner import Item, Record, fingerprint
 

@@ -6,29 +6,26 @@ Paper: S5.3, which it extends.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.config import DEFAULT, value_of
-from geodiff_plugin.evaluation.experiment import RECORDS_NAME, Experiment
+from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
-from geodiff_plugin.evaluation.pairs import pair_cells, remarks_on
-from geodiff_plugin.evaluation.report import Page
-from geodiff_plugin.evaluation.table import (
+from geodiff_plugin.evaluation.pairs import pairs_experiment
+from geodiff_plugin.evaluation.tables import (
     Table,
     by_method,
     cell,
     count_of_pairs,
-    interval_cell,
     label_of,
     mean_with_interval,
     metric_values,
     paired_difference,
+    regions_table,
+    seconds_of,
+    summary_table,
 )
-from geodiff_plugin.evaluation.tables import regions_table, summary_table
 from geodiff_plugin.runner import Record
-
-__all__ = ["CHANGES", "NUMBERS", "changes_table", "flatness_methods", "flatness_table", "run_changes"]
 
 CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
     "guided": (
@@ -82,35 +79,20 @@ NUMBERS = (
 """The numbers that decide the default's result, by knob."""
 
 
-def changes_table(records: Sequence[dict[str, Any]], name: str) -> Table:
-    """Every row of ``CHANGES[name]`` that ran, with its paired difference to the unchanged preset.
-
-    Args:
-        records: of the run.
-        name: key of ``CHANGES``.
-    """
-    abs_rel, delta1 = metric_values(records, "raw", "abs_rel"), metric_values(records, "raw", "delta1")
-    seconds = by_method(records, lambda record: record["seconds"])
-    unchanged = CHANGES[name][0][1]
-    reference, rows = abs_rel.get(unchanged, {}), []
+def changes_table(records: Sequence[Record], name: str) -> Table:
+    """Every row of ``CHANGES[name]`` that ran, with its paired difference to the unchanged preset."""
+    abs_rel, delta1 = (metric_values(records, "raw", metric) for metric in ("abs_rel", "delta1"))
+    seconds, unchanged, rows = by_method(records, seconds_of), CHANGES[name][0][1], []
     for title, method in CHANGES[name]:
         own = abs_rel.get(method)
         if not own:
             continue
-        difference = (
-            "-" if method == unchanged else interval_cell(paired_difference(own, reference), signed=True)
-        )
-        rows.append(
-            (
-                title,
-                str(len(own)),
-                interval_cell(mean_with_interval(list(own.values()))),
-                cell(max(own.values())),
-                interval_cell(mean_with_interval(list(delta1[method].values()))),
-                difference,
-                cell(mean_with_interval(list(seconds[method].values())).value, 1),
-            )
-        )
+        difference = paired_difference(own, abs_rel.get(unchanged, {})).cell(sign="+")
+        cells = [mean_with_interval(list(own.values())).cell(), cell(max(own.values()))]
+        cells.append(mean_with_interval(list(delta1[method].values())).cell())
+        cells.append("-" if method == unchanged else difference)
+        cells.append(cell(mean_with_interval(list(seconds[method].values())).value, 1))
+        rows.append((title, str(len(own)), *cells))
     count = count_of_pairs(len({label_of(record) for record in records}))
     header = ("change", "pairs", "AbsRel ↓ [95 %]", "worst", "δ1 ↑ [95 %]", "AbsRel more", "seconds")
     note = "Metres as they come out; each change alone, and what the knobs leave open follows it."
@@ -129,7 +111,7 @@ def flatness_methods() -> tuple[str, ...]:
     return ("guided", *(_at(number, factor) for number in NUMBERS for factor in (0.5, 2.0)))
 
 
-def flatness_table(records: Sequence[dict[str, Any]]) -> Table:
+def flatness_table(records: Sequence[Record]) -> Table:
     """Mean AbsRel with every number at half and at twice its value, and the pair that it changes most."""
     values = metric_values(records, "raw", "abs_rel")
     unchanged, rows = values.get("guided", {}), []
@@ -144,38 +126,27 @@ def flatness_table(records: Sequence[dict[str, Any]]) -> Table:
         rows.append((f"`{number}`", f"{value_of(number, DEFAULT):g}", *cells, moved))
     mean = mean_with_interval(list(unchanged.values())).value
     title = f"Every number of the default at half and at twice its value, {count_of_pairs(len(unchanged))}"
-    note = f"Mean AbsRel; {cell(mean, 4)} as they are."
-    return Table(
-        title, ("number", "value", "at half", "at twice", "largest change of a pair"), tuple(rows), note
-    )
+    header = ("number", "value", "at half", "at twice", "largest change of a pair")
+    return Table(title, header, tuple(rows), f"Mean AbsRel; {cell(mean, 4)} as they are.")
 
 
 def run_changes(name: str, options: PairsOptions) -> Page | None:
-    """Change one thing of the default at a time: its parts, or its numbers.
+    """Change one thing of the default at a time: its ``parts``, or the numbers of ``flatness``.
 
-    Args:
-        name: ``"parts"`` or ``"flatness"``.
-        options: as of ``geodiff eval pairs``; ``methods`` are run beside the table's own.
-
-    Raises:
-        ValueError, OSError: as ``Experiment.run``.
+    ``options.methods`` are run beside the table's own; errors as ``Experiment.run``.
     """
-    refs = select(all_refs(options), options)
-    rows = flatness_methods() if name == "flatness" else tuple(method for _, method in CHANGES[name])
+    flat, refs = name == "flatness", select(all_refs(options), options)
+    rows = flatness_methods() if flat else tuple(method for _, method in CHANGES[name])
 
     def tables(records: list[Record]) -> list[Table]:
-        whole = [flatness_table(records)] if name == "flatness" else [changes_table(records, name)]
         added = [record for record in records if record["method"] not in rows]
-        if added:
-            labels = {label_of(record) for record in added}
-            whole.append(
-                summary_table(added, labels, f"Further methods and priors, {count_of_pairs(len(labels))}")
-            )
-        return whole if name == "flatness" else [*whole, regions_table(records)]
+        labels = {label_of(record) for record in added}
+        return [
+            flatness_table(records) if flat else changes_table(records, name),
+            summary_table(added, labels, f"Further methods and priors, {count_of_pairs(len(labels))}"),
+            *([] if flat else [regions_table(records)]),
+        ]
 
-    title = "Flatness" if name == "flatness" else "Parts of the default"
-    cells = pair_cells(refs, tuple(dict.fromkeys((*rows, *options.methods))), options)
-    experiment = Experiment(
-        name, title, cells, tables, lambda records: remarks_on(records, options), journal=RECORDS_NAME
-    )
+    title = "Flatness" if flat else "Parts of the default"
+    experiment = pairs_experiment(name, title, refs, (*rows, *options.methods), options, tables)
     return experiment.run(options, command_line(name, options))

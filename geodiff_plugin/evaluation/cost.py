@@ -1,7 +1,4 @@
-"""Seconds and peak memory of methods on a data set, as ratios to the plain pipeline.
-
-Paper: S9 (inference time, run time comparison), as ratios and not as seconds of another machine.
-"""
+"""Seconds and peak memory of methods on a data set, as ratios to the plain pipeline (paper S9)."""
 
 from __future__ import annotations
 
@@ -10,21 +7,17 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
-from typing import Any
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
-from geodiff_plugin.evaluation.datasets.sample import SampleRef
-from geodiff_plugin.evaluation.experiment import measure_cells
+from geodiff_plugin.evaluation.datasets import SampleRef
+from geodiff_plugin.evaluation.experiment import Page, measure_cells, run_facts
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
 from geodiff_plugin.evaluation.pairs import pair_cells, remarks_on
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page
-from geodiff_plugin.evaluation.table import Table, count_of_pairs, label_of
+from geodiff_plugin.evaluation.tables import Table, count_of_pairs, label_of
 from geodiff_plugin.priors import PRIORS, find_prior
 from geodiff_plugin.priors.base import OwnPipelinePrior
 from geodiff_plugin.runner import Record, this_process
-
-__all__ = ["COST_METHODS", "PLAIN", "cost_table", "run_cost"]
 
 PLAIN = "prior-aligned"
 """The stock pipeline, which everything is compared with; its alignment costs nothing beside it."""
@@ -33,44 +26,36 @@ COST_METHODS = (PLAIN, "search-only", "guided", "guided:gradient=full", "paper")
 STEPS = 4
 
 
-def cost_table(records: Sequence[dict[str, Any]]) -> Table:
+def cost_table(records: Sequence[Record]) -> Table:
     """Seconds and memory of every method, and both as multiples of the plain pipeline's.
 
     Args:
-        records: of a run in which ``PLAIN`` is one of the methods.
-
-    Raises:
-        ValueError: no pair on which ``PLAIN`` has worked.
+        records: of a run in which ``PLAIN`` has worked on some pair; ``ValueError`` without.
     """
     costs = {}
     for name in dict.fromkeys(record["method"] for record in records):
         own = [r for r in records if r["method"] == name and r["status"] == "ok"]
         if own:
-            seconds = statistics.median(record["seconds"] for record in own)
-            costs[name] = (len(own), seconds, max(record["peak_bytes"] for record in own))
+            seconds, peak = statistics.median(r["seconds"] for r in own), max(r["peak_bytes"] for r in own)
+            costs[name] = len(own), seconds, peak
     if PLAIN not in costs:
         cure = "See geodiff eval cost without --skip-broken for the reason."
         bad_value("the pairs", f"some on which {PLAIN} works", "none", cure)
     _, plain_seconds, plain_bytes = costs[PLAIN]
-    rows = [
-        (
-            "plain pipeline" if name == PLAIN else find_method(name).title,
-            str(count),
-            f"{seconds:.2f}",
-            f"{seconds / max(plain_seconds, 1e-3):.2f}",
-            f"{peak_bytes / 1e6:.0f}",
-            f"{peak_bytes / max(plain_bytes, 1):.2f}",
-        )
-        for name, (count, seconds, peak_bytes) in costs.items()
-    ]
+    rows = []
+    for name, (count, seconds, peak) in costs.items():
+        times = f"{seconds:.2f}", f"{seconds / max(plain_seconds, 1e-3):.2f}"
+        memory = f"{peak / 1e6:.0f}", f"{peak / max(plain_bytes, 1):.2f}"
+        title = "plain pipeline" if name == PLAIN else find_method(name).title
+        rows.append((title, str(count), *times, *memory))
     header = ("method", "pairs", "seconds", "time × plain", "peak MB", "memory × plain")
-    pairs = count_of_pairs(len({label_of(record) for record in records}))
     note = (
         "Median seconds and greatest peak over the pairs, each method in a process of its own, all of one "
         "prior with the same number of denoising steps. On CUDA the peak is what was allocated, weights "
         "included, reset for each pair; on the CPU it is the increase of resident memory over the start, "
         "sampled every 50 ms."
     )
+    pairs = count_of_pairs(len({label_of(record) for record in records}))
     return Table(f"Cost on {pairs}", header, tuple(rows), note)
 
 
@@ -87,11 +72,9 @@ def _method_records(refs: Sequence[SampleRef], method: str, options: PairsOption
 
 
 def run_cost(name: str, options: PairsOptions) -> Page:
-    """Measure and write the table; records go to ``out/cost``, apart from those of other commands.
+    """Measure ``COST_METHODS`` and further ones, and write the table.
 
-    Args:
-        name: ``"cost"``.
-        options: as of ``geodiff eval pairs``; ``methods`` are measured beside ``COST_METHODS``.
+    Records go to ``out/cost``, apart from those of other commands.
 
     Raises:
         ValueError: no samples, bad options, or started as several processes.
@@ -100,8 +83,7 @@ def run_cost(name: str, options: PairsOptions) -> Page:
     if this_process().count > 1:
         bad_value("the number of processes", "1 for cost", this_process().count)
     refs = select(all_refs(options), options)
-    records: list[Record] = []
-    taken: dict[str, int | None] = {}
+    records, taken = list[Record](), dict[str, int | None]()
     alone = replace(options, prior=options.prior[:1], out=options.out / "cost")
     for method in with_priors(tuple(dict.fromkeys((*COST_METHODS, *options.methods))), options.prior[1:]):
         prior = find_method(method).prior or options.prior[0]
@@ -111,8 +93,7 @@ def run_cost(name: str, options: PairsOptions) -> Page:
         with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
             job = fresh_process.submit(_method_records, refs, method, replace(alone, steps=taken[prior]))
             records += job.result()
-    each = [f"{steps or 'its own number'} with {prior}" for prior, steps in taken.items()]
-    remarks = [*remarks_on(records, options), f"Denoising steps of each: {', '.join(each)}."]
-    page = Page("Cost", run_facts(command_line(name, options)), (cost_table(records),), tuple(remarks))
-    write_page(page, options.out, name, options.results)
-    return page
+    steps = [f"{count or 'its own number'} with {prior}" for prior, count in taken.items()]
+    remarks = (*remarks_on(records, options), f"Denoising steps of each: {', '.join(steps)}.")
+    page = Page("Cost", run_facts(command_line(name, options)), (cost_table(records),), remarks)
+    return page.write(options.out, name, options.results)

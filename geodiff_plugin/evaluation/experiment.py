@@ -6,11 +6,16 @@ that all of them resume, are shared by several processes and report failures in 
 
 from __future__ import annotations
 
+import json
+import os
+import platform
 import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from datetime import date
+from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -19,24 +24,79 @@ import torch
 
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.baselines import find_method
-from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
+from geodiff_plugin.evaluation.baselines import Method, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.baselines.outside import map_name
-from geodiff_plugin.evaluation.datasets import DATASETS, load
-from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
+from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, load
 from geodiff_plugin.evaluation.metrics import crop_mask
-from geodiff_plugin.evaluation.report import Page, run_facts, write_page
 from geodiff_plugin.evaluation.scoring import score
-from geodiff_plugin.evaluation.table import Table
-from geodiff_plugin.formats import write_depth_npy
+from geodiff_plugin.evaluation.tables import Table, headline
+from geodiff_plugin.formats import atomic_path, write_depth_npy
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.runner import Item, Journal, Record, Runner, fingerprint, this_process
-from geodiff_plugin.runtime.machine import PeakMemory
-
-__all__ = ["RECORDS_NAME", "Experiment", "cell_key", "headline", "last_of", "method_cells", "measure_cells"]
+from geodiff_plugin.runtime.machine import PeakMemory, versions
 
 RECORDS_NAME = "samples.jsonl"
 """Journal of methods on samples, which several commands share."""
+
+
+def run_facts(command: str) -> dict[str, Any]:
+    """Command, date, versions and machine of a run."""
+    used = versions()
+    try:
+        used["opencv"] = version("opencv-python-headless")
+    except PackageNotFoundError:
+        used["opencv"] = "not installed"
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads"
+    if torch.cuda.is_available():
+        machine += f", {torch.cuda.get_device_name()}"
+    return {"command": command, "date": date.today().isoformat(), "versions": used, "machine": machine}
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all, making its folder where missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a command of the evaluation measured.
+
+    Attributes:
+        title: heading.
+        facts: of ``run_facts``.
+        tables: in reading order.
+        remarks: sentences that belong above the tables, e.g. how many samples were broken.
+        purpose: what the page is for, its first line; "" where the title says it.
+    """
+
+    title: str
+    facts: dict[str, Any]
+    tables: tuple[Table, ...]
+    remarks: tuple[str, ...] = ()
+    purpose: str = ""
+
+    def origin(self) -> str:
+        """One line: date, versions, machine."""
+        named = ", ".join(f"{name} {value}" for name, value in self.facts["versions"].items())
+        return f"{self.facts['date']}; {named}; {self.facts['machine']}."
+
+    def markdown(self) -> str:
+        """What it is for, how it was made, the remarks, then the tables."""
+        head = [f"# {self.title}", *([self.purpose] if self.purpose else [])]
+        head += [f"    {self.facts['command']}", self.origin(), *self.remarks]
+        return "".join(f"{line}\n\n" for line in head) + "\n".join(t.markdown() for t in self.tables)
+
+    def write(self, out: Path, stem: str, results: Path | None = None) -> Page:
+        """Write ``<stem>.md``, ``.tex`` and ``.json`` into ``out``, the page to ``results`` too."""
+        for path in (out / f"{stem}.md", *([] if results is None else [results])):
+            write_text(path, self.markdown())
+        write_text(out / f"{stem}.tex", "\n".join(table.latex() for table in self.tables))
+        tables = [table.as_json() for table in self.tables]
+        plain = self.facts | {"remarks": list(self.remarks), "tables": tables}
+        write_text(out / f"{stem}.json", json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
+        return self
 
 
 @dataclass(frozen=True)
@@ -47,8 +107,7 @@ class Experiment:
         name: stem of the page's files.
         title: heading of the page.
         cells: what is measured; the payload of each is a function without arguments that returns the body of
-            its
-            record.
+            its record.
         tables: of the records of all cells, in their order.
         remarks: sentences above the tables, likewise.
         purpose: what the page is for.
@@ -67,8 +126,7 @@ class Experiment:
         """Measure the cells that have no record yet, and write the page.
 
         Args:
-            options: with ``out`` and ``quiet``, and where the command has them ``results`` and
-                ``skip_broken``.
+            options: with ``out``, ``results`` and ``quiet``, and where the command has it ``skip_broken``.
             command: that repeats the run.
 
         Returns:
@@ -83,8 +141,7 @@ class Experiment:
             return None
         tables = tuple(table for table in self.tables(records) if table.rows)
         page = Page(self.title, run_facts(command), tables, tuple(self.remarks(records)), self.purpose)
-        write_page(page, options.out, self.name, getattr(options, "results", None))
-        return page
+        return page.write(options.out, self.name, options.results)
 
 
 def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NAME) -> list[Record] | None:
@@ -107,14 +164,6 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
     if runner.process.index > 0:
         return None
     return [records[cell.key] | dict(cell.head) for cell in cells if cell.key in records]
-
-
-def headline(record: Record) -> float | None:
-    """AbsRel over all pixels with truth: not aligned, or aligned for a method without metres."""
-    if record["status"] != "ok":
-        return None
-    both = record["all_pixels"]
-    return (both["raw"] or both["aligned"])["abs_rel"]
 
 
 def _running_means(records: Sequence[Record]) -> dict[str, str]:
@@ -155,12 +204,56 @@ def last_of(make: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 @lru_cache(maxsize=1)
-def _cropped(sample: StereoSample, crop: str) -> StereoSample:
+def cropped(sample: StereoSample, crop: str) -> StereoSample:
     """The sample with the truth inside of a crop only; images and cameras stay whole."""
     valid = sample.valid & crop_mask(crop, sample.valid.shape)
     if not valid.any():
         bad_value(f"the truth of {sample.label}", f"known somewhere in the crop {crop}", "unknown there")
     return sample if crop == "none" else replace(sample, valid=valid)
+
+
+@dataclass(frozen=True, eq=False)
+class _MethodCell:
+    """One method on one sample, scored in a crop; its map goes to ``path`` where one is given."""
+
+    ref: SampleRef
+    read: Callable[[SampleRef], StereoSample]
+    method: Method
+    settings: Settings
+    priors: PriorCache
+    crop: str
+    path: Path | None
+
+    def __call__(self) -> Record:
+        """Run and score; the seconds are those that the method takes alone."""
+        sample, process = self.read(self.ref), {"process": this_process().index}
+        self.priors.evidence.take_spared_seconds()
+        start = time.perf_counter()
+        try:
+            with PeakMemory(torch.device(self.settings.device)) as memory:
+                prediction = self.method.run(sample, self.settings, self.priors)
+        except NotApplicable as reason:
+            why = {"status": "not applicable", "reason": str(reason)}
+            return {"rectified": sample.rectified} | why | process
+        seconds = time.perf_counter() - start + self.priors.evidence.take_spared_seconds()
+        scores = score(cropped(sample, self.crop), prediction, DATASETS[sample.dataset].cap_m)
+        notes = {"sample": dict(sample.notes), "method": dict(prediction.notes)}
+        cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
+        saved = {}
+        if self.path is not None and prediction.depth_m is not None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            write_depth_npy(self.path, prediction.depth_m)
+            saved = {"map": file_digest(self.path)}
+        head = {"rectified": sample.rectified, "status": "ok"}
+        return head | cost | scores | {"notes": notes} | saved | process
+
+
+def _has_map(cell: Item, record: Record) -> bool:
+    """Whether the map that a cell is to save is there, and not that of other settings in its place."""
+    path = getattr(cell.payload, "path", None)
+    if path is None or record["status"] != "ok" or record["all_pixels"]["raw"] is None:
+        return True
+    return path.is_file() and record.get("map") == file_digest(path)
 
 
 def method_cells(
@@ -179,79 +272,30 @@ def method_cells(
         methods: names that ``find_method`` knows.
         settings: the user's choices, the same for every method.
         out: folder of the records.
-        crop: region of the image that is scored, one of ``metrics.CROPS``.
+        crop: region of the image that is scored, one of ``options.CROPS``.
         save_depth: write each metric depth map to ``out/depth/<method>/<dataset>_<sample>.npy``, where the
             method ``files:out/depth/<method>`` finds it; a record without its map is made again.
 
     Returns:
         Cells whose records have ``status`` ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"``
         (``error``); for the numbers see ``scoring.score``.
-
-    Raises:
-        ValueError: an unknown method; two samples of one name.
     """
     process, priors, read = this_process(), PriorCache(), last_of(load)
-    if process.count > 1 and settings.device == "cuda":
+    several = process.count > 1
+    if several and settings.device == "cuda":
         settings = replace(settings, device=f"cuda:{process.local % torch.cuda.device_count()}")
     cells = []
     for ref in refs:
         for method in map(find_method, methods):
             chosen = method.own_settings(settings)
             prior = f"{chosen.prior} {priors.fingerprint(chosen)}" if method.uses_prior else ""
-            configured = replace(
-                chosen, device=chosen.device.partition(":")[0] if process.count > 1 else chosen.device
-            )
-            configuration = method.configuration(configured) | ({} if crop == "none" else {"crop": crop})
-            key = cell_key(ref, method.base_name, configuration, prior)
-            path = None
-            if save_depth:
-                folder = re.sub(r"[^\w.=+-]+", "_", method.name)
-                path = out / "depth" / folder / f"{map_name(ref.dataset, ref.name)}.npy"
+            device = chosen.device.partition(":")[0] if several else chosen.device
+            cropping = {} if crop == "none" else {"crop": crop}
+            configuration = method.configuration(replace(chosen, device=device)) | cropping
+            folder = out / "depth" / re.sub(r"[^\w.=+-]+", "_", method.name)
+            path = folder / f"{map_name(ref.dataset, ref.name)}.npy" if save_depth else None
+            work = _MethodCell(ref, read, method, chosen, priors, crop, path)
             head = {"dataset": ref.dataset, "sample": ref.name, "method": method.name}
-            work = partial(_measure, ref, read, method, chosen, priors, crop, path)
-            cells.append(Item(key, work, name=f"{ref.label}, {method.name}", words=(method.name,), head=head))
+            key, name = cell_key(ref, method.base_name, configuration, prior), f"{ref.label}, {method.name}"
+            cells.append(Item(key, work, name=name, words=(method.name,), head=head))
     return cells
-
-
-def _has_map(cell: Item, record: Record) -> bool:
-    """Whether the map that a cell is to save is there, and not that of other settings in its place."""
-    path = (
-        cell.payload.args[-1] if isinstance(cell.payload, partial) and cell.payload.func is _measure else None
-    )
-    if path is None or record["status"] != "ok" or record["all_pixels"]["raw"] is None:
-        return True
-    return path.is_file() and record.get("map") == file_digest(path)
-
-
-def _measure(
-    ref: SampleRef,
-    read: Callable[[SampleRef], StereoSample],
-    method: Method,
-    settings: Settings,
-    priors: PriorCache,
-    crop: str,
-    path: Path | None,
-) -> Record:
-    """Run and score one method on one sample; its seconds are those that it takes alone."""
-    sample, process = read(ref), {"process": this_process().index}
-    priors.evidence.take_spared_seconds()
-    start = time.perf_counter()
-    try:
-        with PeakMemory(torch.device(settings.device)) as memory:
-            prediction = method.run(sample, settings, priors)
-    except NotApplicable as reason:
-        return {"rectified": sample.rectified, "status": "not applicable", "reason": str(reason)} | process
-    seconds = time.perf_counter() - start + priors.evidence.take_spared_seconds()
-    scores = score(_cropped(sample, crop), prediction, DATASETS[sample.dataset].cap_m)
-    notes = {"sample": dict(sample.notes), "method": dict(prediction.notes)}
-    cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
-    saved = {} if path is None else _save(path, prediction)
-    return {"rectified": sample.rectified, "status": "ok", **cost, **scores, "notes": notes} | saved | process
-
-
-def _save(path: Path, prediction: Prediction) -> Record:
-    if prediction.depth_m is None:
-        return {}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_depth_npy(path, prediction.depth_m)
-    return {"map": file_digest(path)}

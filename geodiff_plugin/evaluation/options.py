@@ -9,7 +9,7 @@ import importlib
 import random
 import shlex
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,40 +18,16 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.options import OUTPUT, SPACES, check_options, declare, flag_of
 
 if TYPE_CHECKING:
-    from geodiff_plugin.evaluation.baselines.base import Settings
-    from geodiff_plugin.evaluation.datasets.sample import SampleRef
+    from geodiff_plugin.evaluation.baselines import Settings
+    from geodiff_plugin.evaluation.datasets import SampleRef
 
-__all__ = [
-    "CAPTURE_ROWS",
-    "COMMANDS",
-    "PAIRS_METHODS",
-    "POSES",
-    "CaptureEvalOptions",
-    "Command",
-    "DirOptions",
-    "EvalOptions",
-    "OutOptions",
-    "FigureOptions",
-    "PairsOptions",
-    "PosesOptions",
-    "SequenceOptions",
-    "StrengthOptions",
-    "TrustOptions",
-    "all_refs",
-    "command_line",
-    "data_of",
-    "first_pairs",
-    "rendered_refs",
-    "select",
-]
-
-PAIRS_METHODS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 CROPS = ("none", "garg", "eigen", "benchmark")
 POSES = ("refine", "given", "estimated")
 """Where ``guided`` has poses from: refined, as given, or withheld but for the baseline's length."""
 CAPTURE_ROWS = ("given", "pairs", "capture")
 """Poses of a capture: as given, refined pair by pair, solved together."""
-DTYPES = ("float32", "float16", "bfloat16")
+STRENGTHS = ("exact", "2%", "5%", "10%", "20%", "blur", "gamma")
+WAYS = ("alone", "alone-half", "scale", "warm", "warm-50", "warm-75")
 #: Fields that are those of ``Settings``.
 SETTINGS = ("ensemble", "seed", "steps", "resolution", "dtype", "space", "views")
 #: What a repeated run need not be told.
@@ -62,15 +38,26 @@ _GIVEN = (
 )
 
 
+def _out(folder: str) -> Any:
+    return declare(Path(folder), "Records and results; resumed where it exists.", "--out", "-o", panel=OUTPUT)
+
+
+def _list(default: tuple[Any, ...], help_text: str, **rules: Any) -> Any:
+    """A tuple that is typed with commas."""
+    return declare(default, help_text, split=True, **rules)
+
+
+def _count(default: int | None, help_text: str, low: int = 1, high: int = 10**9) -> Any:
+    return declare(default, help_text, low=low, high=high)
+
+
 @dataclass(frozen=True, kw_only=True)
 class OutOptions:
     """What every command is told."""
 
     seed: int = declare(0, "Seed of the noise.")
-    steps: int | None = declare(None, "Denoising steps; each method's own by default.", low=1, high=1000)
-    out: Path = declare(
-        Path("geodiff-eval"), "Records and results; resumed where it exists.", "--out", "-o", panel=OUTPUT
-    )
+    steps: int | None = _count(None, "Denoising steps; each method's own by default.", high=1000)
+    out: Path = _out("geodiff-eval")
     results: Path | None = declare(None, "Write the Markdown page here as well.", panel=OUTPUT)
     quiet: bool = declare(False, "No bar and nothing on the screen.", "--quiet", "-q", panel=OUTPUT)
 
@@ -88,7 +75,9 @@ class EvalOptions(OutOptions):
     space: str | None = declare(
         None, "Space in which the prior's map is affine, if its folder does not say.", choices=SPACES
     )
-    dtype: str = declare("float32", "float32, bfloat16 or float16.", choices=DTYPES)
+    dtype: str = declare(
+        "float32", "float32, bfloat16 or float16.", choices=("float32", "float16", "bfloat16")
+    )
     device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
 
     def __post_init__(self) -> None:
@@ -99,7 +88,7 @@ class EvalOptions(OutOptions):
     @property
     def settings(self) -> Settings:
         """What methods are given; imports torch."""
-        from geodiff_plugin.evaluation.baselines.base import Settings
+        from geodiff_plugin.evaluation.baselines import Settings
         from geodiff_plugin.runtime.machine import pick_device
 
         given = {name: getattr(self, name) for name in SETTINGS if hasattr(self, name)}
@@ -113,36 +102,31 @@ class _SampleOptions(EvalOptions):
     data: Path | None = declare(
         None, "Folder with data sets, or the name of a registered set.", metavar="DIR"
     )
-    methods: tuple[str, ...] = declare(
-        (), "Comma-separated, see geodiff eval list; beside the built-in rows.", split=True
-    )
-    datasets: tuple[str, ...] = declare(
-        (), "Comma-separated; all that the folder has by default.", split=True
-    )
-    scenes: tuple[str, ...] = declare((), "Comma-separated parts of sample names to keep.", split=True)
-    limit: int | None = declare(
-        None, "The first N samples alone; in a table of the paper, of each set.", low=1, high=10**9
-    )
-    ensemble: int = declare(1, "Ensemble members.", low=1, high=1000)
-    resolution: int | None = declare(None, "Longer side for the prior, pixels.", low=0, high=8192)
-    views: int = declare(2, "Views that methods take of a group that has more than two.", low=2, high=100)
+    methods: tuple[str, ...] = _list((), "Comma-separated, see geodiff eval list; beside the built-in rows.")
+    datasets: tuple[str, ...] = _list((), "Comma-separated; all that the folder has by default.")
+    scenes: tuple[str, ...] = _list((), "Comma-separated parts of sample names to keep.")
+    limit: int | None = _count(None, "The first N samples alone; in a table of the paper, of each set.")
+    ensemble: int = _count(1, "Ensemble members.", high=1000)
+    resolution: int | None = _count(None, "Longer side for the prior, pixels.", 0, 8192)
+    views: int = _count(2, "Views that methods take of a group that has more than two.", 2, 100)
     perturb: str | None = declare(
         None, "Give poses wrongly: largest turn, and shift / baseline.", metavar="DEGREES,SHARE"
     )
 
-    @property
-    def perturbed(self) -> tuple[float, float] | None:
-        """``perturb`` as numbers."""
-        from geodiff_plugin.evaluation.datasets.changed import perturbation
+    def changed(self, refs: Sequence[SampleRef]) -> list[SampleRef]:
+        """The references, with the poses given wrongly where ``perturb`` says so."""
+        from geodiff_plugin.evaluation.datasets.changed import changed_ref, perturbation
 
-        return None if self.perturb is None else perturbation(self.perturb)
+        if self.perturb is None:
+            return list(refs)
+        return [changed_ref(ref, "perturbed", perturbation(self.perturb)) for ref in refs]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairsOptions(_SampleOptions):
     """``geodiff eval pairs``, and without a few the tables of the paper, of parts, flatness and cost."""
 
-    sample: int | None = declare(None, "Draw this many samples at random, by --seed.", low=1, high=10**9)
+    sample: int | None = _count(None, "Draw this many samples at random, by --seed.")
     pairs: str = declare(
         "default", "Of a group of posed views: default (the first two) or all.", choices=("default", "all")
     )
@@ -152,14 +136,11 @@ class PairsOptions(_SampleOptions):
     crop: str = declare(
         "none", "Region that is scored: none, garg, eigen or benchmark (KITTI).", choices=CROPS
     )
-    seeds: int = declare(
-        1, "Seeds, from --seed on, of methods that use a prior; a table has their spread.", low=1, high=1000
+    seeds: int = _count(
+        1, "Seeds, from --seed on, of methods that use a prior; a table has their spread.", high=1000
     )
-    pose: tuple[str, ...] = declare(
-        (),
-        "Rows of 'guided': refine, given or estimated (poses withheld), comma-separated.",
-        split=True,
-        choices=POSES,
+    pose: tuple[str, ...] = _list(
+        (), "Rows of 'guided': refine, given or estimated (poses withheld), comma-separated.", choices=POSES
     )
     skip_broken: bool = declare(False, "Go on after a broken sample and count it.", panel=OUTPUT)
     save_depth: bool = declare(False, "Write every depth map as .npy.", panel=OUTPUT)
@@ -172,8 +153,9 @@ class DirOptions(PairsOptions):
     data: Path | None = declare(
         MISSING, "Folder of data sets, or the name of a registered set.", "", metavar="DIR"
     )
-    methods: tuple[str, ...] = declare(
-        PAIRS_METHODS, "Comma-separated, see geodiff eval list; five of them by default.", split=True
+    methods: tuple[str, ...] = _list(
+        ("prior-aligned", "search-only", "paper", "guided", "sgbm"),
+        "Comma-separated, see geodiff eval list; five of them by default.",
     )
 
 
@@ -188,12 +170,8 @@ class FigureOptions(_SampleOptions):
         metavar="NAME",
     )
     max: float = declare(80.0, "gs-sweep: the last g_s, metres.", low=1.01, high=1e6)
-    updates: tuple[int, ...] = declare(
-        (1, 2, 5, 10, 20, 40),
-        "inner-steps: updates per step, comma-separated.",
-        split=True,
-        low=1,
-        high=10_000,
+    updates: tuple[int, ...] = _list(
+        (1, 2, 5, 10, 20, 40), "inner-steps: updates per step, comma-separated.", low=1, high=10_000
     )
     results: Path | None = field(default=None)
     clouds: bool = declare(False, "qualitative, ablation: point clouds from another view too.")
@@ -206,12 +184,9 @@ class StrengthOptions(OutOptions):
     data: tuple[Path, ...] = declare(
         (), "Folder of data sets, or the name of a registered set; may be repeated.", metavar="DIR"
     )
-    limit: int | None = declare(None, "The first N pairs alone, of each --data.", low=1, high=10**9)
-    strengths: tuple[str, ...] = declare(
-        ("exact", "2%", "5%", "10%", "20%", "blur", "gamma"),
-        "Comma-separated: exact, 2%, 5%, 10%, 20%, blur, gamma.",
-        split=True,
-        choices=("exact", "2%", "5%", "10%", "20%", "blur", "gamma"),
+    limit: int | None = _count(None, "The first N pairs alone, of each --data.")
+    strengths: tuple[str, ...] = _list(
+        STRENGTHS, f"Comma-separated: {', '.join(STRENGTHS)}.", choices=STRENGTHS
     )
     space: str = declare(
         "disparity", "Affine in disparity, depth or log.", choices=("disparity", "depth", "log")
@@ -219,13 +194,12 @@ class StrengthOptions(OutOptions):
     follow: float = declare(
         0.3, "How far the prior's later answers follow their input, 0 to 1.", low=0.0, high=1.0
     )
-    methods: tuple[str, ...] = declare(
+    methods: tuple[str, ...] = _list(
         ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5"),
         "Comma-separated methods that use a prior, see geodiff eval list.",
-        split=True,
     )
-    steps: int | None = declare(4, "Denoising steps.", low=1, high=1000)
-    resolution: int = declare(384, "Longer side for the prior, pixels.", low=64, high=8192)
+    steps: int | None = _count(4, "Denoising steps.", high=1000)
+    resolution: int = _count(384, "Longer side for the prior, pixels.", 64, 8192)
     figure: Path | None = declare(
         None, "PNG: error against the prior's error, and lit surfaces.", panel=OUTPUT
     )
@@ -235,45 +209,36 @@ class StrengthOptions(OutOptions):
 class SequenceOptions(EvalOptions):
     """``geodiff eval sequence``."""
 
-    scenes: int = declare(4, "Sequences, of the seeds from 0 on.", low=1, high=10_000)
-    frames: int = declare(6, "Frames of each.", low=2, high=10_000)
+    scenes: int = _count(4, "Sequences, of the seeds from 0 on.", high=10_000)
+    frames: int = _count(6, "Frames of each.", 2, 10_000)
     size: tuple[int, int] = field(default=(192, 256))
-    ways: tuple[str, ...] = declare(
-        ("alone", "alone-half", "scale", "warm", "warm-50", "warm-75"),
-        "Comma-separated: alone, alone-half, scale, warm, warm-50, warm-75.",
-        split=True,
-        choices=("alone", "alone-half", "scale", "warm", "warm-50", "warm-75"),
-    )
-    steps: int | None = declare(4, "Denoising steps of a frame alone.", low=1, high=1000)
+    ways: tuple[str, ...] = _list(WAYS, f"Comma-separated: {', '.join(WAYS)}.", choices=WAYS)
+    steps: int | None = _count(4, "Denoising steps of a frame alone.", high=1000)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrustOptions(EvalOptions):
+class _RealOptions(EvalOptions):
+    """Real pairs beside rendered ones."""
+
+    data: Path | None = declare(None, "Folder of real pairs; none by default.", metavar="DIR")
+    limit: int | None = _count(None, "The first N real pairs alone.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrustOptions(_RealOptions):
     """``geodiff eval trust``."""
 
-    data: Path | None = declare(None, "Folder of real pairs; none by default.", metavar="DIR")
-    limit: int | None = declare(None, "The first N real pairs alone.", low=1, high=10**9)
-    rendered: int = declare(
-        0, "Pairs of the registered set 'synthetic', every other one rectified.", low=0, high=10**6
-    )
-    width: int = declare(512, "Width of the rendered pairs, pixels.", low=64, high=8192)
-    kinds: tuple[str, ...] = declare(
-        (), "Comma-separated kinds of wrong calibration; ten by default.", split=True
-    )
-    out: Path = declare(
-        Path("geodiff-trust"), "Records and results; resumed where it exists.", "--out", "-o", panel=OUTPUT
-    )
+    rendered: int = _count(0, "Pairs of the registered set 'synthetic', every other one rectified.", 0, 10**6)
+    width: int = _count(512, "Width of the rendered pairs, pixels.", 64, 8192)
+    kinds: tuple[str, ...] = _list((), "Comma-separated kinds of wrong calibration; ten by default.")
+    out: Path = _out("geodiff-trust")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PosesOptions(EvalOptions):
+class PosesOptions(_RealOptions):
     """``geodiff eval poses``."""
 
-    data: Path | None = declare(None, "Folder of real pairs; none by default.", metavar="DIR")
-    limit: int | None = declare(None, "The first N real pairs alone.", low=1, high=10**9)
-    rendered: int = declare(
-        0, "Pairs of the registered set 'synthetic' in a general pose.", low=0, high=10**6
-    )
+    rendered: int = _count(0, "Pairs of the registered set 'synthetic' in a general pose.", 0, 10**6)
     rendered_size: str | None = declare(
         None, "Size of rendered pairs; smaller is faster.", metavar="WIDTHxHEIGHT"
     )
@@ -283,10 +248,8 @@ class PosesOptions(EvalOptions):
     drift: str = declare(
         "0.3,1.5", "Rectified: turn, shift of the right image; 0,0: none.", metavar="DEGREES,PIXELS"
     )
-    resolution: int | None = declare(None, "Longer side for the prior, pixels.", low=0, high=8192)
-    out: Path = declare(
-        Path("geodiff-poses"), "Records and results; resumed where it exists.", "--out", "-o", panel=OUTPUT
-    )
+    resolution: int | None = _count(None, "Longer side for the prior, pixels.", 0, 8192)
+    out: Path = _out("geodiff-poses")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,11 +260,9 @@ class CaptureEvalOptions(EvalOptions):
         MISSING, "A capture that names depth maps (16-bit PNG, millimetres).", "", metavar="DIR"
     )
     frames: str | None = declare(None, "NAME,NAME or FIRST:LAST:STEP; all by default.")
-    neighbours: tuple[int, ...] = declare(
-        (2, 3, 5), "Comma-separated numbers of right views.", split=True, low=1, high=32
-    )
-    rows: tuple[str, ...] = declare(
-        CAPTURE_ROWS, "Comma-separated: given, pairs, capture.", split=True, choices=CAPTURE_ROWS
+    neighbours: tuple[int, ...] = _list((2, 3, 5), "Comma-separated numbers of right views.", low=1, high=32)
+    rows: tuple[str, ...] = _list(
+        CAPTURE_ROWS, "Comma-separated: given, pairs, capture.", choices=CAPTURE_ROWS
     )
 
 
@@ -315,67 +276,90 @@ class Command(NamedTuple):
     def __call__(self, name: str, options: Any) -> Any:
         """Run it: the page, the path of a figure, or ``None`` in a process that writes nothing."""
         module, _, function = self.run.partition(":")
-        run: Callable[..., Any] = getattr(
-            importlib.import_module(f"geodiff_plugin.evaluation.{module}"), function
+        return getattr(importlib.import_module(f"geodiff_plugin.evaluation.{module}"), function)(
+            name, options
         )
-        return run(name, options)
 
 
+_PAPER, _CHANGES = "paper:run_paper_table", "changes:run_changes"
 COMMANDS: dict[str, Command] = {
-    "pairs": Command(
-        DirOptions, "Measure methods side by side on every metric pair below DIR.", "pairs:run_pairs"
-    ),
-    "table1": Command(
-        PairsOptions,
-        "Table 1: KITTI-Stereo, Booster and Middlebury, in metres and aligned.",
-        "paper:run_paper_table",
-    ),
-    "table2": Command(PairsOptions, "Table 2: Booster, beside stereo.", "paper:run_paper_table"),
-    "table3": Command(PairsOptions, "Table 3: two posed views, Tanks and Temples.", "paper:run_paper_table"),
-    "ablation": Command(
-        PairsOptions,
-        "Table 4, and one change at a time: gradients, rules, terms, no diffusion.",
-        "paper:run_paper_table",
-    ),
-    "parts": Command(
-        PairsOptions, "What each part of the default is worth: one left out at a time.", "changes:run_changes"
-    ),
-    "flatness": Command(
-        PairsOptions,
-        "How flat the default lies: every number of it at half and at twice its value.",
-        "changes:run_changes",
-    ),
-    "cost": Command(
-        PairsOptions, "Seconds and peak memory, plain against guided, as ratios.", "cost:run_cost"
-    ),
-    "strength": Command(
-        StrengthOptions,
-        "Accuracy with emulated priors from exact to weak: aligned to the truth, fitted once, and guided.",
-        "strength:run_strength",
-    ),
-    "sequence": Command(
-        SequenceOptions,
-        "Depth of a moving rig: every frame alone, or each from the frame before; error, flicker, seconds.",
-        "sequence:run_sequence",
-    ),
-    "figure": Command(
-        FigureOptions, "Draw one figure as PNG, with its numbers as JSON beside it.", "figures:run_figure"
-    ),
-    "trust": Command(
-        TrustOptions,
-        "How many wrong calibrations are detected, and how many right ones are not trusted.",
-        "trust:run_trust",
-    ),
-    "poses": Command(
-        PosesOptions,
-        "Accuracy with poses as given, perturbed, refined and estimated, and of rigs that have drifted.",
-        "poses:run_poses",
-    ),
-    "capture": Command(
-        CaptureEvalOptions,
-        "Depth of a capture with its poses as given, refined by pairs, and solved together (extra capture).",
-        "capture:run_capture_eval",
-    ),
+    name: Command(options, about, run)
+    for name, options, about, run in (
+        (
+            "pairs",
+            DirOptions,
+            "Measure methods side by side on every metric pair below DIR.",
+            "pairs:run_pairs",
+        ),
+        (
+            "table1",
+            PairsOptions,
+            "Table 1: KITTI-Stereo, Booster and Middlebury, in metres and aligned.",
+            _PAPER,
+        ),
+        ("table2", PairsOptions, "Table 2: Booster, beside stereo.", _PAPER),
+        ("table3", PairsOptions, "Table 3: two posed views, Tanks and Temples.", _PAPER),
+        (
+            "ablation",
+            PairsOptions,
+            "Table 4, and one change at a time: gradients, rules, terms, no diffusion.",
+            _PAPER,
+        ),
+        (
+            "parts",
+            PairsOptions,
+            "What each part of the default is worth: one left out at a time.",
+            _CHANGES,
+        ),
+        (
+            "flatness",
+            PairsOptions,
+            "How flat the default lies: every number of it at half and at twice its value.",
+            _CHANGES,
+        ),
+        (
+            "cost",
+            PairsOptions,
+            "Seconds and peak memory, plain against guided, as ratios.",
+            "cost:run_cost",
+        ),
+        (
+            "strength",
+            StrengthOptions,
+            "Accuracy with emulated priors from exact to weak: aligned to the truth, fitted once, guided.",
+            "strength:run_strength",
+        ),
+        (
+            "sequence",
+            SequenceOptions,
+            "Depth of a moving rig: frames alone, or each from the one before; error, flicker, seconds.",
+            "sequence:run_sequence",
+        ),
+        (
+            "figure",
+            FigureOptions,
+            "Draw one figure as PNG, with its numbers as JSON beside it.",
+            "figures:run_figure",
+        ),
+        (
+            "trust",
+            TrustOptions,
+            "How many wrong calibrations are detected, and how many right ones are not trusted.",
+            "trust:run_trust",
+        ),
+        (
+            "poses",
+            PosesOptions,
+            "Accuracy with poses as given, perturbed, refined and estimated, and of rigs that have drifted.",
+            "poses:run_poses",
+        ),
+        (
+            "capture",
+            CaptureEvalOptions,
+            "Depth of a capture with poses as given, refined by pairs, and solved together (extra capture).",
+            "capture:run_capture_eval",
+        ),
+    )
 }
 """Every command but ``list``, by name."""
 
@@ -387,11 +371,12 @@ def command_line(name: str, options: Any) -> str:
         value = getattr(options, each.name)
         if not each.metadata or each.name in _NOT_REPEATED or value == each.default:
             continue
-        flag = flag_of(each) if each.metadata["flags"] != ("",) else ""
-        split = each.metadata["split"] and isinstance(value, tuple)
-        entries = (",".join(map(str, value)),) if split else value if isinstance(value, tuple) else (value,)
+        flag = [flag_of(each)] if each.metadata["flags"] != ("",) else []
+        entries = value if isinstance(value, tuple) else (value,)
+        if isinstance(value, tuple) and each.metadata["split"]:
+            entries = (",".join(map(str, value)),)
         for entry in entries:
-            words += [flag] * bool(flag) + ([] if entry is True else [str(entry)])
+            words += flag + ([] if entry is True else [str(entry)])
     return shlex.join(words)
 
 
@@ -418,43 +403,38 @@ def _check_names(refs: Sequence[SampleRef], data: Path) -> None:
         bad_value("--data", "a folder with one sample of each name", f"{data} with several {twice[0]}", cure)
 
 
-def first_pairs(data: Path | None, limit: int | None) -> list[SampleRef]:
-    """The first pairs of a folder, none without a folder.
-
-    Raises:
-        ValueError: a folder without pairs, or with two of one name.
-    """
-    from geodiff_plugin.evaluation.datasets import find_pairs
-
-    if data is None:
-        return []
-    refs = find_pairs(data)
-    if not refs:
-        bad_value("--data", "a folder with pairs", str(data), _GIVEN)
-    _check_names(refs, data)
-    return refs[:limit]
-
-
-def rendered_refs(text: str, count: int) -> list[SampleRef]:
-    """``count`` pairs of the registered set ``synthetic``, which the package does not hold itself.
+def real_and_rendered(
+    options: TrustOptions | PosesOptions, text: str
+) -> tuple[list[SampleRef], list[SampleRef]]:
+    """The first pairs of ``--data``, if given, and ``--rendered`` ones of the registered set ``synthetic``.
 
     Args:
+        options: of the command.
         text: what the set is asked for, as ``synthetic:{}@512x384``.
-        count: how many; none for 0.
+
+    Raises:
+        ValueError: neither; a folder without pairs, or with two of one name; no such set is registered.
     """
     from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
 
-    if count and "synthetic" not in DATASETS:
-        cure = "A clone of the repository has it: python -m tests.scenes eval ..."
-        bad_value("--rendered", "0 where no data set 'synthetic' is registered", count, cure)
-    return find_pairs(text.format(count), ["synthetic"]) if count else []
+    if options.data is None and not options.rendered:
+        bad_value("--data", "given, or --rendered above 0", "neither")
+    real, rendered = list[Any](), list[Any]()
+    if options.data is not None:
+        real = find_pairs(options.data)
+        if not real:
+            bad_value("--data", "a folder with pairs", str(options.data), _GIVEN)
+        _check_names(real, options.data)
+    if options.rendered:
+        if "synthetic" not in DATASETS:
+            cure = "A clone of the repository has it: python -m tests.scenes eval ..."
+            bad_value("--rendered", "0 where no data set 'synthetic' is registered", options.rendered, cure)
+        rendered = find_pairs(text.format(options.rendered), ["synthetic"])
+    return real[: options.limit], rendered
 
 
 def select(refs: Sequence[SampleRef], options: PairsOptions | FigureOptions) -> list[SampleRef]:
     """Keep the samples whose label contains one of ``scenes``, draw ``sample``, keep the first ``limit``.
-
-    Returns:
-        References in the order of ``refs``.
 
     Raises:
         ValueError: nothing is left, two samples have one name, or more are to be drawn than there are.

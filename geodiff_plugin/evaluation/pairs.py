@@ -1,21 +1,18 @@
-"""Methods side by side on pairs: ``geodiff eval pairs``, and what the tables of the paper share with it."""
+"""Methods side by side on pairs: ``geodiff eval pairs``, and what other commands share with it."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_priors, with_seeds
-from geodiff_plugin.evaluation.datasets.changed import perturbed_ref
-from geodiff_plugin.evaluation.datasets.sample import SampleRef
-from geodiff_plugin.evaluation.experiment import RECORDS_NAME, Experiment, method_cells
+from geodiff_plugin.evaluation.datasets import SampleRef
+from geodiff_plugin.evaluation.experiment import RECORDS_NAME, Experiment, Page, method_cells
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
-from geodiff_plugin.evaluation.report import Page
-from geodiff_plugin.evaluation.table import count_of_pairs, label_of
-from geodiff_plugin.evaluation.tables import pairs_tables, without_copies
+from geodiff_plugin.evaluation.tables import Table, count_of_pairs, label_of, pairs_tables, without_copies
 from geodiff_plugin.runner import Item, Record, this_process
 
-__all__ = ["pair_cells", "remarks_on", "run_pairs"]
+Remarks = Callable[[list[Record]], Sequence[str]]
 
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:
@@ -23,12 +20,29 @@ def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: Pairs
 
     Poses given wrongly and the choice of poses apply to all of them and to the method ``guided``.
     """
-    settings = options.settings
-    if options.perturbed is not None:
-        refs = [perturbed_ref(ref, options.perturbed) for ref in refs]
+    settings, refs = options.settings, options.changed(refs)
     names = with_priors(with_poses(methods, options.pose), options.prior[1:])
     names = with_seeds(names, settings.seed, options.seeds)
     return method_cells(refs, names, settings, options.out, crop=options.crop, save_depth=options.save_depth)
+
+
+def pairs_experiment(
+    name: str,
+    title: str,
+    refs: Sequence[SampleRef],
+    methods: Sequence[str],
+    options: PairsOptions,
+    tables: Callable[[list[Record]], Sequence[Table]],
+    more: Sequence[str] = (),
+    purpose: str = "",
+) -> Experiment:
+    """Methods on pairs, with remarks on what was run and ``more``; all such commands share their records."""
+
+    def remarks(records: list[Record]) -> list[str]:
+        return [*remarks_on(records, options), *more]
+
+    cells = pair_cells(refs, tuple(dict.fromkeys(methods)), options)
+    return Experiment(name, title, cells, tables, remarks, purpose, RECORDS_NAME)
 
 
 def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
@@ -60,21 +74,13 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
 
 def run_pairs(name: str, options: PairsOptions) -> Page | None:
     """Measure methods on pairs and write the tables; errors as ``Experiment.run``."""
-    refs = select(all_refs(options), options)
-
-    def remarks(records: Sequence[Record]) -> list[str]:
-        sentences = remarks_on(records, options)
-        if options.sample is not None:
-            sentences.append(f"Drawn with seed {options.seed}: {', '.join(ref.label for ref in refs)}.")
-        count = this_process().count
-        return [*sentences, f"Run by {count} processes."] if count > 1 else sentences
-
-    return Experiment(
-        "table",
-        "Results pair by pair",
-        pair_cells(refs, options.methods, options),
-        pairs_tables,
-        remarks,
-        "Each pair, interval, region and metric behind a comparison of methods.",
-        RECORDS_NAME,
-    ).run(options, command_line(name, options))
+    refs, count, more = select(all_refs(options), options), this_process().count, []
+    if options.sample is not None:
+        more.append(f"Drawn with seed {options.seed}: {', '.join(ref.label for ref in refs)}.")
+    if count > 1:
+        more.append(f"Run by {count} processes.")
+    purpose = "Each pair, interval, region and metric behind a comparison of methods."
+    experiment = pairs_experiment(
+        "table", "Results pair by pair", refs, options.methods, options, pairs_tables, more, purpose
+    )
+    return experiment.run(options, command_line(name, options))

@@ -1,7 +1,4 @@
-"""Every metric of one prediction on one sample, as JSON values.
-
-Paper: S5.1 (metrics, raw and aligned).
-"""
+"""Every metric of one prediction on one sample, as JSON values (paper S5.1: raw and aligned)."""
 
 from __future__ import annotations
 
@@ -15,19 +12,13 @@ import numpy as np
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.evaluation import edges
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.baselines.stereo import sweep
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
-from geodiff_plugin.evaluation.edges import (
-    boundary_errors,
-    boundary_f1,
-    hidden_by_truth,
-    near_disparity_steps,
-)
 from geodiff_plugin.evaluation.metrics import (
     align,
     ause,
-    ause_of_random,
     confidence_deciles,
     counted,
     evaluate_depth,
@@ -37,24 +28,14 @@ from geodiff_plugin.evaluation.metrics import (
 from geodiff_plugin.matching import find_matches
 from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
-__all__ = [
-    "DENSE",
-    "SURE_MATCH",
-    "TOM_CLASSES",
-    "disparity_masks",
-    "disparity_scores",
-    "matched",
-    "out_of_view",
-    "regions",
-    "score",
-]
-
 TOM_CLASSES = (2, 3)
 """Material classes that Booster's authors call transparent or mirror when they score depth."""
 DENSE = 0.5
 """Share of pixels with truth from which on its edges are there to be measured."""
-SURE_MATCH = 0.5
+RELIABLE_MATCH = 0.5
 """Confidence from which on a match of our plane sweep counts as one."""
+
+Scores = dict[str, float | None]
 
 
 def out_of_view(sample: StereoSample) -> np.ndarray:
@@ -74,60 +55,46 @@ def out_of_view(sample: StereoSample) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def matched(sample: StereoSample) -> np.ndarray | None:
-    """``(H, W)`` bool: pixels where our plane sweep of the two views finds a match that it is sure of.
+    """``(H, W)`` bool: pixels where our plane sweep of the two views has a reliable match.
 
     No method, prior or truth has a part in it, and poses are the true ones, however they are given. It is
     kept until another sample object comes, so that one sweep serves all methods, and made on the CPU, so that
-    no two runs differ.
-
-    Returns:
-        ``None`` where the views cannot be swept: no overlap, no baseline, or an image that is too small.
+    no two runs differ. ``None`` where the views cannot be swept: no overlap, no baseline, too small an image.
     """
     try:
         volume = sweep(replace(sample, E=sample.E_scored), "cpu")
     except ValueError:
         return None
     matches = find_matches(volume.left_01, volume.rights, volume.K, volume=volume)
-    sure = (matches.confidence >= SURE_MATCH).float()
-    return F.interpolate(sure[None], sample.depth_m.shape, mode="nearest-exact")[0, 0].numpy() > 0
+    reliable = (matches.confidence >= RELIABLE_MATCH).float()
+    return F.interpolate(reliable[None], sample.depth_m.shape, mode="nearest-exact")[0, 0].numpy() > 0
 
 
 def regions(sample: StereoSample) -> dict[str, np.ndarray]:
-    """Masks by which AbsRel is split: what the right camera sees, what is hidden, what lies outside, matches.
+    """Masks by which AbsRel is split, ``(H, W)`` bool, within ``sample.valid``.
 
-    Returns:
-        ``out_of_view`` always; ``matched`` and ``unmatched`` (the others) where the two views can be swept;
-        ``visible`` and ``occluded`` where the set says what is hidden; where it has
-        material classes, ``tom`` (2 and 3, transparent or mirror), ``not_tom`` (the others) and one
-        ``material_<class>`` per class. All ``(H, W)`` bool, within ``sample.valid``.
+    ``out_of_view`` always; ``matched`` and ``unmatched`` (the others) where the two views can be swept;
+    ``visible`` and ``occluded`` where the set says what is hidden; where it has material classes, ``tom``
+    (transparent or mirror), ``not_tom`` (the others) and one ``material_<class>`` per class.
     """
-    outside = out_of_view(sample)
-    masks = {"out_of_view": outside}
-    found = matched(sample)
-    if found is not None:
-        masks |= {"matched": sample.valid & found, "unmatched": sample.valid & ~found}
+    masks = {"out_of_view": out_of_view(sample)}
+    by_match = matched(sample)
+    if by_match is not None:
+        masks |= {"matched": by_match, "unmatched": ~by_match}
     if sample.occluded is not None:
-        hidden = sample.valid & sample.occluded & ~outside
-        masks |= {"occluded": hidden, "visible": sample.valid & ~hidden & ~outside}
+        hidden = sample.occluded & ~masks["out_of_view"]
+        masks |= {"occluded": hidden, "visible": ~hidden & ~masks["out_of_view"]}
     if sample.material is not None:
         tom = np.isin(sample.material, TOM_CLASSES)
-        masks |= {"tom": sample.valid & tom, "not_tom": sample.valid & ~tom}
+        masks |= {"tom": tom, "not_tom": ~tom}
         for value in np.unique(sample.material[sample.valid]):
-            masks[f"material_{int(value)}"] = sample.valid & (sample.material == value)
-    return masks
+            masks[f"material_{int(value)}"] = sample.material == value
+    return {name: sample.valid & mask for name, mask in masks.items()}
 
 
-def _plain(scores: Mapping[str, float | None]) -> dict[str, float | None]:
+def _plain(scores: Mapping[str, float | None]) -> Scores:
     """Rounded to 7 digits; NaN becomes ``None``, which JSON has a word for."""
     return {k: None if v is None or math.isnan(v) else float(f"{v:.7g}") for k, v in scores.items()}
-
-
-def _split(depth_m: np.ndarray, sample: StereoSample, cap_m: float | None) -> dict[str, float | None]:
-    kept, scores = counted(sample.depth_m, sample.valid, cap_m), {}
-    for name, mask in regions(sample).items():
-        if (mask & kept).any():
-            scores[name] = evaluate_depth(depth_m, sample.depth_m, mask & kept, cap_m)["abs_rel"]
-    return _plain(scores)
 
 
 def _positive(depth_m: np.ndarray | None) -> np.ndarray:
@@ -136,44 +103,30 @@ def _positive(depth_m: np.ndarray | None) -> np.ndarray:
     return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
 
 
-def _both(
-    sample: StereoSample, depth_m: np.ndarray | None, values: np.ndarray, space: str, cap_m: float | None
-) -> dict[str, dict[str, float | None] | None]:
-    """Errors without alignment (``None`` without metres) and after the oracle's, under one cap."""
-    truth, valid = sample.depth_m, sample.valid
-    aligned_m = align(values, truth, counted(truth, valid, cap_m), space)
-    return {
-        "raw": None if depth_m is None else _plain(evaluate_depth(depth_m, truth, valid, cap_m)),
-        "aligned": _plain(evaluate_depth(aligned_m, truth, valid, cap_m)),
-    }
-
-
 def _true_disparity(sample: StereoSample) -> np.ndarray:
     cameras = (sample.K_left, sample.K_right, sample.E_scored)
     return depth_to_disparity(np.where(sample.valid, sample.depth_m, 1.0), *cameras)
 
 
 def disparity_masks(sample: StereoSample) -> dict[str, np.ndarray]:
-    """Masks by which the disparity errors of a rectified sample are split.
+    """Masks by which the disparity errors of a rectified sample are split, ``(H, W)`` bool.
 
-    Returns:
-        ``visible``: neither hidden in the right view nor outside of it, by the set's mask or by dense truth;
-        ``edge`` and ``flat``: near a step of the true disparity, and the rest. ``(H, W)`` bool, within
-        ``sample.valid``; ``visible`` is left out where nothing says what is hidden.
+    ``visible``: neither hidden in the right view nor outside of it, by the set's mask or by dense truth, left
+    out where nothing says what is hidden; ``edge`` and ``flat``: near a step of the true disparity, and not.
     """
     true_px = _true_disparity(sample)
-    edge = near_disparity_steps(true_px, sample.valid)
+    edge = edges.near_disparity_steps(true_px, sample.valid)
     masks = {"edge": edge, "flat": sample.valid & ~edge}
     hidden = sample.occluded
     if hidden is None and sample.valid.mean() > DENSE:
-        hidden = hidden_by_truth(true_px, sample.valid)
+        hidden = edges.hidden_by_truth(true_px, sample.valid)
     if hidden is not None:
         masks = {"visible": sample.valid & ~hidden & ~out_of_view(sample)} | masks
     return masks
 
 
-def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, dict[str, float | None]]:
-    """EPE, bad-1 to bad-3 and D1 of a rectified sample, ``all`` pixels with truth and by ``disparity_masks``.
+def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Scores]:
+    """``DISPARITY_METRICS`` of a rectified sample, ``all`` pixels with truth and by ``disparity_masks``.
 
     Args:
         sample: rectified, with truth.
@@ -190,6 +143,30 @@ def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, dic
     }
 
 
+def _metric_scores(sample: StereoSample, prediction: Prediction, kept: np.ndarray) -> dict[str, Any]:
+    """What only a map in metres has: see ``score``."""
+    depth_m, truth, valid = prediction.depth_m, sample.depth_m, sample.valid
+    names = ("disparity", "ause", "confidence", "ause_confidence", "boundaries")
+    record: dict[str, Any] = dict.fromkeys(names)
+    if depth_m is None:
+        return record
+    if sample.rectified:
+        by_mask = disparity_scores(sample, depth_m)
+        record["disparity"] = by_mask.pop("all") | {"regions": by_mask}
+    if prediction.uncertainty is not None:
+        record |= _plain({"ause": ause(depth_m, truth, kept, prediction.uncertainty)})
+    if (confidence := prediction.confidence) is not None:
+        deciles = confidence_deciles(depth_m, truth, kept, confidence, RIGHT_WITHIN)
+        record["confidence"] = [_plain(decile) for decile in deciles]
+        orders = {"ause": -confidence, "random": None}
+        areas = {name: ause(depth_m, truth, kept, order) for name, order in orders.items()}
+        record["ause_confidence"] = _plain(areas)
+    if valid.mean() > DENSE:
+        f1 = {"f1": edges.boundary_f1(depth_m, truth, valid)}
+        record["boundaries"] = _plain(f1 | edges.boundary_errors(depth_m, truth, valid))
+    return record
+
+
 def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> dict[str, Any]:
     """Score one prediction.
 
@@ -200,11 +177,11 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
 
     Returns:
         ``all_pixels``: ``raw`` and ``aligned`` errors over every pixel with truth, without a cap; ``capped``:
-        the same two under the cap; ``disparity``: for rectified pairs, not aligned; ``regions``: AbsRel by
-        region under the cap, not aligned (aligned for a method without metres); ``ause`` of the uncertainty;
-        ``confidence`` by decile, and ``ause_confidence``: its AUSE, and that of a random order;
-        ``boundaries`` of dense truth: ``f1``, ``dbe_acc``, ``dbe_comp``. ``disparity`` has ``regions`` too.
-        ``None`` where it does not apply.
+        the same two under the cap; ``disparity``: for rectified pairs, not aligned, with its ``regions``;
+        ``regions``: AbsRel by region under the cap, not aligned (aligned for a method without metres);
+        ``ause`` of the uncertainty; ``confidence`` by decile, and ``ause_confidence``: its AUSE, and that of
+        a random order; ``boundaries`` of dense truth: ``f1``, ``dbe_acc``, ``dbe_comp``. ``None`` where it
+        does not apply.
 
     Raises:
         ValueError: a map of the wrong shape, or a sample without truth.
@@ -214,38 +191,22 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
         values = getattr(prediction, name)
         if values is not None and values.shape != truth.shape:
             bad_value(f"prediction.{name}", f"of the left image's shape {truth.shape}", values.shape)
-    if not valid.any():
-        got = f"none ({sample.notes['truth']})" if "truth" in sample.notes else "none"
-        bad_value(f"the truth of {sample.label}", "known for at least one pixel", got)
-    values, depth_m = prediction.relative, prediction.depth_m
+    sample.check_truth()
+    values, depth_m, space = prediction.relative, prediction.depth_m, prediction.space
     if values is None:
         # Metres are aligned in the prior's own space, as its relative map would be.
-        values = depth_m if prediction.space == "depth" else to_space(_positive(depth_m), prediction.space)
-    record: dict[str, Any] = {"all_pixels": _both(sample, depth_m, values, prediction.space, None)}
-    capped = record["all_pixels"]
-    if cap_m is not None:
-        capped = _both(sample, depth_m, values, prediction.space, cap_m)
-    record |= {"capped": capped, "disparity": None, "ause": None, "confidence": None}
-    record["ause_confidence"] = None
+        values = depth_m if space == "depth" else to_space(_positive(depth_m), space)
+
+    def both(cap: float | None) -> dict[str, Scores | None]:
+        aligned_m = align(values, truth, counted(truth, valid, cap), space)
+        raw = None if depth_m is None else _plain(evaluate_depth(depth_m, truth, valid, cap))
+        return {"raw": raw, "aligned": _plain(evaluate_depth(aligned_m, truth, valid, cap))}
+
+    record: dict[str, Any] = {"all_pixels": both(None)}
+    record["capped"] = record["all_pixels"] if cap_m is None else both(cap_m)
     kept = counted(truth, valid, cap_m)
-    shown_m = align(values, truth, kept, prediction.space) if depth_m is None else depth_m
-    if depth_m is not None and sample.rectified:
-        by_mask = disparity_scores(sample, depth_m)
-        record["disparity"] = by_mask.pop("all") | {"regions": by_mask}
-    if depth_m is not None and prediction.uncertainty is not None:
-        record["ause"] = _plain({"ause": ause(depth_m, truth, kept, prediction.uncertainty)})["ause"]
-    if depth_m is not None and prediction.confidence is not None:
-        deciles = confidence_deciles(depth_m, truth, kept, prediction.confidence, RIGHT_WITHIN)
-        record["confidence"] = [_plain(decile) for decile in deciles]
-        record["ause_confidence"] = _plain(
-            {
-                "ause": ause(depth_m, truth, kept, -prediction.confidence),
-                "random": ause_of_random(depth_m, truth, kept),
-            }
-        )
-    record["regions"] = _split(shown_m, sample, cap_m)
-    record["boundaries"] = None
-    if depth_m is not None and valid.mean() > DENSE:
-        found = {"f1": boundary_f1(depth_m, truth, valid)} | boundary_errors(depth_m, truth, valid)
-        record["boundaries"] = _plain(found)
-    return record
+    shown_m = align(values, truth, kept, space) if depth_m is None else depth_m
+    record |= _metric_scores(sample, prediction, kept)
+    masks = {name: mask & kept for name, mask in regions(sample).items() if (mask & kept).any()}
+    errors = {name: evaluate_depth(shown_m, truth, mask, cap_m)["abs_rel"] for name, mask in masks.items()}
+    return record | {"regions": _plain(errors)}

@@ -13,17 +13,14 @@ import torch
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import PriorCache
-from geodiff_plugin.evaluation.experiment import Experiment, last_of
+from geodiff_plugin.evaluation.experiment import Experiment, Page, last_of
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import SequenceOptions, command_line
-from geodiff_plugin.evaluation.report import Page
-from geodiff_plugin.evaluation.table import Table
+from geodiff_plugin.evaluation.tables import Table
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runner import Item, Record
 from geodiff_plugin.runtime.pipeline import native_images
-
-__all__ = ["SEQUENCES", "WAYS", "flicker", "run_sequence", "sequence_table"]
 
 #: What makes a sequence, by name; a checkout registers its renderer (tests/scenes/dataset.py).
 SEQUENCES: dict[str, Any] = {}
@@ -111,9 +108,7 @@ def run_sequence(name: str, options: SequenceOptions) -> Page | None:
         f"{options.scenes} rendered scenes of {options.frames} frames, {options.size[1]}x{options.size[0]} "
         f"pixels, prior {settings.prior}, {options.steps} steps, seed {options.seed} for every frame."
     )
-    experiment = Experiment(
-        name, "Sequences", cells, lambda records: [sequence_table(records)], lambda records: (remark,)
-    )
+    experiment = Experiment(name, "Sequences", cells, lambda own: [sequence_table(own)], lambda _: [remark])
     return experiment.run(options, command_line(name, options))
 
 

@@ -1,31 +1,43 @@
-"""Guidance of priors from exact to weak: ``geodiff eval strength``."""
+"""Guidance of priors from exact to weak: ``geodiff eval strength``, with emulated priors of chosen error.
+
+The pipeline, its scheduler and its autoencoder are real. The emulated network's clean estimate is
+``(1 - follow) z0* + follow z0(z_t)``: ``z0*`` is the code of the erroneous truth, and ``z0(z_t)`` what its
+input says, so that an edit of one step is seen by the next one, as a trained network would see it.
+"""
 
 from __future__ import annotations
 
-import math
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+import torch.nn.functional as F
+from diffusers import ConfigMixin, ModelMixin
+from diffusers.configuration_utils import register_to_config
+from scipy import ndimage
+from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.algorithm.denoising import output_from
+from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.datasets import SampleRef, find_pairs, load
-from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load
 from geodiff_plugin.evaluation.edges import edge_error, surface_error
-from geodiff_plugin.evaluation.emulated import DENSE, STRENGTHS, EmulatedPrior, EmulatedPriors
-from geodiff_plugin.evaluation.experiment import Experiment, cell_key, last_of
+from geodiff_plugin.evaluation.experiment import Experiment, Page, cell_key, last_of
 from geodiff_plugin.evaluation.figures.curves import draw_strength, shaded
-from geodiff_plugin.evaluation.metrics import align, evaluate_depth
+from geodiff_plugin.evaluation.metrics import align, evaluate_depth, to_space
 from geodiff_plugin.evaluation.options import StrengthOptions, command_line, data_of
-from geodiff_plugin.evaluation.report import Page
-from geodiff_plugin.evaluation.table import Table, count_of_pairs
+from geodiff_plugin.evaluation.scoring import DENSE
+from geodiff_plugin.evaluation.tables import Table, count_of_pairs
+from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runner import Item, Record
-
-__all__ = ["run_strength", "strength_tables"]
+from geodiff_plugin.runtime.noise_levels import noise_level
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 #: First paragraph of the page.
 PURPOSE = (
@@ -37,62 +49,212 @@ PURPOSE = (
     "slope of log depth away from edges: the lower, the smoother."
 )
 
+SPACES = ("disparity", "depth", "log")
+#: What a prior calls 0 and 1: the quantiles of Marigold's training; the rest of the map lies beyond them.
+ENDS = (0.02, 0.98)
+#: Standard deviation of the smooth half of the error, and spacing of the segments of the other half, as
+#: shares of the longer side; that of the blur.
+SMOOTH, SEGMENTS, BLUR = 0.12, 0.16, 0.012
+
+
+class Strength(NamedTuple):
+    """How a prior errs.
+
+    Attributes:
+        error: mean absolute error of log depth, half of it smooth and half constant over segments.
+        blur: whether the map is blurred.
+        gamma: exponent of the relative map, 1 for none: an error that no scale and shift takes out.
+    """
+
+    error: float = 0.0
+    blur: bool = False
+    gamma: float = 1.0
+
+
+STRENGTHS = {
+    "exact": Strength(),
+    "2%": Strength(0.02),
+    "5%": Strength(0.05),
+    "10%": Strength(0.10),
+    "20%": Strength(0.20),
+    "blur": Strength(0.01, blur=True),
+    "gamma": Strength(gamma=1.6),
+}
+
+
+def relative_map(sample: StereoSample, strength: Strength, space: str, seed: int = 0) -> np.ndarray:
+    """The map of a prior that errs in a given way, at the truth's resolution.
+
+    Args:
+        sample: with truth everywhere, or at least densely; holes take the nearest known depth.
+        strength: how it errs.
+        space: what the map is affine in, one of ``SPACES``.
+        seed: of the error; the same one gives the same error whatever the space.
+
+    Returns:
+        ``(H, W)`` float64, 0 and 1 at the 2 % and 98 % quantiles, clipped there as trained maps are.
+    """
+    nearest = ndimage.distance_transform_edt(~sample.valid, return_distances=False, return_indices=True)
+    log_depth = np.log(sample.depth_m[tuple(nearest)].astype(np.float64))
+    rng = np.random.default_rng([seed, 47])
+    log_depth = log_depth + strength.error * _error(log_depth, rng)
+    values = to_space(np.exp(log_depth), space)
+    if strength.blur:
+        values = ndimage.gaussian_filter(values, BLUR * max(values.shape), mode="nearest")
+    low, high = np.quantile(values, ENDS)
+    return np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0) ** strength.gamma
+
+
+def _error(log_depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """``(H, W)`` of mean absolute value 1 and median 0: half smooth, half constant over segments.
+
+    A segment is the part of a cell of the picture that lies at one of its depths: things err as wholes.
+    """
+    height, width = log_depth.shape
+    side = max(height, width)
+    smooth = ndimage.gaussian_filter(rng.normal(size=(height, width)), SMOOTH * side, mode="reflect")
+    span = max(float(np.ptp(np.quantile(log_depth, ENDS))), 1e-3)
+    seeds = max(4, round(height * width / (SEGMENTS * side) ** 2))
+    centres = np.stack([rng.uniform(0, height, seeds), rng.uniform(0, width, seeds)], 1)
+    depths = log_depth[tuple(centres.astype(int).T)]
+    rows, columns = np.mgrid[:height, :width]
+    best, label = np.full((height, width), np.inf), np.zeros((height, width), int)
+    for k, ((row, column), depth) in enumerate(zip(centres, depths, strict=True)):
+        away = ((rows - row) ** 2 + (columns - column) ** 2) / (SEGMENTS * side) ** 2
+        away = away + (4.0 * (log_depth - depth) / span) ** 2
+        closer = away < best
+        best[closer], label[closer] = away[closer], k
+    segments = rng.normal(size=seeds)[label]
+    field = sum(part / max(float(part.std()), 1e-9) for part in (smooth, segments))
+    field = field - np.median(field)
+    return field / max(float(np.abs(field).mean()), 1e-9)
+
+
+class _Denoiser(ModelMixin, ConfigMixin):
+    """Stands where the U-Net stands; ``code`` is what it answers with."""
+
+    @register_to_config
+    def __init__(self, follow: float = 0.3) -> None:
+        super().__init__()
+        self.unit = torch.nn.Parameter(torch.ones(()))
+        self.scheduler: Any = None
+        self.code: Tensor | None = None
+        self._noise: Tensor | None = None
+        self._last: Tensor | None = None
+
+    def forward(self, sample: Tensor, timestep: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor]:
+        assert self.code is not None  # set by ``EmulatedPrior.answer``
+        z_t = sample[:, -self.code.shape[1] :].float()
+        level = noise_level(self.scheduler, timestep)
+        own = self.code.expand_as(z_t)
+        starts = self._last is None or timestep >= self._last  # a schedule falls, so this one is new
+        self._last = timestep
+        z0 = own
+        if not starts and self._noise is not None:
+            implied = (z_t - level.sigma * self._noise) / level.alpha
+            z0 = (1.0 - self.config.follow) * own + self.config.follow * implied
+        self._noise = (z_t - level.alpha * z0) / level.sigma  # what its input holds beside that
+        return (output_from(z0, self._noise, level)[0].to(sample.dtype),)
+
+
+class EmulatedPrior:
+    """The bundled pipeline with an emulated network, for one sample after another.
+
+    Args:
+        space: what its maps are affine in, one of ``SPACES``.
+        follow: how far its later answers follow their input, [0, 1].
+
+    Attributes:
+        pipe: the stock pipeline; guidance is enabled as on any other.
+    """
+
+    def __init__(self, space: str = "disparity", follow: float = 0.3) -> None:
+        check_choice(space, "space", SPACES)
+        self.space, self.pipe = space, load_bundled_prior()
+        self.pipe.register_to_config(prediction_type=space)
+        self.pipe.unet = _Denoiser(follow)
+        self.pipe.unet.scheduler = self.pipe.scheduler
+        self.pipe.set_progress_bar_config(disable=True)
+
+    @torch.no_grad()
+    def answer(self, sample: StereoSample, strength: Strength, resolution: int, seed: int = 0) -> Tensor:
+        """Let the network answer for a sample, in calls whose ``processing_resolution`` is this one.
+
+        Returns:
+            ``(1, 1, H, W)`` the relative map at the image's resolution, before the autoencoder.
+        """
+        relative = torch.from_numpy(relative_map(sample, strength, self.space, seed))[None, None].float()
+        image = torch.from_numpy(sample.left).permute(2, 0, 1)[None].float() / 255.0
+        padded, padding, _ = self.pipe.image_processor.preprocess(image, resolution, "bilinear", "cpu")
+        size = tuple(side - pad for side, pad in zip(padded.shape[-2:], padding, strict=True))
+        small = F.interpolate(relative, size, mode="bilinear", antialias=True)
+        small = F.pad(small, (0, padding[1], 0, padding[0]), mode="replicate")
+        self.pipe.unet.code = find_adapter(self.pipe)(self.pipe).encode(small).float()
+        return relative
+
+
+class EmulatedPriors(PriorCache):
+    """Hands an emulated prior, guided, to every method that asks for one."""
+
+    def __init__(self, prior: EmulatedPrior) -> None:
+        super().__init__()
+        self._pipe = enable_geometry_guidance(prior.pipe)
+
+    def get(self, settings: Settings) -> Any:
+        """The emulated pipeline, whatever prior the settings name."""
+        return self._pipe
+
+
 #: The plain call whose scale and shift the truth decides.
 ORACLE = "prior-aligned"
 #: Strength whose surfaces the figure shows.
 SHOWN = "5%"
-#: Field of a record -> heading of its column.
-_VALUES = {"abs_rel": "AbsRel", "delta1": "δ1", "edges": "at edges", "surfaces": "surfaces"}
+#: Field of a record -> heading of its column, and digits.
+_VALUES = {"abs_rel": ("AbsRel", 4), "delta1": ("δ1", 4), "edges": ("at edges", 4)}
+_VALUES |= {"surfaces": ("surfaces", 2)}
 
 
-def strength_tables(records: Sequence[Record]) -> tuple[Table, ...]:
-    """One table a group of pairs (all, rendered rectified, rendered posed, real), strengths by methods.
-
-    Args:
-        records: of ``run_strength``.
-    """
-    groups: dict[str, Callable[[Record], bool]] = {
-        "All pairs": lambda r: True,
-        "Rendered, rectified": lambda r: r["rendered"] and r["rectified"],
-        "Rendered, any pose": lambda r: r["rendered"] and not r["rectified"],
-        "Real": lambda r: not r["rendered"],
+def strength_tables(records: Sequence[Record]) -> list[Table]:
+    """One table a group of pairs (all, rendered rectified, rendered posed, real), strengths by methods."""
+    groups = {
+        "All pairs": list(records),
+        "Rendered, rectified": [r for r in records if r["rendered"] and r["rectified"]],
+        "Rendered, any pose": [r for r in records if r["rendered"] and not r["rectified"]],
+        "Real": [r for r in records if not r["rendered"]],
     }
-    tables = []
-    for title, belongs in groups.items():
-        own = [record for record in records if belongs(record)]
-        if own:
-            tables.append(_table(title, own))
-    return tuple(tables)
+    return [_table(title, own) for title, own in groups.items() if own]
 
 
 def _table(title: str, records: Sequence[Record]) -> Table:
-    strengths = list(dict.fromkeys(record["strength"] for record in records))
-    methods = list(dict.fromkeys(record["method"] for record in records))
-    rows: list[tuple[str, ...]] = []
-    rules: list[int] = []
-    for strength in strengths:
+    rows, rules = list[tuple[str, ...]](), list[int]()
+    cells = Counter((record["strength"], record["method"]) for record in records)
+    for strength in dict.fromkeys(strength for strength, _ in cells):
         rules.append(len(rows))
-        for method in methods:
-            own = [r for r in records if r["strength"] == strength and r["method"] == method]
-            if not own:
-                continue
-            means = {name: _mean([r[name] for r in own]) for name in _VALUES}
+        for method in dict.fromkeys(method for of, method in cells if of == strength):
+            own = [r for r in records if (r["strength"], r["method"]) == (strength, method)]
+            shown = [f"{_mean([r[name] for r in own]):.{digits}f}" for name, (_, digits) in _VALUES.items()]
             worst = max(r["abs_rel"] for r in own)
-            shown = [f"{means[n]:.2f}" if n == "surfaces" else f"{means[n]:.4f}" for n in _VALUES]
             rows.append((strength, find_method(method).title, *shown, f"{worst:.3f}"))
     # Not by label: pairs of one name in two folders are two.
-    pairs = count_of_pairs(max(Counter((r["strength"], r["method"]) for r in records).values()))
     note = (
-        f"{pairs}. AbsRel and δ1 in metres, without alignment but for the prior with oracle; AbsRel within "
-        f"3 px of the truth's edges; error of the slope of log depth away from them, per mille a pixel."
+        f"{count_of_pairs(max(cells.values()))}. AbsRel and δ1 in metres, without alignment but for the "
+        f"prior with oracle; AbsRel within 3 px of the truth's edges; error of the slope of log depth away "
+        f"from them, per mille a pixel."
     )
-    header = ("prior's error", "method", *_VALUES.values(), "worst AbsRel")
+    header = ("prior's error", "method", *(heading for heading, _ in _VALUES.values()), "worst AbsRel")
     return Table(title, header, tuple(rows), note, rules=tuple(rules[1:]))
 
 
 def _mean(values: Sequence[float]) -> float:
-    known = [value for value in values if not math.isnan(value)]
+    known = [value for value in values if value == value]
     return sum(known) / len(known) if known else float("nan")
+
+
+def _dense(records: Sequence[Record]) -> list[Record]:
+    kept = [record for record in records if record.get("status") != "sparse"]
+    if not kept:
+        bad_value("--data", f"with dense truth (on {DENSE:.0%} of the pixels) for some pair", "none")
+    return kept
 
 
 def run_strength(name: str, options: StrengthOptions) -> Page | None:
@@ -102,16 +264,14 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
         InputError: bad options, or no sample with dense truth.
         OSError: missing or unreadable files.
     """
-    _check_methods(options)
+    for method in map(find_method, options.methods):
+        if not method.uses_prior or method.prior is not None:
+            bad_value("--methods", "methods that use a prior, none named after an @", repr(method.name))
+    if options.figure is not None and ORACLE not in options.methods:
+        got = repr(",".join(options.methods))
+        bad_value("--methods", f"with {ORACLE}, the abscissa of the figure", got)
     refs = [ref for root in options.data or (data_of(options),) for ref in find_pairs(root)[: options.limit]]
     bench = _Bench(options)
-    cells = [cell for ref in refs for cell in bench.cells(ref)]
-
-    def dense(records: Sequence[Record]) -> list[Record]:
-        kept = [record for record in records if record.get("status") != "sparse"]
-        if not kept:
-            bad_value("--data", f"with dense truth (on {DENSE:.0%} of the pixels) for some pair", "none")
-        return kept
 
     def remarks(records: list[Record]) -> list[str]:
         sentences = [
@@ -119,29 +279,22 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
             f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}."
         ]
         if options.figure is not None:
-            labels = {record["pair"] for record in dense(records)}
+            labels = {record["pair"] for record in _dense(records)}
             sample = load(next(ref for ref in refs if ref.label in labels))
-            draw_strength(dense(records), ORACLE, bench.pictures(sample), options.figure)
+            draw_strength(_dense(records), ORACLE, bench.pictures(sample), options.figure)
             if options.results is not None:
                 picture = Path(os.path.relpath(options.figure, options.results.parent)).as_posix()
                 sentences.append(f"![What guidance gains by the prior's error; surfaces, lit]({picture})")
         return sentences
 
-    title = "Priors from exact to weak"
-    experiment = Experiment(
-        name, title, cells, lambda records: strength_tables(dense(records)), remarks, PURPOSE
-    )
-    return experiment.run(options, command_line(name, options))
-
-
-def _check_methods(options: StrengthOptions) -> None:
-    for name in options.methods:
-        method = find_method(name)
-        if not method.uses_prior or method.prior is not None:
-            bad_value("--methods", "methods that use a prior, none named after an @", repr(name))
-    if options.figure is not None and ORACLE not in options.methods:
-        got = repr(",".join(options.methods))
-        bad_value("--methods", f"with {ORACLE}, the abscissa of the figure", got)
+    return Experiment(
+        name,
+        "Priors from exact to weak",
+        [cell for ref in refs for cell in bench.cells(ref)],
+        lambda records: strength_tables(_dense(records)),
+        remarks,
+        PURPOSE,
+    ).run(options, command_line(name, options))
 
 
 class _Bench:

@@ -16,7 +16,7 @@ from geodiff_plugin.matching.sweep import UNSEEN_LEVEL, CostVolume
 #: Planes of the truth within which a match counts as right.
 RIGHT_WITHIN_PLANES = 3.0
 #: Log-odds that a checked match is right, linear in its evidence, by logistic regression on pairs with truth
-#: (``python -m geodiff_plugin.evaluation.calibrate`` refits them).
+#: (``python -m tests.benchmarks.confidence`` refits them).
 LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
 #: Which sign each of them may have; 0 for any.
 SIGNS = (0, 1, -1, -1)

@@ -20,7 +20,7 @@ from geodiff_plugin.types import CameraView
 #: What confidence is the probability of: a relative error below this.
 RIGHT_WITHIN = 0.1
 #: Log-odds, by logistic regression on pairs with truth, every pair weighing the same
-#: (``python -m geodiff_plugin.evaluation.calibrate`` refits them): constant, by certainty, by the prior's
+#: (``python -m tests.benchmarks.confidence`` refits them): constant, by certainty, by the prior's
 #: strength, by photometric agreement, by the relative spread of an ensemble (set by hand: members that differ
 #: by 10 % halve the odds twice).
 BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)

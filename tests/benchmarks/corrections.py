@@ -21,8 +21,8 @@ from diffusers.utils import logging as diffusers_logging
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.evaluation.emulated import STRENGTHS, EmulatedPrior
 from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.strength import STRENGTHS, EmulatedPrior
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 __all__ = ["main"]

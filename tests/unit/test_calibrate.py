@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geodiff_plugin.evaluation.calibrate import (
+from geodiff_plugin.evaluation.datasets import find_pairs, load
+from tests.benchmarks.confidence import (
     Observed,
     calibrate,
     deciles,
@@ -17,7 +18,6 @@ from geodiff_plugin.evaluation.calibrate import (
     observe_emulated,
     promised,
 )
-from geodiff_plugin.evaluation.datasets import find_pairs, load
 
 TRUE = (-0.5, 1.2, -0.7)
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from geodiff_plugin.evaluation.figures.gs_sweep import sweep_g_s
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -22,7 +23,6 @@ from geodiff_plugin.evaluation.figures.canvas import (
     show_error,
     show_values,
 )
-from geodiff_plugin.evaluation.figures.gs_sweep import sweep_g_s
 from geodiff_plugin.evaluation.figures.maps import SHRINK, orbit, render_cloud
 from geodiff_plugin.evaluation.figures.one_pair import term_by_term
 from geodiff_plugin.formats import write_depth_npy

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from geodiff_plugin.evaluation.baselines.constant import constant_method
+from geodiff_plugin.evaluation.datasets.folder import find_folder, load_folder
 from PIL import Image
 from transformers import DPTConfig, DPTForDepthEstimation, GLPNConfig, GLPNForDepthEstimation
 
@@ -21,11 +23,9 @@ from geodiff_plugin.evaluation.baselines import (
     constant,
     find_method,
 )
-from geodiff_plugin.evaluation.baselines.constant import constant_method
 from geodiff_plugin.evaluation.baselines.guided import guided_prediction
 from geodiff_plugin.evaluation.baselines.outside import map_name
 from geodiff_plugin.evaluation.baselines.stereo import native_depth
-from geodiff_plugin.evaluation.datasets.folder import find_folder, load_folder
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm

@@ -5,6 +5,8 @@ import re
 
 import numpy as np
 import pytest
+from geodiff_plugin.evaluation.published import LAYOUTS
+from geodiff_plugin.evaluation.table import Table, label_of, latex_escape
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -20,8 +22,6 @@ from geodiff_plugin.evaluation.changes import (
     flatness_table,
 )
 from geodiff_plugin.evaluation.paper import FoundColumn, layout_table
-from geodiff_plugin.evaluation.published import LAYOUTS
-from geodiff_plugin.evaluation.table import Table, label_of, latex_escape
 from geodiff_plugin.formats import write_pfm
 from tests.contracts.tiny_transformers import make_transformers
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from geodiff_plugin.evaluation.table import mean_with_interval, paired_difference
 
 from geodiff_plugin.evaluation import experiment, scoring
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
@@ -14,7 +15,6 @@ from geodiff_plugin.evaluation.datasets.changed import with_perturbed_poses
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 from geodiff_plugin.evaluation.experiment import RECORDS_NAME, cell_key, headline
 from geodiff_plugin.evaluation.scoring import matched, out_of_view, regions, score
-from geodiff_plugin.evaluation.table import mean_with_interval, paired_difference
 from geodiff_plugin.evaluation.tables import (
     disparity_table,
     pairs_tables,

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from geodiff_plugin.evaluation.emulated import SPACES, STRENGTHS, EmulatedPrior, relative_map
 
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, find_method
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.evaluation.emulated import SPACES, STRENGTHS, EmulatedPrior, relative_map
 from geodiff_plugin.evaluation.options import StrengthOptions
 from geodiff_plugin.evaluation.strength import run_strength
 

@@ -6,11 +6,11 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from geodiff_plugin.evaluation.mistakes import WRONG, WRONG_POINTS, case_kinds, make_case
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.evaluation import trust
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.evaluation.mistakes import WRONG, WRONG_POINTS, case_kinds, make_case
 from geodiff_plugin.evaluation.options import TrustOptions
 from geodiff_plugin.runtime.verdict import Indicators
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.text import Text
 
 from geodiff_plugin.cli.terminal import new_table, show
-from geodiff_plugin.evaluation.report import Page
+from geodiff_plugin.evaluation.experiment import Page
 
 __all__ = ["print_page"]
 

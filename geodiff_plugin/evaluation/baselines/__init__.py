@@ -5,31 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
-from geodiff_plugin.evaluation.baselines.constant import NO_DIFFUSION, REPROJECTION_ONLY
-from geodiff_plugin.evaluation.baselines.guided import GUIDED_METHODS, default_variant, paper_variant
+from geodiff_plugin.evaluation.baselines.guided import (
+    CONSTANT_METHODS,
+    GUIDED_METHODS,
+    default_variant,
+    paper_variant,
+)
 from geodiff_plugin.evaluation.baselines.outside import files_method, hf_method
 from geodiff_plugin.evaluation.baselines.stereo import STEREO_METHODS
 
-__all__ = [
-    "FAMILIES",
-    "METHODS",
-    "Method",
-    "NotApplicable",
-    "Prediction",
-    "PriorCache",
-    "Settings",
-    "find_method",
-    "with_poses",
-    "with_priors",
-    "with_seeds",
-]
+__all__ = ["FAMILIES", "METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
+__all__ += ["find_method", "with_poses", "with_priors", "with_seeds"]
 
-METHODS: dict[str, Method] = {
-    method.name: method for method in (*GUIDED_METHODS, REPROJECTION_ONLY, NO_DIFFUSION, *STEREO_METHODS)
-}
+METHODS: dict[str, Method] = {m.name: m for m in (*GUIDED_METHODS, *CONSTANT_METHODS, *STEREO_METHODS)}
 """Every method by name, in the order of the tables' columns."""
 
 FAMILIES: dict[str, Callable[[str], Method]] = {
@@ -64,68 +56,44 @@ def find_method(name: str) -> Method:
         return FAMILIES[family](parameter)
     bare, _, seed = name.rpartition("#")
     if bare and seed.isdecimal():
-        return _seeded(find_method(bare), int(seed))
+        method, number = find_method(bare), int(seed)
+        return _bound(method, f"#{number}", "METHOD#SEED", f"{method.title}, seed {number}", seed=number)
     bare, at, prior = name.rpartition("@")
     if at:
-        return _bound(find_method(bare), prior)
+        method = find_method(bare)
+        title = f"{method.title} ({prior.rstrip('/').rpartition('/')[2]})"
+        return _bound(method, f"@{prior}", "METHOD@PRIOR", title, prior=prior)
     if colon and family in FAMILIES:
         return FAMILIES[family](parameter)
-    known = [*METHODS, *(f"{key}:..." for key in FAMILIES)]
-    bad_value("methods", f"one of {', '.join(known)}", repr(name))
+    bad_value("methods", f"one of {', '.join([*METHODS, *(f'{key}:...' for key in FAMILIES)])}", repr(name))
 
 
-def _bound(method: Method, prior: str) -> Method:
-    if not (prior and method.uses_prior and method.seed is None):
-        bad_value("methods", "METHOD@PRIOR with a method that uses a prior", f"{method.name}@{prior}")
-    title = f"{method.title} ({prior.rstrip('/').rpartition('/')[2]})"
-    return replace(method, name=f"{method.name}@{prior}", title=title, prior=prior)
-
-
-def _seeded(method: Method, seed: int) -> Method:
-    if not (method.uses_prior and method.seed is None):
-        bad_value("methods", "METHOD#SEED with a method that uses a prior", f"{method.name}#{seed}")
-    title = f"{method.title}, seed {seed}"
-    return replace(method, name=f"{method.name}#{seed}", title=title, seed=seed)
+def _bound(method: Method, suffix: str, form: str, title: str, **to: Any) -> Method:
+    """A method bound to a prior or a seed."""
+    if not (len(suffix) > 1 and method.uses_prior and method.seed is None):
+        bad_value("methods", f"{form} with a method that uses a prior", method.name + suffix)
+    return replace(method, name=method.name + suffix, title=title, **to)
 
 
 def with_priors(methods: Sequence[str], priors: Sequence[str]) -> tuple[str, ...]:
-    """The methods, then those of them that use a prior once more for every further prior.
-
-    Args:
-        methods: names.
-        priors: further priors, beside the settings' own.
-
-    Raises:
-        ValueError: as ``find_method``.
-    """
+    """The methods, then those of them that use a prior once more for every further prior."""
     bound = [f"{name}@{prior}" for prior in priors for name in methods if find_method(name).uses_prior]
     return (*methods, *bound)
 
 
 def with_poses(methods: Sequence[str], poses: Sequence[str]) -> tuple[str, ...]:
-    """The methods, with ``guided`` once for each of the named poses.
-
-    Args:
-        methods: names.
-        poses: of ``POSES``; none leaves the methods as they are.
-    """
-    rows = [
-        [f"guided:pose={pose}" for pose in poses] if name == "guided" and poses else [name]
-        for name in methods
-    ]
-    return tuple(name for row in rows for name in row)
+    """The methods, with ``guided`` once for each of the named poses; none leaves them as they are."""
+    own = tuple(f"guided:pose={pose}" for pose in poses) or ("guided",)
+    return tuple(name for given in methods for name in (own if given == "guided" else (given,)))
 
 
 def with_seeds(methods: Sequence[str], first: int, count: int) -> tuple[str, ...]:
-    """The methods, then those of them that use a prior once more for every further seed.
+    """The methods, then those of them that use a prior, and are bound to no seed, for every further seed.
 
     Args:
-        methods: names; one that is bound to a seed already is not run with others.
+        methods: names.
         first: the settings' own seed.
         count: how many seeds, ``first`` counted, at least 1.
-
-    Raises:
-        ValueError: no seed; else as ``find_method``.
     """
     if count < 1:
         bad_value("seeds", "at least 1", count)

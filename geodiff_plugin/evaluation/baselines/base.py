@@ -21,7 +21,7 @@ from geodiff_plugin.priors import load_prior
 from geodiff_plugin.priors.hf_model import HFDepthModel
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
-__all__ = ["Method", "NotApplicable", "Prediction", "PriorCache", "Settings", "folder_fingerprint"]
+_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
 
 def folder_fingerprint(folder: Path) -> str:
@@ -33,9 +33,6 @@ def folder_fingerprint(folder: Path) -> str:
         status = path.stat()
         digest.update(f"{path.relative_to(folder)} {status.st_size} {status.st_mtime_ns}\n".encode())
     return digest.hexdigest()[:16]
-
-
-_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
 
 class NotApplicable(Exception):
@@ -70,17 +67,20 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_choice(self.dtype, "dtype", _DTYPES)
-        if self.ensemble < 1:
-            bad_value("ensemble", "at least 1", self.ensemble)
-        if self.steps is not None and self.steps < 1:
-            bad_value("steps", "at least 1", self.steps)
-        if self.views < 2:
-            bad_value("views", "at least 2", self.views)
+        for name, least in (("ensemble", 1), ("steps", 1), ("views", 2)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                bad_value(name, f"at least {least}", value)
 
     @property
     def weights_dtype(self) -> torch.dtype:
         """``dtype`` as torch names it."""
         return _DTYPES[self.dtype]
+
+    @property
+    def which_prior(self) -> tuple[str | None, ...]:
+        """What decides which pipeline is loaded, and how."""
+        return self.prior, self.device, self.dtype, self.space
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class Prediction:
         depth_m: ``(H, W)`` float, metres, not finite where the method leaves a hole; ``None`` where it knows
             relative depth only.
         relative: ``(H, W)`` float, affine in ``space``; ``None`` where only metres are known.
-        space: space for the oracle's alignment, see ``alignment.align``.
+        space: space for the oracle's alignment, see ``metrics.align``.
         uncertainty: ``(H, W)`` float, larger is less certain; ``None`` where the method has none.
         confidence: ``(H, W)`` float in [0, 1], see ``confidence.depth_confidence``; ``None`` as well.
         notes: what the method reports beside the map, JSON values only.
@@ -103,10 +103,6 @@ class Prediction:
     uncertainty: np.ndarray | None = None
     confidence: np.ndarray | None = None
     notes: Mapping[str, Any] = field(default_factory=dict)
-
-
-def _which(settings: Settings) -> tuple[str | None, ...]:
-    return settings.prior, settings.device, settings.dtype, settings.space
 
 
 class PriorCache:
@@ -129,25 +125,18 @@ class PriorCache:
             ValueError: it does not exist, or is neither cached nor can be fetched.
             TypeError: it loads, but has no adapter.
         """
-        key = _which(settings)
+        key = settings.which_prior
         if key not in self._pipes:
-            said = {} if settings.space is None else {"space": settings.space}
+            options: dict[str, Any] = {"device": settings.device, "dtype": settings.weights_dtype}
+            options |= {} if settings.space is None else {"space": settings.space}
             with no_bars():
-                pipe = load_prior(
-                    settings.prior, device=settings.device, dtype=settings.weights_dtype, **said
-                )
+                pipe = load_prior(settings.prior, **options)
             pipe.set_progress_bar_config(disable=True)
-            enable_geometry_guidance(pipe)
-            self._pipes[key] = pipe
+            self._pipes[key] = enable_geometry_guidance(pipe)
         return self._pipes[key]
 
     def depth_model(self, name: str, settings: Settings) -> HFDepthModel:
-        """A depth model of ``transformers``.
-
-        Raises:
-            ValueError: it does not exist, is neither cached nor can be fetched, or has no safetensors; a
-                class whose output, or a processor that, is not known.
-        """
+        """A depth model of ``transformers``; errors as ``HFDepthModel.from_pretrained``."""
         key = (name, settings.device, settings.dtype)
         if key not in self._models:
             self._models[key] = HFDepthModel.from_pretrained(
@@ -161,23 +150,20 @@ class PriorCache:
         A prior that was trained further under the same name has another fingerprint, so that its old results
         are not taken for its own.
         """
-        key = _which(settings)
+        key = settings.which_prior
         if key not in self._fingerprints:
             pipe, digest = self.get(settings), hashlib.sha256()
             # The pipeline's own options are the space of its map, its size, how images are prepared.
             for name, module in [("", pipe), *sorted(pipe.components.items())]:
                 config = getattr(module, "config", None)
+                config = config if isinstance(config, Mapping) else {}
                 # Names that start with an underscore say where it was loaded from and by which version.
-                values = (
-                    {k: v for k, v in config.items() if k[0] != "_"} if isinstance(config, Mapping) else {}
-                )
+                values = {k: v for k, v in config.items() if k[0] != "_"}
                 digest.update(json.dumps([name, values], default=str, sort_keys=True).encode())
                 if isinstance(module, torch.nn.Module):
-                    for tensor_name, tensor in module.state_dict().items():
-                        sample = tensor.detach().flatten()[:4].double().cpu().numpy()
-                        digest.update(
-                            tensor_name.encode() + str(tuple(tensor.shape)).encode() + sample.tobytes()
-                        )
+                    for label, tensor in module.state_dict().items():
+                        some = tensor.detach().flatten()[:4].double().cpu().numpy()
+                        digest.update(label.encode() + str(tuple(tensor.shape)).encode() + some.tobytes())
             self._fingerprints[key] = digest.hexdigest()[:16]
         return self._fingerprints[key]
 

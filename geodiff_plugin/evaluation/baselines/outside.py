@@ -22,41 +22,28 @@ from geodiff_plugin.evaluation.baselines.base import (
 )
 from geodiff_plugin.evaluation.baselines.guided import (
     call_arguments,
+    guidance_for,
     guided_configuration,
     guided_prediction,
-    posed_views,
 )
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth, read_depth_m, read_npy
 from geodiff_plugin.formats import read_disparity_kitti_png, read_pfm
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 
-__all__ = ["KINDS", "files_method", "hf_method", "map_name"]
-
 
 def hf_method(name: str) -> Method:
     """A depth checkpoint of transformers, hub id or folder; relative ones are scored aligned only.
 
-    Args:
-        name: hub id, or folder as ``save_pretrained`` wrote it.
-
-    Returns:
-        The method; the checkpoint is loaded when it is first run.
-
-    Raises:
-        ValueError: an empty name. When run: what ``HFDepthModel.from_pretrained`` raises.
+    It is loaded when it is first run, where errors are those of ``HFDepthModel.from_pretrained``.
     """
     if not name:
         bad_value("methods", "hf:MODEL with a hub id or a folder", "'hf:'")
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-        model = priors.depth_model(name, settings)
         left_01 = torch.from_numpy(sample.left).permute(2, 0, 1)[None].to(settings.device) / 255.0
-        found = model(left_01, sample.left.shape[:2])
-        values = found.values[0, 0].cpu().numpy()
-        if not found.metric:
-            return Prediction(None, relative=values, space=found.space)
-        depth_m = found.metres()[0, 0].cpu().numpy()
-        return Prediction(depth_m, relative=values, space=found.space)
+        out = priors.depth_model(name, settings)(left_01, sample.left.shape[:2])
+        depth_m = out.metres()[0, 0].cpu().numpy() if out.metric else None
+        return Prediction(depth_m, relative=out.values[0, 0].cpu().numpy(), space=out.space)
 
     def configuration(settings: Settings) -> dict[str, Any]:
         files = folder_fingerprint(Path(name))
@@ -91,23 +78,16 @@ def _read(path: Path, kind: str) -> np.ndarray:
     else:
         values = read_pfm(path, "map") if path.suffix == ".pfm" else read_npy(path, "map")
         signed = kind.startswith("relative")
-    if values.ndim != 2:
-        bad_value("map", "of shape (H, W)", f"{path} of shape {values.shape}")
     known = np.isfinite(values) & (signed | (values > 0))
     return np.where(known, values.astype(np.float64), np.nan)
 
 
-def _to_size(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Bilinear; a hole grows by the pixels that it mixes into."""
-    if values.shape == tuple(size):
-        return values
-    given = torch.from_numpy(values)[None, None]
-    return F.interpolate(given, tuple(size), mode="bilinear", align_corners=False)[0, 0].numpy()
-
-
 def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Prediction:
-    size = sample.left.shape[:2]
-    resized = _to_size(values, size)
+    """A map at the image's size; bilinear, so that a hole grows by the pixels that it mixes into."""
+    size, resized = sample.left.shape[:2], values
+    if values.shape != tuple(size):
+        given = torch.from_numpy(values)[None, None]
+        resized = F.interpolate(given, tuple(size), mode="bilinear", align_corners=False)[0, 0].numpy()
     if kind.startswith("relative"):
         return Prediction(None, relative=resized, space=kind.removeprefix("relative-"))
     if kind == "depth":
@@ -125,11 +105,9 @@ def files_method(text: str, guided: bool = False) -> Method:
     Args:
         text: ``DIR`` or ``KIND:DIR`` with a key of ``KINDS``. The map of a sample is
             ``DIR/<dataset>_<sample>`` with the suffix .npy, .pfm or .png (16 bit: millimetres for depth,
-            pixels * 256 for disparity), of any size; 0 and what is not finite is unknown.
+            pixels * 256 for disparity), of any size; 0 and what is not finite is unknown. The method does
+            not apply to samples without a file.
         guided: the maps are the prior of the default preset.
-
-    Returns:
-        The method, titled by the folder's name; it does not apply to samples without a file.
 
     Raises:
         ValueError: no such folder. When run: a file that is damaged.
@@ -144,16 +122,14 @@ def files_method(text: str, guided: bool = False) -> Method:
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
         stem = map_name(sample.dataset, sample.name)
-        candidates = [folder / f"{stem}{suffix}" for suffix in _SUFFIXES]
-        path = next((path for path in candidates if path.is_file()), None)
+        path = next((folder / (stem + s) for s in _SUFFIXES if (folder / (stem + s)).is_file()), None)
         if path is None:
             raise NotApplicable("no map in the folder")
         values = _read(path, kind)
         if not guided:
             return _prediction(values, sample, kind)
         pipe = priors.get(replace(settings, prior="map", space=kind.removeprefix("relative-")))
-        guidance = GeometryGuidance(*posed_views(sample, settings.views))
-        guidance.measured_baseline = guidance.measured_baseline or sample.measured_baseline
+        guidance = guidance_for(sample, settings, priors, GeometryGuidance)
         call = call_arguments(replace(settings, steps=None, ensemble=1)) | {"depth_map": values}
         return guided_prediction(pipe, sample, guidance, call)
 

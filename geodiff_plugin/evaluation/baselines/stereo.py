@@ -16,8 +16,6 @@ from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.matching import CostVolume, build_cost_volume, find_matches
 from geodiff_plugin.types import CameraView
 
-__all__ = ["STEREO_METHODS", "fill_background", "native_depth", "sgbm_shift", "sweep"]
-
 
 def fill_background(shift: np.ndarray) -> np.ndarray:
     """Fill holes with the farther of the two neighbours in the row, as KITTI's development kit does.
@@ -45,15 +43,12 @@ def fill_background(shift: np.ndarray) -> np.ndarray:
 
 
 def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
-    """Sweep planes from infinity to the package's default nearest one through the left view.
+    """Sweep planes from infinity to the default nearest one through the left view of a sample of any pose.
 
     Args:
         sample: any pose.
         device: where the work is done.
         views: the most views to compare, the left one counted.
-
-    Returns:
-        The volume, on a grid of at most 828 pixels a side.
     """
 
     def moved(x: np.ndarray) -> torch.Tensor:
@@ -70,16 +65,13 @@ def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
 def native_depth(
     inverse_depth: torch.Tensor, volume: CostVolume, size: tuple[int, int], mode: str
 ) -> np.ndarray:
-    """Depth at the left image's resolution.
+    """``(H, W)`` float64, metres at the left image's resolution, NaN in holes.
 
     Args:
-        inverse_depth: ``(H, W)`` 1/m on the volume's grid, NaN in holes.
+        inverse_depth: ``(h, w)`` 1/m on the volume's grid, NaN in holes.
         volume: its planes; nothing is farther than half a step from infinity.
         size: ``(H, W)`` of the left image.
         mode: ``"nearest-exact"`` keeps holes as they are; ``"bilinear"`` for maps without.
-
-    Returns:
-        ``(H, W)`` float64, metres, NaN in holes.
     """
     farthest = 0.5 * float(volume.plane_step)
     options = {} if mode == "nearest-exact" else {"align_corners": False}
@@ -94,13 +86,8 @@ MAX_SHIFT = 0.25
 MIN_SHIFT_PX = 1.0
 #: As OpenCV's own example sets the filter.
 WLS_LAMBDA, WLS_SIGMA = 8000.0, 1.5
-PARAMETERS = {
-    "blockSize": 5,
-    "uniquenessRatio": 10,
-    "speckleWindowSize": 100,
-    "speckleRange": 2,
-    "disp12MaxDiff": 1,
-}
+PARAMETERS = {"blockSize": 5, "uniquenessRatio": 10, "disp12MaxDiff": 1}
+PARAMETERS |= {"speckleWindowSize": 100, "speckleRange": 2}
 
 
 def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
@@ -117,14 +104,8 @@ def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
     # Depth at infinity has the disparity cx_left - cx_right, which is 0 but for Middlebury's doffs.
     lowest = int(np.floor(sample.K_left[0, 2] - sample.K_right[0, 2]))
     count = 16 * int(np.ceil(MAX_SHIFT * width / 16))
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=lowest,
-        numDisparities=count,
-        P1=8 * 3 * block**2,
-        P2=32 * 3 * block**2,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-        **PARAMETERS,
-    )
+    penalties = {"P1": 8 * 3 * block**2, "P2": 32 * 3 * block**2, "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY}
+    matcher = cv2.StereoSGBM.create(minDisparity=lowest, numDisparities=count, **penalties, **PARAMETERS)
     # OpenCV leaves the first lowest + count columns empty; a padded left edge keeps them.
     pad = max(0, lowest + count)
     left, right = (
@@ -186,42 +167,42 @@ def _sgbm_configuration(wls: bool, settings: Settings) -> dict[str, Any]:
     return shifts | {"mode": "3way", "fill": "background"} | PARAMETERS | smoother
 
 
-def _sweep_configuration(choices: dict[str, str], settings: Settings) -> dict[str, Any]:
-    return choices | {"views": settings.views, "device": settings.device}
+def _sweep_method(name: str, title: str, summary: str, run: Any, choices: dict[str, str]) -> Method:
+    def configuration(settings: Settings) -> dict[str, Any]:
+        return {"cost": "census", "views": settings.views, "device": settings.device} | choices
+
+    return Method(name, title, summary, run, configuration, uses_prior=False)
 
 
-STEREO_METHODS = tuple(
-    Method(name, title, summary, run, configuration, uses_prior=False)
-    for name, title, summary, run, configuration in (
-        (
-            "sgbm",
-            "SGBM + fill",
-            "OpenCV StereoSGBM (3-way) with background fill; rectified pairs only",
-            partial(_run_sgbm, False),
-            partial(_sgbm_configuration, False),
-        ),
-        (
-            "sgbm-wls",
-            "SGBM + WLS",
-            "OpenCV StereoSGBM smoothed by its WLS filter (opencv-contrib); rectified pairs only",
-            partial(_run_sgbm, True),
-            partial(_sgbm_configuration, True),
-        ),
-        (
-            "plane-sweep",
-            "plane sweep",
-            "winner take all over our own plane sweep, any pose",
-            _run_plane_sweep,
-            partial(_sweep_configuration, {"cost": "census", "winner": "take all"}),
-        ),
-        (
-            "sweep-sgm",
-            "sweep + SGM",
-            "our own plane sweep, aggregated, left-right checked and filled, any pose",
-            _run_sweep_sgm,
-            partial(
-                _sweep_configuration, {"cost": "census", "aggregation": "semi-global", "fill": "background"}
-            ),
-        ),
-    )
+def _sgbm_method(name: str, title: str, summary: str, wls: bool) -> Method:
+    return Method(name, title, summary, partial(_run_sgbm, wls), partial(_sgbm_configuration, wls), False)
+
+
+STEREO_METHODS = (
+    _sgbm_method(
+        "sgbm",
+        "SGBM + fill",
+        "OpenCV StereoSGBM (3-way) with background fill; rectified pairs only",
+        wls=False,
+    ),
+    _sgbm_method(
+        "sgbm-wls",
+        "SGBM + WLS",
+        "OpenCV StereoSGBM smoothed by its WLS filter (opencv-contrib); rectified pairs only",
+        wls=True,
+    ),
+    _sweep_method(
+        "plane-sweep",
+        "plane sweep",
+        "winner take all over our own plane sweep, any pose",
+        _run_plane_sweep,
+        {"winner": "take all"},
+    ),
+    _sweep_method(
+        "sweep-sgm",
+        "sweep + SGM",
+        "our own plane sweep, aggregated, left-right checked and filled, any pose",
+        _run_sweep_sgm,
+        {"aggregation": "semi-global", "fill": "background"},
+    ),
 )

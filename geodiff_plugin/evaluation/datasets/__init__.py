@@ -1,7 +1,4 @@
-"""Data sets in their official layouts, one file each, one table.
-
-Paper: S5.1 (data sets of Tables 1 to 3).
-"""
+"""Data sets in their official layouts (paper S5.1, Tables 1 to 3), and one table of them."""
 
 from __future__ import annotations
 
@@ -10,57 +7,34 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.datasets.booster import BOOSTER
-from geodiff_plugin.evaluation.datasets.changed import with_drifted_rig, with_exposure, with_perturbed_poses
-from geodiff_plugin.evaluation.datasets.folder import FOLDER
-from geodiff_plugin.evaluation.datasets.kitti import KITTI2012, KITTI2015
-from geodiff_plugin.evaluation.datasets.middlebury import ETH3D, MIDDEVAL3, MIDDLEBURY2014
-from geodiff_plugin.evaluation.datasets.posed import MVSNET, ROBUSTMVD
+from geodiff_plugin.evaluation.datasets.changed import CHANGES
+from geodiff_plugin.evaluation.datasets.pairs import PAIRS
+from geodiff_plugin.evaluation.datasets.posed import POSED
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load", "load_pairs"]
 
-DATASETS: dict[str, Dataset] = {
-    dataset.name: dataset
-    for dataset in (
-        KITTI2015,
-        KITTI2012,
-        MIDDLEBURY2014,
-        MIDDEVAL3,
-        ETH3D,
-        BOOSTER,
-        MVSNET,
-        ROBUSTMVD,
-        FOLDER,
-    )
-}
+DATASETS: dict[str, Dataset] = {dataset.name: dataset for dataset in (*PAIRS[:-1], *POSED, PAIRS[-1])}
 """Every data set by name, in the order in which results are listed."""
 
 
 def load(ref: SampleRef) -> StereoSample:
     """Read the sample that ``ref`` points to with its data set's loader, and change it as ``ref`` asks."""
     sample = DATASETS[ref.dataset].load(ref)
-    for key, changed in (
-        ("right_exposure", with_exposure),
-        ("perturbed", with_perturbed_poses),
-        ("drifted", with_drifted_rig),
-    ):
+    for key, (_, changed) in CHANGES.items():
         if key in ref.files:
             sample = changed(sample, ref.files[key], ref.name)
     return sample
 
 
 def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **options: object) -> list[SampleRef]:
-    """References to every metric pair below ``root``, in the table's order.
+    """References to every metric pair below ``root``, in the table's order; nothing is read yet.
 
     Args:
         root: folder that holds one or several data sets in their official layouts.
         datasets: names to look for; all by default.
         **options: for the data sets that know them: ``pairs`` and ``pixel_centre`` (mvsnet, robustmvd);
             ``None`` for the set's own default.
-
-    Returns:
-        References; nothing is read yet.
 
     Raises:
         ValueError: ``root`` is not a folder, or a name is not in ``DATASETS``.
@@ -80,5 +54,4 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
 
 def load_pairs(root: str | Path, datasets: Iterable[str] | None = None) -> Iterator[StereoSample]:
     """Read every metric pair below ``root``, one at a time; arguments and errors as ``find_pairs``."""
-    for ref in find_pairs(root, datasets):
-        yield load(ref)
+    return map(load, find_pairs(root, datasets))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,71 +15,50 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample
 
-__all__ = [
-    "drift_of",
-    "drifted_ref",
-    "exposed_ref",
-    "perturbation",
-    "perturbed_pose",
-    "perturbed_ref",
-    "with_drifted_rig",
-    "with_exposure",
-    "with_perturbed_poses",
-]
-
-
-def exposed_ref(ref: SampleRef, gain: float, gamma: float) -> SampleRef:
-    """The reference to a sample with a changed right view; it is named by what was changed."""
-    name = f"{ref.name}-gain{gain:g}-gamma{gamma:g}"
-    return replace(ref, name=name, files={**ref.files, "right_exposure": (gain, gamma)})
-
-
-def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
-    """Change the right view only.
-
-    Args:
-        sample: as it was taken.
-        change: gain and gamma; a value v in [0, 1] becomes ``gain * v ** gamma``, clipped as a sensor clips
-            and rounded to 8 bits again.
-        name: of the result.
-    """
-    gain, gamma = change
-    right_01 = np.clip(gain * (sample.right / 255.0) ** gamma, 0.0, 1.0)
-    return replace(sample, name=name, right=np.rint(255 * right_01).astype(np.uint8))
-
-
 #: Errors are drawn between this share of the asked ones and all of them.
 LEAST = 0.3
 
+Numbers = tuple[float, float]
 
-def _two_numbers(
-    text: str, option: str, names: str, most: tuple[float, float], cure: str
-) -> tuple[float, float]:
-    """Two numbers with a comma as typed, each from 0 to its ``most``; else an error with the cure."""
-    found = re.fullmatch(r"\s*([\d.]+)\s*,\s*([\d.]+)\s*", text)
-    try:
-        one, other = (float(number) for number in found.groups()) if found else (-1.0, -1.0)
-    except ValueError:  # two points in a number
-        one, other = -1.0, -1.0
+
+def changed_ref(ref: SampleRef, kind: str, change: Numbers) -> SampleRef:
+    """The reference to a changed sample, which is named by what was changed.
+
+    Args:
+        ref: as it was taken.
+        kind: key of ``CHANGES``.
+        change: its two numbers.
+    """
+    name = f"{ref.name}-{CHANGES[kind][0].format(*change)}"
+    return replace(ref, name=name, files={**ref.files, kind: change})
+
+
+def two_numbers(text: str, option: str, names: str, most: Numbers, cure: str) -> Numbers:
+    """Two numbers with a comma as typed, each from 0 to its ``most``; else ``ValueError`` with the cure."""
+    parts = re.fullmatch(r"\s*(\d*\.?\d+)\s*,\s*(\d*\.?\d+)\s*", text)
+    one, other = map(float, parts.groups()) if parts else (-1.0, -1.0)
     if not (0 <= one <= most[0] and 0 <= other <= most[1]):
         bad_value(option, f"{names} with numbers in [0, {most[0]:g}] and [0, {most[1]:g}]", repr(text), cure)
     return one, other
 
 
-def drift_of(text: str) -> tuple[float, float]:
-    """``DEGREES,PIXELS`` as typed.
+def perturbation(text: str) -> Numbers:
+    """``DEGREES,SHARE`` as typed: at most 30 degrees, and 0.9 of the baseline."""
+    cure = "1.5,0.1 turns by up to 1.5 degrees and shifts by up to a tenth of the baseline."
+    return two_numbers(text, "--perturb", "DEGREES,SHARE", (30, 0.9), cure)
 
-    Raises:
-        ValueError: not two numbers, an angle outside [0, 5], or pixels outside [0, 20].
-    """
+
+def drift_of(text: str) -> Numbers:
+    """``DEGREES,PIXELS`` as typed: at most 5 degrees, and 20 pixels."""
     cure = "0.3,1.5 turns the right camera by 0.3 degrees and moves its image by 1.5 pixels."
-    return _two_numbers(text, "--drift", "DEGREES,PIXELS", (5, 20), cure)
+    return two_numbers(text, "--drift", "DEGREES,PIXELS", (5, 20), cure)
 
 
-def drifted_ref(ref: SampleRef, change: tuple[float, float]) -> SampleRef:
-    """The reference to a sample whose right camera has drifted; it is named by how far."""
-    name = f"{ref.name}-drift{change[0]:g}-{change[1]:g}px"
-    return replace(ref, name=name, files={**ref.files, "drifted": change})
+def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
+    """Change the right view only: v in [0, 1] becomes ``gain * v ** gamma``, clipped, in 8 bits again."""
+    gain, gamma = change
+    right_01 = np.clip(gain * (sample.right / 255.0) ** gamma, 0.0, 1.0)
+    return replace(sample, name=name, right=np.rint(255 * right_01).astype(np.uint8))
 
 
 def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
@@ -103,26 +83,10 @@ def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -
     return replace(sample, name=name, right=right)
 
 
-def perturbation(text: str) -> tuple[float, float]:
-    """``DEGREES,SHARE`` as typed.
-
-    Raises:
-        ValueError: not two numbers, an angle outside [0, 30], or a share outside [0, 0.9].
-    """
-    cure = "1.5,0.1 turns by up to 1.5 degrees and shifts by up to a tenth of the baseline."
-    return _two_numbers(text, "--perturb", "DEGREES,SHARE", (30, 0.9), cure)
-
-
-def perturbed_ref(ref: SampleRef, change: tuple[float, float]) -> SampleRef:
-    """The reference to a sample with perturbed poses; it is named by what was changed."""
-    name = f"{ref.name}-turn{change[0]:g}-shift{change[1]:g}"
-    return replace(ref, name=name, files={**ref.files, "perturbed": change})
-
-
 def perturbed_pose(
     E: np.ndarray, degrees: float, share: float, depth_m: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """A pose with an error.
+    """A pose with an error, whose baseline is as long as before: the length is what no photograph tells.
 
     Args:
         E: ``(4, 4)``, metres; pose of the right camera in the left camera's frame.
@@ -131,9 +95,6 @@ def perturbed_pose(
         depth_m: of the scene.
         rng: draws the error. Every second one is of a tracker's kind, whose shift makes up for its turn at
             the scene's depth as far as it may; the others' shift goes anywhere.
-
-    Returns:
-        ``(4, 4)``; its baseline is as long as before: the length is what no photograph tells.
     """
     axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     turn = axis * np.radians(degrees) * rng.uniform(LEAST, 1.0)
@@ -153,21 +114,25 @@ def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: st
     """Give the poses of a sample's right views wrongly; images, intrinsics and truth stay.
 
     Args:
-        sample: as it was taken.
+        sample: with truth, which says how far away its scene is.
         change: degrees and share, as for ``perturbed_pose``.
         name: of the result; the error is drawn from it.
-
-    Raises:
-        ValueError: a sample without truth, which says how far away its scene is.
     """
-    if not sample.valid.any():
-        bad_value(f"the truth of {sample.label}", "known for at least one pixel", "none")
+    sample.check_truth()
     rng = np.random.default_rng(zlib.crc32(name.encode()))
-    depth_m = float(np.median(sample.depth_m[sample.valid]))
-    degrees, share = change
+    depth_m, (degrees, share) = float(np.median(sample.depth_m[sample.valid])), change
     E = perturbed_pose(sample.E, degrees, share, depth_m, rng)
     extra = tuple(
         (image, K, perturbed_pose(other, degrees, share, depth_m, rng))
         for image, K, other in sample.extra_views
     )
     return replace(sample, name=name, E=E, E_true=sample.E_scored, extra_views=extra)
+
+
+Change = Callable[[StereoSample, Any, str], StereoSample]
+#: Entry of ``SampleRef.files`` -> what it adds to the name, and how a sample becomes so.
+CHANGES: dict[str, tuple[str, Change]] = {
+    "right_exposure": ("gain{:g}-gamma{:g}", with_exposure),
+    "perturbed": ("turn{:g}-shift{:g}", with_perturbed_poses),
+    "drifted": ("drift{:g}-{:g}px", with_drifted_rig),
+}

@@ -1,4 +1,4 @@
-"""The frozen sample that every data set yields, its reference, and what readers of data sets share."""
+"""The sample that every data set yields, its reference, and what readers of data sets share."""
 
 from __future__ import annotations
 
@@ -16,23 +16,8 @@ from geodiff_plugin.formats import check_file, files, read_depth_mm_png, read_im
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.types import Rig
 
-__all__ = [
-    "Dataset",
-    "ExtraView",
-    "SampleRef",
-    "StereoSample",
-    "check_calibrated_sizes",
-    "check_size",
-    "depth_to_disparity",
-    "disparity_to_depth",
-    "folders",
-    "make_sample",
-    "read_depth_m",
-    "read_npy",
-    "read_rgb",
-]
-
 ExtraView = tuple[np.ndarray, np.ndarray, np.ndarray]
+Images = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +25,8 @@ class StereoSample:
     """Two posed views with the truth of the left one.
 
     Attributes:
-        dataset: name of the data set in ``DATASETS``.
-        name: name of the sample within it.
+        dataset: its name in ``DATASETS``.
+        name: of the sample within it.
         left: ``(H, W, 3)`` uint8, the reference view.
         right: ``(H', W', 3)`` uint8.
         K_left: ``(3, 3)`` float64, pixels of ``left``.
@@ -82,7 +67,7 @@ class StereoSample:
 
     @property
     def measured_baseline(self) -> bool:
-        """Whether the length of the baseline is said to be true: a pose given wrongly on purpose keeps it."""
+        """Whether the baseline's length is known to be true: a pose given wrongly on purpose keeps it."""
         return self.E_true is not None
 
     @property
@@ -90,15 +75,19 @@ class StereoSample:
         """``(4, 4)`` the pose that truth and scores go by, whatever the methods are given."""
         return self.E if self.E_true is None else self.E_true
 
+    def check_truth(self) -> StereoSample:
+        """Itself; ``ValueError`` where no pixel has truth."""
+        if not self.valid.any():
+            got = f"none ({self.notes['truth']})" if "truth" in self.notes else "none"
+            bad_value(f"the truth of {self.label}", "known for at least one pixel", got)
+        return self
+
 
 @dataclass(frozen=True)
 class SampleRef:
-    """A sample that was found but not read yet.
+    """A sample that was listed but not read yet; ``files`` has the paths and numbers that its loader needs.
 
-    Attributes:
-        dataset: name of the data set in ``DATASETS``.
-        name: name of the sample within it; unique there.
-        files: paths and numbers that the data set's loader needs.
+    A result is kept by what is in these files, so name files and not their folder.
     """
 
     dataset: str
@@ -113,7 +102,7 @@ class SampleRef:
 
 @dataclass(frozen=True)
 class Dataset:
-    """One data set: how to find it, how to read it, how it is scored.
+    """How to list a data set, how to read it, how it is scored.
 
     Attributes:
         name: key in ``DATASETS``.
@@ -123,7 +112,7 @@ class Dataset:
         obtain: how to get the set, one sentence with its address and licence.
         options: keywords that ``find`` takes beside the folder.
         full_count: number of pairs in the set as the paper used it; ``None`` where it does not apply.
-        needs_folder: whether there is anything to find; not for what is rendered.
+        needs_folder: whether there is a folder to look into; not for what is rendered.
     """
 
     name: str
@@ -162,17 +151,7 @@ def disparity_to_depth(
 def depth_to_disparity(
     depth_m: np.ndarray, K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray
 ) -> np.ndarray:
-    """Inverse of ``disparity_to_depth`` for positive depth.
-
-    Args:
-        depth_m: ``(H, W)`` float, metres, positive.
-        K_left: ``(3, 3)``, pixels.
-        K_right: ``(3, 3)``, pixels.
-        E: ``(4, 4)``, metres.
-
-    Returns:
-        ``(H, W)`` float64, pixels.
-    """
+    """``(H, W)`` float64, pixels: the inverse of ``disparity_to_depth`` for positive depth."""
     return K_left[0, 0] * E[0, 3] / np.asarray(depth_m, np.float64) - (K_right[0, 2] - K_left[0, 2])
 
 
@@ -217,43 +196,18 @@ def check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...], side
         )
 
 
-def check_calibrated_sizes(
-    calibration: tuple[Path, Path], rig: Rig, left: np.ndarray, right: np.ndarray
-) -> None:
-    """Refuse images that are not of the size that their calibration is for, where it says one.
-
-    Args:
-        calibration: the files of the left and the right camera, often the same.
-        rig: what they hold.
-        left: ``(H, W, 3)``.
-        right: ``(H, W, 3)``.
-
-    Raises:
-        ValueError: another size, naming the file.
-    """
-    sizes, sides = (rig.size_left, rig.size_right), ("left", "right")
-    for path, size, image, side in zip(calibration, sizes, (left, right), sides, strict=True):
-        if size is not None:
-            check_size(path, size[::-1], image.shape, side)
-
-
 def folders(root: Path, depth: int) -> list[Path]:
     """``root`` and the folders below it down to ``depth`` levels, sorted."""
-    found = [root] if os.path.isdir(root) else []
-    level = found
+    level = [root] if os.path.isdir(root) else []
+    listed = level
     for _ in range(depth):
         level = [child for parent in level for child in sorted(parent.iterdir()) if child.is_dir()]
-        found = found + level
-    return found
+        listed = listed + level
+    return listed
 
 
 def make_sample(
-    ref: SampleRef,
-    images: tuple[np.ndarray, np.ndarray],
-    rig: Rig,
-    depth_m: np.ndarray,
-    notes: dict[str, Any],
-    **masks: Any,
+    ref: SampleRef, images: Images, rig: Rig, depth_m: np.ndarray, notes: dict[str, Any], **masks: Any
 ) -> StereoSample:
     """The sample of a reference, once its files are read.
 
@@ -268,13 +222,7 @@ def make_sample(
     valid = np.isfinite(depth_m) & (depth_m > 0)
     cameras = (torch.as_tensor(matrix) for matrix in (rig.K_left, rig.K_right, rig.T_right_from_left))
     return StereoSample(
-        dataset=ref.dataset,
-        name=ref.name,
-        left=images[0],
-        right=images[1],
-        K_left=rig.K_left,
-        K_right=rig.K_right,
-        E=rig.E,
+        *(ref.dataset, ref.name, *images, rig.K_left, rig.K_right, rig.E),
         depth_m=np.where(valid, depth_m, 0).astype(np.float32),
         valid=valid,
         rectified=bool(is_rectified(*cameras)),

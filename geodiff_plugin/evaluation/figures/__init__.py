@@ -7,15 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from geodiff_plugin._checks import check_choice
+from geodiff_plugin.evaluation.experiment import run_facts, write_text
 from geodiff_plugin.evaluation.figures.canvas import Drawing, save_png
-from geodiff_plugin.evaluation.figures.curves import draw_exposure, draw_inner_steps
-from geodiff_plugin.evaluation.figures.gs_sweep import draw_gs_sweep
+from geodiff_plugin.evaluation.figures.curves import draw_exposure, draw_gs_sweep, draw_inner_steps
 from geodiff_plugin.evaluation.figures.maps import draw_ablation, draw_qualitative
 from geodiff_plugin.evaluation.figures.one_pair import draw_epipolar, draw_terms
 from geodiff_plugin.evaluation.options import FigureOptions, command_line
-from geodiff_plugin.evaluation.report import run_facts, write_text
-
-__all__ = ["FIGURES", "run_figure"]
 
 FIGURES: dict[str, Callable[[FigureOptions], Drawing]] = {
     "gs-sweep": draw_gs_sweep,
@@ -30,14 +27,7 @@ FIGURES: dict[str, Callable[[FigureOptions], Drawing]] = {
 
 
 def run_figure(name: str, options: FigureOptions) -> Path:
-    """Draw one figure, and write it as PNG and its numbers as JSON.
-
-    Args:
-        name: ``"figure"``.
-        options: with the figure's own name.
-
-    Returns:
-        Path of the PNG.
+    """Draw the figure ``options.name``, write it as PNG and its numbers as JSON, and return the PNG's path.
 
     Raises:
         ValueError: an unknown figure, no samples, bad options.

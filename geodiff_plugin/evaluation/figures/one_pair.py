@@ -17,21 +17,22 @@ from geodiff_plugin.algorithm.terms import CAUCHY
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, posed_views, prior_space
 from geodiff_plugin.evaluation.datasets import StereoSample, load
-from geodiff_plugin.evaluation.datasets.changed import perturbed_ref
+from geodiff_plugin.evaluation.datasets.changed import changed_ref
 from geodiff_plugin.evaluation.figures.canvas import (
     COLOURS,
+    ERROR,
     Drawing,
-    depth_bar,
-    error_bar,
+    colour_bar,
+    depth_scale,
+    known_depth,
     mark,
     new_figure,
     references,
+    relative_error,
     samples,
-    show_depth,
-    show_error,
     show_image,
-    show_values,
-    value_bar,
+    show_map,
+    value_scale,
 )
 from geodiff_plugin.evaluation.figures.maps import CELL_IN
 from geodiff_plugin.evaluation.metrics import evaluate_depth
@@ -46,21 +47,19 @@ from geodiff_plugin.pose.tracks import Tracks, project_tracks, residuals_px
 from geodiff_plugin.scale.space import AffineState
 from geodiff_plugin.types import CameraView, StepReport
 
-__all__ = ["TermByTerm", "draw_epipolar", "draw_terms", "term_by_term"]
-
 #: How wrong the pose is given where the command does not say.
 PERTURBED = (1.5, 0.1)
 _LINES, _SHOWN_PX = 14, 5.0
 
 
-def _spread(tracks: Tracks, residual: np.ndarray) -> np.ndarray:
+def _spread(tracks: Tracks, residual: np.ndarray) -> list[int]:
     """Indices of matches all over the image, outliers left out."""
     chosen: list[int] = []
     for i in np.argsort(residual):
         away = [np.linalg.norm(tracks.left_px[i] - tracks.left_px[j]) for j in chosen]
         if len(chosen) < _LINES and all(d > 0.15 * tracks.left_px.max() for d in away):
             chosen.append(int(i))
-    return np.array(chosen)
+    return chosen
 
 
 def _line(tracks: Tracks, i: int, T: np.ndarray) -> np.ndarray:
@@ -76,45 +75,38 @@ def _line(tracks: Tracks, i: int, T: np.ndarray) -> np.ndarray:
 def draw_epipolar(options: FigureOptions) -> Drawing:
     """Lines and matches in the right image above, residuals of all matches in the left image below."""
     first = references(options)[0]
-    sample = load(first if options.perturb else perturbed_ref(first, PERTURBED))
+    sample = load(first if options.perturb else changed_ref(first, "perturbed", PERTURBED))
     left, right = (torch.from_numpy(v).permute(2, 0, 1) / 255 for v in (sample.left, sample.right))
-    K_left, K_right, T = (
-        torch.as_tensor(m).float() for m in (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
-    )
+    matrices = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
+    K_left, K_right, T = (torch.as_tensor(matrix).float() for matrix in matrices)
     rights = [CameraView(right, K_right, T)]
     _, report = pose_views(left, rights, K_left)
     views = grey_views(left, rights, K_left)
     tracks = sparse_tracks(views)
     Ts = {"as given": np.linalg.inv(report.E_given[0]), "as refined": np.linalg.inv(report.E[0])}
     residuals = {name: residuals_px(tracks, pose[None])[0] for name, pose in Ts.items()}
-    chosen = _spread(tracks, residuals["as refined"])
+    chosen, drawn = _spread(tracks, residuals["as refined"]), None
     figure = new_figure(8.0, 6.4)
     axes = figure.subplots(2, 2)
-    drawn: Any = None
-    for column, (name, pose) in enumerate(Ts.items()):
-        median = float(np.median(residuals[name]))
-        show_image(axes[0, column], views.rights[0], f"right image, {name}: {median:.2f} px")
-        axes[0, column].images[0].set_cmap("gray")
+    for (name, pose), (upper, lower) in zip(Ts.items(), axes.T, strict=True):
+        show_image(upper, views.rights[0], f"right image, {name}: {np.median(residuals[name]):.2f} px")
+        show_image(lower, views.left, "distance of the matches from their lines, px")
         for i in chosen:
-            axes[0, column].plot(*_line(tracks, i, pose).T, color="#f0a020", linewidth=1)
-            axes[0, column].plot(*tracks.right_px[0, i], "+", color="#20c0f0", markersize=7)
-        show_image(axes[1, column], views.left, "distance of the matches from their lines, px")
-        axes[1, column].images[0].set_cmap("gray")
+            upper.plot(*_line(tracks, i, pose).T, color="#f0a020", linewidth=1)
+            upper.plot(*tracks.right_px[0, i], "+", color="#20c0f0", markersize=7)
         shown = np.minimum(residuals[name], _SHOWN_PX)
-        drawn = axes[1, column].scatter(
-            *tracks.left_px.T, c=shown, s=9, cmap="viridis", vmin=0, vmax=_SHOWN_PX
-        )
-        for row in range(2):
-            axes[row, column].set_xlim(0, views.left.shape[1] - 1)
-            axes[row, column].set_ylim(views.left.shape[0] - 1, 0)
+        drawn = lower.scatter(*tracks.left_px.T, c=shown, s=9, cmap="viridis", vmin=0, vmax=_SHOWN_PX)
+        for own in (upper, lower):
+            own.images[0].set_cmap("gray")
+            own.set_xlim(0, views.left.shape[1] - 1)
+            own.set_ylim(views.left.shape[0] - 1, 0)
     figure.colorbar(drawn, ax=axes[1].tolist(), shrink=0.8)
     numbers = {name: float(np.median(values)) for name, values in residuals.items()}
-    return (figure, {"sample": sample.label, "status": report.status, "median_px": numbers})
+    return figure, {"sample": sample.label, "status": report.status, "median_px": numbers}
 
 
 #: The largest mean absolute difference of colours that has a colour of its own.
 WORST_DIFFERENCE = 0.2
-HIDDEN_COLOUR = COLOURS[5]
 
 
 class TermByTerm(NamedTuple):
@@ -180,10 +172,8 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
     """Guide one pair by the default preset and keep what it went through.
 
     The estimate of the first guided step is that of a second call, which searches in every step and whose
-    updates have size 0: the steps before are the prior's own in either.
-
-    Raises:
-        ValueError: an ensemble, whose members differ in every map but the last.
+    updates have size 0: the steps before are the prior's own in either. An ensemble is refused: its members
+    differ in every map but the last.
     """
     if settings.ensemble != 1:
         bad_value("ensemble", "1 for this figure", settings.ensemble)
@@ -197,26 +187,26 @@ def term_by_term(sample: StereoSample, settings: Settings, priors: PriorCache) -
     trajectory = Trajectory(guidance.config, evidence, [0], prior_space(pipe))
     first = out.history[0].step
     start = held.history[first]
-    found = AffineState(*(value.cpu() for value in (start.s_hat, start.t_hat, start.g_s)))
-    relative = trajectory.metric.relative(estimates[first], found)
+    affine = AffineState(*(value.cpu() for value in (start.s_hat, start.t_hat, start.g_s)))
+    relative = trajectory.metric.relative(estimates[first], affine)
     trajectory.prepare(relative, relative)
     first_m = trajectory.metric(relative, trajectory.affine)
     matches, usable = trajectory.matches, trajectory.usable_matches
     assert matches is not None and usable is not None  # two views always have some
     there = (matches.confidence > 0) & (matches.inverse_depth > 0)
     final_m = torch.from_numpy(out.prediction).permute(0, 3, 1, 2).float()
-    inverse_m = 1.0 / _resized(final_m, matches.size)
-
-    def where_matched(values: Tensor) -> np.ndarray:
-        return torch.where(there, values, torch.full_like(values, torch.nan))[0, 0].numpy()
-
+    residual = (1.0 / _resized(final_m, matches.size) - matches.inverse_depth) / matches.plane_step.view(
+        -1, 1, 1, 1
+    )
+    of_matches = (1.0 / matches.inverse_depth, usable.confidence, residual)
+    matches_m, weight, planes = (torch.where(there, values, torch.nan)[0, 0].numpy() for values in of_matches)
     return TermByTerm(
         first_m=_resized(first_m, size)[0, 0].numpy(),
-        matches_m=where_matched(1.0 / matches.inverse_depth),
-        match_weight=where_matched(usable.confidence),
+        matches_m=matches_m,
+        match_weight=weight,
         denoised_m=_resized(steps[-1], size)[0, 0].numpy(),
         final_m=out.prediction[0, ..., 0],
-        residual=where_matched((inverse_m - matches.inverse_depth) / matches.plane_step.view(-1, 1, 1, 1)),
+        residual=planes,
         difference=np.where(out.visible[0, ..., 0], out.photometric_error[0, ..., 0], np.nan),
         hidden=_hidden(guidance, final_m)[0, 0].numpy(),
         confidence=out.confidence[0, ..., 0],
@@ -231,28 +221,33 @@ def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[st
     for axes in lower:
         axes.set_anchor("N")  # level with the one that has no bar below
     truth = np.where(sample.valid, sample.depth_m, np.nan)
-    near, far = depth_range(truth, sample.valid)
+    scale = depth_scale(*depth_range(truth, sample.valid))
     show_image(upper[0], sample.left, "left image")
     show_image(lower[0], sample.right, "right image")
-    drawn = show_depth(upper[1], truth, near, far, "truth")
-    show_depth(upper[2], parts.first_m, near, far, f"prior's first estimate\nAbsRel {abs_rel['first']:.3f}")
-    show_depth(upper[3], parts.matches_m, near, far, "matches\n(grey: none)")
-    show_depth(upper[4], parts.denoised_m, near, far, f"denoised\nAbsRel {abs_rel['denoised']:.3f}")
-    show_depth(upper[5], parts.final_m, near, far, f"refined\nAbsRel {abs_rel['final']:.3f}")
-    depth_bar(figure, drawn, upper, near, far)
-    title = "photometric error\n(blue: hidden, grey: unseen)"
-    shown = show_values(lower[1], parts.difference, title, "inferno", 0.0, WORST_DIFFERENCE)
-    mark(lower[1], parts.hidden, HIDDEN_COLOUR)
-    value_bar(figure, shown, lower[1], "mean absolute difference", "max")
-    title, most = "refined against matches\n(red: nearer)", CAUCHY
-    shown = show_values(lower[2], parts.residual, title, "RdBu_r", -most, most)
-    value_bar(figure, shown, lower[2], "planes of the sweep", "both")
-    shown = show_values(lower[3], parts.match_weight, "weight of the matches", "viridis", 0.0, 1.0)
-    value_bar(figure, shown, lower[3], "confidence, 0 for reflections")
-    shown = show_values(lower[4], parts.confidence, "confidence of refined", "viridis", 0.0, 1.0)
-    value_bar(figure, shown, lower[4], "probability of an error < 10 %")
-    shown = show_error(lower[5], parts.final_m, sample.depth_m, sample.valid, "error of refined")
-    error_bar(figure, shown, [lower[5]], "bottom")
+    depths = (
+        (truth, "truth"),
+        (parts.first_m, f"prior's first estimate\nAbsRel {abs_rel['first']:.3f}"),
+        (parts.matches_m, "matches\n(grey: none)"),
+        (parts.denoised_m, f"denoised\nAbsRel {abs_rel['denoised']:.3f}"),
+        (parts.final_m, f"refined\nAbsRel {abs_rel['final']:.3f}"),
+    )
+    drawn = [show_map(a, known_depth(m), scale, t) for a, (m, t) in zip(upper[1:], depths, strict=True)]
+    colour_bar(figure, drawn[0], upper, scale)
+    difference = value_scale("inferno", 0.0, WORST_DIFFERENCE, "mean absolute difference")
+    planes = value_scale("RdBu_r", -CAUCHY, CAUCHY, "planes of the sweep")
+    weight = value_scale("viridis", 0.0, 1.0, "confidence, 0 for reflections")
+    probability = value_scale("viridis", 0.0, 1.0, "probability of an error < 10 %")
+    compared = (
+        (parts.difference, difference, "photometric error\n(blue: hidden, grey: unseen)", "max"),
+        (parts.residual, planes, "refined against matches\n(red: nearer)", "both"),
+        (parts.match_weight, weight, "weight of the matches", "neither"),
+        (parts.confidence, probability, "confidence of refined", "neither"),
+        (relative_error(parts.final_m, sample), ERROR, "error of refined", "max"),
+    )
+    for axes, (values, own, title, beyond) in zip(lower[1:], compared, strict=True):
+        shown = show_map(axes, values, own, title)
+        colour_bar(figure, shown, [axes], own, "bottom", beyond)
+    mark(lower[1], parts.hidden, COLOURS[5])
 
 
 def _curves(figure: Any, history: Sequence[StepReport], values: dict[str, list[float]]) -> None:
@@ -260,9 +255,8 @@ def _curves(figure: Any, history: Sequence[StepReport], values: dict[str, list[f
     figure.suptitle("terms of the loss in every guided step", fontsize=9)
     repeated = len({report.step for report in history}) < len(history)
     count = [i + 1 if repeated else report.step + 1 for i, report in enumerate(history)]
-    for index, (axes, (name, own)) in enumerate(
-        zip(figure.subplots(1, len(values), squeeze=False)[0], values.items(), strict=True)
-    ):
+    panels = figure.subplots(1, len(values), squeeze=False)[0]
+    for index, (axes, (name, own)) in enumerate(zip(panels, values.items(), strict=True)):
         axes.plot(count, own, color=COLOURS[index % len(COLOURS)], marker="o", markersize=4, clip_on=False)
         axes.set_title(name, fontsize=9)
         axes.set_xticks(count)
@@ -275,18 +269,11 @@ def _curves(figure: Any, history: Sequence[StepReport], values: dict[str, list[f
 
 
 def draw_terms(options: FigureOptions) -> Drawing:
-    """Draw the first sample.
-
-    Raises:
-        ValueError: no sample, or an ensemble.
-    """
+    """What the default preset makes of the first sample, part by part."""
     sample = samples(options)[0]
     parts = term_by_term(sample, options.settings, PriorCache())
     depths = {"first": parts.first_m, "denoised": parts.denoised_m, "final": parts.final_m}
-    abs_rel = {
-        name: evaluate_depth(depth_m, sample.depth_m, sample.valid)["abs_rel"]
-        for name, depth_m in depths.items()
-    }
+    abs_rel = {n: evaluate_depth(m, sample.depth_m, sample.valid)["abs_rel"] for n, m in depths.items()}
     values = {name: [float(r.terms[name]) for r in parts.history] for name in parts.history[0].terms}
     values["weighted sum"] = [float(report.loss) for report in parts.history]
     high = CELL_IN * sample.left.shape[0] / sample.left.shape[1]
@@ -295,8 +282,7 @@ def draw_terms(options: FigureOptions) -> Drawing:
     upper, lower = figure.subfigures(2, 1, height_ratios=heights)
     _maps(upper, sample, parts, abs_rel)
     _curves(lower, parts.history, values)
-    matched = np.isfinite(parts.match_weight)
-    numbers = {"sample": sample.label, "abs_rel": abs_rel, "matched": float(matched.mean())}
-    numbers["match_weight"] = float(parts.match_weight[matched].mean()) if matched.any() else 0.0
-    numbers |= {"hidden": float(parts.hidden.mean()), "terms": values}
-    return (figure, numbers)
+    weight = parts.match_weight[np.isfinite(parts.match_weight)]
+    numbers = {"sample": sample.label, "abs_rel": abs_rel, "matched": weight.size / parts.match_weight.size}
+    numbers["match_weight"] = float(weight.mean()) if weight.size else 0.0
+    return figure, numbers | {"hidden": float(parts.hidden.mean()), "terms": values}

@@ -1,4 +1,7 @@
-"""Logistic regression with coefficients of known sign, and its calibration table."""
+"""Refits what the confidence promises, on pairs with truth: coefficients to paste, and how they do elsewhere.
+
+python -m tests.benchmarks.confidence --data DIR --strengths exact,5%,20%
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,13 @@ from scipy.special import expit
 from tqdm import tqdm
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.evaluation.baselines.base import PriorCache, Settings
+from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, posed_views
 from geodiff_plugin.evaluation.baselines.stereo import sweep
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.evaluation.emulated import DENSE, STRENGTHS, EmulatedPrior, EmulatedPriors
+from geodiff_plugin.evaluation.scoring import DENSE
+from geodiff_plugin.evaluation.strength import STRENGTHS, EmulatedPrior, EmulatedPriors
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import consistency
 from geodiff_plugin.runtime import confidence
