@@ -400,6 +400,10 @@ def _in_turn(items: Iterable[Item], stages: Sequence[Stage], stop: threading.Eve
         stop.set()
 
 
+#: What ends a queue; in the place of an item, what stands beside it is the error of the source.
+_END: Any = object()
+
+
 def _side_by_side(
     items: Iterable[Item], stages: Sequence[Stage], stop: threading.Event, most: int
 ) -> Results:
@@ -408,39 +412,17 @@ def _side_by_side(
     Closing the generator lets every stage end what it is at and no more. What ``items`` itself raises is
     raised behind the items before.
     """
-    end: Any = object()
     queues: list[SimpleQueue[Any]] = [SimpleQueue() for _ in range(len(stages) + 1)]
     room = threading.Semaphore(most)
-
-    def feed() -> None:
-        try:
-            for item in items:
-                queues[0].put((item, item))
-                while not room.acquire(timeout=POLL_S):
-                    if stop.is_set():
-                        return
-        except BaseException as error:  # told where the items are taken, not in a thread that nobody watches
-            queues[-1].put((end, error))
-        finally:
-            queues[0].put(end)
-
-    def work(stage: Stage, before: SimpleQueue[Any], after: SimpleQueue[Any]) -> None:
-        while (entry := before.get()) is not end:
-            item, value = entry
-            if not isinstance(value, _Failed) and not stop.is_set():
-                value = _attempt(stage, value)
-            after.put((item, value))
-        after.put(end)
-
-    jobs = zip(stages, queues[:-1], queues[1:], strict=True)
-    workers = [threading.Thread(target=feed, daemon=True)]
-    workers += [threading.Thread(target=work, args=job, daemon=True) for job in jobs]
+    jobs: list[tuple[Callable[..., None], tuple[Any, ...]]] = [(_feed, (items, queues, room, stop))]
+    jobs += [(_work, (stage, *ends, stop)) for stage, *ends in zip(stages, queues, queues[1:], strict=False)]
+    workers = [threading.Thread(target=target, args=args, daemon=True) for target, args in jobs]
     for worker in workers:
         worker.start()
     source_error: BaseException | None = None
     try:
-        while (entry := queues[-1].get()) is not end:
-            if entry[0] is end:
+        while (entry := queues[-1].get()) is not _END:
+            if entry[0] is _END:
                 source_error = entry[1]
                 continue
             yield entry
@@ -451,6 +433,35 @@ def _side_by_side(
         stop.set()
         for worker in workers:
             worker.join()
+
+
+def _feed(
+    items: Iterable[Item],
+    queues: Sequence[SimpleQueue[Any]],
+    room: threading.Semaphore,
+    stop: threading.Event,
+) -> None:
+    """Put items into the first queue as long as there is room; an error goes to the last one."""
+    try:
+        for item in items:
+            queues[0].put((item, item))
+            while not room.acquire(timeout=POLL_S):
+                if stop.is_set():
+                    return
+    except BaseException as error:  # told where the items are taken, not in a thread that nobody watches
+        queues[-1].put((_END, error))
+    finally:
+        queues[0].put(_END)
+
+
+def _work(stage: Stage, before: SimpleQueue[Any], after: SimpleQueue[Any], stop: threading.Event) -> None:
+    """Take every value of one queue through a stage into the next one."""
+    while (entry := before.get()) is not _END:
+        item, value = entry
+        if not isinstance(value, _Failed) and not stop.is_set():
+            value = _attempt(stage, value)
+        after.put((item, value))
+    after.put(_END)
 
 
 def _say(sentence: str) -> None:

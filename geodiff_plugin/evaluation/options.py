@@ -27,6 +27,8 @@ POSES = ("refine", "given", "estimated")
 CAPTURE_ROWS = ("given", "pairs", "capture")
 """Poses of a capture: as given, refined pair by pair, solved together."""
 STRENGTHS = ("exact", "2%", "5%", "10%", "20%", "blur", "gamma")
+DTYPES = ("float32", "float16", "bfloat16")
+FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative", "epipolar", "terms")
 WAYS = ("alone", "alone-half", "scale", "warm", "warm-50", "warm-75")
 #: Fields that are those of ``Settings``.
 SETTINGS = ("ensemble", "seed", "steps", "resolution", "dtype", "space", "views")
@@ -70,14 +72,12 @@ class EvalOptions(OutOptions):
     """What every command that runs a prior is told."""
 
     prior: tuple[str, ...] = declare(
-        ("bundled",), "'bundled', a hub id or a folder; where several rows make sense, repeat it."
+        ("bundled",), "'bundled', a hub id or a folder; repeat it for further rows."
     )
     space: str | None = declare(
-        None, "Space in which the prior's map is affine, if its folder does not say.", choices=SPACES
+        None, "What the prior's map is affine in, if its folder does not say.", choices=SPACES
     )
-    dtype: str = declare(
-        "float32", "float32, bfloat16 or float16.", choices=("float32", "float16", "bfloat16")
-    )
+    dtype: str = declare("float32", f"{', '.join(DTYPES)}.", choices=DTYPES)
     device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
 
     def __post_init__(self) -> None:
@@ -110,7 +110,7 @@ class _SampleOptions(EvalOptions):
     resolution: int | None = _count(None, "Longer side for the prior, pixels.", 0, 8192)
     views: int = _count(2, "Views that methods take of a group that has more than two.", 2, 100)
     perturb: str | None = declare(
-        None, "Give poses wrongly: largest turn, and shift / baseline.", metavar="DEGREES,SHARE"
+        None, "Poses given wrongly: turn, and shift / baseline.", metavar="DEGREES,SHARE"
     )
 
     def changed(self, refs: Sequence[SampleRef]) -> list[SampleRef]:
@@ -128,19 +128,15 @@ class PairsOptions(_SampleOptions):
 
     sample: int | None = _count(None, "Draw this many samples at random, by --seed.")
     pairs: str = declare(
-        "default", "Of a group of posed views: default (the first two) or all.", choices=("default", "all")
+        "default", "Of posed views: default (the first two) or all.", choices=("default", "all")
     )
-    pixel_centre: float | None = declare(
-        None, "First pixel's centre in posed cameras, 0.5 for COLMAP's; each set's own by default."
-    )
-    crop: str = declare(
-        "none", "Region that is scored: none, garg, eigen or benchmark (KITTI).", choices=CROPS
-    )
+    pixel_centre: float | None = declare(None, "First pixel's centre in posed cameras, 0.5 for COLMAP's.")
+    crop: str = declare("none", "Region that is scored: none, garg, eigen, benchmark (KITTI).", choices=CROPS)
     seeds: int = _count(
-        1, "Seeds, from --seed on, of methods that use a prior; a table has their spread.", high=1000
+        1, "Seeds, from --seed on, of methods with a prior; a table has their spread.", high=1000
     )
     pose: tuple[str, ...] = _list(
-        (), "Rows of 'guided': refine, given or estimated (poses withheld), comma-separated.", choices=POSES
+        (), "Rows of 'guided': refine, given, estimated (poses withheld).", choices=POSES
     )
     skip_broken: bool = declare(False, "Go on after a broken sample and count it.", panel=OUTPUT)
     save_depth: bool = declare(False, "Write every depth map as .npy.", panel=OUTPUT)
@@ -154,8 +150,7 @@ class DirOptions(PairsOptions):
         MISSING, "Folder of data sets, or the name of a registered set.", "", metavar="DIR"
     )
     methods: tuple[str, ...] = _list(
-        ("prior-aligned", "search-only", "paper", "guided", "sgbm"),
-        "Comma-separated, see geodiff eval list; five of them by default.",
+        ("prior-aligned", "search-only", "paper", "guided", "sgbm"), "Comma-separated, see geodiff eval list."
     )
 
 
@@ -163,12 +158,7 @@ class DirOptions(PairsOptions):
 class FigureOptions(_SampleOptions):
     """``geodiff eval figure NAME``."""
 
-    name: str = declare(
-        MISSING,
-        "gs-sweep, inner-steps, ablation, exposure, qualitative, epipolar or terms.",
-        "",
-        metavar="NAME",
-    )
+    name: str = declare(MISSING, f"{', '.join(FIGURES)}.", "", metavar="NAME")
     max: float = declare(80.0, "gs-sweep: the last g_s, metres.", low=1.01, high=1e6)
     updates: tuple[int, ...] = _list(
         (1, 2, 5, 10, 20, 40), "inner-steps: updates per step, comma-separated.", low=1, high=10_000
@@ -182,27 +172,21 @@ class StrengthOptions(OutOptions):
     """``geodiff eval strength``."""
 
     data: tuple[Path, ...] = declare(
-        (), "Folder of data sets, or the name of a registered set; may be repeated.", metavar="DIR"
+        (), "Folder of data sets, or a registered set; may be repeated.", metavar="DIR"
     )
     limit: int | None = _count(None, "The first N pairs alone, of each --data.")
-    strengths: tuple[str, ...] = _list(
-        STRENGTHS, f"Comma-separated: {', '.join(STRENGTHS)}.", choices=STRENGTHS
-    )
+    strengths: tuple[str, ...] = _list(STRENGTHS, f"Some of {', '.join(STRENGTHS)}.", choices=STRENGTHS)
     space: str = declare(
         "disparity", "Affine in disparity, depth or log.", choices=("disparity", "depth", "log")
     )
-    follow: float = declare(
-        0.3, "How far the prior's later answers follow their input, 0 to 1.", low=0.0, high=1.0
-    )
+    follow: float = declare(0.3, "How far the prior's later answers follow their input.", low=0.0, high=1.0)
     methods: tuple[str, ...] = _list(
         ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5"),
         "Comma-separated methods that use a prior, see geodiff eval list.",
     )
     steps: int | None = _count(4, "Denoising steps.", high=1000)
     resolution: int = _count(384, "Longer side for the prior, pixels.", 64, 8192)
-    figure: Path | None = declare(
-        None, "PNG: error against the prior's error, and lit surfaces.", panel=OUTPUT
-    )
+    figure: Path | None = declare(None, "PNG: error against the prior's error, lit surfaces.", panel=OUTPUT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,15 +223,11 @@ class PosesOptions(_RealOptions):
     """``geodiff eval poses``."""
 
     rendered: int = _count(0, "Pairs of the registered set 'synthetic' in a general pose.", 0, 10**6)
-    rendered_size: str | None = declare(
-        None, "Size of rendered pairs; smaller is faster.", metavar="WIDTHxHEIGHT"
-    )
+    rendered_size: str | None = declare(None, "Of rendered pairs; smaller is faster.", metavar="WIDTHxHEIGHT")
     perturb: str = declare(
         "1.5,0.1", "Rendered: largest turn, and shift / baseline.", metavar="DEGREES,SHARE"
     )
-    drift: str = declare(
-        "0.3,1.5", "Rectified: turn, shift of the right image; 0,0: none.", metavar="DEGREES,PIXELS"
-    )
+    drift: str = declare("0.3,1.5", "Rectified: turn and shift of the right image.", metavar="DEGREES,PIXELS")
     resolution: int | None = _count(None, "Longer side for the prior, pixels.", 0, 8192)
     out: Path = _out("geodiff-poses")
 
@@ -256,14 +236,10 @@ class PosesOptions(_RealOptions):
 class CaptureEvalOptions(EvalOptions):
     """``geodiff eval capture DIR``."""
 
-    data: Path = declare(
-        MISSING, "A capture that names depth maps (16-bit PNG, millimetres).", "", metavar="DIR"
-    )
+    data: Path = declare(MISSING, "A capture that names depth maps (16-bit PNG, mm).", "", metavar="DIR")
     frames: str | None = declare(None, "NAME,NAME or FIRST:LAST:STEP; all by default.")
     neighbours: tuple[int, ...] = _list((2, 3, 5), "Comma-separated numbers of right views.", low=1, high=32)
-    rows: tuple[str, ...] = _list(
-        CAPTURE_ROWS, "Comma-separated: given, pairs, capture.", choices=CAPTURE_ROWS
-    )
+    rows: tuple[str, ...] = _list(CAPTURE_ROWS, "Some of given, pairs, capture.", choices=CAPTURE_ROWS)
 
 
 class Command(NamedTuple):
@@ -282,84 +258,37 @@ class Command(NamedTuple):
 
 
 _PAPER, _CHANGES = "paper:run_paper_table", "changes:run_changes"
+_ABLATION = "Table 4, and one change at a time: gradients, rules, terms, no diffusion."
+_FLATNESS = "How flat the default lies: every number of it at half and at twice its value."
+_STRENGTH = "Accuracy with emulated priors from exact to weak: aligned to the truth, fitted once, guided."
+_SEQUENCE = "Depth of a moving rig: frames alone, or each from the one before; error, flicker, seconds."
+_POSES = "Accuracy with poses as given, perturbed, refined and estimated, and of rigs that have drifted."
+_CAPTURE = "Depth of a capture with poses as given, refined by pairs, and solved together (extra capture)."
+_TRUST = "How many wrong calibrations are detected, and how many right ones are not trusted."
+_TABLE1 = "Table 1: KITTI-Stereo, Booster and Middlebury, in metres and aligned."
 COMMANDS: dict[str, Command] = {
-    name: Command(options, about, run)
-    for name, options, about, run in (
-        (
-            "pairs",
-            DirOptions,
-            "Measure methods side by side on every metric pair below DIR.",
-            "pairs:run_pairs",
-        ),
-        (
-            "table1",
-            PairsOptions,
-            "Table 1: KITTI-Stereo, Booster and Middlebury, in metres and aligned.",
-            _PAPER,
-        ),
-        ("table2", PairsOptions, "Table 2: Booster, beside stereo.", _PAPER),
-        ("table3", PairsOptions, "Table 3: two posed views, Tanks and Temples.", _PAPER),
-        (
-            "ablation",
-            PairsOptions,
-            "Table 4, and one change at a time: gradients, rules, terms, no diffusion.",
-            _PAPER,
-        ),
-        (
-            "parts",
-            PairsOptions,
-            "What each part of the default is worth: one left out at a time.",
-            _CHANGES,
-        ),
-        (
-            "flatness",
-            PairsOptions,
-            "How flat the default lies: every number of it at half and at twice its value.",
-            _CHANGES,
-        ),
-        (
-            "cost",
-            PairsOptions,
-            "Seconds and peak memory, plain against guided, as ratios.",
-            "cost:run_cost",
-        ),
-        (
-            "strength",
-            StrengthOptions,
-            "Accuracy with emulated priors from exact to weak: aligned to the truth, fitted once, guided.",
-            "strength:run_strength",
-        ),
-        (
-            "sequence",
-            SequenceOptions,
-            "Depth of a moving rig: frames alone, or each from the one before; error, flicker, seconds.",
-            "sequence:run_sequence",
-        ),
-        (
-            "figure",
-            FigureOptions,
-            "Draw one figure as PNG, with its numbers as JSON beside it.",
-            "figures:run_figure",
-        ),
-        (
-            "trust",
-            TrustOptions,
-            "How many wrong calibrations are detected, and how many right ones are not trusted.",
-            "trust:run_trust",
-        ),
-        (
-            "poses",
-            PosesOptions,
-            "Accuracy with poses as given, perturbed, refined and estimated, and of rigs that have drifted.",
-            "poses:run_poses",
-        ),
-        (
-            "capture",
-            CaptureEvalOptions,
-            "Depth of a capture with poses as given, refined by pairs, and solved together (extra capture).",
-            "capture:run_capture_eval",
-        ),
-    )
+    "pairs": Command(
+        DirOptions, "Measure methods side by side on every metric pair below DIR.", "pairs:run_pairs"
+    ),
+    "table1": Command(PairsOptions, _TABLE1, _PAPER),
+    "table2": Command(PairsOptions, "Table 2: Booster, beside stereo.", _PAPER),
+    "table3": Command(PairsOptions, "Table 3: two posed views, Tanks and Temples.", _PAPER),
+    "ablation": Command(PairsOptions, _ABLATION, _PAPER),
+    "parts": Command(
+        PairsOptions, "What each part of the default is worth: one left out at a time.", _CHANGES
+    ),
+    "flatness": Command(PairsOptions, _FLATNESS, _CHANGES),
+    "cost": Command(
+        PairsOptions, "Seconds and peak memory, plain against guided, as ratios.", "cost:run_cost"
+    ),
+    "strength": Command(StrengthOptions, _STRENGTH, "strength:run_strength"),
+    "sequence": Command(SequenceOptions, _SEQUENCE, "sequence:run_sequence"),
+    "figure": Command(
+        FigureOptions, "Draw one figure as PNG, with its numbers as JSON.", "figures:run_figure"
+    ),
+    "trust": Command(TrustOptions, _TRUST, "trust:run_trust"),
+    "poses": Command(PosesOptions, _POSES, "poses:run_poses"),
+    "capture": Command(CaptureEvalOptions, _CAPTURE, "capture:run_capture_eval"),
 }
 """Every command but ``list``, by name."""
 

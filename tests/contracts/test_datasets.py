@@ -14,9 +14,9 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.evaluation.baselines.base import Prediction
+from geodiff_plugin.evaluation.baselines import Prediction
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, find_pairs, load, load_pairs
-from geodiff_plugin.evaluation.datasets.changed import perturbed_ref
+from geodiff_plugin.evaluation.datasets.changed import changed_ref
 from geodiff_plugin.evaluation.datasets.posed import KEY_VIEWS, find_mvsnet, find_robustmvd
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.experiment import cell_key
@@ -211,97 +211,65 @@ def test_every_data_set_has_a_fixture():
 
 
 @each_dataset
-def test_sample_is_in_our_conventions(tmp_path, name):
+def test_sample_is_in_our_conventions_and_metric(tmp_path, name):
     LAYOUTS[name][0](tmp_path)
-    sample = one(tmp_path, name)
-    assert sample.dataset == name and sample.label == f"{name}/{sample.name}"
+    sample, size = one(tmp_path, name), (HEIGHT, WIDTH)
+    assert sample.dataset == name and sample.label == f"{name}/{sample.name}" and sample.rectified
     for image in (sample.left, sample.right):
-        assert image.dtype == np.uint8 and image.shape == (HEIGHT, WIDTH, 3)
+        assert image.dtype == np.uint8 and image.shape == (*size, 3)
     assert sample.depth_m.dtype == np.float32 and sample.valid.dtype == bool
-    assert sample.depth_m.shape == sample.valid.shape == (HEIGHT, WIDTH)
     np.testing.assert_allclose(sample.K_left, [[F, 0, CX], [0, F, CY], [0, 0, 1]], atol=1e-9)
     # The right camera stands to the right: +x in the left camera's frame, in metres.
     np.testing.assert_allclose(sample.E[:3, 3], [BASELINE, 0, 0], atol=1e-9)
     np.testing.assert_allclose(sample.E[:3, :3], np.eye(3), atol=1e-9)
-    assert sample.rectified
-
-
-@each_dataset
-def test_truth_is_metric_and_its_hole_is_known(tmp_path, name):
-    LAYOUTS[name][0](tmp_path)
-    sample = one(tmp_path, name)
-    expected = F * BASELINE / disparity()
-    hole = np.zeros((HEIGHT, WIDTH), bool)
-    hole[FAR_HOLE] = True
-    np.testing.assert_array_equal(sample.valid, ~hole)
-    np.testing.assert_allclose(sample.depth_m[~hole], expected[~hole], rtol=1e-5)
-    assert (sample.depth_m[hole] == 0).all()
-
-
-@each_dataset
-def test_disparity_moves_left_pixels_to_the_left(tmp_path, name):
-    LAYOUTS[name][0](tmp_path)
-    sample = one(tmp_path, name)
-    raw = depth_to_disparity(
-        np.where(sample.valid, sample.depth_m, 1), sample.K_left, sample.K_right, sample.E
-    )
+    known = with_hole(np.ones(size, bool), False)
+    np.testing.assert_array_equal(sample.valid, known)
+    np.testing.assert_allclose(sample.depth_m[known], (F * BASELINE / disparity())[known], rtol=1e-5)
+    assert (sample.depth_m[~known] == 0).all()
+    # Disparity moves left pixels to the left.
+    cameras = sample.K_left, sample.K_right, sample.E
+    raw = depth_to_disparity(np.where(known, sample.depth_m, 1), *cameras)
     doffs = sample.K_right[0, 2] - sample.K_left[0, 2]
-    np.testing.assert_allclose((raw + doffs)[sample.valid], disparity()[sample.valid], rtol=1e-5)
-    back = disparity_to_depth(raw, sample.K_left, sample.K_right, sample.E)
-    np.testing.assert_allclose(back[sample.valid], sample.depth_m[sample.valid], rtol=1e-5)
+    np.testing.assert_allclose((raw + doffs)[known], disparity()[known], rtol=1e-5)
+    np.testing.assert_allclose(disparity_to_depth(raw, *cameras)[known], sample.depth_m[known], rtol=1e-5)
 
 
 @each_dataset
-@pytest.mark.parametrize("which", [1, 3], ids=["image", "calibration"])
-def test_missing_file_is_named(tmp_path, name, which):
+@pytest.mark.parametrize("which", [1, 2, 3], ids=["image", "truth", "calibration"])
+def test_missing_file_is_named_or_leaves_nothing_valid(tmp_path, name, which):
     LAYOUTS[name][0](tmp_path)
     gone = only_file(tmp_path, LAYOUTS[name][which])
     gone.unlink()
     refs = find_pairs(tmp_path, [name])
-    if not refs:  # what makes the folder a sample is gone with it
-        return
-    with pytest.raises(FileNotFoundError, match=gone.stem):
-        load(refs[0])
-
-
-@each_dataset
-def test_missing_truth_is_named_or_leaves_nothing_valid(tmp_path, name):
-    LAYOUTS[name][0](tmp_path)
-    gone = only_file(tmp_path, LAYOUTS[name][2])
-    gone.unlink()
-    refs = find_pairs(tmp_path, [name])
-    if name in ("mvsnet", "folder"):
+    if which == 2 and name in ("mvsnet", "folder"):
         assert not load(refs[0]).valid.any()
         return
-    for ref in refs:
-        with pytest.raises(
-            FileNotFoundError, match=gone.name.replace(".", r"\.").replace("disp0GT", "disp0")
-        ):
+    for ref in refs:  # none where what makes the folder a sample is gone with it
+        with pytest.raises(FileNotFoundError, match=gone.stem.replace("disp0GT", "disp0")):
             load(ref)
 
 
+def of_another_size(path):
+    size = (HEIGHT, WIDTH - 2)
+    if path.suffix == ".png":
+        save(path, np.ones(size, np.uint16))
+    elif path.suffix == ".pfm":
+        write_pfm(path, np.ones(size))
+    else:
+        write = np.save if path.suffix == ".npy" else np.savez
+        write(path, np.ones(size, np.float32))
+
+
+def cut_off(path):
+    os.truncate(path, path.stat().st_size // 2)
+
+
 @each_dataset
-@pytest.mark.parametrize("which", [1, 2], ids=["image", "truth"])
-def test_truncated_file_is_named(tmp_path, name, which):
+@pytest.mark.parametrize(("which", "damage"), [(1, cut_off), (2, cut_off), (2, of_another_size)])
+def test_damaged_file_is_named(tmp_path, name, which, damage):
     LAYOUTS[name][0](tmp_path)
     path = only_file(tmp_path, LAYOUTS[name][which])
-    os.truncate(path, path.stat().st_size // 2)
-    with pytest.raises(ValueError, match=path.name.replace(".", r"\.")):
-        one(tmp_path, name)
-
-
-@each_dataset
-def test_truth_of_another_size_is_named(tmp_path, name):
-    LAYOUTS[name][0](tmp_path)
-    path = only_file(tmp_path, LAYOUTS[name][2])
-    if path.suffix == ".png":
-        save(path, np.ones((HEIGHT, WIDTH - 2), np.uint16))
-    elif path.suffix == ".npy":
-        np.save(path, np.ones((HEIGHT, WIDTH - 2), np.float32))
-    elif path.suffix == ".npz":
-        np.savez(path, np.ones((HEIGHT, WIDTH - 2), np.float32))
-    else:
-        write_pfm(path, np.ones((HEIGHT, WIDTH - 2)))
+    damage(path)
     with pytest.raises(ValueError, match=path.name.replace(".", r"\.")):
         one(tmp_path, name)
 
@@ -350,6 +318,7 @@ def test_occlusion_masks_are_read(tmp_path, name):
     expected = np.zeros((HEIGHT, WIDTH), bool)
     expected[:, :4] = True
     np.testing.assert_array_equal(sample.occluded, expected & sample.valid)
+    assert name != "booster" or (sample.material == 3).all()
 
 
 def test_test_scenes_without_truth_belong_to_no_set(tmp_path):
@@ -383,15 +352,10 @@ def test_a_pair_without_truth_cannot_be_perturbed(tmp_path):
     for path in (tmp_path / "scan1" / "depths").iterdir():
         path.unlink()
     with pytest.raises(ValueError, match="the truth of mvsnet/scan1-turn1-shift0.1 must be known"):
-        load(perturbed_ref(find_mvsnet(tmp_path)[0], (1.0, 0.1)))
+        load(changed_ref(find_mvsnet(tmp_path)[0], "perturbed", (1.0, 0.1)))
     with pytest.raises(ValueError, match=r"got none \(no .*00000000\.pfm\)"):
         blind = load(find_mvsnet(tmp_path)[0])
         score(blind, Prediction(np.ones(blind.depth_m.shape)), None)
-
-
-def test_booster_has_material_classes(tmp_path):
-    booster(tmp_path)
-    assert (one(tmp_path, "booster").material == 3).all()
 
 
 def test_coarse_middlebury_truth_says_how_coarse(tmp_path):
@@ -415,16 +379,15 @@ def test_mvsnet_pairs_extra_views_and_pixel_centre(tmp_path):
     assert colmap.K_left[0, 0] == F and K[0, 2] == CX
 
 
-@pytest.mark.parametrize("depths", ["1 2", "1 2 3", "1 2 3 4", "0.5 0.01 192 2.5"])
+@pytest.mark.parametrize("depths", ["1 2", "0.5 0.01 192 2.5"])
 def test_mvsnet_depth_numbers_change_nothing(tmp_path, depths):
     mvsnet(tmp_path)
     before = one(tmp_path, "mvsnet")
     for path in (tmp_path / "scan1" / "cams").iterdir():
         path.write_text(path.read_text().replace("9e9 9e9 192 9e9", depths))
     after = one(tmp_path, "mvsnet")
-    np.testing.assert_array_equal(before.K_left, after.K_left)
-    np.testing.assert_array_equal(before.E, after.E)
-    np.testing.assert_array_equal(before.depth_m, after.depth_m)
+    for name in ("K_left", "E", "depth_m"):
+        np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
 
 
 def test_robustmvd_takes_key_views_and_belongs_to_no_other_set(tmp_path):
@@ -444,39 +407,52 @@ def test_robustmvd_takes_key_views_and_belongs_to_no_other_set(tmp_path):
 def test_options_left_open_are_the_sets_own(tmp_path):
     robustmvd(tmp_path / "benchmark")
     mvsnet(tmp_path)
-    first, second = find_pairs(tmp_path, pixel_centre=None, pairs="default")
-    assert (first.dataset, first.files["pixel_centre"]) == ("mvsnet", 0.0)
-    assert (second.dataset, second.files["pixel_centre"]) == ("robustmvd", 0.5)
+    refs = find_pairs(tmp_path, pixel_centre=None, pairs="default")
+    own = [(ref.dataset, ref.files["pixel_centre"]) for ref in refs]
+    assert own == [("mvsnet", 0.0), ("robustmvd", 0.5)]
 
 
 def test_folder_takes_depth_in_three_formats(tmp_path):
     folder(tmp_path)
-    expected = one(tmp_path, "folder").depth_m
-    (tmp_path / "mine" / "depth.npy").unlink()
-    write_pfm(tmp_path / "mine" / "depth.pfm", np.where(expected > 0, expected, np.inf))
+    expected, mine = one(tmp_path, "folder").depth_m, tmp_path / "mine"
+    (mine / "depth.npy").unlink()
+    write_pfm(mine / "depth.pfm", np.where(expected > 0, expected, np.inf))
     np.testing.assert_array_equal(one(tmp_path, "folder").depth_m, expected)
-    (tmp_path / "mine" / "depth.pfm").unlink()
-    write_depth_mm(tmp_path / "mine" / "depth.png", expected)
+    (mine / "depth.pfm").unlink()
+    write_depth_mm(mine / "depth.png", expected)
     np.testing.assert_allclose(one(tmp_path, "folder").depth_m, expected, atol=5.1e-4)
+    (mine / "depth.png").unlink()
+    names = "depth.npy, depth.pfm, depth.png or depth_mm.png"
+    said = f"at least one pixel; got none (no {names} in {mine})"
+    with pytest.raises(ValueError, match=re.escape(said)):
+        score(one(tmp_path, "folder"), Prediction(np.ones((HEIGHT, WIDTH))), None)
 
 
 @pytest.mark.parametrize("suffixes", [(".JPG", ".jpeg"), (".tif", ".bmp"), (".webp", ".PNG")])
-def test_folder_takes_every_image_that_pillow_reads(tmp_path, suffixes):
+def test_folder_takes_every_image_that_pillow_reads_and_a_png_before_its_copies(tmp_path, suffixes):
     folder(tmp_path)
+    mine = tmp_path / "mine"
     for side, suffix in zip(("left", "right"), suffixes, strict=True):
-        path = tmp_path / "mine" / f"{side}.png"
-        with Image.open(path) as image:
-            image.save(tmp_path / "mine" / f"own{suffix}")
-        path.unlink()
-        (tmp_path / "mine" / f"own{suffix}").rename(tmp_path / "mine" / f"{side}{suffix}")
-    (tmp_path / "mine" / "left.txt").write_text("notes")
+        with Image.open(mine / f"{side}.png") as image:
+            image.save(mine / f"own{suffix}")
+        (mine / f"{side}.png").unlink()
+        (mine / f"own{suffix}").rename(mine / f"{side}{suffix}")
+    (mine / "left.txt").write_text("notes")
     assert one(tmp_path, "folder").left.shape == (HEIGHT, WIDTH, 3)
+    save(mine / "left.png", picture(HEIGHT, WIDTH - 2))
+    with pytest.raises(ValueError, match="depth.npy must be for 62 x 40 pixels as the left image"):
+        one(tmp_path, "folder")
 
 
-def test_folder_takes_a_png_before_its_copies(tmp_path):
+@pytest.mark.parametrize("missing", ["left.png", "right.png", "calib.txt"])
+def test_a_folder_of_two_of_three_is_no_silent_gap_and_one_of_less_is_no_pair(tmp_path, missing):
     folder(tmp_path)
-    Image.new("RGB", (64, 48)).save(tmp_path / "mine" / "left.jpg")
-    assert one(tmp_path, "folder").left.shape == (HEIGHT, WIDTH, 3)
+    (tmp_path / "mine" / missing).unlink()
+    with pytest.raises(FileNotFoundError, match=missing):
+        one(tmp_path, "folder")
+    for side in ("left", "right"):
+        (tmp_path / "mine" / f"{side}.png").unlink(missing_ok=True)
+    assert find_pairs(tmp_path, ["folder"]) == []
 
 
 TWO_SIZES = factory.REALSENSE_PRINTED.replace(
@@ -520,16 +496,6 @@ def test_folder_takes_calibrations_that_go_by_size_or_name(
     assert sample.E[0, 3] == pytest.approx(baseline_m)
 
 
-def test_folder_without_depth_says_what_it_lacks(tmp_path):
-    folder(tmp_path)
-    (tmp_path / "mine" / "depth.npy").unlink()
-    sample = one(tmp_path, "folder")
-    names = "depth.npy, depth.pfm, depth.png or depth_mm.png"
-    said = f"at least one pixel; got none (no {names} in {tmp_path / 'mine'})"
-    with pytest.raises(ValueError, match=re.escape(said)):
-        score(sample, Prediction(depth_m=np.ones((HEIGHT, WIDTH))), None)
-
-
 def test_root_must_be_a_folder(tmp_path):
     with pytest.raises(ValueError, match="root must be an existing folder"):
         find_pairs(tmp_path / "nowhere")
@@ -538,6 +504,8 @@ def test_root_must_be_a_folder(tmp_path):
 
 
 def test_synthetic_pairs_are_seeded_and_alternate(tmp_path):
+    with pytest.raises(ValueError, match="sides of at least 1 pixel"):
+        find_pairs("synthetic:1@0x96")
     refs = find_pairs(Path("synthetic:3+4"))
     assert [ref.files["seed"] for ref in refs] == [4, 5, 6]
     assert refs[0].files["size"] == (384, 512)
@@ -574,11 +542,6 @@ def photometric_error(sample, factor):
     warped = warp_right_to_left(right, depth_m, *cameras)
     seen = warped.visible & torch.from_numpy(sample.valid)
     return ((warped.image - left).abs().mean(1, keepdim=True) * seen).sum() / seen.sum()
-
-
-def test_rendered_pairs_have_pixels():
-    with pytest.raises(ValueError, match="sides of at least 1 pixel"):
-        find_pairs("synthetic:1@0x96")
 
 
 def test_reflective_pairs_show_mirrors_or_glass():

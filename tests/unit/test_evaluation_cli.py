@@ -1,4 +1,4 @@
-"""The eval commands on own images in Middlebury's layout, with the method that needs no prior."""
+"""The eval commands on own images in Middlebury's layout and on rendered ones, with methods that are free."""
 
 import json
 import os
@@ -6,17 +6,29 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.eval.app import eval_app
+from geodiff_plugin.evaluation import experiment
 from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
-from geodiff_plugin.evaluation.datasets import DATASETS
-from geodiff_plugin.evaluation.options import COMMANDS
+from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
+from geodiff_plugin.evaluation.datasets.changed import (
+    CHANGES,
+    changed_ref,
+    drift_of,
+    perturbation,
+    perturbed_pose,
+)
+from geodiff_plugin.evaluation.options import COMMANDS, DirOptions, PosesOptions, command_line
+from geodiff_plugin.evaluation.poses import run_poses
 from geodiff_plugin.formats import write_pfm
 
 SHIFT = 8
@@ -32,15 +44,17 @@ def data(tmp_path):
         Image.fromarray(wide[:, :144]).save(scene / "im0.png")
         Image.fromarray(wide[:, SHIFT : SHIFT + 144]).save(scene / "im1.png")
         write_pfm(scene / "disp0.pfm", np.full((48, 144), SHIFT, np.float32))
-        (scene / "calib.txt").write_text(
-            "cam0=[100 0 72; 0 100 24; 0 0 1]\ncam1=[100 0 72; 0 100 24; 0 0 1]\ndoffs=0\nbaseline=100\n"
-            "width=144\nheight=48\nndisp=16\n"
-        )
+        camera, size = "[100 0 72; 0 100 24; 0 0 1]", "width=144\nheight=48\nndisp=16\n"
+        (scene / "calib.txt").write_text(f"cam0={camera}\ncam1={camera}\ndoffs=0\nbaseline=100\n{size}")
     return tmp_path / "data"
 
 
 def invoke(*words):
     return CliRunner().invoke(eval_app, [str(word) for word in words], catch_exceptions=False)
+
+
+def lines_of(out):
+    return [json.loads(line) for line in (out / "samples.jsonl").read_text().splitlines()]
 
 
 def test_pairs_writes_every_table_and_prints_it(data, tmp_path):
@@ -53,54 +67,18 @@ def test_pairs_writes_every_table_and_prints_it(data, tmp_path):
     assert r"\toprule" in (out / "table.tex").read_text()
     facts = json.loads((out / "table.json").read_text())
     assert facts["versions"]["torch"] and facts["tables"][0]["header"] == ["pair", "SGBM + fill"]
-    lines = [json.loads(line) for line in (out / "samples.jsonl").read_text().splitlines()]
-    assert [line["sample"] for line in lines] == ["one", "two"]
-    assert all(line["all_pixels"]["raw"]["abs_rel"] < 0.05 for line in lines)
+    assert [line["sample"] for line in lines_of(out)] == ["one", "two"]
+    assert all(line["all_pixels"]["raw"]["abs_rel"] < 0.05 for line in lines_of(out))
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_out_that_can_be_no_folder_is_told_at_once(tmp_path, command):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="--out must be a folder; got the file"):
-        invoke(command, *{"pairs": ["DIR"], "figure": ["terms"]}.get(command, ()), "--out", tmp_path / "file")
-
-
-def test_pairs_selects_scenes(data, tmp_path):
-    result = invoke("pairs", data, "--methods", "sgbm", "--scenes", "two", "-o", tmp_path / "out", "-q")
-    assert result.exit_code == 0 and result.stdout == ""
-    assert len((tmp_path / "out" / "samples.jsonl").read_text().splitlines()) == 1
-    with pytest.raises(ValueError, match="a sample with three in its name"):
-        invoke("pairs", data, "--methods", "sgbm", "--scenes", "three", "-o", tmp_path / "out")
-
-
-def test_two_samples_of_one_name_are_refused(data, tmp_path):
-    """As two resolutions of a set side by side: one result would stand for both."""
-    shutil.copytree(data, data / "quarter")
-    with pytest.raises(ValueError, match="with several middlebury2014/one"):
-        invoke("pairs", data, "--methods", "sgbm", "-o", tmp_path / "out")
-    assert invoke("pairs", data / "quarter", "--methods", "sgbm", "-o", tmp_path / "out").exit_code == 0
-
-
-def test_pairs_names_bad_options(data, tmp_path):
-    with pytest.raises(ValueError, match="methods"):
-        invoke("pairs", data, "--methods", "magic", "-o", tmp_path / "out")
-    with pytest.raises(ValueError, match="--limit must be between 1"):
-        invoke("pairs", data, "--methods", "sgbm", "--limit", 0, "-o", tmp_path / "out")
-
-
-def test_limit_counts_all_sets_together_and_says_so(tmp_path):
-    """In a table of the paper each column is a set, which is limited by itself."""
-    words = " ".join(invoke("pairs", "--help").stdout.replace("│", " ").split())
-    assert "The first N samples alone; in a table of the paper, of each set." in words
-
-
-def test_pairs_draws_a_seeded_sample(data, tmp_path):
-    words = ("pairs", data, "--methods", "sgbm", "-o", tmp_path / "out", "--sample")
-    picked = ["middlebury2014/two" in invoke(*words, 1, "--seed", seed).stdout for seed in (0, 1, 2, 3, 4, 0)]
+def test_pairs_selects_draws_and_says_so(data, tmp_path):
+    words = ("pairs", data, "--methods", "sgbm", "-o")
+    quiet = invoke(*words, tmp_path / "out", "--scenes", "two", "-q")
+    assert quiet.exit_code == 0 and quiet.stdout == "" and len(lines_of(tmp_path / "out")) == 1
+    drawn = [invoke(*words, tmp_path / "out", "--sample", 1, "--seed", i).stdout for i in (0, 1, 2, 3, 4, 0)]
+    picked = ["middlebury2014/two" in said for said in drawn]
     assert picked[0] == picked[-1] and set(picked) == {True, False}
-    assert "Drawn with seed 0: middlebury2014/" in invoke(*words, 1).stdout
-    with pytest.raises(ValueError, match="--sample must be at most 2"):
-        invoke(*words, 3)
+    assert "Drawn with seed 0: middlebury2014/" in drawn[0]
 
 
 def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
@@ -108,19 +86,15 @@ def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
     maps.mkdir()
     np.save(maps / "middlebury2014_one.npy", np.full((48, 144), SHIFT, np.float32))
     words = ("pairs", data, "--methods", f"files:disparity:{maps}", "--scenes", "one", "-o", tmp_path / "out")
-    result = invoke(*words, "--crop", "eigen", "--prior", "one", "--prior", "two", "--space", "disparity")
-    assert re.search(r"middlebury2014/one +0\.000\n", result.stdout) and "RAFT-Stereo" in result.stdout
-    assert "--prior one --prior two --space disparity" in result.stdout
-    assert (
-        "--crop eigen" in result.stdout
-        and "the crop 'eigen'" in result.stdout
-        and "--seeds" not in result.stdout
-    )
+    said = invoke(
+        *words, "--crop", "eigen", "--prior", "one", "--prior", "two", "--space", "disparity"
+    ).stdout
+    assert re.search(r"middlebury2014/one +0\.000\n", said) and "RAFT-Stereo" in said
+    assert "--prior one --prior two --space disparity" in said and "--crop eigen" in said
+    assert "the crop 'eigen'" in said and "--seeds" not in said
     seeded = invoke(*words, "--seed", 2, "--seeds", 3).stdout
     assert "--seeds 3" in seeded and "--seed 2" in seeded and "Spread" not in seeded
     assert "Every table but the spread over 3 seeds is of seed 2." in seeded
-    with pytest.raises(ValueError, match="--crop must be one of"):
-        invoke(*words, "--crop", "middle")
 
 
 def test_pairs_goes_on_after_a_broken_sample_on_request(data, tmp_path):
@@ -133,31 +107,139 @@ def test_pairs_goes_on_after_a_broken_sample_on_request(data, tmp_path):
     assert "(sgbm, plane-sweep)" in said
 
 
+def test_two_samples_of_one_name_are_refused(data, tmp_path):
+    """As two resolutions of a set side by side: one result would stand for both."""
+    shutil.copytree(data, data / "quarter")
+    with pytest.raises(ValueError, match="with several middlebury2014/one"):
+        invoke("pairs", data, "--methods", "sgbm", "-o", tmp_path / "out")
+    assert invoke("pairs", data / "quarter", "--methods", "sgbm", "-o", tmp_path / "out").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["pairs", "DATA", "--methods", "magic"], "methods"),
+        (["pairs", "DATA", "--limit", 0], "--limit must be between 1"),
+        (["pairs", "DATA", "--sample", 3], "--sample must be at most 2"),
+        (["pairs", "DATA", "--crop", "middle"], "--crop must be one of"),
+        (["pairs", "DATA", "--pose", "guess"], "--pose"),
+        (["pairs", "DATA", "--scenes", "three"], "a sample with three in its name"),
+        (["poses"], "--data must be given, or --rendered above 0"),
+        *((["poses", "--rendered-size", text], "--rendered-size") for text in ("256", "0x0", "256x32")),
+        *(
+            (["poses", "--perturb", text], "--perturb")
+            for text in ("1.5", "a,b", "1,2,3", "1..2,0.1", "99,0")
+        ),
+        *((["poses", "--drift", text], "--drift") for text in ("0.3", "a,b", "9,1", "0.3,99")),
+    ],
+)
+def test_bad_options_are_named(data, tmp_path, words, said):
+    given = [data if word == "DATA" else word for word in words]
+    rendered = ["--rendered", 1] if words[0] == "poses" and len(words) > 1 else []
+    with pytest.raises(ValueError, match=said):
+        invoke(*given, *rendered, "-o", tmp_path / "out")
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_out_that_can_be_no_folder_is_told_at_once(tmp_path, command):
+    (tmp_path / "file").write_text("")
+    arguments = {"pairs": ["DIR"], "capture": ["DIR"], "figure": ["terms"]}.get(command, ())
+    with pytest.raises(InputError, match="--out must be a folder; got the file"):
+        invoke(command, *arguments, "--out", tmp_path / "file")
+
+
 def test_list_tells_what_is_there(data):
-    found = invoke("list", "--data", data).stdout
-    assert re.search(r"middlebury2014 +2 samples", found) and re.search(r"kitti2015 +not found", found)
-    assert "https://" in found and "guided" in found and "files:..." in found
-    assert all(name in found for name in (*DATASETS, *METHODS, *FAMILIES))
+    said = invoke("list", "--data", data).stdout
+    assert re.search(r"middlebury2014 +2 samples", said) and re.search(r"kitti2015 +not found", said)
+    assert "https://" in said and "guided" in said and "files:..." in said
+    assert all(name in said for name in (*DATASETS, *METHODS, *FAMILIES))
     assert "no --data given" in invoke("list").stdout
+
+
+def test_options_come_back_as_a_command_line():
+    given = {"data": Path("synthetic-posed:2"), "methods": ("guided",), "perturb": "1.5,0.1"}
+    options = DirOptions(**given, pose=("refine", "given"), limit=3, out=Path("x"), quiet=True)
+    line = f"{command_line('pairs', options)} "
+    assert line.startswith("geodiff eval pairs") and "quiet" not in line and "--out" not in line
+    words = ("--pose refine,given", "--perturb 1.5,0.1", "--limit 3", "--methods guided", "synthetic-posed:2")
+    assert all(f" {word} " in line for word in words)
 
 
 def test_two_processes_share_the_samples(data, tmp_path):
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    command += [
-        "-m",
-        "geodiff_plugin",
-        "eval",
-        "pairs",
-        str(data),
-        "--methods",
-        "sgbm",
-        "-o",
-        str(tmp_path / "out"),
-    ]
+    command += ["-m", "geodiff_plugin", "eval", "pairs", data, "--methods", "sgbm", "-o", tmp_path / "out"]
     environment = os.environ | {"ACCELERATE_USE_CPU": "true", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240)
+    words = [str(word) for word in command]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
     assert "2 processes" in done.stdout
-    lines = [json.loads(line) for line in (tmp_path / "out" / "samples.jsonl").read_text().splitlines()]
-    assert sorted(line["sample"] for line in lines) == ["one", "two"]
-    assert {line["process"] for line in lines} <= {0, 1}
+    assert sorted(line["sample"] for line in lines_of(tmp_path / "out")) == ["one", "two"]
+    assert {line["process"] for line in lines_of(tmp_path / "out")} <= {0, 1}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_perturbed_poses_stay_within_what_was_asked(seed):
+    E = np.eye(4)
+    E[:3, 3] = (0.3, 0.1, 0.0)
+    wrong = perturbed_pose(E, 1.5, 0.1, 4.0, np.random.default_rng(seed))
+    turn = np.degrees(np.linalg.norm(Rotation.from_matrix(wrong[:3, :3]).as_rotvec()))
+    assert 0.3 * 1.5 <= turn <= 1.5
+    assert np.linalg.norm(wrong[:3, 3]) == pytest.approx(np.linalg.norm(E[:3, 3]))
+    assert 0 < np.linalg.norm(wrong[:3, 3] - E[:3, 3]) < 0.12 * np.linalg.norm(E[:3, 3])
+
+
+def test_changed_samples_differ_in_what_was_changed_only():
+    (ref,) = find_pairs("synthetic:1@96x72")
+    sample = load(ref)
+    assert load(changed_ref(ref, "right_exposure", (2.0, 1.0))).right.max() == 255
+
+    def changed(kind, *change):
+        other = CHANGES[kind][1](sample, change, changed_ref(ref, kind, change).name)
+        assert np.array_equal(other.left, sample.left) and np.array_equal(other.depth_m, sample.depth_m)
+        assert np.array_equal(other.K_right, sample.K_right)
+        assert np.array_equal(other.E, sample.E) == (kind != "perturbed")
+        return other
+
+    wrong, again = (changed("perturbed", 1.5, 0.1) for _ in range(2))
+    assert np.array_equal(wrong.E, again.E) and np.array_equal(wrong.right, sample.right)
+    assert wrong.name == "seed0000-turn1.5-shift0.1" and np.array_equal(wrong.E_scored, sample.E)
+    assert np.array_equal(changed("drifted", 0.0, 0.0).right, sample.right)
+    moved, turned = changed("drifted", 0.0, 2.0), changed("drifted", 0.3, 1.5)
+    down, up = (np.array_equal(moved.right[10:60], sample.right[10 - px : 60 - px]) for px in (2, -2))
+    assert down or up, "by whole pixels nothing is interpolated"
+    assert np.abs(turned.right.astype(int) - sample.right).mean() > 1
+    assert turned.name == "seed0000-drift0.3-1.5px"
+    dark = changed("right_exposure", 0.5, 1.0)
+    np.testing.assert_allclose(dark.right, 0.5 * sample.right, atol=0.51)
+    assert dark.name == "seed0000-gain0.5-gamma1"
+    assert (perturbation(" 1.5, 0.1"), drift_of("0,2")) == ((1.5, 0.1), (0.0, 2.0))
+
+
+def test_the_page_of_poses(tmp_path, monkeypatch):
+    """Two rendered pairs: estimated, one has no pose and the other is off by half without a word."""
+    errors, sizes = {"given": 0.1, "refine": 0.06}, set()
+
+    def measure(cell):
+        files, pose = cell.ref.files, cell.method.name.partition("=")[2]
+        sizes.add(files["size"])
+        error = errors.get(pose, None if files["seed"] > 1 else 0.5)
+        error = 0.05 if "perturbed" not in files and pose == "given" else error
+        warnings = [] if pose == "estimated" else ["said"]
+        notes = {"method": {"warnings": warnings, "residual_px_given": [1.25], "residual_px": [0.5]}}
+        status = {"rectified": False, "status": "not applicable" if error is None else "ok"}
+        return status | {"all_pixels": {"raw": {"abs_rel": error}, "aligned": None}, "notes": notes}
+
+    monkeypatch.setattr(experiment._MethodCell, "__call__", measure)
+    page = tmp_path / "docs" / "results-pose.md"
+    options = PosesOptions(rendered=2, out=tmp_path / "out", results=page, quiet=True)
+    run_poses("poses", options)
+    text = page.read_text()
+    assert text == (tmp_path / "out" / "poses.md").read_text()
+    assert "geodiff eval poses --rendered 2\n" in text
+    assert "| pair | true, given | perturbed, given | perturbed, refined | estimated |" in text
+    assert "| mean of 2 pairs | 0.050 | 0.100 | 0.060 | 0.500 of 1 |" in text
+    assert "| without a result | 0 | 0 | 0 | 1 |" in text
+    assert "| off by more than 0.25, no warning | 0 | 0 | 0 | 1 |" in text
+    run_poses("poses", replace(options, rendered_size="256x192", steps=2, out=tmp_path / "small"))
+    assert "geodiff eval poses --steps 2 --rendered 2 --rendered-size 256x192\n" in page.read_text()
+    assert sizes == {(384, 512), (192, 256)}

@@ -1,17 +1,15 @@
-"""Methods beside guidance: maps made elsewhere, depth models of transformers, guidance without a network."""
+"""What every entry of METHODS owes, and what the methods beside guidance answer: maps, models, SGBM."""
 
 import json
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
-from geodiff_plugin.evaluation.baselines.constant import constant_method
-from geodiff_plugin.evaluation.datasets.folder import find_folder, load_folder
 from PIL import Image
-from transformers import DPTConfig, DPTForDepthEstimation, GLPNConfig, GLPNForDepthEstimation
 
 from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.evaluation.baselines import (
@@ -20,226 +18,31 @@ from geodiff_plugin.evaluation.baselines import (
     NotApplicable,
     PriorCache,
     Settings,
-    constant,
     find_method,
+    guided,
 )
-from geodiff_plugin.evaluation.baselines.guided import guided_prediction
+from geodiff_plugin.evaluation.baselines.guided import constant_method, guided_prediction
 from geodiff_plugin.evaluation.baselines.outside import map_name
-from geodiff_plugin.evaluation.baselines.stereo import native_depth
-from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.evaluation.baselines.stereo import fill_background, native_depth, sgbm_shift
+from geodiff_plugin.evaluation.datasets import StereoSample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
+from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.scale.space import SPACES
+from tests.contracts.tiny_transformers import MODELS, make_transformers
 
-SHAPE = (32, 48)
-
-
-def make_sample(rectified=True) -> StereoSample:
-    image = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
-    K = np.array([[30.0, 0, 23.5], [0, 30.0, 15.5], [0, 0, 1]])
-    K_right = K.copy()
-    K_right[0, 2] += 2  # doffs
-    E = np.eye(4)
-    E[0, 3] = 0.2
-    depth_m = np.linspace(1.0, 2.5, SHAPE[1], dtype=np.float32)[None].repeat(SHAPE[0], 0)
-    return StereoSample(
-        "folder", "mine", image, image, K, K_right, E, depth_m, depth_m > 0, rectified=rectified
-    )
+SHAPE, NAN = (32, 48), float("nan")
 
 
-def run(name, sample):
-    return find_method(name).run(sample, Settings(), PriorCache())
-
-
-def disparity_of(sample):
-    return 30.0 * 0.2 / sample.depth_m - 2
-
-
-def with_hole(values, unknown):
-    values = values.copy()
-    values[:3, :3] = unknown
-    return values
-
-
-def png16(path, values):
-    Image.fromarray(np.rint(values).astype(np.uint16)).save(path)
-
-
-@pytest.mark.parametrize(
-    ("kind", "write", "tolerance"),
-    [
-        ("depth", lambda f, s: np.save(f / "folder_mine.npy", with_hole(s.depth_m, np.nan)), 1e-6),
-        ("depth", lambda f, s: write_pfm(f / "folder_mine.pfm", with_hole(s.depth_m, 0)), 1e-6),
-        ("depth", lambda f, s: write_depth_mm(f / "folder_mine.png", with_hole(s.depth_m, 0)), 1e-3),
-        ("disparity", lambda f, s: np.save(f / "folder_mine.npy", with_hole(disparity_of(s), np.inf)), 1e-5),
-        (
-            "disparity",
-            lambda f, s: write_pfm(f / "folder_mine.pfm", with_hole(disparity_of(s), np.nan)),
-            1e-5,
-        ),
-        (
-            "disparity",
-            lambda f, s: png16(f / "folder_mine.png", with_hole(256 * disparity_of(s), 0)),
-            2e-3,
-        ),
-    ],
-)
-def test_metric_maps_are_read_and_holes_stay(tmp_path, kind, write, tolerance):
-    sample = make_sample()
-    write(tmp_path, sample)
-    prediction = run(f"files:{kind}:{tmp_path}", sample)
-    assert np.isnan(prediction.depth_m[:3, :3]).all()
-    np.testing.assert_allclose(prediction.depth_m[3:], sample.depth_m[3:], rtol=tolerance)
-    assert score(sample, prediction, None)["all_pixels"]["raw"]["coverage"] == pytest.approx(
-        1 - 9 / np.prod(SHAPE)
-    )
-
-
-def test_relative_maps_are_aligned_only_and_depth_is_the_default_kind(tmp_path):
-    sample = make_sample()
-    np.save(tmp_path / "folder_mine.npy", 7 - 3 / sample.depth_m)  # no map of inverse depth falls with it
-    record = score(sample, run(f"files:relative-disparity:{tmp_path}", sample), None)
-    assert record["all_pixels"]["raw"] is None
-    assert record["all_pixels"]["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6)
-    np.save(tmp_path / "folder_mine.npy", sample.depth_m)
-    np.testing.assert_array_equal(run(f"files:{tmp_path}", sample).depth_m, sample.depth_m)
-
-
-def test_disparity_of_another_size_is_resized_in_value_too(tmp_path):
-    sample = make_sample()
-    plane = np.full((2 * SHAPE[0], 2 * SHAPE[1]), 2 * 3.0)
-    np.save(tmp_path / "folder_mine.npy", plane)
-    np.testing.assert_allclose(run(f"files:disparity:{tmp_path}", sample).depth_m, 6.0 / (3 + 2), rtol=1e-6)
-
-
-def test_samples_without_a_map_and_posed_disparity_do_not_apply(tmp_path):
-    with pytest.raises(NotApplicable, match="no map"):
-        run(f"files:{tmp_path}", make_sample())
-    np.save(tmp_path / "folder_mine.npy", np.ones(SHAPE))
-    with pytest.raises(NotApplicable, match="not rectified"):
-        run(f"files:disparity:{tmp_path}", make_sample(rectified=False))
-
-
-@pytest.mark.parametrize("space", ["log", "log1p", "sqrt_disparity"])
-def test_guided_metres_are_aligned_in_the_space_of_the_prior(make_pipeline, space):
-    """A map that is right up to scale and shift in the prior's space is right once it is aligned."""
-    sample = make_sample()
-    pipe = enable_geometry_guidance(make_pipeline(prediction_type=space))
-    guidance = GeometryGuidance.search_only(
-        sample.right, (sample.K_left, sample.K_right), sample.E, min_steps=1
-    )
-    prediction = guided_prediction(pipe, sample, guidance, {"num_inference_steps": 1})
-    assert prediction.space == space
-    value = torch.from_numpy(SPACES[space].inverse(torch.from_numpy(sample.depth_m).double()).numpy())
-    stretched = SPACES[space].forward(1.7 * value + 0.2, torch.ones((), dtype=torch.float64)).numpy()
-    record = score(sample, replace(prediction, depth_m=stretched), None)["all_pixels"]
-    assert record["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6) and record["raw"]["abs_rel"] > 0.1
-
-
-def test_integers_are_no_metres(tmp_path):
-    sample = make_sample()
-    np.save(tmp_path / f"{map_name(sample.dataset, sample.name)}.npy", np.full(sample.depth_m.shape, 2000))
-    with pytest.raises(ValueError, match=r"map must be metres as floats.*int64.*1000 for millimetres"):
-        run(f"files:{tmp_path}", sample)
-    assert run(f"files:relative-depth:{tmp_path}", sample).relative is not None
-
-
-def test_bad_folders_of_maps_are_named(tmp_path):
-    with pytest.raises(ValueError, match="files:DIR or files:KIND:DIR with an existing folder"):
-        find_method(f"files:{tmp_path / 'nowhere'}")
-    (tmp_path / "folder_mine.npy").write_bytes(b"no array")
-    with pytest.raises(ValueError, match=r"folder_mine\.npy"):
-        run(f"files:{tmp_path}", make_sample())
-
-
-def test_changed_maps_are_another_configuration(tmp_path):
-    np.save(tmp_path / "folder_mine.npy", np.ones(SHAPE))
-    method = find_method(f"files:{tmp_path}")
-    before = method.configuration(Settings())
-    assert method.configuration(Settings(seed=1)) == before
-    np.save(tmp_path / "folder_other.npy", np.ones(SHAPE))
-    assert method.configuration(Settings()) != before
-
-
-def save_dpt(folder):
-    """A relative depth model (MiDaS's kind) of random weights."""
-    torch.manual_seed(0)
-    config = DPTConfig(
-        hidden_size=8,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        intermediate_size=8,
-        image_size=32,
-        patch_size=16,
-        backbone_out_indices=[0, 1],
-        is_hybrid=False,
-        neck_hidden_sizes=[4, 4],
-        reassemble_factors=[1, 0.5],
-        fusion_hidden_size=4,
-        head_in_index=-1,
-        use_auxiliary_head=False,
-    )
-    DPTForDepthEstimation(config).save_pretrained(folder)
-    options = {"image_processor_type": "DPTImageProcessor", "size": {"height": 32, "width": 32}}
-    (folder / "preprocessor_config.json").write_text(json.dumps(options))
-
-
-def save_glpn(folder):
-    """A metric depth model of random weights."""
-    torch.manual_seed(0)
-    config = GLPNConfig(
-        num_encoder_blocks=4,
-        depths=[1] * 4,
-        hidden_sizes=[8] * 4,
-        num_attention_heads=[1] * 4,
-        decoder_hidden_size=8,
-        max_depth=10,
-    )
-    GLPNForDepthEstimation(config).save_pretrained(folder)
-    (folder / "preprocessor_config.json").write_text('{"image_processor_type": "GLPNImageProcessor"}')
-
-
-@pytest.mark.parametrize(("save", "metric"), [(save_dpt, False), (save_glpn, True)])
-def test_depth_models_of_transformers_answer(tmp_path, save, metric):
-    folder, sample = tmp_path / "tiny-model", make_sample()
-    folder.mkdir()
-    save(folder)
-    method, cache = find_method(f"hf:{folder}"), PriorCache()
-    prediction = method.run(sample, Settings(), cache)
-    assert method.title == "tiny-model" and not method.uses_prior
-    assert (prediction.depth_m is not None) == metric
-    assert prediction.space == ("depth" if metric else "disparity")
-    assert prediction.relative.shape == SHAPE and np.isfinite(prediction.relative).all()
-    if metric:
-        assert (prediction.depth_m > 0).all() and (prediction.depth_m < 10).all()
-    assert cache.depth_model(str(folder), Settings()) is cache.depth_model(str(folder), Settings())
-    before = method.configuration(Settings())
-    (folder / "note.txt").write_text("trained further")
-    assert method.configuration(Settings()) != before
-
-
-def test_depth_model_needs_a_name():
-    with pytest.raises(ValueError, match="hf:MODEL"):
-        find_method("hf:")
-
-
-def test_families_are_not_taken_for_methods_with_a_prior(tmp_path):
-    folder = tmp_path / "maps@work"
-    folder.mkdir()
-    assert find_method(f"files:{folder}").title == "maps@work"
-    numbered = tmp_path / "maps#3"
-    numbered.mkdir()
-    assert find_method(f"files:{numbered}").seed is None
-    assert find_method("guided:inner_steps=1@org/other").prior == "org/other"
-    bound = find_method("guided:inner_steps=1@org/other#3")
-    assert (bound.prior, bound.seed) == ("org/other", 3) and find_method(bound.name).name == bound.name
-    assert bound.base_name == "guided:inner_steps=1" and bound.seedless_name == f"{bound.base_name}@org/other"
-    own = bound.own_settings(Settings(seed=1, ensemble=2))
-    assert own == Settings("org/other", seed=3, ensemble=2)
-    assert find_method("guided@folder#a").prior == "folder#a"
-    assert set(FAMILIES) == {"guided", "paper", "hf", "files", "prior-map"}
+def plane_sample(pair, E=None) -> StereoSample:
+    E = pair.E if E is None else E
+    cameras = (torch.as_tensor(m) for m in (pair.K, pair.K, np.linalg.inv(E)))
+    views = (pair.left, pair.right, pair.K, pair.K, E)
+    valid = np.ones(pair.depth_m.shape, bool)
+    rectified = bool(is_rectified(*cameras))
+    return StereoSample("middlebury2014", "plane", *views, pair.depth_m, valid, rectified=rectified)
 
 
 class OnePipe(PriorCache):
@@ -253,10 +56,71 @@ class OnePipe(PriorCache):
         return self._pipe
 
 
-def plane_sample(pair) -> StereoSample:
-    valid = np.ones(pair.depth_m.shape, bool)
-    views = (pair.left, pair.right, pair.K, pair.K, pair.E)
-    return StereoSample("folder", "plane", *views, pair.depth_m, valid, rectified=True)
+@pytest.fixture
+def priors(make_pipeline):
+    return OnePipe(make_pipeline())
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_answers_for_a_rectified_pair_and_a_posed_one_or_says_why_not(name, priors, textured_plane):
+    if name == "sgbm-wls" and not hasattr(cv2, "ximgproc"):
+        pytest.skip("opencv-contrib is not installed")
+    sample = plane_sample(textured_plane)
+    prediction = METHODS[name].run(sample, Settings(steps=1), priors)
+    assert (prediction.depth_m is None) != (prediction.relative is None)
+    assert score(sample, prediction, cap_m=None)["all_pixels"]["aligned"]["coverage"] > 0.5
+    json.dumps(dict(prediction.notes))
+    E = textured_plane.E.copy()
+    E[1, 3] = 0.05
+    posed = plane_sample(textured_plane, E)
+    try:
+        prediction = METHODS[name].run(posed, Settings(steps=1), priors)
+    except NotApplicable as reason:
+        assert name.startswith("sgbm") and "rectified" in str(reason)
+    else:
+        values = prediction.depth_m if prediction.relative is None else prediction.relative
+        assert values.shape == posed.depth_m.shape
+
+
+@pytest.mark.parametrize("name", [*METHODS, "hf:somewhere/model"])
+def test_configuration_is_json_and_names_what_matters(name):
+    """Seconds of another device are another result, but of SGBM, which OpenCV runs on the CPU."""
+    method = find_method(name)
+    assert method.name == name and method.summary
+    plain = json.dumps(method.configuration(Settings()), sort_keys=True)
+    other = json.dumps(method.configuration(Settings(seed=1)), sort_keys=True)
+    assert (plain != other) == method.uses_prior
+    assert "bundled" not in plain  # the prior has its own place in the key
+    on_cuda = json.dumps(method.configuration(Settings(device="cuda")), sort_keys=True)
+    assert (on_cuda == plain) == name.startswith("sgbm")
+
+
+def test_one_seed_gives_one_depth_and_an_ensemble_brings_uncertainty(priors, textured_plane):
+    sample = plane_sample(textured_plane)
+    first, second = (METHODS["guided"].run(sample, Settings(steps=1), priors) for _ in range(2))
+    np.testing.assert_array_equal(first.depth_m, second.depth_m)
+    spread = METHODS["search-only"].run(sample, Settings(steps=1, ensemble=3), priors)
+    assert spread.uncertainty.shape == sample.depth_m.shape and first.uncertainty is None
+
+
+def test_fingerprint_tells_priors_and_decoders_apart(make_pipeline, monkeypatch, tmp_path):
+    pipes = [make_pipeline() for _ in range(4)]
+    next(pipes[2].unet.parameters()).data += 1
+    pipes[3].register_to_config(prediction_type="disparity")
+    same, again, trained, other_space = (OnePipe(pipe).fingerprint(Settings()) for pipe in pipes)
+    assert same == again and len({same, trained, other_space}) == 3
+    method = find_method(f"guided:decoder={tmp_path}")
+    before = method.configuration(Settings())
+    (tmp_path / "diffusion_pytorch_model.safetensors").write_bytes(b"trained further")
+    assert method.configuration(Settings()) != before
+    plain = METHODS["guided"].configuration(Settings())
+    assert plain["guidance"]["decoder"] == "full" and "decoder_files" not in plain
+
+
+@pytest.mark.parametrize("name", ["paper", "guided:gradient=full"])
+def test_no_gradient_goes_through_a_network_that_does_not_see_z_t(name, textured_plane):
+    with pytest.raises(NotApplicable, match="does not see"):
+        find_method(name).run(plane_sample(textured_plane), Settings(), OnePipe(make_transformers("glpn")))
 
 
 @pytest.mark.parametrize(("steps", "updates"), [(None, 4), (2, 2)])
@@ -267,13 +131,8 @@ def test_no_diffusion_makes_the_updates_of_the_default_without_the_network(
     monkeypatch.setattr(Objective, "__call__", lambda s, *args: counted.append(args[4]) or stock(s, *args))
     monkeypatch.setattr(pipe.unet, "forward", None)
     # The method with fewer updates a round, for the sake of time.
-    short = constant_method(
-        "short",
-        "short",
-        "short",
-        partial(GeometryGuidance, inner_steps=3, correct=False),
-        constant._ramp,
-    )
+    preset = partial(GeometryGuidance, inner_steps=3, correct=False)
+    short = constant_method("short", "short", "short", preset, guided._ramp)
     prediction = short.run(plane_sample(textured_plane), Settings(steps=steps), OnePipe(pipe))
     assert prediction.depth_m.shape == textured_plane.depth_m.shape and (prediction.depth_m > 0).all()
     assert len(counted) == updates * 3
@@ -292,8 +151,8 @@ def test_reprojection_only_starts_from_the_map_of_the_prior_and_moves_its_pixels
     relative = (depth_m - depth_m.min()) / (depth_m.max() - depth_m.min())
     seen, stock = [], Objective.__call__
     monkeypatch.setattr(Objective, "__call__", lambda self, x, *args: seen.append(x) or stock(self, x, *args))
-    sample = plane_sample(textured_plane)
-    prediction = METHODS["reprojection-only"].run(sample, Settings(), OnePipe(make_oracle(relative)))
+    priors = OnePipe(make_oracle(relative))
+    prediction = METHODS["reprojection-only"].run(plane_sample(textured_plane), Settings(), priors)
     assert len(seen) == 50
     torch.testing.assert_close(seen[0][0, 0].detach(), torch.from_numpy(relative), atol=1e-5, rtol=0)
     moved = (seen[-1] - seen[0]).abs()
@@ -301,47 +160,162 @@ def test_reprojection_only_starts_from_the_map_of_the_prior_and_moves_its_pixels
     assert np.median(np.abs(prediction.depth_m / depth_m - 1)) < 0.05
 
 
-def written_pair(folder, right_shape=SHAPE):
-    """Two grey images of one camera, 0.2 m apart, in the layout of own pairs."""
-    folder.mkdir(parents=True)
-    Image.new("RGB", SHAPE[::-1]).save(folder / "left.png")
-    Image.new("RGB", right_shape[::-1]).save(folder / "right.png")
-    (folder / "calib.txt").write_text(
-        "cam0=[30 0 23.5; 0 30 15.5; 0 0 1]\ncam1=[30 0 23.5; 0 30 15.5; 0 0 1]\ndoffs=0\nbaseline=200\n"
-        f"width={SHAPE[1]}\nheight={SHAPE[0]}\n"
-    )
-    return folder
+def make_sample(rectified=True) -> StereoSample:
+    """A slope from 1 to 2.5 m; the right camera's principal point lies 2 px further (doffs)."""
+    image = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+    K = np.array([[30.0, 0, 23.5], [0, 30.0, 15.5], [0, 0, 1]])
+    K_right, E = K.copy(), np.eye(4)
+    K_right[0, 2], E[0, 3] = K[0, 2] + 2, 0.2
+    depth_m = np.linspace(1.0, 2.5, SHAPE[1], dtype=np.float32)[None].repeat(SHAPE[0], 0)
+    views = (image, image, K, K_right, E)
+    return StereoSample("folder", "mine", *views, depth_m, depth_m > 0, rectified=rectified)
 
 
-@pytest.mark.parametrize("missing", ["left.png", "right.png", "calib.txt"])
-def test_an_own_pair_with_a_missing_file_is_no_silent_gap(tmp_path, missing):
-    (written_pair(tmp_path / "data" / "one") / missing).unlink()
-    (ref,) = find_folder(tmp_path / "data")
-    with pytest.raises(FileNotFoundError, match=missing):
-        load_folder(ref)
-
-
-def test_a_folder_that_is_no_pair_is_none(tmp_path):
-    folder = written_pair(tmp_path / "data" / "one")
-    (folder / "left.png").unlink()
-    (folder / "right.png").unlink()
-    assert find_folder(tmp_path / "data") == []
-
-
-def test_own_right_images_have_the_size_of_their_calibration(tmp_path):
-    (ref,) = find_folder(written_pair(tmp_path / "data" / "one", (40, 56)).parent)
-    with pytest.raises(ValueError, match="calib.txt must be for 56 x 40 pixels as the right image"):
-        load_folder(ref)
-
-
-def test_sgbm_does_not_apply_to_views_of_different_sizes():
+@pytest.mark.parametrize("space", ["log", "log1p", "sqrt_disparity"])
+def test_guided_metres_are_aligned_in_the_space_of_the_prior(make_pipeline, space):
+    """A map that is right up to scale and shift in the prior's space is right once it is aligned."""
     sample = make_sample()
+    cameras = (sample.K_left, sample.K_right), sample.E
+    guidance = GeometryGuidance.search_only(sample.right, *cameras, min_steps=1)
+    pipe = enable_geometry_guidance(make_pipeline(prediction_type=space))
+    prediction = guided_prediction(pipe, sample, guidance, {"num_inference_steps": 1})
+    assert prediction.space == space
+    value = SPACES[space].inverse(torch.from_numpy(sample.depth_m).double())
+    stretched = SPACES[space].forward(1.7 * value + 0.2, torch.ones((), dtype=torch.float64)).numpy()
+    record = score(sample, replace(prediction, depth_m=stretched), None)["all_pixels"]
+    assert record["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6) and record["raw"]["abs_rel"] > 0.1
+
+
+def run(name, sample):
+    return find_method(name).run(sample, Settings(), PriorCache())
+
+
+def save_png16(path, values):
+    Image.fromarray(np.rint(values).astype(np.uint16)).save(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "suffix", "save", "hole", "tolerance"),
+    [
+        ("depth", ".npy", np.save, np.nan, 1e-6),
+        ("depth", ".pfm", write_pfm, 0, 1e-6),
+        ("depth", ".png", write_depth_mm, 0, 1e-3),
+        ("disparity", ".npy", np.save, np.inf, 1e-5),
+        ("disparity", ".pfm", write_pfm, np.nan, 1e-5),
+        ("disparity", ".png", lambda path, values: save_png16(path, 256 * values), 0, 2e-3),
+    ],
+)
+def test_metric_maps_are_read_and_holes_stay(tmp_path, kind, suffix, save, hole, tolerance):
+    sample = make_sample()
+    values = sample.depth_m.copy() if kind == "depth" else 30.0 * 0.2 / sample.depth_m - 2
+    values[:3, :3] = hole
+    save(tmp_path / f"folder_mine{suffix}", values)
+    prediction = run(f"files:{kind}:{tmp_path}", sample)
+    assert np.isnan(prediction.depth_m[:3, :3]).all()
+    np.testing.assert_allclose(prediction.depth_m[3:], sample.depth_m[3:], rtol=tolerance)
+    coverage = score(sample, prediction, None)["all_pixels"]["raw"]["coverage"]
+    assert coverage == pytest.approx(1 - 9 / np.prod(SHAPE))
+
+
+def test_other_maps(tmp_path):
+    """Relative ones are aligned only, integers are no metres, and another size is resized in value too."""
+    sample, path = make_sample(), tmp_path / f"{map_name('folder', 'mine')}.npy"
+    np.save(path, 7 - 3 / sample.depth_m)  # no map of inverse depth falls with it
+    record = score(sample, run(f"files:relative-disparity:{tmp_path}", sample), None)["all_pixels"]
+    assert record["raw"] is None and record["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6)
+    np.save(path, sample.depth_m)
+    np.testing.assert_array_equal(run(f"files:{tmp_path}", sample).depth_m, sample.depth_m)
+    np.save(path, np.full((2 * SHAPE[0], 2 * SHAPE[1]), 2 * 3.0))
+    np.testing.assert_allclose(run(f"files:disparity:{tmp_path}", sample).depth_m, 6.0 / (3 + 2), rtol=1e-6)
+    np.save(path, np.full(SHAPE, 2000))
+    with pytest.raises(ValueError, match=r"map must be metres as floats.*int64.*1000 for millimetres"):
+        run(f"files:{tmp_path}", sample)
+    assert run(f"files:relative-depth:{tmp_path}", sample).relative is not None
+
+
+def test_what_does_not_apply_and_what_is_no_folder(tmp_path):
+    sample = make_sample()
+    with pytest.raises(NotApplicable, match="no map"):
+        run(f"files:{tmp_path}", sample)
+    method = find_method(f"files:{tmp_path}")
+    before = method.configuration(Settings())
+    np.save(tmp_path / "folder_mine.npy", np.ones(SHAPE))
+    assert method.configuration(Settings()) != before
+    assert method.configuration(Settings()) == method.configuration(Settings(seed=1))
+    with pytest.raises(NotApplicable, match="not rectified"):
+        run(f"files:disparity:{tmp_path}", make_sample(rectified=False))
     with pytest.raises(NotApplicable, match="different sizes"):
         run("sgbm", replace(sample, right=sample.right[:16]))
+    (tmp_path / "folder_mine.npy").write_bytes(b"no array")
+    with pytest.raises(ValueError, match=r"folder_mine\.npy"):
+        run(f"files:{tmp_path}", sample)
+    with pytest.raises(ValueError, match="files:DIR or files:KIND:DIR with an existing folder"):
+        find_method(f"files:{tmp_path / 'nowhere'}")
+    with pytest.raises(ValueError, match="hf:MODEL"):
+        find_method("hf:")
+
+
+@pytest.mark.parametrize(("kind", "metric"), [("dpt", False), ("glpn", True)])
+def test_depth_models_of_transformers_answer(tmp_path, kind, metric):
+    folder, sample, cache = tmp_path / "tiny-model", make_sample(), PriorCache()
+    torch.manual_seed(0)
+    model, preparation = MODELS[kind]()
+    model.save_pretrained(folder)
+    (folder / "preprocessor_config.json").write_text(json.dumps(preparation))
+    method = find_method(f"hf:{folder}")
+    prediction = method.run(sample, Settings(), cache)
+    assert method.title == "tiny-model" and not method.uses_prior
+    assert (prediction.depth_m is not None) == metric
+    assert prediction.space == ("depth" if metric else "disparity")
+    assert prediction.relative.shape == SHAPE and np.isfinite(prediction.relative).all()
+    if metric:
+        assert (prediction.depth_m > 0).all() and (prediction.depth_m < 10).all()
+    assert cache.depth_model(str(folder), Settings()) is cache.depth_model(str(folder), Settings())
+    before = method.configuration(Settings())
+    (folder / "note.txt").write_text("trained further")
+    assert method.configuration(Settings()) != before
+
+
+def test_families_are_not_taken_for_methods_with_a_prior(tmp_path):
+    for name in ("maps@work", "maps#3"):
+        (tmp_path / name).mkdir()
+        method = find_method(f"files:{tmp_path / name}")
+        assert (method.title, method.prior, method.seed) == (name, None, None)
+    assert find_method("guided:inner_steps=1@org/other").prior == "org/other"
+    bound = find_method("guided:inner_steps=1@org/other#3")
+    assert (bound.prior, bound.seed) == ("org/other", 3) and find_method(bound.name).name == bound.name
+    assert bound.base_name == "guided:inner_steps=1" and bound.seedless_name == f"{bound.base_name}@org/other"
+    own = bound.own_settings(Settings(seed=1, ensemble=2))
+    assert own == Settings("org/other", seed=3, ensemble=2)
+    assert find_method("guided@folder#a").prior == "folder#a"
+    assert find_method("guided:pose=estimated").title == "guided, poses estimated"
+    assert set(FAMILIES) == {"guided", "paper", "hf", "files", "prior-map"}
+
+
+@pytest.mark.parametrize("doffs", [0.0, 3.5])
+def test_sgbm_recovers_a_known_shift(doffs):
+    wide = np.random.default_rng(0).integers(0, 256, (48, 160, 3), dtype=np.uint8)
+    K, E = np.array([[100.0, 0, 70], [0, 100.0, 24], [0, 0, 1]]), np.eye(4)
+    K_right = K + np.array([[0, 0, doffs], [0, 0, 0], [0, 0, 0]])
+    E[0, 3] = 0.1
+    truth = np.full((48, 144), 10.0 / (6 + doffs), np.float32)
+    views = (wide[:, :144], wide[:, 6:150], K, K_right, E)  # x_left - x_right = 6
+    sample = StereoSample("folder", "shift", *views, truth, truth > 0, rectified=True)
+    shift = sgbm_shift(sample)
+    assert np.isfinite(shift).mean() > 0.8 and np.nanmedian(shift) == pytest.approx(6 + doffs, abs=1 / 16)
+    assert np.median(np.abs(run("sgbm", sample).depth_m / truth - 1)) < 0.02
+
+
+def test_background_fill_takes_the_farther_neighbour():
+    holes = np.full((4, 5), NAN)
+    holes[1, [1, 3]], holes[3, [0, 3, 4]] = (5.0, 2.0), (3.0, 9.0, 9.0)
+    expected = [[5, 5, 2, 2, 2], [5, 5, 2, 2, 2], [5, 5, 2, 2, 2], [3, 3, 3, 9, 9]]
+    np.testing.assert_array_equal(fill_background(holes), expected)
+    assert np.isnan(fill_background(np.full((2, 3), NAN))).all()
 
 
 def test_a_coarse_grid_is_read_at_the_nearest_of_its_pixels():
     """Four cells over six pixels, which have their centres at 0.33, 1, 1.67, ... cells from the edge."""
     volume = SimpleNamespace(plane_step=torch.tensor(0.001))
-    found = native_depth(torch.tensor([[1.0, 2.0, 3.0, 4.0]]), volume, (1, 6), "nearest-exact")
-    np.testing.assert_allclose(1.0 / found[0], [1, 2, 2, 3, 4, 4])
+    depth_m = native_depth(torch.tensor([[1.0, 2.0, 3.0, 4.0]]), volume, (1, 6), "nearest-exact")
+    np.testing.assert_allclose(1.0 / depth_m[0], [1, 2, 2, 3, 4, 4])

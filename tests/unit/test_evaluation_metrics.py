@@ -1,9 +1,11 @@
-"""Every metric against a closed form on two or three pixels; the alignment against a known affine map."""
+"""Metrics against plain loops over pixels, alignment against known affine maps, crops against their rows."""
 
-import kornia
+import math
+
 import numpy as np
 import pytest
-import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from geodiff_plugin.evaluation.metrics import (
     FLOOR_M,
@@ -12,157 +14,170 @@ from geodiff_plugin.evaluation.metrics import (
     ause,
     confidence_deciles,
     counted,
+    crop_mask,
     evaluate_depth,
     evaluate_disparity,
     least_squares,
 )
+from geodiff_plugin.evaluation.options import CROPS
 
-ALL = np.ones((1, 2), bool)
-
-
-def row(*values):
-    return np.array([values], np.float64)
+NAN = float("nan")
 
 
-def test_depth_metrics_match_their_formulas():
-    scores = evaluate_depth(row(1.1, 4.0), row(1.0, 2.0), ALL)
-    assert scores["abs_rel"] == pytest.approx((0.1 / 1 + 2.0 / 2) / 2)
-    assert scores["rmse"] == pytest.approx(np.sqrt((0.1**2 + 2.0**2) / 2))
-    assert scores["log_rmse"] == pytest.approx(np.sqrt((np.log(1.1) ** 2 + np.log(2) ** 2) / 2))
-    assert scores["silog"] == pytest.approx(100 * (np.log(2) - np.log(1.1)) / 2)
-    assert (scores["delta1"], scores["delta2"], scores["delta3"]) == (0.5, 0.5, 0.5)
-    assert (scores["coverage"], scores["pixels"]) == (1.0, 2.0)
+def maps(seed, size=(7, 11)):
+    """Truth from 0.1 m to 300 m with unknown pixels, and a prediction with holes of every kind."""
+    rng = np.random.default_rng(seed)
+    truth = np.exp(rng.uniform(-2.3, 5.7, size))
+    pred = truth * np.exp(rng.normal(0, 0.4, size))
+    pred[rng.random(size) > 0.8] = rng.choice([NAN, np.inf, 0.0, -1.0])
+    truth[0, 0], pred[1, 1] = 2.0, 3.0
+    return pred, truth, rng.random(size) > 0.2
 
 
-@pytest.mark.parametrize("ratio, passed", [(1.2, 3), (1.3, 2), (1.6, 1), (2.0, 0)])
-@pytest.mark.parametrize("too_far", [True, False])
-def test_delta_counts_both_directions(ratio, passed, too_far):
-    pred = row(ratio, ratio) if too_far else row(1 / ratio, 1 / ratio)
-    scores = evaluate_depth(pred, row(1.0, 1.0), ALL)
-    assert [scores[f"delta{k}"] for k in (1, 2, 3)] == [
-        float(passed >= 3),
-        float(passed >= 2),
-        float(passed >= 1),
+def log_sigma(pairs):
+    logs = [math.log(p) - math.log(t) for p, t in pairs]
+    return 100 * math.sqrt(sum(x * x for x in logs) / len(logs) - (sum(logs) / len(logs)) ** 2)
+
+
+@given(seed=st.integers(0, 200), cap=st.sampled_from([None, 20.0, 80.0]))
+def test_depth_metrics_pixel_by_pixel(seed, cap):
+    pred, truth, valid = maps(seed)
+    valid[0, 0] = True
+    known = [
+        (p, t)
+        for p, t, v in zip(pred.flat, truth.flat, valid.flat, strict=True)
+        if v and (not cap or t < cap)
+    ]
+    pairs = [(min(p, cap or p), t) for p, t in known if math.isfinite(p) and p > 0]
+    scores = evaluate_depth(pred, truth, valid, cap)
+    assert scores["pixels"] == len(known) and scores["coverage"] == pytest.approx(len(pairs) / len(known))
+    n = len(pairs)
+    if not n:
+        assert math.isnan(scores["abs_rel"]) and math.isnan(scores["silog"])
+        return
+    assert scores["abs_rel"] == pytest.approx(sum(abs(p - t) / t for p, t in pairs) / n)
+    assert scores["rmse"] == pytest.approx(math.sqrt(sum((p - t) ** 2 for p, t in pairs) / n))
+    log_squares = sum(math.log(p / t) ** 2 for p, t in pairs)
+    assert scores["log_rmse"] == pytest.approx(math.sqrt(log_squares / n))
+    assert scores["silog"] == pytest.approx(log_sigma(pairs), abs=1e-4)
+    for k in (1, 2, 3):
+        assert scores[f"delta{k}"] == pytest.approx(sum(max(p / t, t / p) < 1.25**k for p, t in pairs) / n)
+
+
+@pytest.mark.parametrize("step_px", [0.0, 1.0, 1.5, 4.0])
+def test_disparity_metrics_pixel_by_pixel(step_px):
+    truth, pred = np.array([[100.0, 10.0, 50.0, 5.0, 9.0]]), np.array([[104.0, 13.5, 50.5, np.inf, 9.0]])
+    valid = np.array([[True, True, True, True, False]])
+    scores = evaluate_disparity(pred, truth, valid, step_px)
+    errors = [4.0, 3.5, 0.5]
+    assert scores["epe"] == pytest.approx(sum(errors) / 3)
+    for k in (1, 2, 3):
+        assert scores[f"bad{k}"] == (None if step_px > k else pytest.approx(sum(e > k for e in errors) / 3))
+    assert scores["d1"] == (None if step_px > 3 else pytest.approx(1 / 3))  # 4 px of 100 are no 5 %
+    holes = evaluate_disparity(np.full((1, 5), NAN), truth, valid, step_px)
+    assert math.isnan(holes["epe"])
+
+
+@given(seed=st.integers(0, 200), steps=st.integers(1, 30))
+def test_ause_pixel_by_pixel(seed, steps):
+    pred, truth, valid = maps(seed)
+    valid[1, 1] = True
+    sigma = np.random.default_rng(seed).permutation(truth.size).reshape(truth.shape).astype(float)
+    kept = [
+        (abs(p - t) / t, s)
+        for p, t, s, v in zip(pred.flat, truth.flat, sigma.flat, valid.flat, strict=True)
+        if v and math.isfinite(p) and p > 0
     ]
 
+    def curve(key):
+        ordered = [error for error, _ in sorted(kept, key=key, reverse=True)]
+        left = [ordered[k * len(ordered) // steps :] for k in range(steps)]
+        return [sum(rest) / len(rest) for rest in left]
 
-def test_silog_ignores_scale_and_abs_rel_does_not():
-    truth = row(1.0, 3.0)
-    scores = evaluate_depth(2 * truth, truth, ALL)
-    assert scores["silog"] == pytest.approx(0, abs=1e-9)
-    assert scores["abs_rel"] == pytest.approx(1)
-
-
-def test_cap_drops_truth_and_clips_predictions():
-    truth, pred = row(40.0, 100.0), row(160.0, 1.0)
-    scores = evaluate_depth(pred, truth, ALL, cap_m=80.0)
-    assert scores["pixels"] == 1
-    assert scores["abs_rel"] == pytest.approx(1.0)  # 160 is clipped to 80
-    assert evaluate_depth(pred, truth, ALL)["abs_rel"] == pytest.approx((3.0 + 0.99) / 2)
+    best, mean = curve(lambda e: e[0]), sum(e for e, _ in kept) / len(kept)
+    expected = np.mean(np.subtract(curve(lambda e: e[1]), best))
+    assert ause(pred, truth, valid, sigma, steps) == pytest.approx(expected, abs=1e-9)
+    assert ause(pred, truth, valid, 7 * sigma, steps) == pytest.approx(expected, abs=1e-9)
+    assert ause(pred, truth, valid, None, steps) == pytest.approx(mean - np.mean(best), abs=1e-9)
 
 
-def test_holes_count_as_missing_not_as_wrong():
-    scores = evaluate_depth(row(2.0, np.nan), row(2.0, 5.0), ALL)
-    assert (scores["abs_rel"], scores["coverage"], scores["pixels"]) == (0.0, 0.5, 2.0)
-    nothing = evaluate_depth(row(0.0, -np.inf), row(2.0, 5.0), ALL)
-    assert np.isnan(nothing["abs_rel"]) and nothing["coverage"] == 0
-
-
-def test_truth_that_cannot_count_is_an_error():
-    with pytest.raises(ValueError, match="no valid pixel"):
-        counted(row(100.0, 0.0), ALL, cap_m=80.0)
-    with pytest.raises(ValueError, match="one shape"):
-        evaluate_depth(row(1.0), row(1.0, 2.0), ALL)
-
-
-def test_disparity_metrics_match_their_formulas():
-    truth, pred = row(100.0, 10.0, 50.0, 5.0), row(104.0, 13.5, 50.5, np.inf)
-    valid = np.ones((1, 4), bool)
-    scores = evaluate_disparity(pred, truth, valid)
-    assert scores["epe"] == pytest.approx((4 + 3.5 + 0.5) / 3)
-    assert scores["bad1"] == scores["bad2"] == scores["bad3"] == pytest.approx(2 / 3)
-    assert scores["d1"] == pytest.approx(1 / 3)  # 4 px of 100 is within 5 %
-
-
-def test_coarse_truth_gives_no_fine_scores():
-    scores = evaluate_disparity(row(1.0, 2.0), row(1.0, 2.0), ALL, step_px=1.5)
-    assert scores["bad1"] is None
-    assert (scores["bad2"], scores["bad3"], scores["d1"]) == (0, 0, 0)
-
-
-def test_end_point_error_agrees_with_kornia():
-    rng = np.random.default_rng(0)
-    pred, truth = rng.uniform(0, 9, (2, 5, 6))
-    flows = [torch.from_numpy(np.stack([d, np.zeros_like(d)], -1)) for d in (pred, truth)]
-    expected = float(kornia.metrics.aepe(*flows))
-    assert evaluate_disparity(pred, truth, np.ones((5, 6), bool))["epe"] == pytest.approx(expected)
-
-
-def test_ause_is_zero_for_the_right_order_and_known_for_the_reversed_one():
-    truth, pred = row(1.0, 1.0), row(1.0, 1.5)
-    assert ause(pred, truth, ALL, row(0.0, 9.0), steps=2) == pytest.approx(0)
-    # Reversed: all pixels 0.25 either way; without the "worst" one 0.5 is left instead of 0.
-    assert ause(pred, truth, ALL, row(9.0, 0.0), steps=2) == pytest.approx((0 + 0.5) / 2)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_ause_is_never_negative_and_scale_free_in_uncertainty(seed):
-    rng = np.random.default_rng(seed)
-    truth, pred, sigma = rng.uniform(1, 5, (3, 20, 20))
-    valid = rng.random((20, 20)) > 0.3
-    value = ause(pred, truth, valid, sigma)
-    assert value > 0
-    assert ause(pred, truth, valid, 7 * sigma) == pytest.approx(value)
+def test_confidence_deciles_closed_form():
+    truth, valid = np.full((1, 4), 2.0), np.array([[True, True, True, False]])
+    pred = np.array([[2.0, 2.1, 3.0, 9.0]])
+    classes = confidence_deciles(pred, truth, valid, np.array([[0.95, 1.0, 0.25, 0.25]]), within=0.1)
+    assert [decile["share"] for decile in classes] == pytest.approx([0, 0, 1 / 3, 0, 0, 0, 0, 0, 0, 2 / 3])
+    assert classes[9] == pytest.approx({"share": 2 / 3, "promised": 0.975, "kept": 1.0, "abs_rel": 0.025})
+    assert classes[2]["kept"] == 0.0 and classes[2]["abs_rel"] == pytest.approx(0.5)
+    assert classes[5]["kept"] is None
 
 
 @pytest.mark.parametrize("scale, shift", [(3.0, 0.5), (-2.0, 9.0)])
 def test_least_squares_recovers_an_affine_map(scale, shift):
     x = np.random.default_rng(1).uniform(0, 1, (6, 7))
     mask = x > 0.2
-    target = np.where(mask, scale * x + shift, 1e6)
-    assert least_squares(x, target, mask) == pytest.approx((scale, shift))
+    assert least_squares(x, np.where(mask, scale * x + shift, 1e6), mask) == pytest.approx((scale, shift))
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity", "log", "log1p", "sqrt_disparity"])
 def test_alignment_is_exact_where_the_prediction_is_affine_in_its_space(space):
-    truth = np.random.default_rng(2).uniform(1, 9, (6, 7))
+    truth = np.random.default_rng(2).uniform(1, 90, (6, 7))
     in_space = {"depth": truth, "disparity": 1 / truth, "sqrt_disparity": truth**-0.5}
     in_space |= {"log": np.log(truth), "log1p": np.log(truth + 1)}
     values = 0.7 * in_space[space] + 0.2
-    np.testing.assert_allclose(align(values, truth, np.ones((6, 7), bool), space), truth, rtol=1e-9)
+    np.testing.assert_allclose(align(values, truth, np.ones((6, 7), bool), space), truth, rtol=1e-8)
 
 
-def test_aligned_disparity_is_clipped_before_it_is_inverted():
-    truth = row(1.0, 2.0, 4.0)
-    values = row(1.0, 0.5, -5.0)  # the last one is not positive: left out of the fit, then clipped
-    aligned = align(values, truth, np.ones((1, 3), bool), "disparity")
-    np.testing.assert_allclose(aligned, row(1.0, 2.0, 1 / MIN_DISPARITY))
+def test_alignment_clips_what_lies_behind_the_camera_or_too_far_and_keeps_holes():
+    truth, values = np.array([[1.0, 2.0, 4.0]]), np.array([[1.0, 0.5, -5.0]])
+    aligned = align(values, truth, np.ones((1, 3), bool), "disparity")  # the last is no part of the fit
+    np.testing.assert_allclose(aligned, [[1.0, 2.0, 1 / MIN_DISPARITY]])
+    behind = align(np.array([[1.0, 2.0, -4.0]]), truth, np.array([[True, True, False]]))
+    assert behind[0, 2] == FLOOR_M
+    for space, hole in (("depth", NAN), ("disparity", 0.0)):
+        assert np.isnan(align(np.full((1, 3), hole), truth, truth > 0, space)).all()
 
 
-def test_depth_sent_behind_the_camera_is_clipped_not_dropped():
-    truth, values = row(1.0, 2.0, 3.0), row(1.0, 2.0, 3.0)
-    outlier = np.concatenate([values, row(-4.0)], 1)
-    valid = np.array([[True, True, True, False]])
-    aligned = align(outlier, np.concatenate([truth, row(5.0)], 1), valid)
-    assert aligned[0, 3] == FLOOR_M
+#: (H, W) -> crop -> first and last row, first and last column, worked out by hand.
+RANGES = {
+    (375, 1242): {
+        "none": (0, 374, 0, 1241),
+        "garg": (153, 370, 44, 1196),
+        "eigen": (124, 341, 44, 1196),
+        "benchmark": (23, 374, 13, 1228),
+    },
+    (370, 1225): {
+        "none": (0, 369, 0, 1224),
+        "garg": (151, 365, 44, 1179),
+        "eigen": (122, 336, 44, 1179),
+        "benchmark": (18, 369, 4, 1219),  # an odd margin: the smaller half is on the left
+    },
+}
 
 
-def test_a_map_without_a_value_is_aligned_to_nothing():
-    truth = np.full((4, 5), 2.0)
-    for space, hole in (("depth", np.nan), ("disparity", 0.0)):
-        assert np.isnan(align(np.full((4, 5), hole), truth, truth > 0, space)).all()
+@pytest.mark.parametrize("size", RANGES)
+@pytest.mark.parametrize("name", CROPS)
+def test_crop_keeps_the_rows_and_columns_of_its_definition(size, name):
+    first_row, last_row, first_column, last_column = RANGES[size][name]
+    expected = np.zeros(size, bool)
+    expected[first_row : last_row + 1, first_column : last_column + 1] = True
+    np.testing.assert_array_equal(crop_mask(name, size), expected)
 
 
-def test_alignment_names_an_unknown_space():
-    with pytest.raises(ValueError, match="space must be one of depth, disparity"):
-        align(row(1.0), row(1.0), np.ones((1, 1), bool), "inverse")
+ONE = np.ones((1, 1))
 
 
-def test_confidence_deciles_closed_form():
-    truth, valid = np.full((1, 4), 2.0), np.array([[True, True, True, False]])
-    pred = np.array([[2.0, 2.1, 3.0, 9.0]])
-    found = confidence_deciles(pred, truth, valid, np.array([[0.95, 1.0, 0.25, 0.25]]), within=0.1)
-    assert [decile["share"] for decile in found] == pytest.approx([0, 0, 1 / 3, 0, 0, 0, 0, 0, 0, 2 / 3])
-    assert found[9] == pytest.approx({"share": 2 / 3, "promised": 0.975, "kept": 1.0, "abs_rel": 0.025})
-    assert found[2]["kept"] == 0.0 and found[2]["abs_rel"] == pytest.approx(0.5)
-    assert found[5]["kept"] is None
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: counted(np.array([[100.0, 0.0]]), np.ones((1, 2), bool), 80.0), "no valid pixel"),
+        (lambda: evaluate_depth(ONE, np.ones((1, 2)), ONE > 0), "one shape"),
+        (lambda: evaluate_disparity(ONE, ONE, ONE < 0), "no valid pixel"),
+        (lambda: ause(NAN * ONE, ONE, ONE > 0, ONE), "uncertainty must be finite"),
+        (lambda: align(ONE, ONE, ONE > 0, "inverse"), "space must be one of depth, disparity"),
+        (lambda: crop_mask("middle", (375, 1242)), "crop must be one of"),
+        (lambda: crop_mask("benchmark", (480, 640)), "images of at least 1216 x 352; got 640 x 480"),
+    ],
+)
+def test_refusals(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()

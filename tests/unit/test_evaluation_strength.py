@@ -1,18 +1,21 @@
-"""Emulated priors and the table over their strengths."""
+"""Emulated priors and the table over their strengths; what trust makes wrong, counts and prints."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
-from geodiff_plugin.evaluation.emulated import SPACES, STRENGTHS, EmulatedPrior, relative_map
 
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.evaluation import trust
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, find_method
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.evaluation.options import StrengthOptions
-from geodiff_plugin.evaluation.strength import run_strength
+from geodiff_plugin.evaluation.options import StrengthOptions, TrustOptions
+from geodiff_plugin.evaluation.strength import SPACES, STRENGTHS, EmulatedPrior, relative_map, run_strength
+from geodiff_plugin.evaluation.trust import WRONG, WRONG_POINTS, case_kinds, make_case
+from geodiff_plugin.runtime.verdict import Indicators
 
 SMALL = "synthetic:1+4@128x96"
 
@@ -29,12 +32,9 @@ def test_a_prior_errs_as_much_as_it_says(sample, space):
     off = [np.abs(relative_map(sample, STRENGTHS[s], space) - exact).mean() for s in ("2%", "5%", "20%")]
     assert 0 < off[0] < off[1] < off[2]
     assert np.array_equal(exact, relative_map(sample, STRENGTHS["exact"], space, seed=3))
-
-
-def test_depth_grows_and_disparity_falls(sample):
-    depth, disparity = (relative_map(sample, STRENGTHS["exact"], s) for s in ("depth", "disparity"))
-    inner = (depth > 0.05) & (depth < 0.95)
-    assert np.corrcoef(depth[inner], disparity[inner])[0, 1] < -0.5
+    inner = (exact > 0.05) & (exact < 0.95)
+    grows = np.corrcoef(exact[inner], sample.depth_m[inner])[0, 1]
+    assert grows < -0.5 if space == "disparity" else grows > 0.5
 
 
 @pytest.mark.parametrize("follow", [0.0, 0.6])
@@ -48,30 +48,23 @@ def test_its_answer_follows_its_input_as_far_as_asked(sample, follow):
     first, second = scheduler.timesteps
     v = prior.pipe.unet(torch.cat([image, noise], 1), first)[0]
     moved = scheduler.step(v, first, noise).prev_sample
-    # An edit of 0.5 in the clean latent.
-    a = scheduler.alphas_cumprod[second].sqrt()
-    v = prior.pipe.unet(torch.cat([image, moved + a * 0.5], 1), second)[0]
-    z0 = scheduler.step(v, second, moved + a * 0.5).pred_original_sample
+    moved = moved + scheduler.alphas_cumprod[second].sqrt() * 0.5  # an edit of 0.5 in the clean latent
+    v = prior.pipe.unet(torch.cat([image, moved], 1), second)[0]
+    z0 = scheduler.step(v, second, moved).pred_original_sample
     torch.testing.assert_close(z0 - own, torch.full_like(own, follow * 0.5), atol=2e-3, rtol=0)
 
 
 def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    options = StrengthOptions(
-        data=(SMALL,),
-        strengths=("exact", "20%"),
-        methods=("prior-aligned", "prior-fit", "guided"),
-        steps=2,
-        resolution=96,
-        out=tmp_path,
-        results=tmp_path / "strength.md",
-        figure=tmp_path / "strength.png",
-        quiet=True,
-    )
+    methods, files = ("prior-aligned", "prior-fit", "guided"), {"results": tmp_path / "strength.md"}
+    files |= {"out": tmp_path, "figure": tmp_path / "strength.png"}
+    given = {"strengths": ("exact", "20%"), "methods": methods, "steps": 2, "resolution": 96, "quiet": True}
+    options = StrengthOptions(data=(SMALL,), **given, **files)
     page = run_strength("strength", options)
     rows = {(row[0], row[1]): float(row[2]) for row in page.tables[0].rows}
     assert len(rows) == 6 and rows["exact", "prior + oracle"] < rows["20%", "prior + oracle"]
     assert rows["20%", "guided"] < rows["20%", "prior + oracle"]
     assert (tmp_path / "strength.png").stat().st_size > 10_000
+    assert "![What guidance gains by the prior's error; surfaces, lit](strength.png)" in page.markdown()
     written = (tmp_path / "strength.jsonl").read_text()
 
     def measured_again(*args: object) -> None:
@@ -93,7 +86,7 @@ def test_a_result_is_that_of_its_pair_and_its_seed(tmp_path):
         table = run_strength("strength", StrengthOptions(data=data, methods=methods, **given)).tables[0]
         return [row[2:6] for row in table.rows], table.note
 
-    large, small = "synthetic:1+4@128x96", "synthetic:1+4@64x48"
+    large, small = SMALL, "synthetic:1+4@64x48"
     ((first,), _), ((second,), _) = measure((large,), "prior-aligned"), measure((small,), "prior-aligned")
     assert first != second
     assert measure((large, small), "prior-aligned")[1].startswith("2 pairs.")
@@ -101,26 +94,98 @@ def test_a_result_is_that_of_its_pair_and_its_seed(tmp_path):
     assert rows[0] == first != rows[1]
 
 
-def test_a_method_that_does_not_apply_is_named(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"methods": ("prior-fit@other",)}, "--methods must be methods that use a prior"),
+        ({"methods": ("sgbm",)}, "--methods must be methods that use a prior"),
+        ({"methods": ("prior-fit",), "figure": "figure.png"}, "--methods must be with prior-aligned"),
+        ({"strengths": ("7%",)}, "--strengths"),
+        ({"space": "inverse"}, "--space"),
+        ({"methods": ("refuses",), "strengths": ("5%",)}, "not on synthetic/seed0004: no pose"),
+    ],
+)
+def test_options_that_cannot_be_measured_or_shown(tmp_path, monkeypatch, wrong, said):
     def refuses(*_):
         raise NotApplicable("no pose could be estimated")
 
-    method = replace(find_method("prior-fit"), run=refuses)
-    monkeypatch.setitem(METHODS, "prior-fit", method)
-    options = {"strengths": ("5%",), "methods": ("prior-fit",), "out": tmp_path, "quiet": True}
-    with pytest.raises(ValueError, match=r"not on synthetic/seed0004: no pose could be estimated"):
-        run_strength("strength", StrengthOptions(data=(SMALL,), **options))
+    method = replace(find_method("prior-fit"), name="refuses", run=refuses)
+    monkeypatch.setitem(METHODS, "refuses", method)
+    with pytest.raises(ValueError, match=said):
+        run_strength("strength", StrengthOptions(data=(SMALL,), out=tmp_path, quiet=True, **wrong))
 
 
-@pytest.mark.parametrize(
-    ("methods", "figure"), [(("prior-fit@other",), None), (("prior-fit",), "figure.png")]
-)
-def test_methods_that_cannot_be_shown(methods, figure):
-    with pytest.raises(ValueError, match="--methods must be"):
-        run_strength("strength", StrengthOptions(data=(SMALL,), methods=methods, figure=figure))
+@pytest.fixture(scope="module")
+def samples():
+    return [load(ref) for ref in find_pairs("synthetic:2@64x48")]
 
 
-@pytest.mark.parametrize("wrong", [{"strengths": ("7%",)}, {"space": "inverse"}, {"methods": ("sgbm",)}])
-def test_options_that_do_not_exist(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        run_strength("strength", StrengthOptions(data=(SMALL,), **wrong))
+def test_every_kind_changes_what_it_says(samples):
+    sample, other = samples
+    kinds = case_kinds((*WRONG, *WRONG_POINTS))
+    assert kinds == ("right", "right, points", *WRONG, *WRONG_POINTS)
+    assert case_kinds(("axis",)) == ("right", "axis")
+    cases = {kind: make_case(kind, sample, lambda: other) for kind in kinds}
+    names = ("left", "right", "K_left", "K_right", "E")
+    for kind in WRONG:
+        changed = [n for n in names if not np.array_equal(getattr(cases[kind][0], n), getattr(sample, n))]
+        assert changed and ("left" in changed) == (kind == "swapped"), kind
+    assert cases["millimetres"][0].E[0, 3] == pytest.approx(1000 * sample.E[0, 3])
+    assert cases["K-2"][0].K_left[0, 0] == pytest.approx(2 * sample.K_left[0, 0])
+    assert cases["K-2"][0].K_left[0, 2] == sample.K_left[0, 2]
+    np.testing.assert_allclose(cases["inverse"][0].E @ sample.E, np.eye(4), atol=1e-12)
+    tilt = np.linalg.inv(sample.E[:3, :3]) @ cases["tilted"][0].E[:3, :3]
+    assert np.degrees(np.arctan2(tilt[2, 1], tilt[1, 1])) == pytest.approx(2.0)
+    points = cases["right, points"][1]
+    uv = points @ sample.K_left.T / points[:, 2:]
+    column, row = np.rint(uv[0, :2]).astype(int)
+    assert points[0, 2] == pytest.approx(sample.depth_m[row, column], rel=1e-6)
+    np.testing.assert_allclose(cases["points-3"][1], 3 * points)
+
+
+def test_trust_counts_and_goes_on(tmp_path, monkeypatch, capsys):
+    """All but the rectified pair's K are detected; one right pair is not trusted."""
+    asked, weights = [], ["as they were"]
+
+    def measure(ref, other, kind, read, pipe, settings):
+        asked.append(kind)
+        rectified = not ref.files["posed"]
+        missed, distrusted = kind == "K-2" and rectified, kind == "right" and not rectified
+        bad = distrusted or (kind != "right" and not missed)
+        signs = asdict(Indicators(confidence=0.1 if bad else 0.9, matched=0.8, order=0.8))
+        signs = {name: None if value != value else value for name, value in signs.items()}
+        off = 0.01 if kind == "right" else 0.5
+        return {"rectified": rectified, "status": "finished", "said": [], "off": off, "signs": signs}
+
+    monkeypatch.setattr(trust, "_measure", measure)
+    monkeypatch.setattr(trust.PriorCache, "get", lambda *_: None)
+    monkeypatch.setattr(trust.PriorCache, "fingerprint", lambda *_: weights[-1])
+    options = TrustOptions(rendered=2, width=64, kinds=("swapped", "K-2"), out=tmp_path, quiet=True)
+    for _ in range(2):
+        trust.run_trust("trust", options)
+        assert len(asked) == 6 and capsys.readouterr().out == ""
+    page = (tmp_path / "trust.md").read_text()
+    assert "geodiff eval trust --rendered 2 --width 64 --kinds swapped,K-2\n" in page
+    assert "3 of 4 (75 %)" in page and "1 of 2 (50 %)" in page and "2 of 2 (100 %)" in page
+    weights.append("trained further")
+    trust.run_trust("trust", replace(options, seed=3))
+    assert len(asked) == 12 and "--seed 3" in (tmp_path / "trust.md").read_text()
+
+
+def test_what_cannot_be_counted(tmp_path, monkeypatch, samples):
+    """A pair alone has no unrelated one; without truth nothing says whether a depth is off."""
+    monkeypatch.setattr(trust.PriorCache, "fingerprint", lambda *_: "")
+    monkeypatch.setattr(trust.PriorCache, "get", lambda *_: None)
+    blind = replace(samples[0], valid=np.zeros_like(samples[0].valid))
+    monkeypatch.setattr(trust, "load", lambda ref: blind)
+    options = TrustOptions(rendered=1, width=64, kinds=("swapped",), out=tmp_path / "out", quiet=True)
+    for changed, said in (
+        ({"kinds": ("unrelated",)}, "without 'unrelated' where a pair is alone"),
+        ({"kinds": ("bent",)}, "--kinds must be some of swapped"),
+        ({}, "the truth of synthetic/seed0000 must be known"),
+        ({"rendered": 0}, "--data must be given, or --rendered above 0"),
+        ({"data": tmp_path, "limit": -1}, "--limit must be between 1"),
+        ({"prior": ("bundled", "org/other")}, "--prior must be given once"),
+    ):
+        with pytest.raises(InputError, match=said):
+            trust.run_trust("trust", replace(options, **changed))

@@ -126,15 +126,13 @@ def test_a_failure_ends_the_run_unless_it_is_survived(tmp_path):
     records = go(tmp_path, work, said=said, survives=(OSError,))
     assert [r["status"] for r in records] == ["ok", BROKEN, BROKEN, "ok"]
     assert records[1]["error"] == "item1 is missing"
-    assert said == [
-        "geodiff: item1: item1 is missing",
-        "geodiff: 2 of 4 items failed for one reason: item1, item2.",
-    ]
+    together = "geodiff: 2 of 4 items failed for one reason: item1, item2."
+    assert said == ["geodiff: item1: item1 is missing", together]
     fixed = True
     assert [r["status"] for r in go(tmp_path, work)] == ["ok"] * 4
 
 
-def test_what_fails_every_item_is_said_once(tmp_path):
+def test_what_fails_every_item_is_said_once_and_a_defect_keeps_its_traceback(tmp_path):
     said = []
 
     def work(item):
@@ -143,10 +141,6 @@ def test_what_fails_every_item_is_said_once(tmp_path):
     with pytest.raises(ValueError, match=r"item0 has no camera The same holds for all 4 items"):
         go(tmp_path, work, said=said, survives=(ValueError,), stages=2)
     assert said == []
-
-
-def test_a_defect_keeps_its_traceback(tmp_path):
-    said = []
     records = go(tmp_path, lambda item: {"n": 1 // (item.payload % 2)}, said=said, survives=(Exception,))
     assert records[0]["error"].startswith("ZeroDivisionError: ") and records[1]["n"] == 1
     assert [sentence.startswith("Traceback") for sentence in said] == [True, False, False]

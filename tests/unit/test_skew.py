@@ -42,7 +42,7 @@ HAND_ON = {
     *("_camera_checks.warn_of_other_size", "formats.exif.warn_of_other_lens"),  # or the focal length
     *("algorithm.evidence.prepare_evidence", "algorithm.finish.vote_depth", "capture.fusion.normals_of"),
     *("cli.inputs.pinhole", "cli.inputs._read_known", "app.measure.read_pixel"),
-    *("evaluation.datasets.booster._quarter_intrinsics", "pose.tracks.project_tracks"),
+    *("evaluation.datasets.pairs._quarter_intrinsics", "pose.tracks.project_tracks"),
     *("formats.captures.read_capture", "formats.clouds.make_cloud", "formats.rigs.make_rig"),
     *("formats.distortion.undistorted", "formats.distortion.undistorted_pixels"),  # to OpenCV
     *("formats.distortion.undistorted_points", "pose.capture.solve_capture"),  # the latter to pycolmap

@@ -1,0 +1,252 @@
+"""Cells and their records: resuming, saved maps, seeds and priors, and the tables of a comparison."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geodiff_plugin.evaluation import experiment
+from geodiff_plugin.evaluation.baselines import (
+    Method,
+    NotApplicable,
+    Prediction,
+    Settings,
+    find_method,
+    with_poses,
+    with_priors,
+    with_seeds,
+)
+from geodiff_plugin.evaluation.datasets import SampleRef
+from geodiff_plugin.evaluation.experiment import RECORDS_NAME, cell_key
+from geodiff_plugin.evaluation.tables import (
+    headline,
+    mean_with_interval,
+    paired_difference,
+    pairs_tables,
+    spread_table,
+    without_copies,
+)
+from tests.evaluating import run
+from tests.unit.test_evaluation_scoring import make_sample
+
+SIZES = {"a": 0.1, "b": 0.2, "c": 0.4}
+REFS = [SampleRef("middlebury2014", name, {"left": Path(name)}) for name in SIZES]
+
+
+class Bench:
+    """Three samples, the last one posed, and methods that cost nothing, in the place of all others."""
+
+    def __init__(self, monkeypatch, out):
+        self.calls, self.methods, self.out, self.path = [], {}, out, out / RECORDS_NAME
+        self.samples = {name: make_sample(name, rectified=name != "c") for name in SIZES}
+        self.add("exact", lambda sample, settings: 1.0)
+        self.add("double", lambda sample, settings: 2.0 if sample.rectified else None)
+        self.add("noisy", lambda sample, settings: 1 + SIZES[sample.name] * settings.seed, uses_prior=True)
+        monkeypatch.setattr("geodiff_plugin.evaluation.baselines.METHODS", self.methods)
+        monkeypatch.setattr(experiment, "load", lambda ref: self.samples[ref.name])
+        monkeypatch.setattr(experiment.PriorCache, "fingerprint", lambda _, settings: settings.prior[::-1])
+
+    def add(self, name, factor_of, configuration=None, uses_prior=False):
+        def measure(sample, settings, priors):
+            self.calls.append((name, settings.seed, sample.name))
+            if (factor := factor_of(sample, settings)) is None:
+                raise NotApplicable("not rectified")
+            return Prediction(factor * sample.depth_m.astype(float))
+
+        def configure(settings):
+            return configuration or ({"seed": settings.seed} if uses_prior else {})
+
+        self.methods[name] = Method(name, name, name, measure, configure, uses_prior)
+
+    def go(self, methods=("exact", "double"), settings=None, refs=REFS, **keywords):
+        self.calls.clear()
+        return run(refs, list(methods), settings or Settings(), self.out, **keywords)
+
+
+@pytest.fixture
+def bench(monkeypatch, tmp_path):
+    return Bench(monkeypatch, tmp_path)
+
+
+def without_seconds(records):
+    return [{name: value for name, value in record.items() if name != "seconds"} for record in records]
+
+
+@pytest.mark.parametrize("cut", [0, 2, 40, 400])
+def test_a_run_does_only_what_is_missing(bench, cut):
+    first = bench.go()
+    assert len(bench.calls) == 6 and [r["status"] for r in first].count("not applicable") == 1
+    os.truncate(bench.path, bench.path.stat().st_size - cut)  # killed
+    whole = bench.path.read_bytes().count(b"\n")
+    again = bench.go()
+    assert len(bench.calls) == 6 - whole and without_seconds(again) == without_seconds(first)
+
+
+def test_another_configuration_is_another_result(bench):
+    bench.go()
+    bench.add("double", lambda *_: 3.0, {"factor": 3})
+    records = bench.go()
+    assert [call[0] for call in bench.calls] == ["double"] * 3 and headline(records[1]) == pytest.approx(2)
+
+
+def test_broken_sample_stops_or_is_counted_and_tried_again(bench, monkeypatch):
+    def fails(ref):
+        if ref.name == "b":
+            raise FileNotFoundError("left.png is missing")
+        return bench.samples[ref.name]
+
+    monkeypatch.setattr(experiment, "load", fails)
+    with pytest.raises(FileNotFoundError, match=r"left\.png"):
+        bench.go()
+    records = bench.go(skip_broken=True)
+    assert [r["status"] for r in records] == ["ok", "ok", "broken", "broken", "ok", "not applicable"]
+    assert records[2]["error"] == "left.png is missing"
+    monkeypatch.setattr(experiment, "load", lambda ref: bench.samples[ref.name])
+    assert [r["status"] for r in bench.go()] == ["ok"] * 5 + ["not applicable"]
+    assert {name for _, _, name in bench.calls} == {"b"}
+
+
+def test_a_saved_map_is_that_of_the_record(bench):
+    """Another configuration leaves its map in the same place; a finished run saves its maps when asked."""
+    bench.go()
+    one, target = bench.methods["exact"], bench.out / "depth" / "exact" / "middlebury2014_a.npy"
+    bench.add("exact", lambda *_: 3.0, {"knob": 1})
+    two, maps = bench.methods["exact"], []
+    for method in (one, two, one):
+        bench.methods["exact"] = method
+        bench.go(save_depth=True)
+        maps.append(np.load(target))
+    assert ("exact", 0, "a") in bench.calls and maps[1][0, 0] == 15.0
+    np.testing.assert_array_equal(maps[0], maps[2])
+    bench.go(save_depth=True)
+    assert bench.calls == [] and len(list(bench.out.glob("depth/*/*.npy"))) == 5
+
+
+def test_crop_is_scored_and_is_another_result(bench):
+    bench.go()
+    image, depth_m = np.zeros((50, 60, 3), np.uint8), np.full((50, 60), 2.0, np.float32)
+    changed = {"left": image, "right": image, "depth_m": depth_m, "valid": depth_m > 0}
+    bench.samples["a"] = replace(bench.samples["a"], **changed)
+    records = bench.go(["exact"], refs=REFS[:1], crop="garg")
+    rows, columns = int(0.99189189 * 50) - int(0.40810811 * 50), int(0.96405229 * 60) - int(0.03594771 * 60)
+    assert len(bench.calls) == 1 and records[0]["all_pixels"]["raw"]["pixels"] == rows * columns
+
+
+def test_tables_hold_pairs_means_and_differences(bench):
+    pairs, _, versus, *details = pairs_tables(bench.go(), reference="exact")
+    assert pairs.header == ("pair", "exact", "double")
+    assert pairs.rows == (
+        ("middlebury2014/a", "0.000", "1.000"),
+        ("middlebury2014/b", "0.000", "1.000"),
+        ("middlebury2014/c", "0.000", "-"),
+        ("mean of 3 pairs", "0.000", "-"),
+        ("mean of 2 rectified pairs", "0.000", "1.000"),
+        ("mean of 1 posed pair", "0.000", "-"),
+    )
+    assert versus.rows == (("double", "2", "-1.000", "2 of 2"),)
+    assert "| middlebury2014/a | 0.000 | 1.000 |" in pairs.markdown()
+    assert r"middlebury2014/a & 0.000 & 1.000 \\" in pairs.latex()
+    groups = ("3 pairs", "2 rectified pairs", "1 posed pair")
+    assert [table.title for table in details] == [
+        *(f"All metrics, {group}" for group in groups),
+        *("AbsRel by region and material", "Disparity, rectified pairs"),
+        *("Disparity by region, rectified pairs", "Boundaries, dense truth"),
+    ]
+    assert [row[0] for row in details[0].rows] == ["exact", "exact, aligned", "double", "double, aligned"]
+
+
+def test_priors_and_seeds_make_rows_whose_results_are_those_of_the_settings(bench):
+    names = with_seeds(with_priors(["noisy", "exact"], ["org/x"]), 0, 2)
+    assert names == ("noisy", "exact", "noisy@org/x", "noisy#1", "noisy@org/x#1")
+    records = bench.go(names)
+    assert [r["method"] for r in records[:5]] == list(names) and len(bench.calls) == 15
+    for method, settings in (
+        ("noisy#1", Settings(seed=1)),
+        ("noisy@org/x", Settings("org/x")),
+        ("noisy@org/x#1", Settings("org/x", seed=1)),
+    ):
+        again = bench.go(["noisy"], settings)
+        assert bench.calls == [] and {r["method"] for r in again} == {"noisy"}
+        assert [r["key"] for r in again] == [r["key"] for r in records if r["method"] == method]
+    table = pairs_tables(records, reference="exact")[0]
+    assert table.header == ("pair", "noisy", "exact", "noisy (x)")
+    alone = pairs_tables(bench.go(["noisy#2", "exact"]), reference="exact")
+    assert alone[0].header == ("pair", "noisy, seed 2", "exact")
+    assert not any(table.title.startswith("Spread") for table in alone)
+
+
+def test_further_seeds_have_one_table_and_no_part_in_others(bench):
+    records = bench.go(with_seeds(["noisy", "exact"], 0, 3))
+    *others, spread = pairs_tables(records, reference="exact")
+    assert others == pairs_tables(without_copies(records), reference="exact")
+    assert spread.title == "Spread over 3 seeds"
+    assert spread.rows == (
+        ("noisy", "3 pairs", "0.2333", "0.2333", "0.0000", "0.4667", "0.8000", "middlebury2014/c"),
+        ("noisy", "2 rectified pairs", "0.1500", "0.1500", "0.0000", "0.3000", "0.4000", "middlebury2014/b"),
+        ("noisy", "1 posed pair", "0.4000", "0.4000", "0.0000", "0.8000", "0.8000", "middlebury2014/c"),
+    )
+    torn = [r for r in records if (r["method"], r["sample"]) != ("noisy#2", "c")]
+    rows = spread_table(torn).rows  # a mean over seeds needs every pair of each
+    assert rows[0][2:] == ("-", "-", "-", "-", "0.4000", "middlebury2014/b")
+    assert [row[1] for row in rows] == ["3 pairs", "2 rectified pairs"]
+
+
+def test_names_bind_a_prior_and_a_seed_once(bench):
+    bound = find_method("noisy@org/x#3")
+    assert (bound.prior, bound.seed, bound.base_name, bound.title) == (
+        "org/x",
+        3,
+        "noisy",
+        "noisy (x), seed 3",
+    )
+    assert with_seeds(["noisy", "noisy#1"], 0, 2) == ("noisy", "noisy#1")
+    assert with_poses(("a", "guided"), ("given", "x")) == ("a", "guided:pose=given", "guided:pose=x")
+    assert with_poses(("guided",), ()) == ("guided",)
+    for wrong, said in (
+        ("exact#1", "METHOD#SEED with a method that uses a prior"),
+        ("noisy#1#2", "METHOD#SEED with a method that uses a prior"),
+        ("noisy#1@org/x", "METHOD@PRIOR with a method that uses a prior"),
+        ("double@org/x", "METHOD@PRIOR with a method that uses a prior"),
+        ("noisy#", "methods must be one of"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            find_method(wrong)
+    with pytest.raises(ValueError, match="seeds must be at least 1"):
+        with_seeds(["noisy"], 0, 0)
+
+
+def test_key_depends_on_everything_but_where_the_files_lie(tmp_path, monkeypatch):
+    def key(folder="here", method="guided", configuration=None, prior="bundled 12", **files):
+        files = {"group": Path(f"/{folder}/scan"), "left": 0, "right": None, **files}
+        return cell_key(SampleRef("mvsnet", "scan", files), method, configuration or {"seed": 0}, prior)
+
+    assert key() == key("there")
+    for name, text in (("a", "1.0"), ("b", "2.0"), ("c", "1.0")):
+        (tmp_path / name).write_text(text)
+    depths = [key(depth=tmp_path / name) for name in "abc"]
+    assert depths[0] == depths[2]
+    others = [key(right=2), key(method="paper"), key(configuration={"seed": 1}), key(prior="bundled 13")]
+    keys = {key("there"), *others, *depths}
+    monkeypatch.setattr(experiment, "__version__", "0.2.0")
+    assert len({*keys, key()}) == len(others) + 4
+
+
+def test_intervals_cover_the_mean_and_need_five():
+    assert mean_with_interval([1, 2, 3, 4]).low is None
+    mean = mean_with_interval([1, 2, 3, 4, 5])
+    assert mean.low < mean.value == 3 < mean.high and mean == mean_with_interval([1, 2, 3, 4, 5])
+    assert mean.cell(1, "+") == f"+3.0 [{mean.low:+.1f}, {mean.high:+.1f}]"
+    assert mean_with_interval([]).cell() == "-" and mean_with_interval([-0.5, 0.5]).cell(2) == "0.00"
+    values = np.random.default_rng(3).normal(size=400)
+    wide = mean_with_interval(values)
+    assert wide.high - wide.low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)  # normal theory
+    difference = paired_difference({"a": 1.0, "b": 3.0}, {"b": 1.0, "c": 9.0})
+    assert (difference.value, difference.count) == (2, 1)
+
+
+@pytest.mark.parametrize("wrong", [{"ensemble": 0}, {"dtype": "int8"}, {"steps": 0}, {"views": 1}])
+def test_settings_are_checked(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be"):
+        Settings(**wrong)
