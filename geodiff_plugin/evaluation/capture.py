@@ -34,8 +34,10 @@ ROWS = {
 RIGHT_M, CELL_M = 0.05, 0.02
 #: A point that the next frame sees this much nearer or further is hidden there.
 HIDDEN_SHARE = 0.3
-HEADER = ("poses", "views", "AbsRel", "worst", "scaled", "scale", "within 3 %", "within 25 %", "agreed")
-HEADER += ("F 5 cm", "TAE %")
+HEADER = (
+    *("poses", "views", "AbsRel", "worst", "scaled", "scale"),
+    *("within 3 %", "within 25 %", "agreed", "F 5 cm", "TAE %"),
+)
 NOTE = (
     "AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its median. "
     "Scale: median of depth over truth. Agreed: AbsRel after the frames of the table were checked against "
@@ -117,9 +119,8 @@ def _measure(
     capture: Capture, pipe: Any, row: str, count: int, names: Sequence[str], options: CaptureEvalOptions
 ) -> Record:
     """Depth of every frame by one row and number of neighbours, and its scores."""
-    solved, call = capture.solve(ROWS[row][1]), {}
-    if options.steps is not None:
-        call = {"num_inference_steps": options.steps}
+    solved = capture.solve(ROWS[row][1])
+    call: dict[str, Any] = {} if options.steps is None else {"num_inference_steps": options.steps}
     frames, true_frames, known = [], [], []
     for name in names:
         with torch.no_grad():
@@ -132,7 +133,7 @@ def _measure(
         true_frames.append(DepthFrame(name, truth, np.ones_like(depth), solved.K[i], solved.E[i]))
         known.append(valid)
     together = [agreed(frame, [other for other in frames if other is not frame]) for frame in frames]
-    both = [_thin(kind, known) for kind in (together, true_frames)]
+    f = f_score(_thin(together, known), _thin(true_frames, known))[2]
     scores = [
         _scores(frame.depth, true.depth, mask)
         for frame, true, mask in zip(frames, true_frames, known, strict=True)
@@ -141,7 +142,7 @@ def _measure(
         _scores(frame.depth, true.depth, mask)["abs_rel"]
         for frame, true, mask in zip(together, true_frames, known, strict=True)
     ]
-    more = {"agreed": float(np.mean(off)), "f": f_score(*both)[2], "tae": temporal_error(together)}
+    more = {"agreed": float(np.mean(off)), "f": f, "tae": temporal_error(together)}
     return _means(scores) | more
 
 
