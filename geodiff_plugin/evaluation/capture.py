@@ -17,7 +17,7 @@ from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.experiment import Experiment, Page
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.options import CaptureEvalOptions, command_line
+from geodiff_plugin.evaluation.options import CaptureEvalOptions
 from geodiff_plugin.evaluation.tables import Table
 from geodiff_plugin.formats.depth import read_depth_mm_png
 from geodiff_plugin.runner import Item, Record, fingerprint
@@ -106,7 +106,7 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
     cells.append(Item(fingerprint("points", *how), work, name="sparse points", head=head))
     title = f"{options.data.name}, {len(names)} frames"
     experiment = Experiment(name, "Captures", cells, lambda records: [_table(title, records)])
-    return experiment.run(options, command_line(name, options))
+    return experiment.run(name, options)
 
 
 def _truth(capture: Capture, name: str) -> tuple[np.ndarray, np.ndarray]:

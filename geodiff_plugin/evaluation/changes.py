@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.config import DEFAULT, value_of
 from geodiff_plugin.evaluation.experiment import Page
-from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
+from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
 from geodiff_plugin.evaluation.pairs import pairs_experiment
 from geodiff_plugin.evaluation.tables import (
     Table,
@@ -149,4 +149,4 @@ def run_changes(name: str, options: PairsOptions) -> Page | None:
 
     title = "Flatness" if flat else "Parts of the default"
     experiment = pairs_experiment(name, title, refs, (*rows, *options.methods), options, tables)
-    return experiment.run(options, command_line(name, options))
+    return experiment.run(name, options)

@@ -12,7 +12,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import find_method, with_priors
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.experiment import Page, measure_cells, run_facts
-from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
+from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
 from geodiff_plugin.evaluation.pairs import pair_cells, remarks_on
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs, label_of
 from geodiff_plugin.priors import PRIORS, find_prior
@@ -95,5 +95,5 @@ def run_cost(name: str, options: PairsOptions) -> Page:
             records += job.result()
     steps = [f"{count or 'its own number'} with {prior}" for prior, count in taken.items()]
     remarks = (*remarks_on(records, options), f"Denoising steps of each: {', '.join(steps)}.")
-    page = Page("Cost", run_facts(command_line(name, options)), (cost_table(records),), remarks)
+    page = Page("Cost", run_facts(name, options), (cost_table(records),), remarks)
     return page.write(options.out, name, options.results)

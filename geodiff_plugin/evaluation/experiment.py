@@ -28,6 +28,7 @@ from geodiff_plugin.evaluation.baselines import Method, NotApplicable, PriorCach
 from geodiff_plugin.evaluation.baselines.outside import map_name
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, load
 from geodiff_plugin.evaluation.metrics import crop_mask
+from geodiff_plugin.evaluation.options import command_line
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.evaluation.tables import Table, headline
 from geodiff_plugin.formats import atomic_path, write_depth_npy
@@ -39,8 +40,8 @@ RECORDS_NAME = "samples.jsonl"
 """Journal of methods on samples, which several commands share."""
 
 
-def run_facts(command: str) -> dict[str, Any]:
-    """Command, date, versions and machine of a run."""
+def run_facts(command: str, options: Any) -> dict[str, Any]:
+    """Command line, date, versions and machine of a run."""
     used = versions()
     try:
         used["opencv"] = version("opencv-python-headless")
@@ -49,7 +50,12 @@ def run_facts(command: str) -> dict[str, Any]:
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads"
     if torch.cuda.is_available():
         machine += f", {torch.cuda.get_device_name()}"
-    return {"command": command, "date": date.today().isoformat(), "versions": used, "machine": machine}
+    return {
+        "command": command_line(command, options),
+        "date": date.today().isoformat(),
+        "versions": used,
+        "machine": machine,
+    }
 
 
 def write_text(path: Path, text: str) -> None:
@@ -122,12 +128,12 @@ class Experiment:
     purpose: str = ""
     journal: str = ""
 
-    def run(self, options: Any, command: str) -> Page | None:
+    def run(self, command: str, options: Any) -> Page | None:
         """Measure the cells that have no record yet, and write the page.
 
         Args:
-            options: with ``out``, ``results`` and ``quiet``, and where the command has it ``skip_broken``.
-            command: that repeats the run.
+            command: of ``geodiff eval``.
+            options: its dataclass, with ``out``, ``results`` and ``quiet``, maybe ``skip_broken``.
 
         Returns:
             The page; ``None`` in every process but the first.
@@ -140,7 +146,9 @@ class Experiment:
         if records is None:
             return None
         tables = tuple(table for table in self.tables(records) if table.rows)
-        page = Page(self.title, run_facts(command), tables, tuple(self.remarks(records)), self.purpose)
+        page = Page(
+            self.title, run_facts(command, options), tables, tuple(self.remarks(records)), self.purpose
+        )
         return page.write(options.out, self.name, options.results)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_priors, with_seeds
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.experiment import RECORDS_NAME, Experiment, Page, method_cells
-from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
+from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs, label_of, pairs_tables, without_copies
 from geodiff_plugin.runner import Item, Record, this_process
 
@@ -83,4 +83,4 @@ def run_pairs(name: str, options: PairsOptions) -> Page | None:
     experiment = pairs_experiment(
         "table", "Results pair by pair", refs, options.methods, options, pairs_tables, more, purpose
     )
-    return experiment.run(options, command_line(name, options))
+    return experiment.run(name, options)

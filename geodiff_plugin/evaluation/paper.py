@@ -14,7 +14,7 @@ from geodiff_plugin.evaluation.baselines import find_method, with_priors
 from geodiff_plugin.evaluation.changes import CHANGES, changes_table
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef
 from geodiff_plugin.evaluation.experiment import Page
-from geodiff_plugin.evaluation.options import PairsOptions, all_refs, command_line, select
+from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
 from geodiff_plugin.evaluation.pairs import pairs_experiment
 from geodiff_plugin.evaluation.tables import (
     HEADINGS,
@@ -327,4 +327,4 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
         return [*shown, regions_table(records)]
 
     experiment = pairs_experiment(name, layout.title, refs, names, options, tables, more)
-    return experiment.run(options, command_line(name, options))
+    return experiment.run(name, options)

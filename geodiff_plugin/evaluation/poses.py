@@ -11,7 +11,7 @@ from geodiff_plugin.evaluation.baselines import with_poses
 from geodiff_plugin.evaluation.datasets import SampleRef, load
 from geodiff_plugin.evaluation.datasets.changed import changed_ref, drift_of, perturbation
 from geodiff_plugin.evaluation.experiment import RECORDS_NAME, Experiment, Page, method_cells
-from geodiff_plugin.evaluation.options import POSES, PosesOptions, command_line, real_and_rendered
+from geodiff_plugin.evaluation.options import POSES, PosesOptions, real_and_rendered
 from geodiff_plugin.evaluation.tables import (
     Table,
     cell,
@@ -169,4 +169,4 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
         ],
         "How accurate depth is if poses are exact, perturbed, refined or withheld.",
         RECORDS_NAME,
-    ).run(options, command_line(name, options))
+    ).run(name, options)

@@ -15,7 +15,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.experiment import Experiment, Page, last_of
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.options import SequenceOptions, command_line
+from geodiff_plugin.evaluation.options import SequenceOptions
 from geodiff_plugin.evaluation.tables import Table
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -109,7 +109,7 @@ def run_sequence(name: str, options: SequenceOptions) -> Page | None:
         f"pixels, prior {settings.prior}, {options.steps} steps, seed {options.seed} for every frame."
     )
     experiment = Experiment(name, "Sequences", cells, lambda own: [sequence_table(own)], lambda _: [remark])
-    return experiment.run(options, command_line(name, options))
+    return experiment.run(name, options)
 
 
 def _measure(

@@ -31,7 +31,7 @@ from geodiff_plugin.evaluation.edges import edge_error, surface_error
 from geodiff_plugin.evaluation.experiment import Experiment, Page, cell_key, last_of
 from geodiff_plugin.evaluation.figures.curves import draw_strength, shaded
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth, to_space
-from geodiff_plugin.evaluation.options import StrengthOptions, command_line, data_of
+from geodiff_plugin.evaluation.options import StrengthOptions, data_of
 from geodiff_plugin.evaluation.scoring import DENSE
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs
 from geodiff_plugin.priors import find_adapter
@@ -294,7 +294,7 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
         lambda records: strength_tables(_dense(records)),
         remarks,
         PURPOSE,
-    ).run(options, command_line(name, options))
+    ).run(name, options)
 
 
 class _Bench:

@@ -21,7 +21,7 @@ from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, guided_configuration
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
 from geodiff_plugin.evaluation.experiment import Experiment, Page, cell_key, last_of
-from geodiff_plugin.evaluation.options import TrustOptions, command_line, real_and_rendered
+from geodiff_plugin.evaluation.options import TrustOptions, real_and_rendered
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runner import Item, Record
@@ -245,4 +245,4 @@ def run_trust(name: str, options: TrustOptions) -> Page | None:
         there = dict.fromkeys(record["group"] for record in judged)
         return [_table(group, [r for r in judged if r["group"] == group], kinds) for group in there]
 
-    return Experiment(name, "Trust", cells, tables, purpose=PURPOSE).run(options, command_line(name, options))
+    return Experiment(name, "Trust", cells, tables, purpose=PURPOSE).run(name, options)

@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin.evaluation.baselines import Prediction
-from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, find_pairs, load, load_pairs
+from geodiff_plugin.evaluation.datasets import DATASETS, StereoSample, find_pairs, load, load_pairs
 from geodiff_plugin.evaluation.datasets.changed import changed_ref
 from geodiff_plugin.evaluation.datasets.posed import KEY_VIEWS, find_mvsnet, find_robustmvd
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
@@ -23,7 +23,6 @@ from geodiff_plugin.evaluation.experiment import cell_key
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
 from tests.contracts import factory_calibrations as factory
-from tests.scenes.dataset import is_reflective
 
 HEIGHT, WIDTH, F, CX, CY, BASELINE = 40, 64, 50.0, 31.0, 19.5, 0.2
 FAR_HOLE = (slice(0, 5), slice(0, 7))
@@ -503,24 +502,6 @@ def test_root_must_be_a_folder(tmp_path):
         find_pairs(tmp_path, ["kitty"])
 
 
-def test_synthetic_pairs_are_seeded_and_alternate(tmp_path):
-    with pytest.raises(ValueError, match="sides of at least 1 pixel"):
-        find_pairs("synthetic:1@0x96")
-    refs = find_pairs(Path("synthetic:3+4"))
-    assert [ref.files["seed"] for ref in refs] == [4, 5, 6]
-    assert refs[0].files["size"] == (384, 512)
-    assert find_pairs(Path("synthetic:1+4@64x48"))[0].files == refs[0].files | {"size": (48, 64)}
-    assert find_pairs(tmp_path, ["synthetic"]) == []
-    small = [SampleRef(ref.dataset, ref.name, ref.files | {"size": (48, 64)}) for ref in refs[:2]]
-    rectified, posed = (load(ref) for ref in small)
-    assert rectified.rectified and not posed.rectified
-    for sample in (rectified, posed):
-        assert sample.left.dtype == np.uint8 and sample.left.shape == (48, 64, 3)
-        assert sample.valid.any() and (sample.depth_m[sample.valid] > 0).all()
-        assert sample.occluded.shape == sample.material.shape == (48, 64)
-    np.testing.assert_array_equal(load(small[0]).left, rectified.left)
-
-
 REAL = Path(os.environ.get("GEODIFF_TEST_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
 
@@ -542,24 +523,6 @@ def photometric_error(sample, factor):
     warped = warp_right_to_left(right, depth_m, *cameras)
     seen = warped.visible & torch.from_numpy(sample.valid)
     return ((warped.image - left).abs().mean(1, keepdim=True) * seen).sum() / seen.sum()
-
-
-def test_reflective_pairs_show_mirrors_or_glass():
-    refs = find_pairs(Path("synthetic-reflective:3+10@64x48"))
-    assert [ref.files["seed"] for ref in refs] == sorted(ref.files["seed"] for ref in refs)
-    for ref in refs:
-        material = load(ref).material
-        assert np.isin(material, (2, 3)).mean() > 0.005
-    skipped = set(range(10, refs[-1].files["seed"])) - {ref.files["seed"] for ref in refs}
-    assert skipped and not any(is_reflective(seed) for seed in skipped)
-
-
-@pytest.mark.parametrize("seed", [0, 1], ids=["rectified", "posed"])
-def test_rendered_truth_warps_right_to_left(seed):
-    (ref,) = find_pairs(Path(f"synthetic:1+{seed}"))
-    sample = load(SampleRef(ref.dataset, ref.name, ref.files | {"size": (96, 128)}))
-    true, nearer, farther = (photometric_error(sample, factor) for factor in (1.0, 0.8, 1.2))
-    assert true < nearer and true < farther
 
 
 @pytest.mark.slow

@@ -43,16 +43,9 @@ class NotApplicable(Exception):
 class Settings:
     """What the user chose for a run, the same for every method.
 
-    Attributes:
-        prior: ``"bundled"``, a hub id or a folder.
-        ensemble: ensemble members, at least 1.
-        seed: of the initial noise.
-        steps: denoising steps; ``None`` for the pipeline's default.
-        resolution: longer side that the prior works at, pixels; ``None`` for the pipeline's default.
-        device: torch device.
-        dtype: of U-Net and VAE: ``"float32"``, ``"bfloat16"`` or ``"float16"``.
-        space: what the prior's output is affine in, for a prior that does not say; ``None`` otherwise.
-        views: how many views a method takes of a sample that has more than two, at least 2.
+    ``prior`` is ``"bundled"``, a hub id or a folder; ``steps`` and ``resolution`` (the longer side that it
+    works at, pixels) are the pipeline's own where they are ``None``; ``space`` is for a prior that does not
+    say what its output is affine in; ``views`` is how many views of a sample a method takes, at least 2.
     """
 
     prior: str = "bundled"
@@ -119,12 +112,7 @@ class PriorCache:
         self._fingerprints: dict[tuple[str | None, ...], str] = {}
 
     def get(self, settings: Settings) -> Any:
-        """The pipeline of ``settings.prior`` with geometry guidance enabled.
-
-        Raises:
-            ValueError: it does not exist, or is neither cached nor can be fetched.
-            TypeError: it loads, but has no adapter.
-        """
+        """The pipeline of ``settings.prior`` with geometry guidance enabled; errors as ``load_prior``."""
         key = settings.which_prior
         if key not in self._pipes:
             options: dict[str, Any] = {"device": settings.device, "dtype": settings.weights_dtype}

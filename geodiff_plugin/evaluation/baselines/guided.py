@@ -72,14 +72,7 @@ def _notes(out: Any) -> dict[str, Any]:
 def guided_prediction(
     pipe: Any, sample: StereoSample, guidance: GeometryGuidance, arguments: dict[str, Any]
 ) -> Prediction:
-    """The answer of one guided call.
-
-    Args:
-        pipe: a pipeline with guidance enabled.
-        sample: its left image is asked for.
-        guidance: made for it.
-        arguments: of the call, as ``call_arguments`` gives them.
-    """
+    """The answer of one guided call of a pipeline with guidance enabled; arguments as ``call_arguments``."""
     spread = arguments.get("ensemble_size", 1) > 1
     out = pipe(Image.fromarray(sample.left), guidance=guidance, output_uncertainty=spread, **arguments)
     uncertainty, confidence = (None if m is None else m[0, ..., 0] for m in (out.uncertainty, out.confidence))

@@ -12,7 +12,7 @@ from geodiff_plugin.evaluation.figures.canvas import Drawing, save_png
 from geodiff_plugin.evaluation.figures.curves import draw_exposure, draw_gs_sweep, draw_inner_steps
 from geodiff_plugin.evaluation.figures.maps import draw_ablation, draw_qualitative
 from geodiff_plugin.evaluation.figures.one_pair import draw_epipolar, draw_terms
-from geodiff_plugin.evaluation.options import FigureOptions, command_line
+from geodiff_plugin.evaluation.options import FigureOptions
 
 FIGURES: dict[str, Callable[[FigureOptions], Drawing]] = {
     "gs-sweep": draw_gs_sweep,
@@ -36,6 +36,6 @@ def run_figure(name: str, options: FigureOptions) -> Path:
     figure, numbers = FIGURES[check_choice(options.name, "the figure", FIGURES)](options)
     path = options.out / f"figure-{options.name}.png"
     save_png(figure, path)
-    facts = run_facts(command_line(name, options))
+    facts = run_facts(name, options)
     write_text(path.with_suffix(".json"), json.dumps(facts | numbers, indent=1) + "\n")
     return path
