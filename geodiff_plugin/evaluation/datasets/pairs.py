@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -325,66 +326,37 @@ def _load_folder(ref: SampleRef) -> StereoSample:
     return make_sample(ref, images, rig, depth_m, {"truth": truth})
 
 
+#: How to get each set.
+_OBTAIN = {
+    "kitti2015": "data_scene_flow.zip and data_scene_flow_calib.zip from "
+    "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (CC BY-NC-SA 3.0), unpacked into one folder.",
+    "kitti2012": "data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php "
+    "(CC BY-NC-SA 3.0), unpacked into one folder.",
+    "middlebury2014": "scene folders from https://vision.middlebury.edu/stereo/data/scenes2014/ (free with "
+    "citation).",
+    "middeval3": "MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from "
+    "https://vision.middlebury.edu/stereo/submit3/, unpacked into one folder.",
+    "eth3d": "two_view_training.7z and two_view_training_gt.7z from https://www.eth3d.net/datasets "
+    "(CC BY-NC-SA 4.0), unpacked into two_view_training and two_view_training_gt.",
+    "booster": "booster_gt.zip from https://cvlab-unibo.github.io/booster-web/ (non-commercial research), "
+    "unpacked: train/balanced/<scene>.",
+    "folder": "your own: <pair>/left.png, right.png, calib.* (any known format) and depth.npy, .pfm (metres) "
+    "or .png (mm).",
+}
+
+
+def _kitti(name: str, count: int) -> Dataset:
+    find = partial(_find_kitti, name=name)
+    return Dataset(name, find, _load_kitti, KITTI_CAP_M, _OBTAIN[name], full_count=count)
+
+
+def _scenes(name: str, count: int | None) -> Dataset:
+    return Dataset(name, partial(_find_scenes, name=name), _load_scene, None, _OBTAIN[name], full_count=count)
+
+
 PAIRS = (
-    Dataset(
-        "kitti2015",
-        lambda root: _find_kitti(root, "kitti2015"),
-        _load_kitti,
-        KITTI_CAP_M,
-        "data_scene_flow.zip and data_scene_flow_calib.zip from "
-        "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (CC BY-NC-SA 3.0), "
-        "unpacked into one folder.",
-        full_count=200,
-    ),
-    Dataset(
-        "kitti2012",
-        lambda root: _find_kitti(root, "kitti2012"),
-        _load_kitti,
-        KITTI_CAP_M,
-        "data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php "
-        "(CC BY-NC-SA 3.0), unpacked into one folder.",
-        full_count=194,
-    ),
-    Dataset(
-        "middlebury2014",
-        lambda root: _find_scenes(root, "middlebury2014"),
-        _load_scene,
-        None,
-        "scene folders from https://vision.middlebury.edu/stereo/data/scenes2014/ (free with citation).",
-    ),
-    Dataset(
-        "middeval3",
-        lambda root: _find_scenes(root, "middeval3"),
-        _load_scene,
-        None,
-        "MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from "
-        "https://vision.middlebury.edu/stereo/submit3/, unpacked into one folder.",
-        full_count=15,
-    ),
-    Dataset(
-        "eth3d",
-        lambda root: _find_scenes(root, "eth3d"),
-        _load_scene,
-        None,
-        "two_view_training.7z and two_view_training_gt.7z from https://www.eth3d.net/datasets "
-        "(CC BY-NC-SA 4.0), unpacked into two_view_training and two_view_training_gt.",
-        full_count=27,
-    ),
-    Dataset(
-        "booster",
-        _find_booster,
-        _load_booster,
-        10.0,
-        "booster_gt.zip from https://cvlab-unibo.github.io/booster-web/ (non-commercial research), "
-        "unpacked: train/balanced/<scene>.",
-        full_count=228,
-    ),
-    Dataset(
-        "folder",
-        _find_folders,
-        _load_folder,
-        None,
-        "your own: <pair>/left.png, right.png, calib.* (any known format) and "
-        "depth.npy, .pfm (metres) or .png (mm).",
-    ),
+    *(_kitti("kitti2015", 200), _kitti("kitti2012", 194)),
+    *(_scenes("middlebury2014", None), _scenes("middeval3", 15), _scenes("eth3d", 27)),
+    Dataset("booster", _find_booster, _load_booster, 10.0, _OBTAIN["booster"], full_count=228),
+    Dataset("folder", _find_folders, _load_folder, None, _OBTAIN["folder"]),
 )
