@@ -208,9 +208,10 @@ class GuidanceConfig:
         match_noise: relative error of a perfect match: below it one match is as good as another.
         outlier_width: a match that differs from those of a wide region by more than this many standard
             deviations, of its noise and of the prior's error, counts for less.
-        rule: how a gradient moves the latent, scale and shift: `plain`; `adam`; `norm` scales it to a share
-            of the predicted noise; `adam-norm` scales it to the noise's norm before an Adam with the usual
-            decays (Marigold-DC).
+        rule: how a gradient moves the latent, scale and shift: `plain`; `summed` is plain, and the latent
+            follows the sum of the loss over its pixels; `adam`; `norm` scales the gradient to a share of the
+            predicted noise; `adam-norm` scales it to the noise's norm before an Adam with the usual decays
+            (Marigold-DC).
         step_latents: step size of `rule` on the latent.
         step_affine: step size of `rule` on raw s_hat, t_hat.
         inner_steps: updates in each denoising step that makes any; with 0 only the search and the correction
@@ -383,7 +384,7 @@ DEFAULT = GuidanceConfig()
 #: Algorithm 1 with its printed numbers; docs/reference/paper-map.md settles what the paper leaves open.
 PAPER = DEFAULT.changed(
     gradient="full",
-    rule="plain",
+    rule="summed",
     step_latents=1e-2,
     step_affine=1e-2,
     inner_steps=1,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.correction import correction_target, local_error, prior_error, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence, chunk_views, within
-from geodiff_plugin.algorithm.gradients import RULES, FiniteWatch
+from geodiff_plugin.algorithm.gradients import RULES, SUMMED, FiniteWatch
 from geodiff_plugin.algorithm.settling import search_one_number, settle_ends, span_of_points
 from geodiff_plugin.algorithm.terms import Loss, Objective
 from geodiff_plugin.config import GuidanceConfig
@@ -75,7 +76,8 @@ class Trajectory:
         self.objective = Objective(chunk_views(samples), self.metric, config)
         self.matches = Matches.stack([e.matches for e in samples])
         self.points = Matches.stack([e.points for e in samples])
-        self.latent_rule = RULES[config.rule](step_latents)
+        pixels = math.prod(self.objective.views.size) if config.rule == SUMMED else 1
+        self.latent_rule = RULES[config.rule](step_latents * pixels)
         self.scale_rule, self.shift_rule = (RULES[config.rule](config.step_affine) for _ in range(2))
         # Of a disparity, x = 1 is the nearest end.
         self._prior_range = None if prior_range is None else tuple(torch.stack(prior_range).sort(0).values)

@@ -44,7 +44,7 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         # One number that is searched within a thousandth of 1 is 1.
         ("g_s = 1", "paper:g_s_range=[0.999,1.001]"),
         ("gradient to the clean latent (denoised)", "paper:gradient=denoised"),
-        *((f"rule {name}", f"paper:rule={name}") for name in RULES if name != "plain"),
+        *((f"rule {name}", f"paper:rule={name}") for name in RULES if name != "summed"),
     ),
     "parts": (
         ("as it is", "guided"),

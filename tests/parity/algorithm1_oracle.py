@@ -1,7 +1,7 @@
 """Algorithm 1 of the paper, written once more from its equations, to hold the ``paper`` preset against.
 
 Nothing of ``geodiff_plugin`` is imported: warp, SSIM, noise arithmetic and autograd are torch's own. Choices
-that the paper leaves open are those of docs/reference/paper-map.md (E1 to E10), restated here.
+that the paper leaves open are those of docs/reference/paper-map.md (E1 to E19), restated here.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ def algorithm_1(pipe, image_latent, text, z, steps, left, right, K, T, rate, rat
             g_s = 1 + min(range(80), key=lambda k: costs[k][0].item() if costs[k][1] else float("inf"))
         loss = photometric(left, right, g_s * relative, K, T)[0] + GAMMA * (s_hat**2 + t_hat**2)  # Eq. 16, 17
         to_z, to_s, to_t = torch.autograd.grad(loss, (z, s_hat, t_hat))
+        to_z = to_z * left[0].numel()  # E4: for latents Eq. 14 is a sum over pixels
         s_hat, t_hat = s_hat - rate_affine * to_s, t_hat - rate_affine * to_t
         z = before.sqrt() * z0 + (1 - before).sqrt() * eps - rate * to_z  # E12
         found.append((F.softplus(s_hat).item(), F.softplus(t_hat).item(), g_s, z.detach()))

@@ -342,7 +342,7 @@ def test_the_numbers_of_published_presets():
     assert (config.gradient, config.rule, config.min_steps) == ("full", "adam-norm", 50)
     assert (config.step_latents, config.step_affine, config.inner_steps) == (0.05, 0.005, 1)
     assert (config.positive, config.points_loss, config.weights) == ("square", "l1l2", {"points": 1.0})
-    assert (PAPER.gradient, PAPER.rule, PAPER.inner_steps) == ("full", "plain", 1)
+    assert (PAPER.gradient, PAPER.rule, PAPER.inner_steps) == ("full", "summed", 1)
     assert PAPER.step_latents == PAPER.step_affine == 1e-2
     assert (PAPER.weights, PAPER.eta) == ({"photometric": 1.0, "prior_pull": 1e-2}, 0.85)
     assert (PAPER.pull_to, PAPER.search, PAPER.g_s_range) == ("zero", "one-number", (1.0, 80.0))
