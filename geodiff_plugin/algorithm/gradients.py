@@ -57,8 +57,8 @@ class FiniteWatch:
         bad_value(f"{name} of denoising step {step + 1}", f"finite in {short}", "NaN or infinity in it", cure)
 
 
-#: The plain rule, but the latent follows the sum of the photometric error over the pixels of the loss, in which
-#: Eq. 14 is a norm. Of the mean the printed step of 1e-2 moves a latent by less than a thousandth.
+#: The plain rule, but the latent follows the sum of the loss over its pixels, since Eq. 14 is a norm. Along
+#: the mean the printed step of 1e-2 moves a latent by less than a thousandth.
 SUMMED = "summed"
 
 
