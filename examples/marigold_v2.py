@@ -21,8 +21,8 @@ from PIL import Image, ImageOps
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
+from geodiff_plugin.priors.components import FixedPrompt
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
-from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
 
 #: A transformer and an autoencoder of Qwen-Image's classes, some 280 000 weights together.
 TINY_TRANSFORMER = {

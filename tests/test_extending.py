@@ -22,8 +22,8 @@ from geodiff_plugin.evaluation.metrics import align
 from geodiff_plugin.formats import CALIBRATION_FORMATS, read_calibration
 from geodiff_plugin.matching import points_to_matches
 from geodiff_plugin.priors import PRIORS
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+from geodiff_plugin.priors.components import DirectScheduler
+from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.scale.points import fit_to_points
 from geodiff_plugin.scale.space import SPACES, MetricMap
 from tests.conftest import make_vae

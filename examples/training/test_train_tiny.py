@@ -16,7 +16,7 @@ from examples.training.train_tiny import (
 )
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
 from geodiff_plugin.bundled.loading import open_pipeline
-from geodiff_plugin.priors.folders import BUNDLED_FOLDER
+from geodiff_plugin.priors.loading import BUNDLED_FOLDER
 
 
 @pytest.fixture(scope="module")

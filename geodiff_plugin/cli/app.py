@@ -266,14 +266,11 @@ def convert(
             help="marigold-v2: space of its map, if the name of CHECKPOINT's folder does not say it."
         ),
     ] = None,
-    lora: Annotated[
-        str | None, typer.Option(help="marigold-v2: merged (default), apart (peft), or 4bit (CUDA).")
-    ] = None,
 ) -> None:
     """Convert pickled or split weights to a folder for --prior; no code in a pickle is run."""
     from geodiff_plugin.cli.convert import run_convert
 
-    run_convert(paths, part, space, lora)
+    run_convert(paths, part, space)
 
 
 app.add_typer(eval_app, name="eval")

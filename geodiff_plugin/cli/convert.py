@@ -16,14 +16,15 @@ from geodiff_plugin.cli.converters.reading import read_checkpoint, save_weights
 
 __all__ = ["run_convert"]
 
+#: Kind -> module with ``recognises(checkpoint)`` and ``write(checkpoint, folder, part)``.
 CONVERTERS = {"depthfm": depthfm, "ppd": ppd}
 #: Keys of an unknown checkpoint that the error names.
 NAMED_KEYS = 8
+#: What is copied beside weights: configs, vocabularies, licences.
+COPIED = (".json", ".txt", ".md", ".model", ".safetensors")
 
 
-def run_convert(
-    paths: Sequence[Path], part: str | None, space: str | None = None, lora: str | None = None
-) -> None:
+def run_convert(paths: Sequence[Path], part: str | None, space: str | None = None) -> None:
     """Convert and say where it is.
 
     Args:
@@ -31,7 +32,6 @@ def run_convert(
             or ``marigold-v2``, base, checkpoint and the folder to appear.
         part: file, folder or hub id of what the checkpoint lacks (DepthFM's VAE), ``None`` for the usual one.
         space: of Marigold V2, where the checkpoint's folder does not tell.
-        lora: of Marigold V2, of ``unmerged_lora.LORAS``.
 
     Raises:
         ValueError: another number of paths; a target that exists or has no parent; a source that is no
@@ -41,8 +41,8 @@ def run_convert(
     if not layered and len(paths) != 2:
         expected = f"SRC DST, or {MARIGOLD_V2} BASE CHECKPOINT DST"
         bad_value("paths", expected, " ".join(map(str, paths)) or "none")
-    if not layered and (space or lora):
-        bad_value("--space and --lora", f"for {MARIGOLD_V2} alone", f"given for {paths[0]}")
+    if not layered and space:
+        bad_value("--space", f"for {MARIGOLD_V2} alone", f"given for {paths[0]}")
     source, target = paths[-2:]
     if os.path.lexists(target):
         bad_value("DST", "a folder that does not exist yet", target, "Name another, or remove it first.")
@@ -52,12 +52,14 @@ def run_convert(
         unfinished = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     except OSError as error:
         bad_value("DST", "a folder that can be made", f"{target} ({error.strerror})", "Name another.")
+    kind = MARIGOLD_V2 if layered else "folder"
     try:
         if layered:
-            convert_marigold_v2(paths[1], source, unfinished, part, space, lora or "merged")
-            kind = MARIGOLD_V2
+            convert_marigold_v2(paths[1], source, unfinished, part, space)
+        elif os.path.isdir(source):
+            _convert_folder(source, unfinished)
         else:
-            kind = _fill(source, unfinished, part)
+            kind = _convert_file(source, unfinished, part)
         unfinished.chmod(0o755)  # mkdtemp's is its owner's alone
         os.replace(unfinished, target)
     finally:
@@ -65,30 +67,18 @@ def run_convert(
     print(f"{source} ({kind}) -> {target}; use it with --prior {target}")
 
 
-def _fill(source: Path, folder: Path, part: str | None) -> str:
-    """Convert into an empty folder; what kind it was."""
-    if os.path.isdir(source):
-        _convert_folder(source, folder)
-        return "folder"
+def _convert_file(source: Path, folder: Path, part: str | None) -> str:
+    """Convert a checkpoint into an empty folder; what kind it was."""
     checkpoint = read_checkpoint(source)
     for kind, converter in CONVERTERS.items():
         if converter.recognises(checkpoint):
             converter.write(checkpoint, folder, part)
             return kind
     keys = list(map(str, checkpoint))
-    got = ", ".join(keys[:NAMED_KEYS]) + (
-        f" and {len(keys) - NAMED_KEYS} more" if len(keys) > NAMED_KEYS else ""
-    )
-    bad_value(
-        "SRC",
-        f"a checkpoint of a known kind ({', '.join(CONVERTERS)})",
-        f"{source} with the keys {got or 'of an empty mapping'}",
-        "docs/reference/priors.md tells which prior comes from where.",
-    )
-
-
-#: What is copied beside weights: configs, vocabularies, licences.
-COPIED = (".json", ".txt", ".md", ".model", ".safetensors")
+    more = f" and {len(keys) - NAMED_KEYS} more" if len(keys) > NAMED_KEYS else ""
+    got = f"{source} with the keys {', '.join(keys[:NAMED_KEYS]) or 'of an empty mapping'}{more}"
+    cure = "docs/reference/priors.md tells which prior comes from where."
+    bad_value("SRC", f"a checkpoint of a known kind ({', '.join(CONVERTERS)})", got, cure)
 
 
 def _safe_name(name: str) -> str:
@@ -98,32 +88,24 @@ def _safe_name(name: str) -> str:
 
 
 def _convert_folder(source: Path, folder: Path) -> None:
-    """Write the same folder with safetensors in place of pickled ``.bin`` files.
-
-    Args:
-        source: of one component or several.
-        folder: an empty one to fill.
+    """Write the same folder, of one component or several, with safetensors in place of ``.bin`` files.
 
     Raises:
         ValueError: no .bin file in it, or one that cannot be read.
     """
     if not any(source.rglob("*.bin")):
-        cure = "One with .safetensors needs no conversion: give it to --prior."
-        bad_value(
-            "SRC", "a checkpoint file, or a folder with .bin weights", f"the folder {source} without", cure
-        )
+        expected, cure = "a checkpoint file, or a folder with .bin weights", "Give it to --prior as it is."
+        bad_value("SRC", expected, f"the folder {source} without: it needs no conversion", cure)
     for path in sorted(p for p in source.rglob("*") if p.is_file()):
         target = folder / path.relative_to(source)
         safe = target.with_name(_safe_name(path.name))
+        target.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".bin":
             if not (source / safe.relative_to(folder)).is_file():  # else it is copied
-                safe.parent.mkdir(parents=True, exist_ok=True)
                 save_weights(read_checkpoint(path), safe)
         elif path.name.endswith(".bin.index.json"):
             index = json.loads(path.read_text(encoding="utf-8"))
             index["weight_map"] = {key: _safe_name(name) for key, name in index["weight_map"].items()}
-            safe.parent.mkdir(parents=True, exist_ok=True)
             safe.write_text(json.dumps(index, indent=2), encoding="utf-8")
         elif path.suffix in COPIED or path.name.upper().startswith("LICEN"):
-            target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)

@@ -30,7 +30,7 @@ from geodiff_plugin.cli.report import build_report, summary_line
 from geodiff_plugin.cli.terminal import StopWatch, collected_warnings, say
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.priors import find_prior
-from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import MetricDepthOutput

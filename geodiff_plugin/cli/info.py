@@ -12,7 +12,7 @@ from geodiff_plugin.cli.depth import loading_bars
 from geodiff_plugin.cli.terminal import print_lines
 from geodiff_plugin.options import SPACES
 from geodiff_plugin.priors import BUNDLED_FOLDER, PRIORS, FoundPrior, find_adapter, find_prior
-from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import versions
 
 __all__ = ["run_info"]

@@ -16,7 +16,6 @@ from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
 from geodiff_plugin.evaluation.pairs import pair_cells, remarks_on
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs, label_of
 from geodiff_plugin.priors import PRIORS, find_prior
-from geodiff_plugin.priors.base import OwnPipelinePrior
 from geodiff_plugin.runner import Record, this_process
 
 PLAIN = "prior-aligned"
@@ -61,9 +60,8 @@ def cost_table(records: Sequence[Record]) -> Table:
 
 def _steps_of(prior: str) -> int | None:
     """``STEPS``, or ``None`` for a prior that was trained for fewer: its own number then."""
-    adapter = PRIORS[find_prior(prior).key]
-    kind = adapter.pipeline_class if issubclass(adapter, OwnPipelinePrior) else adapter
-    return STEPS if kind.max_steps is None or kind.max_steps >= STEPS else None
+    most = getattr(PRIORS[find_prior(prior).key].pipeline_class, "max_steps", None)
+    return STEPS if most is None or most >= STEPS else None
 
 
 def _method_records(refs: Sequence[SampleRef], method: str, options: PairsOptions) -> list[Record]:

@@ -1,6 +1,4 @@
-"""Adapters of diffusion depth priors, one a file, and how a prior is found by name.
-
-Paper: S4 (any diffusion-based depth model with iterative updates).
+"""Adapters of diffusion depth priors, one a file, and how a prior is found by name (paper S4).
 
 A new prior is a new file and one line in ``PRIORS``.
 """
@@ -15,20 +13,12 @@ import torch
 from diffusers import DiffusionPipeline
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice
-from geodiff_plugin.priors.base import DepthPrior, OwnPipelinePrior
+from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.depthfm import DepthFMPrior
 from geodiff_plugin.priors.depthmaster import DepthMasterPrior
 from geodiff_plugin.priors.e2e_ft import E2EFTPrior
-from geodiff_plugin.priors.folders import (
-    BUNDLED_FOLDER,
-    REFUSED,
-    Layout,
-    fetch_small_files,
-    fetch_weights,
-    refuse,
-)
 from geodiff_plugin.priors.geowizard import GeoWizardPrior
-from geodiff_plugin.priors.loading import check_device
+from geodiff_plugin.priors.loading import BUNDLED_FOLDER, REFUSED, Layout, check_device, fetch, refuse
 from geodiff_plugin.priors.lotus import LotusPrior
 from geodiff_plugin.priors.map import MAP_LAYOUT, DepthMapPrior
 from geodiff_plugin.priors.marigold import MarigoldPrior
@@ -64,23 +54,15 @@ PRIORS: dict[str, type[DepthPrior]] = {
 
 
 def find_adapter(pipe: Any) -> type[DepthPrior]:
-    """The class in ``PRIORS`` that understands a live pipeline.
+    """The class in ``PRIORS`` that understands a live pipeline; otherwise a ``TypeError``.
 
     A ``DepthDiffusionPipeline`` that is not in the table says of itself what guidance must know.
-
-    Raises:
-        TypeError: none does.
     """
-    adapters: list[type[DepthPrior]] = [*PRIORS.values(), OwnPipelinePrior]
-    for adapter in adapters:
+    for adapter in (*PRIORS.values(), DepthPrior):
         if adapter.matches(pipe):
             return adapter
-    bad_type(
-        "pipe",
-        f"a pipeline with an adapter ({', '.join(PRIORS)})",
-        pipe,
-        "docs/how-to/extending.md shows how to write one.",
-    )
+    expected = f"a pipeline with an adapter ({', '.join(PRIORS)})"
+    bad_type("pipe", expected, pipe, "docs/how-to/extending.md shows how to write one.")
 
 
 @dataclass(frozen=True)
@@ -137,23 +119,20 @@ def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> Foun
         key, typed = prefix, rest
     else:
         refuse(typed)
-    folder = fetch_small_files(typed, hub)
-    key = key or _recognise(Layout(folder, typed))
-    return FoundPrior(key, Layout(fetch_weights(typed, folder, variant, hub), typed, variant))
+    key = key or _recognise(Layout(fetch(typed, hub), typed))
+    return FoundPrior(key, Layout(fetch(typed, hub, weights=True, variant=variant), typed, variant))
 
 
 def _recognise(layout: Layout) -> str:
+    """Key of the first adapter that recognises the folder."""
     for key, adapter in PRIORS.items():
         if adapter.recognises(layout):
             return key
+    cure = f"Known are {', '.join(PRIORS)} (docs/reference/priors.md); --prior bundled always works."
     if any(layout.folder.glob("*.ckpt")) or any(layout.folder.glob("*.pth")):
         cure = "A checkpoint becomes such a folder by `geodiff convert SRC DST`."
-    else:
-        cure = f"Known are {', '.join(PRIORS)} (docs/reference/priors.md); --prior bundled always works."
     got = (
-        f"{layout.folder} without model_index.json"
-        if not layout.index
-        else f"{layout.folder}, of no known kind"
+        f"{layout.folder}, of no known kind" if layout.index else f"{layout.folder} without model_index.json"
     )
     bad_value("prior", "a folder in diffusers' layout, or of a depth model of transformers", got, cure)
 

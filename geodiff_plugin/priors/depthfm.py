@@ -11,12 +11,10 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
-from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
-from geodiff_plugin.priors.pipelines.sides import SidesOf
+from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.components import FixedPrompt, SidesOf
+from geodiff_plugin.priors.loading import Layout
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, decode_picture
 
 __all__ = ["DepthFMPipeline", "DepthFMPrior", "cosine_alpha_bar"]
 
@@ -41,7 +39,6 @@ class DepthFMPipeline(DepthDiffusionPipeline):
         scheduler: rectified flow without a shift.
         prompt: the empty prompt's embedding, which comes with the weights.
         noising_step: how much noise the image latent gets to start from, 0 (none) to 999.
-        prediction_type: what the map is affine in.
         default_denoising_steps: 4; the authors run 2 to 4.
         default_processing_resolution: longer side, pixels; 0, the image's own, is what the authors run.
 
@@ -65,14 +62,9 @@ class DepthFMPipeline(DepthDiffusionPipeline):
         super().__init__()
         check_number(noising_step, "noising_step", 0, NOISING_STEPS - 1, integer=True)
         self.deterministic = noising_step == 0
-        self.register_prior(
-            {"unet": unet, "vae": vae, "scheduler": scheduler, "prompt": prompt},
-            prediction_type,
-            default_denoising_steps,
-            default_processing_resolution,
-            image_processor=SidesOf(SIDE),
-            noising_step=noising_step,
-        )
+        defaults = prediction_type, default_denoising_steps, default_processing_resolution
+        modules = {"unet": unet, "vae": vae, "scheduler": scheduler, "prompt": prompt}
+        self.register_prior(modules, *defaults, SidesOf(SIDE), noising_step=noising_step)
 
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
@@ -113,13 +105,9 @@ class DepthFMPipeline(DepthDiffusionPipeline):
         )[0]
         return -velocity
 
-    def decode_relative(self, z0: Tensor) -> Tensor:
-        """Mean of the decoded channels, which is log depth, from [-1, 1] to [0, 1], not clipped."""
-        return (self.decode_latents(z0).mean(dim=1, keepdim=True) + 1.0) / 2.0
-
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """Log depth as decoded, about [-1, 1]: members are averaged before the exponential."""
-        return self.decode_latents(latents).mean(dim=1, keepdim=True)
+        return decode_picture(self.vae, latents).mean(dim=1, keepdim=True)
 
     def put_together(
         self, maps: Tensor, ensemble_size: int, output_uncertainty: bool, ensembling_kwargs: dict[str, Any]
@@ -136,10 +124,11 @@ class DepthFMPipeline(DepthDiffusionPipeline):
         return (depth - low) / width, spread
 
 
-class DepthFMPrior(OwnPipelinePrior):
+class DepthFMPrior(DepthPrior):
     """DepthFM: rectified flow, log depth, a prompt that is part of the weights."""
 
     pipeline_class = DepthFMPipeline
+    component_classes = {"prompt": FixedPrompt}
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
@@ -148,11 +137,4 @@ class DepthFMPrior(OwnPipelinePrior):
             layout.config("unet").get("in_channels") == 8
             and bool(layout.config("prompt"))
             and "shift" in layout.config("scheduler")
-        )
-
-    @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> DepthFMPipeline:
-        """Components as the index names them, and our prompt."""
-        return build_pipeline(
-            cls.pipeline_class, layout, dtype, classes={"prompt": FixedPrompt}, prediction_type=space
         )

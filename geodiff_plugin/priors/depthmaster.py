@@ -2,23 +2,77 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import torch
-from diffusers import AutoencoderKL
-from torch import Tensor
+from diffusers import AutoencoderKL, UNet2DConditionModel
+from torch import Tensor, nn
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
-from geodiff_plugin.priors.pipelines.fourier_unet import FourierUNet
-from geodiff_plugin.priors.pipelines.prompts import text_embedding
+from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.components import DirectScheduler, text_embedding
+from geodiff_plugin.priors.loading import Layout
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
 
-__all__ = ["DepthMasterPipeline", "DepthMasterPrior"]
+__all__ = ["DepthMasterPipeline", "DepthMasterPrior", "FourierBlock", "FourierUNet"]
 
 #: The timestep that the network is always told.
 TIMESTEP = 1
+
+
+class FourierBlock(nn.Module):
+    """Features mended twice, in their Fourier magnitude and angle and in space, and fused.
+
+    Args:
+        channels: C.
+        groups: of the normalisation.
+
+    The submodules are named as in the published weights.
+    """
+
+    def __init__(self, channels: int, groups: int = 8) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(groups, channels)
+        self.conv_f1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv_f2 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv_f4 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv_f3 = nn.Conv2d(channels, channels, 1)
+        self.conv_s1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv_s2 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.fuse = nn.Conv2d(2 * channels, channels, 1)
+        self.act = nn.SiLU()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``(B, C, h, w)`` to the same shape and dtype."""
+        features = self.norm(features)
+        start = self.act(self.conv_f1(features))
+        # There is no half precision FFT for sizes that are no power of two.
+        spectrum = torch.fft.rfft2(start.float(), norm="ortho")  # (B, C, h, w // 2 + 1)
+        magnitude = self.act(self.conv_f2(spectrum.abs().to(start.dtype)))
+        angle = self.act(self.conv_f4(spectrum.angle().to(start.dtype))).float()
+        mended = torch.complex(magnitude * torch.cos(angle), magnitude * torch.sin(angle))
+        mended = torch.fft.irfft2(mended, s=start.shape[-2:], norm="ortho").to(start.dtype)
+        in_frequency = self.conv_f3(mended + start)
+        in_space = self.conv_s2(self.act(self.conv_s1(features))) + features
+        return self.fuse(torch.cat([in_space, in_frequency], dim=1))
+
+
+class FourierUNet(UNet2DConditionModel):
+    """``UNet2DConditionModel`` whose middle block is followed by a ``FourierBlock`` named ``fftblock``.
+
+    Everything else, config and weights included, is the stock class's.
+    """
+
+    # The wraps keeps the signature, from which diffusers reads what a config may hold.
+    @functools.wraps(UNet2DConditionModel.__init__)  # type: ignore[misc]
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.fftblock = FourierBlock(self.config.block_out_channels[-1])
+        self.mid_block.register_forward_hook(self._after_middle)
+
+    def _after_middle(self, middle: nn.Module, inputs: tuple[Any, ...], output: Tensor) -> Tensor:
+        return self.fftblock(output)
 
 
 class DepthMasterPipeline(DepthDiffusionPipeline):
@@ -28,10 +82,7 @@ class DepthMasterPipeline(DepthDiffusionPipeline):
         unet: takes the image latent alone and answers with the clean depth latent.
         vae: of Stable Diffusion 2.
         text_encoder: for the empty prompt.
-        tokenizer: for the empty prompt.
-        prediction_type: what the map is affine in.
-        default_denoising_steps: 1.
-        default_processing_resolution: longer side, pixels.
+        tokenizer: likewise.
     """
 
     max_steps = 1
@@ -52,12 +103,9 @@ class DepthMasterPipeline(DepthDiffusionPipeline):
         super().__init__()
         # Not a component: the authors' folders have none, and ours are like theirs.
         self.scheduler = DirectScheduler(TIMESTEP)
-        self.register_prior(
-            {"unet": unet, "vae": vae, "text_encoder": text_encoder, "tokenizer": tokenizer},
-            prediction_type,
-            default_denoising_steps,
-            default_processing_resolution,
-        )
+        defaults = prediction_type, default_denoising_steps, default_processing_resolution
+        modules = {"unet": unet, "vae": vae, "text_encoder": text_encoder, "tokenizer": tokenizer}
+        self.register_prior(modules, *defaults)
 
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
@@ -73,15 +121,12 @@ class DepthMasterPipeline(DepthDiffusionPipeline):
             condition["image_latent"], timestep, encoder_hidden_states=condition["prompt"], return_dict=False
         )[0]
 
-    def decode_relative(self, z0: Tensor) -> Tensor:
-        """Mean of the decoded channels, from [-1, 1] to [0, 1], not clipped; near is 1."""
-        return (self.decode_latents(z0).mean(dim=1, keepdim=True) + 1.0) / 2.0
 
-
-class DepthMasterPrior(OwnPipelinePrior):
+class DepthMasterPrior(DepthPrior):
     """DepthMaster: a U-Net on the image latent alone, and no scheduler."""
 
     pipeline_class = DepthMasterPipeline
+    component_classes = {"unet": FourierUNet}
     licence = {"zysong212/DepthMaster": "apache-2.0"}
 
     @staticmethod
@@ -93,11 +138,4 @@ class DepthMasterPrior(OwnPipelinePrior):
             and not unet.get("class_embed_type")
             and "text_encoder" in layout.index
             and "scheduler" not in layout.index
-        )
-
-    @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> DepthMasterPipeline:
-        """The U-Net by our class, whatever the index names."""
-        return build_pipeline(
-            cls.pipeline_class, layout, dtype, classes={"unet": FourierUNet}, prediction_type=space
         )

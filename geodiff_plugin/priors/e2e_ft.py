@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
-from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, UNet2DConditionModel
+from diffusers import DDIMScheduler, MarigoldDepthPipeline
 from torch import Tensor
-from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.loading import build_pipeline
+from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.marigold import MarigoldPrior
 
 __all__ = ["E2EFTPipeline", "E2EFTPrior"]
@@ -20,63 +19,25 @@ __all__ = ["E2EFTPipeline", "E2EFTPrior"]
 class E2EFTPipeline(MarigoldDepthPipeline):
     """``MarigoldDepthPipeline`` that starts from zeros and takes one step, whose result is the clean latent.
 
-    Args:
-        unet: of image and depth latent.
-        vae: of both.
-        scheduler: any over the same betas; a DDIM with trailing spacing is made of it, whose last step ends
-            at no noise at all (the authors read ``pred_original_sample`` instead).
-        text_encoder: for the empty prompt.
-        tokenizer: likewise.
-        prediction_type: what the map is affine in.
-        scale_invariant: as Marigold's.
-        shift_invariant: as Marigold's.
-        default_denoising_steps: 1.
-        default_processing_resolution: longer side, pixels.
-        initial_latents: ``"zeros"``; saved, so that the folder can be distinguished from Marigold's.
+    Of its scheduler the betas count: it becomes a DDIM with trailing spacing whose last step ends at no noise
+    at all (the authors read ``pred_original_sample`` instead). Arguments as ``MarigoldDepthPipeline``'s.
     """
 
     max_steps = 1
     deterministic = True
 
-    def __init__(
-        self,
-        unet: UNet2DConditionModel,
-        vae: AutoencoderKL,
-        scheduler: Any,
-        text_encoder: CLIPTextModel,
-        tokenizer: CLIPTokenizer,
-        prediction_type: str = "depth",
-        scale_invariant: bool = True,
-        shift_invariant: bool = True,
-        default_denoising_steps: int = 1,
-        default_processing_resolution: int = 768,
-        initial_latents: str = "zeros",
-    ) -> None:
-        if initial_latents != "zeros":
-            bad_value("initial_latents", "'zeros'", repr(initial_latents), "A Marigold starts from noise.")
-        to_the_end = DDIMScheduler.from_config(
-            scheduler.config, timestep_spacing="trailing", set_alpha_to_one=True
-        )
-        super().__init__(
-            unet,
-            vae,
-            to_the_end,
-            text_encoder,
-            tokenizer,
-            prediction_type=prediction_type,
-            scale_invariant=scale_invariant,
-            shift_invariant=shift_invariant,
-            default_denoising_steps=default_denoising_steps,
-            default_processing_resolution=default_processing_resolution,
-        )
-        self.register_to_config(initial_latents=initial_latents)
+    # The wraps keeps the signature, from which diffusers reads what a folder may hold.
+    @functools.wraps(MarigoldDepthPipeline.__init__)  # type: ignore[misc]
+    def __init__(self, unet: Any, vae: Any, scheduler: Any, *args: Any, **kwargs: Any) -> None:
+        to_the_end = {"timestep_spacing": "trailing", "set_alpha_to_one": True}
+        scheduler = DDIMScheduler.from_config(scheduler.config, **to_the_end)
+        options = {"default_denoising_steps": 1, "default_processing_resolution": 768}
+        options |= {name: value for name, value in kwargs.items() if value is not None}
+        super().__init__(unet, vae, scheduler, *args, **options)
+        self.register_to_config(initial_latents="zeros")  # so that the folder differs from Marigold's
 
     def check_inputs(self, image: Any, num_inference_steps: int, *args: Any, **kwargs: Any) -> int:
-        """Marigold's checks, and one step only.
-
-        Raises:
-            ValueError: more steps than one.
-        """
+        """Marigold's checks, and a ``ValueError`` for more steps than one."""
         if num_inference_steps is not None and num_inference_steps > 1:
             bad_value("num_inference_steps", "1 with a prior that was tuned for it", num_inference_steps)
         return super().check_inputs(image, num_inference_steps, *args, **kwargs)
@@ -92,14 +53,8 @@ class E2EFTPipeline(MarigoldDepthPipeline):
 class E2EFTPrior(MarigoldPrior):
     """Adapter of ``E2EFTPipeline``; network, input and decoder are Marigold's."""
 
-    max_steps: int | None = 1
-    deterministic = True
-    licence: dict[str, str] = {}  # the authors' repository does not say
-
-    @staticmethod
-    def matches(pipe: object) -> bool:
-        """Any instance of ``E2EFTPipeline``."""
-        return isinstance(pipe, E2EFTPipeline)
+    pipeline_class = E2EFTPipeline
+    licence = {}  # the authors' repository does not say
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
@@ -124,13 +79,8 @@ class E2EFTPrior(MarigoldPrior):
         )
 
     @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> E2EFTPipeline:
-        """The folder's networks; of its scheduler the betas.
-
-        Raises:
-            ValueError: weights that do not fit; a model of normals.
-        """
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
+        """As Marigold's; a model of normals is a ``ValueError``."""
         if "normals" in layout.name.lower():
             bad_value("prior", "a model of depth", repr(layout.name), "Its sibling *-e2e-ft-depth is one.")
-        space = space or layout.index.get("prediction_type") or "depth"
-        return build_pipeline(E2EFTPipeline, layout, dtype, prediction_type=space)
+        return super().load(layout, dtype, space)

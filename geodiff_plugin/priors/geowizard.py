@@ -14,11 +14,10 @@ from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjec
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.loading import LIBRARIES, build_pipeline, load_component
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
-from geodiff_plugin.priors.pipelines.prompts import text_embedding
+from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.components import text_embedding
+from geodiff_plugin.priors.loading import LIBRARIES, Layout, build_pipeline, load_component
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, decode_picture
 
 __all__ = ["DOMAINS", "GeoWizardPipeline", "GeoWizardPrior", "PairAttention"]
 
@@ -48,9 +47,6 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         image_encoder: v1 only.
         text_encoder: v2 only.
         tokenizer: v2 only.
-        prediction_type: what the map is affine in.
-        default_denoising_steps: when a call names none.
-        default_processing_resolution: longer side, pixels, when a call names none.
         default_domain: one of ``DOMAINS``, when a call names none.
         clip_statistics: ``{"mean": [3], "std": [3]}`` of the image encoder's input, CLIP's own for ``None``.
 
@@ -94,18 +90,11 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
             expected = "image_encoder" if width == IMAGE_EMBEDDING else "text_encoder and tokenizer"
             bad_value("components", f"with {expected} for this U-Net", "None")
         couple_pairs(unet)
+        conditions = {"image_encoder": image_encoder, "text_encoder": text_encoder, "tokenizer": tokenizer}
+        defaults = prediction_type, default_denoising_steps, default_processing_resolution
         self.register_prior(
-            {
-                "unet": unet,
-                "vae": vae,
-                "scheduler": scheduler,
-                "image_encoder": image_encoder,
-                "text_encoder": text_encoder,
-                "tokenizer": tokenizer,
-            },
-            prediction_type,
-            default_denoising_steps,
-            default_processing_resolution,
+            {"unet": unet, "vae": vae, "scheduler": scheduler, **conditions},
+            *defaults,
             default_domain=check_choice(default_domain, "default_domain", DOMAINS),
             clip_statistics=clip_statistics or {"mean": list(OPENAI_CLIP_MEAN), "std": list(OPENAI_CLIP_STD)},
         )
@@ -121,12 +110,11 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         """Image latent, prompt and class embedding of every member.
 
         Args:
-            image: ``(N, 3, H, W)`` in [-1, 1].
-            ensemble_size: members E per image.
-            batch_size: images per forward.
-            generator: unused, nothing is drawn here.
-            domain: ``"indoor"``, ``"outdoor"`` or ``"object"`` (an object without background);
-                ``default_domain`` for ``None``.
+            image: as in the base class, like the next two.
+            ensemble_size: E.
+            batch_size: of the VAE.
+            generator: unused.
+            domain: ``"indoor"``, ``"outdoor"`` or ``"object"`` (without background), or the default.
 
         Returns:
             ``image_latent (N * E, 4, h, w)``, ``prompt (N * E, tokens, width)``,
@@ -179,10 +167,6 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         )[0]  # (2B, 4, h, w)
         return torch.cat(output.chunk(2), dim=1)
 
-    def decode_relative(self, z0: Tensor) -> Tensor:
-        """Mean of the decoded channels from [-1, 1] to [0, 1], not clipped."""
-        return (self.decode_latents(z0).mean(dim=1, keepdim=True) + 1.0) / 2.0
-
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """Their ending: clipped, then stretched so that every map has a 0 and a 1."""
         maps = super().decode_prediction(latents)
@@ -190,13 +174,9 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         return (maps - low) / (high - low).clamp_min(torch.finfo(maps.dtype).tiny)
 
     def decode_extras(self, latents: Tensor, ensemble_size: int) -> dict[str, Tensor]:
-        """Normals of every image: those of the member that lies closest to the mean of all.
-
-        Returns:
-            ``{"normals": (N, 3, H, W)}``, unit vectors; frame and sign as the class says.
-        """
+        """``{"normals": (N, 3, H, W)}`` of every image: those of the member closest to the mean of all."""
         halves = latents[:, self.normal_channels].split(1)
-        normals = torch.cat([self.decode_latents(half) for half in halves])
+        normals = torch.cat([decode_picture(self.vae, half) for half in halves])
         normals = normals / (normals.norm(dim=1, keepdim=True) + EPS_LENGTH)
         return {"normals": torch.cat([closest_to_mean(m) for m in normals.split(ensemble_size)])}
 
@@ -217,30 +197,20 @@ def closest_to_mean(normals: Tensor) -> Tensor:
     return normals[angle.argmin()][None]
 
 
-def _self_attention(unet: UNet2DConditionModel) -> dict[str, Any]:
-    return {name: p for name, p in unet.attn_processors.items() if name.endswith("attn1.processor")}
-
-
 def couple_pairs(unet: UNet2DConditionModel) -> None:
     """Let every self-attention of the transformer blocks see the pair; it has no weights of its own."""
-    coupled = dict.fromkeys(_self_attention(unet), PairAttention())
-    unet.set_attn_processor(unet.attn_processors | coupled)
+    own = (name for name in unet.attn_processors if name.endswith("attn1.processor"))
+    unet.set_attn_processor(unet.attn_processors | dict.fromkeys(own, PairAttention()))
 
 
 def check_coupled(unet: UNet2DConditionModel) -> None:
-    """Refuse a U-Net that would treat depth and normals as strangers.
-
-    Raises:
-        ValueError: some processor was replaced after the pipeline was made.
-    """
-    strangers = {type(p).__name__ for p in _self_attention(unet).values() if not isinstance(p, PairAttention)}
+    """Refuse a U-Net with replaced processors, in which depth and normals do not see each other."""
+    own = (p for name, p in unet.attn_processors.items() if name.endswith("attn1.processor"))
+    strangers = sorted({type(p).__name__ for p in own if not isinstance(p, PairAttention)})
     if strangers:
-        bad_value(
-            "pipe.unet",
-            "with PairAttention, through which depth and normals see each other",
-            ", ".join(sorted(strangers)),
-            "Do not set attention processors (xformers, slicing, ...) on this pipeline.",
-        )
+        expected = "with PairAttention, through which depth and normals see each other"
+        cure = "Do not set attention processors (xformers, slicing, ...) on this pipeline."
+        bad_value("pipe.unet", expected, ", ".join(strangers), cure)
 
 
 #: What the authors' scripts load from a folder whose index names classes of their own, or that has no index.
@@ -255,7 +225,7 @@ CLASSES = {
 UNET_V2 = "unet_v2"
 
 
-class GeoWizardPrior(OwnPipelinePrior):
+class GeoWizardPrior(DepthPrior):
     """Depth and normals from one noise; guidance touches the depth half alone.
 
     The domain is an argument of the call: ``pipe(image, domain="outdoor", guidance=...)``.
@@ -280,11 +250,7 @@ class GeoWizardPrior(OwnPipelinePrior):
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> GeoWizardPipeline:
-        """From our folder or the authors'.
-
-        Theirs for v2 holds ``unet_v2`` beside ``vae``, ``text_encoder``, ``tokenizer`` and ``scheduler`` of
-        Stable Diffusion 2, and no ``unet``.
-        """
+        """From our folder or the authors', whose v2 holds ``unet_v2`` and parts of Stable Diffusion 2."""
         classes = {
             name: found
             for name, found in CLASSES.items()

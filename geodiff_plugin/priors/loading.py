@@ -1,33 +1,66 @@
-"""Strict loading: every weight has a place, every place a weight; errors of libraries in one sentence."""
+"""From a name, a path or a hub id to a pipeline whose weights were checked one by one."""
 
 from __future__ import annotations
 
 import inspect
+import json
+import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import diffusers
 import torch
 import transformers
+from huggingface_hub import snapshot_download
+from huggingface_hub.errors import HfHubHTTPError
 from safetensors import SafetensorError
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.pipelines import direct_scheduler
+from geodiff_plugin.priors import components
 
 __all__ = [
+    "BUNDLED_FOLDER",
+    "LIBRARIES",
+    "REFUSED",
+    "Layout",
     "build_pipeline",
     "check_device",
     "check_finite",
     "check_weights",
-    "component_class",
+    "fetch",
     "load_component",
     "reading",
+    "refuse",
 ]
 
-#: What the libraries are known to raise over a damaged or foreign folder.
+BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
+
+#: Priors that people ask for and that cannot be run: pattern of the last part of the name -> reason.
+REFUSED = {
+    r"apdepth": "its U-Net takes the depth of a Depth Anything V2 Giant, whose weights were never released",
+    r"lotus-?2": "it is a LoRA on FLUX.1-dev, which is gated and needs some 40 GB; Lotus v1 and v2 work",
+    r"marigold.*-hr\b.*": "no code that runs it was published; marigold-depth-v1-1 takes any resolution",
+    r"geowizard-e2e-ft": "it needs GeoWizard's networks with another start; take marigold-e2e-ft-depth, "
+    "whose authors report it as better",
+    r"diffusion-?depth": "its 2023 toolchain (torch 1.10, mmdet3d, compiled extensions) cannot be installed "
+    "any more, and its metric depth is of KITTI or NYU alone",
+    r"ddp": "its 2023 toolchain (mmsegmentation, mmcv) cannot be installed any more, and its metric depth is "
+    "of KITTI or NYU alone",
+}
+LICENCE_LINE = re.compile(r"^license:\s*(\S.*?)\s*$", re.MULTILINE)
+SMALL_FILES = ["*.json", "*.txt", "*.md"]
+WEIGHTS = ["*/*.safetensors", "model*.safetensors"]
+#: Second copies of the same weights, which only ``variant`` asks for.
+OTHER_VARIANTS = ["*.fp16.*safetensors", "*.bf16.*safetensors", "*.fp16-*.safetensors", "*non_ema*"]
+#: What ``model_index.json`` may name: the two hosts, and the small components of this package.
+LIBRARIES = {"diffusers": diffusers, "transformers": transformers, components.__name__: components}
+
+#: What the libraries are known to raise over a damaged, foreign or absent folder.
 ERRORS = (
     OSError,
     ValueError,
@@ -38,14 +71,12 @@ ERRORS = (
     ImportError,
     RuntimeError,  # RecursionError and torch's are among them
     SafetensorError,
+    HfHubHTTPError,
 )
 LONGEST_REASON = 200
-
-
-def _reason(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    text = lines[0] if lines else type(error).__name__
-    return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]}..."
+#: Keys listed in an error before it says how many more there are.
+LISTED_KEYS = 12
+CURE = "Is a file of it cut off, or of another version? Save or fetch the folder anew."
 
 
 @contextmanager
@@ -64,50 +95,131 @@ def reading(what: str, expected: str, got: str, cure: str) -> Iterator[None]:
     try:
         yield
     except ERRORS as error:
-        reason = _reason(error)
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        reason = lines[0] if lines else type(error).__name__
     else:
         return
+    reason = reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]}..."
     bad_value(what, expected, f"{got} ({reason})", cure)
 
 
-def check_finite(module: torch.nn.Module, where: str | Path) -> None:
-    """Refuse weights with NaN or infinity in them, naming the first.
+@dataclass(frozen=True)
+class Layout:
+    """A folder that may hold a prior.
+
+    Attributes:
+        folder: where it lies on this machine.
+        name: as the user typed it, a hub id or a path.
+        variant: of the weight files, such as ``"fp16"``.
+    """
+
+    folder: Path
+    name: str
+    variant: str | None = None
+
+    def read_json(self, path: str) -> dict[str, Any]:
+        """A JSON file below the folder; empty if there is none.
+
+        Raises:
+            ValueError: it is there and holds no JSON object.
+        """
+        file = self.folder / path
+        if not file.is_file():
+            return {}
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+        except (ValueError, RecursionError):
+            content = None
+        if not isinstance(content, dict):
+            bad_value(str(file), "a JSON object", "something else", "Save or fetch the folder anew.")
+        return content
+
+    @cached_property
+    def index(self) -> dict[str, Any]:
+        """``model_index.json``: components and options of a pipeline; empty without the file."""
+        return self.read_json("model_index.json")
+
+    def config(self, component: str) -> dict[str, Any]:
+        """Config of a component by the name of its subfolder, a scheduler's too; ``""`` is the folder itself.
+
+        Empty where there is none, so that ``config("unet").get("in_channels") == 8`` is a safe question.
+        """
+        prefix = f"{component}/" if component else ""
+        return self.read_json(f"{prefix}config.json") or self.read_json(f"{prefix}scheduler_config.json")
+
+    def has(self, component: str) -> bool:
+        """Whether there is such a subfolder (or file)."""
+        return (self.folder / component).exists()
+
+    @cached_property
+    def licence(self) -> str | None:
+        """``license:`` of the model card's front matter, if it has one."""
+        card = self.folder / "README.md"
+        if not card.is_file():
+            return None
+        text = card.read_text(encoding="utf-8", errors="replace")
+        front = text.split("---")[1] if text.startswith("---") and text.count("---") > 1 else ""
+        line = LICENCE_LINE.search(front)
+        return line.group(1) if line else None
+
+
+def refuse(name: str) -> None:
+    """Say why a prior that is known not to work does not, by a ``ValueError``; others pass."""
+    last = Path(name).name.lower()
+    for pattern, reason in REFUSED.items():
+        if re.fullmatch(pattern, last):
+            bad_value("prior", "one that can be run", repr(name), f"It is refused because {reason}.")
+
+
+def fetch(name: str, hub: dict[str, Any], weights: bool = False, variant: str | None = None) -> Path:
+    """The folder of a prior, from the hub with its configs at least.
+
+    Args:
+        name: ``"bundled"``, a folder, or a hub id.
+        hub: options of ``snapshot_download`` (``revision``, ``token``, ``cache_dir``, ``local_files_only``).
+        weights: with the weights, too.
+        variant: of the weight files, such as ``"fp16"``.
 
     Raises:
-        ValueError: there is any.
+        ValueError: no such folder; a hub id that is neither cached nor can be reached.
     """
+    if name == "bundled":
+        return BUNDLED_FOLDER
+    if os.path.isdir(name):
+        return Path(name)
+    if name.count("/") > 1 or name.startswith((".", "/", "~")):
+        bad_value("prior", "'bundled', a folder that is there, or a hub id", repr(name), "Check the path.")
+    patterns, ignored = list(SMALL_FILES), None
+    if weights and variant is None:
+        patterns, ignored = patterns + WEIGHTS, OTHER_VARIANTS
+    elif weights:
+        patterns += [f"*.{variant}.safetensors", f"*.{variant}-*.safetensors"]
+    expected = "'bundled', a folder or a hub id that is cached or can be reached"
+    cure = "Fetch it once with `hf download ID` while online, give a folder, or use --prior bundled."
+    with reading("prior", expected, repr(name), cure):
+        folder = snapshot_download(name, allow_patterns=patterns, ignore_patterns=ignored, **hub)
+    return Path(folder)
+
+
+def check_device(device: str | torch.device) -> torch.device:
+    """A device that this machine has; another is a ``ValueError``."""
+    with reading("device", "one that PyTorch has on this machine", repr(str(device)), "Try 'cpu'."):
+        try:
+            place = torch.device(device)
+            torch.empty(1, device=place)
+        except AssertionError as error:  # torch built without CUDA
+            raise RuntimeError(str(error)) from error
+    return place
+
+
+def check_finite(module: torch.nn.Module, where: str | Path) -> None:
+    """Refuse weights with NaN or infinity in them by a ``ValueError`` that names the first."""
     for name, weight in module.named_parameters():
         if weight.numel() and weight.is_floating_point() and weight.device.type != "meta":
             low, high = weight.detach().aminmax()  # one pass; NaN comes through
             if not bool(torch.isfinite(low) & torch.isfinite(high)):
                 cure = "The file is damaged, or was trained or converted so: fetch it anew."
                 bad_value(f"weights in {where}", "finite", f"NaN or infinity in {name}", cure)
-
-
-def check_device(device: str | torch.device) -> torch.device:
-    """A device that this machine has.
-
-    Raises:
-        ValueError: it has not.
-    """
-    try:
-        found = torch.device(device)
-        torch.empty(1, device=found)
-    except (RuntimeError, AssertionError, NotImplementedError, TypeError) as error:
-        reason = _reason(error)
-    else:
-        return found
-    bad_value("device", "one that PyTorch has on this machine", f"{str(device)!r} ({reason})", "Try 'cpu'.")
-
-
-#: Keys listed in an error before it says how many more there are.
-LISTED_KEYS = 12
-CURE = "Is a file of it cut off, or of another version? Save or fetch the folder anew."
-LIBRARIES = {
-    "diffusers": diffusers,
-    "transformers": transformers,
-    direct_scheduler.__name__: direct_scheduler,  # ours, and as small as a scheduler can be
-}
 
 
 def check_weights(missing: Any, unexpected: Any, where: str) -> None:
@@ -131,27 +243,20 @@ def check_weights(missing: Any, unexpected: Any, where: str) -> None:
         bad_value(f"weights in {where}", "those of its config, name by name", "; ".join(parts), cure)
 
 
-def component_class(layout: Layout, name: str) -> type[Any]:
-    """The class of a component as ``model_index.json`` names it, out of diffusers or transformers.
-
-    Raises:
-        ValueError: not named, or of another library.
-    """
+def _component_class(layout: Layout, name: str) -> type[Any]:
+    """The class of a component as ``model_index.json`` names it, out of diffusers or transformers alone."""
     entry = layout.index.get(name)
     library, cls = entry if isinstance(entry, list) and len(entry) == 2 else ("", "")
-    found = getattr(LIBRARIES.get(str(library)), str(cls), None)
-    if not isinstance(found, type) or not hasattr(found, "from_pretrained"):
-        bad_value(
-            f"component {name!r} in {layout.folder / 'model_index.json'}",
-            "a class of diffusers or transformers",
-            repr(entry),
-            "Code that comes with weights is never run.",
-        )
-    return found
+    named = getattr(LIBRARIES.get(str(library)), str(cls), None)
+    if not isinstance(named, type) or not hasattr(named, "from_pretrained"):
+        what = f"component {name!r} in {layout.folder / 'model_index.json'}"
+        cure = "Code that comes with weights is never run."
+        bad_value(what, "a class of diffusers or transformers", repr(entry), cure)
+    return named
 
 
 def load_component(
-    layout: Layout, name: str, cls: type[Any], dtype: torch.dtype, extra: dict[str, Any] | None = None
+    layout: Layout, name: str, cls: type[Any], dtype: torch.dtype, unread: str | None = None
 ) -> Any:
     """One component of a folder; a module's weights are checked name by name, and it is in eval mode.
 
@@ -160,32 +265,35 @@ def load_component(
         name: of the subfolder; ``""`` for the folder itself.
         cls: with ``from_pretrained``.
         dtype: of a module's weights.
-        extra: further arguments of ``from_pretrained`` (a quantisation).
+        unread: for files that transformers' users published: part of the names of weights that may be
+            missing, since no forward reads them; weights left over do not matter either.
 
     Raises:
         ValueError: weights missing, left over, cut off or not finite; files that cannot be read.
     """
     folder = str(layout.folder / name)
     damaged = reading(f"component {name or 'model'!r} of {layout.name}", "one that can be read", folder, CURE)
-    # Said aloud, since transformers asks at the terminal where it is not.
-    untrusted = {"trust_remote_code": False} if cls.__module__.startswith("transformers.") else {}
-    is_module = issubclass(cls, torch.nn.Module)
-    if not is_module:
+    options: dict[str, Any] = {"local_files_only": True}
+    if cls.__module__.startswith("transformers."):  # which asks at the terminal where it is not told
+        options["trust_remote_code"] = False
+    if not (issubclass(cls, torch.nn.Module) or cls.__name__.startswith("AutoModel")):
         with damaged:
-            return cls.from_pretrained(folder, local_files_only=True, **untrusted)
+            return cls.from_pretrained(folder, **options)
     if not any((layout.folder / name).glob("*.safetensors")):
         cure = "`geodiff convert SRC DST` once makes such a folder of .bin, .ckpt or .pth."
         bad_value(f"weights in {folder}", "safetensors", "none of them", cure)
-    options: dict[str, Any] = {"use_safetensors": True, "local_files_only": True} | (extra or {})
     if layout.variant is not None:
         options["variant"] = layout.variant
     with damaged:
-        module, found = cls.from_pretrained(
-            folder, dtype=dtype, output_loading_info=True, **options, **untrusted
+        module, info = cls.from_pretrained(
+            folder, dtype=dtype, use_safetensors=True, output_loading_info=True, **options
         )
-    if found.get("mismatched_keys"):
-        check_weights((), [entry[0] for entry in found["mismatched_keys"]], folder)
-    check_weights(found["missing_keys"], found["unexpected_keys"], folder)
+    if info.get("mismatched_keys"):
+        check_weights((), [entry[0] for entry in info["mismatched_keys"]], folder)
+    if unread is None:
+        check_weights(info["missing_keys"], info["unexpected_keys"], folder)
+    else:
+        check_weights([key for key in info["missing_keys"] if unread not in key], (), folder)
     check_finite(module, folder)
     return module.eval()
 
@@ -209,17 +317,16 @@ def build_pipeline(
     Raises:
         ValueError: a component that the folder lacks, weights that do not fit.
     """
-    options = {name: value for name, value in options.items() if value is not None}
-    arguments: dict[str, Any] = {}
+    arguments = {name: value for name, value in options.items() if value is not None}
     classes = classes or {}
     for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:
         entry = layout.index.get(name)
-        if name in options:
-            arguments[name] = options[name]
-        elif name in classes:
+        if name in arguments:
+            continue
+        if name in classes and layout.has(name):
             arguments[name] = load_component(layout, name, classes[name], dtype)
         elif isinstance(entry, list) and entry[0] is not None:
-            arguments[name] = load_component(layout, name, component_class(layout, name), dtype)
+            arguments[name] = load_component(layout, name, _component_class(layout, name), dtype)
         elif entry is not None and not isinstance(entry, list):
             arguments[name] = entry
         elif parameter.default is parameter.empty:

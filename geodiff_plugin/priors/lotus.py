@@ -12,12 +12,10 @@ from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
-from geodiff_plugin.priors.pipelines.prompts import text_embedding
+from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.components import DirectScheduler, text_embedding
+from geodiff_plugin.priors.loading import Layout, build_pipeline
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, decode_picture
 
 __all__ = ["LotusPipeline", "LotusPrior", "space_of_name"]
 
@@ -60,8 +58,6 @@ class LotusPipeline(DepthDiffusionPipeline):
         scheduler: any; replaced by ``DirectScheduler``: a schedule of noise prediction (SD-2's own, which
             such a folder may carry) is not what the network was trained on.
         prediction_type: ``"depth"`` or ``"disparity"``; the repository's name is the only place that says.
-        default_denoising_steps: 1.
-        default_processing_resolution: longer side, pixels.
 
     Raises:
         ValueError: an unknown prediction type; a U-Net of other channels or without task embedding.
@@ -86,30 +82,16 @@ class LotusPipeline(DepthDiffusionPipeline):
         if prediction_type not in ("depth", "disparity"):
             cure = "No config of Lotus says; the disparity versions are those with disparity in their name."
             bad_value("prediction_type", "'depth' or 'disparity'", repr(prediction_type), cure)
-        channels = unet.config.in_channels
-        if channels not in (4, 8) or unet.config.projection_class_embeddings_input_dim != 4:
-            bad_value(
-                "unet",
-                "one of Lotus (4 or 8 input channels, 4-d class embedding)",
-                f"{channels} channels, {unet.config.projection_class_embeddings_input_dim}-d class embedding",
-            )
+        channels, task = unet.config.in_channels, unet.config.projection_class_embeddings_input_dim
+        if channels not in (4, 8) or task != 4:
+            got = f"{channels} channels, {task}-d class embedding"
+            bad_value("unet", "one of Lotus (4 or 8 input channels, 4-d class embedding)", got)
         self.sees_latents = channels == 8
         if not isinstance(scheduler, DirectScheduler):
             scheduler = DirectScheduler(timestep=TIMESTEP)
-        modules = {
-            "unet": unet,
-            "vae": vae,
-            "text_encoder": text_encoder,
-            "tokenizer": tokenizer,
-            "scheduler": scheduler,
-        }
-        self.register_prior(
-            modules,
-            prediction_type,
-            default_denoising_steps,
-            default_processing_resolution,
-            LotusImageProcessor(),
-        )
+        defaults = prediction_type, default_denoising_steps, default_processing_resolution
+        modules = {"unet": unet, "vae": vae, "text_encoder": text_encoder, "tokenizer": tokenizer}
+        self.register_prior(modules | {"scheduler": scheduler}, *defaults, LotusImageProcessor())
 
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
@@ -144,7 +126,7 @@ class LotusPipeline(DepthDiffusionPipeline):
         The latent covers whole cells of 8 pixels only; a guided call repeats the last row and column beyond
         them. (The authors stretch instead, which moves the map by up to 7 pixels.)
         """
-        return self._decode(z0)  # (B, 1, 8 h, 8 w)
+        return (decode_picture(self.vae, z0) / 2 + 0.5).mean(dim=1, keepdim=True)  # (B, 1, 8 h, 8 w)
 
     def encode_relative(self, x: Tensor) -> Tensor:
         """As the base class, of whole cells only."""
@@ -153,13 +135,8 @@ class LotusPipeline(DepthDiffusionPipeline):
         return super().encode_relative(x[..., :height, :width])
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
-        """As the authors end: clipped to [0, 1], whole cells only; the caller's resizing stretches it."""
-        return self._decode(latents, clip=True)
-
-    def _decode(self, z0: Tensor, clip: bool = False) -> Tensor:
-        """Mean of the decoded channels, ``(B, 1, 8 h, 8 w)``; the authors clip every channel before it."""
-        decoded = self.decode_latents(z0) / 2 + 0.5
-        return (decoded.clamp(0.0, 1.0) if clip else decoded).mean(dim=1, keepdim=True)
+        """As the authors end: channels clipped to [0, 1], whole cells only, which the resizing stretches."""
+        return (decode_picture(self.vae, latents) / 2 + 0.5).clamp(0.0, 1.0).mean(dim=1, keepdim=True)
 
 
 def space_of_name(name: str) -> str:
@@ -167,9 +144,6 @@ def space_of_name(name: str) -> str:
 
     Args:
         name: hub id or path, such as ``"jingheya/lotus-depth-g-v2-1-disparity"``.
-
-    Returns:
-        ``"disparity"`` if the part of the name that holds "lotus" holds "disparity" too, else ``"depth"``.
 
     Raises:
         ValueError: no part of it is named as the authors' repositories are, or it predicts normals.
@@ -183,15 +157,12 @@ def space_of_name(name: str) -> str:
         return "disparity"
     if "lotus-depth-" in named:
         return "depth"
-    bad_value(
-        "prior",
-        "named as its authors named it (lotus-depth-g-v1-0, lotus-depth-g-v2-1-disparity)",
-        repr(name),
-        "Only the name tells depth from disparity; say which with --space or space=.",
-    )
+    expected = "named as its authors named it (lotus-depth-g-v1-0, lotus-depth-g-v2-1-disparity)"
+    cure = "Only the name tells depth from disparity; say which with --space or space=."
+    bad_value("prior", expected, repr(name), cure)
 
 
-class LotusPrior(OwnPipelinePrior):
+class LotusPrior(DepthPrior):
     """Adapter of ``LotusPipeline``."""
 
     pipeline_class = LotusPipeline

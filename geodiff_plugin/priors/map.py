@@ -15,11 +15,10 @@ from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.finish import sharpen_edges
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.geometry.cameras import image_size
-from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import Condition, DirectMapPipeline, Generators
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.components import DirectScheduler
+from geodiff_plugin.priors.loading import Layout
+from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
 from geodiff_plugin.priors.transformers_depth import range_of
 
 __all__ = ["MAP_LAYOUT", "DepthMapPipeline", "DepthMapPrior"]
@@ -41,8 +40,6 @@ class DepthMapPipeline(DirectMapPipeline):
 
     Args:
         scheduler: one step whose result is what it is given.
-        prediction_type: what the values of the maps are affine in, key of ``scale.space.SPACES``.
-        default_denoising_steps: 1.
         default_processing_resolution: longer side of the map that is guided, 0 for the image's own.
 
     Attributes:
@@ -61,13 +58,8 @@ class DepthMapPipeline(DirectMapPipeline):
         self.known: Tensor | None = None
         self._place = torch.nn.Module()  # of the pipeline, which has no weights that would tell
         self._place.register_buffer("at", torch.empty(0))
-        self.register_prior(
-            {"scheduler": scheduler},
-            prediction_type,
-            default_denoising_steps,
-            default_processing_resolution,
-            image_processor=1,
-        )
+        defaults = prediction_type, default_denoising_steps, default_processing_resolution
+        self.register_prior({"scheduler": scheduler}, *defaults, image_processor=1)
 
     @property
     def device(self) -> torch.device:
@@ -92,10 +84,10 @@ class DepthMapPipeline(DirectMapPipeline):
         """The maps on the image's grid, from 0 to about 1, holes filled smoothly.
 
         Args:
-            image: as in the base class.
-            ensemble_size: as there.
-            batch_size: as there.
-            generator: as there.
+            image: as in the base class, like the next three.
+            ensemble_size: E.
+            batch_size: unused.
+            generator: unused.
             depth_map: of every image a map ``(h, w)`` of any size and unit that covers the same view, ``(N,
                 h, w)`` or a list; not finite where nothing is known.
 
@@ -167,10 +159,11 @@ def _resized(values: Tensor, left_01: Tensor) -> Tensor:
     return 1.0 / sharpen_edges(1.0 / (resized + OFFSET), left_01, round(ratio)) - OFFSET
 
 
-class DepthMapPrior(OwnPipelinePrior):
+class DepthMapPrior(DepthPrior):
     """Adapter of ``DepthMapPipeline``: scale, shift and a residual per pixel can be guided."""
 
     pipeline_class = DepthMapPipeline
+    component_classes = {"scheduler": DirectScheduler}
     licence = {"map": "that of the model which made the map"}
 
     def known(self, samples: slice) -> Tensor | None:
@@ -188,4 +181,4 @@ class DepthMapPrior(OwnPipelinePrior):
         """A pipeline without weights; of ``"map"`` the values are depth unless ``space`` says otherwise."""
         if layout == MAP_LAYOUT:
             return cls.pipeline_class(DirectScheduler(timestep=0), space or "depth")
-        return build_pipeline(cls.pipeline_class, layout, dtype, prediction_type=space)
+        return super().load(layout, dtype, space)

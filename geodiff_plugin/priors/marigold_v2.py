@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any, Self
-
 import torch
-from diffusers import AutoencoderKLQwenImage, FlowMatchEulerDiscreteScheduler, QwenImageTransformer2DModel
+from diffusers import (
+    AutoencoderKLQwenImage,
+    FlowMatchEulerDiscreteScheduler,
+    QwenImageEditPipeline,
+    QwenImageTransformer2DModel,
+)
 from diffusers.utils.accelerate_utils import apply_forward_hook
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
-from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
-from geodiff_plugin.priors.pipelines.sides import SidesOf
-from geodiff_plugin.priors.unmerged_lora import LORA_FOLDER, LORAS, has_lora, load_with_lora
+from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.components import FixedPrompt, SidesOf
+from geodiff_plugin.priors.loading import Layout
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
 
 __all__ = [
     "MarigoldV2Pipeline",
@@ -25,8 +23,6 @@ __all__ = [
     "SPACE_OF_CHECKPOINT",
     "frame_of",
     "latents_of",
-    "pack",
-    "unpack",
 ]
 
 
@@ -40,19 +36,12 @@ def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tens
 def latents_of(
     vae: AutoencoderKLQwenImage,
     picture: Tensor,
-    generator: torch.Generator | list[torch.Generator] | None = None,
+    generator: Generators = None,
     sample: bool = False,
 ) -> Tensor:
-    """Normalised latents of pictures.
+    """Normalised latents ``(B, C, H / 8, W / 8)`` float32 of pictures ``(B, 3, H, W)`` in [-1, 1].
 
-    Args:
-        vae: the autoencoder.
-        picture: ``(B, 3, H, W)`` in [-1, 1], sides multiples of 8.
-        generator: of the sample.
-        sample: draw from the posterior; otherwise its mode.
-
-    Returns:
-        ``(B, C, H / 8, W / 8)`` float32.
+    The posterior's mode, or a sample of it by ``generator``; sides are multiples of 8.
     """
     posterior = vae.encode(picture.to(vae.dtype)[:, :, None]).latent_dist
     latents = posterior.sample(generator) if sample else posterior.mode()
@@ -65,13 +54,7 @@ def frame_of(vae: AutoencoderKLQwenImage, latents: Tensor) -> Tensor:
     """Decode normalised latents without the clamp at the end of ``vae.decode``.
 
     That clamp has no gradient beyond [-1, 1], which is where near and far lie. Slicing and tiling are kept.
-
-    Args:
-        vae: the autoencoder.
-        latents: ``(B, C, h, w)``.
-
-    Returns:
-        ``(B, 3, 8 h, 8 w)`` float32 or wider, about [-1, 1], with the graph of ``latents``.
+    Latents ``(B, C, h, w)`` give ``(B, 3, 8 h, 8 w)``, float32 or wider, with their graph.
     """
     wide = latents.to(torch.promote_types(latents.dtype, torch.float32))
     mean, deviation = _statistics(vae, wide)
@@ -89,24 +72,12 @@ def _decode(vae: AutoencoderKLQwenImage, z: Tensor) -> Tensor:
     return vae.decoder(vae.post_quant_conv(z))
 
 
-def pack(latents: Tensor) -> Tensor:
-    """Squares of 2 x 2 latents as tokens: ``(B, C, h, w)``, h and w even, to ``(B, hw / 4, 4 C)``."""
-    squares = latents.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))  # (B, C, h / 2, 2, w / 2, 2)
-    return squares.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2)
-
-
-def unpack(tokens: Tensor, height: int, width: int) -> Tensor:
-    """Latents ``(B, C, height, width)`` of tokens ``(B, hw / 4, 4 C)``; inverse of ``pack``."""
-    squares = tokens.unflatten(1, (height // 2, width // 2)).unflatten(3, (-1, 2, 2))
-    return squares.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)
-
-
 #: First word of a checkpoint's name -> what its map is affine in.
 SPACE_OF_CHECKPOINT = {"log": "log", "uniform": "depth", "disparity": "disparity"}
 #: Timestep input of the network, of 1000. The authors write 499 / 1000 in bfloat16, where 499 is 500.
 TIMESTEP = 500.0
-#: One token is a square of this side.
-SIDE = 16
+#: One token is a square of this side, one latent a cell of half of it.
+SIDE, CELL = 16, 8
 
 
 class MarigoldV2Pipeline(DepthDiffusionPipeline):
@@ -123,13 +94,7 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         prediction_type: ``"log"``, ``"depth"`` (their "Uniform") or ``"disparity"``.
         sample_latent: draw the image's latent from the posterior, as their ``infer.py``, instead of taking
             its mode, as their depth completion.
-        lora: where the LoRA is, one of ``LORAS``; what is not merged, ``load_prior`` and ``from_pretrained``
-            put on.
-        default_denoising_steps: 1.
         default_processing_resolution: longer side, pixels; they trained at 768.
-
-    Raises:
-        ValueError: an unknown ``lora``; a transformer without the LoRA that is kept apart from it.
     """
 
     max_steps = 1
@@ -143,45 +108,15 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         prompt: FixedPrompt,
         prediction_type: str = "log",
         sample_latent: bool = False,
-        lora: str = "merged",
         default_denoising_steps: int = 1,
         default_processing_resolution: int = 768,
     ) -> None:
         super().__init__()
-        if check_choice(lora, "lora", LORAS) != "merged" and not has_lora(transformer):
-            cure = "Load the folder by load_prior or MarigoldV2Pipeline.from_pretrained."
-            bad_value("transformer", "with the LoRA that its folder keeps apart", "one without", cure)
         self.deterministic = not sample_latent
         transformer.enable_gradient_checkpointing()
-        self.register_prior(
-            {"transformer": transformer, "vae": vae, "scheduler": scheduler, "prompt": prompt},
-            prediction_type,
-            default_denoising_steps,
-            default_processing_resolution,
-            image_processor=SidesOf(SIDE, grow=True),
-            sample_latent=sample_latent,
-            lora=lora,
-        )
-
-    @classmethod
-    def from_pretrained(cls, name: str | Path, **kwargs: Any) -> Self:
-        """As of any pipeline; a LoRA that the folder keeps apart is put on the transformer."""
-        folder = Path(name)
-        if "transformer" not in kwargs and (folder / LORA_FOLDER).is_dir():
-            layout = Layout(folder, str(name))
-            kwargs["transformer"] = load_with_lora(layout, kwargs.get("dtype", torch.float32))
-        return super().from_pretrained(name, **kwargs)
-
-    def save_pretrained(self, *args: Any, **kwargs: Any) -> None:
-        """As of any pipeline.
-
-        Raises:
-            ValueError: its LoRA is kept apart: the folder that it came from is what there is to save.
-        """
-        if self.config.lora != "merged":
-            cure = "Copy the folder that it came from, or convert the checkpoint with --lora merged."
-            bad_value("the pipeline", "with a merged LoRA to be saved", f"lora={self.config.lora!r}", cure)
-        super().save_pretrained(*args, **kwargs)
+        defaults = prediction_type, default_denoising_steps, default_processing_resolution
+        modules = {"transformer": transformer, "vae": vae, "scheduler": scheduler, "prompt": prompt}
+        self.register_prior(modules, *defaults, SidesOf(SIDE, grow=True), sample_latent=sample_latent)
 
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
@@ -211,15 +146,17 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
         """Velocity from the depth's latent to the image's."""
-        prompt, (height, width) = condition["prompt"], latents.shape[-2:]
+        prompt, (batch, channels, height, width) = condition["prompt"], latents.shape
+        tokens = QwenImageEditPipeline._pack_latents(latents, batch, channels, height, width)
         velocity = self.transformer(
-            hidden_states=pack(latents).to(prompt.dtype),
-            timestep=(timestep / 1000).to(prompt).expand(len(latents)),
+            hidden_states=tokens.to(prompt.dtype),
+            timestep=(timestep / 1000).to(prompt).expand(batch),
             encoder_hidden_states=prompt,
-            img_shapes=[[(1, height // 2, width // 2)]] * len(latents),
+            img_shapes=[[(1, height // 2, width // 2)]] * batch,
             return_dict=False,
         )[0]
-        return unpack(velocity, height, width).to(latents.dtype)
+        frames = QwenImageEditPipeline._unpack_latents(velocity, CELL * height, CELL * width, CELL)
+        return frames[:, :, 0].to(latents.dtype)
 
     def decode_relative(self, z0: Tensor) -> Tensor:
         """Mean of the decoded channels, from [-1, 1] to [0, 1], not clipped."""
@@ -234,10 +171,11 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         return (frame_of(self.vae, latents).clamp(-1.0, 1.0).mean(dim=1, keepdim=True) + 1.0) / 2.0
 
 
-class MarigoldV2Prior(OwnPipelinePrior):
+class MarigoldV2Prior(DepthPrior):
     """Marigold V2: one step of a transformer on the image's latent, in log, linear or inverse depth."""
 
     pipeline_class = MarigoldV2Pipeline
+    component_classes = {"prompt": FixedPrompt}
     licence = {"huawei-bayerlab/marigold-v2-0": "apache-2.0"}
 
     @staticmethod
@@ -247,21 +185,4 @@ class MarigoldV2Prior(OwnPipelinePrior):
             "joint_attention_dim" in layout.config("transformer")
             and "latents_mean" in layout.config("vae")
             and bool(layout.config("prompt"))
-        )
-
-    @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> MarigoldV2Pipeline:
-        """Components as the index names them, and our prompt; a LoRA kept apart is put on.
-
-        Raises:
-            ValueError: weights that do not fit; a LoRA kept apart, without the packages that it needs.
-        """
-        transformer = load_with_lora(layout, dtype) if layout.has(LORA_FOLDER) else None
-        return build_pipeline(
-            cls.pipeline_class,
-            layout,
-            dtype,
-            classes={"prompt": FixedPrompt},
-            transformer=transformer,
-            prediction_type=space,
         )

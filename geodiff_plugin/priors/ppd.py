@@ -13,11 +13,10 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import Dinov2Model
 
-from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import Condition, DepthDiffusionPipeline, Generators
-from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
+from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.loading import Layout
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pixel_dit import PixelDiT
 
 __all__ = [
     "AreaImageProcessor",
@@ -71,13 +70,8 @@ class AreaImageProcessor(MarigoldImageProcessor):
     def resize_to_max_edge(image: Tensor, max_edge_sz: int, mode: str) -> Tensor:
         """The image at the area of ``max_edge_sz x 0.75 max_edge_sz``, whatever its aspect ratio.
 
-        Args:
-            image: ``(B, 3, H, W)``.
-            max_edge_sz: longer side that an image of 4:3 gets; 1024 is what the network was trained at.
-            mode: unused; as the authors, the mean over areas where it shrinks and cubic where it grows.
-
-        Returns:
-            ``(B, 3, h, w)``, sides multiples of 16.
+        ``max_edge_sz`` is the longer side that an image of 4:3 gets; 1024 is what the network was trained at.
+        As the authors, the mean over areas where it shrinks and cubic where it grows.
         """
         height, width = image.shape[-2:]
         scale = (max_edge_sz**2 * TRAINING_RATIO / (height * width)) ** 0.5
@@ -87,8 +81,11 @@ class AreaImageProcessor(MarigoldImageProcessor):
         return F.interpolate(image, size, mode="bicubic", align_corners=False).clamp(-1.0, 1.0)
 
 
+@apply_forward_hook
 def semantic_tokens(encoder: Dinov2Model, image_01: Tensor) -> Tensor:
     """Normed patch tokens of Depth Anything V2's encoder, one for each 16 x 16 pixels.
+
+    The parts of ``encoder.forward`` are called one by one; the hook brings an offloaded encoder back.
 
     Args:
         encoder: ``Dinov2Model`` with patches of 14.
@@ -99,15 +96,8 @@ def semantic_tokens(encoder: Dinov2Model, image_01: Tensor) -> Tensor:
     """
     mean, std = (image_01.new_tensor(v).view(1, 3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
     rows, columns = image_01.shape[-2] // SIDE, image_01.shape[-1] // SIDE
-    patch = encoder.config.patch_size
+    patch, embeddings = encoder.config.patch_size, encoder.embeddings
     view = F.interpolate((image_01 - mean) / std, (rows * patch, columns * patch), mode="bicubic")
-    return _tokens_of(encoder, view, rows, columns)
-
-
-@apply_forward_hook
-def _tokens_of(encoder: Dinov2Model, view: Tensor, rows: int, columns: int) -> Tensor:
-    """The parts of ``encoder.forward``, called one by one; the hook brings an offloaded encoder back."""
-    embeddings = encoder.embeddings
     patches = embeddings.patch_embeddings(view)  # (B, n, C)
     tokens = torch.cat([embeddings.cls_token.expand(len(patches), -1, -1), patches], dim=1)
     tokens = tokens + _position_embeddings(embeddings.position_embeddings, rows, columns)
@@ -152,13 +142,9 @@ class PPDPipeline(DepthDiffusionPipeline):
         default_processing_resolution: int = 1024,
     ) -> None:
         super().__init__()
-        self.register_prior(
-            {"dit": dit, "semantic_encoder": semantic_encoder, "scheduler": scheduler},
-            prediction_type,
-            default_denoising_steps,
-            default_processing_resolution,
-            image_processor=AreaImageProcessor(vae_scale_factor=SIDE),
-        )
+        defaults = prediction_type, default_denoising_steps, default_processing_resolution
+        modules = {"dit": dit, "semantic_encoder": semantic_encoder, "scheduler": scheduler}
+        self.register_prior(modules, *defaults, AreaImageProcessor(vae_scale_factor=SIDE))
 
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators, **options: Any
@@ -200,10 +186,11 @@ class PPDPipeline(DepthDiffusionPipeline):
 LICENCE = "apache-2.0, and cc-by-nc-4.0 for the encoder of Depth Anything V2 Large"
 
 
-class PPDPrior(OwnPipelinePrior):
+class PPDPrior(DepthPrior):
     """Adapter of ``PPDPipeline``: no VAE, so that decoding is an offset and the gradient its own."""
 
     pipeline_class = PPDPipeline
+    component_classes = {"dit": PixelDiT, "semantic_encoder": Dinov2Model}
     licence = {"gangweix/Pixel-Perfect-Depth": LICENCE}
 
     @staticmethod
@@ -212,9 +199,3 @@ class PPDPrior(OwnPipelinePrior):
         semantic_size = layout.config("dit").get("semantic_size")
         encoder = layout.config("semantic_encoder")
         return semantic_size is not None and encoder.get("model_type") == "dinov2"
-
-    @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> PPDPipeline:
-        """Components by name; the transformer's class is ours."""
-        classes = {"dit": PixelDiT, "semantic_encoder": Dinov2Model}
-        return build_pipeline(cls.pipeline_class, layout, dtype, classes, prediction_type=space)

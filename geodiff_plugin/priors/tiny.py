@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from diffusers import AutoencoderTiny
 
-from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.loading import reading
 
 __all__ = ["FULL", "KNOWN", "TINY", "tiny_autoencoder"]
 
@@ -72,15 +73,8 @@ def tiny_autoencoder(pipe: Any, prior: DepthPrior, decoder: str) -> AutoencoderT
 def _loaded(name: str, dtype: torch.dtype, device: str) -> AutoencoderTiny:
     if not os.path.isdir(name) and (name.count("/") != 1 or name.startswith((".", "/", "~"))):
         bad_value("decoder", f"{FULL!r}, {TINY!r}, a folder that is there, or a hub id", repr(name))
-    try:
+    expected = "a folder of an AutoencoderTiny, or a hub id of one that is cached or can be reached"
+    cure = "Fetch it once with `hf download ID` while online, or give a folder that save_pretrained wrote."
+    with reading("decoder", expected, repr(name), cure):
         tiny = AutoencoderTiny.from_pretrained(name, dtype=dtype, use_safetensors=True)
-    except (OSError, ValueError, ConnectionError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        cure = (
-            "Fetch it once with `hf download ID` while online, or give a folder that save_pretrained wrote."
-        )
-        raise InputError(
-            "decoder must be a folder of an AutoencoderTiny, or a hub id of one that is cached or can be "
-            f"reached; got {name!r} ({reason}). {cure}"
-        ) from error
     return tiny.to(device).eval().requires_grad_(False)

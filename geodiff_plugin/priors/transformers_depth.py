@@ -1,27 +1,215 @@
-"""Depth models of ``transformers`` as priors that answer in one step, without a latent."""
+"""Depth models of ``transformers`` as priors that answer in one step, prepared without torchvision."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
-from transformers import PreTrainedModel
+from transformers import AutoModelForDepthEstimation, PreTrainedModel
+from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.priors.base import OwnPipelinePrior
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.hf_model import DEPTH_ARCHITECTURES, DepthMap, HFDepthModel, Preparation, output_of
-from geodiff_plugin.priors.loading import build_pipeline
-from geodiff_plugin.priors.pipelines.base import Condition, DirectMapPipeline, Generators
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.priors.base import DepthPrior
+from geodiff_plugin.priors.components import DirectScheduler
+from geodiff_plugin.priors.loading import Layout, build_pipeline, load_component
+from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
 
-__all__ = ["TransformersDepthPipeline", "TransformersDepthPrior", "range_of", "unit_range"]
+__all__ = [
+    "NO_DEPTH",
+    "Preparation",
+    "TransformersDepthPipeline",
+    "TransformersDepthPrior",
+    "output_of",
+    "range_of",
+    "unit_range",
+]
 
+MODES = {2: "bilinear", 3: "bicubic"}  # of PIL
+#: Whose library resizes without antialiasing, or pads after normalising.
+ALIASED, PADDED_LAST = ("ZoeDepth", "DepthPro"), ("DPT", "PromptDepthAnything")
+#: Whose library brings the map to the image's size bilinearly; the others' do so bicubically.
+BILINEAR = ("DepthPro", "Tipsv2Dpt")
+HALF = (0.5, 0.5, 0.5)  # mean and standard deviation where the file names none
+_PLAIN: dict[str, Any] = {"resample": 2, "do_normalize": True, "do_pad": False}
+#: Processor -> what its file leaves out; GLPN and Tipsv2Dpt do not normalise.
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "DPT": _PLAIN | {"size": 384, "resample": 3},
+    "ZoeDepth": _PLAIN
+    | {
+        "size": {"height": 384, "width": 512},
+        "do_pad": True,
+        "keep_aspect_ratio": True,
+        "ensure_multiple_of": 1 / 32,
+    },
+    "GLPN": _PLAIN | {"size": None, "do_normalize": False, "size_divisor": 32},
+    "DepthPro": _PLAIN | {"size": 1536},
+    "PromptDepthAnything": _PLAIN | {"size": 384, "resample": 3},
+    "Tipsv2Dpt": _PLAIN | {"size": {"height": 448, "width": 448}, "do_normalize": False},
+}
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Resizing, padding and normalisation of one checkpoint.
+
+    Attributes:
+        kind: key of ``DEFAULTS``.
+        options: ``preprocessor_config.json`` over the processor's defaults.
+    """
+
+    kind: str
+    options: dict[str, Any]
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> Preparation:
+        """Of the contents of ``preprocessor_config.json``.
+
+        Raises:
+            ValueError: a processor, a resampling or a size that is not known here.
+        """
+        file = "of preprocessor_config.json"
+        name = str(config.get("image_processor_type") or config.get("feature_extractor_type"))
+        kind = name.removesuffix("Fast").removesuffix("Pil")
+        kind = kind.removesuffix("ImageProcessor").removesuffix("FeatureExtractor")
+        if kind not in DEFAULTS:
+            expected = f"one of {', '.join(f'{k}ImageProcessor' for k in DEFAULTS)}"
+            bad_value(f"image_processor_type {file}", expected, name)
+        given = {k: v for k, v in config.items() if v is not None}
+        options = {"image_mean": HALF, "image_std": HALF, "do_resize": True, **DEFAULTS[kind], **given}
+        if options["resample"] not in MODES:
+            bad_value(f"resample {file}", "2 (bilinear) or 3 (bicubic)", options["resample"])
+        size = options["size"]
+        if size is not None and not isinstance(size, int) and not {"height", "width"} <= set(size):
+            bad_value(f"size {file}", "a number or a height and a width", size)
+        return cls(kind, options)
+
+    def border(self, height: int, width: int) -> tuple[int, int]:
+        """Pixels that ZoeDepth reflects above and below, and left and right, before it resizes."""
+        if self.kind != "ZoeDepth" or not self.options["do_pad"]:
+            return 0, 0
+        return int((height / 2) ** 0.5 * 3), int((width / 2) ** 0.5 * 3)
+
+    def resized(self, height: int, width: int) -> tuple[int, int]:
+        """Sides ``(h, w)`` of the network's view of an image, without what is padded after resizing."""
+        if not self.options["do_resize"]:
+            return height, width
+        if self.kind == "GLPN":
+            divisor = self.options["size_divisor"]
+            return height // divisor * divisor, width // divisor * divisor
+        size = self.options["size"]
+        target_h, target_w = (size["height"], size["width"]) if isinstance(size, dict) else (size, size)
+        scale_h, scale_w = target_h / height, target_w / width
+        if self.options.get("keep_aspect_ratio", False):  # the side that changes least decides
+            scale_h = scale_w = scale_w if abs(1 - scale_w) < abs(1 - scale_h) else scale_h
+        multiple = self.options.get("ensure_multiple_of", 1)
+        h, w = (int(round(side / multiple) * multiple) for side in (scale_h * height, scale_w * width))
+        return h, w
+
+    def padding(self, height: int, width: int) -> tuple[int, int, int, int]:
+        """Left, right, top, bottom zeros after normalising, to a multiple of a patch (``PADDED_LAST``)."""
+        divisor = self.options.get("size_divisor")
+        if self.kind not in PADDED_LAST or not self.options["do_pad"] or not divisor:
+            return 0, 0, 0, 0
+        rows, columns = -height % divisor, -width % divisor
+        return columns // 2, columns - columns // 2, rows // 2, rows - rows // 2
+
+    def __call__(self, image_01: Tensor) -> Tensor:
+        """What the network is given.
+
+        Args:
+            image_01: ``(B, 3, H, W)`` float32 in [0, 1].
+
+        Returns:
+            ``(B, 3, h, w)`` float32, within about a grey level of the library's, which rounds to bytes twice.
+
+        Raises:
+            ValueError: an image smaller than the patch that it is cut into.
+        """
+        rows, columns = self.border(*image_01.shape[-2:])
+        x = F.pad(image_01, (columns, columns, rows, rows), mode="reflect") if rows or columns else image_01
+        size = self.resized(*x.shape[-2:])
+        if min(size) < 1:
+            bad_value("image", "at least as large as a patch of the network", f"{x.shape[-1]}x{x.shape[-2]}")
+        if size != tuple(x.shape[-2:]):
+            mode, corners = MODES[self.options["resample"]], self.kind == "ZoeDepth"
+            antialias = self.kind not in ALIASED
+            x = F.interpolate(x, size, mode=mode, align_corners=corners, antialias=antialias)
+            x = x.clamp(0.0, 1.0) if antialias else x  # the library resizes bytes, which cannot overshoot
+        if self.options["do_normalize"]:
+            mean, std = (
+                torch.as_tensor(self.options[k], dtype=x.dtype, device=x.device).view(1, -1, 1, 1)
+                for k in ("image_mean", "image_std")
+            )
+            x = (x - mean) / std
+        return F.pad(x, self.padding(*size))
+
+    def on_the_image(self, values: Tensor, height: int, width: int) -> Tensor:
+        """The network's map ``(B, 1, h, w)`` without what was padded around ``(height, width)``."""
+        rows, columns = self.border(height, width)
+        if rows or columns:
+            values = _bicubic(values, (height + 2 * rows, width + 2 * columns))
+            return values[:, :, rows : rows + height, columns : columns + width]
+        h, w = self.resized(height, width)
+        left, right, top, bottom = self.padding(h, w)
+        if left + right + top + bottom == 0:
+            return values
+        return _bicubic(values, (h + top + bottom, w + left + right))[:, :, top : top + h, left : left + w]
+
+
+def _bicubic(values: Tensor, size: tuple[int, int]) -> Tensor:
+    return F.interpolate(values, size, mode="bicubic", align_corners=False)
+
+
+#: Class names of every model that ``AutoModelForDepthEstimation`` loads, and what TIPSv2's files name.
+DEPTH_ARCHITECTURES = frozenset(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values()) | {
+    "Tipsv2DptForDensePrediction"
+}
+#: Those whose map is no depth, and what it is.
+NO_DEPTH = {"CHMv2ForDepthEstimation": "its map is the height of trees above the ground, seen from the air"}
+#: The one that takes depths to start from, and gives metres with them.
+PROMPTED = "PromptDepthAnythingForDepthEstimation"
+SPACES = ("depth", "disparity")
+#: Weights that DPT's published files lack and no forward reads: the first fusion has nothing to add to.
+UNREAD = "fusion_stage.layers.0.residual_layer1."
+#: DepthPro's own limits on inverse metres.
+NEAREST, FARTHEST = 1e4, 1e-4
 #: What is 1; a few stray pixels shall not press the rest together.
 TOP_QUANTILE = 0.98
 #: Metres; a network's least depth may be 0.
 NEAREST_M = 1e-3
+PREPARATION_FILES = ("preprocessor_config.json", "processor_config.json")
+
+
+def output_of(model: PreTrainedModel) -> tuple[str, bool]:
+    """What the class of a model predicts: space (``depth`` or ``disparity``) and whether in (inverse) metres.
+
+    Depth Anything as its ``depth_estimation_type`` says; DPT relative disparity, but metres with the
+    projection that only DINOv2's depth heads have; ZoeDepth, GLPN and TIPSv2 metres; DepthPro inverse metres,
+    relative without the head for its field of view; Prompt Depth Anything relative depth, until it is given a
+    prompt.
+
+    Raises:
+        ValueError: a class of which this is not known.
+    """
+    name, config = type(model).__name__.removesuffix("ForDepthEstimation"), model.config
+    if name in ("DepthAnything", "DPT"):
+        metres = config.depth_estimation_type == "metric" if name != "DPT" else config.add_projection
+        return ("depth", True) if metres else ("disparity", False)
+    if name in ("ZoeDepth", "GLPN", "Tipsv2Dpt", "PromptDepthAnything"):
+        return "depth", name != "PromptDepthAnything"
+    if name == "DepthPro":
+        return "disparity", bool(config.use_fov_model)
+    cure = "Say what its output is affine in: space='depth' or space='disparity' (--space)."
+    bad_value("the prior", "a depth model whose output is known", type(model).__name__, cure)
+
+
+def _check_is_depth(name: str) -> None:
+    """Refuse a class of ``transformers`` whose map is no depth, by its name."""
+    if name in NO_DEPTH:
+        bad_value("the prior", "a model of depth", name, f"It is refused because {NO_DEPTH[name]}.")
 
 
 def range_of(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -51,12 +239,16 @@ class TransformersDepthPipeline(DirectMapPipeline):
         scheduler: one step whose result is what it is given.
         preparation: contents of ``preprocessor_config.json``; needed.
         prediction_type: ``"depth"`` or ``"disparity"``; ``None`` for what the model's class is known to give.
-        default_denoising_steps: 1.
         default_processing_resolution: see above.
 
     Attributes:
+        takes_prompt: whether it can be given depths to start from.
+        metric: whether its maps are in metres (inverse metres in disparity space) without a prompt.
         own_range: ``(N * E, 2)`` metres at 0 and at 1 of the latest call's maps, of a model that is metric by
             itself or was given a prompt; else ``None``.
+
+    Raises:
+        ValueError: a class whose map is no depth, or of which it is not known.
     """
 
     model_cpu_offload_seq = "model"
@@ -71,19 +263,26 @@ class TransformersDepthPipeline(DirectMapPipeline):
         default_processing_resolution: int = 768,
     ) -> None:
         super().__init__()
-        wrapped = HFDepthModel(model, Preparation.from_config(preparation or {}), prediction_type)
-        # A space that the model's class is known for says nothing new: what is saved with it stays metric.
-        self._said = None if wrapped.space == _space_of(model) else wrapped.space
-        self.takes_prompt = wrapped.takes_prompt
+        _check_is_depth(type(model).__name__)
+        self.takes_prompt = type(model).__name__ == PROMPTED
         self.own_range: Tensor | None = None
-        self.register_prior(
-            {"model": model, "scheduler": scheduler},
-            wrapped.space,
+        self.prepare = Preparation.from_config(preparation or {})
+        try:
+            space, self.metric = output_of(model)
+        except ValueError:
+            if prediction_type is None:
+                raise
+            space, self.metric = prediction_type, False
+        # A space that the model's class is known for says nothing new: what is saved with it stays metric.
+        if prediction_type is not None and prediction_type != space:
+            space, self.metric = check_choice(prediction_type, "space", SPACES), False
+        defaults = (
+            check_choice(space, "space", SPACES),
             default_denoising_steps,
             default_processing_resolution,
-            image_processor=1,
-            preparation=preparation,
         )
+        modules = {"model": model, "scheduler": scheduler}
+        self.register_prior(modules, *defaults, image_processor=1, preparation=preparation)
 
     def prepare_condition(
         self,
@@ -95,53 +294,89 @@ class TransformersDepthPipeline(DirectMapPipeline):
     ) -> Condition:
         """The relative map of every image, ``(N * E, 1, H, W)`` float32.
 
-        Args:
-            image: as in the base class.
-            ensemble_size: as there.
-            batch_size: as there.
-            generator: as there.
-            prompt_depth: ``(N, 1, h, w)`` metres everywhere, for Prompt Depth Anything; a guided call makes
-                it of matches and points, unless it is given one.
+        ``prompt_depth`` is ``(N, 1, h, w)`` metres everywhere, for Prompt Depth Anything; a guided call makes
+        it of matches and points, unless it is given one. Other arguments as in the base class.
         """
-        prompts = [None] * len(image.split(batch_size))
+        parts = image.split(batch_size)
+        prompts: Any = [None] * len(parts)
         if prompt_depth is not None:
             prompt_depth = torch.as_tensor(prompt_depth)
             if prompt_depth.ndim != 4 or len(prompt_depth) != len(image):
                 bad_value("prompt_depth", f"({len(image)}, 1, h, w) metres", tuple(prompt_depth.shape))
             prompts = prompt_depth.split(batch_size)
-        wrapped = HFDepthModel(self.model, Preparation.from_config(self.config.preparation), self._said)
+        size = tuple(image.shape[-2:])
         maps = [
-            wrapped(part.float() / 2 + 0.5, tuple(part.shape[-2:]), prompt)
-            for part, prompt in zip(image.split(batch_size), prompts, strict=True)
+            self.predict(part.float() / 2 + 0.5, size, told)
+            for part, told in zip(parts, prompts, strict=True)
         ]
-        self.own_range = _own_range(maps, ensemble_size)
-        values = torch.cat([found.values for found in maps])
+        values = torch.cat(maps)
+        self.own_range = None
+        if self.metric or prompt_depth is not None:
+            ends = torch.cat([torch.stack([self.metres(v) for v in range_of(part)], 1) for part in maps])
+            self.own_range = ends.clamp_min(NEAREST_M).repeat_interleave(ensemble_size, dim=0)
         return {"relative": unit_range(values).repeat_interleave(ensemble_size, dim=0)}
 
+    def metres(self, values: Tensor) -> Tensor:
+        """Metres, > 0, of values of a metric map's unit, any shape."""
+        return values if self.config.prediction_type == "depth" else 1.0 / values.clamp(FARTHEST, NEAREST)
 
-def _space_of(model: PreTrainedModel) -> str | None:
-    """What the class of a model is known to give, if it is."""
-    try:
-        return output_of(model)[0]
-    except ValueError:
-        return None
+    @torch.no_grad()
+    def predict(self, image_01: Tensor, size: tuple[int, int], prompt_m: Tensor | None = None) -> Tensor:
+        """What the model says, in its own unit and not clipped.
+
+        Args:
+            image_01: ``(B, 3, H, W)`` in [0, 1], on the model's device.
+            size: sides ``(h, w)`` of the map.
+            prompt_m: ``(B, 1, h', w')`` metres everywhere, of any size, for a model that takes a prompt; its
+                map is in metres then.
+
+        Returns:
+            ``(B, 1, h, w)`` float32 over the whole image and nothing but it (what was padded is gone),
+            resampled as the library's ``post_process_depth_estimation`` does.
+
+        Raises:
+            ValueError: an image too small for the network; a prompt for a model that takes none.
+        """
+        told, unit = {}, None
+        if prompt_m is not None:
+            if not self.takes_prompt:
+                bad_value("prompt_depth", "left out with this model", "given", f"Only {PROMPTED} takes one.")
+            prompt = _with_a_span(prompt_m.to(image_01.device))
+            if self.model.dtype != torch.float32:  # metres would lose the digits that the model divides by
+                low, high = prompt.amin((1, 2, 3), keepdim=True), prompt.amax((1, 2, 3), keepdim=True)
+                unit, prompt = (low, high - low), (prompt - low) / (high - low)
+            told["prompt_depth"] = prompt.to(self.model.dtype)
+        output = self.model(pixel_values=self.prepare(image_01.float()).to(self.model.dtype), **told)
+        values = output.predicted_depth.float()[:, None]  # (B, 1, h', w')
+        if unit is not None:  # as the model itself does it
+            values = values * unit[1] + unit[0]
+        fov = getattr(output, "field_of_view", None)
+        if fov is not None:  # canonical inverse depth -> inverse metres: times width over focal length
+            values = values * 2.0 * torch.tan(0.5 * torch.deg2rad(fov.float())).view(-1, 1, 1, 1)
+        values = self.prepare.on_the_image(values, *image_01.shape[-2:])
+        if tuple(values.shape[-2:]) == tuple(size):
+            return values
+        if self.prepare.kind in BILINEAR:
+            return F.interpolate(values, size, mode="bilinear", align_corners=False)
+        return _bicubic(values, size)
 
 
-def _own_range(maps: list[DepthMap], ensemble_size: int) -> Tensor | None:
-    """``(N * E, 2)`` metres where the ranged maps are 0 and 1; ``None`` for relative ones."""
-    if not all(found.metric for found in maps):
-        return None
-    ends = [torch.stack([found.metres_of(v) for v in range_of(found.values)], 1) for found in maps]
-    return torch.cat(ends).clamp_min(NEAREST_M).repeat_interleave(ensemble_size, dim=0)
+def _with_a_span(prompt_m: Tensor) -> Tensor:
+    """A prompt that is not one number everywhere, as the library makes it: its span is divided by."""
+    prompt_m = prompt_m.float().clone()
+    corner = prompt_m[:, :, 0, 0]
+    # A millionth of a metre is lost beside tens of them.
+    above = torch.maximum(corner + 1e-6, torch.nextafter(corner, torch.full_like(corner, torch.inf)))
+    is_flat = (prompt_m.amax((1, 2, 3)) == prompt_m.amin((1, 2, 3)))[:, None]
+    prompt_m[:, :, 0, 0] = torch.where(is_flat, above, corner)
+    return prompt_m
 
 
-PREPARATION_FILES = ("preprocessor_config.json", "processor_config.json")
-
-
-class TransformersDepthPrior(OwnPipelinePrior):
+class TransformersDepthPrior(DepthPrior):
     """Adapter of ``TransformersDepthPipeline``: scale, shift and a residual per pixel can be guided."""
 
     pipeline_class = TransformersDepthPipeline
+    component_classes = {"scheduler": DirectScheduler}
     licence = {
         "depth-anything/Depth-Anything-V2-Small-hf": "apache-2.0",
         "depth-anything/Depth-Anything-V2-Base-hf": "cc-by-nc-4.0",
@@ -168,23 +403,21 @@ class TransformersDepthPrior(OwnPipelinePrior):
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> TransformersDepthPipeline:
-        """The model and the preparation of its images.
+        """The model and the preparation of its images, from our folder or as the hub has it.
 
         Raises:
             ValueError: a folder without safetensors, or without what says how images are prepared.
         """
         if layout.index:
-            classes = {"scheduler": DirectScheduler}
-            return build_pipeline(cls.pipeline_class, layout, dtype, classes, prediction_type=space)
-        if not any(map(layout.has, PREPARATION_FILES)):
+            return build_pipeline(
+                cls.pipeline_class, layout, dtype, cls.component_classes, prediction_type=space
+            )
+        for name in layout.config("").get("architectures", ()):
+            _check_is_depth(name)
+        config = next(filter(None, map(layout.read_json, PREPARATION_FILES)), None)
+        if config is None:
             cure = "Fetch the whole folder anew: without it nobody knows how images are prepared."
             bad_value(str(layout.folder), f"a folder with {PREPARATION_FILES[0]}", "none", cure)
-        if not any(layout.folder.glob("*.safetensors")):
-            cure = "Run `geodiff convert SRC DST` once if it has a .bin file."
-            bad_value(str(layout.folder), "a folder with .safetensors weights", "none", cure)
-        options = {} if layout.variant is None else {"variant": layout.variant}
-        loaded = HFDepthModel.from_pretrained(
-            layout.folder, dtype=dtype, space=space, local_files_only=True, **options
-        )
-        scheduler, preparation = DirectScheduler(timestep=0), loaded.preparation.options
-        return cls.pipeline_class(loaded.model, scheduler, preparation, loaded.space)
+        model = load_component(layout, "", AutoModelForDepthEstimation, dtype, unread=UNREAD)
+        preparation = config.get("image_processor", config)  # a processor's file holds that of its images
+        return cls.pipeline_class(model.requires_grad_(False), DirectScheduler(0), preparation, space)

@@ -14,7 +14,7 @@ from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_numb
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
-from geodiff_plugin.priors.pipelines.base import RESAMPLING
+from geodiff_plugin.priors.pipeline import RESAMPLING
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 
 #: What every stock pipeline's call takes, whatever the prior.

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.denoising import NoiseLevel
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+from geodiff_plugin.priors.components import DirectScheduler
 
 
 def _clip(scheduler: Any) -> float | None:

@@ -21,7 +21,7 @@ from geodiff_plugin._checks import bad_type, bad_value, noted, refuse, warn
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
-from geodiff_plugin.priors.pipelines.base import DepthDiffusionPipeline
+from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.priors.tiny import tiny_autoencoder
 from geodiff_plugin.runtime.checks import (
     check_arguments,

@@ -33,16 +33,14 @@ from transformers import (
     Dinov2Model,
 )
 
+from geodiff_plugin.priors.components import DirectScheduler, FixedPrompt
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
-from geodiff_plugin.priors.depthmaster import DepthMasterPipeline
+from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
 from geodiff_plugin.priors.e2e_ft import E2EFTPipeline
 from geodiff_plugin.priors.geowizard import GeoWizardPipeline
 from geodiff_plugin.priors.lotus import LotusPipeline
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
-from geodiff_plugin.priors.pipelines.fourier_unet import FourierUNet
-from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
-from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
+from geodiff_plugin.priors.pixel_dit import PixelDiT
 from geodiff_plugin.priors.ppd import PPDPipeline
 from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline
 

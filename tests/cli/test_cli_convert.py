@@ -1,4 +1,4 @@
-"""``geodiff convert``: pickled weights to a folder that loads, clear refusals, and nothing half-written."""
+"""``geodiff convert``: every checkpoint format to a folder that loads, clear refusals, nothing half-written."""
 
 from __future__ import annotations
 
@@ -8,20 +8,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from diffusers import AutoencoderKL
-from safetensors.torch import load_file
+from diffusers import AutoencoderKL, AutoencoderKLQwenImage, QwenImageTransformer2DModel
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
-from geodiff_plugin.cli.converters.depthfm import diffusers_name, unet_config
-from geodiff_plugin.priors.depthfm import DepthFMPrior
-from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, DepthMasterPrior
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.pipelines.fourier_unet import FourierUNet
+from geodiff_plugin.cli.converters.depthfm import unet_config
+from geodiff_plugin.cli.converters.marigold_v2 import merged, read_prompt
+from geodiff_plugin.priors import find_prior, load_prior
+from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
+from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
+from geodiff_plugin.priors.pixel_dit import PixelDiT
 from tests.conftest import make_text_encoder, make_vae
+from tests.contracts.tiny_ppd import make_ppd
+from tests.parity import marigold_v2_reference as reference
 from tests.parity.depthfm_reference import HPARAMS, VAE
 from tests.parity.depthmaster_reference import UNET
 from tests.parity.named_weights import fill, named_state
 
 FIXTURE = Path(__file__).parents[1] / "parity" / "fixtures" / "depthfm.npz"
+IMAGE = np.random.default_rng(0).random((32, 48, 3), np.float32)
+
+
+def refused(answer, folder, left: set[str], *parts: str) -> None:
+    assert answer.code == 2 and answer.err.count("\n") == 1, answer.err
+    assert all(part in answer.err for part in parts), answer.err
+    assert {path.name for path in folder.iterdir()} <= left, "something was left behind"
+
+
+# A checkpoint (DepthFM) and what is wrong with others ----------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -45,67 +60,76 @@ def checkpoint():
 
 @pytest.fixture
 def convert(geodiff, tmp_path, vae_folder):
-    """Save an object, convert it to ``out``; the answer, and what stands in the folder afterwards."""
+    """Save an object and convert it to ``out``."""
 
-    def run(content):
+    def run(content, *options):
         torch.save(content, tmp_path / "weights.ckpt")
-        answer = geodiff("convert", tmp_path / "weights.ckpt", tmp_path / "out", "--with", vae_folder)
-        return answer, {path.name for path in tmp_path.iterdir()}
+        options = options or ("--with", vae_folder)
+        return geodiff("convert", tmp_path / "weights.ckpt", tmp_path / "out", *options)
 
     return run
 
 
-def refused(answer, left: set[str], *parts: str) -> None:
-    assert answer.code == 2 and answer.err.count("\n") == 1, answer.err
-    assert all(part in answer.err for part in parts), answer.err
-    assert left == {"weights.ckpt"}, "something was left behind"
-
-
 def test_a_checkpoint_of_depthfm_loads(convert, checkpoint, tmp_path):
-    answer, left = convert(checkpoint)
+    answer = convert(checkpoint)
     assert answer.code == 0, answer.err
-    assert left == {"weights.ckpt", "out"} and "(depthfm)" in answer.out and "--prior" in answer.out
-    layout = Layout(tmp_path / "out", "out")
-    assert DepthFMPrior.recognises(layout) and not DepthMasterPrior.recognises(layout)
-    assert layout.licence == "mit"
-    pipe = DepthFMPrior.load(layout, torch.float32, None)
+    assert {path.name for path in tmp_path.iterdir()} == {"weights.ckpt", "out"}
+    assert "(depthfm)" in answer.out and "--prior" in answer.out
+    found = find_prior(tmp_path / "out")
+    assert (found.key, found.licence) == ("depthfm", "mit")
+    pipe = found.load()
     assert pipe.config.noising_step == 400 and pipe.config.prediction_type == "log"
-    torch.testing.assert_close(
-        pipe.unet.conv_in.weight, checkpoint["state_dict"]["input_blocks.0.0.weight"], rtol=0, atol=0
-    )
-    again, _ = convert(checkpoint)
+    assert torch.equal(pipe.unet.conv_in.weight, checkpoint["state_dict"]["input_blocks.0.0.weight"])
+    again = convert(checkpoint)
     assert again.code == 2 and "does not exist yet" in again.err
 
 
-def test_weights_that_do_not_fit_are_listed(convert, checkpoint):
-    state = dict(checkpoint["state_dict"])
-    del state["middle_block.1.proj_in.weight"]
-    state |= {"middle_block.0.in_layers.1.weight": torch.ones(1), "label_emb.weight": torch.ones(1)}
-    answer, left = convert(checkpoint | {"state_dict": state})
-    refused(answer, left, "missing: mid_block.attentions.0.proj_in.weight", "unexpected: label_emb.weight")
-    assert "middle_block.0.in_layers.1.weight" in answer.err
-
-
-def test_options_beyond_the_network_are_named(convert, checkpoint):
-    refused(*convert(checkpoint | {"ldm_hparams": {**HPARAMS, "num_classes": 4}}), "num_classes", "4")
-    refused(*convert(checkpoint | {"ldm_hparams": {**HPARAMS, "colour": 1}}), "colour")
-    short = {key: value for key, value in HPARAMS.items() if key != "context_dim"}
-    refused(*convert(checkpoint | {"ldm_hparams": short}), "context_dim")
-
-
-def test_an_unknown_checkpoint_is_named_by_its_keys(convert):
-    content = {f"layer{i}.weight": torch.zeros(1) for i in range(10)}
-    refused(*convert(content), "depthfm", "layer0.weight", "layer7.weight and 2 more")
-    refused(*convert([1, 2]), "holds a mapping", "list")
+def test_options_of_the_published_depthfm():
+    """As ``depthfm-v1.ckpt`` holds them: the U-Net of Stable Diffusion 2 with 8 heads."""
+    theirs = {"model_channels": 320, "attention_resolutions": [4, 2, 1], "channel_mult": [1, 2, 4, 4]}
+    hparams = HPARAMS | theirs | {"num_heads": 8, "context_dim": 1024}
+    config = unet_config(hparams)
+    assert config["block_out_channels"] == (320, 640, 1280, 1280)
+    assert config["down_block_types"] == ("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",)
+    assert config["up_block_types"] == ("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3
+    by_width = unet_config({**hparams, "num_head_channels": 64})
+    assert config["attention_head_dim"] == 8 and by_width["attention_head_dim"] == (5, 10, 20, 20)
 
 
 class Foreign:
     """Not plain data."""
 
 
-def test_nothing_is_run(convert):
-    answer, left = convert({"state_dict": Foreign(), "empty_text_embedding": np.zeros(1)})
-    refused(answer, left, "Foreign", "never done")
+def spoilt(checkpoint, kind):
+    state, hparams = dict(checkpoint["state_dict"]), dict(checkpoint["ldm_hparams"])
+    if kind == "weights":
+        del state["middle_block.1.proj_in.weight"]
+        state |= {"middle_block.0.in_layers.1.weight": torch.ones(1), "label_emb.weight": torch.ones(1)}
+    elif kind == "shape":
+        state["out.2.bias"] = torch.ones(9)
+    elif kind == "option":
+        del hparams["context_dim"]
+    return checkpoint | {"state_dict": state, "ldm_hparams": hparams}
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        ("weights", ("missing: mid_block.attentions.0.proj_in.weight", "label_emb.weight")),
+        ("weights", ("middle_block.0.in_layers.1.weight",)),
+        ("shape", ("of the shapes of its ldm_hparams",)),
+        ("option", ("context_dim",)),
+        (
+            {f"layer{i}.weight": torch.zeros(1) for i in range(10)},
+            ("layer0.weight", "layer7.weight and 2 more"),
+        ),
+        ([1, 2], ("holds a mapping", "list")),
+        ({"state_dict": Foreign(), "empty_text_embedding": np.zeros(1)}, ("Foreign", "never done")),
+    ],
+)
+def test_checkpoints_that_do_not_fit(convert, checkpoint, content, parts, tmp_path):
+    answer = convert(spoilt(checkpoint, content) if isinstance(content, str) else content)
+    refused(answer, tmp_path, {"weights.ckpt"}, *parts)
     assert "numpy" not in answer.err, "arrays are plain data"
 
 
@@ -113,48 +137,47 @@ def test_nothing_is_run(convert):
 def test_files_that_are_no_checkpoints(geodiff, tmp_path, content):
     (tmp_path / "weights.ckpt").write_bytes(content)
     answer = geodiff("convert", tmp_path / "weights.ckpt", tmp_path / "out")
-    refused(answer, {path.name for path in tmp_path.iterdir()}, "written by torch.save")
+    refused(answer, tmp_path, {"weights.ckpt"}, "written by torch.save")
 
 
-def test_paths_are_checked(geodiff, tmp_path, checkpoint):
-    torch.save(checkpoint, tmp_path / "weights.ckpt")
-    refused(geodiff("convert", tmp_path / "no.ckpt", tmp_path / "out"), {"weights.ckpt"}, "no.ckpt")
+def test_paths_and_options_are_checked(geodiff, convert, tmp_path, checkpoint):
     refused(
-        geodiff("convert", tmp_path / "weights.ckpt", tmp_path / "a/b"), {"weights.ckpt"}, "Make the folder"
+        convert(checkpoint, "--with", tmp_path / "sd"), tmp_path, {"weights.ckpt"}, "Stable Diffusion 1.5"
     )
-    missing = geodiff("convert", tmp_path / "weights.ckpt", tmp_path / "out", "--with", tmp_path / "sd")
-    refused(missing, {path.name for path in tmp_path.iterdir()}, "--with", "Stable Diffusion 1.5")
+    refused(geodiff("convert", tmp_path / "no.ckpt", tmp_path / "out"), tmp_path, {"weights.ckpt"}, "no.ckpt")
+    nowhere = geodiff("convert", tmp_path / "weights.ckpt", tmp_path / "a/b")
+    refused(nowhere, tmp_path, {"weights.ckpt"}, "Make the folder")
+    for paths in (("one",), ("a", "b", "c"), ("marigold", "a", "b", "c")):
+        answer = geodiff("convert", *paths)
+        assert answer.code == 2 and "SRC DST, or marigold-v2 BASE CHECKPOINT DST" in answer.err
+    answer = geodiff("convert", tmp_path / "a.ckpt", tmp_path / "b", "--space", "log")
+    assert answer.code == 2 and "marigold-v2 alone" in answer.err
+
+
+# Folders of .bin files -----------------------------------------------------------------------------------
 
 
 def test_a_folder_of_bin_files(geodiff, tmp_path, tokenizer):
     """As DepthMaster's trainer writes them; index without a scheduler and with the authors' class names."""
     source = tmp_path / "theirs"
-    text_encoder = make_text_encoder()
     unet = fill(FourierUNet(**UNET | {"cross_attention_dim": 8, "block_out_channels": (32, 32)}))
-    DepthMasterPipeline(unet, make_vae(), text_encoder, tokenizer).save_pretrained(source)
+    DepthMasterPipeline(unet, make_vae(), make_text_encoder(), tokenizer).save_pretrained(source)
     index = json.loads((source / "model_index.json").read_text())
     index["unet"] = ["depthmaster.modules.unet_2d_condition_s2", "UNet2DConditionModel"]
-    index["_class_name"] = "DepthMasterPipeline"
     del index["prediction_type"], index["default_denoising_steps"]
     (source / "model_index.json").write_text(json.dumps(index))
     for path in list(source.rglob("*.safetensors")):
-        torch.save(
-            load_file(path),
-            path.with_name("pytorch_model.bin" if path.stem == "model" else f"{path.stem}.bin"),
-        )
+        name = "pytorch_model.bin" if path.stem == "model" else f"{path.stem}.bin"
+        torch.save(load_file(path), path.with_name(name))
         path.unlink()
-    assert not list(source.rglob("*.safetensors"))
-
     answer = geodiff("convert", source, tmp_path / "out")
     assert answer.code == 0, answer.err
     assert not list((tmp_path / "out").rglob("*.bin"))
-    layout = Layout(tmp_path / "out", "out")
-    assert DepthMasterPrior.recognises(layout)
-    pipe = DepthMasterPrior.load(layout, torch.float32, None)
-    assert pipe.config.prediction_type == "sqrt_disparity"
+    found = find_prior(tmp_path / "out")
+    pipe = found.load()
+    assert found.key == "depthmaster" and pipe.config.prediction_type == "sqrt_disparity"
     loaded = pipe.unet.state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in unet.state_dict().items())
-
     again = geodiff("convert", tmp_path / "out", tmp_path / "more")
     assert again.code == 2 and "needs no conversion" in again.err
 
@@ -173,22 +196,151 @@ def test_shards_keep_their_index(geodiff, tmp_path):
     assert set(load_file(tmp_path / "out" / index["a"])) == {"a", "tied"}
 
 
-def test_names_and_options_of_the_published_checkpoint():
-    """Options as ``depthfm-v1.ckpt`` holds them: the U-Net of Stable Diffusion 2 with 8 heads."""
-    hparams = HPARAMS | {
-        "model_channels": 320,
-        "attention_resolutions": [4, 2, 1],
-        "channel_mult": [1, 2, 4, 4],
-        "num_heads": 8,
-        "context_dim": 1024,
-    }
-    config = unet_config(hparams)
-    assert config["block_out_channels"] == (320, 640, 1280, 1280)
-    assert config["down_block_types"] == ("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",)
-    assert config["up_block_types"] == ("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3
-    by_width = unet_config({**hparams, "num_head_channels": 64})
-    assert config["attention_head_dim"] == 8 and by_width["attention_head_dim"] == (5, 10, 20, 20)
-    assert diffusers_name("input_blocks.3.0.op.bias", 2) == "down_blocks.0.downsamplers.0.conv.bias"
-    assert diffusers_name("output_blocks.2.1.conv.bias", 2) == "up_blocks.0.upsamplers.0.conv.bias"
-    assert diffusers_name("output_blocks.5.2.conv.bias", 2) == "up_blocks.1.upsamplers.0.conv.bias"
-    assert diffusers_name("betas", 2) is None
+# Pixel-Perfect Depth with an encoder ---------------------------------------------------------------------
+
+
+def save_depth_anything(folder) -> DepthAnythingForDepthEstimation:
+    """A small Depth Anything V2 as transformers saves it."""
+    torch.manual_seed(0)
+    vit = {"hidden_size": 64, "num_hidden_layers": 4, "num_attention_heads": 1, "mlp_ratio": 1}
+    stages = {"out_features": [f"stage{i}" for i in range(1, 5)], "reshape_hidden_states": False}
+    backbone = Dinov2Config(**vit, **stages, image_size=28, patch_size=14)
+    sizes = {"reassemble_hidden_size": 64, "neck_hidden_sizes": [8] * 4, "fusion_hidden_size": 8}
+    model = DepthAnythingForDepthEstimation(DepthAnythingConfig(backbone_config=backbone, **sizes))
+    model.save_pretrained(folder)
+    return model
+
+
+def test_ppd_takes_its_encoder_from_a_folder_of_transformers(convert, tmp_path):
+    model, dit = save_depth_anything(tmp_path / "da2"), PixelDiT(16, 2, 2, semantic_size=64)
+    state = {f"dit.{name}": value for name, value in dit.state_dict().items()}
+    assert convert(state, "--with", tmp_path / "da2").code == 0
+    pipe = load_prior(tmp_path / "out")
+    torch.testing.assert_close(dict(pipe.dit.state_dict()), dict(dit.state_dict()))
+    wanted = model.backbone.state_dict()
+    assert all(torch.equal(v, wanted[name]) for name, v in pipe.semantic_encoder.state_dict().items())
+    other = PixelDiT(16, 2, 2, semantic_size=128).state_dict()
+    (tmp_path / "out").rename(tmp_path / "first")
+    answer = convert({f"dit.{name}": v for name, v in other.items()}, "--with", tmp_path / "da2")
+    refused(answer, tmp_path, {"weights.ckpt", "da2", "first"}, "128 wide")
+    make_ppd().dit.save_pretrained(tmp_path / "encoder")
+    answer = convert(state, "--with", tmp_path / "encoder")
+    refused(answer, tmp_path, {"weights.ckpt", "da2", "first", "encoder"}, "--with")
+
+
+# Marigold V2 ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def assets(tmp_path):
+    """A tiny base in shards, one checkpoint, the prompt's two files."""
+    transformer = QwenImageTransformer2DModel(**reference.TRANSFORMER)
+    vae = AutoencoderKLQwenImage(**reference.VAE)
+    transformer.load_state_dict(reference.base_state(transformer, "transformer."))
+    transformer.to(torch.bfloat16).save_pretrained(tmp_path / "base" / "transformer", max_shard_size="100KB")
+    vae.save_pretrained(tmp_path / "base" / "vae")
+    folder = tmp_path / "V2" / "depth" / "Log-stage2"
+    folder.mkdir(parents=True)
+    save_file(reference.trainables("Log-stage2", transformer, vae), folder / "trainables.safetensors")
+    (tmp_path / "V2" / "qwen_text_embeddings").mkdir()
+    for part, value in zip(("embeds", "mask"), reference.prompts(), strict=True):
+        name = f"{reference.PREFIX}_prompt_{part}.pt"
+        torch.save(value, tmp_path / "V2" / "qwen_text_embeddings" / name)
+    return tmp_path
+
+
+@pytest.fixture
+def convert_v2(geodiff, assets):
+    def run(*options, checkpoint="V2/depth/Log-stage2"):
+        paths = ("marigold-v2", assets / "base", assets / checkpoint, assets / "out")
+        return geodiff("convert", *paths, *options)
+
+    return run
+
+
+KEPT = {"base", "V2", "elsewhere"}
+
+
+def test_a_merged_v2_loads_by_both_doors_and_is_saved_again(convert_v2, assets, tmp_path):
+    answer = convert_v2()
+    assert answer.code == 0, answer.err
+    found = find_prior(assets / "out")
+    assert (found.key, found.licence) == ("marigold-v2", "apache-2.0")
+    ours, stock = found.load(), MarigoldV2Pipeline.from_pretrained(assets / "out")
+    ours.save_pretrained(tmp_path / "again")
+    maps = []
+    for pipe in (ours, stock, load_prior(tmp_path / "again")):
+        pipe.set_progress_bar_config(disable=True)
+        maps.append(pipe(IMAGE, processing_resolution=0).prediction)
+    assert np.array_equal(maps[0], maps[1]) and np.allclose(maps[0], maps[2])
+    assert ours.prompt.embedding.shape == (1, reference.KNOWN, 16)  # without its padding
+
+
+def test_merging_adds_the_factors_product_and_keeps_files_and_index(convert_v2, assets):
+    convert_v2()
+    checkpoint = load_file(assets / "V2/depth/Log-stage2/trainables.safetensors")
+    pipe, name = load_prior(assets / "out"), "transformer_blocks.1.attn.to_out.0"
+    base = QwenImageTransformer2DModel.from_pretrained(assets / "base" / "transformer", dtype=torch.float32)
+    down, up = (checkpoint[f"Diffuser.{name}.lora_{f}.default.weight"].float() for f in "AB")
+    wanted = (base.get_submodule(name).weight + up @ down).to(torch.bfloat16).float()
+    assert torch.equal(pipe.transformer.get_submodule(name).weight, wanted)
+    untouched = "transformer_blocks.1.img_mod.1.weight"
+    assert torch.equal(pipe.transformer.get_parameter(untouched), base.get_parameter(untouched))
+    assert torch.equal(pipe.vae.decoder.conv_out.weight, checkpoint["VAE.decoder.conv_out.weight"].float())
+    folder = assets / "out" / "transformer"
+    files = sorted(folder.glob("*.safetensors"))
+    index = json.loads((folder / "diffusion_pytorch_model.safetensors.index.json").read_text())
+    assert len(files) > 1 and set(index["weight_map"].values()) == {file.name for file in files}
+    for file in files:
+        with safe_open(file, "pt") as opened:
+            assert {index["weight_map"][key] for key in opened.keys()} == {file.name}  # noqa: SIM118
+    assert torch.equal(merged("a", torch.zeros(2, 2), {"a": torch.ones(2, 2)}), torch.ones(2, 2))
+
+
+@pytest.mark.parametrize(
+    ("name", "space"),
+    [("Log-layered", "log"), ("Uniform-base", "depth"), ("Disparity-layered", "disparity"), ("mine", None)],
+)
+def test_the_folders_name_tells_the_space(convert_v2, assets, name, space):
+    (assets / "V2/depth/Log-stage2").rename(assets / "V2/depth" / name)
+    file = f"V2/depth/{name}/trainables.safetensors"
+    options = ()
+    if space is None:
+        refused(convert_v2(checkpoint=file), assets, KEPT, "'mine'", "--space")
+        options, space = ("--space", "disparity"), "disparity"
+    assert convert_v2(*options, checkpoint=file).code == 0
+    assert load_prior(assets / "out").config.prediction_type == space
+
+
+def test_what_is_missing_or_does_not_fit_v2_is_named(convert_v2, assets):
+    file = assets / "V2/depth/Log-stage2/trainables.safetensors"
+    good, key = load_file(file), "Diffuser.img_in.lora_A.default.weight"
+    for state, parts in (
+        (good | {"Diffuser.nowhere.weight": torch.zeros(2)}, ("unexpected: nowhere.weight",)),
+        ({k: v for k, v in good.items() if k != key}, ("img_in.weight of factor A",)),
+        (good | {key: torch.zeros(4, 9)}, ("img_in.weight", "factors of a matrix")),
+        ({k: v for k, v in good.items() if k.startswith("VAE.")}, ("with a LoRA",)),
+    ):
+        save_file(state, file)
+        refused(convert_v2(), assets, KEPT, *parts)
+    save_file(good, file)
+    (assets / "base/vae/config.json").unlink()
+    refused(convert_v2(), assets, KEPT, "BASE", "vae/")
+    refused(convert_v2(checkpoint="V2/depth/nothing"), assets, KEPT, "CHECKPOINT", "trainables.safetensors")
+
+
+def test_prompts_are_looked_for_beside_and_read_as_plain_data(convert_v2, assets):
+    prompts, elsewhere = assets / "V2" / "qwen_text_embeddings", assets / "elsewhere"
+    prompts.rename(elsewhere)
+    refused(convert_v2(), assets, KEPT, "--with", "qwen_text_embeddings")
+    assert convert_v2("--with", elsewhere).code == 0
+    embeds, mask = (elsewhere / f"{reference.PREFIX}_prompt_{part}.pt" for part in ("embeds", "mask"))
+    torch.save(torch.tensor([[1, 0, 1]]), mask)
+    for content, sentence in (
+        (torch.zeros(1, 3, 4), "padded at its end"),
+        (torch.nn.Linear(2, 2), "would run code"),
+        ({"a": 1}, "holds a tensor"),
+    ):
+        torch.save(content, embeds)
+        with pytest.raises(ValueError, match=sentence):
+            read_prompt(elsewhere)

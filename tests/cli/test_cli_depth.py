@@ -248,7 +248,7 @@ def test_info(geodiff, prior, monkeypatch, tmp_path):
 
 def test_demo(geodiff, prior, pair_files, monkeypatch):
     """Over the folder of an earlier run; the tiny prior stands in for the bundled one."""
-    monkeypatch.setattr("geodiff_plugin.priors.folders.BUNDLED_FOLDER", prior)
+    monkeypatch.setattr("geodiff_plugin.priors.loading.BUNDLED_FOLDER", prior)
     out = pair_files.folder / "geodiff-demo"
     out.mkdir()
     (out / "depth.npy").write_text("of an earlier run")

@@ -6,8 +6,8 @@ import torch
 from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, UNet2DConditionModel
 
 from geodiff_plugin.cli.converters.depthfm import unet_config
+from geodiff_plugin.priors.components import FixedPrompt
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
-from geodiff_plugin.priors.pipelines.prompts import FixedPrompt
 from tests.parity import depthfm_reference as reference
 
 #: Under the groups of 32 that Stable Diffusion's has.

@@ -9,8 +9,7 @@ import torch
 from diffusers import AutoencoderKL
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
-from geodiff_plugin.priors.depthmaster import DepthMasterPipeline
-from geodiff_plugin.priors.pipelines.fourier_unet import FourierUNet
+from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
 from tests.parity import depthmaster_reference as reference
 from tests.parity.lotus_reference import TEXT, write_tokenizer
 

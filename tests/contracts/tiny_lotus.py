@@ -9,8 +9,8 @@ import torch
 from diffusers import AutoencoderKL, UNet2DConditionModel
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
+from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.lotus import LotusPipeline
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from tests.parity import lotus_reference as reference
 
 

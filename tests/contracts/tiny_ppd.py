@@ -6,7 +6,7 @@ import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
 from transformers import Dinov2Config, Dinov2Model
 
-from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
+from geodiff_plugin.priors.pixel_dit import PixelDiT
 from geodiff_plugin.priors.ppd import PPDPipeline
 
 

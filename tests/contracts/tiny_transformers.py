@@ -26,7 +26,7 @@ from transformers import (
     ZoeDepthForDepthEstimation,
 )
 
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
+from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline
 
 IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}

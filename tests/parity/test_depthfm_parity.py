@@ -13,7 +13,7 @@ from PIL import Image
 
 from geodiff_plugin.cli.convert import run_convert
 from geodiff_plugin.priors.depthfm import DepthFMPrior
-from geodiff_plugin.priors.folders import Layout
+from geodiff_plugin.priors.loading import Layout
 from tests.parity.depthfm_reference import HPARAMS, NOISING_STEP, STEPS, VAE, image_u8, noise, prompt
 from tests.parity.named_weights import fill, weight
 

@@ -11,8 +11,7 @@ from diffusers import AutoencoderKL
 from PIL import Image
 
 from geodiff_plugin.priors import depthmaster
-from geodiff_plugin.priors.depthmaster import DepthMasterPipeline
-from geodiff_plugin.priors.pipelines.fourier_unet import FourierUNet
+from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
 from tests.conftest import make_text_encoder
 from tests.parity.depthmaster_reference import UNET, VAE, image_u8, prompt
 from tests.parity.named_weights import fill

@@ -15,7 +15,8 @@ from transformers.models.prompt_depth_anything.image_processing_pil_prompt_depth
 )
 from transformers.models.zoedepth.image_processing_pil_zoedepth import ZoeDepthImageProcessorPil
 
-from geodiff_plugin.priors.hf_model import HFDepthModel, Preparation
+from geodiff_plugin.priors.components import DirectScheduler
+from geodiff_plugin.priors.transformers_depth import Preparation, TransformersDepthPipeline
 from tests.contracts.tiny_transformers import MODELS, spread
 
 PATCH_OF_14 = {"keep_aspect_ratio": True, "ensure_multiple_of": 14}
@@ -67,9 +68,10 @@ def test_map(kind, photograph):
     with torch.no_grad():
         output = model(pixel_values=preparation(as_tensor(photograph)))
     theirs = processor.post_process_depth_estimation(output, [photograph.shape[:2]])[0]["predicted_depth"]
-    ours = HFDepthModel(model, preparation)(as_tensor(photograph), size=photograph.shape[:2])
+    pipe = TransformersDepthPipeline(model, DirectScheduler(0), config)
+    ours = pipe.predict(as_tensor(photograph), photograph.shape[:2])
     assert theirs.std() > 0
-    torch.testing.assert_close(ours.values[0, 0], theirs, rtol=0, atol=1e-6)
+    torch.testing.assert_close(ours[0, 0], theirs, rtol=0, atol=1e-6)
 
 
 def theirs_without_torchvision(kind: str, monkeypatch):
@@ -105,8 +107,7 @@ def test_metres_by_the_librarys_own_ending(kind, library, photograph, monkeypatc
     output = model(pixel_values=preparation(as_tensor(photograph)), **told)
     ending = theirs_without_torchvision(library, monkeypatch).post_process_depth_estimation
     theirs = ending(SimpleNamespace(resample=2), output, [photograph.shape[:2]])[0]["predicted_depth"]
-    ours = HFDepthModel(model, preparation)(
-        as_tensor(photograph), photograph.shape[:2], told.get("prompt_depth")
-    )
+    pipe = TransformersDepthPipeline(model, DirectScheduler(0), config)
+    ours = pipe.metres(pipe.predict(as_tensor(photograph), photograph.shape[:2], told.get("prompt_depth")))
     assert theirs.std() > 0
-    torch.testing.assert_close(ours.metres()[0, 0], theirs, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(ours[0, 0], theirs, rtol=1e-5, atol=1e-5)

@@ -12,8 +12,8 @@ from diffusers.models.autoencoders import vae as vae_module
 from PIL import Image
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
+from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.lotus import LotusPipeline
-from geodiff_plugin.priors.pipelines.direct_scheduler import DirectScheduler
 from tests.parity.lotus_reference import CASES, TEXT, UNET, VAE, drawn, image_u8, keep, loud, write_tokenizer
 from tests.parity.named_weights import fill
 

@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 
 from geodiff_plugin.cli.convert import run_convert
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
+from geodiff_plugin.priors.loading import Layout
+from geodiff_plugin.priors.pixel_dit import PixelDiT
 from geodiff_plugin.priors.ppd import AreaImageProcessor, PPDPrior, sampling_timesteps, semantic_tokens
 from tests.parity import ppd_reference as reference
 from tests.parity.named_weights import named_state

@@ -11,18 +11,17 @@ from typing import Any
 
 import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 from transformers import Dinov2Config, Dinov2Model
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.converters.reading import read_checkpoint, write_card
-from geodiff_plugin.priors.folders import Layout
-from geodiff_plugin.priors.loading import check_weights, load_component
-from geodiff_plugin.priors.pipelines.pixel_dit import PixelDiT
+from geodiff_plugin.cli.converters.reading import read_checkpoint, renamed, save_weights, write_card
+from geodiff_plugin.priors.loading import Layout, check_weights, load_component
+from geodiff_plugin.priors.pixel_dit import PixelDiT
 from geodiff_plugin.priors.ppd import PPDPipeline
 
-__all__ = ["encoder_name", "recognises", "write"]
+__all__ = ["ENCODER_NAMES", "recognises", "write"]
 
 TRANSFORMER, IN_CHECKPOINT, IN_FILE, IN_FOLDER = "dit.", "sem_encoder.pretrained.", "pretrained.", "backbone."
 #: The same weights as depth_anything_v2_vitl.pth, as transformers has them.
@@ -30,69 +29,48 @@ ENCODER_ID = "depth-anything/Depth-Anything-V2-Large-hf"
 ENCODER_FILE = "depth_anything_v2_vitl.pth"
 #: Every DINOv2 has heads of this width.
 HEAD_SIZE = 64
-OUTSIDE = {
-    "cls_token": "embeddings.cls_token",
-    "pos_embed": "embeddings.position_embeddings",
-    "mask_token": "embeddings.mask_token",
-    "patch_embed.proj": "embeddings.patch_embeddings.projection",
-    "norm": "layernorm",
-}
-INSIDE = {
-    "attn.proj": "attention.output.dense",
-    "ls1.gamma": "layer_scale1.lambda1",
-    "ls2.gamma": "layer_scale2.lambda1",
-}
-IN_A_BLOCK = re.compile(r"blocks\.(\d+)\.(.+)")
-QKV = ("query", "key", "value")
+#: Depth Anything's names of its encoder's weights -> those of transformers, but for ``qkv``, three there.
+ENCODER_NAMES = (
+    (r"^(cls_token|mask_token)$", r"embeddings.\1"),
+    (r"^pos_embed$", "embeddings.position_embeddings"),
+    (r"^patch_embed\.proj\.", "embeddings.patch_embeddings.projection."),
+    (r"^norm\.", "layernorm."),
+    (r"^blocks\.", "encoder.layer."),
+    (r"\.attn\.proj\.", ".attention.output.dense."),
+    (r"\.attn\.qkv\.", ".attention.attention.qkv."),
+    (r"\.ls([12])\.gamma$", r".layer_scale\1.lambda1"),
+)
 
 
-def encoder_name(name: str) -> str:
-    """Name in transformers of a weight of Depth Anything's encoder, but for ``qkv``, three there."""
-    module, _, kind = name.rpartition(".")
-    found = IN_A_BLOCK.fullmatch(name)
-    if found is None:
-        return OUTSIDE.get(name) or f"{OUTSIDE.get(module, module)}.{kind}"
-    index, rest = found.groups()
-    module, _, kind = rest.rpartition(".")
-    return f"encoder.layer.{index}." + (INSIDE.get(rest) or f"{INSIDE.get(module, module)}.{kind}")
-
-
-def _in_transformers_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    renamed: dict[str, Tensor] = {}
-    for name, value in state.items():
-        new = encoder_name(name)
-        if ".attn.qkv." in new:
-            parts = zip(QKV, value.chunk(3), strict=True)
-            renamed |= {new.replace("attn.qkv", f"attention.attention.{part}"): v for part, v in parts}
+def _encoder_in_transformers_names(state: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:
+    result: dict[str, Tensor] = {}
+    for name, value in renamed(state, ENCODER_NAMES, prefix).items():
+        if ".qkv." in name:
+            parts = zip(("query", "key", "value"), value.chunk(3), strict=True)
+            result |= {name.replace("qkv", part): third for part, third in parts}
         else:
-            renamed[new] = value
-    return renamed
-
-
-def _without(prefix: str, state: Mapping[str, Any]) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): v for name, v in state.items() if str(name).startswith(prefix)}
+            result[name] = value
+    return result
 
 
 def _encoder_state(checkpoint: Mapping[str, Any], part: str | None) -> dict[str, Tensor]:
     """The encoder in transformers' names: out of the checkpoint itself, or what ``--with`` names."""
-    own = _without(IN_CHECKPOINT, checkpoint)
-    if own and part is None:
-        return _in_transformers_names(own)
     source = Path(part or "")
-    if part and source.is_file():
-        state = _in_transformers_names(_without(IN_FILE, read_checkpoint(source)))
-    elif part and (source / "model.safetensors").is_file():
-        state = _without(IN_FOLDER, load_file(source / "model.safetensors"))
+    if part is None:
+        state = _encoder_in_transformers_names(checkpoint, IN_CHECKPOINT)
+    elif source.is_file():
+        state = _encoder_in_transformers_names(read_checkpoint(source), IN_FILE)
+    elif (source / "model.safetensors").is_file():
+        state = renamed(load_file(source / "model.safetensors"), (), IN_FOLDER)
     else:
         state = {}
     if not state:
-        bad_value(
-            "--with",
-            f"{ENCODER_FILE} or a folder of {ENCODER_ID}: the encoder whose tokens ppd.pth needs",
-            part or "nothing",
+        expected = f"{ENCODER_FILE} or a folder of {ENCODER_ID}: the encoder whose tokens ppd.pth needs"
+        cure = (
             f"Fetch it once: hf download {ENCODER_ID} --local-dir da2. A checkpoint that was trained with "
-            "MoGe-2's tokens (ppd_moge.pth) cannot be used.",
+            "MoGe-2's tokens (ppd_moge.pth) cannot be used."
         )
+        bad_value("--with", expected, part or "nothing", cure)
     return state
 
 
@@ -105,7 +83,7 @@ def _load_encoder(state: dict[str, Tensor], where: str) -> Dinov2Model:
         hidden = state["encoder.layer.0.mlp.fc1.weight"].shape[0]
     except KeyError as error:
         bad_value(where, "the weights of a DINOv2 encoder", f"none called {error}")
-    layers = {int(found[1]) for name in state if (found := re.match(r"encoder\.layer\.(\d+)\.", name))}
+    layers = {hit[1] for name in state if (hit := re.match(r"encoder\.layer\.(\d+)\.", name))}
     config = Dinov2Config(
         hidden_size=width,
         num_hidden_layers=len(layers),
@@ -117,8 +95,7 @@ def _load_encoder(state: dict[str, Tensor], where: str) -> Dinov2Model:
     )
     with tempfile.TemporaryDirectory() as folder:
         # Through a file: transformers renames on loading, and which names are its own differs by its version.
-        whole = {name: value.contiguous().float() for name, value in state.items()}
-        save_file(whole, Path(folder) / "model.safetensors", metadata={"format": "pt"})
+        save_weights({name: v.float() for name, v in state.items()}, Path(folder) / "model.safetensors")
         text = json.dumps(config.to_dict() | {"architectures": ["Dinov2Model"]})
         (Path(folder) / "config.json").write_text(text, encoding="utf-8")
         return load_component(Layout(Path(folder), where), "", Dinov2Model, torch.float32)
@@ -148,13 +125,12 @@ def recognises(checkpoint: Mapping[str, Any]) -> bool:
 
 def write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
     """Fill an empty folder; ``part`` is what ``--with`` names."""
-    dit = _load_transformer(_without(TRANSFORMER, checkpoint))
+    dit = _load_transformer(renamed(checkpoint, (), TRANSFORMER))
     encoder = _load_encoder(_encoder_state(checkpoint, part), part or "the checkpoint")
     if encoder.config.hidden_size != dit.config.semantic_size:
+        expected = f"{dit.config.semantic_size} wide, as the checkpoint's tokens"
         got = f"{encoder.config.hidden_size} wide, another size of Depth Anything V2"
-        bad_value(
-            "the encoder of --with", f"{dit.config.semantic_size} wide, as the checkpoint's tokens", got
-        )
+        bad_value("the encoder of --with", expected, got)
     PPDPipeline(dit, encoder, FlowMatchEulerDiscreteScheduler()).save_pretrained(folder)
     write_card(
         folder,

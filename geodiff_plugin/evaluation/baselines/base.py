@@ -18,7 +18,7 @@ from geodiff_plugin.bundled.loading import no_bars
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.priors import load_prior
-from geodiff_plugin.priors.hf_model import HFDepthModel
+from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
@@ -108,7 +108,7 @@ class PriorCache:
     def __init__(self) -> None:
         self.evidence = EvidenceStore()
         self._pipes: dict[tuple[str | None, ...], Any] = {}
-        self._models: dict[tuple[str, ...], HFDepthModel] = {}
+        self._models: dict[tuple[str, ...], TransformersDepthPipeline] = {}
         self._fingerprints: dict[tuple[str | None, ...], str] = {}
 
     def get(self, settings: Settings) -> Any:
@@ -123,13 +123,12 @@ class PriorCache:
             self._pipes[key] = enable_geometry_guidance(pipe)
         return self._pipes[key]
 
-    def depth_model(self, name: str, settings: Settings) -> HFDepthModel:
-        """A depth model of ``transformers``; errors as ``HFDepthModel.from_pretrained``."""
+    def depth_model(self, name: str, settings: Settings) -> TransformersDepthPipeline:
+        """A depth model of ``transformers``; errors as ``load_prior``."""
         key = (name, settings.device, settings.dtype)
         if key not in self._models:
-            self._models[key] = HFDepthModel.from_pretrained(
-                name, device=settings.device, dtype=settings.weights_dtype
-            )
+            pipe = load_prior(f"transformers:{name}", device=settings.device, dtype=settings.weights_dtype)
+            self._models[key] = pipe
         return self._models[key]
 
     def fingerprint(self, settings: Settings) -> str:

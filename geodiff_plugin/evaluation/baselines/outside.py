@@ -34,16 +34,17 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance
 def hf_method(name: str) -> Method:
     """A depth checkpoint of transformers, hub id or folder; relative ones are scored aligned only.
 
-    It is loaded when it is first run, where errors are those of ``HFDepthModel.from_pretrained``.
+    It is loaded when it is first run, where errors are those of ``load_prior``.
     """
     if not name:
         bad_value("methods", "hf:MODEL with a hub id or a folder", "'hf:'")
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
         left_01 = torch.from_numpy(sample.left).permute(2, 0, 1)[None].to(settings.device) / 255.0
-        out = priors.depth_model(name, settings)(left_01, sample.left.shape[:2])
-        depth_m = out.metres()[0, 0].cpu().numpy() if out.metric else None
-        return Prediction(depth_m, relative=out.values[0, 0].cpu().numpy(), space=out.space)
+        model = priors.depth_model(name, settings)
+        values = model.predict(left_01, sample.left.shape[:2])[0, 0]
+        depth_m = model.metres(values).cpu().numpy() if model.metric else None
+        return Prediction(depth_m, relative=values.cpu().numpy(), space=model.config.prediction_type)
 
     def configuration(settings: Settings) -> dict[str, Any]:
         files = folder_fingerprint(Path(name))

@@ -1,4 +1,4 @@
-"""Base pipeline of the priors that diffusers has no pipeline for.
+"""The loop of the priors that diffusers has no pipeline for, with what a prior's author writes for it.
 
 A subclass says how its network is called; preprocessing, batching, ensembling and resizing are those of
 ``MarigoldDepthPipeline``, whose call signature and meaning are kept, so that guidance works on it unchanged.
@@ -7,9 +7,8 @@ A subclass says how its network is called; preprocessing, batching, ensembling a
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,18 +22,21 @@ from torch import Tensor
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number
 
 __all__ = [
+    "RESAMPLING",
     "Condition",
     "DepthDiffusionPipeline",
     "DepthOutput",
     "DirectMapPipeline",
     "Generators",
-    "PriorHooks",
-    "RESAMPLING",
+    "decode_map",
+    "decode_picture",
     "encode_map",
 ]
 
 Condition = dict[str, Tensor]
 Generators = torch.Generator | list[torch.Generator] | None
+#: Ways of resampling that the stock pipeline takes.
+RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
 
 
 def encode_map(vae: Any, x: Tensor) -> Tensor:
@@ -45,8 +47,36 @@ def encode_map(vae: Any, x: Tensor) -> Tensor:
     return latents.to(torch.promote_types(latents.dtype, torch.float32)) * vae.config.scaling_factor
 
 
-class PriorHooks:
-    """The part of a prior's pipeline that its author writes; ``DepthDiffusionPipeline`` calls it.
+def decode_picture(vae: Any, z0: Tensor) -> Tensor:
+    """Scaled latents ``(B, C, h, w)`` as pictures ``(B, 3, H, W)``, about [-1, 1], float32, not clipped."""
+    decoded = vae.decode((z0 / vae.config.scaling_factor).to(vae.dtype), return_dict=False)[0]
+    return decoded.to(torch.promote_types(decoded.dtype, torch.float32))  # half precision ends here
+
+
+def decode_map(vae: Any, z0: Tensor) -> Tensor:
+    """Mean of the decoded channels ``(B, 1, H, W)``, from [-1, 1] to [0, 1] and not clipped.
+
+    The pipelines' own endings clip, which silences the gradient exactly at near and far.
+    """
+    return (decode_picture(vae, z0).mean(dim=1, keepdim=True) + 1.0) / 2.0
+
+
+@dataclass
+class DepthOutput(MarigoldDepthOutput):
+    """``MarigoldDepthOutput`` and what else a prior tells.
+
+    Attributes:
+        extras: further maps by name, such as ``"normals"``, shaped as ``prediction`` with their own channels.
+    """
+
+    extras: dict[str, np.ndarray | Tensor] = field(default_factory=dict)
+
+
+class DepthDiffusionPipeline(DiffusionPipeline):
+    """Depth of an image by a latent (or pixel) diffusion prior.
+
+    A subclass registers its modules with ``register_prior`` and overrides ``prepare_condition`` and
+    ``denoise``; the rest as it needs.
 
     Attributes:
         max_steps: most denoising steps that make sense, ``None`` for any number.
@@ -56,12 +86,8 @@ class PriorHooks:
         output_resampling: how its authors bring the map to the image's size.
     """
 
-    if TYPE_CHECKING:  # what DiffusionPipeline, the other base of every subclass, brings
-        vae: Any
-        scheduler: Any
-        register_modules: Callable[..., None]
-        register_to_config: Callable[..., None]
-
+    vae: Any  # registered by the subclasses that have them
+    scheduler: Any
     max_steps: int | None = None
     deterministic = False
     depth_channels = slice(None)
@@ -77,7 +103,7 @@ class PriorHooks:
         image_processor: MarigoldImageProcessor | int = 8,
         **config: Any,
     ) -> None:
-        """Register modules and options; the last line of a subclass's constructor.
+        """Register modules and options; the last line of a subclass's constructor, whose parameters they are.
 
         Args:
             modules: by the names of the constructor's parameters.
@@ -154,7 +180,7 @@ class PriorHooks:
         raise NotImplementedError
 
     def decode_relative(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map of clean latents.
+        """Unclipped relative map of clean latents, by ``self.vae``.
 
         Args:
             z0: ``(B, C, h, w)``, the depth channels only.
@@ -162,7 +188,7 @@ class PriorHooks:
         Returns:
             ``(B, 1, H, W)`` about [0, 1] on the padded grid, float32 or wider, with the graph of ``z0``.
         """
-        raise NotImplementedError
+        return decode_map(self.vae, z0)
 
     def encode_relative(self, x: Tensor) -> Tensor:
         """Clean latents of a relative map, about the inverse of ``decode_relative``; by ``self.vae``.
@@ -216,33 +242,7 @@ class PriorHooks:
         latents = posterior.sample(generator) if sample else posterior.mode()
         return latents * self.vae.config.scaling_factor
 
-    def decode_latents(self, z0: Tensor) -> Tensor:
-        """Scaled latents ``(B, C, h, w)`` through ``self.vae``: ``(B, 3, H, W)``, about [-1, 1], float32."""
-        decoded = self.vae.decode((z0 / self.vae.config.scaling_factor).to(self.vae.dtype), return_dict=False)
-        return decoded[0].to(torch.promote_types(decoded[0].dtype, torch.float32))  # half precision ends here
-
-
-#: Ways of resampling that the stock pipeline takes.
-RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
-
-
-@dataclass
-class DepthOutput(MarigoldDepthOutput):
-    """``MarigoldDepthOutput`` and what else a prior tells.
-
-    Attributes:
-        extras: further maps by name, such as ``"normals"``, shaped as ``prediction`` with their own channels.
-    """
-
-    extras: dict[str, np.ndarray | Tensor] = field(default_factory=dict)
-
-
-class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
-    """Depth of an image by a latent (or pixel) diffusion prior.
-
-    A subclass registers its modules with ``register_prior`` and overrides ``prepare_condition``,
-    ``denoise`` and ``decode_relative``; the rest as it needs.
-    """
+    # The call ------------------------------------------------------------------------------------------
 
     scale_invariant = shift_invariant = True
 
@@ -271,23 +271,8 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
     ) -> DepthOutput | tuple[Any, ...]:
         """Estimate relative depth; arguments as ``MarigoldDepthPipeline`` takes them.
 
-        Args:
-            image: PIL, numpy in [0, 1] or uint8, torch in [0, 1]; or a list of images of one size.
-            num_inference_steps: denoising steps, the prior's own for ``None``.
-            ensemble_size: members E per image.
-            processing_resolution: longer side, pixels; 0 for the image's own.
-            match_input_resolution: give the map at the image's size.
-            resample_method_input: of the image.
-            resample_method_output: of the map; ``None`` for ``output_resampling``, bilinear while guided.
-            batch_size: members per forward.
-            ensembling_kwargs: for ``ensemble_depth``.
-            latents: initial latents instead of drawn ones.
-            generator: source of everything that is drawn.
-            output_type: ``"np"`` or ``"pt"``.
-            output_uncertainty: with the spread of the members.
-            output_latent: with the final latents.
-            return_dict: record or tuple.
-            **options: what this prior adds, see its ``prepare_condition``.
+        ``None`` for steps and resolution is the prior's own, for ``resample_method_output`` its authors'
+        (bilinear while guided). ``options`` are what this prior adds, see its ``prepare_condition``.
 
         Returns:
             ``DepthOutput``, or the tuple (prediction, uncertainty, latent).
@@ -296,12 +281,16 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
             TypeError, ValueError: an argument of another type, or out of its range.
         """
         steps = self.default_denoising_steps if num_inference_steps is None else num_inference_steps
-        resolution = (
-            self.default_processing_resolution if processing_resolution is None else processing_resolution
-        )
-        self.check_call(steps, ensemble_size, resolution, batch_size, output_type, output_uncertainty)
+        resolution = processing_resolution
+        if resolution is None:
+            resolution = self.default_processing_resolution
+        method_output = resample_method_output or self.output_resampling
+        self._check_numbers(steps, ensemble_size, resolution, batch_size)
+        check_choice(output_type, "output_type", ("np", "pt"))
+        if output_uncertainty and ensemble_size == 1:
+            bad_value("ensemble_size", "2 or more with output_uncertainty=True", ensemble_size)
         check_choice(resample_method_input, "resample_method_input", RESAMPLING)
-        check_choice(resample_method_output or self.output_resampling, "resample_method_output", RESAMPLING)
+        check_choice(method_output, "resample_method_output", RESAMPLING)
         if latents is not None and not isinstance(latents, Tensor):
             bad_type("latents", "None or a torch.Tensor", latents)
         if latents is not None and generator is not None:
@@ -322,9 +311,7 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
             z = latents.to(z)
         z = self.run_steps(z, condition, steps, batch_size, generator)
 
-        def restore(
-            maps: Tensor, method: str = resample_method_output or self.output_resampling
-        ) -> Tensor | np.ndarray:
+        def restore(maps: Tensor, method: str = method_output) -> Tensor | np.ndarray:
             """From the padded processing grid to what the caller gets."""
             if match_input_resolution:
                 maps = processor.resize_antialias(maps, size, method, is_aa=False)
@@ -348,48 +335,21 @@ class DepthDiffusionPipeline(PriorHooks, DiffusionPipeline):
 
     def call_options(self) -> list[str]:
         """What this prior adds to the call: the keywords of its ``prepare_condition``."""
-        common = inspect.signature(PriorHooks.prepare_condition).parameters
+        common = inspect.signature(DepthDiffusionPipeline.prepare_condition).parameters
         own = inspect.signature(self.prepare_condition).parameters
         return [name for name, p in own.items() if name not in common and p.kind is not p.VAR_KEYWORD]
 
-    def check_call(
-        self,
-        steps: int,
-        ensemble_size: int,
-        resolution: int,
-        batch_size: int,
-        output_type: str,
-        output_uncertainty: bool,
-    ) -> None:
-        """Refuse numbers that make no call.
-
-        Raises:
-            TypeError, ValueError: naming the argument.
-        """
+    def _check_numbers(self, steps: int, members: int, resolution: int, batch_size: int) -> None:
         most = 1000 if self.max_steps is None else self.max_steps
         check_number(steps, "num_inference_steps", 1, most, integer=True)
-        check_number(ensemble_size, "ensemble_size", 1, 1 << 20, integer=True)
+        check_number(members, "ensemble_size", 1, 1 << 20, integer=True)
         check_number(resolution, "processing_resolution", 0, 1 << 16, integer=True)
         check_number(batch_size, "batch_size", 1, 1 << 20, integer=True)
-        check_choice(output_type, "output_type", ("np", "pt"))
-        if output_uncertainty and ensemble_size == 1:
-            bad_value("ensemble_size", "2 or more with output_uncertainty=True", ensemble_size)
 
     def run_steps(
         self, latents: Tensor, condition: Condition, steps: int, batch_size: int, generator: Generators
     ) -> Tensor:
-        """Denoise all members, chunk by chunk; every chunk is a trajectory of its own.
-
-        Args:
-            latents: ``(N * E, C, h, w)`` initial latents.
-            condition: of all members.
-            steps: denoising steps.
-            batch_size: members per chunk.
-            generator: for schedulers that draw.
-
-        Returns:
-            ``(N * E, C, h, w)`` clean latents.
-        """
+        """Denoise the members ``(N * E, C, h, w)`` in chunks, each of which is a trajectory of its own."""
         done = []
         for i in self.progress_bar(range(0, len(latents), batch_size), leave=True, desc="Depth predictions"):
             z = latents[i : i + batch_size]

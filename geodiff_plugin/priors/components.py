@@ -1,0 +1,144 @@
+"""Small components that the pipelines of this package share: a one-step schedule, prompts, image sizes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from diffusers import ModelMixin
+from diffusers.configuration_utils import ConfigMixin, register_to_config
+from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
+from diffusers.schedulers.scheduling_utils import SchedulerMixin, SchedulerOutput
+from torch import Tensor
+from transformers import CLIPTextModel, CLIPTokenizer
+
+from geodiff_plugin._checks import bad_value
+
+__all__ = ["DirectScheduler", "FixedPrompt", "SidesOf", "text_embedding"]
+
+
+class DirectScheduler(SchedulerMixin, ConfigMixin):
+    """One step whose result is the network's output, for networks that answer with the clean latent.
+
+    Args:
+        timestep: the timestep input of the network, 999 for Lotus, 1 for DepthMaster.
+        prediction_type: always ``"sample"``; kept in the config, where others look for it.
+    """
+
+    order = 1
+    init_noise_sigma = 1.0
+
+    @register_to_config
+    def __init__(self, timestep: int = 999, prediction_type: str = "sample") -> None:
+        if prediction_type != "sample":
+            bad_value("prediction_type of a DirectScheduler", "'sample'", repr(prediction_type))
+        self.set_timesteps()
+
+    def set_timesteps(self, num_inference_steps: int = 1, device: str | torch.device | None = None) -> None:
+        """Start over; any other number of steps than 1 is a ``ValueError``."""
+        if num_inference_steps != 1:
+            cure = "This prior answers in one step; leave num_inference_steps out."
+            bad_value("num_inference_steps", "1", num_inference_steps, cure)
+        self.num_inference_steps = num_inference_steps
+        self.timesteps = torch.tensor([self.config.timestep], device=device)
+
+    def scale_model_input(self, sample: Tensor, timestep: Any = None) -> Tensor:
+        """The sample, as it is."""
+        return sample
+
+    def step(
+        self,
+        model_output: Tensor,
+        timestep: Any,
+        sample: Tensor,
+        generator: torch.Generator | None = None,
+        return_dict: bool = True,
+    ) -> SchedulerOutput | tuple[Tensor]:
+        """The clean latent ``(B, C, h, w)``, which is ``model_output``; nothing else is read."""
+        return SchedulerOutput(prev_sample=model_output) if return_dict else (model_output,)
+
+
+class SidesOf(MarigoldImageProcessor):
+    """Resizes each side to a multiple of ``side`` pixels, each with a factor of its own, and never pads.
+
+    Args:
+        side: what both sides are multiples of, pixels.
+        grow: always round up; else to the nearest multiple.
+    """
+
+    def __init__(self, side: int, grow: bool = False) -> None:
+        super().__init__(vae_scale_factor=side)
+        self.side, self.grow = side, grow
+
+    @staticmethod
+    def pad_image(image: Tensor, align: int) -> tuple[Tensor, tuple[int, int]]:
+        """The image as it is, and no padding."""
+        return image, (0, 0)
+
+    def preprocess(
+        self,
+        image: Any,
+        processing_resolution: int | None = None,
+        resample_method_input: str = "bilinear",
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> tuple[Tensor, tuple[int, int], tuple[int, int]]:
+        """As the stock method, but for the size.
+
+        Returns:
+            ``(N, 3, H, W)`` in [-1, 1] with sides of a multiple of ``side``, no padding ``(0, 0)``, and the
+            size ``(H, W)`` that the image came with.
+        """
+        # In float32 until the end: not every device resizes in half precision.
+        image, padding, size = super().preprocess(image, 0, resample_method_input, device, torch.float32)
+        factor = processing_resolution / max(size) if processing_resolution else 1.0
+        grid = tuple(self._multiple(length * factor) for length in size)
+        if grid != tuple(size):
+            image = self.resize_antialias(image, grid, resample_method_input, is_aa=True)
+        return image.to(dtype), padding, size
+
+    def _multiple(self, length: float) -> int:
+        parts = -(-round(length) // self.side) if self.grow else round(int(length) / self.side)
+        return max(1, parts) * self.side
+
+
+def text_embedding(
+    tokenizer: CLIPTokenizer, text_encoder: CLIPTextModel, device: torch.device, prompt: str = ""
+) -> Tensor:
+    """Embedding ``(1, n, C)`` of a prompt, not padded, as Marigold and its descendants were trained with.
+
+    Args:
+        tokenizer: of the text encoder.
+        text_encoder: its weights may be offloaded.
+        device: where it computes.
+        prompt: its words; empty for most depth priors, which leaves the start and the end token.
+    """
+    tokens = tokenizer(
+        prompt,
+        padding="do_not_pad",
+        max_length=tokenizer.model_max_length,
+        truncation=True,
+        return_tensors="pt",
+    )
+    return text_encoder(tokens.input_ids.to(device))[0]
+
+
+class FixedPrompt(ModelMixin, ConfigMixin):
+    """A text embedding that was saved instead of the text encoder that made it.
+
+    Args:
+        length: tokens n.
+        width: channels C.
+
+    Attributes:
+        embedding: ``(1, n, C)``.
+    """
+
+    @register_to_config
+    def __init__(self, length: int = 77, width: int = 1024) -> None:
+        super().__init__()
+        self.embedding = torch.nn.Parameter(torch.zeros(1, length, width), requires_grad=False)
+
+    def forward(self) -> Tensor:
+        """The embedding; a call brings it back where it is offloaded."""
+        return self.embedding
