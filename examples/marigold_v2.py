@@ -82,7 +82,7 @@ def main(argv: list[str] | None = None) -> None:
         # They trained in bfloat16; a CPU is faster in float32.
         dtype = torch.float32 if options.device == "cpu" else torch.bfloat16
         pipe = load_prior(options.prior or tiny, device=options.device, dtype=dtype)
-    print(f"affine in {pipe.config.prediction_type} depth, LoRA {pipe.config.lora}")
+    print(f"affine in {pipe.config.prediction_type} depth")
     enable_geometry_guidance(pipe)
 
     started = time.perf_counter()

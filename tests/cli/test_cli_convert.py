@@ -1,4 +1,4 @@
-"""``geodiff convert``: every checkpoint format to a folder that loads, clear refusals, nothing half-written."""
+"""``geodiff convert``: every checkpoint format to a folder that loads, and clear refusals."""
 
 from __future__ import annotations
 

@@ -1,0 +1,1 @@
+"""geodiff-plugin as a model of the robustmvd benchmark."""
