@@ -12,6 +12,7 @@ import torch
 from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.runtime.confidence import expected_error
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.runtime.verdict import Verdict
 from geodiff_plugin.types import MetricDepthOutput
@@ -134,6 +135,9 @@ def build_report(
         "verdict": _verdict(output.verdict),
         "assumed": output.assumed,
         "photometric_error_mean": error_mean,
+        "expected_error_median_m": np.median(
+            expected_error(depth_m, rig.K_left, used_poses(output, inputs.guidance))
+        ),
         "uncertainty_median_m": None
         if output.uncertainty is None
         else np.median(single_map(output.uncertainty)),
@@ -182,9 +186,10 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
     return values | {"signs": values.pop("indicators")}
 
 
-def _quality(signs: dict[str, Any]) -> str:
-    """What a trusted depth rests on, in a few words."""
+def _quality(signs: dict[str, Any], expected: str | None) -> str:
+    """What a trusted depth rests on, in a few words; ``expected`` is the error that the geometry allows."""
     said = [] if signs["confidence"] is None else [f"confidence {signs['confidence']:.2f}"]
+    said += [] if expected is None else [f"expected error {expected}"]
     said += [] if signs["matched"] is None else [f"{100 * signs['matched']:.0f} % matched"]
     said += [] if not signs["points"] else [f"{signs['points']} known depths"]
     return ", ".join(["trusted", *said])
@@ -210,6 +215,8 @@ def summary_line(report: dict[str, Any], where: str) -> str:
     near, far, median = (_length(depth[name], unit) for name in ("min_m", "max_m", "median_m"))
     verdict, metres = report["verdict"], f"{near} to {far}, median {median}{lengths}"
     if verdict["status"] == "trusted":
-        return f"{metres}; {_quality(verdict['signs'])}{said}; {seconds:.1f} s -> {where}"
+        error = report.get("expected_error_median_m")
+        expected = None if error is None else _length(error, unit)
+        return f"{metres}; {_quality(verdict['signs'], expected)}{said}; {seconds:.1f} s -> {where}"
     reason = verdict["reasons"][0] if verdict["reasons"] else "neither matches nor known depths test it."
     return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {seconds:.1f} s -> {where})"

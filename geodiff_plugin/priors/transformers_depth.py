@@ -268,19 +268,17 @@ class TransformersDepthPipeline(DirectMapPipeline):
         self.own_range: Tensor | None = None
         self.prepare = Preparation.from_config(preparation or {})
         try:
-            space, self.metric = output_of(model)
+            space, metric = output_of(model)
         except ValueError:
             if prediction_type is None:
                 raise
-            space, self.metric = prediction_type, False
+            space, metric = prediction_type, False
         # A space that the model's class is known for says nothing new: what is saved with it stays metric.
         if prediction_type is not None and prediction_type != space:
-            space, self.metric = check_choice(prediction_type, "space", SPACES), False
-        defaults = (
-            check_choice(space, "space", SPACES),
-            default_denoising_steps,
-            default_processing_resolution,
-        )
+            space, metric = prediction_type, False
+        self.metric = metric
+        check_choice(space, "space", SPACES)
+        defaults = space, default_denoising_steps, default_processing_resolution
         modules = {"model": model, "scheduler": scheduler}
         self.register_prior(modules, *defaults, image_processor=1, preparation=preparation)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -16,6 +17,9 @@ from geodiff_plugin.algorithm.photometric import match_exposure
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.geometry.warping import warp_right_to_left
 from geodiff_plugin.types import CameraView
+
+#: Standard deviation of a good match, pixels of the left image.
+MATCH_NOISE_PX = 0.25
 
 #: What confidence is the probability of: a relative error below this.
 RIGHT_WITHIN = 0.1
@@ -94,6 +98,30 @@ def depth_confidence(
         evidence = depth_evidence(near, off, seen, None if spread is None else spread[:, :, rows], of_prior)
         confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
     return confidence
+
+
+def expected_error(depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:
+    """What the geometry alone lets a matched depth be off: ``z^2 sigma_d / (f b)`` of a rectified pair.
+
+    In general ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|`` with the pixel's ray ``r`` and the centre ``t`` of
+    the right camera; its rotation moves no point relative to another.
+
+    Args:
+        depth_m: ``(H, W)`` metres.
+        K_left: ``(3, 3)`` pixels of that map.
+        poses: ``(4, 4)`` of the right cameras in the left camera's frame, metres; the best of them counts.
+
+    Returns:
+        ``(H, W)`` metres, standard deviation at ``MATCH_NOISE_PX``; infinite where no camera moves.
+    """
+    rows, columns = np.indices(depth_m.shape)
+    rays = (columns - K_left[0, 2]) / K_left[0, 0], (rows - K_left[1, 2]) / K_left[1, 1]
+    best = np.full(depth_m.shape, np.inf)
+    for E in poses:
+        moved = [K_left[i, i] * (E[i, 3] - rays[i] * E[2, 3]) for i in (0, 1)]  # pixels times metres
+        with np.errstate(divide="ignore"):
+            best = np.minimum(best, (depth_m - E[2, 3]) ** 2 * MATCH_NOISE_PX / np.hypot(*moved))
+    return best
 
 
 def reprojection(

@@ -78,7 +78,9 @@ def test_metrics_by_hand():
 
 
 @pytest.mark.skipif("ROBUSTMVD" not in os.environ, reason="ROBUSTMVD names no checkout of the benchmark")
-def test_metrics_are_the_benchmarks():
+def test_metrics_are_the_benchmarks(monkeypatch):
+    stock = np.nan_to_num  # the benchmark's call is NumPy 1's
+    monkeypatch.setattr(np, "nan_to_num", lambda x, copy=True, **fill: stock(x, **fill))
     path = Path(os.environ["ROBUSTMVD"]) / "rmvd" / "eval" / "metrics.py"
     spec = importlib.util.spec_from_file_location("benchmark_metrics_of_rmvd", path)
     theirs = importlib.util.module_from_spec(spec)
