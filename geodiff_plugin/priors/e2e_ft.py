@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import torch
-from diffusers import DDIMScheduler, MarigoldDepthPipeline
+from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, UNet2DConditionModel
 from torch import Tensor
+from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.loading import Layout
@@ -26,15 +26,38 @@ class E2EFTPipeline(MarigoldDepthPipeline):
     max_steps = 1
     deterministic = True
 
-    # The wraps keeps the signature, from which diffusers reads what a folder may hold.
-    @functools.wraps(MarigoldDepthPipeline.__init__)  # type: ignore[misc]
-    def __init__(self, unet: Any, vae: Any, scheduler: Any, *args: Any, **kwargs: Any) -> None:
-        to_the_end = {"timestep_spacing": "trailing", "set_alpha_to_one": True}
-        scheduler = DDIMScheduler.from_config(scheduler.config, **to_the_end)
-        options = {"default_denoising_steps": 1, "default_processing_resolution": 768}
-        options |= {name: value for name, value in kwargs.items() if value is not None}
-        super().__init__(unet, vae, scheduler, *args, **options)
-        self.register_to_config(initial_latents="zeros")  # so that the folder differs from Marigold's
+    def __init__(
+        self,
+        unet: UNet2DConditionModel,
+        vae: AutoencoderKL,
+        scheduler: Any,
+        text_encoder: CLIPTextModel,
+        tokenizer: CLIPTokenizer,
+        prediction_type: str = "depth",
+        scale_invariant: bool = True,
+        shift_invariant: bool = True,
+        default_denoising_steps: int = 1,
+        default_processing_resolution: int = 768,
+        initial_latents: str = "zeros",
+    ) -> None:
+        if initial_latents != "zeros":  # saved, so that the folder differs from Marigold's
+            bad_value("initial_latents", "'zeros'", repr(initial_latents), "A Marigold starts from noise.")
+        to_the_end = DDIMScheduler.from_config(
+            scheduler.config, timestep_spacing="trailing", set_alpha_to_one=True
+        )
+        super().__init__(
+            unet,
+            vae,
+            to_the_end,
+            text_encoder,
+            tokenizer,
+            prediction_type=prediction_type,
+            scale_invariant=scale_invariant,
+            shift_invariant=shift_invariant,
+            default_denoising_steps=default_denoising_steps,
+            default_processing_resolution=default_processing_resolution,
+        )
+        self.register_to_config(initial_latents=initial_latents)
 
     def check_inputs(self, image: Any, num_inference_steps: int, *args: Any, **kwargs: Any) -> int:
         """Marigold's checks, and a ``ValueError`` for more steps than one."""

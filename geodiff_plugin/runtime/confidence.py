@@ -103,8 +103,8 @@ def depth_confidence(
 def expected_error(depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:
     """What the geometry alone lets a matched depth be off: ``z^2 sigma_d / (f b)`` of a rectified pair.
 
-    In general ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|`` with the pixel's ray ``r`` and the centre ``t`` of
-    the right camera; its rotation moves no point relative to another.
+    In general ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|`` by the pixel's ray ``r`` and the right camera's
+    centre ``t``; its rotation moves no point relative to another.
 
     Args:
         depth_m: ``(H, W)`` metres.
