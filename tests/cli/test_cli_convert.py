@@ -13,6 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
+from geodiff_plugin.cli.convert import run_convert
 from geodiff_plugin.cli.converters.depthfm import unet_config
 from geodiff_plugin.cli.converters.marigold_v2 import merged, read_prompt
 from geodiff_plugin.priors import find_prior, load_prior
@@ -219,13 +220,13 @@ def test_ppd_takes_its_encoder_from_a_folder_of_transformers(convert, tmp_path):
     torch.testing.assert_close(dict(pipe.dit.state_dict()), dict(dit.state_dict()))
     wanted = model.backbone.state_dict()
     assert all(torch.equal(v, wanted[name]) for name, v in pipe.semantic_encoder.state_dict().items())
-    other = PixelDiT(16, 2, 2, semantic_size=128).state_dict()
-    (tmp_path / "out").rename(tmp_path / "first")
-    answer = convert({f"dit.{name}": v for name, v in other.items()}, "--with", tmp_path / "da2")
-    refused(answer, tmp_path, {"weights.ckpt", "da2", "first"}, "128 wide")
     make_ppd().dit.save_pretrained(tmp_path / "encoder")
-    answer = convert(state, "--with", tmp_path / "encoder")
-    refused(answer, tmp_path, {"weights.ckpt", "da2", "first", "encoder"}, "--with")
+    wide = {f"dit.{name}": v for name, v in PixelDiT(16, 2, 2, semantic_size=128).state_dict().items()}
+    for content, encoder, sentence in ((wide, "da2", "128 wide"), (state, "encoder", "--with")):
+        torch.save(content, tmp_path / "weights.ckpt")
+        with pytest.raises(ValueError, match=sentence):
+            run_convert([tmp_path / "weights.ckpt", tmp_path / "more"], str(tmp_path / encoder))
+    assert {path.name for path in tmp_path.iterdir()} == {"weights.ckpt", "da2", "out", "encoder"}
 
 
 # Marigold V2 ---------------------------------------------------------------------------------------------

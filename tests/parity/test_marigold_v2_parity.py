@@ -112,10 +112,3 @@ def test_bfloat16_behaves(downloads, theirs):
     pipe.set_timesteps(1, torch.device("cpu"))
     told = (pipe.scheduler.timesteps[0] / 1000).to(torch.bfloat16)
     assert told == 0.5 == torch.full((), 499.0, dtype=torch.bfloat16) / 1000  # as theirs comes out
-
-
-def test_a_lora_kept_apart_gives_the_same(downloads, theirs):
-    pytest.importorskip("peft", reason="peft is an extra")
-    pipe = converted(downloads, "Log-stage2", lora="apart")
-    assert pipe.config.lora == "apart"
-    compare(pipe, theirs, "mode", **TOLERANCE)
