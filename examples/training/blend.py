@@ -14,7 +14,7 @@ from diffusers import MarigoldDepthPipeline
 
 from examples.training.models import save_prior
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.bundled import open_pipeline
 
 __all__ = ["blend", "main"]
 

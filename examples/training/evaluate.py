@@ -15,8 +15,7 @@ from diffusers import MarigoldDepthPipeline
 
 from examples.training.data import held_out
 from examples.training.validate import contact_sheet, predict, score_scenes
-from geodiff_plugin.bundled import PRIOR_FOLDER
-from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.bundled import PRIOR_FOLDER, open_pipeline
 from geodiff_plugin.evaluation.datasets import load_pairs
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 

@@ -13,7 +13,7 @@ import torch
 from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, UNet2DConditionModel
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
-from geodiff_plugin.bundled.loading import no_bars
+from geodiff_plugin.bundled import no_bars
 
 __all__ = [
     "LATENT_SCALE",

@@ -5,8 +5,7 @@ import torch
 
 from examples.training.blend import blend, main
 from examples.training.models import save_prior
-from geodiff_plugin.bundled import PRIOR_FOLDER
-from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.bundled import PRIOR_FOLDER, open_pipeline
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import torch
 
 from examples.training import models, schedule
 from examples.training.state import Average, Progress, restore, store
-from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.bundled import open_pipeline
 
 
 def test_parts_fit_into_sixteen_megabytes_of_float16():

@@ -15,7 +15,7 @@ from examples.training.train_tiny import (
     train_tiny,
 )
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
-from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.bundled import open_pipeline
 from geodiff_plugin.priors.loading import BUNDLED_FOLDER
 
 

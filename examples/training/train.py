@@ -32,7 +32,7 @@ from examples.training.schedule import (
 )
 from examples.training.state import Average, Progress, restore, store
 from examples.training.train_vae import save_vae, train_vae
-from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.bundled import open_pipeline
 
 __all__ = ["main", "parse", "run"]
 

@@ -21,7 +21,7 @@ from examples.training.data import normalise_disparity, read_shard, shards
 from examples.training.schedule import learning_rate
 from examples.training.train_vae import edge_error
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.bundled.loading import no_bars
+from geodiff_plugin.bundled import no_bars
 
 __all__ = ["build_tiny", "distillation_loss", "draw_maps", "main", "perturbed", "train_tiny"]
 

@@ -1,18 +1,17 @@
-"""The small prior and the stereo pair that ship with the package.
-
-Paper: S3.1 (the prior); this one is ours, so that everything works without a download.
-"""
+"""The small prior and the stereo pair that ship with the package, so that everything works offline."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 from diffusers import MarigoldDepthPipeline
+from diffusers.utils import logging as diffusers_logging
+from transformers.utils import logging as transformers_logging
 
-from geodiff_plugin.bundled.loading import open_pipeline
-
-__all__ = ["PRIOR_FOLDER", "load_bundled_prior"]
+__all__ = ["PRIOR_FOLDER", "load_bundled_prior", "no_bars", "open_pipeline"]
 
 PRIOR_FOLDER = Path(__file__).parent / "prior"
 """The pipeline folder in the package."""
@@ -34,3 +33,28 @@ def load_bundled_prior(
         OSError: the package was installed without its weights.
     """
     return open_pipeline(PRIOR_FOLDER, device, dtype)
+
+
+def open_pipeline(
+    folder: str | Path, device: str | torch.device | None = None, dtype: torch.dtype = torch.float32
+) -> MarigoldDepthPipeline:
+    """Load a folder of the bundled prior, or of one trained like it, offline and without progress bars."""
+    with no_bars():
+        pipeline = MarigoldDepthPipeline.from_pretrained(
+            str(folder), dtype=dtype, local_files_only=True, trust_remote_code=False
+        )
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline.to("cpu" if device is None else device)
+
+
+@contextmanager
+def no_bars() -> Iterator[None]:
+    """Switch off the progress bars of both hosts, for files this small, and put them back after."""
+    shown = [log for log in (diffusers_logging, transformers_logging) if log.is_progress_bar_enabled()]
+    for log in shown:
+        log.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for log in shown:
+            log.enable_progress_bar()

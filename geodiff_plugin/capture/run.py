@@ -19,7 +19,7 @@ import torch
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin._threads import available_cores
-from geodiff_plugin.bundled.loading import no_bars
+from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.capture.results import ALONE, write_agreement, write_results

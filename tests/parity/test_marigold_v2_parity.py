@@ -49,7 +49,7 @@ def downloads(tmp_path_factory):
 
 def converted(downloads, name, dtype=torch.float32, **options):
     """By the command, then by ``find_prior``."""
-    target = downloads / f"converted-{name}-{options.get('lora', 'merged')}"
+    target = downloads / f"converted-{name}"
     if not target.exists():
         checkpoint = downloads / "Marigold-V2" / "depth" / name
         run_convert([Path("marigold-v2"), downloads / "base", checkpoint, target], None, **options)

@@ -12,8 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from examples.training.models import save_prior
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.bundled import PRIOR_FOLDER
-from geodiff_plugin.bundled.loading import open_pipeline
+from geodiff_plugin.bundled import PRIOR_FOLDER, open_pipeline
 from geodiff_plugin.priors import PRIORS, REFUSED, find_prior, load_prior
 from geodiff_plugin.priors.loading import Layout, refuse
 

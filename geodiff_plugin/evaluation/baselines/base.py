@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.bundled.loading import no_bars
+from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.priors import load_prior

@@ -1,0 +1,46 @@
+"""Maps of every prior with random weights, plain and guided, against stored ones.
+
+``python -m tests.unit.test_prior_outputs`` stores them anew.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.priors import PRIORS
+from tests.conftest import plane_pair
+from tests.contracts.tiny_priors import CALL, TINY
+
+FILE = Path(__file__).with_name("prior_outputs.npz")
+#: Every eighth column and sixth row.
+KEPT = np.s_[0, ::6, ::8, 0]
+
+
+def outputs(key: str, pair) -> dict[str, np.ndarray]:
+    torch.manual_seed(0)
+    pipe, told = TINY[key](), CALL.get(key, {})
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E)
+    maps = {}
+    for name, more in (("plain", {}), ("guided", {"guidance": guidance})):
+        seeded = torch.Generator().manual_seed(0)
+        call = {"generator": seeded, **told, **more}
+        maps[f"{key}/{name}"] = pipe(Image.fromarray(pair.left), **call).prediction[KEPT]
+        pipe = enable_geometry_guidance(pipe)
+    return maps
+
+
+@pytest.mark.parametrize("key", PRIORS)
+def test_maps_are_the_stored_ones(key, textured_plane):
+    with np.load(FILE) as stored:
+        for name, values in outputs(key, textured_plane).items():
+            np.testing.assert_allclose(values, stored[name], rtol=2e-3, atol=2e-4, err_msg=name)
+
+
+if __name__ == "__main__":
+    np.savez_compressed(FILE, **{k: v for key in TINY for k, v in outputs(key, plane_pair()).items()})
