@@ -10,8 +10,6 @@ import numpy as np
 from geodiff_plugin.formats import read_calibration, read_depth_mm_png, read_image
 from geodiff_plugin.types import Rig
 
-__all__ = ["DEMO_PAIR_FOLDER", "DemoPair", "read_demo_pair"]
-
 #: ``left.png``, ``right.png``, ``calib.txt`` (Middlebury's format), ``depth_mm.png``.
 DEMO_PAIR_FOLDER = Path(__file__).resolve().parent / "pair"
 

@@ -14,8 +14,6 @@ from geodiff_plugin.cli.converters import depthfm, ppd
 from geodiff_plugin.cli.converters.marigold_v2 import MARIGOLD_V2, convert_marigold_v2
 from geodiff_plugin.cli.converters.reading import read_checkpoint, save_weights
 
-__all__ = ["run_convert"]
-
 #: Kind -> module with ``recognises(checkpoint)`` and ``write(checkpoint, folder, part)``.
 CONVERTERS = {"depthfm": depthfm, "ppd": ppd}
 #: Keys of an unknown checkpoint that the error names.

@@ -10,8 +10,6 @@ from torch import Tensor
 from geodiff_plugin.priors.loading import Layout, build_pipeline
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 
-__all__ = ["DepthPrior"]
-
 
 class DepthPrior:
     """Adapter of one kind of pipeline; as it stands, of any ``DepthDiffusionPipeline``.

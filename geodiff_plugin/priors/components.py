@@ -14,8 +14,6 @@ from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["DirectScheduler", "FixedPrompt", "SidesOf", "text_embedding"]
-
 
 class DirectScheduler(SchedulerMixin, ConfigMixin):
     """One step whose result is the network's output, for networks that answer with the clean latent.

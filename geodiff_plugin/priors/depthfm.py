@@ -16,8 +16,6 @@ from geodiff_plugin.priors.components import FixedPrompt, SidesOf
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, decode_picture
 
-__all__ = ["DepthFMPipeline", "DepthFMPrior", "cosine_alpha_bar"]
-
 #: Steps of the schedule that ``noising_step`` counts in.
 NOISING_STEPS = 1000
 #: Both sides of the processed image are multiples of this.

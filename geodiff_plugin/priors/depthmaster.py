@@ -15,8 +15,6 @@ from geodiff_plugin.priors.components import DirectScheduler, text_embedding
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
 
-__all__ = ["DepthMasterPipeline", "DepthMasterPrior", "FourierBlock", "FourierUNet"]
-
 #: The timestep that the network is always told.
 TIMESTEP = 1
 

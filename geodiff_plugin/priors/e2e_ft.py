@@ -13,8 +13,6 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.marigold import MarigoldPrior
 
-__all__ = ["E2EFTPipeline", "E2EFTPrior"]
-
 
 class E2EFTPipeline(MarigoldDepthPipeline):
     """``MarigoldDepthPipeline`` that starts from zeros and takes one step, whose result is the clean latent.

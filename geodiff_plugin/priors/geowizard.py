@@ -19,8 +19,6 @@ from geodiff_plugin.priors.components import text_embedding
 from geodiff_plugin.priors.loading import LIBRARIES, Layout, build_pipeline, load_component
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, decode_picture
 
-__all__ = ["DOMAINS", "GeoWizardPipeline", "GeoWizardPrior", "PairAttention"]
-
 DOMAINS = ("indoor", "outdoor", "object")
 #: Width of the class embedding -> further condition of the U-Net: the image in v1, the domain as text in v2.
 IMAGE_EMBEDDING, TEXT_PROMPT = 10, 4

@@ -23,21 +23,6 @@ from safetensors import SafetensorError
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors import components
 
-__all__ = [
-    "BUNDLED_FOLDER",
-    "LIBRARIES",
-    "REFUSED",
-    "Layout",
-    "build_pipeline",
-    "check_device",
-    "check_finite",
-    "check_weights",
-    "fetch",
-    "load_component",
-    "reading",
-    "refuse",
-]
-
 BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
 
 #: Priors that people ask for and that cannot be run: pattern of the last part of the name -> reason.

@@ -17,8 +17,6 @@ from geodiff_plugin.priors.components import DirectScheduler, text_embedding
 from geodiff_plugin.priors.loading import Layout, build_pipeline
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, decode_picture
 
-__all__ = ["LotusPipeline", "LotusPrior", "space_of_name"]
-
 #: The only timestep that Lotus was trained at.
 TIMESTEP = 999
 #: One-hot of the task: [1, 0] predicts depth, [0, 1] repeats the image (used in training only).

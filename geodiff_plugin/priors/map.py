@@ -21,8 +21,6 @@ from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
 from geodiff_plugin.priors.transformers_depth import range_of
 
-__all__ = ["MAP_LAYOUT", "DepthMapPipeline", "DepthMapPrior"]
-
 #: What ``load_prior("map")`` loads: no folder is there, and none is needed.
 MAP_LAYOUT = Layout(Path(__file__).with_suffix(""), "map")
 #: Weight of a known pixel against its links in the fill of holes, and conjugate-gradient steps per grid.

@@ -14,8 +14,6 @@ from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import decode_map, encode_map
 from geodiff_plugin.scale.space import SPACES
 
-__all__ = ["MarigoldPrior"]
-
 
 class MarigoldPrior(DepthPrior):
     """Adapter of ``MarigoldDepthPipeline``; its ``prediction_type`` must be a key of ``SPACES``."""

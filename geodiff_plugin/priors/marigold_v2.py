@@ -17,14 +17,6 @@ from geodiff_plugin.priors.components import FixedPrompt, SidesOf
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
 
-__all__ = [
-    "MarigoldV2Pipeline",
-    "MarigoldV2Prior",
-    "SPACE_OF_CHECKPOINT",
-    "frame_of",
-    "latents_of",
-]
-
 
 def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of the latents by channel, ``(1, C, 1, 1)`` each."""

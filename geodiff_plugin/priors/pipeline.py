@@ -21,18 +21,6 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number
 
-__all__ = [
-    "RESAMPLING",
-    "Condition",
-    "DepthDiffusionPipeline",
-    "DepthOutput",
-    "DirectMapPipeline",
-    "Generators",
-    "decode_map",
-    "decode_picture",
-    "encode_map",
-]
-
 Condition = dict[str, Tensor]
 Generators = torch.Generator | list[torch.Generator] | None
 #: Ways of resampling that the stock pipeline takes.

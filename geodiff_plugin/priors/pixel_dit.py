@@ -10,8 +10,6 @@ from diffusers.configuration_utils import ConfigMixin, register_to_config
 from diffusers.models.modeling_utils import ModelMixin
 from torch import Tensor, nn
 
-__all__ = ["PixelDiT"]
-
 ROPE_BASE = 100.0
 NORM_EPS = 1e-6
 

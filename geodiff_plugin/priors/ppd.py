@@ -18,16 +18,6 @@ from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
 from geodiff_plugin.priors.pixel_dit import PixelDiT
 
-__all__ = [
-    "AreaImageProcessor",
-    "LICENCE",
-    "PPDPipeline",
-    "PPDPrior",
-    "area_resize",
-    "sampling_timesteps",
-    "semantic_tokens",
-]
-
 #: Sides are multiples of this; one semantic token for each such square.
 SIDE = 16
 LAST_TIMESTEP = 1000

@@ -13,8 +13,6 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.loading import reading
 
-__all__ = ["FULL", "KNOWN", "TINY", "tiny_autoencoder"]
-
 #: Values of ``decoder`` that are no folder and no hub id.
 FULL, TINY = "full", "tiny"
 #: Channels, pixels a cell and scaling factor of a latent -> hub id of the tiny autoencoder that knows it.

@@ -17,16 +17,6 @@ from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout, build_pipeline, load_component
 from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
 
-__all__ = [
-    "NO_DEPTH",
-    "Preparation",
-    "TransformersDepthPipeline",
-    "TransformersDepthPrior",
-    "output_of",
-    "range_of",
-    "unit_range",
-]
-
 MODES = {2: "bilinear", 3: "bicubic"}  # of PIL
 #: Whose library resizes without antialiasing, or pads after normalising.
 ALIASED, PADDED_LAST = ("ZoeDepth", "DepthPro"), ("DPT", "PromptDepthAnything")

@@ -17,8 +17,6 @@ from geodiff_plugin.priors.components import FixedPrompt
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.loading import check_weights, reading
 
-__all__ = ["recognises", "unet_config", "write"]
-
 KEYS = {"state_dict", "ldm_hparams", "noising_step", "empty_text_embedding"}
 #: A copy of runwayml/stable-diffusion-v1-5, which the authors name and which is gone.
 VAE_ID = "stable-diffusion-v1-5/stable-diffusion-v1-5"

@@ -23,8 +23,6 @@ from geodiff_plugin.priors.loading import check_weights
 from geodiff_plugin.priors.marigold_v2 import SPACE_OF_CHECKPOINT, MarigoldV2Pipeline
 from geodiff_plugin.scale.space import SPACES
 
-__all__ = ["MARIGOLD_V2", "convert_marigold_v2", "merged", "read_prompt"]
-
 MARIGOLD_V2 = "marigold-v2"
 TRAINABLES = "trainables.safetensors"
 PROMPT_FOLDER, PROMPT = "qwen_text_embeddings", "qwen_edit_2509_qwen_depth_realimg512"

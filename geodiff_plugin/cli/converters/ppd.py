@@ -21,8 +21,6 @@ from geodiff_plugin.priors.loading import Layout, check_weights, load_component
 from geodiff_plugin.priors.pixel_dit import PixelDiT
 from geodiff_plugin.priors.ppd import PPDPipeline
 
-__all__ = ["ENCODER_NAMES", "recognises", "write"]
-
 TRANSFORMER, IN_CHECKPOINT, IN_FILE, IN_FOLDER = "dit.", "sem_encoder.pretrained.", "pretrained.", "backbone."
 #: The same weights as depth_anything_v2_vitl.pth, as transformers has them.
 ENCODER_ID = "depth-anything/Depth-Anything-V2-Large-hf"

@@ -17,8 +17,6 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["read_checkpoint", "renamed", "save_weights", "write_card"]
-
 _reconstruct = importlib.import_module("numpy._core.multiarray")._reconstruct
 #: A numpy array in a checkpoint is rebuilt by these; files of numpy 1 call the module ``numpy.core``.
 NUMPY_PARTS: list[Any] = [

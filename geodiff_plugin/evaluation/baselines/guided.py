@@ -30,8 +30,8 @@ from geodiff_plugin.evaluation.baselines.base import (
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import find_adapter
-from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.priors.components import DirectScheduler
+from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.checks import needs_network
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.scale.space import SPACES
