@@ -10,18 +10,18 @@ files whose path contains one of them run.
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import sys
 import tempfile
 import time
+import traceback
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("geodiff_plugin", "tests", "examples", "docs", "pyproject.toml", "constraints.txt", "README.md")
-#: Imported before the copies fork, so that each starts in a second.
-HEAVY = ("cv2", "diffusers", "kornia", "pytest", "scipy.spatial", "torch", "transformers")
 PARTS, REFERENCES = "tests/golden/test_parts.py", "tests/parity/test_numpy_references.py"
 
 
@@ -338,8 +338,11 @@ def killed(copy: Path, mutant: Mutant | None) -> bool:
         status = 3
         try:
             status = _run(copy, [PARTS, REFERENCES, *(() if mutant is None else mutant.tests)])
+        except BaseException:
+            traceback.print_exc()
         finally:
             sys.stdout.flush()
+            sys.stderr.flush()
             os._exit(status)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
 
@@ -355,14 +358,23 @@ def _run(copy: Path, tests: list[str]) -> int:
     sys.path[:] = [str(copy), *(path for path in sys.path if Path(path).resolve() != ROOT)]
     os.environ["PYTHONPATH"] = str(copy)
     os.chdir(copy)
-    return int(pytest.main(["-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]))
+    options = [
+        "-x",
+        "-q",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        "-W",
+        "ignore::pytest.PytestAssertRewriteWarning",
+    ]
+    return int(pytest.main([*options, *tests]))
 
 
 def main(words: list[str]) -> int:
     """Run the mutants of files that contain a word, all without any; how many are not killed."""
     chosen = [m for m in MUTANTS if not words or any(word in m.file for word in words)]
-    for module in HEAVY:
-        __import__(module)
+    importlib.import_module("tests.golden.parts")  # and with it all that a run then need not import anew
     survivors, gone = [], []
     with tempfile.TemporaryDirectory() as name:
         copy = prepared(Path(name))

@@ -127,7 +127,7 @@ def agreement(t: torch.Tensor, expected: torch.Tensor) -> float:
     return float(same.float().mean())
 
 
-@pytest.mark.parametrize("kind", ["room", "terrain"])
+@pytest.mark.parametrize("kind", ["terrain", pytest.param("room", marks=pytest.mark.slow)])
 def test_culling_loses_no_hit(kind):
     scenes = [sample_scene(3, kind), sample_scene(4, "tabletop")]
     cameras = [Camera(intrinsics((24, 32), s.fov_deg), s.T_world_from_camera) for s in scenes]
