@@ -143,8 +143,8 @@ def warn_of_long_baseline(E: np.ndarray, name: str) -> None:
 
 
 def warn_of_far_points(points: np.ndarray, name: str) -> None:
-    """Warn of known depths, ``(H, W)`` or ``(N, 3)``, that look like millimetres."""
-    depths = points[:, 2] if points.shape[1] == 3 else points
+    """Warn of known depths that look like millimetres; in the forms of ``points_to_matches``."""
+    depths = points[..., 0] if points.ndim == 3 else points[:, 2] if points.shape[1] in (3, 4) else points
     depths = depths[np.isfinite(depths) & (depths > 0)]
     if not len(depths):
         return

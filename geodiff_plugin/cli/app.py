@@ -102,7 +102,16 @@ def _root(
 
 def _run_depth(options: DepthOptions) -> None:
     from geodiff_plugin.cli.pairs import is_many, start_many
+    from geodiff_plugin.formats.bags import is_bag
 
+    if is_bag(options.left):
+        prepare_torch(options.quiet)
+        from geodiff_plugin.cli.bag import run_bag
+
+        run_bag(options)
+        return
+    names = ("topic_left", "topic_right")
+    options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
     if is_many(options.left):
         options = dataclasses.replace(options, out=options.out or Path("geodiff-out"))
         refs = start_many(options)
@@ -222,6 +231,19 @@ def video(
     from geodiff_plugin.cli.video import run_video
 
     run_video(frames, out, fps, near, far, photographs)
+
+
+@app.command()
+def submit(
+    results: Annotated[list[Path], typer.Argument(metavar="RESULT...", help="Folders of geodiff depth.")],
+    to: Annotated[str, typer.Option(help="The benchmark: middlebury or eth3d.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for its files.")],
+    method: Annotated[str, typer.Option(help="Name of the method in Middlebury's files.")] = "GeoDiff",
+) -> None:
+    """Write disparities and times as the benchmarks of Middlebury and ETH3D take them."""
+    from geodiff_plugin.cli.submit import run_submit
+
+    run_submit(results, to, out, method)
 
 
 @app.command("app")

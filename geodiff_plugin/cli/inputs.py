@@ -29,6 +29,7 @@ from geodiff_plugin.formats.distortion import (
     undistorted_points,
 )
 from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov, warn_of_other_lens
+from geodiff_plugin.formats.points import depth_of_disparity, read_confidence
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.guidance.evidence import cleaned
 from geodiff_plugin.guidance.guidance import GeometryGuidance, assume_same_centre
@@ -92,7 +93,8 @@ def read_inputs(
         poses = [np.eye(4), rig.E, *(E for _, E in further)]
     lenses = lenses_of(options, rig)
     images = [pinhole(*each, config) for each in zip(images, Ks, lenses, strict=False)]
-    points, cropped = _read_known(options, Ks[0], lenses[0], sizes[0]), options.cropped
+    points, cropped = _read_known(options, Ks[0], lenses[0], sizes[0], rig), options.cropped
+    confidence = _read_confidence(options, lenses[0])
     if rig is None:
         if options.baseline is not None:
             check_positive(options.baseline, "--baseline", "metres")
@@ -102,16 +104,18 @@ def read_inputs(
             baseline_m=options.baseline,
             known_length=_known_length(options.known_length, Ks[0], lenses[0]),
             points=points,
+            points_confidence=confidence,
             matcher=options.matcher or "sift",
             cropped=cropped,
             config=config,
         )
         rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
     elif len(images) == 1:
-        guidance = GeometryGuidance(None, rig.K_left, points=points, cropped=cropped, config=config)
+        known = {"points": points, "points_confidence": confidence}
+        guidance = GeometryGuidance(None, rig.K_left, **known, cropped=cropped, config=config)
     else:
         posed = list(zip([None, *images[1:]], Ks, poses, strict=True))
-        lengths = {"unit": rig.unit, "measured_baseline": rig.measured}
+        lengths = {"unit": rig.unit, "measured_baseline": rig.measured, "points_confidence": confidence}
         guidance = GeometryGuidance.from_views(
             posed, points=points, cropped=cropped, **lengths, config=config
         )
@@ -143,7 +147,7 @@ def read_rig(options: DepthOptions, left_size: Size, right_size: Size | None = N
     Raises:
         InputError: no calibration or more than one, a file that is none, K for images of another size.
     """
-    way, alone = calibration_way(options), right_size is None
+    way, alone = calibration_way(options), right_size is None and options.disparity is None
     if way == "file":
         rig = read_calibration(
             options.calib,
@@ -277,9 +281,9 @@ def _known_length(
 
 
 def _read_known(
-    options: DepthOptions, K: np.ndarray, lens: Distortion | None, size: Size
+    options: DepthOptions, K: np.ndarray, lens: Distortion | None, size: Size, rig: Rig | None
 ) -> np.ndarray | None:
-    """The depths of ``--points`` as the left image without lens distortion has them; ``None`` for none.
+    """The depths of ``--points`` or ``--disparity`` as the left image without lens distortion has them.
 
     Points in the camera's frame stay as they are. The pixels of a map are those of the image as it was
     taken, so behind a lens with distortion its depths become points.
@@ -287,6 +291,11 @@ def _read_known(
     Returns:
         ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)`` float32 metres.
     """
+    if options.disparity is not None:
+        if rig is None or lens is not None:
+            got = "--estimate-pose" if rig is None else "a lens with distortion"
+            bad_value("--disparity", "of a rectified rig with a calibration", got)
+        return depth_of_disparity(options.disparity, rig, size, "--disparity")
     if options.points is None:
         return None
     scale, calibration = options.points_scale, options.points_calib
@@ -298,6 +307,15 @@ def _read_known(
         cure = "A map belongs to the image as it was taken, pixel by pixel; else give points (N, 3)."
         bad_value("--points", f"a map of the left image's {expected} pixels", got, cure)
     return undistorted_points(known, K, lens)
+
+
+def _read_confidence(options: DepthOptions, lens: Distortion | None) -> np.ndarray | None:
+    if options.points_confidence is None:
+        return None
+    if lens is not None:
+        cure = "Give the points of an image without distortion, with theirs."
+        bad_value("--points-confidence", "of points of a pinhole's image", "a lens with distortion", cure)
+    return read_confidence(options.points_confidence, "--points-confidence")
 
 
 def pinhole(

@@ -34,6 +34,7 @@ from geodiff_plugin.cli.terminal import (
     say,
     show,
 )
+from geodiff_plugin.formats.bags import BagReader, is_bag
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import OutFolder, atomic_path, reason_of
 from geodiff_plugin.formats.reading import has_pose_per_image
@@ -52,7 +53,7 @@ JOURNAL = ".pairs.jsonl"
 #: A table of more pairs than this has only those that want to be looked at.
 MOST_ROWS = 20
 #: Options by which a finished result is no other one.
-NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "show", "strict", "device"}
+NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "show", "strict", "device", "encoding"}
 #: The next pair cannot be written either.
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -101,7 +102,7 @@ class Stages:
         self._options, self._device, self._pipe, self._among = options, device, pipe, among
         self._number = {ref.name: number for number, ref in enumerate(refs)}
         self._jobs: dict[str, _Job] = {}
-        self._videos, self._held = dict[Path, VideoReader](), ExitStack()
+        self._videos, self._held = dict[Path, VideoReader | BagReader](), ExitStack()
         self._before: tuple[PairRef, tuple[int, ...], MetricDepthOutput] | None = None
         self._thread, self._told = threading.local(), set[str]()
 
@@ -143,9 +144,13 @@ class Stages:
         views = [self._video(path).read(frame) for path in (ref.left, ref.right) if path is not None]
         return both_halves(views[0], "LEFT") if ref.right is None else views
 
-    def _video(self, path: Path) -> VideoReader:
+    def _video(self, path: Path) -> VideoReader | BagReader:
         if path not in self._videos:
-            self._videos[path] = self._held.enter_context(VideoReader(path))
+            if is_bag(path):
+                reader: Any = BagReader(path, self._options.bag_topics(), self._options.tolerance)
+            else:
+                reader = VideoReader(path)
+            self._videos[path] = self._held.enter_context(reader)
         return self._videos[path]
 
     def evidence(self, job: _Job) -> _Job:

@@ -121,6 +121,22 @@ class DepthOptions(RunOptions):
     points_calib: tuple[Path, ...] = declare(
         (), "KITTI's lidar calibration, for a .bin; twice if it is in two files."
     )
+    disparity: Path | None = declare(
+        None,
+        "Known disparities of LEFT against the right camera of a rectified rig, in pixels, by a network or a "
+        "sensor: .npy, .npz, .pfm, or KITTI's .png; instead of --points.",
+    )
+    points_confidence: Path | None = declare(
+        None, "How far to rely on --points or --disparity, in [0, 1], of the same shape: .npy, .pfm or .png."
+    )
+    topic_left: str | None = declare(None, "Topic of the left images, where LEFT is a bag.", "--left")
+    topic_right: str | None = declare(None, "Topic of the right images, where LEFT is a bag.", "--right")
+    tolerance: float = declare(
+        0.005, "A bag: most seconds between the time stamps of a pair.", low=0.0, high=10.0
+    )
+    encoding: str = _output(
+        "16UC1", "A bag: depth in whole millimetres, or metres.", choices=("16UC1", "32FC1")
+    )
     warm_start: bool = declare(
         False, "Many pairs: start each from the result of the previous frame, in fewer steps."
     )
@@ -153,7 +169,7 @@ class DepthOptions(RunOptions):
     def other_files(self) -> list[tuple[str, Path]]:
         """Name and path of every input that is no photograph."""
         named = [("calibration" if name == "calib" else name, getattr(self, name)) for name in CAMERA_FILES]
-        others = ("view_k", "view_e", "points", "points_calib", "prior_map")
+        others = ("view_k", "view_e", "points", "points_calib", "disparity", "points_confidence", "prior_map")
         named += [(name, getattr(self, name)) for name in others]
         flags = {field.name: flag_of(field) for field in fields(self)}
         return [
@@ -179,6 +195,18 @@ class DepthOptions(RunOptions):
         for field in fields(self):
             if field.name in names and getattr(self, field.name) not in (None, (), False):
                 bad_value(flag_of(field), expected, got, cure)
+
+    def bag_topics(self) -> tuple[str, str]:
+        """The topics of ``--left`` and ``--right``.
+
+        Raises:
+            InputError: one of them is not given, or RIGHT is.
+        """
+        self.refuse(["right"], "left out where LEFT is a bag", "given", "Name the topics: --left, --right.")
+        for flag, topic in (("--left", self.topic_left), ("--right", self.topic_right)):
+            if topic is None:
+                bad_value(flag, "given as a topic of images, as LEFT is a bag", "nothing")
+        return str(self.topic_left), str(self.topic_right)
 
     def camera_pair(self) -> tuple[int, int] | None:
         """The two numbers of ``--cameras``.
@@ -207,7 +235,7 @@ class DepthOptions(RunOptions):
         self.camera_pair()
         if self.preset == "paper":
             given, got = "given with the default preset", "--preset paper"
-            self.refuse(["points"], given, got, "Algorithm 1 has no points.")
+            self.refuse(["points", "disparity"], given, got, "Algorithm 1 has no points.")
             self.refuse(["view"], given, got, "Algorithm 1 has two views.")
             cure = "Its scale is settled once, by a search over one number."
             self.refuse(["warm_start"], given, got, cure)
@@ -219,6 +247,10 @@ class DepthOptions(RunOptions):
             bad_value("--prior-map", "given in place of a --prior", f"--prior {self.prior} and {beside}")
         if self.points is None:
             self.refuse(["points_scale", "points_calib"], "given with --points", "no --points")
+        else:
+            self.refuse(["disparity"], "given in place of --points", "both")
+        if self.points is None and self.disparity is None:
+            self.refuse(["points_confidence"], "given with --points or --disparity", "neither")
         if self.right is None:
             self._check_alone()
         poses = 0 if self.estimate_pose else len(self.view)
@@ -232,13 +264,15 @@ class DepthOptions(RunOptions):
 
     def _check_alone(self) -> None:
         """LEFT without RIGHT: known points, and nothing that is of a second camera."""
-        if self.points is None:
+        if self.points is None and self.disparity is None:
             cure = (
                 "One photograph alone does not tell metres: give a second one, or known depths with --points."
             )
             bad_value("RIGHT", "given, or --points instead of it", "neither", cure)
         expected, got, cure = "given with RIGHT", "no RIGHT", "It belongs to a second view."
-        self.refuse(("baseline", "e", "k_right", "view", "estimate_pose"), expected, got, cure)
+        if self.disparity is None:  # which is of a rig
+            self.refuse(("baseline",), expected, got, cure)
+        self.refuse(("e", "k_right", "view", "estimate_pose"), expected, got, cure)
         if self.preset == "paper":
             bad_value("--preset paper", expected, got, cure)
 
@@ -272,7 +306,7 @@ def calibration_way(options: DepthOptions) -> str:
     }
     taken = [way for way, is_taken in ways.items() if is_taken]
     known = "--calib FILE, or --fx --fy --cx --cy --baseline, or --K FILE --E FILE"
-    if options.right is None:
+    if options.right is None and options.disparity is None:
         known = known.replace(" --baseline", "").replace(" --E FILE", "")
     if not taken:
         bad_value("calibration", f"given: {known}", "none", "Without cameras two images do not tell metres.")

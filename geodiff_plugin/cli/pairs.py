@@ -19,6 +19,7 @@ from PIL import Image
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.options import DepthOptions, calibration_way, check_files, intrinsics_way
+from geodiff_plugin.formats.bags import is_bag, list_pairs
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.out import check_out, reason_of
 from geodiff_plugin.formats.video import VIDEOS, count_frames, is_video
@@ -46,7 +47,7 @@ class PairRef:
         left: left image, or the video that it is a frame of.
         right: likewise; ``None`` where the video has both views side by side.
         calib: its own calibration, or ``None`` for that of the run.
-        frame: number in the video, from 0; ``None`` for images.
+        frame: number in the video or the bag, from 0; ``None`` for images.
     """
 
     name: str
@@ -70,7 +71,7 @@ def start_many(options: DepthOptions) -> list[PairRef]:
     Raises:
         InputError: naming the option or the file.
     """
-    names = ("show", "points", "view", "known_length")
+    names = ("show", "points", "disparity", "view", "known_length")
     options.refuse(names, "left out with many pairs", "given", "It is of one pair.")
     refs = find_pairs(options)
     for ref in refs if options.prior_map is not None else ():
@@ -137,6 +138,9 @@ def find_pairs(options: DepthOptions) -> list[PairRef]:
         OSError, ValueError: a folder or list without pairs, views that have no partner, a line that is none.
     """
     left, right = options.left, options.right
+    if is_bag(left):
+        pairs = list_pairs(left, options.bag_topics(), options.tolerance)
+        return _frames(len(pairs), left, None)
     if os.path.isdir(left):
         return _of_folders(left, right)
     if is_video(left):
@@ -150,6 +154,8 @@ def find_pairs(options: DepthOptions) -> list[PairRef]:
 def assumption(refs: Sequence[PairRef], options: DepthOptions) -> str | None:
     """What was assumed about which views belong together, for the user to check; ``None`` for nothing."""
     first, last = refs[0], refs[-1]
+    if is_bag(first.left):
+        return None
     if first.frame is not None and first.right is None:
         return f"{first.left} is read as both views side by side; with a video for each view, name both."
     if first.right is None or last.right is None or not os.path.isdir(options.left):
@@ -226,8 +232,12 @@ def _of_videos(left: Path, right: Path | None) -> list[PairRef]:
     if right is not None and (others := count_frames(right, "RIGHT")) != frames:
         cure = "Cut them to the same moments first."
         bad_value("RIGHT", f"a video of {frames} frames, as the left one", f"{others} frames", cure)
-    digits = max(6, len(str(frames)))
-    return [PairRef(f"{frame:0{digits}d}", left, right, frame=frame) for frame in range(frames)]
+    return _frames(frames, left, right)
+
+
+def _frames(count: int, left: Path, right: Path | None) -> list[PairRef]:
+    digits = max(6, len(str(count)))
+    return [PairRef(f"{frame:0{digits}d}", left, right, frame=frame) for frame in range(count)]
 
 
 def _of_list(path: Path) -> list[PairRef]:

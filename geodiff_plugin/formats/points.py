@@ -11,10 +11,12 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value, check_metres, check_number, warn
 from geodiff_plugin.formats.benchmarks import KITTI_ROW
-from geodiff_plugin.formats.depth import read_depth_png, read_pfm
+from geodiff_plugin.formats.depth import read_depth_png, read_map, read_pfm
 from geodiff_plugin.formats.files import check_file, read_npy, read_rows, read_text
+from geodiff_plugin.formats.images import open_image
+from geodiff_plugin.types import Rig
 
-__all__ = ["read_ply_points", "read_points"]
+__all__ = ["depth_of_disparity", "read_confidence", "read_ply_points", "read_points"]
 
 PathLike = str | os.PathLike[str]
 KINDS = (
@@ -97,6 +99,62 @@ def read_points(
     with np.errstate(over="ignore"):
         values = (values / (scale or 1.0)).astype(np.float32)
     return values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
+
+
+def depth_of_disparity(
+    path: PathLike, rig: Rig, size: tuple[int, int], name: str = "disparity"
+) -> np.ndarray:
+    """Depths by a disparity map of the left image, from a stereo network or a sensor.
+
+    Args:
+        path: of ``read_map``; a PNG holds 256 units a pixel, as KITTI's.
+        rig: rectified; its K are for images of ``size``.
+        size: ``(width, height)`` of the left image. A map of another size is one of the image scaled to it:
+            its disparities grow with its width, and every pixel takes the nearest.
+        name: the argument that it came in, for messages.
+
+    Returns:
+        ``(H, W)`` float32 metres, ``fx baseline / (d + doffs)``; 0 where the disparity is not finite or 0, or
+        nothing is in front of the cameras.
+
+    Raises:
+        OSError, ValueError: no map; a rig that is not rectified, or a map of another shape.
+    """
+    x, others = rig.E[0, 3], rig.E - np.eye(4)
+    others[0, 3] = 0.0
+    if x <= 0 or np.abs(others).max() > 1e-3 * max(x, 1.0) or rig.unit is None:
+        cure = "Its right camera stands to the right, and a disparity goes along rows."
+        bad_value(name, "of a rectified rig in metres", f"the rig of {rig.source}", cure)
+    values = read_map(path, name) / (KITTI_UNITS if Path(path).suffix.lower() == ".png" else 1.0)
+    (width, height), (rows, columns) = size, values.shape
+    scale = width / columns
+    if abs(height / (scale * rows) - 1.0) > 0.02:
+        got = f"{path} of {columns}x{rows}"
+        bad_value(name, f"a map of the shape of the left image, {width}x{height} pixels", got)
+    nearest = [((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ((height, rows), (width, columns))]
+    disparity = values[np.ix_(*nearest)] * scale
+    shift = disparity + rig.K_right[0, 2] - rig.K_left[0, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth_m = rig.K_left[0, 0] * x / shift
+    return np.where(np.isfinite(depth_m) & (shift > 0) & (disparity != 0), depth_m, 0.0).astype(np.float32)
+
+
+def read_confidence(path: PathLike, name: str = "points_confidence") -> np.ndarray:
+    """How far to rely on points: ``(N,)`` or ``(H, W)`` in [0, 1], from ``.npy``, ``.pfm``, or an image.
+
+    Raises:
+        OSError, ValueError: no such file.
+    """
+    file = check_file(path, name, "a file of confidences")
+    kind = file.suffix.lower()
+    if kind == ".png":
+        with open_image(file, name) as image:
+            values = np.asarray(image)
+        if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16):
+            bad_value(name, "a grey PNG of 8 or 16 bits", f"{file} of shape {values.shape}")
+        return (values / np.iinfo(values.dtype).max).astype(np.float32)
+    values = read_pfm(file, name) if kind == ".pfm" else read_npy(file, name, "numbers in [0, 1] as .npy")
+    return np.squeeze(values).astype(np.float32)
 
 
 def _png_scale(path: Path, scale: float | None) -> float:

@@ -21,10 +21,11 @@ from geodiff_plugin.formats.rigs import (
 )
 from geodiff_plugin.formats.structured import CUT_OFF, parse_storage, parse_yaml
 
-__all__ = ["read_euroc", "read_kalibr", "read_orb_slam", "read_ros", "ros_pair"]
+__all__ = ["read_euroc", "read_kalibr", "read_orb_slam", "read_ros"]
 
 #: OpenCV's name of a distortion model.
-LENSES = {"radtan": "opencv", "radial-tangential": "opencv", "equidistant": "fisheye"}
+LENSES = dict.fromkeys(("radtan", "radial-tangential", "plumb_bob", "rational_polynomial", ""), "opencv")
+LENSES |= {"equidistant": "fisheye", "fisheye": "fisheye"}
 CALIBRATE_PAIR = "Calibrate the pair (camera_calibration with two topics)."
 #: Which coefficients a lens has, and what OpenCV calls it, by ORB-SLAM's ``Camera.type``.
 ORB_LENSES = {
@@ -72,34 +73,41 @@ def read_euroc(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     return RawRig(left, right, np.linalg.inv(T_body_left) @ T_body_right)
 
 
-def _camera_info(text: str) -> tuple[np.ndarray, Any]:
+def _camera_info(text: str) -> tuple[dict[str, Any], np.ndarray, Any]:
     info = parse_yaml(text)
     matrix = next((info[name] for name in ("projection_matrix", "P", "p") if name in info), None)
     if matrix is None:
         bad_value("the file", "a camera_info with projection_matrix (or P)", "none", CUT_OFF)
     P = array_of(matrix.get("data") if isinstance(matrix, dict) else matrix, (3, 4), "projection_matrix")
-    return P, size_of(info, "image_width", "image_height") or size_of(info)
+    if not P.any():
+        refuse(f"the camera is not calibrated: its projection_matrix (P) is all zeros. {CALIBRATE_PAIR}")
+    return info, P, size_of(info, "image_width", "image_height") or size_of(info)
 
 
 def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
-    """Files of ``camera_calibration``, or the message as ``echo`` prints it, left file first."""
-    return ros_pair(*map(_camera_info, texts))
+    """Files of ``camera_calibration``, or the message as ``echo`` prints it, left file first.
 
-
-def ros_pair(left: tuple[np.ndarray, Any], right: tuple[np.ndarray, Any]) -> RawRig:
-    """The rectified images (``image_rect``) of two ``camera_info``, as ``(P, (width, height))`` each.
-
-    ``P`` is that of the rectified image, so ``D`` and ``K`` of the raw one are not read. ``P[0, 3]`` of the
-    right camera is ``-fx * baseline``, in metres.
+    They stand for the rectified images (``image_rect``), of which ``P`` is; ``P[0, 3]`` of the right camera
+    is ``-fx * baseline``, in metres. Those that say ``rectified: false``, as ``geodiff depth`` writes them
+    for a bag, stand for the images as taken: ``K`` and ``D``, posed by ``R``, which turns a camera's points
+    to the rectified frame.
     """
-    if not (left[0].any() and right[0].any()):
-        refuse(f"the camera is not calibrated: its projection_matrix (P) is all zeros. {CALIBRATE_PAIR}")
-    raw = projected(left[0], right[0], left[1], right[1])
+    (left, P_left, size_left), (right, P_right, size_right) = map(_camera_info, texts)
+    raw = projected(P_left, P_right, size_left, size_right)
     if not raw.pose[:3, 3].any():
         expected = "-fx * baseline in the right camera's file"
         cure = f"These are of single cameras. {CALIBRATE_PAIR}"
         bad_value("projection_matrix[0, 3]", expected, "the same in both", cure)
-    return raw
+    if left.get("rectified", True) and right.get("rectified", True):
+        return raw
+    turns, cameras = [], []
+    for info, size in ((left, size_left), (right, size_right)):
+        turns.append(np.eye(4))
+        turns[-1][:3, :3] = array_of(info["R"], (3, 3), "R")
+        model = str(info["distortion_model"])
+        cameras.append(Camera(array_of(info["K"], (3, 3), "K"), size, info["D"], LENSES.get(model, model)))
+    E = np.linalg.inv(rigid(turns[0], "R")) @ raw.pose @ rigid(turns[1], "R")
+    return RawRig(cameras[0], cameras[1], E)
 
 
 def _orb_number(entries: dict[str, Any], key: str) -> float:

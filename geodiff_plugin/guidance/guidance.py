@@ -69,6 +69,8 @@ class GeometryGuidance:
             ``(E_left, E_right, ...)`` of camera-to-world poses; ``None`` without a right view.
         points: known depths, metres: a sparse map ``(H, W)`` of the left image's size (0, NaN and infinity
             mean unknown), or ``(N, 3)`` points in the left camera's frame; floats.
+        points_confidence: of the points in [0, 1], ``(H, W)`` or ``(N,)``; ``None`` takes all as measured. A
+            point of less weight decides less, and gives way to a match of the views that is more confident.
         left_size: ``(width, height)`` that the left image must have; ``None`` for any that fits ``K``.
         cropped: the images are crops, so the principal point may lie outside of the image.
         unit: ``"m"``, or ``None`` where the lengths of ``E`` are in no known unit, as in a model of COLMAP.
@@ -115,6 +117,7 @@ class GeometryGuidance:
         E: Any = None,
         *,
         points: Any = None,
+        points_confidence: Any = None,
         left_size: tuple[int, int] | None = None,
         cropped: bool = False,
         unit: str | None = "m",
@@ -138,7 +141,7 @@ class GeometryGuidance:
         for name in self.config.weights:
             check_choice(name, "a key of weights", TERMS)
         with noted() as self.warned:
-            self.inputs = read_inputs(right, K, E, points, cropped=cropped, unit=unit)
+            self.inputs = read_inputs(right, K, E, points, points_confidence, cropped=cropped, unit=unit)
         self.assumed: list[str] = []
         if not isinstance(K, (tuple, list)):
             assume_same_centre(self)

@@ -38,8 +38,7 @@ class Inputs:
         K_left: ``(3, 3)`` float64, pixels of the left image.
         views: the further views, of native size, on the CPU.
         rigs: their cameras in float64, for reports and exports.
-        points: ``(N, 3)`` float32 metres in the left camera's frame, or ``(H, W)`` float32 metres with 0
-            where unknown; ``None`` for none.
+        points: float32 metres as ``points_to_matches`` takes them; ``None`` for none.
         unit: of the lengths, ``"m"`` or ``None``.
     """
 
@@ -60,7 +59,14 @@ class Inputs:
 
 
 def read_inputs(
-    right: Any, K: Any, E: Any, points: Any, *, cropped: bool = False, unit: str | None = "m"
+    right: Any,
+    K: Any,
+    E: Any,
+    points: Any,
+    points_confidence: Any = None,
+    *,
+    cropped: bool = False,
+    unit: str | None = "m",
 ) -> list[Inputs]:
     """Arguments of ``GeometryGuidance`` in any of their forms, checked: one entry per left image.
 
@@ -69,6 +75,8 @@ def read_inputs(
     """
     if right is None and points is None:
         bad_value("right", "an image, or None together with points", "None without points")
+    if points is None and points_confidence is not None:
+        bad_value("points_confidence", "given with points", "no points")
     count = len(
         next((x for x in (right, points) if isinstance(x, list) and not _is_nested_matrix(x)), [None])
     )
@@ -79,9 +87,10 @@ def read_inputs(
     inputs = []
     for i in range(count):
         label = "{}" if count == 1 else f"{{}}[{i}]"
-        arguments = {"right": right, "K": K, "E": E, "points": points}
-        entries = (_entry(value, name, i, count) for name, value in arguments.items())
-        inputs.append(_read_image(*entries, label, cropped, unit))
+        arguments = {"right": right, "K": K, "E": E, "points": points, "points_confidence": points_confidence}
+        *views, known, confidence = (_entry(value, name, i, count) for name, value in arguments.items())
+        known = None if known is None else as_points(known, label.format("points"), confidence)
+        inputs.append(_read_image(*views, known, label, cropped, unit))
     have_points = [entry.points is not None for entry in inputs]
     for name, given in (("right", [bool(entry.views) for entry in inputs]), ("points", have_points)):
         if any(given) and not all(given):
@@ -90,7 +99,7 @@ def read_inputs(
 
 
 def _read_image(
-    right: Any, K: Any, E: Any, points: Any, label: str, cropped: bool, unit: str | None
+    right: Any, K: Any, E: Any, points: Tensor | None, label: str, cropped: bool, unit: str | None
 ) -> Inputs:
     """The entry of one left image; ``label`` makes the names in messages."""
     given = right if isinstance(right, tuple) else () if right is None else (right,)
@@ -108,7 +117,6 @@ def _read_image(
             warn_of_other_lens(given[v], K_right, names[v])
     matrices = [(torch.from_numpy(rig.K_right), torch.from_numpy(rig.T_right_from_left)) for rig in rigs]
     views = tuple(CameraView(x, K.float(), T.float()) for x, (K, T) in zip(images, matrices, strict=True))
-    points = None if points is None else as_points(points, label.format("points"))
     if points is not None and unit == "m":
         warn_of_far_points(points.numpy(), label.format("points"))
     return Inputs(K_left, views, rigs, points, unit)
@@ -175,8 +183,12 @@ def _poses(E: Any, name: str, views: int, unit: str | None) -> list[np.ndarray]:
     return poses
 
 
-def as_points(value: Any, name: str) -> Tensor:
-    """``(N, 3)`` of finite rows, or ``(H, W)`` with 0 where unknown, float32, metres."""
+def as_points(value: Any, name: str, confidence: Any = None) -> Tensor:
+    """``(N, 3)`` of finite rows, or ``(H, W)`` with 0 where unknown, float32, metres.
+
+    With a ``confidence`` in [0, 1], ``(N,)`` or ``(H, W)``, that is the last channel: ``(N, 4)``, ``(H, W,
+    2)``. What has none is unknown.
+    """
     forms = "a sparse depth map (H, W) or points (N, 3) in the left camera's frame, metres"
     if isinstance(value, Tensor):
         value = value.detach().cpu()
@@ -195,15 +207,35 @@ def as_points(value: Any, name: str) -> Tensor:
         check_metres(array, name)
     array = array.astype(np.float32)
     finite = np.isfinite(array)
+    weight = None if confidence is None else _as_confidence(confidence, array, f"{name}_confidence")
     if array.shape[1] == 3:
-        array = array[finite.all(1)]
+        use = finite.all(1) if weight is None else finite.all(1) & (weight > 0)
+        array = array[use] if weight is None else np.column_stack([array, weight])[use]
         count = len(array)
     else:
-        array = np.where(finite & (array > 0), array, np.float32(0))
+        use = finite & (array > 0) if weight is None else finite & (array > 0) & (weight > 0)
+        array = np.where(use, array, np.float32(0))
         count = int(np.count_nonzero(array))
+        array = array if weight is None else np.stack([array, np.where(use, weight, np.float32(0))], axis=-1)
     if not count:
         bad_value(name, forms + ", at least one of them known", "none: all are 0, NaN or infinite")
     return torch.from_numpy(np.ascontiguousarray(array))
+
+
+def _as_confidence(value: Any, points: np.ndarray, name: str) -> np.ndarray:
+    """The confidence of points ``(N, 3)`` or of a map ``(H, W)``, float32 in [0, 1]; not finite is 0."""
+    shape = (len(points),) if points.shape[1] == 3 else points.shape
+    try:
+        array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value, dtype=np.float32)
+    except (ValueError, TypeError):
+        bad_type(name, f"numbers of shape {shape}", value)
+    if array.shape != shape:
+        bad_value(name, f"of shape {shape}, as the points", f"shape {array.shape}")
+    array = np.where(np.isfinite(array), array, np.float32(0))
+    if array.min() < 0 or array.max() > 1:
+        cure = "Scale it: 1 is as good as a measured depth, 0 none."
+        bad_value(name, "in [0, 1]", f"values from {array.min():g} to {array.max():g}", cure)
+    return array
 
 
 def split_views(

@@ -80,29 +80,33 @@ def points_to_matches(
     """Put known depths on a grid of the left view; where several fall on one pixel, the nearest wins.
 
     Args:
-        points: ``(N, 3)`` float32, metres, in the left camera's frame (x right, y down, z forward); or a map
-            ``(H, W)`` of ``size``, metres, 0 where unknown.
+        points: ``(N, 3)`` float32, metres, in the left camera's frame (x right, y down, z forward), or ``(N,
+            4)`` with their confidence in (0, 1]; or a map ``(H, W)`` of ``size``, metres, 0 where unknown, or
+            ``(H, W, 2)`` with its confidence.
         K_left: ``(3, 3)`` pixels of the left image.
         size: ``(H, W)`` of the left image.
         size_grid: ``(h, w)`` of the grid.
 
     Returns:
-        ``Matches`` of the grid, with confidence 1 where a depth is known and 0 elsewhere, and how many of the
-        points are left out: behind the camera, or outside the image.
+        ``Matches`` of the grid, with the points' confidence (1 without any) where a depth is known and 0
+        elsewhere, and how many of the points are left out: behind the camera, or outside the image.
 
     Raises:
         InputError: no point is left, or a map is not of the image's size.
     """
-    if points.shape[1] == 3:
-        uv, z = project(points[None, None], K_left[None])
-        uv, z = uv[0, 0], z[0, 0]
+    weight = None
+    if points.ndim == 2 and points.shape[1] in (3, 4):
+        uv, z = project(points[None, None, :, :3], K_left[None])
+        uv, z, weight = uv[0, 0], z[0, 0], points[:, 3] if points.shape[1] == 4 else None
     else:
-        if tuple(points.shape) != size:
+        if tuple(points.shape[:2]) != size:
             cure = "A sparse depth map belongs to the left image, pixel by pixel; else give points (N, 3)."
             got = f"{points.shape[1]}x{points.shape[0]}"
             bad_value("points", f"a map of the left image's {size[1]}x{size[0]} pixels", got, cure)
-        rows, columns = (points > 0).nonzero(as_tuple=True)
-        uv, z = torch.stack([columns, rows], dim=1).float(), points[rows, columns]
+        depth_m = points if points.ndim == 2 else points[..., 0]
+        rows, columns = (depth_m > 0).nonzero(as_tuple=True)
+        uv, z = torch.stack([columns, rows], dim=1).float(), depth_m[rows, columns]
+        weight = points[rows, columns, 1] if points.ndim == 3 else None
     # A pixel reaches half a pixel beyond its centre.
     inside = ((uv >= -0.5) & (uv < uv.new_tensor([size[1], size[0]]) - 0.5)).all(dim=1) & (z > NEAREST_M)
     left_out = int((~inside).sum())
@@ -119,8 +123,11 @@ def points_to_matches(
     at = cell[:, 1].clamp(0, height - 1) * width + cell[:, 0].clamp(0, width - 1)
     nearest = z.new_zeros(height * width).scatter_reduce_(0, at, 1.0 / z[inside], "amax")
     inverse_depth = nearest.view(1, height, width)
-    unit = UNIT * nearest[nearest > 0].median()
-    return Matches(inverse_depth, (inverse_depth > 0).float(), unit), left_out
+    unit, confidence = UNIT * nearest[nearest > 0].median(), (inverse_depth > 0).float()
+    if weight is not None:
+        weight = torch.where(1.0 / z[inside] == nearest[at], weight[inside], 0.0)
+        confidence = torch.zeros_like(nearest).scatter_reduce_(0, at, weight, "amax").view(1, height, width)
+    return Matches(inverse_depth, confidence, unit), left_out
 
 
 def with_points(matches: Matches | None, points: Matches) -> Matches:
@@ -128,13 +135,15 @@ def with_points(matches: Matches | None, points: Matches) -> Matches:
 
     Both are of one image or of a chunk of samples, on one grid; ``matches`` may be ``None``. The confidence
     of a point is the number of pixels that it stands for: few points then decide as much as many, and one
-    that a poor prior contradicts is not taken for an outlier, as a match would be.
+    that a poor prior contradicts is not taken for an outlier, as a match would be. A match stays where it is
+    more confident than a point.
     """
     given = points.confidence > 0
     share = given.float().mean((-2, -1), keepdim=True)
     confidence = points.confidence / share.clamp_min(1.0 / given[0].numel())
     if matches is None:
         return replace(points, confidence=confidence)
+    given &= (points.confidence >= 1.0) | (points.confidence >= matches.confidence)
     return replace(
         matches,
         inverse_depth=torch.where(given, points.inverse_depth, matches.inverse_depth),

@@ -43,6 +43,9 @@ WEAK_CONFIDENCE, WEAK_MATCHED, WEAK_ORDER = 0.6, 0.4, 0.45
 LEAST_SPREAD = 0.15
 #: Points and matches that differ by the first factor are reported; by the second, the result is not trusted.
 POINTS_REPORTED, POINTS_WRONG = math.log(1.08), math.log(1.2)
+#: Share of the points that differ so, one by one, from which that is reported, or is not trusted. Of dense
+#: maps some always do: at edges, and where a view is hidden.
+MANY_OFF, MOST_OFF = 0.25, 0.5
 #: A rig's baseline in metres is longer, and a lens's horizontal field of view lies between these, in degrees:
 #: that of 135 mm and that of 10 mm in 35 mm equivalent. A long baseline is warned of when it is given.
 LEAST_BASELINE_M, VIEWS_DEG = 1e-3, (15.0, 120.0)
@@ -82,6 +85,7 @@ class Indicators:
         order: rank correlation of the prior's first map with matches or points, [-1, 1].
         spread: of the matched depths, log of their 95 % over their 5 % quantile.
         points_ratio: median of known points over matched depths at the same places.
+        points_off: share of the compared points that differ from the matches by a factor of 1.2 or more.
         points: number of known depths within the image.
         at_end: share of the confident matches on the first or the last plane of a given range, [0, 1].
         baseline_m: distance of the first right camera; 0 without one, or where it has no unit.
@@ -103,6 +107,7 @@ class Indicators:
     order: float = math.nan
     spread: float = math.nan
     points_ratio: float = math.nan
+    points_off: float = math.nan
     points: int = 0
     at_end: float = 0.0
     baseline_m: float = 0.0
@@ -161,16 +166,18 @@ def _alike(image_01: Tensor, left_01: Tensor) -> bool:
     return largest < SAME_SHARE * float(brightest - darkest)
 
 
-def _points_ratio(matches: Matches, points: Matches) -> float:
-    """Median ratio of points to matched depths; NaN for too few that can be compared."""
+def _of_points(matches: Matches, points: Matches) -> dict[str, float]:
+    """Median ratio of points to matched depths, and the share that contradicts; none for too few of them."""
     confident = (matches.confidence > CONFIDENT).float()
     window = (2 * REACH_PX + 1, 1, REACH_PX)
     near = F.avg_pool2d(confident[None], *window)[0]
     mean = F.avg_pool2d((confident * matches.inverse_depth)[None], *window)[0] / near.clamp_min(1e-6)
     at = (points.confidence > 0) & (near > 0) & (mean > matches.plane_step)
     if int(at.sum()) < FEWEST_COMPARED:
-        return math.nan
-    return float((mean[at] / points.inverse_depth[at]).median())
+        return {}
+    ratio = mean[at] / points.inverse_depth[at]
+    off = (ratio.log().abs() > POINTS_WRONG).float().mean()
+    return {"points_ratio": float(ratio.median()), "points_off": float(off)}
 
 
 def _of_matches(matches: Matches, depth_m: Tensor | None, planes: Tensor | None) -> dict[str, Any]:
@@ -218,7 +225,7 @@ def read_indicators(
         planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
         more |= _of_matches(matches, depth_m, planes)
         if evidence.sweep_points is not None:
-            more["points_ratio"] = _points_ratio(matches, evidence.sweep_points)
+            more |= _of_points(matches, evidence.sweep_points)
     if pose is not None:
         more["epipolar_px"] = max((px for px in pose.residual_px if not math.isnan(px)), default=math.nan)
         if pose.status == "mistaken":
@@ -250,11 +257,23 @@ def points_agreement(run: Indicators) -> float:
 def _why_points(run: Indicators) -> str:
     """On points that differ from the views; empty where they do not."""
     ratio = run.points_ratio
-    if math.isnan(ratio) or abs(math.log(ratio)) < POINTS_REPORTED:
+    if math.isnan(ratio):
         return ""
+    if abs(math.log(ratio)) < POINTS_REPORTED:
+        if not run.points_off > MANY_OFF:
+            return ""
+        return (
+            f"{100 * run.points_off:.0f} % of the known depths contradict what both views match there, and "
+            "the result follows them: give them a confidence (points_confidence, --points-confidence), or "
+            "leave them out."
+        )
     causes = [text for factor, text in FACTORS.items() if abs(math.log(ratio / factor)) < NEARLY]
     cause = causes[0] if causes else "a unit, the baseline or K may be off by that, or the points want a pose"
     return f"The points lie {ratio:.3g} times as far as what both views match: {cause}."
+
+
+def _points_wrong(run: Indicators) -> bool:
+    return _log(run.points_ratio) > POINTS_WRONG or run.points_off > MOST_OFF
 
 
 def _why_order(run: Indicators) -> str:
@@ -319,7 +338,7 @@ def _reasons(run: Indicators) -> list[str]:
             f"K gives the left image {run.view_deg:.0f} degrees of view, which no lens without distortion "
             "has: K must be in pixels of this image, not normalised by its size."
         )
-    if _log(run.points_ratio) > POINTS_WRONG:
+    if _points_wrong(run):
         reasons.append(_why_points(run))
     if 0 < run.points < LEAST_POINTS and math.isnan(run.matched):
         reasons.append(
@@ -351,7 +370,7 @@ def _remarks(run: Indicators, trusted: bool) -> list[str]:
             f"The depth is {run.own_ratio:.2g} times the prior's own metres: is the baseline in metres, "
             "and K for an image of this size? Or is the scene of a kind that the prior does not know?"
         )
-    if _log(run.points_ratio) <= POINTS_WRONG and (sentence := _why_points(run)):
+    if not _points_wrong(run) and (sentence := _why_points(run)):
         remarks.append(sentence)
     if 0 < run.points < LEAST_POINTS and not math.isnan(run.matched):
         remarks.append(f"Known depths that lie in the image: {run.points}, too few to rely on.")

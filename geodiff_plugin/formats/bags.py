@@ -1,0 +1,244 @@
+"""Recorded bags of ROS 1, ROS 2 and MCAP by ``rosbags`` (extra ``ros``): pairs of images, cameras, depth."""
+
+from __future__ import annotations
+
+import bisect
+import os
+import struct
+import tempfile
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import cv2
+import numpy as np
+import yaml
+
+from geodiff_plugin._checks import InputFileError, bad_value, refuse
+from geodiff_plugin.formats.depth import depth_mm
+
+__all__ = ["BAG_SUFFIXES", "BagReader", "is_bag", "list_pairs", "stereo_calibration", "write_depth_bag"]
+
+#: What an output may be: one MCAP file of ROS 2, or a bag of ROS 1.
+BAG_SUFFIXES = (".mcap", ".bag")
+#: Encoding of a raw image -> type of its numbers, channels, and what makes RGB of it. OpenCV names Bayer
+#: patterns by the second row, ROS by the first.
+ENCODINGS: dict[str, tuple[str, int, int | None]] = {
+    "rgb8": ("u1", 3, None),
+    "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB),
+    "8UC1": ("u1", 1, cv2.COLOR_GRAY2RGB),
+    "16UC1": ("u2", 1, cv2.COLOR_GRAY2RGB),
+}
+for _bits in (8, 16):
+    for _name, _opencv in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")):
+        ENCODINGS[f"bayer_{_name}{_bits}"] = (f"u{_bits // 8}", 1, getattr(cv2, f"COLOR_Bayer{_opencv}2RGB"))
+    ENCODINGS[f"mono{_bits}"] = (f"u{_bits // 8}", 1, cv2.COLOR_GRAY2RGB)
+
+
+class Stamp(NamedTuple):
+    """Nanoseconds of a message: by its header, and when it was recorded."""
+
+    header: int
+    recorded: int
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is named as a bag is, or is the folder of one."""
+    return path.suffix in (*BAG_SUFFIXES, ".db3") or os.path.isfile(path / "metadata.yaml")
+
+
+def _open(path: Path) -> Any:
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        refuse("Bags are read by rosbags. Run: pip install 'geodiff-plugin[ros]'.")
+    return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+
+
+def _connections(reader: Any, path: Path, topic: str) -> list[Any]:
+    images = [c for c in reader.connections if c.msgtype.endswith(("/Image", "/CompressedImage"))]
+    named = [connection for connection in images if connection.topic == topic]
+    if not named:
+        got = f"{path}, whose images are {', '.join(sorted({c.topic for c in images})) or 'none'}"
+        bad_value(topic, "a topic of images in the bag", got)
+    return named
+
+
+def _header_stamp(raw: bytes | memoryview, is_ros2: bool) -> int:
+    """Nanoseconds in the header, which every message with an image begins with."""
+    layout = "<4xII" if not is_ros2 or raw[1] & 1 else ">4xII"
+    seconds, nanoseconds = struct.unpack_from(layout, raw)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+@lru_cache(maxsize=4)
+def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple[tuple[Stamp, Stamp], ...]:
+    """The stamps of the images that belong together, each right one to one left one, in order.
+
+    Raises:
+        OSError, ValueError: no bag, no such topics, or no images within the tolerance of each other.
+    """
+    stamps: list[list[Stamp]] = []
+    try:
+        with _open(path) as reader:
+            for topic in topics:
+                messages = reader.messages(_connections(reader, path, topic))
+                stamps.append(sorted(Stamp(_header_stamp(raw, reader.is2), at) for _, at, raw in messages))
+    except ValueError:
+        raise
+    except Exception as error:  # of any kind that a damaged bag leads to
+        said = str(error).partition("\n")[0] or type(error).__name__
+        bad_value("LEFT", "a whole bag that rosbags reads", f"{path} ({said})", "Is it cut off?")
+    pairs, free = [], stamps[1]
+    for left in stamps[0]:
+        at = bisect.bisect(free, left)
+        near = min(free[max(0, at - 1) : at + 1], key=lambda s: abs(s.header - left.header), default=None)
+        if near is not None and abs(near.header - left.header) <= 1e9 * tolerance_s:
+            pairs.append((left, near))
+            free.remove(near)
+    if not pairs:
+        got = f"{len(stamps[0])} and {len(stamps[1])} images, none within {tolerance_s:g} s of each other"
+        bad_value("--left, --right", "of images of the same moments", got, "Give a larger --tolerance.")
+    return tuple(pairs)
+
+
+class BagReader:
+    """Both images of the pairs of ``list_pairs``, side by side as in a video; a context manager."""
+
+    def __init__(self, path: Path, topics: tuple[str, str], tolerance_s: float) -> None:
+        self._path, self._pairs = path, list_pairs(path, topics, tolerance_s)
+        self._reader = _open(path)
+        self._reader.open()
+        self._connections = [_connections(self._reader, path, topic) for topic in topics]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._reader.close()
+
+    def read(self, frame: int) -> np.ndarray:
+        """A pair, ``(H, 2 W, 3)`` float32 in [0, 1], RGB, left one first.
+
+        Raises:
+            OSError: it does not decode, or its images are of two sizes.
+        """
+        images = [self._image(*each) for each in zip(self._connections, self._pairs[frame], strict=True)]
+        if images[0].shape != images[1].shape:
+            sizes = " and ".join("{1}x{0}".format(*image.shape) for image in images)
+            raise InputFileError(f"pair {frame} of {self._path} must be of one size; got {sizes}.")
+        return np.hstack(images)
+
+    def _image(self, connections: list[Any], stamp: Stamp) -> np.ndarray:
+        for connection, _, raw in self._reader.messages(connections, stamp.recorded, stamp.recorded + 1):
+            if _header_stamp(raw, self._reader.is2) == stamp.header:
+                return _decoded(self._reader.deserialize(raw, connection.msgtype), self._path)
+        raise InputFileError(f"the image of {stamp.header} ns in {self._path} does not read.")
+
+
+def _decoded(message: Any, path: Path) -> np.ndarray:
+    """``(H, W, 3)`` float32 in [0, 1] of an ``Image`` or a ``CompressedImage``."""
+    data = np.asarray(message.data, dtype=np.uint8)
+    if hasattr(message, "format"):
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        if image is None:
+            raise InputFileError(f"an image of {path} ({message.format}) does not decode.")
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    else:
+        if message.encoding not in ENCODINGS:
+            bad_value("the encoding", f"one of {', '.join(ENCODINGS)}", f"{message.encoding} in {path}")
+        kind, channels, code = ENCODINGS[message.encoding]
+        numbers = np.dtype((">" if message.is_bigendian else "<") + kind)
+        rows = data.reshape(message.height, message.step)[:, : message.width * channels * numbers.itemsize]
+        image = np.ascontiguousarray(rows).view(numbers).astype(kind).reshape(len(rows), -1, channels)
+        image = image if code is None else cv2.cvtColor(image, code)
+    return image.astype(np.float32) / np.iinfo(image.dtype).max
+
+
+def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], str]:
+    """The ``camera_info`` beside two topics as files of ``robots.read_ros``, and the left one's ``frame_id``.
+
+    Topics with "rect" in their name are of rectified images, others of the images as taken.
+
+    Raises:
+        OSError, ValueError: no bag, or no ``camera_info``.
+    """
+    texts, frames = [], []
+    with _open(path) as reader:
+        for topic in topics:
+            base, _, name = topic.removesuffix("/compressed").rpartition("/")
+            named = [c for c in reader.connections if c.topic == f"{base}/camera_info"]
+            first = next(reader.messages(named), None) if named else None
+            if first is None:
+                cure = "Give --calib, or the cameras in another way."
+                bad_value("calibration", f"in the bag as {base}/camera_info, or given", "neither", cure)
+            info = reader.deserialize(first[2], first[0].msgtype)
+            entries: dict[str, Any] = {"image_width": int(info.width), "image_height": int(info.height)}
+            for key in "DKRP":  # ROS 2 has them in small letters
+                entries[key] = np.array(getattr(info, key, getattr(info, key.lower(), ())), float).tolist()
+            entries |= {"distortion_model": info.distortion_model, "rectified": "rect" in name}
+            texts.append(yaml.safe_dump(entries))
+            frames.append(info.header.frame_id)
+    return texts, frames[0]
+
+
+def write_depth_bag(
+    path: Path,
+    frames: Iterable[tuple[Stamp, np.ndarray, np.ndarray]],
+    frame_id: str,
+    encoding: str = "16UC1",
+) -> int:
+    """Write ``/depth/image`` and ``/depth/camera_info``, one of each a frame; whole or not at all.
+
+    Args:
+        path: ends in .mcap (ROS 2) or .bag (ROS 1); a file there is replaced.
+        frames: stamp, ``(H, W)`` metres and ``(3, 3)`` K in pixels of each image.
+        frame_id: of the left camera.
+        encoding: ``"16UC1"``, whole millimetres, 0 where unknown; or ``"32FC1"``, metres, NaN where unknown.
+
+    Returns:
+        How many were written.
+    """
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    is_ros2, count = path.suffix != ".bag", 0
+    store = get_typestore(Stores.ROS2_HUMBLE if is_ros2 else Stores.ROS1_NOETIC)
+    serialize = store.serialize_cdr if is_ros2 else store.serialize_ros1
+    plugin: dict[str, Any] = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}
+    kinds = {"/depth/image": "sensor_msgs/msg/Image", "/depth/camera_info": "sensor_msgs/msg/CameraInfo"}
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+        made = Path(folder) / "depth"
+        writer: Any = rosbag2.Writer(made, **plugin) if is_ros2 else rosbag1.Writer(made)
+        with writer:
+            topics = [writer.add_connection(name, kind, typestore=store) for name, kind in kinds.items()]
+            for stamp, depth_m, K in frames:
+                count += 1
+                time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp.header, 1_000_000_000))
+                order = {} if is_ros2 else {"seq": 0}
+                header = store.types["std_msgs/msg/Header"](**order, stamp=time, frame_id=frame_id)
+                messages = _image(store, header, depth_m, encoding), _info(store, header, depth_m.shape, K)
+                for topic, kind, message in zip(topics, kinds.values(), messages, strict=True):
+                    writer.write(topic, stamp.recorded, serialize(message, kind))
+        os.replace(made / "depth.mcap" if is_ros2 else made, path)
+    return count
+
+
+def _image(store: Any, header: Any, depth_m: np.ndarray, encoding: str) -> Any:
+    values = np.where(depth_m > 0, depth_m, np.nan).astype("<f4")
+    values = depth_mm(values) if encoding == "16UC1" else values
+    (height, width), data = values.shape, np.ascontiguousarray(values).view(np.uint8).ravel()
+    kind = store.types["sensor_msgs/msg/Image"]
+    return kind(header, height, width, encoding, 0, width * values.itemsize, data)
+
+
+def _info(store: Any, header: Any, size: tuple[int, ...], K: np.ndarray) -> Any:
+    """The camera of a pinhole's image ``(H, W)``."""
+    P = np.column_stack([K, np.zeros(3)])
+    matrices = [m.astype(np.float64).ravel() for m in (np.zeros(5), K, np.eye(3), P)]
+    roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    return store.types["sensor_msgs/msg/CameraInfo"](header, *size, "plumb_bob", *matrices, 0, 0, roi)

@@ -1,0 +1,95 @@
+"""``geodiff depth`` on a bag, resumed, and ``geodiff submit``, read back by others' code."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+from rosbags.highlevel import AnyReader
+
+from tests.unit import test_bags as bags
+
+TOPICS = ("--left", bags.TOPICS[0], "--right", bags.TOPICS[1])
+
+
+def depth_images(path: Path) -> list[tuple[int, np.ndarray]]:
+    with AnyReader([path]) as reader:
+        images = [c for c in reader.connections if c.topic == "/depth/image"]
+        read = [(at, reader.deserialize(raw, c.msgtype)) for c, at, raw in reader.messages(images)]
+    return [(at, image.data.view(np.uint16).reshape(image.height, image.width)) for at, image in read]
+
+
+def test_a_bag_becomes_a_bag_and_goes_on(geodiff, prior, textured_plane, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(bags, "K", textured_plane.K)
+    pair = textured_plane.left, textured_plane.right
+    assert pair[0].shape[:2] == bags.SIZE
+    bags.write_bag(tmp_path / "drive.mcap", images=pair)
+    words = ["depth", "drive.mcap", *TOPICS, "--prior", prior, "--steps", "2", "-q", "--out", "depth.mcap"]
+    answer = geodiff(*words)
+    assert answer.code == 0, answer.err
+    images = depth_images(Path("depth.mcap"))
+    assert [at for at, _ in images] == [10**12 + 5, 10**12 + 10**8 + 5]
+    for number, (_, image) in enumerate(images):
+        depth_m = np.load(f"depth-frames/{number:06d}/depth.npy")
+        np.testing.assert_allclose(image / 1000.0, np.where(depth_m < 65.5, depth_m, 0), atol=6e-4)
+    assert "which exists" in geodiff(*words).err
+    Path("depth.mcap").unlink()
+    shutil.rmtree("depth-frames/000001")
+    kept = Path("depth-frames/000000/depth.npy").stat().st_mtime_ns
+    assert geodiff(*words).code == 0
+    assert Path("depth-frames/000000/depth.npy").stat().st_mtime_ns == kept
+    again = depth_images(Path("depth.mcap"))
+    for (_, first), (_, second) in zip(images, again, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["drive.mcap", "--left", "/cam0/image_rect", "--out", "d.mcap"], "--right must be given as a topic"),
+        (["drive.mcap", *TOPICS, "--out", "folder"], "--out must be a file that ends in .mcap or .bag"),
+        (["left.png", "right.png", *TOPICS], "--left must be left out where LEFT is no bag"),
+    ],
+)
+def test_refusals(geodiff, pair_files, words, said) -> None:
+    (pair_files.folder / "drive.mcap").write_bytes(b"\0" * 99)
+    answer = geodiff("depth", *words)
+    assert answer.code == 2 and said in answer.err
+
+
+@pytest.mark.parametrize("benchmark", ["middlebury", "eth3d"])
+def test_submissions_are_what_the_benchmarks_read(geodiff, prior, pair_files, benchmark) -> None:
+    scene = pair_files.folder / "trainingH" / "Plane"
+    scene.mkdir(parents=True)
+    for file in (pair_files.left, pair_files.right):
+        shutil.move(file, scene / file.name)
+    images = scene / "left.png", scene / "right.png"
+    command = ["depth", *images, "--calib", pair_files.calib, "--prior", prior, "--steps", "2", "-q"]
+    assert geodiff(*command, "--out", "result").code == 0
+    assert geodiff("submit", "result", "--to", benchmark, "--out", "sent", "--method", "Ours").code == 0
+    middlebury = ("trainingH/Plane/disp0Ours.pfm", "trainingH/Plane/timeOurs.txt")
+    paths = (
+        middlebury
+        if benchmark == "middlebury"
+        else ("low_res_two_view/Plane.pfm", "low_res_two_view/Plane.txt")
+    )
+    written = sorted(str(path.relative_to("sent")) for path in Path("sent").rglob("*") if path.is_file())
+    assert written == sorted(paths)
+    disparity = cv2.imread(str(Path("sent") / paths[0]), cv2.IMREAD_UNCHANGED)
+    depth_m = np.load("result/depth.npy")
+    np.testing.assert_allclose(disparity, pair_K(pair_files) * 0.12 / depth_m, rtol=1e-5)
+    text = (Path("sent") / paths[1]).read_text()
+    assert float(text.removeprefix("runtime ")) > 0 and text.startswith("runtime") == (benchmark == "eth3d")
+    assert (
+        "to must be one of eth3d, middlebury" in geodiff("submit", "result", "--to", "kitti", "-o", "x").err
+    )
+
+
+def pair_K(pair_files) -> float:
+    return float(pair_files.calib.read_text().partition("[")[2].split()[0])

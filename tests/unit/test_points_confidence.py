@@ -1,0 +1,139 @@
+"""Dense evidence of others: confidence of points and maps, disparities, and what contradicts the views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from geodiff_plugin import GeometryGuidance
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.formats import rig_from_parameters, write_pfm
+from geodiff_plugin.formats.points import depth_of_disparity, read_confidence
+from geodiff_plugin.guidance.inputs import as_points
+from geodiff_plugin.matching import points_to_matches, with_points
+from geodiff_plugin.runtime.verdict import Indicators, judge
+
+K = torch.tensor([[60.0, 0, 31.5], [0, 66.0, 23.5], [0, 0, 1]])
+SIZE, GRID = (48, 64), (24, 32)
+
+
+def test_the_nearest_point_of_a_cell_brings_its_confidence() -> None:
+    """Against a loop over all points, with unequal sizes and anisotropic pixels."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, 300), rng.uniform(-0.8, 0.8, 300), rng.uniform(2, 9, 300)])
+    weight = rng.uniform(0.1, 1.0, 300)
+    given = as_points(points.astype(np.float32), "points", weight)
+    matches, left_out = points_to_matches(given, K, SIZE, GRID)
+    depth, expected, outside = np.full(GRID, np.inf), np.zeros(GRID), 0
+    for (x, y, z), w in zip(points.astype(np.float32), weight, strict=True):
+        u, v = 60.0 * x / z + 31.5, 66.0 * y / z + 23.5
+        column, row = int(np.floor((u + 0.5) / 2)), int(np.floor((v + 0.5) / 2))
+        if not (0 <= column < 32 and 0 <= row < 24):
+            outside += 1
+        elif z < depth[row, column]:
+            depth[row, column], expected[row, column] = z, w
+    assert left_out == outside > 0
+    np.testing.assert_allclose(matches.confidence[0], expected, atol=1e-6)
+    np.testing.assert_allclose(matches.inverse_depth[0], 1 / depth, rtol=1e-5)
+
+
+def test_a_map_with_confidence_is_its_points_with_theirs() -> None:
+    rng = np.random.default_rng(1)
+    depth = np.where(rng.random(SIZE) < 0.3, rng.uniform(2, 9, SIZE), 0.0).astype(np.float32)
+    confidence = rng.random(SIZE).astype(np.float32)
+    confidence[::3], confidence[1::3, ::2] = 0.0, np.nan
+    (rows, columns), inverse = np.nonzero(depth), np.linalg.inv(K.double().numpy())
+    xyz = np.stack([columns, rows, np.ones_like(rows)], 1) @ inverse.T * depth[rows, columns, None]
+    ones = (as_points(depth, "points", confidence), as_points(xyz, "points", confidence[rows, columns]))
+    of_map, of_list = (points_to_matches(given, K, SIZE, SIZE)[0] for given in ones)
+    torch.testing.assert_close(of_map.confidence, of_list.confidence)
+    torch.testing.assert_close(of_map.inverse_depth, of_list.inverse_depth)
+    plain, _ = points_to_matches(as_points(depth, "points"), K, SIZE, SIZE)
+    full, _ = points_to_matches(as_points(depth, "points", np.ones(SIZE)), K, SIZE, SIZE)
+    assert torch.equal(plain.confidence, full.confidence) and plain.plane_step == full.plane_step
+
+
+def test_a_confident_match_stays_beside_a_point_of_less() -> None:
+    depth = np.zeros(SIZE, np.float32)
+    depth[0, :3] = 4.0
+    confidence = np.zeros(SIZE)
+    confidence[0, :3] = 0.2, 0.9, 1.0
+    points, _ = points_to_matches(as_points(depth, "points", confidence), K, SIZE, SIZE)
+    matches = replace(
+        points, inverse_depth=torch.full((1, *SIZE), 0.5), confidence=torch.full((1, *SIZE), 0.5)
+    )
+    both = with_points(matches, points)
+    assert both.inverse_depth[0, 0, :4].tolist() == [0.5, 0.25, 0.25, 0.5]
+    share = 48 * 64 / 3
+    np.testing.assert_allclose(both.confidence[0, 0, :4], [0.5, 0.9 * share, share, 0.5], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("confidence", "said"),
+    [
+        (
+            np.ones((3, 4)),
+            r"points_confidence must be of shape \(48, 64\), as the points; got shape \(3, 4\)",
+        ),
+        (np.full(SIZE, 100), r"points_confidence must be in \[0, 1\]; got values from 100 to 100"),
+        ("high", "points_confidence must be numbers"),
+        (np.zeros(SIZE), "at least one of them known"),
+    ],
+)
+def test_what_is_no_confidence(confidence, said) -> None:
+    with pytest.raises(InputError, match=said):
+        GeometryGuidance.from_points(np.ones(SIZE, np.float32), K, points_confidence=confidence)
+
+
+def test_confidence_without_points() -> None:
+    right = np.zeros((48, 64, 3), np.uint8)
+    with pytest.raises(InputError, match="points_confidence must be given with points; got no points"):
+        GeometryGuidance.from_baseline(right, K, 0.1, points_confidence=np.ones(SIZE))
+
+
+def test_disparities_of_any_size_become_depths(tmp_path) -> None:
+    rig = rig_from_parameters(60, 66, 31.5, 23.5, 0.12, cx_right=33.0)
+    disparity = np.random.default_rng(2).uniform(1, 12, SIZE).astype(np.float32)
+    disparity[0, 0], disparity[0, 1] = np.inf, 0.0
+    expected = np.where(np.isfinite(disparity) & (disparity > 0), 60 * 0.12 / (disparity + 1.5), 0)
+    write_pfm(tmp_path / "d.pfm", disparity)
+    Image.fromarray((256 * np.where(np.isfinite(disparity), disparity, 0)).astype(np.uint16)).save(
+        tmp_path / "d.png"
+    )
+    np.testing.assert_allclose(depth_of_disparity(tmp_path / "d.pfm", rig, (64, 48)), expected, rtol=1e-6)
+    np.testing.assert_allclose(depth_of_disparity(tmp_path / "d.png", rig, (64, 48)), expected, rtol=2e-3)
+    np.save(tmp_path / "half.npy", disparity[::2, ::2] / 2)
+    half = depth_of_disparity(tmp_path / "half.npy", rig, (64, 48))
+    np.testing.assert_allclose(half[:2, 2:4], np.full((2, 2), expected[0, 2]), rtol=1e-6)
+    with pytest.raises(InputError, match="of the shape of the left image, 64x60"):
+        depth_of_disparity(tmp_path / "half.npy", rig, (64, 60))
+    E = rig.E.copy()
+    E[1, 3] = 0.05
+    with pytest.raises(InputError, match="disparity must be of a rectified rig in metres"):
+        depth_of_disparity(tmp_path / "d.pfm", replace(rig, E=E), (64, 48))
+
+
+def test_confidence_from_files(tmp_path) -> None:
+    values = np.random.default_rng(3).random(SIZE).astype(np.float32)
+    np.save(tmp_path / "c.npy", values)
+    write_pfm(tmp_path / "c.pfm", values)
+    Image.fromarray(np.rint(values * 65535).astype(np.uint16)).save(tmp_path / "c.png")
+    for name, atol in (("c.npy", 0), ("c.pfm", 0), ("c.png", 1e-5)):
+        np.testing.assert_allclose(read_confidence(tmp_path / name), values, atol=atol)
+    Image.new("RGB", (64, 48)).save(tmp_path / "rgb.png")
+    with pytest.raises(InputError, match="a grey PNG of 8 or 16 bits"):
+        read_confidence(tmp_path / "rgb.png")
+
+
+@pytest.mark.parametrize(
+    ("off", "status", "said"), [(0.1, "trusted", 0), (0.3, "trusted", 1), (0.6, "not trusted", 1)]
+)
+def test_points_that_contradict_the_views_are_told_and_judged(off, status, said) -> None:
+    run = Indicators(confidence=0.8, matched=0.7, order=0.8, spread=1.0, points=900, points_ratio=1.01)
+    verdict = judge(replace(run, points_off=off))
+    sentences = [s for s in (*verdict.reasons, *verdict.remarks) if "contradict what both views match" in s]
+    assert verdict.status == status and len(sentences) == said
