@@ -28,9 +28,10 @@ except ImportError:  # where there is no flock, two runs with one folder are not
 else:
     CAN_LOCK = True
 
-__all__ = ["LOCK", "PARTIAL", "OutFolder", "atomic_path", "check_out", "free_folder", "reason_of"]
+__all__ = ["PARTIAL", "OutFolder", "atomic_path", "check_out", "free_folder", "reason_of"]
 
-LOCK, PARTIAL = ".geodiff-lock", ".geodiff-partial"
+#: The hidden folder of a run that is under way, with its lock and its files.
+PARTIAL, LOCK, FILES = ".geodiff-partial", "process", "files"
 #: Lists what a run wrote, and is written last.
 REPORT = "report.json"
 MOST_NUMBERED = 10_000
@@ -72,12 +73,16 @@ def reason_of(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _hidden(target: Path, kind: str) -> Path:
-    """Where the lock or the unfinished files of a folder lie: inside it, or beside it until it is there.
+def _beside(target: Path) -> Path:
+    return target.with_name(f".{target.name}{PARTIAL}")
+
+
+def _hidden(target: Path) -> Path:
+    """The folder of unfinished files and of the lock: inside a folder, or beside it until it is there.
 
     A folder that exists may be a disk of its own, below one that nobody may write to.
     """
-    return target / kind if target.is_dir() else target.with_name(f".{target.name}{kind}")
+    return target / PARTIAL if target.is_dir() else _beside(target)
 
 
 def _absolute(path: Path, name: str) -> Path:
@@ -103,7 +108,7 @@ def check_out(path: Path, name: str = "--out") -> Path:
             bad_value(name, "a folder", f"the file {path}", "Name a folder.")
         if not target.name:
             bad_value(name, "a folder below the root", str(path), "Name a folder.")
-        os.stat(target.with_name(f".{target.name}{PARTIAL}"))  # the longest name that will be needed
+        os.stat(_beside(target))  # the longest name that will be needed
     except FileNotFoundError:
         pass
     except NotADirectoryError:
@@ -114,8 +119,8 @@ def check_out(path: Path, name: str = "--out") -> Path:
 
 
 def _holds_files(target: Path) -> bool:
-    """Whether a folder is there and has more in it than a lock and what an unfinished run left."""
-    return target.is_dir() and any(path.name not in (LOCK, PARTIAL) for path in target.iterdir())
+    """Whether a folder is there and has more in it than what an unfinished run left."""
+    return target.is_dir() and any(path.name != PARTIAL for path in target.iterdir())
 
 
 def free_folder(default: Path) -> Path:
@@ -123,7 +128,7 @@ def free_folder(default: Path) -> Path:
     for number in range(1, MOST_NUMBERED):
         path = default if number == 1 else default.with_name(f"{default.name}-{number}")
         taken = os.path.lexists(path) and (not path.is_dir() or _holds_files(path))
-        if not taken and not _held(_hidden(_absolute(path, "--out"), LOCK)):
+        if not taken and not _held(_hidden(_absolute(path, "--out"))):
             return path
     bad_value("--out", "given, as a new folder", f"{MOST_NUMBERED} folders {default}-N that hold files")
 
@@ -137,8 +142,9 @@ def _take_lock(file: IO[bytes]) -> bool:
     return True
 
 
-def _held(lock: Path) -> bool:
-    """Whether a process that writes to the folder of this lock is alive."""
+def _held(hidden: Path) -> bool:
+    """Whether the process that writes there is alive."""
+    lock = hidden / LOCK
     if not (CAN_LOCK and lock.is_file()):
         return False
     with open(lock, "rb") as file:
@@ -166,7 +172,6 @@ class OutFolder:
         inputs: files that the run reads, none of which it may replace or delete.
         overwrite: take a folder that holds files. Those that its report lists as an earlier run's go where
             the new run does not write them; all others stay.
-        resume: the folder is written to directly, file by file, and may hold an earlier part of the same.
         option: what ``path`` was given as, for messages.
 
     Raises:
@@ -181,34 +186,31 @@ class OutFolder:
         *,
         inputs: Collection[Path] = (),
         overwrite: bool = False,
-        resume: bool = False,
         option: str = "--out",
     ) -> None:
         self.path = Path(path)
         self._names, self._inputs = set(names), inputs
-        self._overwrite, self._resume, self._option = overwrite, resume, option
+        self._overwrite, self._option = overwrite, option
         self._earlier: set[str] = set()
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         self._target = check_out(self.path, self._option)
-        if _holds_files(self._target) and not (self._overwrite or self._resume):
+        if _holds_files(self._target) and not self._overwrite:
             cure = "Name another, or add --overwrite."
             bad_value(self._option, "a new or empty folder", f"{self.path}, which holds files", cure)
         if self._overwrite:
             self._earlier = _files_of_report(self._target)
             self._refuse_inputs()
+        self._staging = _hidden(self._target)
         with ExitStack() as stack:
             try:
-                self._make(self._target if self._resume else self._target.parent, stack)
+                self._make(self._staging, stack)
                 self._lock(stack)
-                self._staging = _hidden(self._target, PARTIAL)
-                self._clear_leftovers()
-                if shutil.disk_usage(self._staging.parent).free < LEAST_FREE_BYTES:
+                if shutil.disk_usage(self._staging).free < LEAST_FREE_BYTES:
                     self._refuse_place(os.strerror(errno.ENOSPC))
             except OSError as error:
                 self._refuse_place(reason_of(error))
-            stack.callback(shutil.rmtree, self._staging, ignore_errors=True)
             self._stack = stack.pop_all()
         return self
 
@@ -238,78 +240,71 @@ class OutFolder:
 
     def _lock(self, stack: ExitStack) -> None:
         """Take the folder's lock; the kernel gives it back when the process ends, however it ends."""
-        beside = self._target.with_name(f".{self._target.name}{LOCK}")
-        lock = _hidden(self._target, LOCK)
-        if lock != beside and _held(beside):  # a run that began before the folder was there
+        beside, lock = _beside(self._target), self._staging / LOCK
+        if self._staging != beside and _held(beside):  # a run that began before the folder was there
             self._refuse_held(beside)
         while True:
             file = stack.enter_context(open(lock, "a+b", buffering=0))
             if not CAN_LOCK:
                 break
             if not _take_lock(file):
-                self._refuse_held(lock)
+                self._refuse_held(self._staging)
             # A run that ended meanwhile has taken the file away: what we hold is then nobody's lock.
             if lock.exists() and os.path.samestat(os.fstat(file.fileno()), lock.stat()):
                 break
-        stack.callback(lock.unlink, missing_ok=True)
+            self._staging.mkdir(exist_ok=True)
+        stack.callback(shutil.rmtree, self._staging, ignore_errors=True)
         file.truncate(0)
         file.write(f"{os.getpid()}\n".encode())  # says who, and finds out whether the disk takes a byte
-
-    def _refuse_held(self, lock: Path) -> None:
-        process = lock.read_text(encoding="ascii", errors="replace").strip() or "unknown"
-        got = f"{self.path}, which process {process} is writing to"
-        bad_value(self._option, "a folder that no other run has", got, "Wait for it, or name another.")
-
-    def _clear_leftovers(self) -> None:
-        if self._staging.exists():  # we have the lock, so whoever made it is gone
-            shutil.rmtree(self._staging)
+        if (self._staging / FILES).exists():  # we have the lock, so whoever made them is gone
+            shutil.rmtree(self._staging / FILES)
             line = f"geodiff: removed what a run that was killed had left in {self._staging}"
             tqdm.write(line, file=sys.stderr)  # above a progress bar, if there is one
+
+    def _refuse_held(self, hidden: Path) -> None:
+        process = (hidden / LOCK).read_text(encoding="ascii", errors="replace").strip() or "unknown"
+        got = f"{self.path}, which process {process} is writing to"
+        bad_value(self._option, "a folder that no other run has", got, "Wait for it, or name another.")
 
     def write(self, fill: Callable[[Path], Result]) -> Result:
         """Let ``fill`` write into an empty folder beside the place, whose files are then moved.
 
         A new folder appears by one rename. In one that exists each file is replaced by one rename, then what
-        only an earlier run wrote goes, and the report is replaced last.
-
-        Args:
-            fill: writes all files into the folder that it is given.
-
-        Returns:
-            What ``fill`` returned.
+        only an earlier run wrote goes, and the report is replaced last. Returns what ``fill`` does.
 
         Raises:
             OSError: it could not be written; what was there before is as it was.
         """
+        files = self._staging / FILES
         try:
-            self._staging.mkdir(parents=True)
-            result = fill(self._staging)
-            self._move()
+            files.mkdir()
+            result = fill(files)
+            self._move(files)
         except InputFileError:  # of a file that it names
             raise
         except OSError as error:
             cure = "Free disk space or check its permissions, and run it again."
             raise InputFileError(f"{self.path} could not be written ({reason_of(error)}). {cure}") from error
         finally:
-            shutil.rmtree(self._staging, ignore_errors=True)
+            shutil.rmtree(files, ignore_errors=True)
         return result
 
-    def _move(self) -> None:
+    def _move(self, files: Path) -> None:
         if not self._target.is_dir():
             try:
-                os.rename(self._staging, self._target)
+                os.rename(files, self._target)
                 return
             except OSError:
                 if not self._target.is_dir():  # else somebody made it meanwhile
                     raise
-        written = {path.name for path in self._staging.iterdir()}
+        written = {path.name for path in files.iterdir()}
         for name in sorted(written - {REPORT}):
-            os.replace(self._staging / name, self._target / name)
+            os.replace(files / name, self._target / name)
         for path in (self._target / name for name in self._earlier - written):
             if path.is_file():
                 path.unlink()
         if REPORT in written:  # last: until then the old one lists what is still to go
-            os.replace(self._staging / REPORT, self._target / REPORT)
+            os.replace(files / REPORT, self._target / REPORT)
 
 
 def _remove_empty(folder: Path) -> None:

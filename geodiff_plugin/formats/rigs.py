@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_pose
 from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin.geometry import nearest_rotation
 from geodiff_plugin.types import Distortion, Rig
 
 __all__ = [
@@ -153,8 +155,11 @@ def rigid(matrix: Any, name: str) -> np.ndarray:
     """A ``(4, 4)`` float64 transform of 12 or 16 numbers, its rotation projected to the nearest one."""
     numbers = array_of(matrix, (-1,), name)
     shape = (3, 4) if numbers.size == 12 else (4, 4)
+    matrix = array_of(numbers, shape, name)
     cure = "Check that rows and columns are not swapped and that no scale is multiplied in."
-    return check_pose(array_of(numbers, shape, name), name, cure)
+    T = check_pose(matrix, name, cure)
+    T[:3, :3] = nearest_rotation(torch.from_numpy(matrix[:3, :3].copy())).numpy()  # in torch's last bit
+    return T
 
 
 def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> RawRig:

@@ -16,7 +16,7 @@ import pytest
 
 from geodiff_plugin._checks import InputError, InputFileError
 from geodiff_plugin.formats import out as out_module
-from geodiff_plugin.formats.out import LOCK, PARTIAL, OutFolder, free_folder
+from geodiff_plugin.formats.out import PARTIAL, OutFolder, free_folder
 
 
 def fill(folder: Path) -> str:
@@ -129,7 +129,7 @@ def test_the_unfinished_files_lie_inside_a_folder_that_exists(tmp_path):
     link.symlink_to(disk)
 
     def watched(folder):
-        assert folder.parent == disk.resolve()
+        assert folder.parent.parent == disk.resolve()
         return fill(folder)
 
     with OutFolder(link) as held:
@@ -188,8 +188,6 @@ def test_a_second_run_is_refused(tmp_path):
     assert names(out) == ["depth.npy", "report.json"] and names(tmp_path) == ["out"]
     with OutFolder(out, overwrite=True):
         assert f"process {os.getpid()}" in refused(out, overwrite=True)
-    with OutFolder(out, resume=True):
-        assert f"process {os.getpid()}" in refused(out, resume=True)
     assert names(out) == ["depth.npy", "report.json"]
 
 
@@ -208,7 +206,7 @@ def test_what_a_killed_run_left_is_recognised_and_cleared(tmp_path, exists, caps
     killed = subprocess.run([sys.executable, "-c", code, str(out)])
     assert killed.returncode == -signal.SIGKILL
     left = names(out if exists else tmp_path)
-    assert len(left) == 2 and any(LOCK in name for name in left) and any(PARTIAL in name for name in left)
+    assert len(left) == 1 and PARTIAL in left[0]
     assert free_folder(out) == out
     with OutFolder(out) as held:
         assert "killed" in capsys.readouterr().err
