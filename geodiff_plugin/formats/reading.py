@@ -30,54 +30,40 @@ def _json(*keys: str) -> Callable[[str], object]:
     return lambda text: text.lstrip().startswith(("{", "[")) and all(f'"{key}"' in text for key in keys)
 
 
+_OPENCV = re.compile('!!opencv-matrix|<opencv_storage|"opencv-matrix"').search
 #: Every format by name. The first that recognises a file reads it: formats that others contain come first.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "middlebury": CalibrationFormat(
-        "Middlebury, MiddEval3 or ETH3D calib.txt (cam0=[...])",
-        _line(r"\s*cam0\s*=\s*\["),
-        benchmarks.read_middlebury,
+        "Middlebury or ETH3D calib.txt (cam0=[...])", _line(r"\s*cam0\s*=\s*\["), benchmarks.read_middlebury
     ),
     "kitti_cam_to_cam": CalibrationFormat(
-        "KITTI calib_cam_to_cam (P_rect_02: ...)",
-        _line(r"\s*P_rect_\d+\s*:"),
-        benchmarks.read_kitti,
-        uses_cameras=True,
+        "KITTI (P_rect_02: ...)", _line(r"\s*P_rect_\d+\s*:"), benchmarks.read_kitti, uses_cameras=True
     ),
     # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" out.
     "kitti_projections": CalibrationFormat(
-        "KITTI projections (P0: ... to P3: ...)",
-        _line(r"\s*P[0-3]\s*:\s*[-+.\d]"),
-        benchmarks.read_kitti,
-        uses_cameras=True,
+        "KITTI (P0: ...)", _line(r"\s*P[0-3]\s*:\s*[-+.\d]"), benchmarks.read_kitti, uses_cameras=True
     ),
     "foundation_stereo": CalibrationFormat(
-        "K.txt of FoundationStereo (9 numbers, baseline in metres)",
+        "K.txt of FoundationStereo (9 numbers, baseline)",
         re.compile(r"(?:[-+.\de\s,]|nan|inf)+", re.IGNORECASE).fullmatch,
         benchmarks.read_foundation_stereo,
     ),
     "booster": CalibrationFormat(
-        "Booster xml (proj_matL, proj_matR, baselineLR)",
-        re.compile("<opencv_storage(?s:.*)proj_matL").search,
-        benchmarks.read_booster,
+        "Booster xml (proj_matL)", re.compile("<opencv_st(?s:.*)proj_matL").search, benchmarks.read_booster
     ),
     "mvsnet": CalibrationFormat(
-        "a pair of MVSNet cam.txt (extrinsic, intrinsic)",
-        _line(r"\s*extrinsic\s*$"),
-        benchmarks.read_mvsnet,
-        file_counts=(2,),
+        "a pair of MVSNet cam.txt (extrinsic)", _line(r"\s*extrinsic\s*$"), benchmarks.read_mvsnet, (2,)
     ),
     "zed": CalibrationFormat(
-        "ZED factory calibration SN*.conf ([LEFT_CAM_HD], [STEREO])",
-        _line(r"\s*\[(LEFT|RIGHT)_CAM_\w+\]"),
-        devices.read_zed,
+        "ZED SN*.conf ([LEFT_CAM_HD])", _line(r"\s*\[(LEFT|RIGHT)_CAM_\w+\]"), devices.read_zed
     ),
     "realsense": CalibrationFormat(
-        "RealSense intrinsics and extrinsics (rs-enumerate-devices -c, or rs2 as JSON)",
+        "RealSense (rs-enumerate-devices -c, or rs2 as JSON)",
         lambda text: devices.RS_PRINTED.search(text) or _json("ppx")(text),
         devices.read_realsense,
     ),
     "oak": CalibrationFormat(
-        "OAK-D calibration JSON (cameraData)", _json("cameraData"), devices.read_oak, uses_cameras=True
+        "OAK-D JSON (cameraData)", _json("cameraData"), devices.read_oak, uses_cameras=True
     ),
     "nerf": CalibrationFormat(
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
@@ -87,13 +73,10 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         by_image=True,
     ),
     "kalibr": CalibrationFormat(
-        "Kalibr camchain.yaml (cam0, cam1)",
-        _line(r"cam\d+:\s*(?:#.*)?$"),
-        robots.read_kalibr,
-        uses_cameras=True,
+        "Kalibr camchain.yaml (cam0)", _line(r"cam\d+:\s*(?:#.*)?$"), robots.read_kalibr, uses_cameras=True
     ),
     "euroc": CalibrationFormat(
-        "a pair of EuRoC sensor.yaml (T_BS)", _line(r"T_BS\s*:"), robots.read_euroc, file_counts=(2,)
+        "a pair of EuRoC sensor.yaml (T_BS)", _line(r"T_BS\s*:"), robots.read_euroc, (2,)
     ),
     # Older settings describe the rectification too, and OpenCV's reader has these names.
     "orb_slam": CalibrationFormat(
@@ -102,20 +85,15 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         robots.read_orb_slam,
     ),
     "opencv": CalibrationFormat(
-        "OpenCV stereoRectify YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
-        re.compile('!!opencv-matrix|<opencv_storage|"opencv-matrix"').search,
-        opencv.read_opencv,
-        file_counts=(1, 2),
+        "OpenCV YAML, XML or JSON (P1, P2, or M1, M2, R, T)", _OPENCV, opencv.read_opencv, (1, 2)
     ),
     "ros": CalibrationFormat(
         "a pair of ROS camera_info (projection_matrix)",
         _line(r"(projection_matrix|distortion_model|rectification_matrix)\s*:"),
         robots.read_ros,
-        file_counts=(2,),
+        (2,),
     ),
-    "stereodemo": CalibrationFormat(
-        "stereodemo JSON (fx, fy, cx0, cx1, cy, baseline_meters)", _json("fx"), benchmarks.read_stereodemo
-    ),
+    "stereodemo": CalibrationFormat("stereodemo JSON (fx)", _json("fx"), benchmarks.read_stereodemo),
     "colmap": COLMAP,
 }
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.distortion import (
     distortion_from_text,
     undistorted,
@@ -85,23 +84,3 @@ def test_a_point_comes_to_its_pinhole_pixel(point) -> None:
     bent = np.array([100 * x * scale + 79.5, 100 * y * scale + 59.5])
     found = undistorted(blob(bent), K, distortion_from_text("fisheye:0.03,0,0,0"))
     assert np.allclose(middle(found), pinhole, atol=0.1)
-
-
-def test_a_calibration_hands_its_lenses_over_on_request(tmp_path) -> None:
-    camera = "60, 0, 31.5, 0, 60, 23.5, 0, 0, 1"
-    entries = {"M1": (3, 3, camera), "D1": (1, 5, "-0.3, 0.1, 0, 0, 0"), "M2": (3, 3, camera)}
-    entries |= {
-        "D2": (1, 5, "0, 0, 0, 0, 0"),
-        "R": (3, 3, "1, 0, 0, 0, 1, 0, 0, 0, 1"),
-        "T": (3, 1, "-0.12, 0, 0"),
-    }
-    text = "".join(
-        f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [{numbers}]\n"
-        for name, (rows, columns, numbers) in entries.items()
-    )
-    file = tmp_path / "stereo.yml"
-    file.write_text("%YAML:1.0\n---\n" + text)
-    left, right = read_calibration(file, distorted=True).distortion
-    assert left.model == "opencv" and left.coefficients[0] == -0.3 and right is None
-    with pytest.raises(ValueError, match="Lens distortion of the left camera"):
-        read_calibration(file)

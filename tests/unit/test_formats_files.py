@@ -1,9 +1,15 @@
-"""Depth maps, point clouds and the atomic rename."""
+"""Depth maps, point clouds and the atomic rename: what is written is read back, by others' code too."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from geodiff_plugin.formats import (
@@ -18,20 +24,27 @@ from geodiff_plugin.formats import (
     write_ply,
 )
 
+TAKE = settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
+SIDES = st.integers(1, 9)
+SHAPES = st.tuples(SIDES, SIDES) | st.tuples(SIDES, SIDES, st.just(3))
+FLOATS = st.floats(width=32, allow_nan=False, allow_subnormal=False)
 
-def names(folder):
+
+def names(folder: Path) -> list[str]:
     return sorted(p.name for p in folder.iterdir())
 
 
-# ---- atomic
+# The atomic rename
 
 
-def test_atomic_path_appears_whole(tmp_path):
+def test_atomic_path_appears_whole_as_a_plain_file(tmp_path):
+    (tmp_path / "plain").write_text("x")
     with atomic_path(tmp_path / "a.png") as temporary:
         assert temporary.parent == tmp_path and temporary.suffix == ".png"
         temporary.write_text("new")
         assert not (tmp_path / "a.png").exists()
-    assert names(tmp_path) == ["a.png"] and (tmp_path / "a.png").read_text() == "new"
+    assert names(tmp_path) == ["a.png", "plain"] and (tmp_path / "a.png").read_text() == "new"
+    assert (tmp_path / "a.png").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
@@ -43,13 +56,6 @@ def test_atomic_path_leaves_the_old_file_on_any_error(tmp_path, error):
     assert names(tmp_path) == ["a.txt"] and (tmp_path / "a.txt").read_text() == "old"
 
 
-def test_atomic_path_has_the_permissions_of_a_plain_file(tmp_path):
-    (tmp_path / "plain").write_text("x")
-    with atomic_path(tmp_path / "a.txt") as temporary:
-        temporary.write_text("x")
-    assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
 def test_atomic_path_errors(tmp_path):
     with pytest.raises(IsADirectoryError, match="folder"), atomic_path(tmp_path):
         pass
@@ -57,32 +63,26 @@ def test_atomic_path_errors(tmp_path):
         pass
 
 
-# ---- depth and disparity
+# Maps
 
 
-@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3)])
-def test_pfm_round_trip(tmp_path, shape):
-    values = np.random.default_rng(0).normal(size=shape).astype(np.float32)
-    values[0, 0] = np.inf
-    write_pfm(tmp_path / "a.pfm", values)
-    np.testing.assert_array_equal(read_pfm(tmp_path / "a.pfm"), values)
-
-
-def test_pfm_layout_is_bottom_row_first_in_both_byte_orders(tmp_path):
-    rows = np.array([[1.0, 2.0], [3.0, 4.0]])
-    for scale, kind in (("-1.0", "<f4"), ("1.0", ">f4")):
-        bytes_ = b"Pf\n2 2\n" + scale.encode() + b"\n" + rows[::-1].astype(kind).tobytes()
-        (tmp_path / "a.pfm").write_bytes(bytes_)
-        np.testing.assert_array_equal(read_pfm(tmp_path / "a.pfm"), rows)
-
-
-def test_pfm_agrees_with_opencv(tmp_path):
-    cv2 = pytest.importorskip("cv2")
-    values = np.random.default_rng(1).random((6, 9)).astype(np.float32)
-    write_pfm(tmp_path / "ours.pfm", values)
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "ours.pfm"), cv2.IMREAD_UNCHANGED), values)
-    cv2.imwrite(str(tmp_path / "theirs.pfm"), values)
-    np.testing.assert_array_equal(read_pfm(tmp_path / "theirs.pfm"), values)
+@TAKE
+@given(
+    values=SHAPES.flatmap(
+        lambda shape: arrays(np.float32, shape, elements=st.floats(width=32, allow_nan=False))
+    )
+)
+def test_pfm_comes_back_as_opencv_has_it(tmp_path, values):
+    path = tmp_path / "a.pfm"
+    write_pfm(path, values)
+    np.testing.assert_array_equal(read_pfm(path), values)
+    theirs = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(theirs if values.ndim == 2 else theirs[..., ::-1], values)
+    cv2.imwrite(str(path), values if values.ndim == 2 else np.ascontiguousarray(values[..., ::-1]))
+    np.testing.assert_array_equal(read_pfm(path), values)
+    head, data = b"P%c\n%d %d\n1.0\n" % ("fF"[values.ndim - 2].encode(), *values.shape[1::-1]), values[::-1]
+    path.write_bytes(head + data.astype(">f4").tobytes())
+    np.testing.assert_array_equal(read_pfm(path), values)
 
 
 @pytest.mark.parametrize(
@@ -114,41 +114,33 @@ def test_depth_mm_png_round_trip_and_zero_count(tmp_path):
     assert zeros == 6 == int((~known).sum())
     with Image.open(tmp_path / "d.png") as image:
         assert image.mode.startswith("I;16")
-    assert write_depth_mm(tmp_path / "e.png", np.full((2, 2), 3.0)) == 0
 
 
-def test_kitti_disparity_png(tmp_path):
+def test_kitti_disparity_png_and_errors(tmp_path):
     Image.fromarray(np.array([[0, 256], [384, 65535]], dtype=np.uint16)).save(tmp_path / "d.png")
     disparity, known = read_disparity_kitti_png(tmp_path / "d.png")
     np.testing.assert_array_equal(disparity, np.float32([[0, 1], [1.5, 65535 / 256]]))
     np.testing.assert_array_equal(known, [[False, True], [True, True]])
-
-
-def test_png_errors(tmp_path):
     Image.new("L", (4, 4)).save(tmp_path / "eight.png")
     with pytest.raises(ValueError, match="16-bit grey.*mode L.*lost"):
         read_disparity_kitti_png(tmp_path / "eight.png")
-    Image.fromarray(np.random.default_rng(0).integers(0, 9999, (64, 64), dtype=np.uint16)).save(
-        tmp_path / "w.png"
-    )
+    noise = np.random.default_rng(0).integers(0, 9999, (64, 64), dtype=np.uint16)
+    Image.fromarray(noise).save(tmp_path / "w.png")
     (tmp_path / "cut.png").write_bytes((tmp_path / "w.png").read_bytes()[:600])
     with pytest.raises(ValueError, match="cut off"):
         read_depth_mm_png(tmp_path / "cut.png")
-    with pytest.raises(FileNotFoundError, match="disparity"):
-        read_disparity_kitti_png(tmp_path / "nope.png")
 
 
-# ---- point cloud
+# Clouds
 
 
-def read_ply(path):
-    raw = path.read_bytes()
-    head, _, body = raw.partition(b"end_header\n")
+def read_ply(path: Path) -> np.ndarray:
+    head, _, body = path.read_bytes().partition(b"end_header\n")
     lines = head.decode("ascii").split("\n")
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
     count = int(next(line for line in lines if line.startswith("element vertex")).split()[-1])
-    properties = [tuple(line.split()[1:]) for line in lines if line.startswith("property")]
     kinds = {"float": "<f4", "uchar": "u1"}
+    properties = [tuple(line.split()[1:]) for line in lines if line.startswith("property")]
     dtype = np.dtype([(name, kinds[kind]) for kind, name in properties])
     assert len(body) == count * dtype.itemsize
     return np.frombuffer(body, dtype=dtype)
@@ -160,19 +152,15 @@ def test_convention_ply_camera_frame(tmp_path):
     depth = np.linspace(1, 3, 12).reshape(3, 4)
     image = np.random.default_rng(0).random((3, 4, 3))
     valid = np.ones((3, 4), dtype=bool)
-    valid[0, 0] = False
-    depth[2, 3] = np.nan
-    depth[2, 2] = 0
+    valid[0, 0], depth[2, 3], depth[2, 2] = False, np.nan, 0
     assert write_ply(tmp_path / "c.ply", depth, image, K, valid) == 9
     points = read_ply(tmp_path / "c.ply")
     u, v = points["x"] / points["z"] * 10 + 2, points["y"] / points["z"] * 20 + 1
     rows, columns = np.rint(v).astype(int), np.rint(u).astype(int)
     np.testing.assert_allclose(np.stack([u, v]), np.stack([columns, rows]), atol=1e-5)
     np.testing.assert_allclose(points["z"], depth[rows, columns], rtol=1e-6)
-    np.testing.assert_array_equal(points["red"], np.rint(image[rows, columns, 0] * 255))
-    np.testing.assert_array_equal(points["blue"], np.rint(image[rows, columns, 2] * 255))
-    centre = points[(rows == 1) & (columns == 2)]
-    assert (centre["x"][0], centre["y"][0]) == (0, 0)
+    for channel, name in enumerate(("red", "green", "blue")):
+        np.testing.assert_array_equal(points[name], np.rint(image[rows, columns, channel] * 255))
 
 
 def test_ply_without_points_and_errors(tmp_path):
@@ -188,31 +176,19 @@ def test_ply_without_points_and_errors(tmp_path):
 
 def test_flying_points_keep_planes_and_clean_edges():
     v, u = np.mgrid[0:30, 0:40]
-    tilted = 1.0 / (0.5 - 0.004 * u - 0.003 * v)
-    assert not flying_points(tilted).any()
-    step = np.where(u < 20, 1.0, 3.0)
-    assert not flying_points(step).any()
-    box = np.where((u > 10) & (u < 25) & (v > 8) & (v < 20), 1.0, 3.0)
-    assert not flying_points(box).any()
+    box = (u > 10) & (u < 25) & (v > 8) & (v < 20)
+    for depth in (1.0 / (0.5 - 0.004 * u - 0.003 * v), np.where(u < 20, 1.0, 3.0), np.where(box, 1.0, 3.0)):
+        assert not flying_points(depth).any()
 
 
 @pytest.mark.parametrize("angle", [0, 30, 45, 70, 90])
 def test_flying_points_find_a_ramp_between_two_surfaces(angle):
     v, u = np.mgrid[0:60, 0:60]
     across = np.cos(np.deg2rad(angle)) * (u - 30) + np.sin(np.deg2rad(angle)) * (v - 30)
-    depth = np.interp(across, [-1.5, 1.5], [1.0, 4.0])
-    flying = flying_points(depth)
-    middle = np.abs(across) < 1.4
-    assert flying[middle].mean() > 0.95
-    assert not flying[np.abs(across) > 3].any()
-
-
-def test_flying_points_reach_follows_an_enlarged_map():
-    u = np.mgrid[0:60, 0:60][1]
-    depth = np.interp(u, [24, 36], [1.0, 1.4])
-    middle = np.abs(u - 30) < 5
-    assert not flying_points(depth).any()
-    assert flying_points(depth, reach=6)[middle].mean() > 0.95
+    flying = flying_points(np.interp(across, [-1.5, 1.5], [1.0, 4.0]))
+    assert flying[np.abs(across) < 1.4].mean() > 0.95 and not flying[np.abs(across) > 3].any()
+    wide = np.interp(u, [24, 36], [1.0, 1.4])  # of an enlarged map
+    assert not flying_points(wide).any() and flying_points(wide, reach=6)[np.abs(u - 30) < 5].mean() > 0.95
 
 
 def test_flying_points_ignore_what_is_not_valid():
