@@ -86,7 +86,7 @@ def test_kitti_pairs_that_nothing_chooses_between(reading):
         rig = reading("\n".join(rows), image_folder_hint="my/photos")
     assert rig.E[0, 3] == pytest.approx(385.0 / 721.5, rel=1e-3)
     grey = reading("\n".join(rows[:2]), image_folder_hint="image_2")
-    assert grey.E[0, 3] == pytest.approx(380.0 / 721.5)
+    assert grey.E[0, 3] == pytest.approx(380.0 / 721.5, rel=1e-3)
     driving = {101: 0.0, 103: -1093.1}
     text = "".join(f"P_rect_{c}: 1003.5 0 455.7 {b} 0 1003.5 197.7 0 0 0 1 0\n" for c, b in driving.items())
     assert reading(text).E[0, 3] == pytest.approx(1093.1 / 1003.5)
@@ -361,9 +361,8 @@ def test_orb_slam_of_all_ages(reading):
     posed = posed.replace("rows: 4", "rows: 3").replace(",\n         0.0, 0.0, 0.0, 1.0]", "]")
     assert reading(posed).E[0, 3] == pytest.approx(0.12)
     with pytest.raises(ValueError, match="Camera2.k1.*finite number; got none"):
-        reading(
-            re.sub(r"\.p(\d): 0\.0", r".k\g<1>x: 0.0", factory.ORB_SLAM).replace("PinHole", "KannalaBrandt8")
-        )
+        text = factory.ORB_SLAM.replace("PinHole", "KannalaBrandt8")
+        reading(text.replace(".p1:", ".k3:").replace(".p2:", ".k4:"))
 
 
 # COLMAP, nerfstudio
