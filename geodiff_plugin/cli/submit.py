@@ -33,6 +33,7 @@ def run_submit(results: Sequence[Path], benchmark: str, out: Path, method: str) 
     reports = [path for folder in results for path in sorted(Path(folder).glob("**/report.json"))]
     if not reports:
         bad_value("RESULT", "a folder of geodiff depth", ", ".join(map(str, results)))
+    scenes: set[Path] = set()
     for path in reports:
         report = json.loads(check_file(path, "RESULT").read_text(encoding="utf-8"))
         given = report["inputs"]
@@ -40,5 +41,9 @@ def run_submit(results: Sequence[Path], benchmark: str, out: Path, method: str) 
         depth_m = read_npy(path.parent / "depth.npy", "RESULT", "a depth map")
         disparity = disparity_of_depth(depth_m, K_left, K_right, E)
         scene = Path(report["arguments"]["left"]).absolute().parent
+        if scene in scenes:
+            got = f"two of {scene}"
+            bad_value("RESULT", "one pair of every scene, whose folder its left image lies in", got)
+        scenes.add(scene)
         write_submission(out, benchmark, scene, method, disparity, report["seconds"]["guided call"])
     say(f"{out}: {len(reports)} pairs for {benchmark} ({BENCHMARKS[benchmark]})")
