@@ -33,7 +33,7 @@ class DepthFrame:
         K: ``(3, 3)`` pixels.
         E: ``(4, 4)`` camera-to-world.
         confirmed: ``(H, W)`` how many other frames have the same depth there.
-        asked: ``(H, W)`` how many other frames see the point by this depth.
+        asked: ``(H, W)`` how many other frames see the point by this depth, or a surface before it.
     """
 
     name: str
@@ -99,8 +99,11 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame]) -> DepthFrame:
         missing = missing * np.where(same, 1.0 - RISES * sure, 1.0)
     inverse, confidence = above / total, 1.0 - missing
     alone = confirmed == 0
-    if len(others) >= OUTVOTES and alone.any():
-        votes, share, new, new_confidence = _vote([_rendered(other, frame) for other in others], alone)
+    rendered = [_rendered(other, frame) for other in others] if alone.any() else []
+    for maps in rendered:  # a surface of another frame before ours speaks against ours
+        asked += alone & (maps[0] > 0) & (maps[0] < (1 - SAME_SHARE) * frame.depth)
+    if len(rendered) >= OUTVOTES:
+        votes, share, new, new_confidence = _vote(rendered, alone)
         lost = (votes >= OUTVOTES) & (share > weight[alone])
         at = np.flatnonzero(alone)[lost]
         for values, by_others in ((inverse, new), (confidence, new_confidence), (confirmed, votes)):
@@ -140,8 +143,8 @@ def _rendered(other: DepthFrame, frame: DepthFrame) -> tuple[np.ndarray, np.ndar
     at = (row[inside] * frame.depth.shape[1] + column[inside])[order]
     maps = []
     for values in (z, other.confidence):
-        maps.append(np.zeros(frame.depth.size))
-        maps[-1][at] = values[inside][order]
+        maps.append(np.zeros(frame.depth.shape))
+        maps[-1].flat[at] = values[inside][order]
     return maps[0], maps[1]
 
 
@@ -151,7 +154,7 @@ def _vote(rendered: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -
     Returns:
         ``(n,)`` each: how many agree, their weight, their mean inverse depth and joint confidence.
     """
-    depths, sures = (np.stack([maps[k][mask.ravel()] for maps in rendered]) for k in (0, 1))
+    depths, sures = (np.stack([maps[k][mask] for maps in rendered]) for k in (0, 1))
     weights = np.where(depths > 0, LEAST_WEIGHT + sures, 0.0)
     inverse = 1.0 / np.where(depths > 0, depths, 1.0)
     best = [np.zeros(depths.shape[1]) for _ in range(4)]

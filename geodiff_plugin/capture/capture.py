@@ -16,7 +16,7 @@ from geodiff_plugin._threads import available_cores
 from geodiff_plugin.capture.neighbours import choose_neighbours
 from geodiff_plugin.capture.options import NEIGHBOURS
 from geodiff_plugin.formats.captures import CaptureFiles, CaptureFrame, read_capture
-from geodiff_plugin.formats.depth import read_depth_mm_png
+from geodiff_plugin.formats.depth import read_depth_png
 from geodiff_plugin.formats.distortion import undistorted
 from geodiff_plugin.formats.images import read_image
 from geodiff_plugin.formats.video import VideoReader
@@ -28,6 +28,8 @@ __all__ = ["Capture"]
 
 #: Points of a model that fewer images see, or that lie further off, are no known depths.
 FEWEST_VIEWS, MOST_ERROR_PX = 3, 1.5
+#: What 7-Scenes writes where depth is unknown.
+NO_DEPTH = 65535
 
 
 class Capture:
@@ -48,6 +50,7 @@ class Capture:
         self.unit = files.unit
         self._number = {name: number for number, name in enumerate(self.names)}
         self._solved: SolvedCapture | None = None
+        self._video: VideoReader | None = None
 
     @classmethod
     def open(
@@ -161,8 +164,9 @@ class Capture:
         """
         frame = self.frame(name)
         if frame.index is not None:
-            with VideoReader(frame.image, f"the video {frame.image}") as video:
-                image = video.read(frame.index)
+            if self._video is None:
+                self._video = VideoReader(frame.image, f"the video {frame.image}")
+            image = self._video.read(frame.index)
         else:
             image = read_image(frame.image, f"frame {name}")[0]
         return image if frame.lens is None else undistorted(image, frame.K, frame.lens)
@@ -225,9 +229,7 @@ class Capture:
             cure = "Give --metres-per-unit, --known-length or --distance."
             bad_value("points", "of a capture whose scale is known", "one without a unit", cure)
         if points == "depth":
-            if frame.depth is None:
-                bad_value("points", "depth maps that the capture names", f"none for {name}")
-            depth_m, known = read_depth_mm_png(frame.depth, f"the depth map of {name}")
+            depth_m, known = self.measured_depth(name)
             depth_m = np.where(known, depth_m, 0.0).astype(np.float32)
             return cv2.resize(depth_m, frame.size, interpolation=cv2.INTER_NEAREST)
         model = self.files.points
@@ -237,6 +239,18 @@ class Capture:
         rows = rows[(model.tracks[rows] >= FEWEST_VIEWS) & (model.error_px[rows] <= MOST_ERROR_PX)]
         T = np.linalg.inv(frame.E)
         return (model.xyz[rows] @ T[:3, :3].T + T[:3, 3]).astype(np.float32) if len(rows) else None
+
+    def measured_depth(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """The depth map that the capture names for a frame: ``(h, w)`` metres, and where it is known.
+
+        Raises:
+            InputError: it names none.
+        """
+        frame = self.frame(name)
+        if frame.depth is None:
+            bad_value("points", "depth maps that the capture names", f"none for {name}")
+        depth_m, known = read_depth_png(frame.depth, frame.depth_per_m, f"the depth map of {name}")
+        return depth_m, known & (depth_m < NO_DEPTH / frame.depth_per_m)
 
     def depth(
         self,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -14,6 +13,7 @@ from geodiff_plugin.capture.agreement import DepthFrame
 from geodiff_plugin.formats.clouds import Cloud, flying_points
 from geodiff_plugin.formats.colmap import write_colmap
 from geodiff_plugin.formats.out import atomic_path
+from geodiff_plugin.pose.capture import Observations
 
 __all__ = ["fuse", "normals_of", "write_colmap_maps", "write_mesh", "write_normal_ply"]
 
@@ -23,6 +23,8 @@ CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
 MOST_POINTS = 200_000
 #: Frames after which their points are merged, so that a long capture fits the memory.
 MERGED_AFTER = 20
+#: A voxel of the mesh as a share of the median depth; voxels along a block's side; blocks to begin with.
+MESH_SHARE, BLOCK, BLOCKS = 0.004, 16, 10_000
 VERTEX = np.dtype(
     [(n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")] + [(n, "u1") for n in ("red", "green", "blue")]
 )
@@ -83,9 +85,10 @@ def _thinned(rows: np.ndarray, cell: float) -> np.ndarray:
     """The mean of the rows of every cell of a grid over their first three columns."""
     if not len(rows):
         return rows
-    keys = np.floor(rows[:, :3] / cell).astype(np.int64)
-    _, inverse, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    inverse = inverse.reshape(-1)
+    cells = np.floor(rows[:, :3] / cell).astype(np.int64)
+    cells -= cells.min(0)
+    keys = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1))
+    _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
     sums = [np.bincount(inverse, rows[:, column], len(counts)) for column in range(rows.shape[1])]
     return np.stack(sums, -1) / counts[:, None]
 
@@ -122,57 +125,62 @@ def write_mesh(path: Path, frames: Sequence[DepthFrame], image: Callable[[str], 
         import open3d
     except ImportError:
         bad_value("open3d", "installed for a mesh", "missing", "pip install 'geodiff-plugin[mesh]'")
-    middle = float(np.median([np.median(frame.depth) for frame in frames]))
-    volume = open3d.pipelines.integration.ScalableTSDFVolume(
-        voxel_length=middle / 250,
-        sdf_trunc=middle / 50,
-        color_type=open3d.pipelines.integration.TSDFVolumeColorType.RGB8,
-    )
+    core, tensors = open3d.core, open3d.t.geometry
+    voxel = MESH_SHARE * float(np.median([np.median(frame.depth) for frame in frames]))
+    kinds = ("tsdf", "weight", "color"), (core.float32,) * 3, ((1,), (1,), (3,))
+    grid = tensors.VoxelBlockGrid(*kinds, voxel, BLOCK, BLOCKS)
     for frame in frames:
         depth = np.where(kept(frame), frame.depth, 0).astype(np.float32)
-        colour = np.ascontiguousarray(np.rint(image(frame.name) * 255).astype(np.uint8))
-        rgbd = open3d.geometry.RGBDImage.create_from_color_and_depth(
-            open3d.geometry.Image(colour),
-            open3d.geometry.Image(depth),
-            depth_scale=1.0,
-            depth_trunc=float(depth.max()) + 1.0,
-            convert_rgb_to_intensity=False,
-        )
-        height, width = depth.shape
-        camera = open3d.camera.PinholeCameraIntrinsic(
-            width, height, frame.K[0, 0], frame.K[1, 1], frame.K[0, 2], frame.K[1, 2]
-        )
-        volume.integrate(rgbd, camera, np.linalg.inv(frame.E))
-    mesh = volume.extract_triangle_mesh()
+        colour = np.ascontiguousarray(image(frame.name), np.float32)
+        maps = [tensors.Image(core.Tensor(values)) for values in (depth[..., None], colour)]
+        K, T = core.Tensor(frame.K.astype(np.float64)), core.Tensor(np.linalg.inv(frame.E))
+        reach = 1.0, float(depth.max()) * 1.01 + voxel
+        blocks = grid.compute_unique_block_coordinates(maps[0], K, T, *reach)
+        grid.integrate(blocks, *maps, K, K, T, *reach)
+    mesh = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
     mesh.compute_vertex_normals()
     with atomic_path(path) as temporary:
         open3d.io.write_triangle_mesh(str(temporary), mesh)
 
 
 def write_colmap_maps(
-    folder: Path, frames: Sequence[DepthFrame], cloud: Cloud, image: Callable[[str], Any]
+    folder: Path,
+    frames: Sequence[DepthFrame],
+    image: Callable[[str], np.ndarray],
+    points: np.ndarray,
+    seen: Sequence[Observations],
 ) -> None:
     """Write a dense workspace of COLMAP: images, sparse model, depth and normal maps.
 
     Args:
         folder: to appear.
         frames: agreed; maps have depth only where frames are kept.
-        cloud: points of the sparse model.
         image: a frame's name -> ``(H, W, 3)`` in [0, 1].
+        points: ``(M, 3)`` of the poses' solve, the model's; by what frames share COLMAP chooses pairs.
+        seen: where each of the frames sees them.
 
     Convention:
         ``colmap stereo_fusion --workspace_path FOLDER --input_type geometric --output_path fused.ply``
     """
-    for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps"):
+    for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    views, maps = [], folder / "stereo"
-    for frame in frames:
+    views, maps, colours = [], folder / "stereo", np.zeros(points.shape, np.uint8)
+    for frame, observed in zip(frames, seen, strict=True):
         file, depth = f"{frame.name}.png", np.where(kept(frame), frame.depth, 0).astype(np.float32)
-        Image.fromarray(np.rint(image(frame.name) * 255).astype(np.uint8)).save(folder / "images" / file)
+        picture = np.rint(image(frame.name) * 255).astype(np.uint8)
+        Image.fromarray(picture).save(folder / "images" / file)
+        u, v = np.rint(observed.px).astype(int).T.clip(0, np.array(depth.shape[::-1])[:, None] - 1)
+        colours[observed.point] = picture[v, u]
         write_map(maps / "depth_maps" / f"{file}.geometric.bin", depth[..., None])
         write_map(maps / "normal_maps" / f"{file}.geometric.bin", normals_of(frame.depth, frame.K))
         views.append((file, frame.K, frame.E, depth.shape[::-1]))
-    write_colmap(folder / "sparse", views, cloud)
+    rows, counts = np.unique(np.concatenate([observed.point for observed in seen]), return_counts=True)
+    rows = rows[counts > 1]
+    place = np.full(len(points), -1)
+    place[rows] = np.arange(len(rows))
+    shared = [place[observed.point] >= 0 for observed in seen]
+    tracks = [(o.px[both], place[o.point[both]]) for o, both in zip(seen, shared, strict=True)]
+    write_colmap(folder / "sparse", views, Cloud(points[rows], colours[rows]), tracks)
     (maps / "fusion.cfg").write_text("".join(f"{file}\n" for file, *_ in views), encoding="utf-8")
     pairs = "".join(f"{file}\n__auto__, 20\n" for file, *_ in views)
     (maps / "patch-match.cfg").write_text(pairs, encoding="utf-8")

@@ -41,43 +41,35 @@ def choose_neighbours(
     """
     values = _values(solved, frame)
     chosen: list[int] = []
-    first = 0.0
-    left = np.ones(values.shape[1])
-    shared = (values > 0).sum(1)
-    shared[[i for i in range(len(shared)) if among is not None and i not in among]] = 0
+    first, left = 0.0, np.ones(values.shape[1])
+    out = (values > 0).sum(1) < FEWEST_SHARED
+    out |= [among is not None and i not in among for i in range(len(out))]
     while len(chosen) < most:
-        gains = values @ left
-        gains[chosen], gains[shared < FEWEST_SHARED] = -1.0, -1.0
+        gains = np.where(out, -1.0, values @ left)
         best = int(np.argmax(gains))
         if gains[best] <= LEAST_SHARE * first:
             break
         first = first or float(gains[best])
         chosen.append(best)
+        out[best] = True
         left = left * np.where(values[best] > 0, SEEN_AGAIN, 1.0)
     return chosen if chosen or among is not None else _nearest(solved, frame, most)
 
 
 def _values(solved: SolvedCapture, frame: int) -> np.ndarray:
     """``(N, P)`` worth of the frame's points to every other frame, 0 where it does not see them."""
-    own = solved.seen[frame].point
-    lost = solved.E_given is not None and not np.isfinite(solved.E[frame]).all()
-    centres = (solved.E_given if lost and solved.E_given is not None else solved.E)[:, :3, 3]
-    xyz = solved.points[own]
-    row = np.full(len(solved.points), -1)
-    row[own] = np.arange(len(own))
-    to = xyz - centres[frame]
-    to /= np.linalg.norm(to, axis=1, keepdims=True)
-    values = np.zeros((len(solved.E), len(own)))
-    for other, seen in enumerate(solved.seen):
-        at = np.unique(row[seen.point])
-        at = at[at >= 0]
-        if other == frame or not len(at) or not np.isfinite(centres[other]).all():
+    own, values = solved.seen[frame].point, np.zeros((len(solved.E), len(solved.seen[frame].point)))
+    rays = solved.points[own] - solved.E[frame, :3, 3]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    for other, (E, seen) in enumerate(zip(solved.E, solved.seen, strict=True)):
+        if other == frame or not np.isfinite(E).all():
             continue
-        back = xyz[at] - centres[other]
+        back = solved.points[own] - E[:3, 3]
         back /= np.linalg.norm(back, axis=1, keepdims=True)
-        angle = np.degrees(np.arccos(np.clip((to[at] * back).sum(1), -1, 1)))
+        angle = np.degrees(np.arccos(np.clip((rays * back).sum(1), -1, 1)))
         width = np.where(angle < BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG)
-        values[other, at] = np.exp(-0.5 * ((angle - BEST_ANGLE_DEG) / width) ** 2)
+        worth = np.exp(-0.5 * ((angle - BEST_ANGLE_DEG) / width) ** 2)
+        values[other] = worth * np.isin(own, seen.point)
     return values
 
 

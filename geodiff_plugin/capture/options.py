@@ -15,7 +15,7 @@ from geodiff_plugin.options import CAMERAS, OUTPUT, SPACES, check_options, decla
 __all__ = ["NEIGHBOURS", "CaptureOptions"]
 
 #: Right views of a frame, at most.
-NEIGHBOURS = 4
+NEIGHBOURS = 5
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -100,7 +100,9 @@ def write_results(capture: Capture, out: Path, names: Sequence[str], export: Seq
     if "mesh" in export:
         write_mesh(out / "mesh.ply", frames, capture.image)
     if "colmap" in export:
-        write_colmap_maps(out / "colmap", frames, cloud, capture.image)
+        solved = capture.solve()
+        seen = [solved.seen[capture.names.index(name)] for name in names]
+        write_colmap_maps(out / "colmap", frames, capture.image, solved.points, seen)
     _sheet(capture, out, names)
     _video(capture, out, names)
     return {"cloud_points": len(cloud.points_m)}

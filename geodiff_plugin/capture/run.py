@@ -57,6 +57,10 @@ def open_capture(options: CaptureOptions) -> Capture:
     capture = Capture.open(options.path, K=K, fov=options.fov, trajectory=options.trajectory)
     if options.poses == "given" and capture.poses is None:
         bad_value("--poses given", "used with a capture that has poses", f"{options.path} without")
+    if options.distance is not None:
+        _pair(capture, options.distance)
+    if options.known_length is not None:
+        _length(capture, options.known_length)
     return capture
 
 
@@ -68,11 +72,7 @@ def solved_poses(capture: Capture, options: CaptureOptions) -> None:
         solved = capture.solve(options.poses, threads=available_cores())
         save_solved(path, solved, key)
     capture.adopt(solved)
-    factor = options.metres_per_unit
-    if options.distance is not None:
-        factor = _factor_of_pair(capture, options.distance)
-    elif options.known_length is not None:
-        factor = _factor_of_length(capture, options, key)
+    factor = _factor(capture, options, key)
     if factor is not None:
         capture.rescale(factor)
 
@@ -88,22 +88,17 @@ def _numbers(words: Sequence[str], option: str, typed: str) -> list[float]:
     return numbers
 
 
-def _factor_of_pair(capture: Capture, text: str) -> float:
-    """Metres per unit of ``--distance``."""
+def _pair(capture: Capture, text: str) -> tuple[list[int], float]:
+    """Numbers of the frames of ``--distance``, and their distance in metres."""
     *names, metres = (part.strip() for part in text.split(","))
     if len(names) != 2:
         bad_value("--distance", "NAME,NAME,METRES", repr(text))
     (length,) = _numbers([metres], "--distance", text)
-    numbers = [capture.names.index(capture.frame(name).name) for name in names]
-    apart = float(np.linalg.norm(np.diff(capture.solve().E[numbers, :3, 3], axis=0)))
-    if not apart > 0:
-        bad_value("--distance", "of two frames with different positions", repr(text))
-    return length / apart
+    return [capture.names.index(capture.frame(name).name) for name in names], length
 
 
-def _factor_of_length(capture: Capture, options: CaptureOptions, key: str) -> float:
-    """Metres per unit of ``--known-length``: by the depth of that frame in the poses' unit, found once."""
-    text = options.known_length or ""
+def _length(capture: Capture, text: str) -> tuple[str, np.ndarray, float]:
+    """Frame of ``--known-length``, its two pixels ``(2, 2)``, and the length between them in metres."""
     name, _, rest = text.rpartition(":")
     words = rest.split(",")
     if not name or len(words) != 5:
@@ -112,13 +107,27 @@ def _factor_of_length(capture: Capture, options: CaptureOptions, key: str) -> fl
     frame, ends = capture.frame(name), np.array(px).reshape(2, 2)
     if not ((ends >= 0) & (ends <= np.array(frame.size) - 1)).all():
         bad_value("--known-length", f"pixels of {frame.size[0]}x{frame.size[1]}", repr(text))
-    path, asked = options.out / SCALE_FILE, f"{key} {text}"
+    return name, ends, metres
+
+
+def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None:
+    """Metres per unit of the poses; that of ``--known-length`` by the depth of its frame, found once."""
+    if options.distance is not None:
+        numbers, metres = _pair(capture, options.distance)
+        apart = float(np.linalg.norm(np.diff(capture.solve().E[numbers, :3, 3], axis=0)))
+        if not apart > 0:
+            bad_value("--distance", "of two frames with different positions", repr(options.distance))
+        return metres / apart
+    if options.known_length is None:
+        return options.metres_per_unit
+    path, asked = options.out / SCALE_FILE, f"{key} {options.known_length}"
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))
         if saved["of"] == asked and not options.overwrite:
             return float(saved["metres_per_unit"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
+    name, ends, metres = _length(capture, options.known_length)
     depth = np.asarray(_depth(capture, _pipe(options), name, options).prediction)[0, ..., 0]
     rays = np.linalg.solve(capture.solve().K[capture.names.index(name)], np.c_[ends, np.ones(2)].T).T
     points = rays * depth[tuple(np.rint(ends).astype(int).T[::-1])][:, None]
@@ -137,11 +146,7 @@ def _pipe(options: CaptureOptions) -> Any:
 
 
 def _depth(
-    capture: Capture,
-    pipe: Any,
-    name: str,
-    options: CaptureOptions,
-    points: str = "none",
+    capture: Capture, pipe: Any, name: str, options: CaptureOptions, points: str = "none"
 ) -> MetricDepthOutput:
     """Depth of one frame as the options say."""
     call: dict[str, Any] = {} if options.steps is None else {"num_inference_steps": options.steps}

@@ -11,7 +11,6 @@ import torch
 from scipy.spatial import cKDTree
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.agreement import DepthFrame, agreed, seen_in
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache
@@ -19,7 +18,6 @@ from geodiff_plugin.evaluation.experiment import Experiment, Page
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import CaptureEvalOptions
 from geodiff_plugin.evaluation.tables import Table
-from geodiff_plugin.formats.depth import read_depth_mm_png
 from geodiff_plugin.runner import Item, Record, fingerprint
 
 __all__ = ["ROWS", "f_score", "run_capture_eval", "temporal_error"]
@@ -34,6 +32,10 @@ ROWS = {
 RIGHT_M, CELL_M = 0.05, 0.02
 #: A point that the next frame sees this much nearer or further is hidden there.
 HIDDEN_SHARE = 0.3
+PURPOSE = (
+    "Depth of frames of a moving camera, with the bundled prior unless the command says otherwise: poses as "
+    "the tracker gave them, refined by the views of each frame alone, and solved over the whole capture."
+)
 HEADER = (
     *("poses", "views", "AbsRel", "worst", "scaled", "scale"),
     *("within 3 %", "within 25 %", "agreed", "F 5 cm", "TAE %"),
@@ -84,35 +86,39 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
         InputError: a capture without depth maps, bad options.
         OSError: missing or unreadable files.
     """
-    captures = {poses: Capture.open(options.data) for poses in ("given", "refined")}
-    names = captures["given"].choose(options.frames)
-    if any(captures["given"].frame(frame).depth is None for frame in names):
-        bad_value("DIR", "a capture that names depth maps of its frames", f"{options.data}")
-    priors, settings = PriorCache(), options.settings
-    pipe, prior = priors.get(settings), priors.fingerprint(settings)
-    how = (str(options.data.resolve()), names, options.prior, prior, options.seed, options.steps, __version__)
-    cells = [
-        Item(
-            fingerprint(row, count, *how),
-            partial(_measure, captures[ROWS[row][1]], pipe, row, count, names, options),
-            name=f"{ROWS[row][0]}, {1 + count} views",
-            head={"row": ROWS[row][0], "views": str(1 + count)},
-        )
-        for row in options.rows
-        for count in options.neighbours
-    ]
-    work = partial(_of_points, captures["refined"], names)
-    head = {"row": "COLMAP's sparse points", "views": "all"}
-    cells.append(Item(fingerprint("points", *how), work, name="sparse points", head=head))
-    title = f"{options.data.name}, {len(names)} frames"
-    experiment = Experiment(name, "Captures", cells, lambda records: [_table(title, records)])
+    priors, settings, cells, titles = PriorCache(), options.settings, [], {}
+    for data in options.data:
+        captures = {poses: Capture.open(data) for poses in ("given", "refined")}
+        names = _chosen(captures["given"], options)
+        titles[str(data)] = f"{data.name}, {len(names)} frames"
+        how = (str(data.resolve()), names, options.prior, priors.fingerprint(settings), options.steps)
+        for row in options.rows:
+            for count in options.neighbours:
+                work = partial(
+                    _measure, captures[ROWS[row][1]], priors.get(settings), row, count, names, options
+                )
+                head = {"data": str(data), "row": ROWS[row][0], "views": str(1 + count)}
+                key = fingerprint(row, count, options.seed, __version__, *how)
+                cells.append(Item(key, work, name=f"{data.name}, {row}, {1 + count} views", head=head))
+        head = {"data": str(data), "row": "COLMAP's sparse points", "views": "all"}
+        key = fingerprint("points", __version__, *how)
+        work = partial(_of_points, captures["refined"], names)
+        cells.append(Item(key, work, name=f"{data.name}, sparse points", head=head))
+    experiment = Experiment(
+        name, "Captures", cells, partial(_tables, titles), lambda records: (NOTE,), PURPOSE
+    )
     return experiment.run(name, options)
 
 
-def _truth(capture: Capture, name: str) -> tuple[np.ndarray, np.ndarray]:
-    file = capture.frame(name).depth
-    assert file is not None
-    return read_depth_mm_png(file, f"the depth map of {name}")
+def _chosen(capture: Capture, options: CaptureEvalOptions) -> list[str]:
+    """Names of the frames to measure, all of which have a depth map."""
+    names = capture.choose(options.frames)
+    if options.count is not None:
+        at = ((np.arange(options.count) + 0.5) * len(names) / options.count).astype(int)
+        names = [names[i] for i in np.unique(at)]
+    for name in names:
+        capture.measured_depth(name)
+    return names
 
 
 def _measure(
@@ -128,7 +134,7 @@ def _measure(
             out = capture.depth(pipe, name, count, seed=options.seed, knobs=knobs, **call)
         i, depth = capture.names.index(name), np.asarray(out.prediction)[0, ..., 0]
         confidence = np.ones_like(depth) if out.confidence is None else np.asarray(out.confidence)[0, ..., 0]
-        truth, valid = _truth(capture, name)
+        truth, valid = capture.measured_depth(name)
         frames.append(DepthFrame(name, depth, confidence, solved.K[i], solved.E[i]))
         true_frames.append(DepthFrame(name, truth, np.ones_like(depth), solved.K[i], solved.E[i]))
         known.append(valid)
@@ -156,7 +162,7 @@ def _of_points(capture: Capture, names: Sequence[str]) -> Record:
     solved, scores = capture.solve(), []
     for name in names:
         i = capture.names.index(name)
-        truth, known = _truth(capture, name)
+        truth, known = capture.measured_depth(name)
         seen, T = solved.seen[i], np.linalg.inv(solved.E[i])
         z = solved.points[seen.point] @ T[2, :3] + T[2, 3]
         u, v = np.rint(seen.px).astype(int).T.clip(0, np.array(truth.shape[::-1])[:, None] - 1)
@@ -180,11 +186,16 @@ def _means(scores: Sequence[dict[str, float]]) -> Record:
     return {name: float(np.mean([each[name] for each in scores])) for name in scores[0]} | worst
 
 
-def _table(title: str, records: Sequence[Record]) -> Table:
+def _tables(titles: dict[str, str], records: Sequence[Record]) -> list[Table]:
+    """A table a capture."""
     digits = {"abs_rel": 4, "worst": 4, "scaled": 4, "scale": 3, "delta_103": 3, "delta_125": 3, "agreed": 4}
     digits |= {"f": 3, "tae": 2}
-    rows = [
-        (r["row"], r["views"], *(f"{r[key]:.{n}f}" if key in r else "-" for key, n in digits.items()))
-        for r in records
-    ]
-    return Table(title, HEADER, tuple(rows), NOTE)
+    tables = []
+    for data, title in titles.items():
+        rows = [
+            (r["row"], r["views"], *(f"{r[key]:.{n}f}" if key in r else "-" for key, n in digits.items()))
+            for r in records
+            if r["data"] == data
+        ]
+        tables.append(Table(title, HEADER, tuple(rows)))
+    return tables

@@ -234,12 +234,20 @@ class PosesOptions(_RealOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureEvalOptions(EvalOptions):
-    """``geodiff eval capture DIR``."""
+    """``geodiff eval capture DIR ...``."""
 
-    data: Path = declare(MISSING, "A capture that names depth maps (16-bit PNG, mm).", "", metavar="DIR")
+    data: tuple[Path, ...] = declare((), "Captures that name depth maps of their frames.", "", metavar="DIR")
     frames: str | None = declare(None, "NAME,NAME or FIRST:LAST:STEP; all by default.")
+    count: int | None = declare(
+        None, "So many frames of each, evenly spread, in place of --frames.", low=2, high=10**6
+    )
     neighbours: tuple[int, ...] = _list((2, 3, 5), "Comma-separated numbers of right views.", low=1, high=32)
     rows: tuple[str, ...] = _list(CAPTURE_ROWS, "Some of given, pairs, capture.", choices=CAPTURE_ROWS)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.data:
+            bad_value("DIR", "at least one capture", "none")
 
 
 class Command(NamedTuple):

@@ -23,15 +23,17 @@ from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fo
 from geodiff_plugin.formats.files import read_text
 from geodiff_plugin.formats.nerf import nerf_camera, nerf_frames, nerf_pose
 from geodiff_plugin.formats.rigs import Camera, intrinsics, is_distorted, rigid
+from geodiff_plugin.formats.video import count_frames, is_video
 from geodiff_plugin.types import Distortion
 
 __all__ = ["CaptureFiles", "CaptureFrame", "ModelPoints", "read_capture"]
 
 IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 #: Factory intrinsics (fx, fy, cx, cy, width, height) that the data sets publish for files without their own.
 SEVEN_SCENES = (525.0, 525.0, 320.0, 240.0, 640, 480)
 TUM_RGBD = (525.0, 525.0, 319.5, 239.5, 640, 480)
+#: Values a metre of TUM's depth maps; all others are in millimetres.
+TUM_DEPTH = 5000.0
 #: Entries of a frame by which a transforms.json says that its poses come from structure from motion.
 OF_COLMAP = ("colmap_im_id", "sharpness")
 #: Poses of a trajectory further from an image than this, in seconds, are not its own.
@@ -52,7 +54,8 @@ class CaptureFrame:
         size: ``(width, height)``.
         E: ``(4, 4)`` camera-to-world in OpenCV's axes, or ``None`` where no pose is given.
         lens: its distortion, ``None`` for none.
-        depth: a depth map that the capture names for it, or ``None``.
+        depth: a 16-bit PNG with depth that the capture names for it, or ``None``.
+        depth_per_m: its values a metre.
         index: number of the frame in a video, ``None`` for an image file.
     """
 
@@ -63,6 +66,7 @@ class CaptureFrame:
     E: np.ndarray | None = None
     lens: Distortion | None = None
     depth: Path | None = None
+    depth_per_m: float = 1000.0
     index: int | None = None
 
 
@@ -90,7 +94,6 @@ class CaptureFiles:
     Attributes:
         frames: in order of the capture.
         kind: what the files are, in words.
-        source: the path as given.
         unit: ``"m"``, or ``None`` where lengths are in no known unit.
         points: of a COLMAP model, or ``None``.
         notes: sentences for the user, such as frames without image.
@@ -98,7 +101,6 @@ class CaptureFiles:
 
     frames: tuple[CaptureFrame, ...]
     kind: str
-    source: Path
     unit: str | None = "m"
     points: ModelPoints | None = None
     notes: tuple[str, ...] = ()
@@ -127,22 +129,16 @@ def read_capture(
     source = Path(path)
     if not source.exists():
         raise MissingFileError(f"PATH must be a capture; there is no {source}.")
-    typed: Typed = None if K is None else (np.asarray(K, dtype=np.float64), None)
-    typed = (None, float(fov)) if fov is not None else typed
+    typed: Typed = fov if K is None else np.asarray(K, dtype=np.float64)
     for recognised, read in READERS:
         found = recognised(source)
         if found is not None:
-            files = read(found, typed, trajectory)
-            break
-    else:
-        expected = (
-            "a COLMAP model, a transforms.json, a folder of 7-Scenes, ScanNet or TUM RGB-D, a video or images"
-        )
-        bad_value("PATH", expected, f"{source}, which is none of these")
-    return _checked(replace(files, source=source))
+            return _checked(read(found, typed, trajectory), source)
+    expected = "a COLMAP model, a transforms.json, 7-Scenes, ScanNet or TUM RGB-D, a video or images"
+    bad_value("PATH", expected, f"{source}, which is none of these")
 
 
-def _checked(files: CaptureFiles) -> CaptureFiles:
+def _checked(files: CaptureFiles, source: Path) -> CaptureFiles:
     """The capture without frames whose images are missing; unique names."""
     there = [frame for frame in files.frames if frame.image.is_file()]
     notes = list(files.notes)
@@ -156,7 +152,7 @@ def _checked(files: CaptureFiles) -> CaptureFiles:
         bad_value(
             "a capture",
             "at least two frames",
-            f"{len(there)} in {files.source}",
+            f"{len(there)} in {source}",
             "One frame has no second view: use geodiff depth with known points, or record more.",
         )
     return replace(files, frames=tuple(there), notes=tuple(notes))
@@ -175,39 +171,36 @@ def _size(path: Path) -> tuple[int, int]:
     return (height, width) if turned else (width, height)
 
 
-Typed = tuple[np.ndarray | None, float | None] | None
+#: Intrinsics, or the horizontal field of view in degrees.
+Typed = np.ndarray | float | None
 
 
 def _K_of(typed: Typed, size: tuple[int, int]) -> np.ndarray | None:
-    if typed is None:
-        return None
-    K, fov = typed
-    if K is not None:
-        return K
-    return None if fov is None else intrinsics_from_fov(fov, size)
+    return typed if typed is None or isinstance(typed, np.ndarray) else intrinsics_from_fov(typed, size)
 
 
 def _framed(
     path: Path, camera: Camera, E: np.ndarray | None, typed: Typed, depth: Path | None = None
 ) -> CaptureFrame:
     """A frame of an image file, its camera scaled to the image's size."""
+    depth = depth if depth is not None and depth.is_file() else None
     if not path.is_file():
         return CaptureFrame(path.stem, path, camera.K, (0, 0), E)
-    size, K = _size(path), camera.K
-    if camera.size is not None and tuple(camera.size) != size:
-        factors = [of / float(side) for of, side in zip(size, camera.size, strict=True)]
+    size, K = _size(path), _K_of(typed, _size(path))
+    if K is None:
+        factors = np.array(size) / np.array(camera.size or size, float)
         if abs(factors[0] / factors[1] - 1) > SAME_SHAPE:
             got = f"{size[0]}x{size[1]} pixels where its camera has {camera.size[0]}x{camera.size[1]}"
             bad_value(f"{path}", "of the shape of its camera's images", got, "Is it a crop? Give --K.")
-        K = np.array([[f, 0, 0.5 * f - 0.5] for f in factors[:1]] + [[0, factors[1], 0.5 * factors[1] - 0.5]])
-        K = np.vstack([K, (0, 0, 1)]) @ camera.K
-    own = _K_of(typed, size)
+        to_image = np.diag([*factors, 1.0])
+        to_image[:2, 2] = 0.5 * factors - 0.5
+        K = to_image @ camera.K
     if camera.model not in ("opencv", "fisheye"):
         cure = "Undistort the images first (colmap image_undistorter)."
         bad_value(f"the lens of {path}", "one that OpenCV has", camera.model, cure)
     lens = Distortion(camera.model, np.asarray(camera.coefficients, np.float64).ravel())
-    known = lens if len(lens.coefficients) and is_distorted(lens) else None
-    return CaptureFrame(path.stem, path, K if own is None else own, size, E, known, depth)
+    distorted = len(lens.coefficients) and is_distorted(lens)
+    return CaptureFrame(path.stem, path, K, size, E, lens if distorted else None, depth)
 
 
 # transforms.json
@@ -226,13 +219,11 @@ def _read_transforms(file: Path, typed: Typed, _: object) -> CaptureFiles:
     for name, entries in nerf_frames(read_text(file, "PATH")).items():
         image = _named_image(file.parent, name)
         camera = nerf_camera(entries, _size(image) if image.is_file() else None)
-        depth = entries.get("depth_file_path")
-        frames.append(
-            _framed(image, camera, nerf_pose(entries), typed, file.parent / depth if depth else None)
-        )
+        depth = file.parent / entries.get("depth_file_path", f"depth/{image.stem}.png")
+        frames.append(_framed(image, camera, nerf_pose(entries), typed, depth))
         if any(key in entries for key in OF_COLMAP):
             unit = None
-    return CaptureFiles(tuple(frames), "transforms.json", file, unit)
+    return CaptureFiles(tuple(frames), "transforms.json", unit)
 
 
 def _named_image(folder: Path, name: str) -> Path:
@@ -264,7 +255,7 @@ def _read_colmap(folder: Path, typed: Typed, _: object) -> CaptureFiles:
     try:
         xyz, _, error_px, tracks = read_colmap_points(folder)
     except OSError:
-        return CaptureFiles(tuple(frames), "COLMAP model", folder, None)
+        return CaptureFiles(tuple(frames), "COLMAP model", None)
     rows: dict[str, list[int]] = {name: [] for name in name_of.values()}
     for row, track in enumerate(tracks):
         for number in np.unique(track):
@@ -272,7 +263,7 @@ def _read_colmap(folder: Path, typed: Typed, _: object) -> CaptureFiles:
                 rows[name_of[int(number)]].append(row)
     seen = {name: np.array(own, int) for name, own in rows.items()}
     points = ModelPoints(xyz, error_px, seen, np.array([len(track) for track in tracks], int))
-    return CaptureFiles(tuple(frames), "COLMAP model", folder, None, points if len(xyz) else None)
+    return CaptureFiles(tuple(frames), "COLMAP model", None, points if len(xyz) else None)
 
 
 # 7-Scenes and ScanNet
@@ -283,18 +274,13 @@ def _find_seven(path: Path) -> Path | None:
 
 
 def _read_seven(folder: Path, typed: Typed, _: object) -> CaptureFiles:
-    images = sorted(folder.glob("frame-*.color.*"))
-    camera = _file_camera(
-        folder, ("intrinsics.txt", "camera-intrinsics.txt", "intrinsic_color.txt"), SEVEN_SCENES
-    )
-    frames = []
-    for image in images:
+    names = ("intrinsics.txt", "camera-intrinsics.txt", "intrinsic_color.txt")
+    camera, frames = _file_camera(folder, names, SEVEN_SCENES), []
+    for image in sorted(folder.glob("frame-*.color.*")):
         name = image.name.partition(".")[0]
-        depth = folder / f"{name}.depth.png"
         E = _matrix_pose(folder / f"{name}.pose.txt")
-        frame = _framed(image, camera, E, typed, depth if depth.is_file() else None)
-        frames.append(replace(frame, name=name))
-    return _with_poses(frames, "7-Scenes", folder)
+        frames.append(replace(_framed(image, camera, E, typed, folder / f"{name}.depth.png"), name=name))
+    return _with_poses(frames, "7-Scenes")
 
 
 def _find_scannet(path: Path) -> Path | None:
@@ -302,17 +288,18 @@ def _find_scannet(path: Path) -> Path | None:
 
 
 def _read_scannet(folder: Path, typed: Typed, _: object) -> CaptureFiles:
-    images = sorted(
-        (p for p in (folder / "color").iterdir() if p.suffix.lower() in IMAGES),
-        key=lambda p: _natural(p.name),
-    )
     camera = _file_camera(folder, ("intrinsic/intrinsic_color.txt", "intrinsic_color.txt"), None)
     frames = []
-    for image in images:
-        depth = folder / "depth" / f"{image.stem}.png"
+    for image in _images_in(folder / "color"):
         E = _matrix_pose(folder / "pose" / f"{image.stem}.txt")
-        frames.append(_framed(image, camera, E, typed, depth if depth.is_file() else None))
-    return _with_poses(frames, "ScanNet", folder)
+        frames.append(_framed(image, camera, E, typed, folder / "depth" / f"{image.stem}.png"))
+    return _with_poses(frames, "ScanNet")
+
+
+def _images_in(folder: Path) -> list[Path]:
+    """Images of a folder, numbers in names in order."""
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
+    return sorted(paths, key=lambda path: _natural(path.name))
 
 
 def _natural(name: str) -> list[object]:
@@ -347,14 +334,14 @@ def _matrix_pose(file: Path) -> np.ndarray | None:
     return rigid(numbers, f"the pose in {file}")
 
 
-def _with_poses(frames: Sequence[CaptureFrame], kind: str, source: Path) -> CaptureFiles:
+def _with_poses(frames: Sequence[CaptureFrame], kind: str) -> CaptureFiles:
     """The frames that have a pose, and a sentence on the others; all of them where none has."""
     posed = [frame for frame in frames if frame.E is not None]
     lost = [frame.name for frame in frames if frame.E is None]
     if not posed:
-        return CaptureFiles(tuple(frames), kind, source, None)
+        return CaptureFiles(tuple(frames), kind, None)
     notes = (f"{_some(lost)}: no pose; skipped. {NO_POSE_CURE}",) if lost else ()
-    return CaptureFiles(tuple(posed), kind, source, notes=notes)
+    return CaptureFiles(tuple(posed), kind, notes=notes)
 
 
 # TUM RGB-D, and videos with a trajectory
@@ -373,10 +360,10 @@ def _read_tum(folder: Path, typed: Typed, _: object) -> CaptureFiles:
     for t, name in _timed_names(folder / "rgb.txt"):
         nearest = int(np.argmin(np.abs(times - t))) if len(times) else -1
         close = nearest >= 0 and abs(times[nearest] - t) < FARTHEST_S
-        frames.append(
-            _framed(folder / name, camera, pose_at(t), typed, folder / depths[nearest][1] if close else None)
-        )
-    return _with_poses(frames, "TUM RGB-D", folder)
+        depth = folder / depths[nearest][1] if close else None
+        frame = _framed(folder / name, camera, pose_at(t), typed, depth)
+        frames.append(replace(frame, depth_per_m=TUM_DEPTH))
+    return _with_poses(frames, "TUM RGB-D")
 
 
 def _lines(file: Path) -> Iterator[list[str]]:
@@ -418,25 +405,23 @@ def _trajectory(file: Path) -> Callable[[float], np.ndarray | None]:
 
 
 def _find_video(path: Path) -> Path | None:
-    return path if path.is_file() and path.suffix.lower() in VIDEOS else None
+    return path if path.is_file() and is_video(path) else None
 
 
 def _read_video(path: Path, typed: Typed, trajectory: str | os.PathLike[str] | None) -> CaptureFiles:
     import cv2
 
-    video = cv2.VideoCapture(str(path))
-    count, fps = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), video.get(cv2.CAP_PROP_FPS) or 30.0
+    if typed is None:
+        bad_value("K", "given by --K or --fov", "none", "A video does not say its focal length.")
+    count, video = count_frames(path, "PATH"), cv2.VideoCapture(str(path))
+    fps = video.get(cv2.CAP_PROP_FPS) or 30.0
     size = (int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)))
     video.release()
-    if count < 1 or typed is None:
-        if count < 1:
-            bad_value("PATH", "a video that OpenCV decodes", f"{path}")
-        bad_value("K", "given by --K or --fov", "none", "A video does not say its focal length.")
     K = _K_of(typed, size)
     assert K is not None
     pose_at = _trajectory(Path(trajectory)) if trajectory is not None else lambda t: None
     frames = [CaptureFrame(f"{n:06d}", path, K, size, pose_at(n / fps), index=n) for n in range(count)]
-    return _with_poses(frames, "video", path)
+    return _with_poses(frames, "video")
 
 
 # Images without poses
@@ -450,14 +435,13 @@ def _find_images(path: Path) -> Path | None:
 
 
 def _read_images(folder: Path, typed: Typed, _: object) -> CaptureFiles:
-    paths = [p for p in folder.iterdir() if p.suffix.lower() in IMAGES]
     frames = []
-    for path in sorted(paths, key=lambda p: _natural(p.name)):
+    for path in _images_in(folder):
         size = _size(path)
         K = _K_of(typed, size)
         K = intrinsics_from_exif(path, path.name)[0] if K is None else K
         frames.append(CaptureFrame(path.stem, path, K, size))
-    return CaptureFiles(tuple(frames), "images without poses", folder, None)
+    return CaptureFiles(tuple(frames), "images without poses", None)
 
 
 READERS: tuple[tuple[Callable[[Path], Path | None], Callable[..., CaptureFiles]], ...] = (

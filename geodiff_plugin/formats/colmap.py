@@ -286,14 +286,17 @@ def write_colmap(
     folder: str | os.PathLike[str],
     views: Sequence[tuple[str, np.ndarray, np.ndarray, tuple[int, int]]],
     cloud: Cloud,
+    seen: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> None:
-    """Write a text model whose world is the left camera's frame, in metres, for splatting and MVS.
+    """Write a text model, for splatting and MVS.
 
     Args:
         folder: an existing one.
-        views: ``(name, K, E, (width, height))`` of every image; K in pixels, E its pose in the left camera's
-            frame. Names have no blanks, as COLMAP's text allows none.
-        cloud: the points; at most 100 000 of them are written.
+        views: ``(name, K, E, (width, height))`` of every image; K in pixels, E its camera-to-world pose.
+            Names have no blanks, as COLMAP's text allows none.
+        cloud: the points in the same world; without ``seen`` at most 100 000 of them are written.
+        seen: of every image the pixels ``(n, 2)`` at which it sees points, and their rows ``(n,)`` in the
+            cloud; ``None`` for points without tracks. Programs choose pairs of images by them.
 
     Raises:
         ValueError: a name with a blank.
@@ -304,27 +307,35 @@ def write_colmap(
         half a pixel more than in K.
     """
     check_colmap_names([name for name, *_ in views])
+    cloud = cloud.thinned(MOST_POINTS) if seen is None else cloud
+    seen = [(np.zeros((0, 2)), np.zeros(0, int))] * len(views) if seen is None else seen
     cameras = [f"{CAMERAS_MARK} one line of data each:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     images = [
         f"{IMAGES_MARK} two lines of data each:",
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
         "#   POINTS2D[] as (X, Y, POINT3D_ID)",
     ]
-    for number, (name, K, E, (width, height)) in enumerate(views, 1):
+    tracks = [""] * len(cloud.points_m)
+    for number, ((name, K, E, (width, height)), (px, rows)) in enumerate(zip(views, seen, strict=True), 1):
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
         cameras.append(f"{number} PINHOLE {width} {height} {fx:.9g} {fy:.9g} {cx:.9g} {cy:.9g}")
         T = np.linalg.inv(E)
         qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
         numbers = " ".join(f"{value:.12g}" for value in (qw, qx, qy, qz, *T[:3, 3]))
-        images += [f"{number} {numbers} {number} {name}", ""]
-    thin = cloud.thinned(MOST_POINTS)
+        images.append(f"{number} {numbers} {number} {name}")
+        each = zip(px + 0.5, rows, strict=True)
+        images.append(" ".join(f"{x:.3f} {y:.3f} {row + 1}" for (x, y), row in each))
+        for index, row in enumerate(rows):
+            tracks[row] += f" {number} {index}"
     points = [
         "# 3D point list with one line of data each:",
         "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
     ]
     points += [
-        f"{number} {x:.5f} {y:.5f} {z:.5f} {r} {g} {b} 0"
-        for number, ((x, y, z), (r, g, b)) in enumerate(zip(thin.points_m, thin.colours, strict=True), 1)
+        f"{number} {x:.5f} {y:.5f} {z:.5f} {r} {g} {b} 0{track}"
+        for number, ((x, y, z), (r, g, b), track) in enumerate(
+            zip(cloud.points_m, cloud.colours, tracks, strict=True), 1
+        )
     ]
     for name, lines in zip(COLMAP_FILES, (cameras, images, points), strict=True):
         with atomic_path(Path(folder) / name) as temporary:

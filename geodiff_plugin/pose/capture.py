@@ -71,8 +71,6 @@ class SolvedCapture:
         K: ``(N, 3, 3)`` pixels.
         connected: ``(N,)`` frames that the solve holds; the others keep their pose as given.
         points: ``(M, 3)`` world.
-        error_px: ``(M,)`` mean reprojection errors.
-        tracks: ``(M,)`` frames that see each point.
         seen: of every frame.
         residual_px_given: median distance of matches from their epipolar lines under the given poses.
         residual_px: the same under these.
@@ -88,8 +86,6 @@ class SolvedCapture:
     K: np.ndarray
     connected: np.ndarray
     points: np.ndarray
-    error_px: np.ndarray
-    tracks: np.ndarray
     seen: tuple[Observations, ...]
     residual_px_given: float = math.nan
     residual_px: float = math.nan
@@ -259,7 +255,7 @@ def _from_given(
     before = _residuals_px(given, base.K_given, matches)
     start = base.triangulated(base.model(given), ROUNDS[0][0])
     as_given = (_median_px(before),) * 2
-    if not refine or not matches or not start.num_points3D():
+    if not refine or start.num_points3D() < FEWEST_OBSERVATIONS:
         return _noted(replace(_found(base, start, "given", given, as_given), E=given), notes, names)
     by_given = base.depths(start)
     focal = len(base) >= FEWEST_FOR_FOCAL
@@ -361,9 +357,7 @@ def _found(
     """What a model says, in its world's frame."""
     by_number = dict(model.points3D.items())  # every access of the property copies all points
     E, numbers = base.poses(model), sorted(by_number)
-    rows = {number: row for row, number in enumerate(numbers)}
-    points = [by_number[number] for number in numbers]
-    seen = []
+    rows, seen = {number: row for row, number in enumerate(numbers)}, []
     for i in range(len(base)):
         image = model.image(i + 1) if model.exists_image(i + 1) else None
         pairs = [(p.xy, rows[p.point3D_id]) for p in image.points2D if p.has_point3D()] if image else []
@@ -376,9 +370,7 @@ def _found(
         given,
         base.K(model),
         np.isfinite(E).all((1, 2)) & enough,
-        np.array([p.xyz for p in points]).reshape(-1, 3),
-        np.array([p.error for p in points]),
-        np.array([p.track.length() for p in points], int),
+        np.array([by_number[number].xyz for number in numbers]).reshape(-1, 3),
         tuple(seen),
         *residuals,
     )

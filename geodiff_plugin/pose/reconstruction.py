@@ -174,7 +174,7 @@ class Reconstruction:
         config = colmap.BundleAdjustmentConfig()
         for image in model.reg_image_ids():
             config.add_image(image)
-        spread = float(np.sqrt(given[:, :3, 3].var(0).sum()))
+        spread = max(float(np.sqrt(given[:, :3, 3].var(0).sum())), 1e-9)
         priors = [
             colmap.PosePrior(
                 corr_data_id=model.image(i + 1).data_id,

@@ -142,6 +142,21 @@ def test_rig_video_of_files(prior, pair, textured_plane, tmp_path, monkeypatch, 
         load(EXAMPLES / "rig_video.py").main(arguments)
 
 
+def test_poses_of_networks_are_a_capture(tmp_path, capsys):
+    """Scaled evenly but for rounding; cropped to a square, and padded to it."""
+    example = load(EXAMPLES / "network_poses.py")
+    example.main([])
+    assert capsys.readouterr().out.count("3 frames, unit None, 2 at [0.4 0.  0. ]") == 3
+    K = np.array([[400.0, 0, 258.5], [0, 400.0, 258.5], [0, 0, 1]])
+    for padded, focal in ((False, 400 * 480 / 518), (True, 400 * 640 / 518)):
+        found = example.to_image(K, (518, 518), (480, 640), padded)
+        np.testing.assert_allclose(found, [[focal, 0, 239.5], [0, focal, 319.5], [0, 0, 1]])
+    path = example.stub("da3", tmp_path)
+    (tmp_path / "1.png").unlink()
+    with pytest.raises(SystemExit, match="3 poses for 2 images"):
+        example.main(["da3", str(path), str(tmp_path)])
+
+
 @pytest.mark.slow
 def test_capture_folder(prior, capsys):
     pytest.importorskip("pycolmap")
