@@ -391,6 +391,10 @@ def spaces() -> dict[str, object]:
             depth_m = metric(x, affine)
             result[f"{space}_{positive}"] = depth_m
             result[f"{space}_{positive}_back"] = metric.relative(depth_m, affine)
+            low = torch.linspace(-0.004, 0.01, 9).view(1, 1, 1, -1)
+            result[f"{space}_{positive}_low"] = metric.relative(metric(low, affine), affine)
+            moved = replace(affine, s_hat=1.2 * affine.s_hat, t_hat=0.8 * affine.t_hat)
+            result[f"{space}_{positive}_moved"] = metric(x, moved)
             result[f"{space}_{positive}_state"] = torch.cat([affine.s_hat, affine.t_hat, affine.g_s])
     return result
 
