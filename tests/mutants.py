@@ -64,7 +64,7 @@ MUTANTS = [
     *of(
         "geometry/warping.py",
         ("max(width - 1, 1), max(height - 1, 1)", "max(width, 1), max(height, 1)"),
-        ("in_columns & in_rows & (z > NEAREST_M)", "in_columns & in_rows"),
+        ("v <= size[0] - 1 + _EDGE_PX", "v <= size[1] - 1 + _EDGE_PX"),
         ("u <= size[1] - 1 + _EDGE_PX", "u <= size[1] + _EDGE_PX"),
         ("cell = (uv + 0.5) * scale - 0.5", "cell = uv * scale"),
         ("margin: float = 0.05", "margin: float = 0.1"),

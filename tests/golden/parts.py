@@ -30,7 +30,13 @@ from geodiff_plugin.algorithm.schedule import make_schedule
 from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
 from geodiff_plugin.formats.exif import intrinsics_from_exif
-from geodiff_plugin.geometry import hidden_in_right, is_rectified, resize_image, warp_right_to_left
+from geodiff_plugin.geometry import (
+    hidden_in_right,
+    is_rectified,
+    project,
+    resize_image,
+    warp_right_to_left,
+)
 from geodiff_plugin.matching import build_cost_volume, points_to_matches, with_points
 from geodiff_plugin.matching.build import mirrored_pose_preferred
 from geodiff_plugin.matching.consistency import match_volume
@@ -145,6 +151,12 @@ def cameras() -> dict[str, object]:
         result |= {f"image_{v}": warped.image, f"visible_{v}": warped.visible, f"z_{v}": warped.z_right}
         result[f"hidden_{v}"] = hidden_in_right(*given, image.shape[-2:])
         result[f"uv_{v}"] = warped.uv.clamp(-500, 500)
+    step = torch.full_like(depth_m, 2.0)  # its near part hides about a column, by 7 % of depth
+    step[..., 20:40, 30:50] = 1.86
+    cameras = K[None], views[0].K[None], views[0].T_right_from_left[None]
+    result["hidden_step"] = hidden_in_right(step, *cameras, views[0].image_01.shape[-2:])
+    uv, z = project(3.0 * _noise(1, 5, 7, 3, seed=6), K[None])
+    result |= {"projected": uv[uv > -1e5], "behind": (uv < -1e5).float(), "z": z}
     small, K_small = resize_image(left, K, (37, 66))
     return result | {"small": small, "K_small": K_small}
 
