@@ -196,13 +196,11 @@ class GuidanceConfig:
             corrected: the last, and the others spread over the second half of the schedule, or over more of
             it if they do not fit there; a step with neither correction nor updates is left to the prior, and
             is not decoded.
-        refine: the result is fitted to its matches and points once more, at full resolution.
-        sharpen: before the result is refined, pixels that hang in the air between a near and a far surface
-            get the depth of one of them, the weighted median of their neighbours (after Ma et al. 2013).
         even_ensemble: the middle of an even number of ensemble members: the mean of the two middle ones, or
             the lower of them (Marigold-DC).
-        crisp: after the refinement, matches, the image's colours and the refined map vote on every depth:
-            fewer pixels off by a pixel of disparity, most of all at edges.
+        crisp: the result is finished at full resolution: pixels that hang in the air between two surfaces
+            get the depth of one of them, the map is fitted to its matches and points once more, and for a
+            rectified pair matches, the image's colours and the map vote on every depth.
         smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
             long, for a prior that is wrong by 5 %; it falls with the fourth power of that error.
         match_noise: relative error of a perfect match: below it one match is as good as another.
@@ -254,8 +252,6 @@ class GuidanceConfig:
     reject_reflections: bool = _flag(True)
     correct: bool = _flag(True)
     corrections: int = _integer(2, 1, 10_000, paper="-")
-    refine: bool = _flag(True)
-    sharpen: bool = _flag(True, paper="-")
     even_ensemble: str = _choice("mean", "lower", paper="-")
     crisp: bool = _flag(True, paper="-")
     smoothness: float = _number(40.0, TINY, 1e6, paper="-")
@@ -316,6 +312,9 @@ class GuidanceConfig:
                 flat |= _mapping(value, name)
             else:
                 flat[name] = value
+        if "refine" in flat:  # what is now the first half of ``crisp``
+            refine = check_flag(flat.pop("refine"), "refine")
+            flat["crisp"] = flat.get("crisp", True) if refine else False
         for name in flat:
             if name not in KNOBS and name not in FORMER:
                 bad_value("a name in the configuration", "a knob", repr(name), close_names(name, KNOBS))
@@ -376,7 +375,7 @@ FORMER: dict[str, Any] = {
     **{"stiff_inertia": 1.3e-3, "block": 0.08, "least_error": 0.01, "most_error": 0.5},
     **{"image_edge": 0.1, "depth_edge": 0.1, "edge_reach": 0.006, "edge_step": 0.3, "edge_error": 0.11},
     **{"least_link": 1e-3, "reweightings": 3, "solver_steps": 12},
-    **{"affine_rule": "adam", "updates_from": None},
+    **{"affine_rule": "adam", "updates_from": None, "sharpen": True},
 }
 
 DEFAULT = GuidanceConfig()
@@ -402,11 +401,11 @@ PAPER = DEFAULT.changed(
     clean_photographs=False,
     correct=False,
     reject_reflections=False,
-    refine=False,
+    crisp=False,
 )
 
 #: Scale and shift of the search alone.
-SEARCH_ONLY = DEFAULT.changed(inner_steps=0, weights={"photometric": 1.0}, correct=False, refine=False)
+SEARCH_ONLY = DEFAULT.changed(inner_steps=0, weights={"photometric": 1.0}, correct=False, crisp=False)
 
 #: A plain call that is fitted to the matches and refined once: the default without its loop.
 PRIOR_FIT = DEFAULT.changed(inner_steps=0, correct=False)
@@ -428,7 +427,7 @@ MARIGOLD_DC = DEFAULT.changed(
     even_ensemble="lower",
     loss_resolution=1 << 16,
     correct=False,
-    refine=False,
+    crisp=False,
 )
 
 #: All presets by name; ``geodiff depth --preset`` takes the first two.

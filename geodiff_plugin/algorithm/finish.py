@@ -1,7 +1,7 @@
 """The last stage: depth edges of the result follow the prior, the matches and the image's colours.
 
 Beyond the paper, whose result is the decoded latent. Ramps between two surfaces are made steep, the map is
-fitted to its matches (``correction.refine_depth``), and then the neighbours of every pixel vote on its depth.
+fitted to its matches (``correction.refine_depth``), and the matches around every pixel vote on its depth.
 Weighted medians after Ma et al., Constant Time Weighted Median Filtering for Stereo Matching and Beyond, ICCV
 2013; large pictures after Kopf et al., Joint Bilateral Upsampling, SIGGRAPH 2007.
 """
@@ -9,26 +9,23 @@ Weighted medians after Ma et al., Constant Time Weighted Median Filtering for St
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.evidence import as_fine_as
 from geodiff_plugin.formats.depth import row_strips
-from geodiff_plugin.geometry import plane_rays
-from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
+from geodiff_plugin.geometry.cameras import image_size, is_rectified, resize_intrinsics
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.matching.census import MARGIN_PX, census, census_cost, grey, grey_levels
-from geodiff_plugin.matching.sweep import UNSEEN_LEVEL
+from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.scale.points import weighted_quantile
 from geodiff_plugin.types import CameraView
 
 __all__ = ["sharpen_edges", "vote_depth", "weighted_median"]
 
-#: Samples of a window to each side of its centre, for both medians and for the mean.
+#: Samples of a window to each side of its centre.
 HALF = 2
 #: Difference in brightness at which a neighbour's weight falls to a third; a Gaussian over the window, in
 #: samples, does the rest.
@@ -45,19 +42,19 @@ DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 CHUNK, STRIP = 1 << 16, 1 << 13
 #: Pixels of the grid of the votes at most: a larger picture takes its depth from there, by its colours.
 MOST_PIXELS = 600_000
-#: Distance between the samples of the median, and of the mean, in pixels of the grid of the matches. Side of
-#: the window there whose mean confidence a match's vote is multiplied with, so that a speckle has none.
-MEDIAN_STEP, MEAN_STEP, REGION = 3.0, 2.0, 9
+#: Offsets of the voters in samples, every second of a window, and their distance in pixels.
+WINDOW = [(v, u) for v in range(-HALF, HALF + 1) for u in range(-HALF, HALF + 1) if (v + u) % 2 == 0]
+SPACING = 4
+#: Weight of a match of rows, and of the farther surface beside a gap, against a sure match of the sweep.
+ROWS, FILLED = 1.5, 0.5
 #: Vote of the map itself, as a share of a window full of sure matches, for a prior whose measured error is
 #: ``WEAK`` or more. It grows as the cube of a smaller one: a good prior knows where edges are.
 MAP_VOTE, WEAK = 0.03, 0.2
 #: A match counts for a quarter where it differs from the map by this many errors of the prior; a larger error
 #: than the second number counts as that.
-DIFFERS, MOST_ERROR = 1.5, 0.1
-#: Votes within about this many planes of the median make the mean.
-NEAR_PLANES = 3.0
-#: Window in which the shifts of -1, 0 and 1 pixel are compared, and what a shift must gain, in cost levels.
-WINDOW, LEAST_GAIN = 9, 2.0
+DIFFERS, MOST_ERROR = 2.0, 0.1
+#: Votes within about this many pixels of the median make the mean.
+NEAR_PX = 1.0
 
 
 @torch.no_grad()
@@ -155,118 +152,74 @@ class _Strip:
 def vote_depth(
     depth_m: Tensor,
     left_01: Tensor,
+    K_left: Tensor,
+    views: Sequence[CameraView],
     target: Matches,
     error: Tensor,
-    views: Sequence[CameraView] = (),
-    K_left: Tensor | None = None,
 ) -> Tensor:
-    """Give every pixel the depth that its matches, its neighbours of the same colour, and the map vote for.
+    """Give every pixel the depth that matches around it of the same colour, and the map, vote for.
 
-    A local search in the photographs at this resolution first places each match to a fraction of a pixel.
-    The weighted median of the votes then chooses a surface; matches that stand alone, look different or
-    contradict a good prior hardly count. The mean of the votes near the median is the depth.
+    The weighted median of the votes chooses a surface; the mean of those near it is the depth. Rows of a
+    rectified view are matched again at this resolution, which sees edges that the sweep's grid does not.
 
     Args:
         depth_m: ``(1, 1, H, W)`` metres, > 0, fitted to the matches.
-        left_01: ``(1, 3, H, W)`` in [0, 1], the left image on the same grid.
-        target: matches of one image on the grid of the sweep, ``(1, 1, h, w)``.
-        error: ``(1, 1, 1, 1)`` of the prior in log depth, as ``correction.prior_error`` measures it.
-        views: the further views; without any, matches stay where the sweep put them.
-        K_left: ``(3, 3)`` pixels of ``left_01``; needed with ``views``.
+        left_01: ``(1, 3, h, w)`` in [0, 1], the left image.
+        K_left: ``(3, 3)`` pixels of it.
+        views: the further views; without a rectified one the map stays as it is.
+        target: matches of the sweep, ``(1, 1, h', w')``.
+        error: ``(1, 1, 1, 1)`` of the prior in log depth, as ``correction.prior_error`` measures it: matches
+            that contradict a good prior are doubted, and its own vote counts for more.
 
     Returns:
         ``(1, 1, H, W)`` metres, within the range of ``depth_m``.
     """
+    native = image_size(left_01)
+    view = next((v for v in views if image_size(v.image_01) == native and _rectified(K_left, v)), None)
+    if view is None:
+        return depth_m
     full = image_size(depth_m)
     share = min(1.0, math.sqrt(MOST_PIXELS / (full[0] * full[1])))
     size = max(1, round(full[0] * share)), max(1, round(full[1] * share))
-    small = depth_m.float(), left_01.float()
-    if size != full:
-        small = (
-            F.interpolate(small[0], size, mode="nearest-exact"),  # a mean across an edge is neither surface's
-            F.interpolate(small[1], size, mode="bilinear", antialias=True),
-        )
-    log_map, left = -small[0][0, 0].log(), small[1][0]
-    matches, weight = _ballots(log_map, left, target, error, views, K_left, full)
-    strength = (WEAK / error.flatten()[0]).clamp_min(1.0) ** 3
-    spacing = max(size) / max(image_size(target.confidence))
-    noise = target.plane_step.flatten()[0] * NEAR_PLANES
-    chosen = _median(
-        matches, weight, left, log_map, MAP_VOTE * strength, max(1, round(MEDIAN_STEP * spacing))
+    left, right = (_resized(image.float(), size) for image in (left_01, view.image_01[None]))
+    K, K_right = (resize_intrinsics(each[None].float(), native, size)[0] for each in (K_left, view.K))
+    # Nearest: a mean across an edge is the depth of neither surface.
+    small_m, inverse_depth, confidence = (
+        F.interpolate(each.float(), size, mode="nearest-exact")[0, 0]
+        for each in (depth_m, target.inverse_depth, target.confidence)
     )
-    step = max(1, round(MEAN_STEP * spacing))
-    voted = _mean(matches, weight, left, log_map, MAP_VOTE * strength, step, chosen, noise)
-    if size != full:
-        voted = _enlarged(voted, left, left_01[0], noise)
-    out = (-voted).exp()[None, None].clamp(depth_m.amin(), depth_m.amax())
-    return out.to(depth_m.dtype)
-
-
-def _ballots(
-    log_map: Tensor,
-    left: Tensor,
-    target: Matches,
-    error: Tensor,
-    views: Sequence[CameraView],
-    K_left: Tensor | None,
-    full: tuple[int, int],
-) -> tuple[Tensor, Tensor]:
-    """Log inverse depth of the matches and the weight of their votes, ``(H, W)`` on the grid of the votes."""
-    size, error = image_size(log_map[None]), error.flatten()[0].clamp_min(1e-3)
-    confidence = target.confidence.float().clamp(0.0, 1.0)  # that of a known point is a count
-    around = F.avg_pool2d(confidence, REGION, 1, REGION // 2, count_include_pad=False)
-    confidence = confidence * around ** (2.0 * (WEAK / error).clamp_max(1.0))
-    inverse_depth, confidence = (
-        F.interpolate(values, size, mode="nearest-exact")[0, 0]
-        for values in (target.inverse_depth.float(), confidence)
+    px = (K[0, 0] * view.T_right_from_left[0, 3]).abs()  # shift of a depth of 1 m
+    shift = px / small_m
+    nearest = torch.maximum(inverse_depth.amax(), 1.0 / small_m.amin()) * px
+    rows = match_rows(left[0], CameraView(right[0], K_right, view.T_right_from_left), K, float(nearest))
+    error = error.flatten()[0].clamp_min(1e-3)
+    # The confidence of a known point is a count.
+    votes = (
+        _doubted(rows.shift, ROWS * rows.matched + FILLED * rows.filled, shift, error),
+        _doubted(px * inverse_depth, confidence.clamp(0.0, 1.0), shift, error),
     )
-    inverse_depth = inverse_depth.clamp_min(1e-9)
-    if views and K_left is not None:
-        inverse_depth = _placed(inverse_depth, left, views, resize_intrinsics(K_left[None], full, size)[0])
-    noise = (target.plane_step.flatten()[0] / inverse_depth).clamp_max(1.0)
-    matches = inverse_depth.log().clamp(log_map.amin(), log_map.amax())
-    apart = (matches - log_map) ** 2 / (DIFFERS**2 * (error.clamp_max(MOST_ERROR) ** 2 + noise**2))
-    return matches, confidence / (1.0 + apart) ** 2
+    voted = _elected(votes, left[0], shift, MAP_VOTE * (WEAK / error).clamp_min(1.0) ** 3)
+    if size != full:
+        voted = _enlarged(voted, left[0], _resized(left_01.float(), full)[0])
+    out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(depth_m.amin(), depth_m.amax())
+    return out_m.to(depth_m.dtype)
 
 
-def _placed(inverse_depth: Tensor, left: Tensor, views: Sequence[CameraView], K_left: Tensor) -> Tensor:
-    """Matches moved by up to a pixel of the grid to where the views agree best, ``(H, W)`` 1/m.
+def _rectified(K_left: Tensor, view: CameraView) -> bool:
+    return bool(is_rectified(K_left, view.K, view.T_right_from_left))
 
-    Every pixel of a window is shifted from its own depth: a window may lie on a slope or across an edge.
-    """
-    size, margin = image_size(left), (MARGIN_PX,) * 4
-    own = census(grey_levels(F.pad(grey(left)[None], margin, mode="replicate")[0, 0]))
-    room = torch.empty_like(own)
-    costs = inverse_depth.new_zeros(3, *size)
-    counts = inverse_depth.new_zeros(3, *size)
-    step: Tensor | None = None
-    for view in views:
-        image, K = as_fine_as(grey(view.image_01), view.K.float(), K_left)
-        rays = plane_rays(K_left[None].float(), K[None], view.T_right_from_left[None].float(), size)
-        A, b = rays.A[0], rays.b[0]
-        if step is None:  # the inverse depth that moves the median pixel by one of the right image's
-            moved = torch.hypot(b[0] - A[0] / A[2] * b[2], b[1] - A[1] / A[2] * b[2])
-            step = 1.0 / moved.median().clamp_min(1e-9)
-        last = image.new_tensor([image.shape[-1] - 1.0, image.shape[-2] - 1.0])
-        for k in range(3):
-            p = A + (inverse_depth + (k - 1) * step).flatten() * b
-            uv = (p[:2] / p[2].clamp_min(1e-9)).T
-            seen = ((p[2] > 0) & (uv >= 0).all(1) & (uv <= last).all(1)).view(size)
-            at = (uv * (2.0 / last.clamp_min(1.0)) - 1.0).view(1, *size, 2)
-            warped = F.grid_sample(image[None], at, padding_mode="border", align_corners=True)
-            other = census(grey_levels(F.pad(warped, margin, mode="replicate")[0, 0]), out=room)
-            costs[k] += census_cost(other, own, out=other) * seen
-            counts[k] += seen
-    assert step is not None
-    costs = torch.where(counts > 0, costs / counts.clamp_min(1.0), float(UNSEEN_LEVEL))
-    for window in ((WINDOW, 1), (1, WINDOW)):
-        padding = window[0] // 2, window[1] // 2
-        costs = F.avg_pool2d(costs[None], window, 1, padding, count_include_pad=False)[0]
-    near, middle, far = costs[0] + LEAST_GAIN, costs[1], costs[2] + LEAST_GAIN
-    offset = (0.5 * (near - far) / (near + far - 2.0 * middle).clamp_min(1e-3)).clamp(-0.5, 0.5)
-    beyond = torch.where(near < far, -torch.ones_like(near), torch.ones_like(near))
-    offset = torch.where(torch.minimum(near, far) < middle, beyond, offset)
-    return (inverse_depth + offset * step).clamp_min(1e-9)
+
+def _resized(image_01: Tensor, size: tuple[int, int]) -> Tensor:
+    if image_size(image_01) == size:
+        return image_01
+    return F.interpolate(image_01, size, mode="bilinear", antialias=True)
+
+
+def _doubted(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
+    """Votes, and their weight, less where they differ from a map with this error; ``(H, W)`` pixels each."""
+    noise = error.clamp_max(MOST_ERROR) ** 2 + 1.0 / shift**2  # of the map, and of a match: a pixel
+    apart = (votes.clamp_min(0.1) / shift).log() ** 2 / (DIFFERS**2 * noise)
+    return votes, weight / (1.0 + apart) ** 2
 
 
 def weighted_median(values: Tensor, weight: Tensor, rounds: int = 7) -> Tensor:
@@ -290,67 +243,51 @@ def weighted_median(values: Tensor, weight: Tensor, rounds: int = 7) -> Tensor:
     return 0.5 * (low + high)
 
 
-def _windows(
-    matches: Tensor, weight: Tensor, left: Tensor, step: int
-) -> Iterator[tuple[slice, Tensor, Tensor, float]]:
-    """Rows, the votes in the windows of their pixels, the weights of these, and those of a whole window.
+def _elected(
+    ballots: Sequence[tuple[Tensor, Tensor]], left: Tensor, shift: Tensor, map_vote: Tensor
+) -> Tensor:
+    """``(H, W)`` the mean of the votes near their weighted median, strip by strip.
 
-    ``(n, h, W)`` each, strip by strip, with samples ``step`` pixels apart.
+    Args:
+        ballots: votes and their weights, ``(H, W)`` each, which count in the windows around.
+        left: ``(3, H, W)`` in [0, 1]; neighbours of another colour count for less.
+        shift: ``(H, W)`` of the map.
+        map_vote: its weight, as a share of a window full of sure matches.
     """
-    height, width = matches.shape
-    halo = HALF * step
+    height, width = shift.shape
+    halo = HALF * SPACING
     padded = [
-        F.pad(values[None], (halo,) * 4, mode="replicate")[0]
-        for values in (matches[None], weight[None], left)
+        F.pad(each.view(1, -1, height, width), (halo,) * 4, mode="replicate")[0]
+        for each in (*(values for ballot in ballots for values in ballot), left)
     ]
-    steps = range(-HALF, HALF + 1)
-    at = [(halo + step * down, halo + step * right) for down in steps for right in steps]
-    close = [math.exp(-(down**2 + right**2) / (2.0 * REACH**2)) for down in steps for right in steps]
-    closeness = matches.new_tensor(close)[:, None, None]
+    closeness = [math.exp(-(v**2 + u**2) / (2.0 * REACH**2)) for v, u in WINDOW]
+    out = torch.empty_like(shift)
     count = max(1, STRIP // width)
     for first in range(0, height, count):
         rows = slice(first, min(height, first + count))
-        votes, weights, colours = (
-            torch.stack([values[:, rows.start + v : rows.stop + v, u : u + width] for v, u in at])
-            for values in padded
-        )
-        unlike = (colours - left[:, rows]).abs().mean(1) / BRIGHTNESS
-        yield rows, votes[:, 0], weights[:, 0] * closeness * torch.exp(-unlike), sum(close)
-
-
-def _median(
-    matches: Tensor, weight: Tensor, left: Tensor, log_map: Tensor, map_vote: Tensor, step: int
-) -> Tensor:
-    """``(H, W)`` the weighted median of the votes in a window and that of the map."""
-    out = torch.empty_like(log_map)
-    for rows, votes, weights, whole in _windows(matches, weight, left, step):
-        own = (map_vote * whole).expand_as(log_map[rows])
-        out[rows] = weighted_median(torch.cat([votes, log_map[rows][None]]), torch.cat([weights, own[None]]))
+        around = [
+            [each[:, rows.start + v : rows.stop + v, u : u + width] for each in padded]
+            for v, u in ((halo + SPACING * v, halo + SPACING * u) for v, u in WINDOW)
+        ]
+        unlike = torch.stack([colours for *_, colours in around]).sub_(left[:, rows]).abs_().mean(1)
+        alike = unlike.div_(-BRIGHTNESS).exp_() * shift.new_tensor(closeness)[:, None, None]
+        votes, weights = [shift[rows][None]], [(map_vote * sum(closeness)).expand_as(shift[rows])[None]]
+        for k in range(len(ballots)):
+            votes.append(torch.cat([each[2 * k] for each in around]))
+            weights.append(torch.cat([each[2 * k + 1] for each in around]).mul_(alike))
+        out[rows] = _mean_near_median(torch.cat(votes), torch.cat(weights))
     return out
 
 
-def _mean(
-    matches: Tensor,
-    weight: Tensor,
-    left: Tensor,
-    log_map: Tensor,
-    map_vote: Tensor,
-    step: int,
-    centre: Tensor,
-    noise: Tensor,
-) -> Tensor:
-    """``(H, W)`` the mean of the votes that lie near ``centre``, within about ``noise``, 1/m."""
-    out = torch.empty_like(log_map)
-    for rows, votes, weights, whole in _windows(matches, weight, left, step):
-        at = centre[rows]
-        votes = torch.cat([votes, log_map[rows][None]]) - at
-        weights = torch.cat([weights, (map_vote * whole).expand_as(at)[None]])
-        weights = weights / (1.0 + (votes * at.exp() / noise) ** 2) ** 2
-        out[rows] = at + (weights * votes).sum(0) / weights.sum(0).clamp_min(1e-9)
-    return out
+def _mean_near_median(votes: Tensor, weights: Tensor) -> Tensor:
+    """``(...)`` the mean of votes ``(n, ...)`` within about ``NEAR_PX`` of their weighted median."""
+    median = weighted_median(votes, weights)
+    votes = votes - median
+    weights = weights / (1.0 + (votes / NEAR_PX) ** 2) ** 2
+    return median + (weights * votes).sum(0) / weights.sum(0).clamp_min(1e-9)
 
 
-def _enlarged(voted: Tensor, left: Tensor, whole: Tensor, noise: Tensor) -> Tensor:
+def _enlarged(voted: Tensor, left: Tensor, whole: Tensor) -> Tensor:
     """``(H, W)`` votes at the size of ``whole (3, H, W)``, from the nine around that look like the pixel."""
     (height, width), (rows, columns) = image_size(whole), image_size(left)
     out = voted.new_empty(height, width)
@@ -365,12 +302,9 @@ def _enlarged(voted: Tensor, left: Tensor, whole: Tensor, noise: Tensor) -> Tens
             for right in (-1, 0, 1):
                 v, u = y.round() + down, x.round() + right
                 row, column = v.long().clamp(0, rows - 1)[:, None], u.long().clamp(0, columns - 1)
-                unlike = (left[:, row, column] - whole[:, part].float()).abs().mean(0) / BRIGHTNESS
+                unlike = (left[:, row, column] - whole[:, part]).abs().mean(0) / BRIGHTNESS
                 away = (v - y)[:, None] ** 2 + (u - x) ** 2
                 votes.append(voted[row, column])
                 weights.append(torch.exp(-unlike - 2.0 * away))
-        values, weight = torch.stack(votes), torch.stack(weights)
-        at = weighted_median(values, weight)
-        weight = weight / (1.0 + ((values - at) * at.exp() / noise) ** 2) ** 2
-        out[part] = at + (weight * (values - at)).sum(0) / weight.sum(0).clamp_min(1e-9)
+        out[part] = _mean_near_median(torch.stack(votes), torch.stack(weights))
     return out

@@ -154,7 +154,7 @@ class Trajectory:
                 kept = reject_reflections(self.matches.within(self.valid), depth_m)
                 inside = F.interpolate(self.valid.float(), kept.shape[-2:], mode="nearest-exact")
                 self.kept = torch.where(inside > 0, kept, self.kept)
-        if config.correct or config.refine:
+        if config.correct or config.crisp:
             target = self._target(depth_m)
             assert target is not None  # there are matches or points
             target = target if self.valid is None else target.within(self.valid)

@@ -109,7 +109,7 @@ def corrected_step(
     x = estimate.decode(z0, final=is_result)
     state.prepare(x, z0)
     unread = is_result and not estimate.latent_is_read
-    refined_later = is_result and state.config.refine
+    refined_later = is_result and state.config.crisp
     if unread and refined_later:
         return z0, x
     corrected = state.corrected(x)

@@ -358,7 +358,7 @@ class GeometryGuidance:
         if self._left_size not in (None, size[::-1]):
             width, height = self._left_size
             bad_value("image", f"of {width}x{height} pixels, as the left view", f"{size[1]}x{size[0]}")
-        used = self.updates.inner_steps > 0 or self.config.correct or self.config.refine
+        used = self.updates.inner_steps > 0 or self.config.correct or self.config.crisp
         needs_matches = used and bool(self.config.weights.get("matches"))
         make = make_evidence if self.evidence_store is None else self.evidence_store.get
         evidence = []

@@ -54,18 +54,19 @@ def finish(
         none.
     """
     matches, points = Matches.stack([evidence.sweep_matches]), Matches.stack([evidence.sweep_points])
-    if config.sharpen and (matches is not None or points is not None):
+    if matches is not None or points is not None:
         depth_m = sharpen_edges(depth_m, left, spacing)
     target = correction_target(matches, points, kept, error, depth_m)
     if target is None or error is None:
         return None
     fitted_m, support, _ = refine_depth(depth_m, target, evidence.native_left[None], error, config)
-    if config.crisp and matches is not None:
+    if matches is not None:
         target = correction_target(matches, points, kept, error, fitted_m)
         assert target is not None
-        K = resize_intrinsics(evidence.K_left[None], image_size(evidence.left_01), image_size(left))[0]
+        native = evidence.native_left[None]
+        K = resize_intrinsics(evidence.K_left[None], image_size(evidence.left_01), image_size(native))[0]
         measured = error.amin((2, 3), keepdim=True)  # where the prior says something
-        fitted_m = vote_depth(fitted_m, left, target, measured, evidence.native, K)
+        fitted_m = vote_depth(fitted_m, native, K, evidence.native, target, measured)
     return fitted_m, support
 
 
@@ -81,7 +82,7 @@ def finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tenso
         ``(N, 1, H, W)`` metres, and support in [0, 1]; the depth as it was given and ``None`` where the
         result is not to be refined, or some image has neither matches nor points.
     """
-    if not run.config.refine:
+    if not run.config.crisp:
         return depth_m, None
     results = []
     for i, (depth, left) in enumerate(zip(depth_m.split(1), lefts.split(1), strict=True)):

@@ -23,12 +23,13 @@ from geodiff_plugin.evaluation.baselines import (
 )
 from geodiff_plugin.evaluation.baselines.guided import constant_method, guided_prediction
 from geodiff_plugin.evaluation.baselines.outside import map_name
-from geodiff_plugin.evaluation.baselines.stereo import fill_background, native_depth, sgbm_shift
+from geodiff_plugin.evaluation.baselines.stereo import native_depth, sgbm_shift
 from geodiff_plugin.evaluation.datasets import StereoSample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.matching.rows import fill_background
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.scale.space import SPACES
 from tests.contracts.tiny_transformers import MODELS, make_transformers

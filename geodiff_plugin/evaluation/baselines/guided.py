@@ -148,7 +148,7 @@ def _without(weight: str) -> Preset:
 
 _SEARCH = "the search for the scale alone: no correction, no gradient updates, no refinement"
 _FIT = "a plain call, fitted to the matches and refined once: no guided step"
-_AFFINE = partial(GeometryGuidance, optimize_latents=False, refine=False)
+_AFFINE = partial(GeometryGuidance, optimize_latents=False, crisp=False)
 _PLAIN = "the stock pipeline, scale and shift by least squares against the truth"
 
 GUIDED_METHODS = (

@@ -14,32 +14,8 @@ from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Pred
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.matching import CostVolume, build_cost_volume, find_matches
+from geodiff_plugin.matching.rows import PARAMETERS, fill_background, make_matcher, pad_columns
 from geodiff_plugin.types import CameraView
-
-
-def fill_background(shift: np.ndarray) -> np.ndarray:
-    """Fill holes with the farther of the two neighbours in the row, as KITTI's development kit does.
-
-    Args:
-        shift: ``(H, W)`` float, smaller is farther (pixels or 1/m), NaN in holes.
-
-    Returns:
-        ``(H, W)`` without holes: within a row the smaller of the nearest known values to either side, the
-        only one at the row's ends; an empty row copies the nearest filled one above, else below. All NaN
-        where nothing is known.
-    """
-    known = np.isfinite(shift)
-    columns = np.arange(shift.shape[1])[None]
-    from_left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
-    from_right = np.minimum.accumulate(np.where(known, columns, shift.shape[1])[:, ::-1], axis=1)[:, ::-1]
-    rows = np.arange(shift.shape[0])[:, None]
-    padded = np.pad(np.where(known, shift, np.inf), ((0, 0), (1, 1)), constant_values=np.inf)
-    filled = np.minimum(padded[rows, from_left + 1], padded[rows, from_right + 1])
-    full_rows = np.flatnonzero(known.any(axis=1))
-    if full_rows.size == 0:
-        return np.full_like(shift, np.nan)
-    above = np.searchsorted(full_rows, rows[:, 0], side="right") - 1
-    return filled[full_rows[np.maximum(above, 0)]].astype(shift.dtype)
 
 
 def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
@@ -86,8 +62,6 @@ MAX_SHIFT = 0.25
 MIN_SHIFT_PX = 1.0
 #: As OpenCV's own example sets the filter.
 WLS_LAMBDA, WLS_SIGMA = 8000.0, 1.5
-PARAMETERS = {"blockSize": 5, "uniquenessRatio": 10, "disp12MaxDiff": 1}
-PARAMETERS |= {"speckleWindowSize": 100, "speckleRange": 2}
 
 
 def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
@@ -100,18 +74,11 @@ def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
     Returns:
         ``(H, W)`` float32, pixels, disparity plus Middlebury's doffs; NaN where the match was rejected.
     """
-    width, block = sample.left.shape[1], PARAMETERS["blockSize"]
     # Depth at infinity has the disparity cx_left - cx_right, which is 0 but for Middlebury's doffs.
     lowest = int(np.floor(sample.K_left[0, 2] - sample.K_right[0, 2]))
-    count = 16 * int(np.ceil(MAX_SHIFT * width / 16))
-    penalties = {"P1": 8 * 3 * block**2, "P2": 32 * 3 * block**2, "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY}
-    matcher = cv2.StereoSGBM.create(minDisparity=lowest, numDisparities=count, **penalties, **PARAMETERS)
-    # OpenCV leaves the first lowest + count columns empty; a padded left edge keeps them.
-    pad = max(0, lowest + count)
-    left, right = (
-        np.pad(image, ((0, 0), (pad, 0), (0, 0)), mode="edge") for image in (sample.left, sample.right)
-    )
-    left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
+    count = 16 * int(np.ceil(MAX_SHIFT * sample.left.shape[1] / 16))
+    matcher, pad = make_matcher(lowest, count, 3), max(0, lowest + count)
+    left, right = (pad_columns(image, pad) for image in (sample.left, sample.right))
     raw = matcher.compute(left, right)
     if wls:
         ximgproc: Any = cv2.ximgproc  # type: ignore[attr-defined]

@@ -1,0 +1,119 @@
+"""Matches along the rows of a rectified pair at full resolution, by OpenCV's semi-global matcher."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from geodiff_plugin.matching.census import grey
+from geodiff_plugin.types import CameraView
+
+__all__ = ["PARAMETERS", "RowMatches", "fill_background", "make_matcher", "match_rows", "pad_columns"]
+
+#: Of the matcher: only what both views agree on, and no speckles.
+PARAMETERS = {
+    "blockSize": 5,
+    "uniquenessRatio": 10,
+    "speckleWindowSize": 100,
+    "speckleRange": 2,
+    "disp12MaxDiff": 1,
+}
+#: Matches with a smaller shift, in pixels, say nothing of depth. Shares of the width that shifts reach at
+#: most.
+MIN_SHIFT_PX, MAX_SHIFT = 0.3, 0.3
+
+
+class RowMatches(NamedTuple):
+    """Matches of a left image, ``(H, W)`` each.
+
+    Attributes:
+        shift: pixels, from where the point would be at infinity; defined everywhere, read where one of the
+            others says so.
+        matched: 1 where both views agree, else 0.
+        filled: 1 in a gap between two matches, where ``shift`` is that of the farther one.
+    """
+
+    shift: Tensor
+    matched: Tensor
+    filled: Tensor
+
+
+def make_matcher(lowest: int, count: int, channels: int) -> Any:
+    """OpenCV's matcher for disparities from ``lowest`` on, ``count`` of them, for so many colour channels."""
+    area = channels * PARAMETERS["blockSize"] ** 2
+    return cv2.StereoSGBM.create(
+        minDisparity=lowest,
+        numDisparities=count,
+        P1=8 * area,
+        P2=32 * area,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        **PARAMETERS,
+    )
+
+
+def pad_columns(image: np.ndarray, count: int) -> np.ndarray:
+    """An image with its first column repeated ``count`` times: OpenCV leaves so many columns empty."""
+    pads = ((0, 0), (count, 0), (0, 0))[: image.ndim]
+    return np.ascontiguousarray(np.pad(image, pads, mode="edge"))
+
+
+def fill_background(shift: np.ndarray) -> np.ndarray:
+    """Fill holes with the farther of the two neighbours in the row, as KITTI's development kit does.
+
+    Args:
+        shift: ``(H, W)`` float, smaller is farther (pixels or 1/m), NaN in holes.
+
+    Returns:
+        ``(H, W)`` without holes: within a row the smaller of the nearest known values to either side, the
+        only one at the row's ends; an empty row copies the nearest filled one above, else below. All NaN
+        where nothing is known.
+    """
+    known = np.isfinite(shift)
+    columns = np.arange(shift.shape[1])[None]
+    from_left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
+    from_right = np.minimum.accumulate(np.where(known, columns, shift.shape[1])[:, ::-1], axis=1)[:, ::-1]
+    rows = np.arange(shift.shape[0])[:, None]
+    padded = np.pad(np.where(known, shift, np.inf), ((0, 0), (1, 1)), constant_values=np.inf)
+    filled = np.minimum(padded[rows, from_left + 1], padded[rows, from_right + 1])
+    full_rows = np.flatnonzero(known.any(axis=1))
+    if full_rows.size == 0:
+        return np.full_like(shift, np.nan)
+    above = np.searchsorted(full_rows, rows[:, 0], side="right") - 1
+    return filled[full_rows[np.maximum(above, 0)]].astype(shift.dtype)
+
+
+def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: float) -> RowMatches:
+    """Match a rectified pair of images of one size.
+
+    Args:
+        left_01: ``(3, H, W)`` in [0, 1].
+        view: the other one, rectified with it, to its right or to its left.
+        K_left: ``(3, 3)`` pixels.
+        nearest_px: largest shift that is looked for, pixels.
+
+    Returns:
+        On the device of ``left_01``.
+    """
+    images = [(grey(image) * 255.0).round().byte()[0].cpu().numpy() for image in (left_01, view.image_01)]
+    infinity = float(K_left[0, 2] - view.K[0, 2])
+    mirrored = float(view.T_right_from_left[0, 3]) > 0
+    if mirrored:  # a view to the left is one to the right in a mirror
+        images, infinity = [image[:, ::-1] for image in images], -infinity
+    width = images[0].shape[1]
+    lowest = int(np.floor(infinity))
+    count = 16 * max(1, int(np.ceil(min(nearest_px + 4.0, MAX_SHIFT * width) / 16)))
+    pad = max(0, lowest + count)
+    left, right = (pad_columns(image, pad) for image in images)
+    raw = make_matcher(lowest, count, 1).compute(left, right)[:, pad:]
+    shift = raw.astype(np.float32) / 16.0 - np.float32(infinity)
+    known = (raw > 16 * (lowest - 1)) & (shift >= MIN_SHIFT_PX)
+    between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
+    shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
+    maps = [shift, known.astype(np.float32), (between & ~known).astype(np.float32)]
+    return RowMatches(
+        *(torch.from_numpy(each[:, ::-1].copy() if mirrored else each).to(left_01.device) for each in maps)
+    )
