@@ -164,7 +164,7 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "knob-unknown": _with("--knob", "speed=9"),
     "knob-range": _with("--knob", "inner_steps=-1"),
     "knob-weight": _with("--knob", "weights.smooth=1"),
-    "knob-type": _with("--knob", "refine=maybe"),
+    "knob-type": _with("--knob", "crisp=maybe"),
     "knob-nested": _with("--knob", "smoothness=" + "[" * 100_000),
     "knob-depth-range": _with("--knob", "depth_range=[1,2]"),
     "paper-with-points": _with("--preset", "paper", "--points", "calib.txt"),

@@ -1,4 +1,4 @@
-"""``sharpen`` in a guided call: fewer pixels between two surfaces, and no depth that is worse for it."""
+"""``crisp`` in a guided call: fewer pixels between two surfaces, and no depth that is worse for it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def test_the_demo_pair_has_fewer_flying_points_with_it():
     pipe = enable_geometry_guidance(load_prior("bundled"))
     pipe.set_progress_bar_config(disable=True)
     flying, error = {}, {}
-    for sharpen in (False, True):
+    for crisp in (False, True):
         guidance = GeometryGuidance.from_calibration(
-            Image.open(PAIR / "right.png"), PAIR / "calib.txt", sharpen=sharpen
+            Image.open(PAIR / "right.png"), PAIR / "calib.txt", crisp=crisp
         )
         out = pipe(
             Image.open(PAIR / "left.png"),
@@ -30,8 +30,8 @@ def test_the_demo_pair_has_fewer_flying_points_with_it():
             generator=torch.Generator().manual_seed(0),
         )
         depth_m = out.prediction[0, ..., 0]
-        flying[sharpen] = flying_points(depth_m).mean()
-        error[sharpen] = (np.abs(depth_m - truth_m)[known] / truth_m[known]).mean()
+        flying[crisp] = flying_points(depth_m).mean()
+        error[crisp] = (np.abs(depth_m - truth_m)[known] / truth_m[known]).mean()
         assert np.isfinite(out.uncertainty).all()
     assert flying[True] < 0.9 * flying[False]
     assert error[True] < 1.01 * error[False]

@@ -13,6 +13,7 @@ from torch import Tensor
 from geodiff_plugin.algorithm import finish
 from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth, weighted_median
 from geodiff_plugin.matching import Matches
+from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.types import CameraView
 
 NEAR, FAR = 2.0, 6.0
@@ -101,87 +102,108 @@ def test_the_median_is_numpys(count, seed):
         assert float(found[i]) == pytest.approx(values[order, i][reached][0], abs=1e-6)
 
 
-def test_a_weak_map_takes_its_edges_from_matches_and_colours():
-    truth = box()
+#: Cameras of ``scene``: a shift of 9 px at 2 m, of 3 px at 6 m.
+K = torch.tensor([[90.0, 0.0, 47.5], [0.0, 90.0, 35.5], [0.0, 0.0, 1.0]])
+BASELINE_M = 0.2
+
+
+def scene(side: int = 1, doffs: float = 0.0) -> tuple[Tensor, Tensor, CameraView]:
+    """Depth ``(1, 1, 72, 96)``, left image and a view to its right (``side`` 1) or left of a textured box."""
+    truth = box(72, 96)
+    generator = torch.Generator().manual_seed(5)
+    wall, front = (0.1 * torch.rand(1, 3, 72, 160, generator=generator) + low for low in (0.1, 0.6))
+
+    def seen(shift_near: int, shift_far: int) -> Tensor:
+        columns = torch.arange(96) + 32
+        inside = torch.roll(truth, -shift_near, -1) < 4.0
+        return torch.where(inside, front[..., columns + shift_near], wall[..., columns + shift_far])
+
+    T = torch.eye(4)
+    T[0, 3] = -side * BASELINE_M
+    K_right = K.clone()
+    K_right[0, 2] -= doffs
+    moved = [round(side * shift + doffs) for shift in (9, 3)]
+    return truth, seen(0, 0), CameraView(seen(*moved)[0], K_right, T)
+
+
+def voted(map_m: Tensor, left: Tensor, view: CameraView, target: Matches, error: float) -> Tensor:
+    return vote_depth(map_m, left, K, [view], target, error_of(error))
+
+
+def wrong(depth_m: Tensor, truth: Tensor) -> float:
+    """Share of the pixels that both views see that are off by more than 10 %."""
+    return float(((depth_m / truth - 1.0).abs() > 0.1)[..., 12:-12].float().mean())
+
+
+@pytest.mark.parametrize(("side", "doffs"), [(1, 0.0), (-1, 0.0), (1, 4.0), (-1, 4.0)])
+def test_rows_are_matched_whatever_side_and_principal_point_the_view_has(side, doffs):
+    truth, left, view = scene(side, doffs)
+    rows = match_rows(left[0], view, K, 9.0)
+    shift = 18.0 / truth[0, 0]
+    seen = rows.matched > 0
+    assert seen.float().mean() > 0.6 and ((rows.shift - shift).abs()[seen] < 0.5).float().mean() > 0.9
+    gaps = rows.filled > 0
+    assert gaps.any() and not (gaps & seen).any()
+
+
+def test_a_weak_map_takes_its_edges_from_the_views_and_their_colours():
+    truth, left, view = scene()
     moved = torch.roll(truth, (3, -4), (2, 3))
-    voted = vote_depth(moved, picture(truth), matches(truth), error_of(0.4))
-    wrong = [((each / truth - 1.0).abs() > 0.1).float().mean() for each in (voted, moved)]
-    assert wrong[1] > 0.05 and wrong[0] < 0.1 * wrong[1]
+    assert wrong(moved, truth) > 0.05
+    nothing = matches(truth, 0.0)
+    assert wrong(voted(moved, left, view, nothing, 0.4), truth) < 0.4 * wrong(moved, truth)
+    assert wrong(voted(moved, left, view, matches(truth), 0.4), truth) < 0.1 * wrong(moved, truth)
 
 
 def test_a_good_map_keeps_its_edges_where_matches_are_fattened():
-    truth = box()
+    truth, _, view = scene()
     fattened = -F.max_pool2d(-truth, 7, 1, 3)
-    voted = vote_depth(truth, picture(truth, 0.0), matches(fattened), error_of(0.01))
-    assert (voted / truth - 1.0).abs().max() < 0.01
+    kept = voted(truth, torch.full((1, 3, 72, 96), 0.5), view, matches(fattened), 0.01)
+    assert (kept / truth - 1.0).abs().max() < 0.01
 
 
 def test_speckles_holes_and_far_outliers_have_no_vote():
-    truth, generator = box(), torch.Generator().manual_seed(2)
+    (truth, left, view), generator = scene(), torch.Generator().manual_seed(2)
     bad = torch.rand(truth.shape, generator=generator) < 0.04
-    speckled = torch.where(
-        bad, torch.where(torch.rand(truth.shape, generator=generator) < 0.5, 0.3, 1e6), truth
-    )
+    outlier = torch.where(torch.rand(truth.shape, generator=generator) < 0.5, 0.3, 1e6)
     confidence = torch.where(bad, 0.9, 0.95)
     confidence[..., 20:24, 30:34] = 0.0
-    voted = vote_depth(truth * 1.005, picture(truth), matches(speckled, confidence), error_of(0.3))
-    assert (voted / truth - 1.0).abs().max() < 0.02
+    after = voted(truth * 1.005, left, view, matches(torch.where(bad, outlier, truth), confidence), 0.3)
+    assert ((after / truth - 1.0).abs()[..., 12:-12] < 0.05).float().mean() > 0.99
 
 
-def test_nothing_moves_without_matches_and_nothing_leaves_the_maps_range():
+def test_nothing_leaves_the_maps_range_and_nothing_moves_without_a_rectified_view():
     generator = torch.Generator().manual_seed(3)
-    depth_m = 1.0 + torch.rand(1, 1, 30, 41, generator=generator)
-    left = torch.rand(1, 3, 30, 41, generator=generator)
-    nowhere = vote_depth(depth_m, left, matches(depth_m, 0.0), error_of(0.3))
-    assert (nowhere / depth_m - 1.0).abs().max() < 5e-3
-    elsewhere = vote_depth(depth_m, left, matches(20.0 * depth_m), error_of(0.5))
-    assert elsewhere.amin() >= depth_m.amin() and elsewhere.amax() <= depth_m.amax()
+    truth, left, view = scene()
+    map_m = 1.0 + torch.rand(truth.shape, generator=generator)
+    after = voted(map_m, left, view, matches(20.0 * truth), 0.5)
+    assert after.amin() >= map_m.amin() and after.amax() <= map_m.amax()
+    turned = view._replace(T_right_from_left=view.T_right_from_left.roll(1, 0))
+    for other in (turned, view._replace(image_01=view.image_01[..., 1:])):
+        assert voted(map_m, left, other, matches(truth), 0.5) is map_m
+    assert vote_depth(map_m, left, K, [], matches(truth), error_of(0.5)) is map_m
 
 
 def test_a_plane_stays_one_and_scale_does_not_matter():
-    u = torch.arange(80.0).expand(1, 1, 50, -1)
-    plane = 400.0 / (40.0 + u)
-    left = torch.full((1, 3, 50, 80), 0.5)
-    voted = vote_depth(plane, left, matches(plane), error_of(0.3))
-    assert (voted / plane - 1.0)[..., 8:-8].abs().max() < 2e-3
+    u = torch.arange(96.0).expand(1, 1, 72, -1)
+    plane, (_, _, view) = 400.0 / (40.0 + u), scene()
+    left = torch.full((1, 3, 72, 96), 0.5)  # in which rows match nothing
+    view = view._replace(image_01=left[0])
+    after = voted(plane, left, view, matches(plane), 0.3)
+    assert (after / plane - 1.0)[..., 12:-12].abs().max() < 5e-3
+    T = view.T_right_from_left.clone()
+    T[:3, 3] *= 100.0
     far = Matches(1e-2 / plane, torch.full_like(plane, 0.95), torch.full((1,), 2e-5))
-    assert torch.allclose(vote_depth(100.0 * plane, left, far, error_of(0.3)), 100.0 * voted, rtol=1e-4)
+    again = voted(100.0 * plane, left, view._replace(T_right_from_left=T), far, 0.3)
+    assert torch.allclose(again, 100.0 * after, rtol=1e-4)
 
 
 def test_strips_change_nothing_and_a_large_picture_takes_its_edges_from_its_colours(monkeypatch):
-    truth = F.interpolate(box(), scale_factor=3, mode="nearest")
-    left, coarse = picture(truth), matches(box())
-    usual = vote_depth(truth, left, coarse, error_of(0.3))
+    truth, left, view = scene()
+    usual = voted(truth, left, view, matches(truth), 0.3)
     monkeypatch.setattr(finish, "STRIP", 700)
-    assert torch.allclose(vote_depth(truth, left, coarse, error_of(0.3)), usual, rtol=1e-5)
-    monkeypatch.setattr(finish, "MOST_PIXELS", 48 * 64)
-    large = vote_depth(truth, left, coarse, error_of(0.3))
+    assert torch.allclose(voted(truth, left, view, matches(truth), 0.3), usual, rtol=1e-5)
+    monkeypatch.setattr(finish, "MOST_PIXELS", 36 * 48)
+    large = voted(truth, left, view, matches(truth), 0.3)
     assert large.shape == truth.shape
-    assert ((large / truth - 1.0).abs() > 0.05).float().mean() < 2e-3
-
-
-@pytest.mark.parametrize("posed", [False, True])
-def test_matches_that_are_off_by_half_a_pixel_are_placed(posed):
-    height, width, focal = 60, 90, 80.0
-    v, u = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
-
-    def texture(x: Tensor, y: Tensor) -> Tensor:
-        return 0.5 + 0.2 * torch.sin(0.9 * x + 0.3 * y) + 0.2 * torch.sin(0.37 * x - 0.8 * y)
-
-    shift = torch.tensor([4.0, -3.0 if posed else 0.0])  # pixels, of a wall at 2 m
-    K = torch.tensor([[focal, 0.0, 44.5], [0.0, focal, 29.5], [0.0, 0.0, 1.0]])
-    T = torch.eye(4)
-    T[:2, 3] = -shift * 2.0 / focal
-    left = texture(u, v).expand(1, 3, -1, -1)
-    right = texture(u + shift[0], v + shift[1]).expand(3, -1, -1)
-    truth = torch.full((1, 1, height, width), 2.0)
-    step = 1.0 / (focal * float(T[:3, 3].norm()))  # 1/m for a pixel
-    off = Matches(1.0 / truth + 0.5 * step, torch.full_like(truth, 0.95), torch.full((1,), step))
-    views = [CameraView(right, K, T)]
-    map_m = 1.02 * truth
-    map_m[..., 0], map_m[..., -1] = 1.0, 4.0  # matches outside of the map's range are cut to it
-    errors = [
-        (vote_depth(map_m, left, off, error_of(0.4), each, K) / truth - 1.0)[..., 8:-8, 8:-8]
-        for each in ([], views)
-    ]
-    assert errors[1].abs().mean() < 0.6 * errors[0].abs().mean()
+    assert ((large < 3.5) != (truth < 3.5))[..., 12:-12].float().mean() < 0.02

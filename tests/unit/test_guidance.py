@@ -332,9 +332,9 @@ def test_automatic_choices_are_settled_for_what_is_given(textured_plane):
     assert GeometryGuidance(RIGHT, K, E, points=POINTS, **only_points).updates.inner_steps == 0
     pair, knobs = textured_plane, {"inner_steps": 0, "correct": False}
     left_01 = torch.from_numpy(pair.left).permute(2, 0, 1)[None] / 255
-    for refine in (True, False):  # the refinement of the result alone asks for matches too
-        (evidence,) = GeometryGuidance(pair.right, pair.K, pair.E, **knobs, refine=refine).prepare(left_01)
-        assert (evidence.sweep_matches is not None) == refine
+    for crisp in (True, False):  # the last stage alone asks for matches too
+        (evidence,) = GeometryGuidance(pair.right, pair.K, pair.E, **knobs, crisp=crisp).prepare(left_01)
+        assert (evidence.sweep_matches is not None) == crisp
 
 
 def test_the_numbers_of_published_presets():

@@ -152,7 +152,7 @@ def test_a_guided_call_ends_at_its_points(textured_plane):
     for correct in (False, True):
         pipe = tiny_marigold_v2()
         pipe.vae = BlockCode(4)
-        depth_m = guided(pipe, textured_plane, 1.1, inner_steps=0, refine=False, correct=correct)
+        depth_m = guided(pipe, textured_plane, 1.1, inner_steps=0, crisp=False, correct=correct)
         truth_m = 1.1 * textured_plane.depth_m
         errors[correct] = np.abs(depth_m / truth_m - 1)[::4, ::4].mean()
     # 0.039 and 0.091 were seen: the prior has random weights, and 16 channels do not hold its whole map.

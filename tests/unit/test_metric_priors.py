@@ -84,7 +84,7 @@ def test_the_search_starts_from_the_priors_own_metres(kind, textured_plane, monk
     monkeypatch.setattr(settling, "search_scale", watched)
     pipe = make_transformers(kind)
     knows(pipe, textured_plane.depth_m)
-    out = guided(pipe, textured_plane, refine=False)
+    out = guided(pipe, textured_plane, crisp=False)
     ends = sorted(float(v) for v in started[0])
     # One end is the map's 98 % quantile, which lies up to 6.4 % within the range of this plane.
     assert ends[0] == pytest.approx(textured_plane.depth_m.min(), rel=0.08)
