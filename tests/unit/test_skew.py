@@ -42,7 +42,7 @@ HAND_ON = {
     "formats.submissions.disparity_of_depth",  # of rectified pairs: along rows
     *("_camera_checks.warn_of_other_size", "formats.exif.warn_of_other_lens"),  # or the focal length
     *("algorithm.evidence.prepare_evidence", "algorithm.finish.vote_depth", "matching.rows.match_rows"),
-    *("capture.fusion.normals_of"),
+    "capture.fusion.normals_of",
     *("cli.inputs.pinhole", "cli.inputs._read_known", "app.measure.read_pixel"),
     *("evaluation.datasets.pairs._quarter_intrinsics", "pose.tracks.project_tracks"),
     *("formats.captures.read_capture", "formats.clouds.make_cloud", "formats.rigs.make_rig"),
