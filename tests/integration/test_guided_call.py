@@ -297,7 +297,7 @@ def test_a_callback_that_hands_back_its_latents_changes_nothing(guided):
     assert [np.array_equal(other, alone) for other in others] == [True, True, False]
 
 
-@pytest.mark.parametrize("knobs", [{}, {"refine": False}])
+@pytest.mark.parametrize("knobs", [{}, {"crisp": False}])
 def test_bicubic_enlargement_stays_within_the_map(make_oracle, textured_plane, knobs):
     """It overshoots at a step of depth, below 0 m from 3 m to 60 m."""
     relative = np.zeros((24, 32), np.float32)
@@ -511,7 +511,7 @@ def test_autocast_holds_for_every_call_of_the_network(guided, monkeypatch):
 
 @pytest.mark.parametrize("bounds", [(5.0, 10.0), (0.1, 1.0)])
 def test_a_given_range_bounds_the_scale(guided, bounds):
-    knobs = FAST | {"inner_steps": 0, "correct": False, "refine": False}
+    knobs = FAST | {"inner_steps": 0, "correct": False, "crisp": False}
     points = np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 2.1]])
     out = guided(GeometryGuidance.from_points(points, guided.pair.K, depth_range=bounds, **knobs))
     at_ends = out.global_scale * torch.stack([out.shift, out.scale + out.shift])

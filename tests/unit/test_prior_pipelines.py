@@ -403,7 +403,7 @@ def guided_lotus(pipe, image, callback=None):
     """Without updates, at the image's own size."""
     camera = np.array([[60.0, 0, 29.5], [0, 60.0, 21.5], [0, 0, 1]])
     points = np.array([[0.1, 0.1, 2.0], [0.2, 0.0, 3.0]])
-    still = {"inner_steps": 0, "correct": False, "refine": False}
+    still = {"inner_steps": 0, "correct": False, "crisp": False}
     guidance = GeometryGuidance.from_points(points, camera, **still)
     call = {"processing_resolution": 0, "match_input_resolution": False, "generator": seeded()}
     return pipe(image, guidance=guidance, callback_on_step_end=callback, **call)

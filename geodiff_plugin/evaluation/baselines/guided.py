@@ -333,7 +333,7 @@ def _photometric_updates(right: Any, K: Any, E: Any, **changes: Any) -> Geometry
     gradient of a mean over all pixels is tiny in each; Adam's do.
     """
     preset: dict[str, Any] = {"weights": PAPER.weights, "inner_steps": 50, "step_latents": 0.01}
-    preset |= {"correct": False, "refine": False}
+    preset |= {"correct": False, "crisp": False}
     return GeometryGuidance(right, K, E, **(preset | changes))
 
 
