@@ -150,7 +150,7 @@ def solve_capture(
         blurred = np.flatnonzero(base.features < BLURRED_SHARE * np.median(base.features))
         notes = []
         if len(blurred):
-            these = some_names([names[i] for i in blurred])
+            these = some_names([names[int(i)] for i in blurred])
             notes.append(f"{these}: blurred or without texture; they are no good neighbours of others.")
         if E is None:
             return _from_nothing(base, notes, names)
