@@ -84,10 +84,10 @@ def _table(rows: list[dict[str, str | float]]) -> str:
     ]
     keys = ("prior", "delta1", "plane", "constant")
     mean = {key: float(np.mean([row[key] for row in rows])) for key in keys}
-    for row in [*rows, {"dataset": "mean", "name": f"{len(rows)} pairs"} | mean]:
-        lines.append(
-            f"| {row['dataset']} | {row['name']} | " + " | ".join(f"{row[k]:.3f}" for k in keys) + " |"
-        )
+    lines += [
+        f"| {row['dataset']} | {row['name']} | " + " | ".join(f"{row[k]:.3f}" for k in keys) + " |"
+        for row in [*rows, {"dataset": "mean", "name": f"{len(rows)} pairs"} | mean]
+    ]
     return "\n".join(lines)
 
 

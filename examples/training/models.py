@@ -182,12 +182,11 @@ def _half_copy(part: object) -> object:
         # transformers loads in the dtype of the file, diffusers in float32: half would not meet the rest.
         copy.load_state_dict({name: value.detach().cpu() for name, value in part.state_dict().items()})
         return copy.float().eval()
-    else:
-        # from_config falls back to the class's default for what was a default when the module was built
-        # (scaling_factor), so the configuration is written once more.
-        # Names that start with an underscore say where it was loaded from, which is nobody's business.
-        config = {key: value for key, value in part.config.items() if key[0] != "_"}
-        copy = type(part).from_config(config)
-        copy.register_to_config(**config)
+    # from_config falls back to the class's default for what was a default when the module was built
+    # (scaling_factor), so the configuration is written once more.
+    # Names that start with an underscore say where it was loaded from, which is nobody's business.
+    config = {key: value for key, value in part.config.items() if key[0] != "_"}
+    copy = type(part).from_config(config)
+    copy.register_to_config(**config)
     copy.load_state_dict({name: value.detach().cpu() for name, value in part.state_dict().items()})
     return copy.half().eval()

@@ -8,7 +8,7 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -180,9 +180,9 @@ class Stages:
         guidance, size, before = job.inputs.guidance, job.inputs.left.shape, self._before
         self._before = None  # whatever happens now: a sequence with a hole begins anew
         # A pair between that failed before this stage, or that was there already, has left no trace here.
-        if before is not None and before[1] == size:
-            if self._number[before[0].name] == self._number[job.ref.name] - 1:
-                job.began_from, guidance.previous = before[0].name, before[2]
+        follows = before is not None and self._number[before[0].name] == self._number[job.ref.name] - 1
+        if before is not None and before[1] == size and follows:
+            job.began_from, guidance.previous = before[0].name, before[2]
         warm = self._options.warm_start
         with job.watch.stage("guided call"), WithinCores(self._among):
             quiet = replace(job.options, quiet=True)
@@ -322,6 +322,15 @@ def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
             bad_value("--baseline", "left out with many pairs of one model", str(calib[0]), cure)
 
 
+def _items(refs: Sequence[PairRef], out: Path, journal: Journal, there: Mapping[str, Row]) -> list[Item]:
+    """An item a pair; what is there already, in folders of its own, has its record."""
+    items = [Item(r.name, r, words=(str(r.left), str(r.right), str(out / r.name))) for r in refs]
+    for item in items:
+        if item.key in there and journal.get(item) is None:
+            journal.put(item, there[item.key])
+    return items
+
+
 def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     """Run the command on all pairs, answer on stdout, and leave with a code if one of them failed.
 
@@ -345,10 +354,7 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
         return not options.overwrite and finished_row(options_of(item.payload, options)) is not None
 
     journal = Journal(options.out / JOURNAL)
-    items = [Item(r.name, r, words=(str(r.left), str(r.right), str(options.out / r.name))) for r in refs]
-    for item in items:
-        if item.key in there and journal.get(item) is None:
-            journal.put(item, there[item.key])
+    items = _items(refs, options.out, journal, there)
     runner = Runner(
         items,
         journal,

@@ -210,9 +210,9 @@ def _rectified(tracks: Tracks, near: np.ndarray) -> np.ndarray | None:
     for way in (-1.0, 1.0):
         T = np.eye(4)
         T[0, 3] = way
-        if len(inliers) >= FEWEST_INLIERS and np.median(residuals_px(inliers, T[None])) < RECTIFIED_PX:
-            if (solve_inverse_depth(inliers, T[None]) > 0).mean() > SIMPLER:
-                return T
+        fits = len(inliers) >= FEWEST_INLIERS and np.median(residuals_px(inliers, T[None])) < RECTIFIED_PX
+        if fits and (solve_inverse_depth(inliers, T[None]) > 0).mean() > SIMPLER:
+            return T
     return None
 
 

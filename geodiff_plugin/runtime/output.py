@@ -32,6 +32,23 @@ LITTLE_OVERLAP = 0.3
 LEAST_M = 1e-6
 
 
+def _confidence(
+    support: Tensor | None,
+    depth_m: Tensor,
+    shown: tuple[Tensor | None, Tensor | None],
+    uncertainty: Tensor | None,
+    prior_error: Tensor | None,
+) -> Tensor | None:
+    """``(N, 1, H, W)`` in [0, 1] from support and what the views show: visible, error; ``None`` without."""
+    if support is None:
+        return None
+    spread, nowhere, (visible, error) = None, torch.zeros_like(depth_m), shown
+    if uncertainty is not None:
+        spread = uncertainty / depth_m
+    seen = nowhere if error is None else error, nowhere.bool() if visible is None else visible
+    return depth_confidence(support, *seen, spread, prior_error)
+
+
 def assemble_output(
     stock: MarigoldDepthOutput,
     run: GuidedRun,
@@ -60,12 +77,7 @@ def assemble_output(
     K = resize_intrinsics(torch.stack(Ks), size, grid)
     visible, error = _reprojected(run, depth_m, lefts, K)
     prior_error = run.prior_error()  # (N, 1, 1, 1), or of every pixel with the measured one as the least
-    confidence = None
-    if support is not None:
-        spread = None if uncertainty is None else uncertainty / depth_m
-        nowhere = torch.zeros_like(depth_m)
-        shown = nowhere if error is None else error, nowhere.bool() if visible is None else visible
-        confidence = depth_confidence(support, *shown, spread, prior_error)
+    confidence = _confidence(support, depth_m, (visible, error), uncertainty, prior_error)
     over_prior = _over_prior(run, depth_m)
     relative = torch.cat(run.relative)
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)

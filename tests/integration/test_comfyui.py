@@ -148,7 +148,7 @@ def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plan
     size = textured_plane.depth_m.shape
     assert depth["depth_m"].shape == (2, *size) and (depth["depth_m"] > 0).all()
     assert coloured.shape == near_is_white.shape == (2, *size, 3) and coloured.dtype == torch.float32
-    assert confidence.shape == (2, *size) and 0 <= confidence.min() and confidence.max() <= 1
+    assert confidence.shape == (2, *size) and confidence.min() >= 0 and confidence.max() <= 1
     assert near_is_white.min() == 0 and near_is_white.max() == 1
     nearest = np.unravel_index(depth["depth_m"][0].argmin(), size)
     assert near_is_white[0][nearest].min() == 1

@@ -21,7 +21,7 @@ IMAGE = np.random.default_rng(0).random((53, 70, 3), np.float32)
 def test_the_map_comes_back_at_the_images_size():
     out = tiny_marigold_v2()(IMAGE)
     assert out.prediction.shape == (1, 53, 70, 1)
-    assert 0 <= out.prediction.min() and out.prediction.max() <= 1 and out.prediction.std() > 0
+    assert out.prediction.min() >= 0 and out.prediction.max() <= 1 and out.prediction.std() > 0
 
 
 def test_a_frame_is_the_librarys_but_for_the_clamp_in_slices_and_tiles_too():

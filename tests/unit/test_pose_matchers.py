@@ -83,7 +83,7 @@ def test_pixels_are_those_of_the_image(tmp_path, views, monkeypatch) -> None:
 
     class Stub:
         def __call__(self, pixel_values):
-            assert pixel_values.shape == (1, 2, 3, 96, 128) and 0 <= pixel_values.min()
+            assert pixel_values.shape == (1, 2, 3, 96, 128) and pixel_values.min() >= 0
             at = torch.tensor([10 / 128, 20 / 96])
             keypoints = torch.stack([torch.stack([at, at * 2]), torch.stack([at * 3, at])])[None]
             matches = torch.tensor([[[1, -1], [-1, 0]]])

@@ -254,7 +254,7 @@ def test_of_several_factors_the_one_that_fits_best_is_named() -> None:
 def test_axes_of_opengl_are_named_where_most_matches_lie_near_the_wrong_lines() -> None:
     tracks, T = near_cameras((0.5, 3.0, 0.2))
     given = FLIP @ T @ FLIP
-    assert 0.5 < np.mean(residuals_px(tracks, given[None]) < 4.0), "coarsely it cannot be exceeded twice"
+    assert np.mean(residuals_px(tracks, given[None]) < 4.0) > 0.5, "coarsely it cannot be exceeded twice"
     assert "OpenGL" in find_mistake(tracks, given, given)
 
 

@@ -83,8 +83,7 @@ def _load_vae(part: str | None) -> AutoencoderKL:
         bad_value("--with", expected, repr(source), "Check the path.")
     subfolder = "" if (Path(source) / "config.json").is_file() else "vae"
     with reading("--with", expected, repr(source), f"Fetch it once: hf download {VAE_ID}."):
-        vae = AutoencoderKL.from_pretrained(source, subfolder=subfolder, use_safetensors=True)
-    return vae
+        return AutoencoderKL.from_pretrained(source, subfolder=subfolder, use_safetensors=True)
 
 
 def recognises(checkpoint: Mapping[str, Any]) -> bool:

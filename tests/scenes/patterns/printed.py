@@ -60,7 +60,7 @@ def poster(rng: np.random.Generator) -> np.ndarray:
         accent = np.where(shape, float(rng.random() < 0.35), accent)
     if rng.random() < 0.6:
         tone = tone * 0.5 + 0.5 * spectral(rng, 1.6, 1)
-    ink = print_lines(rng, int(rng.integers(8, 30)), 0.08) * (TILE_Y > rng.uniform(0.4, 0.7))
+    ink = print_lines(rng, int(rng.integers(8, 30)), 0.08) * (rng.uniform(0.4, 0.7) < TILE_Y)
     edge = (np.minimum(TILE_X, 1 - TILE_X) < 0.02) | (np.minimum(TILE_Y, 1 - TILE_Y) < 0.02)
     return pack(np.where(edge, 0.0, tone), accent * (1 - ink), 0.05, np.where(edge, 0.5, 1 - 0.8 * ink))
 
@@ -79,7 +79,7 @@ def books(rng: np.random.Generator) -> np.ndarray:
             c = rng.uniform(0.35, 0.9)
             band[int(c * TEXELS) : int((c + rng.uniform(0.02, 0.2)) * TEXELS), a + 1 : b - 1] = 1
         x += w
-    above = TILE_Y < top[None]
+    above = top[None] > TILE_Y
     tone = np.where(band > 0, 1 - tone[None], tone[None])
     return pack(
         np.where(above, 0.2, tone), np.where(above, 0, accent[None]), 0.08, np.where(above, 0.08, shade[None])
@@ -93,14 +93,14 @@ def screen(rng: np.random.Generator) -> np.ndarray:
     for _ in range(rng.integers(1, 4)):
         x0, y0 = rng.uniform(0.02, 0.5, 2)
         box = (
-            (TILE_X > x0)
-            & (TILE_X < x0 + rng.uniform(0.3, 0.6))
-            & (TILE_Y > y0)
-            & (TILE_Y < y0 + rng.uniform(0.3, 0.6))
+            (x0 < TILE_X)
+            & (x0 + rng.uniform(0.3, 0.6) > TILE_X)
+            & (y0 < TILE_Y)
+            & (y0 + rng.uniform(0.3, 0.6) > TILE_Y)
         )
         tone = np.where(box, rng.uniform(0.6, 1.0), tone)
-        accent = np.where(box & (TILE_Y < y0 + 0.04), 1.0, accent)
-        ink = np.where(box & (TILE_Y > y0 + 0.05), print_lines(rng, 34, x0 + 0.02), ink)
+        accent = np.where(box & (y0 + 0.04 > TILE_Y), 1.0, accent)
+        ink = np.where(box & (y0 + 0.05 < TILE_Y), print_lines(rng, 34, x0 + 0.02), ink)
     edge = (np.minimum(TILE_X, 1 - TILE_X) < 0.03) | (np.minimum(TILE_Y, 1 - TILE_Y) < 0.04)
     return pack(tone, accent, 0.35, np.where(edge, 0.03, 1 - 0.7 * ink))
 
@@ -146,7 +146,7 @@ def window(rng: np.random.Generator) -> np.ndarray:
     """Panes with a bright view, frame and bars."""
     du, dv = np.abs(TILE_X - 0.5), np.abs(TILE_Y - 0.5)
     frame = (du > 0.45) | (dv > 0.46) | (du < 0.025) | (np.abs(TILE_Y - 0.35) < 0.02)
-    view = np.clip(1.0 - 0.5 * (TILE_Y > 0.62 + 0.1 * (spectral(rng, 1.5, 1, 20) - 0.5)), 0, 1) * (
+    view = np.clip(1.0 - 0.5 * (0.62 + 0.1 * (spectral(rng, 1.5, 1, 20) - 0.5) < TILE_Y), 0, 1) * (
         0.8 + 0.2 * spectral(rng, 1.5, 1, 30)
     )
     return pack(
