@@ -58,7 +58,8 @@ def find_adapter(pipe: Any) -> type[DepthPrior]:
 
     A ``DepthDiffusionPipeline`` that is not in the table says of itself what guidance must know.
     """
-    for adapter in (*PRIORS.values(), DepthPrior):
+    adapters: list[type[DepthPrior]] = [*PRIORS.values(), DepthPrior]
+    for adapter in adapters:
         if adapter.matches(pipe):
             return adapter
     expected = f"a pipeline with an adapter ({', '.join(PRIORS)})"

@@ -292,7 +292,7 @@ class TransformersDepthPipeline(DirectMapPipeline):
             if prompt_depth.ndim != 4 or len(prompt_depth) != len(image):
                 bad_value("prompt_depth", f"({len(image)}, 1, h, w) metres", tuple(prompt_depth.shape))
             prompts = prompt_depth.split(batch_size)
-        size = tuple(image.shape[-2:])
+        size = image.shape[-2], image.shape[-1]
         maps = [
             self.predict(part.float() / 2 + 0.5, size, told)
             for part, told in zip(parts, prompts, strict=True)

@@ -81,7 +81,7 @@ def _base_files(base: Path, name: str) -> tuple[list[Path], dict[str, tuple[int,
     if missing or not files:
         got = f"one without {', '.join(missing)}" if missing else "one without"
         bad_value("BASE", f"a folder with safetensors in {folder}", got, "Fetch it anew.")
-    shapes = {}
+    shapes: dict[str, tuple[int, ...]] = {}
     for file in files:
         with safe_open(file, "pt") as opened:
             shapes |= {key: tuple(opened.get_slice(key).get_shape()) for key in opened.keys()}  # noqa: SIM118
