@@ -19,7 +19,7 @@ from geodiff_plugin.matching import (
     CostVolume,
     Matches,
     build_cost_volume,
-    find_matches,
+    match_volume,
     mirrored_pose_preferred,
     points_to_matches,
 )
@@ -122,7 +122,7 @@ def prepare_evidence(
         # The sweep chooses its own grid, finer than that of the losses for wide images.
         volume = build_cost_volume(left_01, views, K_left, depth_range=config.depth_range, config=config)
         if needs_matches:
-            sweep_matches = find_matches(left_01, views, K_left, volume=volume)
+            sweep_matches = match_volume(volume)
             matches = _on_grid(sweep_matches, loss_size)
         if mirrored_pose_preferred(left_01, views, K_left, sweep_matches):
             warnings.append(INVERSE)

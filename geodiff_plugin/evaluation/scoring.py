@@ -25,7 +25,7 @@ from geodiff_plugin.evaluation.metrics import (
     evaluate_disparity,
     to_space,
 )
-from geodiff_plugin.matching import find_matches
+from geodiff_plugin.matching import match_volume
 from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
 TOM_CLASSES = (2, 3)
@@ -65,7 +65,7 @@ def matched(sample: StereoSample) -> np.ndarray | None:
         volume = sweep(replace(sample, E=sample.E_scored), "cpu")
     except ValueError:
         return None
-    matches = find_matches(volume.left_01, volume.rights, volume.K, volume=volume)
+    matches = match_volume(volume)
     reliable = (matches.confidence >= RELIABLE_MATCH).float()
     return F.interpolate(reliable[None], sample.depth_m.shape, mode="nearest-exact")[0, 0].numpy() > 0
 

@@ -157,25 +157,6 @@ def build_cost_volume(
     return sweep_planes(left, small, K, planes)
 
 
-def find_matches(
-    left_01: torch.Tensor,
-    rights: Sequence[CameraView],
-    K_left: torch.Tensor,
-    *,
-    volume: CostVolume | None = None,
-    depth_range: tuple[float, float] | None = None,
-    config: GuidanceConfig = DEFAULT,
-) -> Matches:
-    """What the views alone say about depth, on the grid of the cost volume.
-
-    ``volume`` is what ``build_cost_volume`` gave for the same views, if it was called already; otherwise it
-    is built here. Other arguments and errors as there.
-    """
-    if volume is None:
-        volume = build_cost_volume(left_01, rights, K_left, depth_range=depth_range, config=config)
-    return match_volume(volume)
-
-
 @torch.no_grad()
 def mirrored_pose_preferred(
     left_01: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, matches: Matches | None = None

@@ -16,7 +16,7 @@ from torch import Tensor
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.matching import find_matches
+from geodiff_plugin.matching import build_cost_volume, match_volume
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.scale import NO_UNIT
 from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
@@ -201,8 +201,9 @@ def _indicators(
     order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())
     if evidence.sweep_matches is None and evidence.native:
         with suppress(InputError):  # views without overlap: not judged
-            views, how = (evidence.native_left, evidence.native, K_left), {"volume": evidence.volume}
-            matches = find_matches(*views, **how, depth_range=config.depth_range, config=config)
+            views, how = (evidence.native_left, evidence.native, K_left), {"depth_range": config.depth_range}
+            volume = evidence.volume or build_cost_volume(*views, **how, config=config)
+            matches = match_volume(volume)
             evidence = replace(evidence, sweep_matches=matches, sweep_points=None)
             order = float(order_agreement(relative, matches, run.prior.space))
     more["on_edge"] = any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in samples)

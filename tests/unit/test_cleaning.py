@@ -14,7 +14,7 @@ from geodiff_plugin.cli.inputs import pinhole
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
 from geodiff_plugin.guidance.evidence import make_evidence
 from geodiff_plugin.guidance.inputs import Inputs
-from geodiff_plugin.matching import clean, find_matches
+from geodiff_plugin.matching import build_cost_volume, clean, match_volume
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.cleaning import find_flaws
 from geodiff_plugin.types import CameraView
@@ -107,7 +107,7 @@ def test_fewer_matches_are_wrong(pair: SyntheticPair, flawed) -> None:
 
     def wrong(images: tuple[torch.Tensor, torch.Tensor]) -> float:
         view = CameraView(images[1], pair.K_right.float(), T)
-        matches = find_matches(images[0], [view], pair.K_left.float())
+        matches = match_volume(build_cost_volume(images[0], [view], pair.K_left.float()))
         truth, seen = 1.0 / pair.left.depth_m, torch.isfinite(pair.left.depth_m) & ~pair.occluded
         planes = (matches.inverse_depth - truth).abs() / matches.plane_step
         off = (planes > 1.5) * matches.confidence

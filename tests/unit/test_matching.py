@@ -43,6 +43,10 @@ def rectified():
     return left, right, K, depth, visible, volume, m.match_volume(volume)
 
 
+def find_matches(left, rights, K):
+    return m.match_volume(m.build_cost_volume(left, rights, K))
+
+
 def relative_errors(matches, depth, mask):
     mask = mask & (matches.confidence > 0.5)
     return ((matches.inverse_depth - 1 / depth).abs() / matches.plane_step)[mask]
@@ -55,7 +59,7 @@ MOTIONS = [(SIZE, 0.4, 0.0), (SIZE, -0.4, 0.1), ((94, 320), -0.4, 0.0), ((144, 9
 def test_motion_along_the_view_gives_matches(size, ahead, sideways):
     """Behind the left camera no pixel moves further than to the epipole."""
     left, right, K, depth, visible = scene(at=(sideways, 0.0, ahead), size=size)
-    matches = m.find_matches(left, [right], K)
+    matches = find_matches(left, [right], K)
     truth = torch.nn.functional.interpolate(depth[None], matches.size, mode="nearest-exact")[0]
     reliable = matches.confidence > 0.5
     assert reliable.float().mean() > 0.3
@@ -197,7 +201,7 @@ def test_planes_reach_what_is_there_and_not_much_further(rectified):
 )
 def test_matches_in_any_pose(turn, at):
     left, right, K, depth, visible = scene(turn, at)
-    matches = m.find_matches(left, [right], K)
+    matches = find_matches(left, [right], K)
     errors = relative_errors(matches, depth, visible)
     assert errors.numel() > 0.4 * visible.sum()
     assert errors.median() < 0.4 and (errors > 3).float().mean() < 0.06
@@ -217,7 +221,7 @@ def test_noise_has_few_matches():
     generator = torch.Generator().manual_seed(0)
     left, right = torch.rand(2, 3, *SIZE, generator=generator)
     _, (_, K, T), _, _, _ = scene()
-    matches = m.find_matches(left, [(right, K, T)], K)
+    matches = find_matches(left, [(right, K, T)], K)
     assert matches.confidence.mean() < 0.2
 
 
@@ -225,7 +229,7 @@ def test_other_size_and_intrinsics_of_the_right_view():
     left, (texture, K, T), _, depth, visible = scene()
     large = torch.nn.functional.interpolate(texture[None], scale_factor=2, mode="bicubic")[0].clamp(0, 1)
     K_large = g.resize_intrinsics(K[None], SIZE, (2 * SIZE[0], 2 * SIZE[1]))[0]
-    matches = m.find_matches(left, [(large, K_large, T)], K)
+    matches = find_matches(left, [(large, K_large, T)], K)
     errors = relative_errors(matches, depth, visible)
     assert errors.numel() > 0.4 * visible.sum() and errors.median() < 0.5
 
@@ -258,8 +262,8 @@ def test_a_third_view_sees_what_the_second_does_not():
     right = pairs[0][1]
     T_other = pairs[1][1][2]
     other = forward_view(left, depth, K, T_other)
-    two = m.find_matches(left, [right], K)
-    three = m.find_matches(left, [right, (other, K, T_other)], K)
+    two = find_matches(left, [right], K)
+    three = find_matches(left, [right, (other, K, T_other)], K)
     unseen = ~pairs[0][4] & (depth < 5.9)
     assert (three.confidence[unseen] > 0.5).float().mean() > (
         two.confidence[unseen] > 0.5

@@ -19,7 +19,7 @@ from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.figures.maps import render_cloud
 from geodiff_plugin.formats.clouds import write_ply
-from geodiff_plugin.matching import build_cost_volume, find_matches, points_to_matches
+from geodiff_plugin.matching import build_cost_volume, match_volume, points_to_matches
 from geodiff_plugin.matching.alignment import align_view
 from geodiff_plugin.matching.build import mirrored_pose_preferred, pilot_volume
 from geodiff_plugin.matching.sweep import sweep_planes
@@ -50,7 +50,7 @@ HAND_ON = {
     *("formats.distortion.undistorted_points", "pose.capture.solve_capture"),  # the latter to pycolmap
     *("guidance.evidence.coarse_depth", "guidance.evidence.pose_views", "guidance.inputs.read_inputs"),
     *("guidance.photographs.estimate_rig", "pose.matches.grey_views"),
-    *("matching.build.find_matches", "matching.build.mirrored_pose_preferred", "matching.build.pilot_volume"),
+    *("matching.build.mirrored_pose_preferred", "matching.build.pilot_volume"),
     *("pose.refine.polished", "pose.refine.refine_views", "runtime.confidence.reprojection"),
     "runtime.verdict.read_indicators",
 }
@@ -96,7 +96,7 @@ def test_the_sweep_and_all_that_is_made_of_it():
     )
     config = GuidanceConfig().changed(loss_resolution=48)
     evidence = prepare_evidence(left, rights, camera, None, config, needs_matches=True)
-    for matches in (*(find_matches(left, rights, camera, volume=v) for v in volumes), evidence.sweep_matches):
+    for matches in (*(match_volume(v) for v in volumes), evidence.sweep_matches):
         reliable = matches.confidence > 0.5
         assert reliable.float().mean() > 0.3
         assert float((1 / matches.inverse_depth[reliable]).median()) == pytest.approx(2.0, rel=0.04)

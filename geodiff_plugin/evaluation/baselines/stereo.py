@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.formats import as_image_01
-from geodiff_plugin.matching import CostVolume, build_cost_volume, find_matches
+from geodiff_plugin.matching import CostVolume, build_cost_volume, match_volume
 from geodiff_plugin.matching.rows import PARAMETERS, fill_background, make_matcher, pad_columns
 from geodiff_plugin.types import CameraView
 
@@ -118,7 +118,7 @@ def _run_plane_sweep(sample: StereoSample, settings: Settings, priors: PriorCach
 
 def _run_sweep_sgm(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     volume = sweep(sample, settings.device, settings.views)
-    matches = find_matches(volume.left_01, volume.rights, volume.K, volume=volume)
+    matches = match_volume(volume)
     # A match at infinity is none: the sky would spread over every hole beside it.
     matched = (matches.confidence[0] > 0) & (matches.inverse_depth[0] > 0.5 * volume.plane_step)
     with_holes = torch.where(matched, matches.inverse_depth[0], torch.nan).cpu().numpy()
