@@ -45,12 +45,9 @@ def gradient_step(
 ) -> tuple[Tensor, Tensor, Loss]:
     """One pass of Algorithm 1's loop body, but for the score before it and the DDIM line after it.
 
-    Args:
-        state: scale s_hat, shift t_hat and their optimisers, which are advanced.
-        estimate: of this denoising step.
-        z: ``(B, C, h, w)`` the guided latent, z_t or z0_hat.
-        anchor: ``(B, C, h, w)`` the clean latent that the term of that name pulls towards.
-        is_first: of this round, for which g_s is searched (S7.3).
+    It moves ``z (B, C, h, w)``, z_t or z0_hat, and advances the state's scale s_hat, shift t_hat and their
+    optimisers. g_s is searched if it ``is_first`` of its round (S7.3). ``anchor``, shaped as z, is the clean
+    latent that the term of that name pulls towards.
 
     Returns:
         z, less lambda times its gradient; the relative map of z as it was; its loss.
@@ -70,10 +67,8 @@ def gradient_step(
         affine = replace(state.affine, s_hat=s_hat, t_hat=t_hat)
         L_geo = state.loss(x0, affine, z0, anchor)  # noqa: N806  # Eq. 14 of Eq. 16's metric depth, with Eq. 17
         inputs = (s_hat, t_hat, x0, z0) if moves else (s_hat, t_hat)
-        # Samples do not mix, so the gradient of the sum is each one's own.
-        grad_s, grad_t, *grads = torch.autograd.grad(
-            L_geo.total.sum(), inputs, allow_unused=True, materialize_grads=True
-        )
+        total = L_geo.total.sum()  # samples do not mix, so its gradient is each one's own
+        grad_s, grad_t, *grads = torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)
     s_hat = s_hat.detach() + state.scale_rule.step(grad_s)  # s_hat - lambda_s grad L_geo
     t_hat = t_hat.detach() + state.shift_rule.step(grad_t)  # t_hat - lambda_t grad L_geo
     if moves:  # z - lambda grad L_geo, through the decoder, and with the full gradient through the network
