@@ -27,7 +27,7 @@ POSE = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t
 
 
 def _as_matrix(value: Any, name: str, cure: str, *shapes: tuple[int, int]) -> np.ndarray:
-    """A finite float64 matrix of one of some shapes; messages tell the first."""
+    """A finite float64 matrix of one of the given shapes; messages name the first."""
     rows, columns = shapes[0]
     if hasattr(value, "detach"):
         value = value.detach().cpu().double().numpy()  # numpy has no bfloat16
@@ -66,7 +66,7 @@ def check_intrinsics_fit(
 
 
 def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -> None:
-    """Refuse a camera matrix that cannot be that of an image ``(H, W)``, and warn of one that hardly is."""
+    """Refuse a camera matrix that cannot belong to an image ``(H, W)``, and warn of a doubtful one."""
     check_intrinsics_fit(K, size[1], size[0], name, image)
     warn_of_other_size(K, size[1], size[0], name, image)
 
@@ -74,14 +74,14 @@ def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -
 def check_calibrated_size(
     size: tuple[int, int], calibrated: tuple[int, int] | None, name: str, source: object, cure: str
 ) -> None:
-    """Refuse an image whose ``(width, height)`` is not what its calibration says, if that says any."""
+    """Refuse an image whose ``(width, height)`` differs from that of its calibration, if it has one."""
     if calibrated is not None and tuple(calibrated) != size:
         expected = "of {}x{} pixels, as {} says".format(*calibrated, source)
         bad_value(name, expected, "{}x{}".format(*size), cure)
 
 
 def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
-    """Warn of a principal point such as an image of another size has, and of a mistyped focal length."""
+    """Warn of a principal point that suggests another image size, and of a mistyped focal length."""
     shares = (K[0, 2] / width, K[1, 2] / height)
     at = f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f})"
     cure = f"If it is for another resolution, {SCALED_K}."

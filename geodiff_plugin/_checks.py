@@ -20,31 +20,31 @@ _NOTED: ContextVar[dict[str, bool] | None] = ContextVar("noted", default=None)
 
 
 class InputError(ValueError):
-    """What the user gave cannot be used; the message says what, and what would do."""
+    """An input that cannot be used; the message says what is wrong and how to correct it."""
 
 
 class InputTypeError(InputError, TypeError):
-    """The same for what is of the wrong type."""
+    """An input of the wrong type."""
 
 
 class InputFileError(InputError, OSError):
-    """The same for a file or folder that cannot be read or written."""
+    """A file or folder that cannot be read or written."""
 
 
 class MissingFileError(InputFileError, FileNotFoundError):
-    """The same for what is not there."""
+    """A file or folder that does not exist."""
 
 
 class FolderError(InputFileError, IsADirectoryError):
-    """The same for a folder where a file must be."""
+    """A folder where a file is needed."""
 
 
 class ForbiddenFileError(InputFileError, PermissionError):
-    """The same for what may not be read."""
+    """A file that may not be read."""
 
 
 def quoted(got: object) -> str:
-    """What was given, on one line of a message and not too long for it."""
+    """A given value as a single line of limited length, for a message."""
     text = " ".join(str(got).split())  # arrays are printed over several lines; file names may hold line ends
     return text if len(text) <= LONGEST_GOT else f"{text[:LONGEST_GOT]}..."
 
@@ -64,12 +64,12 @@ def refuse(sentences: str) -> NoReturn:
 
 
 def bad_type(name: str, expected: str, got: object, cure: str = "") -> NoReturn:
-    """Raise ``InputTypeError`` with the same sentence, naming the type of what came."""
+    """Raise ``InputTypeError`` with the same sentence, naming the type of the value."""
     raise InputTypeError(_sentence(name, expected, f"{type(got).__name__}", cure))
 
 
 def _short(value: object) -> str:
-    """A number as text that fits a line."""
+    """A number as short text."""
     if isinstance(value, int) and value.bit_length() > 128:
         return "a whole number of more than 128 bits"
     return str(value)
@@ -102,7 +102,7 @@ def noted() -> Iterator[dict[str, bool]]:
 
 
 def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
-    """Refuse integers: in a map ``(H, W)`` some file's unit, in points ``(N, 3)`` that or metres cut off."""
+    """Refuse integers, which are a file's own unit, or metres without their fraction."""
     if array.dtype.kind == "f":
         return
     cure = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."

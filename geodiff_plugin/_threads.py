@@ -18,7 +18,7 @@ import torch
 
 
 def available_cores() -> int:
-    """Cores that this process may use, >= 1: what is there, within its affinity and its cgroup's quota."""
+    """Number of cores that this process may use, >= 1, by its affinity and its cgroup's quota."""
     cores = cv2.getNumberOfCPUs()  # reads the quota of cgroups v1 and v2, but only once
     if hasattr(os, "sched_getaffinity"):  # Linux
         cores = min(cores, len(os.sched_getaffinity(0)))

@@ -175,7 +175,7 @@ def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: GuidanceConf
 
 
 def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
-    """The field ``(B, 1, h, w)`` that only says what matches say over wide regions."""
+    """The correction ``(B, 1, h, w)`` that follows matches over wide regions only."""
     stiff = torch.full_like(error, STIFF_SMOOTHNESS)
 
     def robust(left_over: Tensor) -> Tensor:

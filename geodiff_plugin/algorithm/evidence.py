@@ -152,7 +152,7 @@ def prepare_evidence(
 
 
 def _read_back_once(volume: CostVolume | None, targets: Sequence[Matches | None]) -> None:
-    """Ask now for what only the device knows and these objects keep, so that no step waits for it."""
+    """Compute now what has to be read back from the device, so that no step waits for it."""
     if volume is not None:
         _ = volume.reach_m, volume.rectified
     for target in targets:

@@ -31,7 +31,7 @@ def pull_back(output: Tensor, source: Tensor, gradient: Tensor) -> Tensor:
 
 
 class FiniteWatch:
-    """Remembers which tensors of a trajectory were finite, on their device, and is asked once at the end."""
+    """Records, on their device, which tensors of a trajectory were finite; checked once at the end."""
 
     def __init__(self) -> None:
         self._names: list[tuple[str, int]] = []

@@ -117,7 +117,7 @@ def make_schedule(
 
 
 def _spread(active: list[int], wanted: int) -> set[int]:
-    """So many of the rounds, the last one among them, the others over the second half if they fit there."""
+    """The last round, and the other ``wanted`` ones spread over the second half if they fit there."""
     wanted = min(wanted, len(active))
     first = min(len(active) // 2, len(active) - wanted)
     step = (len(active) - 1 - first) / max(wanted - 1, 1)

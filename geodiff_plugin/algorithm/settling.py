@@ -55,7 +55,7 @@ def settle_ends(
     on_edge: Tensor | None,
     valid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Near and far jointly, by lookup, or by a fit to points where there is no right view.
+    """Nearest and farthest depth of a map, by lookup, or by a fit to points where there is no right view.
 
     Args:
         x: ``(B, 1, h, w)`` float32 relative maps.

@@ -136,7 +136,7 @@ class EvidenceStore:
         return evidence
 
     def take_spared_seconds(self) -> float:
-        """Seconds that remembering has spared since this was last asked; a fair account adds them."""
+        """Seconds saved since the last call of this; a fair account of time adds them."""
         spared, self._spared = self._spared, 0.0
         return spared
 

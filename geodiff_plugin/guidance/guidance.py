@@ -39,7 +39,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def _remembers_warnings(make: F) -> F:
-    """Let a constructor keep what is warned of before it calls ``__init__``, too."""
+    """Let a constructor also remember the warnings given before it calls ``__init__``."""
 
     @functools.wraps(make)
     def made(*args: Any, **kwargs: Any) -> Any:

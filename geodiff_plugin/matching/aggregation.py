@@ -29,7 +29,7 @@ def cells(planes: int, size: tuple[int, int], dtype: torch.dtype, device: torch.
 
 
 class Room:
-    """Memory that one aggregation after the other works in: to touch fresh memory costs as much as a path."""
+    """Memory reused from one aggregation to the next: touching fresh memory costs as much as a path."""
 
     def __init__(self) -> None:
         self._held: dict[str, torch.Tensor] = {}

@@ -128,7 +128,7 @@ def _turned(
 
 
 def _translation(to_right: torch.Tensor, size: tuple[int, int]) -> torch.Tensor | None:
-    """The shift ``(2,)`` that a homography is on the left grid, or ``None`` if it is none."""
+    """The shift ``(2,)`` that a homography amounts to on the left grid, or ``None``."""
     height, width = size
     ends = [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]
     corners = torch.tensor(ends, **_HERE)
@@ -176,7 +176,7 @@ def _resampled(grey: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor) ->
 
 
 class ComparedView:
-    """What an aligned right view costs the left view on every plane, and what it sees of it."""
+    """Costs of every plane between the left view and an aligned right view, and where it is seen."""
 
     def __init__(self, left: torch.Tensor, view: AlignedView) -> None:
         """Take ``left``, the ``census`` of the left view, ``(16, H, W)`` int16."""

@@ -68,7 +68,7 @@ def _even_planes(
     step_px: float,
     most: int,
 ) -> torch.Tensor:
-    """Inverse depths over ``span``, so many that one moves the median pixel by ``step_px``."""
+    """Inverse depths over ``span``; from one to the next the median pixel moves by ``step_px``."""
     ends = torch.stack(list(span))
     shifts = [median_shift(plane_rays(K[None], K_r[None], T[None], size), ends) for _, K_r, T in rights]
     moved = max(float(shift[1] - shift[0]) for shift in shifts)
@@ -109,7 +109,7 @@ def _at_shift(
 
 
 def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
-    """The inverse depth that a coarse sweep says nothing is nearer than."""
+    """The inverse depth of the nearest surface, by a coarse sweep."""
     matches = match_volume(pilot)
     reliable, limit = matches.confidence > PILOT_CONFIDENCE, pilot.inverse_depth[-1]
     inverse_depth = torch.where(reliable, matches.inverse_depth, torch.nan)

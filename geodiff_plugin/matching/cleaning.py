@@ -113,7 +113,7 @@ def find_flaws(image_01: torch.Tensor) -> tuple[float, float]:
 
 
 def _threshold(jpeg_scale: float, noise: float, like: torch.Tensor) -> torch.Tensor | None:
-    """Size ``(8, 8)`` below which a coefficient counts for nothing; ``None`` if none does."""
+    """Size ``(8, 8)`` below which coefficients are removed; ``None`` where nothing is to be removed."""
     low, high = _NOISE_RANGE
     noise *= min(max((noise - low) / (high - low), 0.0), 1.0)
     if not jpeg_scale and not noise:

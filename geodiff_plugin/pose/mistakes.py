@@ -1,4 +1,4 @@
-"""Names the usual mistakes of a given pose or K by which of them would make it fit; nothing is repaired.
+"""Which usual mistake of a given pose or K would explain its misfit; nothing is repaired.
 
 What only the user knows is what was meant. Epipolar lines do not show the unit of a translation, nor K of a
 rectified pair.

@@ -146,7 +146,7 @@ def refine_views(
 def polished(
     left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, first_depth: FirstDepth, sparse: Tracks
 ) -> tuple[np.ndarray, Tracks]:
-    """Estimated poses fitted once more to all matches, every view's to all that it shares with others.
+    """Estimated poses fitted once more, to all matches of all views together.
 
     ``rights`` have the poses that the ``sparse`` tracks, inliers of the estimation, gave; other arguments as
     for ``refine_views``.
@@ -209,7 +209,7 @@ class Displacement:
     rms_px: float
 
     def at(self, px: np.ndarray) -> np.ndarray:
-        """``(N, 2)`` pixels that are to be added to ``(N, 2)`` pixels."""
+        """The displacement ``(N, 2)`` of pixels ``(N, 2)``."""
         moved = _cubic(px, self.size) @ self.coefficients
         length = np.linalg.norm(moved, axis=1, keepdims=True)
         return moved * np.minimum(1.0, self.most_px / np.maximum(length, 1e-9))
@@ -311,7 +311,7 @@ def _sentences(tracks: Tracks, ask: Callable[..., str | None], *poses: np.ndarra
 
 
 def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ...]:
-    """A sentence where the matches leave the pose, and with it the depth, open."""
+    """A sentence where the matches do not determine the pose, and with it the depth."""
     used, other = (solve_inverse_depth(tracks, poses) for poses in (Ts, free))
     ahead = (used > 0) & (other > 0)
     spread = float(np.median(np.abs(np.log(used[ahead] / other[ahead])))) if ahead.any() else 0.0

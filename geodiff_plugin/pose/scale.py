@@ -1,4 +1,4 @@
-"""The one thing that photographs do not show: the scale of an estimated or refined pose."""
+"""The scale of an estimated or refined pose, which photographs alone do not show."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NEAR_PX = 40.0
 
 @dataclass(frozen=True)
 class Scale:
-    """Where the unit comes from.
+    """Metres per unit of an estimated pose, and where they come from.
 
     Attributes:
         source: ``"baseline"``, ``"known length"``, ``"points"`` or ``"none"``.
@@ -71,7 +71,7 @@ def find_scale(
     known_length: tuple[float, float, float, float, float] | None,
     points: np.ndarray | None,
 ) -> Scale:
-    """Metres a unit, from whichever length is given.
+    """Metres per unit, from whichever length is given.
 
     Args:
         tracks: the matches.

@@ -121,7 +121,7 @@ class Whitened:
 
     @cached_property
     def left_by_pose(self) -> np.ndarray:
-        """``(N, n, 6V)``: what of ``by_pose`` no change of depth makes up for."""
+        """``(N, n, 6V)``: the part of ``by_pose`` that no change of depth compensates."""
         along = self.by_depth / self.slopes[:, None]
         return self.by_pose - along[..., None] * self.depth_by_pose[:, None]
 
@@ -311,7 +311,7 @@ def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
 
 
 def open_pose(spread: float | None) -> tuple[str, ...]:
-    """A sentence where the matches leave an estimated pose, and so the depth, open; none for ``None``."""
+    """A sentence where the matches do not determine an estimated pose; none for ``None``."""
     if spread is None or spread <= MOST_SPREAD:
         return ()
     return (

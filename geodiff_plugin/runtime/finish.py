@@ -34,7 +34,7 @@ def finish(
     spacing: int,
     config: GuidanceConfig,
 ) -> tuple[Tensor, Tensor] | None:
-    """One decoded depth map as it is given out: fitted to matches and points, with crisp edges.
+    """A decoded depth map refined to the result: fitted to matches and points, with crisp edges.
 
     Ramps first: a fit that finds edges steep does not carry the depth of a surface over to the next one. Then
     the fit, and the votes of matches, colours and the fitted map.

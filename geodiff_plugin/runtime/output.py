@@ -195,7 +195,7 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> Metr
 def _indicators(
     run: GuidedRun, image: int, K_left: Tensor, depth_m: Tensor, relative: Tensor, **more: Any
 ) -> Indicators:
-    """What the run of one image tells; where it used no matches, they are made here, to judge it by."""
+    """Indicators of one image; matches to judge it by are made here, where its run used none."""
     samples = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
     evidence, config = run.evidence[image], run.config
     order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())

@@ -269,7 +269,7 @@ class GuidedRun:
 
 
 def _latents_of(answer: Any, latents: Tensor) -> Tensor:
-    """What a callback answered for the latents, checked; ``latents`` where it left them alone."""
+    """The latents that a callback returned, checked; ``latents`` where it returned none."""
     name = "the answer of callback_on_step_end"
     cure = "Return callback_kwargs, or nothing to leave the latents as they are."
     if answer is None:

@@ -34,7 +34,7 @@ PROMPT_LONG_EDGE = 256
 
 @dataclass(frozen=True)
 class WarmStart:
-    """Where a call goes on.
+    """Where a call starts, after the frame before.
 
     Attributes:
         near_m: ``(N * E,)`` metres, depth of the nearest end of the relative map.
@@ -52,7 +52,7 @@ class WarmStart:
 def plan_warm_start(
     pipe: Any, prior: DepthPrior, guidance: GeometryGuidance, call: Mapping[str, Any], size: tuple[int, int]
 ) -> WarmStart | None:
-    """What ``guidance.previous`` gives to a call; ``None`` without one.
+    """The start that ``guidance.previous`` gives to a call; ``None`` without it.
 
     The latent is taken over by a DDIM of two steps or more. Other schedulers, and priors of a single step,
     take over the scale alone.

@@ -77,7 +77,7 @@ NEARLY = math.log(1.04)
 
 @dataclass(frozen=True)
 class Indicators:
-    """Numbers of one image's run; NaN where the run does not tell.
+    """Numbers of one image's run; NaN where unknown.
 
     Attributes:
         confidence: mean of the confidence map, [0, 1].
@@ -142,7 +142,7 @@ class Verdict:
 
     @property
     def sentence(self) -> str:
-        """One line for people; empty where it is trusted."""
+        """A sentence for the user; empty where it is trusted."""
         if self.status == "not judged":
             return "This depth was not judged: neither matches of two views nor known depths test it."
         return "" if self.trusted else f"Do not trust this depth: {' '.join(self.reasons)}"
@@ -255,7 +255,7 @@ def points_agreement(run: Indicators) -> float:
 
 
 def _why_points(run: Indicators) -> str:
-    """On points that differ from the views; empty where they do not."""
+    """A sentence on points that differ from the views; empty where they agree."""
     ratio = run.points_ratio
     if math.isnan(ratio):
         return ""

@@ -99,7 +99,7 @@ class Space:
     from_ends: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
     def ends(self, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-        """Nearest and farthest depth as those at ``x = 0`` and ``x = 1``; the same way back."""
+        """The nearest and the farthest depth as those at ``x = 0`` and ``x = 1``, or the other way around."""
         return (near, far) if self.grows_with_depth else (far, near)
 
     def depth_at(self, x: Tensor, near: Tensor, far: Tensor) -> Tensor:
@@ -171,7 +171,7 @@ class MetricMap:
         check_choice(self.space, "space", SPACES)
 
     def confine(self, x: Tensor) -> Tensor:
-        """``x`` as it may be resampled: clipped with ``"square"``, as it is with ``"softplus"``."""
+        """``x`` ready to be resampled: clipped with ``"square"``, unchanged with ``"softplus"``."""
         return x.clamp(0.0, 1.0) if self.positive == SQUARE else x
 
     def __call__(self, x: Tensor, affine: AffineState) -> Tensor:
