@@ -292,7 +292,7 @@ def _levels(error: Tensor, config: GuidanceConfig) -> list[tuple[Tensor, Tensor]
     inertia = (INERTIA * ratio**4).clamp_max(MOST_INERTIA)
     levels = []
     for k in range(PASSES):
-        share = k / (PASSES - 1) if PASSES > 1 else 1.0
+        share = k / (PASSES - 1)
         least = BROAD_INERTIA ** (1.0 - share) * LEAST_INERTIA**share
         levels.append((broad ** (1.0 - share) * last**share, inertia.clamp_min(least)))
     return levels
