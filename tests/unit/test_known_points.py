@@ -17,6 +17,7 @@ def test_points_land_on_their_pixels_and_the_nearest_wins():
     one_focal_right = torch.tensor([[30.0 / 60.0 * 4.0, 0.0, 4.0]])
     found, left_out = points_to_matches(torch.cat([at_centre, one_focal_right]), K, SIZE, SIZE)
     assert left_out == 0 and found.confidence.sum() == 2
+    assert [float(m) for m in depth_span(found)] == pytest.approx([2.0, 4.0])
     assert found.inverse_depth[0, 24, 32] == 0.5  # (31.5 + 0.6, 23.5 + 0.6), not the one at 5 m
     assert found.inverse_depth[0, 24, 62] == 0.25 or found.inverse_depth[0, 23, 61] == 0.25
     assert found.plane_step == pytest.approx(0.01 * 0.25)
@@ -73,8 +74,3 @@ def test_fit_finds_the_ends_in_spite_of_wrong_points(space):
     assert ((found - truth).abs() / truth).median() < 0.1
     kept = fit_to_points(x, points, metric, (ends[0][:1], ends[1][:1]))
     assert float(kept[0]) == 1.5 and float(kept[1]) == 9.0
-
-
-def test_span_of_points():
-    points, _ = points_to_matches(torch.tensor([[0.0, 0.0, 2.0], [0.4, 0.0, 5.0]]), K, SIZE, SIZE)
-    assert [float(m) for m in depth_span(points)] == pytest.approx([2.0, 5.0])

@@ -82,7 +82,7 @@ def test_inverse_depth_of_exact_tracks() -> None:
     assert np.allclose(1.0 / solve_inverse_depth(tracks, Ts), depth_m, rtol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_perturbed_pose_comes_back(seed: int) -> None:
     rng = np.random.default_rng(seed)
     tracks, Ts, depth_m = make_tracks([TRUE], seed=seed)
@@ -113,7 +113,7 @@ def settled(tracks: Tracks, given: np.ndarray) -> np.ndarray:
     return settle_poses(tracks, given, given, before, rig)[0]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_shift_that_makes_up_for_a_turn_comes_back(seed: int) -> None:
     """A tracker's error: matches lie near their lines and still far from where they should be along them."""
     tracks, Ts, depth_m = make_tracks([TRUE], seed=seed)
@@ -139,9 +139,9 @@ def test_what_most_matches_agree_on_counts_where_the_pose_was_wrong(monkeypatch)
         w = solve_inverse_depth(tracks, settled(tracks, np.linalg.inv(wrong)[None]))
         return float(np.median(np.abs(w * depth_m - 1)[~rough]))
 
-    narrower = np.mean([error(seed) for seed in range(8)])
+    narrower = np.mean([error(seed) for seed in range(4)])
     monkeypatch.setattr("geodiff_plugin.pose.solve._NARROWER_BY", ())
-    assert narrower < 0.9 * np.mean([error(seed) for seed in range(8)])
+    assert narrower < 0.9 * np.mean([error(seed) for seed in range(4)])
 
 
 def test_scale_of_a_refined_pose_is_weighed_between_baseline_and_scene() -> None:
@@ -261,7 +261,7 @@ def test_axes_of_opengl_are_named_where_most_matches_lie_near_the_wrong_lines() 
 @pytest.mark.parametrize("degrees", [0.4, 1.5])
 def test_an_inexact_pose_of_near_cameras_has_no_mistaken_axes(degrees: float) -> None:
     tracks, T = near_cameras((0.5, 3.0, 0.2))
-    for turn in np.random.default_rng(0).normal(size=(40, 3)):
+    for turn in np.random.default_rng(0).normal(size=(20, 3)):
         given = T @ pose(degrees * turn / np.linalg.norm(turn), (0, 0, 0))
         assert find_mistake(tracks, given, T) is None
 
@@ -277,7 +277,7 @@ def test_an_inexact_pose_of_near_cameras_is_no_wrong_intrinsics() -> None:
     """All matches lie within some pixels of many lines then, those of another K among them."""
     near = pose((0.2, -0.4, 0.1), (0.02, 0.004, 0.003))
     tracks, Ts, _ = make_tracks([near], noise_px=0.3)
-    for turn in np.random.default_rng(0).normal(size=(40, 3)):
+    for turn in np.random.default_rng(0).normal(size=(20, 3)):
         given = np.linalg.inv(near @ pose(1.2 * turn / np.linalg.norm(turn), (0, 0, 0)))
         assert find_mistake(tracks, given, Ts[0]) is None
 
