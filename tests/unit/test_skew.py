@@ -52,7 +52,7 @@ HAND_ON = {
     *("guidance.photographs.estimate_rig", "pose.matches.grey_views"),
     *("matching.build.mirrored_pose_preferred", "matching.build.pilot_volume"),
     *("pose.refine.polished", "pose.refine.refine_views", "runtime.confidence.reprojection"),
-    "runtime.verdict.read_indicators",
+    *("runtime.confidence.expected_error", "runtime.verdict.read_indicators"),  # the focal length
 }
 
 
