@@ -122,6 +122,15 @@ def check_number(value: Any, name: str, low: float, high: float, *, integer: boo
     return value
 
 
+def check_positive(value: Any, name: str, unit: str) -> Any:
+    """A finite number above 0, returned as it came."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        bad_type(name, "a number", value)
+    if not 0 < value < float("inf"):
+        bad_value(name, f"a finite number of {unit} above 0", _short(value))
+    return value
+
+
 def check_flag(value: Any, name: str) -> bool:
     """``True`` or ``False``; a number or a text is neither."""
     numpy = sys.modules.get("numpy")

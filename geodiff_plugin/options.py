@@ -6,31 +6,16 @@ Nothing here imports torch: ``geodiff --help`` and what is wrong with an option 
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 from collections.abc import Callable
 from dataclasses import Field, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from geodiff_plugin._checks import bad_value, check_choice, check_number, refuse
+from geodiff_plugin._checks import bad_value, check_choice, check_number, check_positive, refuse
 
 if TYPE_CHECKING:
     from geodiff_plugin.config import GuidanceConfig
-
-__all__ = [
-    "CAMERAS",
-    "OUTPUT",
-    "PRESETS",
-    "RUN",
-    "SPACES",
-    "RunOptions",
-    "check_options",
-    "check_positive",
-    "declare",
-    "flag_of",
-    "help_of",
-]
 
 #: Headings of the help.
 CAMERAS, RUN, OUTPUT = "Cameras", "Prior and run", "Output"
@@ -82,12 +67,6 @@ def help_of(name: str, options: type | None = None) -> str:
     """The sentence that says what an option of ``RunOptions``, or of another dataclass, is."""
     text: str = (options or RunOptions).__dataclass_fields__[name].metadata["help"]  # type: ignore[attr-defined]
     return text
-
-
-def check_positive(value: float, name: str, unit: str, cure: str = "") -> None:
-    """Refuse what is not a finite number above 0."""
-    if not (math.isfinite(value) and value > 0):
-        bad_value(name, f"a finite number of {unit} above 0", value, cure)
 
 
 def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) -> None:

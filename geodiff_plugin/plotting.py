@@ -367,7 +367,7 @@ def check_video(path: str | os.PathLike[str], fps: float) -> None:
     path = Path(path)
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         bad_value("the video", f"a file that ends in {', '.join(VIDEO_SUFFIXES)}", path.name)
-    if path.is_dir():
+    if os.path.isdir(path):
         bad_value("the video", "a file", f"the folder {path}", "Name a file inside of it.")
     if not path.parent.is_dir():
         bad_value("the video", "in an existing folder", path, f"Make the folder {path.parent} first.")

@@ -79,7 +79,7 @@ def tokenizer(tmp_path_factory) -> CLIPTokenizer:
     return CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt"), model_max_length=77)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_pipeline(tokenizer):
     """Factory of tiny random Marigold pipelines; the same seed gives the same weights."""
 

@@ -16,10 +16,13 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior, read_calibration
 from geodiff_plugin.formats import flying_points, make_cloud, rig_from_parameters, write_glb, write_ply
+from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.options import PRESETS, help_of
 from geodiff_plugin.plotting import colour_depth
 
 CATEGORY = "GeoDiff"
+CALIBRATIONS = (".txt", ".yaml", ".yml", ".json", ".xml", ".conf")
+NUMBERS = "(the numbers below)"
 #: The prior that was used last, with the device it is on: a graph is run again and again.
 _LOADED: dict[tuple[str, str], object] = {}
 
@@ -29,10 +32,22 @@ def _prior(name: str) -> object:
     key = (name, str(device))
     if key not in _LOADED:
         _LOADED.clear()
-        pipe = load_prior(name).to(device)
-        pipe.set_progress_bar_config(disable=True)
+        pipe = load_prior(name)
+        parts = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
+        needed = sum(weight.nbytes for part in parts for weight in part.parameters())
+        comfy.model_management.free_memory(2 * needed, device)  # the host's models make room
+        pipe.to(device).set_progress_bar_config(disable=True)
         _LOADED[key] = enable_geometry_guidance(pipe)
     return _LOADED[key]
+
+
+def _input_file(name: str) -> Path:
+    """A file of the host's input folder, and of no other."""
+    folder = Path(folder_paths.get_input_directory()).resolve()
+    path = (folder / name).resolve()
+    if folder not in path.parents:
+        raise ValueError(f"The calibration must lie in ComfyUI's input folder; got {name}.")
+    return path
 
 
 class GeoDiffCalibration:
@@ -44,36 +59,39 @@ class GeoDiffCalibration:
     @classmethod
     def INPUT_TYPES(cls):  # noqa: D102, N802
         number = {"default": 0.0, "min": 0.0, "max": 1e6, "step": 0.01}
+        folder = Path(folder_paths.get_input_directory())
+        files = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in CALIBRATIONS)
         return {
-            "required": {
-                "file": (
-                    "STRING",
-                    {"default": "", "tooltip": "In ComfyUI's input folder; empty: the numbers."},
-                )
-            },
+            "required": {"file": ([NUMBERS, *files], {"tooltip": "Calibration in ComfyUI's input folder."})},
             "optional": {
                 "fx": ("FLOAT", number | {"tooltip": "Focal length, pixels."}),
-                "cx": ("FLOAT", number | {"tooltip": "Principal point, pixels."}),
-                "cy": ("FLOAT", number | {"tooltip": "Principal point, pixels."}),
+                "cx": ("FLOAT", number | {"tooltip": "Principal point, pixels; 0: the image's centre."}),
+                "cy": ("FLOAT", number | {"tooltip": "Principal point, pixels; 0: the image's centre."}),
                 "baseline_m": ("FLOAT", number | {"tooltip": "Distance of the cameras, metres."}),
-                "image": ("IMAGE", {"tooltip": "Left image, for files with several resolutions."}),
-                "cx_right": ("FLOAT", number | {"tooltip": "cx of the right image; 0: taken as cx."}),
+                "image": ("IMAGE", {"tooltip": "Left image: for its centre, and files with several sizes."}),
+                "cx_right": ("FLOAT", number | {"tooltip": "cx of the right image, cx + doffs; 0: as cx."}),
             },
         }
 
     def read(self, file, fx=0.0, cx=0.0, cy=0.0, baseline_m=0.0, image=None, cx_right=0.0):
         """Read the file, or make a rectified rig of the numbers."""
-        if not file:
-            return (rig_from_parameters(fx, fx, cx, cy, baseline_m, cx_right=cx_right or None),)
         size = None if image is None else (image.shape[2], image.shape[1])
-        path = Path(folder_paths.get_input_directory()) / file
-        return (read_calibration(path, image_size=size, baseline_m=baseline_m or None),)
+        if file != NUMBERS:
+            return (read_calibration(_input_file(file), image_size=size, baseline_m=baseline_m or None),)
+        if not (cx and cy) and size is None:
+            raise ValueError("Connect the left image, or give cx and cy.")
+        cx, cy = cx or (size[0] - 1) / 2, cy or (size[1] - 1) / 2
+        return (rig_from_parameters(fx, fx, cx, cy, baseline_m, cx_right=cx_right or None),)
+
+    @classmethod
+    def IS_CHANGED(cls, file, **_):  # noqa: D102, N802
+        return "" if file == NUMBERS else file_digest(_input_file(file))
 
 
 class GeoDiffDepth:
     """Depth in metres of the left image, guided by the right one."""
 
-    CATEGORY, FUNCTION = CATEGORY, "estimate"
+    CATEGORY, FUNCTION, OUTPUT_NODE = CATEGORY, "estimate", True  # shows its verdict
     RETURN_TYPES = ("GEODIFF_DEPTH", "IMAGE", "IMAGE", "MASK", "STRING")
     RETURN_NAMES = ("depth", "coloured", "near_is_white", "confidence", "verdict")
 
@@ -105,7 +123,8 @@ class GeoDiffDepth:
         pipe = _prior(prior)
         lefts, rights = (list(batch.cpu().numpy()) for batch in (left, right))
         make = GeometryGuidance.paper if preset == "paper" else GeometryGuidance
-        guidance = make(rights, (rig.K_left, rig.K_right), rig.E)
+        same = rig.source == "arguments" and np.array_equal(rig.K_left, rig.K_right)
+        guidance = make(rights, rig.K_left if same else (rig.K_left, rig.K_right), rig.E)
         count = guidance.denoising_steps(steps or None, pipe.default_denoising_steps)
         bar = comfy.utils.ProgressBar(count * len(lefts) * ensemble)
 
@@ -123,12 +142,14 @@ class GeoDiffDepth:
             callback_on_step_end=show,
         )
         depth_m = out.prediction[..., 0].astype(np.float32)
-        found = {"depth_m": depth_m, "K": np.asarray(out.K), "image": np.stack(lefts), "rig": rig}
+        depth = {"depth_m": depth_m, "K": np.asarray(out.K), "image": np.stack(lefts), "rig": rig}
         sure = np.ones_like(depth_m) if out.confidence is None else out.confidence[..., 0].astype(np.float32)
-        found["confidence"] = sure
+        depth["confidence"] = sure
         coloured = np.stack([colour_depth(each) for each in depth_m]).astype(np.float32) / 255.0
-        verdict = " ".join([out.verdict.status, *out.warnings, *out.assumed])
-        return found, torch.from_numpy(coloured), _near_is_white(depth_m), torch.from_numpy(sure), verdict
+        sentences = list(dict.fromkeys([*out.verdict.reasons, *out.warnings, *out.assumed]))
+        verdict = " ".join([f"{out.verdict.status.capitalize()}.", *sentences])
+        result = (depth, torch.from_numpy(coloured), _near_is_white(depth_m), torch.from_numpy(sure), verdict)
+        return {"ui": {"text": [verdict]}, "result": result}
 
 
 def _near_is_white(depth_m: np.ndarray) -> torch.Tensor:

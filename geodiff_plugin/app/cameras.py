@@ -20,8 +20,6 @@ from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.guidance.guidance import GeometryGuidance, assume_same_centre
 from geodiff_plugin.types import Rig
 
-__all__ = ["CAMERA_WAYS", "CameraFields", "CameraWay", "Views"]
-
 
 @dataclass(frozen=True)
 class CameraFields:

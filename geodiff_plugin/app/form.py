@@ -1,20 +1,18 @@
-"""Input fields of the page."""
+"""Input fields of the page, and pairs to try it with."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import gradio as gr
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields
-from geodiff_plugin.app.examples import EXAMPLES
-from geodiff_plugin.app.job import MOST_MEMBERS, MOST_STEPS, PRESETS, Request
-from geodiff_plugin.app.priors import Priors
-from geodiff_plugin.options import help_of
-
-__all__ = ["Form", "build_form", "photograph_field"]
+from geodiff_plugin.app.job import LIMITS, Priors, Request
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
+from geodiff_plugin.options import PRESETS, RunOptions, help_of
 
 PICTURE_HEIGHT = 190
 #: Labels of the fields that hold a number or nothing.
@@ -29,6 +27,14 @@ NUMBERS = {
     "far": "Farthest depth, m",
 }
 CAMERA_NAMES = tuple(field.name for field in fields(CameraFields))
+RUN_NAMES = ("prior", "preset", "steps", "ensemble", "resolution", "near", "far", "seed")
+PAIRS_FOLDER = Path(__file__).resolve().parent / "pairs"
+#: Folder, ending of its images -> what the page calls it; ``tests.scenes.make_examples`` renders them anew.
+EXAMPLES = {
+    (DEMO_PAIR_FOLDER, "png"): "A room, 12 cm apart",
+    (PAIRS_FOLDER / "table", "jpg"): "A table, 6 cm apart",
+    (PAIRS_FOLDER / "street", "jpg"): "A street, 50 cm apart",
+}
 
 
 @dataclass(frozen=True)
@@ -36,12 +42,16 @@ class Form:
     """The components, and how their values become a request.
 
     Attributes:
-        fields: by the name of what they fill in, of ``Request`` or ``CameraFields``.
+        fields: by the name of what they fill in, of ``Request``, ``CameraFields`` or ``RunOptions``.
+        untouched: the values that they begin with.
+        examples: the gallery of ``EXAMPLES``.
         run: starts a job.
         stop: ends it.
     """
 
     fields: dict[str, Any]
+    untouched: dict[str, Any]
+    examples: gr.Gallery
     run: gr.Button
     stop: gr.Button
 
@@ -51,9 +61,17 @@ class Form:
         for name, label in NUMBERS.items():
             named[name] = _number(named[name], label)
         cameras = CameraFields(**{name: named.pop(name) or None for name in CAMERA_NAMES})
-        for name in ("steps", "members", "resolution", "seed"):
-            named[name] = int(named[name] or 0)
-        return Request(**named, cameras=cameras)
+        run = {name: named.pop(name) for name in RUN_NAMES}
+        run |= {name: int(run[name] or 0) for name in ("steps", "ensemble", "resolution", "seed")}
+        run |= {name: run[name] or None for name in ("steps", "resolution")}  # 0: the prior's own
+        return Request(**named, cameras=cameras, run=RunOptions(**run))
+
+    def example(self, number: int) -> list[Any]:
+        """A value for every field: the files of an example, and all others as they began."""
+        folder, ending = list(EXAMPLES)[number]
+        files = {side: str(folder / f"{side}.{ending}") for side in ("left", "right")}
+        files["calibration"] = str(folder / "calib.txt")
+        return list((self.untouched | files).values())
 
 
 def _number(text: str | None, label: str) -> float | None:
@@ -85,82 +103,87 @@ def photograph_field(label: str, name: str) -> gr.Image:
 
 
 def _photographs() -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    drawn: dict[str, Any] = {}
     with gr.Row():
         for name, label in (("left", "Left photograph"), ("right", "Right photograph")):
-            found[name] = photograph_field(label, name)
+            drawn[name] = photograph_field(label, name)
     with gr.Accordion("A third photograph", open=False):
-        found["third"] = photograph_field("Third photograph, of the left camera", "third")
-        found["third_pose"] = gr.Textbox(
+        drawn["third"] = photograph_field("Third photograph, of the left camera", "third")
+        drawn["third_pose"] = gr.Textbox(
             label="Its pose in the left camera's frame, metres",
             info="4x4, row by row: a camera 0.1 m higher has -0.1 as the fourth number of the second row.",
             placeholder="1 0 0 0    0 1 0 -0.1    0 0 1 0    0 0 0 1",
             lines=2,
         )
-    return found
+    return drawn
 
 
 def _cameras() -> dict[str, Any]:
     ways = [(way.label, name) for name, way in CAMERA_WAYS.items()]
     way = gr.Radio(ways, value=ways[0][1], label="Where the cameras are", elem_id="way")
-    found: dict[str, Any] = {"way": way}
+    drawn: dict[str, Any] = {"way": way}
     with gr.Column(visible=True) as files:
-        found["calibration"] = gr.File(label="Calibration file", height=140, elem_id="calibration")
+        drawn["calibration"] = gr.File(label="Calibration file", height=140, elem_id="calibration")
         with gr.Accordion("One file per camera (MVSNet, ROS, COLMAP)", open=False):
-            found["second_calibration"] = gr.File(label="Second file", height=140)
+            drawn["second_calibration"] = gr.File(label="Second file", height=140)
     with gr.Row(visible=False) as lens:
         for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
-            found[name] = _optional(name, placeholder)
-        found["cx_right"] = _optional("cx_right", "assumed as cx")
-    found["baseline_m"] = _optional("baseline_m", "as the calibration file says")
+            drawn[name] = _optional(name, placeholder)
+        note = "cx + doffs; if it is not cx and left empty, every depth is off"
+        drawn["cx_right"] = _optional("cx_right", "assumed as cx", info=note)
+    drawn["baseline_m"] = _optional("baseline_m", "as the calibration file says")
 
     def show(chosen: str) -> tuple[Any, Any]:
-        fields = CAMERA_WAYS[chosen].fields
-        return gr.update(visible="calibration" in fields), gr.update(visible="fx" in fields)
+        asked = CAMERA_WAYS[chosen].fields
+        return gr.update(visible="calibration" in asked), gr.update(visible="fx" in asked)
 
     way.change(show, way, [files, lens], queue=False, api_visibility="private")
-    return found
+    return drawn
 
 
 def _settings(priors: Priors) -> dict[str, Any]:
+    drawn: dict[str, Any] = {}
     with gr.Accordion("Settings", open=False):
         with gr.Row():
-            prior = gr.Dropdown(list(priors.names), value=priors.names[0], label="Prior")
-            preset = gr.Dropdown(list(PRESETS), value="default", label="Preset", info=help_of("preset"))
+            drawn["prior"] = gr.Dropdown(list(priors.names), value=priors.names[0], label="Prior")
+            drawn["preset"] = gr.Dropdown(
+                list(PRESETS), value="default", label="Preset", info=help_of("preset")
+            )
         with gr.Row():
-            steps = gr.Slider(0, MOST_STEPS, value=0, step=1, label="Steps", info=help_of("steps"))
-            members = gr.Slider(1, MOST_MEMBERS, value=1, step=1, label="Ensemble", info=help_of("ensemble"))
+            for name, label, least in (("steps", "Steps", 0), ("ensemble", "Ensemble", 1)):
+                drawn[name] = gr.Slider(
+                    least, LIMITS[name], value=least, step=1, label=label, info=help_of(name)
+                )
         with gr.Row():
-            resolution = gr.Slider(
+            drawn["resolution"] = gr.Slider(
                 0, 1536, value=0, step=32, label="Resolution, px", info="0: the prior's own"
             )
-            seed = gr.Number(0, precision=0, minimum=0, label="Seed", min_width=90)
+            drawn["seed"] = gr.Number(0, precision=0, minimum=0, label="Seed", min_width=90)
         with gr.Row():
-            near, far = _optional("near", "unknown"), _optional("far", "unknown")
-        show_prior = gr.Checkbox(True, label="Also show what the prior says alone (one more plain call)")
-    return {
-        "prior": prior,
-        "preset": preset,
-        "steps": steps,
-        "members": members,
-        "resolution": resolution,
-        "seed": seed,
-        "near": near,
-        "far": far,
-        "show_prior": show_prior,
-    }
+            drawn |= {name: _optional(name, "unknown") for name in ("near", "far")}
+        drawn["show_prior"] = gr.Checkbox(
+            True, label="Also show what the prior says alone (one more plain call)"
+        )
+    return drawn
 
 
 def build_form(priors: Priors) -> Form:
     """Draw the fields into the open gradio context."""
-    found = _photographs() | _cameras() | _settings(priors)
+    examples = gr.Gallery(
+        [(str(folder / f"left.{ending}"), label) for (folder, ending), label in EXAMPLES.items()],
+        label="Try an example, rendered by this project: one click runs it",
+        columns=len(EXAMPLES),
+        rows=1,
+        height=150,
+        allow_preview=False,
+        interactive=False,
+        buttons=[],
+        object_fit="cover",
+        elem_id="examples",
+    )
+    drawn = _photographs() | _cameras() | _settings(priors)
+    untouched = {name: component.value for name, component in drawn.items()}
     with gr.Row():
         run = gr.Button("Estimate depth", variant="primary", scale=3, elem_id="run")
         stop = gr.Button("Stop", scale=1, elem_id="stop")
-    gr.Examples(
-        [list(example.paths) for example in EXAMPLES],
-        inputs=[found["left"], found["right"], found["calibration"]],
-        example_labels=[example.label for example in EXAMPLES],
-        label="Examples, rendered by this project",
-    )
-    return Form(found, run, stop)
+    return Form(drawn, untouched, examples, run, stop)

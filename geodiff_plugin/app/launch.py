@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib.util
 import os
+import shutil
+import signal
+import sys
+import tempfile
 from typing import Any
+from urllib.parse import urlsplit
 
-from geodiff_plugin._checks import bad_value, check_number, refuse
-
-__all__ = ["launch_page", "run_app"]
+from geodiff_plugin._checks import bad_value, refuse
 
 #: What the page may load and talk to: itself. A browser that is offline misses nothing.
 POLICY = (
-    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob: ws: wss:; "
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob:; "
     "worker-src 'self' blob:"
 )
 QUIET = {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_DISABLE_TELEMETRY": "1"}
 SESSIONS_KEPT = 200
+LARGEST_FILE = "40mb"
 
 
 def _check_gradio() -> None:
@@ -28,7 +33,7 @@ def _check_gradio() -> None:
 
 
 class _OwnOnly:
-    """ASGI middleware: adds the policy to every page."""
+    """ASGI middleware: adds the policy to every page, and refuses requests that another site's page makes."""
 
     def __init__(self, app: Any) -> None:
         self.app = app
@@ -36,13 +41,29 @@ class _OwnOnly:
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         async def say(message: Any) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] = [
-                    *message.get("headers", []),
-                    (b"content-security-policy", POLICY.encode()),
-                ]
+                headers = [*message.get("headers", []), (b"content-security-policy", POLICY.encode())]
+                message["headers"] = headers
             await send(message)
 
-        await self.app(scope, receive, say if scope["type"] == "http" else send)
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+        elif _is_foreign(dict(scope["headers"])):
+            await say({"type": "http.response.start", "status": 403, "headers": []})
+            await say({"type": "http.response.body", "body": b"Requests of other sites are refused."})
+        else:
+            await self.app(scope, receive, say)
+
+
+def _is_foreign(headers: dict[bytes, bytes]) -> bool:
+    origin = headers.get(b"origin", b"").decode("latin-1")
+    return bool(origin) and urlsplit(origin).netloc != headers.get(b"host", b"").decode("latin-1")
+
+
+def _own_folder() -> None:
+    """Let uploads and results lie in a folder that goes with this process."""
+    folder = tempfile.mkdtemp(prefix="geodiff-app-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ["GRADIO_TEMP_DIR"] = tempfile.tempdir = folder
 
 
 def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **options: Any) -> Any:
@@ -61,21 +82,31 @@ def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **
     """
     _check_gradio()
     os.environ.update(QUIET)  # gradio looks at it when it is imported
+    _own_folder()
+    from starlette.middleware import Middleware
+
+    from geodiff_plugin.app.job import Priors
     from geodiff_plugin.app.look import CSS
-    from geodiff_plugin.app.page import THEME, build_page
-    from geodiff_plugin.app.priors import Priors
+    from geodiff_plugin.app.page import build_page
+    from geodiff_plugin.app.panels import THEME
     from geodiff_plugin.runtime.machine import pick_device
 
     offered = Priors(priors, pick_device(device))
     offered.get(priors[0])  # a name that cannot be loaded is told here, not to the first visitor
     page = build_page(offered)
     return page.queue(default_concurrency_limit=8).launch(
-        theme=THEME, css=CSS, state_session_capacity=SESSIONS_KEPT, footer_links=[], **options
+        theme=THEME,
+        css=CSS,
+        state_session_capacity=SESSIONS_KEPT,
+        max_file_size=LARGEST_FILE,
+        footer_links=[],
+        app_kwargs={"middleware": [Middleware(_OwnOnly)]},
+        **options,
     )
 
 
 def run_app(priors: tuple[str, ...], device: str, host: str, port: int | None, browser: bool) -> None:
-    """Serve until Ctrl-C.
+    """Serve until Ctrl-C, or until the process is asked to end.
 
     Args:
         priors: as in ``launch_page``.
@@ -84,21 +115,11 @@ def run_app(priors: tuple[str, ...], device: str, host: str, port: int | None, b
         port: to listen on; ``None`` takes the first free one from 7860 on.
         browser: open the page in a browser.
     """
-    if port is not None:
-        check_number(port, "--port", 1, 65535, integer=True)
     _check_gradio()
-    from starlette.middleware import Middleware
-
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that what visitors gave is deleted
+    where = {"server_name": host, "server_port": port, "inbrowser": browser, "share": False}
     try:
-        launch_page(
-            priors,
-            device,
-            server_name=host,
-            server_port=port,
-            inbrowser=browser,
-            share=False,
-            app_kwargs={"middleware": [Middleware(_OwnOnly)]},
-        )
+        launch_page(priors, device, **where)
     except OSError as error:
         if "empty port" not in str(error):
             raise

@@ -1,40 +1,58 @@
-"""Texts and style sheet of the page."""
+"""Texts, theme and style sheet of the page."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Sequence
 
-__all__ = ["BUSY", "CSS", "HEADER", "HOW_TO_MEASURE", "WAITING", "failed", "finished", "stopped"]
-
 HEADER = """
 <div class="head">
   <h1>Depth in metres from two photographs</h1>
   <p>A diffusion model knows shapes, a second view with a known camera knows metres.
-  Drop both photographs, say where the cameras are, and measure.</p>
+  Drop both photographs, say where the cameras are, and measure. What you give is deleted when you close the
+  page, or after ten minutes.</p>
 </div>
 """
 BUSY = '<div class="say say-busy"></div>'
-WAITING = '<div class="say say-quiet">Results appear here. Try one of the examples below the settings.</div>'
+WAITING = '<div class="say say-quiet">Results appear here. Try one of the examples above the form.</div>'
 HOW_TO_MEASURE = (
-    '<div class="say say-quiet">Click a point to read its depth, a second one for the distance.</div>'
+    '<div class="say say-quiet">Click a point to read its depth, or type its pixel; a second one gives the '
+    "distance, further ones more segments.</div>"
 )
+STALE = "These results are of earlier inputs. Estimate again."
+
+#: Scripts of the page: results are marked as those of earlier inputs from the first change on.
+RUN_BEGINS = "() => { window.changed = false; document.getElementById('results').classList.remove('stale'); }"
+CHANGED = (
+    "() => { window.changed = true; "
+    "if (document.querySelector('#status .verdict')) "
+    "document.getElementById('results').classList.add('stale'); }"
+)
+RUN_ENDS = "() => { if (window.changed) document.getElementById('results').classList.add('stale'); }"
 
 CSS = """
 .gradio-container { max-width: 1500px !important; margin: 0 auto !important; }
 .head h1 { font-size: 1.65rem; font-weight: 700; margin: 0.2rem 0; }
 .head p { color: var(--body-text-color-subdued); margin: 0 0 0.3rem; max-width: 60rem; }
-.say { border-radius: 8px; padding: 0.7rem 1rem; border: 1px solid var(--border-color-primary);
-  background: var(--background-fill-secondary); line-height: 1.45; }
+.say, .verdict { border-radius: 8px; padding: 0.7rem 1rem; line-height: 1.45;
+  border: 1px solid var(--border-color-primary); background: var(--background-fill-secondary); }
 .say-busy { min-height: 4.6rem; }
 .say-quiet { color: var(--body-text-color-subdued); }
-.say-bad { border-color: #e03131;
-  background: color-mix(in srgb, #e03131 10%, var(--background-fill-primary)); }
-.say ul { margin: 0.4rem 0 0; padding-left: 1.2rem; }
-.figures { display: flex; flex-wrap: wrap; gap: 0.4rem 2rem; }
+.say-bad, .verdict { --tone: #b91c1c; border-color: var(--tone); border-left-width: 6px;
+  background: color-mix(in srgb, var(--tone) 10%, var(--background-fill-primary)); }
+.verdict b:first-child { font-size: 1.1rem; }
+.verdict.trusted { --tone: #15803d; }
+.verdict.not-judged { --tone: #a16207; }
+.say ul, .verdict ul { margin: 0.4rem 0 0; padding-left: 1.2rem; }
+#results::before { content: "STALE_TEXT"; display: none; border-radius: 8px; padding: 0.5rem 1rem;
+  background: #a16207; color: white; font-weight: 600; }
+#results.stale::before { display: block; }
+#results.stale > * { opacity: 0.45; }
+#examples .caption-label { font-size: 0.8rem; }
+.figures { display: flex; flex-wrap: wrap; gap: 0.4rem 2rem; margin-top: 0.3rem; }
 .figures div { display: flex; flex-direction: column; }
 .figures b { font-size: 1.15rem; font-variant-numeric: tabular-nums; }
-.figures span { color: var(--body-text-color-subdued); font-size: 0.82rem; }
+.figures span, .cameras { color: var(--body-text-color-subdued); font-size: 0.82rem; }
 .legend { padding: 0.4rem 1.2rem 0.1rem; }
 .legend-bar { height: 14px; border-radius: 4px; }
 .legend-ticks { position: relative; height: 1.3rem; font-size: 0.82rem; font-variant-numeric: tabular-nums; }
@@ -46,30 +64,42 @@ CSS = """
 .readings th { color: var(--body-text-color-subdued); font-weight: 500; font-size: 0.85rem; }
 .distance { font-size: 1.55rem; font-weight: 700; white-space: nowrap; font-variant-numeric: tabular-nums;
   margin: 0.1rem 0 0.4rem; }
-.field-note { color: var(--body-text-color-subdued); font-size: 0.82rem; }
 #measure-picture img, #measure-picture button { cursor: crosshair; }
-footer { opacity: 0.7; }
-"""
+footer { opacity: 0.8; }
+""".replace("STALE_TEXT", STALE)
+
+
+def _box(kind: str, role: str, body: str) -> str:
+    return f'<div class="{kind}" role="{role}">{body}</div>'
 
 
 def failed(sentence: str) -> str:
     """A box that says what was wrong with the input, or that there is a defect."""
-    return f'<div class="say say-bad" role="alert"><b>That did not work.</b> {html.escape(sentence)}</div>'
+    return _box("say say-bad", "alert", f"<b>That did not work.</b> {html.escape(sentence)}")
 
 
 def stopped() -> str:
     """A box after the visitor's own stop."""
-    return '<div class="say say-quiet">Stopped.</div>'
+    return _box("say say-quiet", "status", "Stopped.")
 
 
-def finished(status: str, figures: Sequence[tuple[str, str]], warnings: Sequence[str]) -> str:
-    """A box of the verdict, numbers with their names, and warnings under them."""
+def banner(status: str, more: str = "") -> str:
+    """The verdict in its colour, with HTML under it."""
+    role = "status" if status == "trusted" else "alert"
+    return _box(f"verdict {status.replace(' ', '-')}", role, f"<b>{status.capitalize()}</b>{more}")
+
+
+def finished(
+    status: str, figures: Sequence[tuple[str, str]], sentences: Sequence[str], cameras: str = ""
+) -> str:
+    """The banner with numbers and their names, sentences, and the cameras as understood.
+
+    Where the result is not trusted the sentences come first, and the numbers stand back behind them.
+    """
     cells = "".join(
         f"<div><b>{html.escape(value)}</b><span>{html.escape(name)}</span></div>" for value, name in figures
     )
-    items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in warnings)
+    items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
     numbers, notes = f'<div class="figures">{cells}</div>', f"<ul>{items}</ul>" if items else ""
-    if status != "trusted":  # the reasons come before the numbers
-        bad = "say say-bad" if status == "not trusted" else "say"
-        return f'<div class="{bad}" role="alert"><b>{status.capitalize()}</b>{notes}{numbers}</div>'
-    return f'<div class="say"><b>Trusted</b>{numbers}{notes}</div>'
+    body = numbers + notes if status == "trusted" else notes + numbers
+    return banner(status, f'{body}<div class="cameras">{html.escape(cameras)}</div>')

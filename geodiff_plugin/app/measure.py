@@ -12,8 +12,6 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["Reading", "distance_m", "read_pixel"]
-
 #: ``confidence`` is the probability that a depth is within this share of the truth.
 CONFIDENT_WITHIN = 0.1
 #: Confidences beyond these say no more about the spread than these do.

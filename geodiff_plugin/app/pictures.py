@@ -11,29 +11,14 @@ from PIL import Image, ImageDraw, ImageFont
 from geodiff_plugin.app.measure import Reading, distance_m
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
 
-__all__ = [
-    "colour_relative",
-    "colour_share",
-    "in_metres",
-    "legend_of_depth",
-    "legend_of_share",
-    "marked",
-    "metres",
-]
-
-MARKS = ("A", "B")
 LEGEND_STOPS = 24
+MARK = "#c2410c"
 
 
 def metres(value: float, spread: float | None = None) -> str:
     """``2.31 m`` or ``2.31 ± 0.07 m``; to the millimetre where the spread is below half a centimetre."""
     decimals = 3 if spread is not None and spread < 0.005 else 2
     return f"{value:.{decimals}f}{'' if spread is None else f' ± {spread:.{decimals}f}'} m"
-
-
-def in_metres(depth_m: np.ndarray) -> np.ndarray:
-    """``(H, W, 3)`` uint8: the depth map in the colours of ``legend_of_depth``."""
-    return colour_depth(depth_m)
 
 
 def colour_relative(values: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
@@ -77,33 +62,28 @@ def legend_of_share(most: float, caption: str) -> str:
     return _legend(colours, [(s, f"{100 * s * most:.0f} %") for s in (0, 0.25, 0.5, 0.75, 1)], caption)
 
 
-def marked(picture: np.ndarray, points: Sequence[tuple[tuple[int, int], Reading]]) -> np.ndarray:
-    """A copy of a picture with the points that were clicked, and the distance of two between them.
+def marked(picture: np.ndarray, points: Sequence[tuple[tuple[int, int], str, Reading]]) -> np.ndarray:
+    """A copy of a picture with the points that were chosen, and the distance of every two of them.
 
     Args:
         picture: ``(h, w, 3)`` uint8.
-        points: none, one or two, each ``(pixel of this picture, reading)``.
+        points: ``(pixel of this picture, name, reading)``; the first two are a segment, and so on.
     """
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image)
     unit = max(image.size) / 100
     radius, font = max(3.0, 0.8 * unit), ImageFont.load_default(size=max(11.0, 2.8 * unit))
-    pixels = [pixel for pixel, _ in points]
-    if len(pixels) == 2:
-        draw.line(pixels, fill="black", width=max(3, round(0.7 * unit)))
-        draw.line(pixels, fill="white", width=max(1, round(0.3 * unit)))
-    for (x, y), name in zip(pixels, MARKS, strict=False):
+    segments = list(zip(points[::2], points[1::2], strict=False))
+    for (a, _, _), (b, _, _) in segments:
+        draw.line([a, b], fill="black", width=max(3, round(0.7 * unit)))
+        draw.line([a, b], fill="white", width=max(1, round(0.3 * unit)))
+    for (x, y), name, _ in points:
         box = (x - radius, y - radius, x + radius, y + radius)
-        draw.ellipse(box, fill="#e8590c", outline="white", width=max(1, round(0.25 * unit)))
+        draw.ellipse(box, fill=MARK, outline="white", width=max(1, round(0.25 * unit)))
         _label(draw, (x, y - 2.6 * radius), name, font)
-    if len(pixels) == 2:
-        middle = tuple((a + b) / 2 for a, b in zip(*pixels, strict=True))
-        _label(
-            draw,
-            (middle[0], middle[1] - 2.2 * radius),
-            f"{distance_m(*(reading for _, reading in points))[0]:.2f} m",
-            font,
-        )
+    for (a, _, first), (b, _, second) in segments:
+        middle = ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2 - 2.2 * radius)
+        _label(draw, middle, f"{distance_m(first, second)[0]:.2f} m", font)
     return np.asarray(image)
 
 

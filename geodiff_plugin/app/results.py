@@ -1,36 +1,32 @@
-"""Contents of the result panels of the page."""
+"""Contents of the result panels of the page, and the files to take home."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from zipfile import ZIP_STORED, ZipFile
 
-import gradio as gr
 import numpy as np
 from PIL import Image
 
 from geodiff_plugin.app import look
-from geodiff_plugin.app.files import report_of, write_files, write_scene
 from geodiff_plugin.app.job import Result
 from geodiff_plugin.app.measure import Reading, distance_m, read_pixel
-from geodiff_plugin.app.panels import Panels
-from geodiff_plugin.app.pictures import (
-    colour_relative,
-    colour_share,
-    in_metres,
-    legend_of_depth,
-    legend_of_share,
-    marked,
-    metres,
-)
-
-__all__ = ["Shown", "comparison", "everything", "measurement", "scene"]
+from geodiff_plugin.app.pictures import colour_relative, marked, metres
+from geodiff_plugin.cli.exports import cameras_of, write_maps
+from geodiff_plugin.cli.report import plain, result_entries
+from geodiff_plugin.formats import flying_points, make_cloud, write_glb
+from geodiff_plugin.plotting import colour_depth, colour_share
 
 #: Pictures on the page are no larger than this; files to take home have every pixel.
 LARGEST_SIDE = 1600
-#: Where the cloud is looked at from: degrees around it and down from above, and a share of its depth.
-VIEW_ANGLES, VIEW_FROM = (90, 75), 1.05
+#: More points than this make a browser slow; the files to take home hold all.
+MOST_POINTS_SHOWN = 250_000
+NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+Pixels = list[tuple[int, int]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,39 +36,41 @@ class Shown:
     Attributes:
         result: of the job.
         folder: of its own.
-        scale: size of the pictures on the page / size of the maps.
     """
 
     result: Result
     folder: Path
-    scale: float
 
-    def picture(self, name: str) -> np.ndarray:
-        """``(h, w, 3)`` uint8, as large as the page shows it."""
+    @property
+    def scale(self) -> float:
+        """Size of the pictures on the page / size of the maps."""
+        return min(1.0, LARGEST_SIDE / max(self.result.depth_m.shape))
+
+    def picture(self, name: str) -> np.ndarray | None:
+        """``(h, w, 3)`` uint8, as large as the page shows it; ``None`` where the result has no such map."""
         full = self._full(name)
-        if self.scale == 1:
+        if full is None or self.scale == 1:
             return full
         size = (round(full.shape[1] * self.scale), round(full.shape[0] * self.scale))
         return np.asarray(Image.fromarray(full).resize(size, Image.Resampling.LANCZOS))
 
-    def _full(self, name: str) -> np.ndarray:
+    def _full(self, name: str) -> np.ndarray | None:
         result = self.result
-        if name == "photograph":
+        if name == "photograph" or (name == "prior" and result.prior_map is None):
             return np.rint(np.clip(result.views.left, 0, 1) * 255).astype(np.uint8)
-        if name == "depth":
-            return in_metres(result.depth_m)
-        if name == "prior" and result.prior_map is not None:
+        if name == "prior":
+            assert result.prior_map is not None
             return colour_relative(result.prior_map, result.depth_m)
-        if name == "confidence" and result.confidence is not None:
-            return colour_share(result.confidence)
-        if name == "error" and result.error is not None:
-            return colour_share(result.error, self.most_error)
-        raise KeyError(name)
+        if name == "depth":
+            return colour_depth(result.depth_m)
+        values = result.map(name)
+        most = self.most_error if name == "photometric_error" else 1.0
+        return None if values is None else colour_share(values, most)
 
     @property
     def most_error(self) -> float:
         """The error at the upper end of its colours."""
-        error = self.result.error
+        error = self.result.map("photometric_error")
         return 1.0 if error is None else max(float(np.percentile(error, 99)), 1e-3)
 
     def reading(self, pixel: tuple[int, int]) -> Reading:
@@ -81,19 +79,17 @@ class Shown:
         height, width = result.depth_m.shape
         x, y = (round((value + 0.5) / self.scale - 0.5) for value in pixel)
         inside = (min(max(x, 0), width - 1), min(max(y, 0), height - 1))
-        return read_pixel(result.depth_m, result.K, inside, result.confidence, result.uncertainty_m)
+        return read_pixel(
+            result.depth_m, result.K, inside, result.map("confidence"), result.map("uncertainty")
+        )
 
 
-def comparison(shown: Shown, beside: str) -> tuple[np.ndarray, np.ndarray]:
-    """The two pictures of the slider."""
-    has_prior = shown.result.prior_map is not None
-    return shown.picture(beside if has_prior else "photograph"), shown.picture("depth")
-
-
-def measurement(shown: Shown, clicks: list[tuple[int, int]], under: str) -> tuple[np.ndarray, str]:
-    """The picture with the points of these clicks, and what they say as HTML."""
-    readings = [shown.reading(pixel) for pixel in clicks]
-    picture = marked(shown.picture(under), list(zip(clicks, readings, strict=True)))
+def measurement(shown: Shown, pixels: Pixels, under: str) -> tuple[np.ndarray, str]:
+    """The picture with the points of these pixels, and what they say as HTML; every two are a segment."""
+    readings = [shown.reading(pixel) for pixel in pixels]
+    picture = shown.picture(under)
+    assert picture is not None
+    picture = marked(picture, list(zip(pixels, NAMES, readings, strict=False)))
     return picture, _words(readings) if readings else look.HOW_TO_MEASURE
 
 
@@ -101,70 +97,86 @@ def _words(readings: list[Reading]) -> str:
     rows = "".join(
         f"<tr><td><b>{name}</b></td><td>{metres(reading.depth_m, reading.spread_m)}</td>"
         f"<td>{'unknown' if reading.confidence is None else f'{100 * reading.confidence:.0f} %'}</td></tr>"
-        for name, reading in zip("AB", readings, strict=False)
+        for name, reading in zip(NAMES, readings, strict=False)
     )
     table = f'<table class="readings"><tr><th></th><th>depth</th><th>confidence</th></tr>{rows}</table>'
-    if len(readings) < 2:
-        return f'<div class="say">{table}<p>Click a second point for the distance.</p></div>'
-    length = metres(*distance_m(*readings))
-    note = "± is one standard deviation, from the confidence that each depth is within 10 %."
-    return (
-        f'<div class="say"><div>Distance A to B</div><div class="distance">{length}</div>{table}'
-        f'<p class="legend-caption" style="text-align:left">{note}</p></div>'
+    segments = "".join(
+        f'<div>Distance {names}</div><div class="distance">{metres(*distance_m(a, b))}</div>'
+        for names, a, b in _segments(readings)
     )
+    note = (
+        "± is one standard deviation of the depth, from its confidence and the spread of the members. Errors "
+        "have heavier tails than a normal distribution: one in ten may be beyond twice that."
+    )
+    more = "<p>Choose a second point for the distance.</p>" if len(readings) % 2 else ""
+    return f'<div class="say">{segments}{table}{more}<p class="legend-caption">{note}</p></div>'
 
 
-def scene(shown: Shown, least_confidence: float) -> tuple[Any, str]:
-    """The view of the cloud of the sure points from behind the cameras, and a line about it."""
-    sure = least_confidence if shown.result.confidence is not None else 0.0
-    path = shown.folder / f"scene-{round(100 * sure)}.glb"
-    count = write_scene(path, shown.result, sure)
-    share = 100 * count / shown.result.depth_m.size
-    away = VIEW_FROM * float(np.percentile(shown.result.depth_m, 90))
-    view = gr.Model3D(str(path), camera_position=(*VIEW_ANGLES, away))
-    return view, f'<div class="legend-caption">{count:,} points, {share:.0f} % of the pixels</div>'
+def _segments(readings: list[Reading]) -> list[tuple[str, Reading, Reading]]:
+    named = list(zip(NAMES, readings, strict=False))
+    pairs = zip(named[::2], named[1::2], strict=False)
+    return [(f"{a} to {b}", first, second) for (a, first), (b, second) in pairs]
 
 
-def _figures(shown: Shown) -> list[tuple[str, str]]:
-    report, result = report_of(shown.result), shown.result
-    depth = report["depth"]
-    figures = [
-        (f"{depth['min_m']:.2f} m to {depth['max_m']:.2f} m", "nearest and farthest"),
-        (f"{depth['median_m']:.2f} m", "median depth"),
-    ]
-    if not result.verdict.trusted:  # what is not trusted is not praised
-        return [(f"{figures[1][0]}, unconfirmed", "median depth"), *_seconds(shown)]
-    if result.visible is not None:
-        figures.append((f"{100 * depth['visible_fraction']:.0f} %", "seen by both cameras"))
-    if result.confidence is not None:
-        figures.append((f"{100 * depth['median_confidence']:.0f} %", "median confidence"))
-    return [*figures, *_seconds(shown)]
+def readings_csv(shown: Shown, pixels: Pixels) -> str:
+    """The points and segments as CSV: pixels of the photograph, metres."""
+    readings = [shown.reading(pixel) for pixel in pixels]
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(("name", "x_px", "y_px", "x_m", "y_m", "z_m", "spread_m", "confidence", "distance_m"))
+    for name, each in zip(NAMES, readings, strict=False):
+        point = (f"{value:.4f}" for value in each.point_m)
+        writer.writerow((name, *each.pixel, *point, each.spread_m, each.confidence, ""))
+    for name, a, b in _segments(readings):
+        length, spread = distance_m(a, b)
+        writer.writerow((name, *[""] * 5, spread, "", f"{length:.4f}"))
+    return text.getvalue()
 
 
-def _seconds(shown: Shown) -> list[tuple[str, str]]:
-    return [(f"{sum(shown.result.seconds.values()):.1f} s", "computing")]
+def write_scene(path: Path, result: Result, least_confidence: float, most: int = MOST_POINTS_SHOWN) -> int:
+    """Cloud and cameras as GLB, by default light enough for a browser; how many points there are in all."""
+    keep, confidence = ~flying_points(result.depth_m), result.map("confidence")
+    if confidence is not None:
+        keep &= confidence >= least_confidence
+    cloud = make_cloud(result.depth_m, result.views.left, result.K, keep)
+    write_glb(path, cloud.thinned(most), cameras_of(result.output, result.guidance))
+    return len(cloud.points_m)
 
 
-def everything(panels: Panels, shown: Shown, beside: str, under: str) -> dict[Any, Any]:
-    """Every panel's value for a new result, but the cloud's, which is drawn when its tab is opened."""
-    result = shown.result
-    picture, words = measurement(shown, [], under)
-    legend = legend_of_depth(result.depth_m)
-    sure = "probability that a depth is within 10 % of the truth"
-    differ = "difference between the photograph and the other view brought to it; dark where they agree"
-    values: dict[Any, Any] = {
-        panels.status: look.finished(result.verdict.status, _figures(shown), result.warnings),
-        panels.slider: comparison(shown, beside),
-        panels.depth_legend: legend,
-        panels.picture: picture,
-        panels.readings: words,
-        panels.files: [str(path) for path in write_files(shown.folder, result)],
+def write_files(folder: Path, result: Result) -> list[Path]:
+    """Write everything that can be downloaded.
+
+    Returns:
+        The files, most wanted first: ``everything.zip`` has all.
+    """
+    counts = write_maps(folder, result.output, result.views.left)
+    write_scene(folder / "cloud.glb", result, 0.0, result.depth_m.size)
+    rigs = result.guidance.rigs
+    report = result_entries(result.output, result.guidance) | {
+        "warnings": result.warnings,
+        "cameras": [
+            {"K": rig.K_right, "E": E}
+            for rig, (_, E, _) in zip(rigs, cameras_of(result.output, result.guidance)[1:], strict=True)
+        ],
+        "photographs": [Path(name).name for name in result.views.names],
+        "settings": result.request.run.as_json(),
+        "seconds": {name: round(value, 3) for name, value in result.seconds.items()},
+        "files": counts,
     }
-    for name, image, note, most, caption in (
-        ("confidence", panels.confidence, panels.confidence_legend, 1.0, sure),
-        ("error", panels.error, panels.error_legend, 0.0, differ),
-    ):
-        known = getattr(result, name) is not None
-        values[image] = shown.picture(name) if known else None
-        values[note] = legend_of_share(most or shown.most_error, caption) if known else ""
-    return values
+    text = json.dumps(plain(report), indent=2, allow_nan=False, default=str)
+    (folder / "report.json").write_text(f"{text}\n", encoding="utf-8")
+    first = [
+        "depth_mm.png",
+        "depth.npy",
+        "depth.png",
+        "confidence.npy",
+        "cloud.ply",
+        "cloud.glb",
+        "report.json",
+    ]
+    others = sorted(path.name for path in folder.iterdir() if path.name not in first)
+    paths = [folder / name for name in (*first, *others) if (folder / name).is_file()]
+    with ZipFile(folder / "everything.zip", "w", ZIP_STORED) as archive:
+        for path in paths:
+            archive.write(path, path.name)
+    return [folder / "everything.zip", *paths]

@@ -5,61 +5,22 @@ Torch and diffusers are imported inside the commands, so that ``--help`` and ``-
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import os
 import sys
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
-from geodiff_plugin._checks import InputError
 from geodiff_plugin.capture.options import CaptureOptions
-from geodiff_plugin.cli.commands import add_command
-from geodiff_plugin.cli.eval.app import eval_app
-from geodiff_plugin.cli.options import DepthOptions, demo_options, start_pair
-from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, StopWatch, say
-from geodiff_plugin.options import OUTPUT, RUN
-
-__all__ = ["app", "main", "new_group"]
-
-
-class CommandGroup(TyperGroup):
-    """A group of subcommands: bad input is one line and exit code 2, Ctrl-C is exit code 130."""
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run the chosen subcommand."""
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt:
-            say("geodiff: interrupted; the same command resumes")
-            sys.exit(EXIT_INTERRUPTED)
-        except InputError as error:  # any other is a defect, and keeps its traceback
-            say(f"geodiff: {error}")
-            sys.exit(EXIT_BAD_INPUT)
-
-
-def new_group(help_text: str) -> typer.Typer:
-    """A group whose commands are added by ``add_command``."""
-    return typer.Typer(
-        cls=CommandGroup,
-        help=help_text,
-        no_args_is_help=True,
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )
-
-
-def _out_folder(typed: Path | None, default: str, overwrite: bool) -> Path:
-    """The folder that was named, else the default, with a number where it is taken."""
-    from geodiff_plugin.formats.out import free_folder
-
-    if typed is not None:
-        return typed
-    return Path(default) if overwrite else free_folder(Path(default))
+from geodiff_plugin.cli.commands import Command, new_group
+from geodiff_plugin.cli.options import DepthOptions, start_pair
+from geodiff_plugin.cli.terminal import StopWatch
+from geodiff_plugin.formats.out import free_folder
+from geodiff_plugin.options import OUTPUT, check_options, declare, help_of
 
 
 def prepare_torch(quiet: bool) -> None:
@@ -74,12 +35,203 @@ def prepare_torch(quiet: bool) -> None:
         sys.stderr.flush()
 
 
-app = new_group(
-    "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."
-)
+def _with_folder(options: DepthOptions, default: str) -> DepthOptions:
+    """With the folder that was named, else the default, with a number where that is taken."""
+    if options.out is not None:
+        return options
+    return replace(options, out=Path(default) if options.overwrite else free_folder(Path(default)))
 
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar.", rich_help_panel=OUTPUT)]
-Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:N or mps.", rich_help_panel=RUN)]
+
+def _depth(options: DepthOptions) -> None:
+    from geodiff_plugin.cli.pairs import is_many, start_many
+    from geodiff_plugin.formats.bags import is_bag
+
+    if is_bag(options.left):
+        prepare_torch(options.quiet)
+        from geodiff_plugin.cli.bag import run_bag
+
+        run_bag(options)
+        return
+    names = ("topic_left", "topic_right")
+    options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
+    if is_many(options.left):
+        options = replace(options, out=options.out or Path("geodiff-out"))
+        refs = start_many(options)
+        prepare_torch(options.quiet)
+        from geodiff_plugin.cli.many import run_many
+
+        run_many(options, refs)
+        return
+    options, watch = _with_folder(options, "geodiff-out"), StopWatch()
+    with start_pair(options) as folder:
+        with watch.stage("start"):
+            prepare_torch(options.quiet)
+            from geodiff_plugin.cli.depth import run_depth
+
+        run_depth(options, folder, watch)
+
+
+def _capture(options: CaptureOptions) -> None:
+    prepare_torch(options.quiet)
+    from geodiff_plugin.cli.capture import run_and_report
+
+    run_and_report(options)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Demo:
+    out: Path | None = declare(
+        None, "Folder; geodiff-demo, or -2 and so on where that is taken.", "--out", "-o", panel=OUTPUT
+    )
+    overwrite: bool = declare(False, "Write into a folder that holds files.", panel=OUTPUT)
+    quiet: bool = declare(False, "No progress bar.", "--quiet", "-q", panel=OUTPUT)
+
+    def run(self) -> None:
+        pair = Path(__file__).resolve().parents[1] / "bundled" / "pair"
+        files: dict[str, Any] = {
+            "left": pair / "left.png",
+            "right": pair / "right.png",
+            "calib": (pair / "calib.txt",),
+        }
+        options = _with_folder(DepthOptions(**files, device="cpu", **vars(self)), "geodiff-demo")
+        with start_pair(options) as folder:
+            prepare_torch(options.quiet)
+            from geodiff_plugin.cli.demo import run_demo
+
+            run_demo(options, folder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Info:
+    prior: str | None = declare(None, "Describe this prior as well.")
+    space: str | None = declare(None, "Space in which its map is affine, if its folder does not say.")
+    knobs: bool = declare(False, "List the knobs of the guidance instead: default, range, what each does.")
+
+    def run(self) -> None:
+        if self.knobs:
+            from geodiff_plugin.config import knob_lines
+
+            typer.echo("\n".join(knob_lines()))
+            return
+        from geodiff_plugin.cli.info import run_info
+
+        run_info(self.prior, self.space)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Bench:
+    device: str = declare("auto", help_of("device"))
+
+    def run(self) -> None:
+        prepare_torch(True)
+        from geodiff_plugin.cli.bench import run_bench
+
+        run_bench(self.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Video:
+    frames: tuple[Path, ...] = declare(
+        MISSING, "Folders of geodiff depth, or .npy maps, in order.", "", metavar="FRAME..."
+    )
+    out: Path = declare(
+        Path("depth.webp"), "The video: .mp4 (OpenCV), .webp or .gif.", "--out", "-o", panel=OUTPUT
+    )
+    fps: float = declare(10.0, "Frames a second.")
+    near: float | None = declare(None, "Depth of the last colour, metres.")
+    far: float | None = declare(None, "Depth of the first colour, metres.")
+    photographs: bool = declare(False, "Show the left images beside the depth.")
+
+    def run(self) -> None:
+        from geodiff_plugin.cli.video import run_video
+
+        run_video(**vars(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Submit:
+    results: tuple[Path, ...] = declare(MISSING, "Folders of geodiff depth.", "", metavar="RESULT...")
+    to: str = declare(MISSING, "The benchmark: middlebury or eth3d.")
+    out: Path = declare(MISSING, "Folder for its files.", "--out", "-o", panel=OUTPUT)
+    method: str = declare("GeoDiff", "Name of the method in Middlebury's files.")
+
+    def run(self) -> None:
+        from geodiff_plugin.cli.submit import run_submit
+
+        run_submit(self.results, self.to, self.out, self.method)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Page:
+    prior: tuple[str, ...] = declare((), "A prior that visitors may choose; repeatable.")
+    device: str = declare("auto", help_of("device"))
+    host: str = declare("127.0.0.1", "Address to listen on; 0.0.0.0 lets other machines in.")
+    port: int | None = declare(None, "Port; by default the first free one.", low=1, high=65535)
+    browser: bool = declare(False, "Open the page in a browser.")
+
+    def run(self) -> None:
+        check_options(self)
+        prepare_torch(False)
+        from geodiff_plugin.app.launch import run_app
+
+        run_app(self.prior or ("bundled",), self.device, self.host, self.port, self.browser)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Convert:
+    paths: tuple[Path, ...] = declare(
+        MISSING,
+        "SRC: checkpoint (.ckpt, .pth) or a folder of .bin weights. BASE: Qwen-Image-Edit-2509; CHECKPOINT: "
+        "its trainables.safetensors. DST: the folder to appear, for --prior.",
+        "",
+        metavar="SRC DST | marigold-v2 BASE CHECKPOINT DST",
+    )
+    part: str | None = declare(
+        None, "What is not in SRC (docs/reference/priors.md): a file, a folder or a hub id.", "--with"
+    )
+    space: str | None = declare(None, "marigold-v2: space of its map, if CHECKPOINT's folder does not say.")
+
+    def run(self) -> None:
+        from geodiff_plugin.cli.convert import run_convert
+
+        run_convert(self.paths, self.part, self.space)
+
+
+def _eval(_: None) -> typer.Typer:
+    from geodiff_plugin.cli.eval import eval_app
+
+    return eval_app
+
+
+COMMANDS: dict[str, tuple[type | None, Callable[[Any], Any], str]] = {
+    "depth": (DepthOptions, _depth, "Metric depth of LEFT with RIGHT as its guide; of one pair, or of many."),
+    "capture": (
+        CaptureOptions,
+        _capture,
+        "Depth of every frame of a capture, with poses solved together, and one cloud of all.",
+    ),
+    "demo": (
+        _Demo,
+        _Demo.run,
+        "Run on a rendered pair of the package's own, and print how good it is.",
+    ),
+    "info": (_Info, _Info.run, "Print versions, devices, priors and what is cached."),
+    "bench": (_Bench, _Bench.run, "What guidance costs in seconds and memory, and a command's seconds."),
+    "video": (_Video, _Video.run, "Join the depth maps of a sequence into a video, in one range of colours."),
+    "submit": (_Submit, _Submit.run, "Write disparities and times as Middlebury's and ETH3D's benchmarks do."),
+    "app": (_Page, _Page.run, "Serve a web page: drop two photographs, and measure (needs the extra app)."),
+    "convert": (
+        _Convert,
+        _Convert.run,
+        "Convert pickled or split weights to a folder for --prior.",
+    ),
+    "eval": (None, _eval, "Measure this package and its peers on data sets in their official layouts."),
+}
+app = new_group(
+    "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior.",
+    {name: Command(*command) for name, command in COMMANDS.items()},
+    outermost=True,
+)
 
 
 def _print_version(wanted: bool) -> None:
@@ -98,204 +250,6 @@ def _root(
     ] = False,
 ) -> None:
     pass
-
-
-def _run_depth(options: DepthOptions) -> None:
-    from geodiff_plugin.cli.pairs import is_many, start_many
-    from geodiff_plugin.formats.bags import is_bag
-
-    if is_bag(options.left):
-        prepare_torch(options.quiet)
-        from geodiff_plugin.cli.bag import run_bag
-
-        run_bag(options)
-        return
-    names = ("topic_left", "topic_right")
-    options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
-    if is_many(options.left):
-        options = dataclasses.replace(options, out=options.out or Path("geodiff-out"))
-        refs = start_many(options)
-        prepare_torch(options.quiet)
-        from geodiff_plugin.cli.many import run_many
-
-        run_many(options, refs)
-        return
-    out = _out_folder(options.out, "geodiff-out", options.overwrite)
-    options = dataclasses.replace(options, out=out)
-    watch = StopWatch()
-    with start_pair(options) as folder:
-        with watch.stage("start"):
-            prepare_torch(options.quiet)
-            from geodiff_plugin.cli.depth import run_depth
-
-        run_depth(options, folder, watch)
-
-
-add_command(
-    app,
-    "depth",
-    DepthOptions,
-    _run_depth,
-    "Estimate the metric depth of LEFT with RIGHT as its guide; of one pair, or of many.",
-)
-
-
-def _run_capture(options: CaptureOptions) -> None:
-    prepare_torch(options.quiet)
-    from geodiff_plugin.cli.capture import run_and_report
-
-    run_and_report(options)
-
-
-add_command(
-    app,
-    "capture",
-    CaptureOptions,
-    _run_capture,
-    "Depth of every frame of a capture, with poses solved together, and one cloud of all.",
-)
-
-
-@app.command()
-def demo(
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", help="Folder for the results; geodiff-demo, or -2 and so on where taken."
-        ),
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write into a folder that holds files.")
-    ] = False,
-    quiet: Quiet = False,
-) -> None:
-    """Run on a rendered pair that ships with the package, offline, and print how good it is."""
-    options = demo_options(_out_folder(out, "geodiff-demo", overwrite), overwrite, quiet)
-    with start_pair(options) as folder:
-        prepare_torch(quiet)
-        from geodiff_plugin.cli.demo import run_demo
-
-        run_demo(options, folder)
-
-
-@app.command()
-def info(
-    prior: Annotated[str | None, typer.Option(help="Describe this prior as well.")] = None,
-    space: Annotated[
-        str | None, typer.Option(help="Space in which its map is affine, if its folder does not say.")
-    ] = None,
-    knobs: Annotated[
-        bool,
-        typer.Option(
-            "--knobs", help="List the knobs of the guidance instead: default, range, what each does."
-        ),
-    ] = False,
-) -> None:
-    """Print versions, devices, priors and what is cached."""
-    if knobs:
-        from geodiff_plugin.config import knob_lines
-
-        typer.echo("\n".join(knob_lines()))
-        return
-    from geodiff_plugin.cli.info import run_info
-
-    run_info(prior, space)
-
-
-@app.command()
-def bench(device: Device = "auto") -> None:
-    """Measure what guidance costs, in seconds and peak memory, and where the seconds of a command go."""
-    prepare_torch(True)
-    from geodiff_plugin.cli.bench import run_bench
-
-    run_bench(device)
-
-
-@app.command()
-def video(
-    frames: Annotated[
-        list[Path],
-        typer.Argument(metavar="FRAME...", help="Folders of geodiff depth, or .npy maps, in order."),
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The video: .mp4 (OpenCV), .webp or .gif.")] = Path(
-        "depth.webp"
-    ),
-    fps: Annotated[float, typer.Option(help="Frames a second.")] = 10.0,
-    near: Annotated[float | None, typer.Option(help="Depth of the last colour, metres.")] = None,
-    far: Annotated[float | None, typer.Option(help="Depth of the first colour, metres.")] = None,
-    photographs: Annotated[
-        bool, typer.Option("--photographs", help="Show the left images beside the depth.")
-    ] = False,
-) -> None:
-    """Join the depth maps of a sequence into a video, in one range of colours."""
-    from geodiff_plugin.cli.video import run_video
-
-    run_video(frames, out, fps, near, far, photographs)
-
-
-@app.command()
-def submit(
-    results: Annotated[list[Path], typer.Argument(metavar="RESULT...", help="Folders of geodiff depth.")],
-    to: Annotated[str, typer.Option(help="The benchmark: middlebury or eth3d.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for its files.")],
-    method: Annotated[str, typer.Option(help="Name of the method in Middlebury's files.")] = "GeoDiff",
-) -> None:
-    """Write disparities and times as the benchmarks of Middlebury and ETH3D take them."""
-    from geodiff_plugin.cli.submit import run_submit
-
-    run_submit(results, to, out, method)
-
-
-@app.command("app")
-def page(
-    prior: Annotated[
-        list[str] | None, typer.Option(help="A prior that visitors may choose; repeatable.")
-    ] = None,
-    device: Device = "auto",
-    host: Annotated[
-        str, typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.")
-    ] = "127.0.0.1",
-    port: Annotated[int | None, typer.Option(help="Port; by default the first free one.")] = None,
-    browser: Annotated[bool, typer.Option("--browser", help="Open the page in a browser.")] = False,
-) -> None:
-    """Serve a web page: drop two photographs and measure in their depth (needs the extra app)."""
-    prepare_torch(False)
-    from geodiff_plugin.app.launch import run_app
-
-    run_app(tuple(prior or ("bundled",)), device, host, port, browser)
-
-
-@app.command()
-def convert(
-    paths: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SRC DST | marigold-v2 BASE CHECKPOINT DST",
-            help="SRC: checkpoint (.ckpt, .pth) or a folder of .bin weights. BASE: Qwen-Image-Edit-2509; "
-            "CHECKPOINT: its trainables.safetensors. DST: the folder to appear, for --prior.",
-        ),
-    ],
-    part: Annotated[
-        str | None,
-        typer.Option(
-            "--with",
-            help="The part that is not in SRC (docs/reference/priors.md): a file, a folder or a hub id.",
-        ),
-    ] = None,
-    space: Annotated[
-        str | None,
-        typer.Option(
-            help="marigold-v2: space of its map, if the name of CHECKPOINT's folder does not say it."
-        ),
-    ] = None,
-) -> None:
-    """Convert pickled or split weights to a folder for --prior; no code in a pickle is run."""
-    from geodiff_plugin.cli.convert import run_convert
-
-    run_convert(paths, part, space)
-
-
-app.add_typer(eval_app, name="eval")
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -17,8 +17,6 @@ from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.formats.bags import BAG_SUFFIXES, Stamp, list_pairs, stereo_calibration, write_depth_bag
 from geodiff_plugin.formats.out import atomic_path
 
-__all__ = ["run_bag"]
-
 
 def run_bag(options: DepthOptions) -> None:
     """Depth of every pair of a bag.

@@ -1,4 +1,4 @@
-"""``geodiff bench``: time and memory of a guided call against a plain one."""
+"""``geodiff bench``: time and memory of a guided call against a plain one, and the seconds of a command."""
 
 from __future__ import annotations
 
@@ -23,18 +23,8 @@ from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
-__all__ = ["BUNDLED", "Cost", "Workload", "command_seconds", "measure", "run_bench"]
-
 #: Name in the table -> gradient of the guidance, ``None`` for the plain pipeline.
 VARIANTS = {"plain": None, "guided, denoised gradient": "denoised", "guided, full gradient": "full"}
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Seconds of a call, and the most memory that it took, in bytes."""
-
-    seconds: float
-    peak_bytes: int
 
 
 @dataclass(frozen=True)
@@ -63,8 +53,8 @@ def _load_bundled(device: torch.device) -> Any:
 BUNDLED = Workload("bundled prior, default guidance", _load_bundled)
 
 
-def measure(gradient: str | None, workload: Workload, device_name: str) -> Cost:
-    """Cost of one call on the demo pair, to be run in a process of its own.
+def measure(gradient: str | None, workload: Workload, device_name: str) -> tuple[float, int]:
+    """Seconds of one call on the demo pair, and the most bytes that it took; in a process of its own.
 
     The first call of a process tells its memory, since what is freed later stays with the allocator.
 
@@ -88,10 +78,8 @@ def measure(gradient: str | None, workload: Workload, device_name: str) -> Cost:
         pipe(pair.left, generator=torch.Generator("cpu").manual_seed(0), **options)
 
     with PeakMemory(device) as memory:
-        seconds = timed(call, device)
-    if workload.repeats:
-        seconds = min(timed(call, device) for _ in range(workload.repeats))
-    return Cost(seconds, memory.peak_bytes)
+        first = timed(call, device)
+    return min([timed(call, device) for _ in range(workload.repeats)], default=first), memory.peak_bytes
 
 
 def command_seconds(device_name: str) -> dict[str, float]:
@@ -100,8 +88,7 @@ def command_seconds(device_name: str) -> dict[str, float]:
     "start" imports torch and diffusers, "python" is what comes before and behind the stages.
     """
     with tempfile.TemporaryDirectory() as folder:
-        pair = [DEMO_PAIR_FOLDER / name for name in ("left.png", "right.png", "calib.txt")]
-        left, right, calib = map(str, pair)
+        left, right, calib = (str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png", "calib.txt"))
         words = ["depth", left, right, "--calib", calib, "--device", device_name, "--json", "--quiet"]
         words = [sys.executable, "-m", "geodiff_plugin", *words, "--out", f"{folder}/out"]
         started = time.perf_counter()
@@ -130,11 +117,10 @@ def run_bench(device_name: str, workload: Workload = BUNDLED) -> None:
         for name, gradient in VARIANTS.items():
             with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
                 cost = fresh_process.submit(measure, gradient, workload, str(device)).result()
-            plain = cost if plain is None else plain
-            ratios = cost.seconds / plain.seconds, cost.peak_bytes / max(plain.peak_bytes, 1)
-            table.add_row(
-                name, f"{cost.seconds:.2f}", f"{cost.peak_bytes / 1e6:.0f}", *(f"{x:.2f}" for x in ratios)
-            )
+            plain = plain or cost
+            ratios = cost[0] / plain[0], cost[1] / max(plain[1], 1)
+            numbers = (f"{ratio:.2f}" for ratio in ratios)
+            table.add_row(name, f"{cost[0]:.2f}", f"{cost[1] / 1e6:.0f}", *numbers)
     stages = command_seconds(device_name)
     told = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
     console.print(f"geodiff depth on the demo pair: {sum(stages.values()):.1f} s ({told})")

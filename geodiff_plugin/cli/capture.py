@@ -12,8 +12,6 @@ from geodiff_plugin.capture.run import run_capture
 from geodiff_plugin.cli.exports import write_maps
 from geodiff_plugin.cli.terminal import collected_warnings, say
 
-__all__ = ["run_and_report"]
-
 
 def run_and_report(options: CaptureOptions) -> None:
     """Depth of every frame, the answer on stdout, and exit code 1 where a frame failed."""

@@ -1,18 +1,89 @@
-"""Commands of typer from dataclasses of options."""
+"""Commands of typer from dataclasses of options, each built when it is typed: ``--help`` answers at once."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from inspect import Parameter, Signature
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import typer
+import typer.main
+from typer.core import TyperGroup
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, say
 from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, flag_of
 
-__all__ = ["add_command"]
+APPEARANCE: dict[str, Any] = {
+    "add_completion": False,
+    "pretty_exceptions_enable": False,
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
+
+
+class Command(NamedTuple):
+    """A command: its dataclass of options, what is called with an instance, and what it does, a sentence.
+
+    A group of commands has no options, and its function returns the group.
+    """
+
+    options: type | None
+    run: Callable[[Any], Any]
+    about: str
+
+
+class _Group(TyperGroup):
+    table: Mapping[str, Command]
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that was typed, with its options."""
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, None if name is None else _built(name, self.table[name]), rest
+
+
+class _OutermostGroup(_Group):
+    """Bad input is one line and exit code 2, Ctrl-C is exit code 130."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen subcommand."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            say("geodiff: interrupted; the same command resumes")
+            sys.exit(EXIT_INTERRUPTED)
+        except InputError as error:  # any other is a defect, and keeps its traceback
+            say(f"geodiff: {error}")
+            sys.exit(EXIT_BAD_INPUT)
+
+
+def new_group(help_text: str, commands: Mapping[str, Command], outermost: bool = False) -> typer.Typer:
+    """A group of commands by their names; errors are told by the outermost one."""
+    kind = type("Group", (_OutermostGroup if outermost else _Group,), {"table": commands})
+    group = typer.Typer(cls=kind, help=help_text, no_args_is_help=True, **APPEARANCE)
+    for name, command in commands.items():
+        group.command(name, help=command.about)(lambda: None)
+    return group
+
+
+def _built(name: str, command: Command) -> Any:
+    if command.options is None:
+        return typer.main.get_command(command.run(None))
+    kinds = get_type_hints(command.options)
+    panels = [CAMERAS, RUN, OUTPUT]
+    known = [field for field in dataclasses.fields(command.options) if field.metadata]
+    known.sort(key=lambda f: (flag_of(f)[0] == "-", panels.index(f.metadata["panel"])))
+
+    def call(**typed: Any) -> None:
+        values = {f.name: _value(f, typed[f.name], kinds[f.name]) for f in known}
+        assert command.options is not None
+        command.run(command.options(**values))
+
+    vars(call)["__signature__"] = Signature([_parameter(field, kinds[field.name]) for field in known])
+    single = typer.Typer(**APPEARANCE)
+    single.command(name, help=command.about)(call)
+    return typer.main.get_command(single)
 
 
 def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
@@ -23,6 +94,8 @@ def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
     if get_origin(kind) is tuple:
         if rules["split"]:
             kind, default = str | None, ",".join(map(str, default)) or None
+        elif default is dataclasses.MISSING:
+            kind = list[get_args(kind)[0]]  # type: ignore[misc]
         else:
             kind, default = list[get_args(kind)[0]] | None, list(default) or None  # type: ignore[misc]
     if flags == ("",):
@@ -45,25 +118,3 @@ def _value(field: dataclasses.Field[Any], value: Any, kind: Any) -> Any:
             bad_value(flag_of(field), "whole numbers, comma-separated", repr(value))
         return tuple(get_args(kind)[0](part) for part in parts)
     return tuple(value or ())
-
-
-def add_command(group: typer.Typer, name: str, options: type, run: Callable[[Any], None], about: str) -> None:
-    """Add a command whose options are the fields of a dataclass.
-
-    Args:
-        group: of the command.
-        name: as typed.
-        options: dataclass with fields of ``geodiff_plugin.options.declare``.
-        run: called with an instance.
-        about: what the command does, a sentence.
-    """
-    kinds = get_type_hints(options)
-    panels = [CAMERAS, RUN, OUTPUT]
-    known = [field for field in dataclasses.fields(options) if field.metadata]
-    known.sort(key=lambda f: (flag_of(f)[0] == "-", panels.index(f.metadata["panel"] or RUN)))
-
-    def call(**typed: Any) -> None:
-        run(options(**{f.name: _value(f, typed[f.name], kinds[f.name]) for f in known}))
-
-    vars(call)["__signature__"] = Signature([_parameter(field, kinds[field.name]) for field in known])
-    group.command(name, help=about)(call)

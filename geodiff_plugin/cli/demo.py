@@ -17,8 +17,6 @@ from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
 
-__all__ = ["run_demo"]
-
 CELL_WIDTH = 360
 
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
-from diffusers.utils import logging as diffusers_logging
-from transformers.utils import logging as transformers_logging
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.cli.exports import (
     check_image_names,
     make_scene,
@@ -35,54 +33,27 @@ from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = [
-    "estimate_and_write",
-    "guided_call",
-    "load_guided_prior",
-    "loading_bars",
-    "run_depth",
-    "write_result",
-]
-
-
-@contextmanager
-def loading_bars(prior: str, quiet: bool = False) -> Iterator[None]:
-    """Switch off the bars of diffusers and transformers, but for a download, which is worth one.
-
-    Args:
-        prior: as typed.
-        quiet: switch them off for a download too.
-    """
-    on_disk = prior == "bundled" or os.path.isdir(prior) or os.path.isdir(prior.partition(":")[2])
-    libraries = (diffusers_logging, transformers_logging) if on_disk or quiet else ()
-    shown = [library for library in libraries if library.is_progress_bar_enabled()]
-    for library in shown:
-        library.disable_progress_bar()
-    try:
-        yield
-    finally:
-        for library in shown:
-            library.enable_progress_bar()
-
 
 def load_guided_prior(options: DepthOptions, device: torch.device) -> Any:
-    """The prior of ``--prior``, with guidance enabled and its own progress bars off.
+    """The prior of ``--prior``, with guidance enabled and no progress bars but that of a download.
 
     Which it is and its licence are said on stderr, unless ``--quiet``.
 
     Raises:
         InputError: no such prior, not cached, of no known kind; an option that it does not take.
     """
-    with loading_bars(options.prior, options.quiet):
-        found = find_prior(options.prior)
+    name = options.prior
+    on_disk = name == "bundled" or os.path.isdir(name) or os.path.isdir(name.partition(":")[2])
+    with no_bars() if on_disk or options.quiet else nullcontext():
+        prior = find_prior(name)
         if not options.quiet:
-            say(f"prior: {options.prior} ({found.key}; {found.licence})")
-        pipe = found.load(device, getattr(torch, options.dtype), options.space)
+            say(f"prior: {name} ({prior.key}; {prior.licence})")
+        pipe = prior.load(device, getattr(torch, options.dtype), options.space)
     taken = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
     for entry in options.option:
-        if (name := entry.partition("=")[0]) not in taken:
-            expected = f"one that {found.key} takes ({', '.join(taken) or 'none'})"
-            bad_value("--option", expected, repr(name))
+        if (option := entry.partition("=")[0]) not in taken:
+            expected = f"one that {prior.key} takes ({', '.join(taken) or 'none'})"
+            bad_value("--option", expected, repr(option))
     pipe.set_progress_bar_config(disable=True)
     enable_geometry_guidance(pipe)
     return pipe
@@ -161,15 +132,9 @@ def write_result(
     report: dict[str, Any],
     watch: StopWatch,
 ) -> None:
-    """Fill the folder: every map, what ``--export`` asks for, and last the report.
+    """Fill the folder of a pair: every map, what ``--export`` asks for, and last the report.
 
-    Args:
-        options: of this pair.
-        out: its folder, held.
-        inputs: views and cameras.
-        output: of the guided call.
-        report: of ``build_report``; files and seconds are added to it.
-        watch: of the stages so far.
+    Files and seconds are added to ``report``.
     """
 
     def fill(folder: Path) -> None:

@@ -29,19 +29,9 @@ from geodiff_plugin.formats import (
     write_ply,
 )
 from geodiff_plugin.formats.colmap import check_colmap_names
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.plotting import depth_figure, overview, share_figure
 from geodiff_plugin.types import MetricDepthOutput
-
-__all__ = [
-    "Scene",
-    "check_image_names",
-    "make_scene",
-    "pick_viewer",
-    "show_scene",
-    "write_exports",
-    "write_maps",
-    "write_undistorted",
-]
 
 
 def write_maps(
@@ -62,24 +52,22 @@ def write_maps(
     write_depth_npy(folder / "depth.npy", depth_m)
     zeros = write_depth_mm(folder / "depth_mm.png", depth_m)
     depth_figure(depth_m, unit=output.unit).save(folder / "depth.png")
-    error = confidence = None
+    maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
         Image.fromarray(visible.astype(np.uint8) * 255).save(folder / "visible.png")
-        error = single_map(output.photometric_error).astype(np.float32)
-        np.save(folder / "photometric_error.npy", error)
-        error = np.where(visible, error, np.nan)
+        maps["photometric_error"] = single_map(output.photometric_error)
     if output.uncertainty is not None:
-        np.save(folder / "uncertainty.npy", single_map(output.uncertainty).astype(np.float32))
-    for name, extra in output.extras.items():
-        np.save(folder / f"{name}.npy", np.asarray(extra)[0].astype(np.float32))
+        maps["uncertainty"] = single_map(output.uncertainty)
     flying, doubtful = flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool)
     if output.confidence is not None:
-        confidence = single_map(output.confidence).astype(np.float32)
-        np.save(folder / "confidence.npy", confidence)
-        share_figure(confidence, "confidence", 1.0).save(folder / "confidence.png")
-        doubtful = confidence < min_confidence
-    overview(left, depth_m, confidence, error, output.unit).save(folder / "overview.png")
+        maps["confidence"] = single_map(output.confidence)
+        share_figure(maps["confidence"], "confidence", 1.0).save(folder / "confidence.png")
+        doubtful = maps["confidence"] < min_confidence
+    for name, values in maps.items():
+        np.save(folder / f"{name}.npy", values.astype(np.float32))
+    error = np.where(visible, maps["photometric_error"], np.nan) if output.visible is not None else None
+    overview(left, depth_m, maps.get("confidence"), error, output.unit).save(folder / "overview.png")
     points = write_ply(folder / "cloud.ply", depth_m, left, K, valid=~(flying | doubtful), unit=output.unit)
     return {
         "depth_mm_zero_pixels": zeros,
@@ -95,13 +83,24 @@ def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> No
     image.save(folder / undistorted_name(number))
 
 
+Cameras = tuple[tuple[np.ndarray, np.ndarray, tuple[int, int]], ...]
+
+
+def cameras_of(output: MetricDepthOutput, guidance: GeometryGuidance) -> Cameras:
+    """``(K, E, (width, height))`` of every view of one image, left one first; poses as the call used them."""
+    depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
+    further = zip(guidance.rigs, used_poses(output, guidance), guidance.rights, strict=True)
+    rights = ((rig.K_right, E, (image.shape[-1], image.shape[-2])) for rig, E, image in further)
+    return ((K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """What can be exported and shown.
 
     Attributes:
         cloud: points of at least the least confidence, without those that hang between two surfaces.
-        cameras: ``(K, E, (width, height))``, the left one first; poses as the call used them.
+        cameras: of ``cameras_of``.
         names: of their images, which a pinhole camera took: the photographs, or without lens distortion
             those of ``write_undistorted``.
         left: ``(H, W, 3)`` in [0, 1].
@@ -109,7 +108,7 @@ class Scene:
     """
 
     cloud: Cloud
-    cameras: tuple[tuple[np.ndarray, np.ndarray, tuple[int, int]], ...]
+    cameras: Cameras
     names: tuple[str, ...]
     left: np.ndarray
     further: tuple[np.ndarray, ...] = ()
@@ -123,20 +122,16 @@ def make_scene(output: MetricDepthOutput, inputs: Inputs, options: DepthOptions)
         inputs: the views and cameras.
         options: names of the images, and the least confidence of a point.
     """
-    depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
+    depth_m, cameras = single_map(output.prediction), cameras_of(output, inputs.guidance)
     keep = ~flying_points(depth_m)
     if output.confidence is not None:
         keep &= single_map(output.confidence) >= options.min_confidence
-    cameras = [(K, np.eye(4), (depth_m.shape[1], depth_m.shape[0]))]
-    Es = used_poses(output, inputs.guidance)
-    for rig, E, image in zip(inputs.guidance.rigs, Es, inputs.guidance.rights, strict=True):
-        cameras.append((rig.K_right, E, (image.shape[-1], image.shape[-2])))
-    cloud = make_cloud(depth_m, inputs.left, K, keep)
+    cloud = make_cloud(depth_m, inputs.left, cameras[0][0], keep)
     if not inputs.undistorted:
-        return Scene(cloud, tuple(cameras), _image_names(options.photographs().values()), inputs.left)
+        return Scene(cloud, cameras, _image_names(options.photographs().values()), inputs.left)
     further = tuple(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)
     written = tuple(undistorted_name(number) for number in range(1, 2 + len(further)))
-    return Scene(cloud, tuple(cameras), written, inputs.left, further)
+    return Scene(cloud, cameras, written, inputs.left, further)
 
 
 def _image_names(paths: Collection[Path]) -> tuple[str, ...]:
@@ -180,8 +175,7 @@ def _in_rerun(scene: Scene) -> None:
         entity = f"world/camera {number}"
         rerun.log(entity, rerun.Transform3D(translation=E[:3, 3], mat3x3=E[:3, :3]))
         rerun.log(entity, rerun.Pinhole(image_from_camera=K, width=width, height=height))
-        if number == 0:
-            rerun.log(entity, rerun.Image(np.rint(scene.left * 255).astype(np.uint8)))
+    rerun.log("world/camera 0", rerun.Image(np.rint(scene.left * 255).astype(np.uint8)))
 
 
 def _in_viser(scene: Scene) -> None:
@@ -189,20 +183,14 @@ def _in_viser(scene: Scene) -> None:
 
     server = viser.ViserServer()
     server.scene.set_up_direction("-y")
-    size = float(np.median(scene.cloud.points_m[:, 2])) / 400 if len(scene.cloud.points_m) else 0.01
-    points = scene.cloud.points_m.astype(np.float32)
-    server.scene.add_point_cloud("/cloud", points, scene.cloud.colours, point_size=size)
+    points_m, left = scene.cloud.points_m.astype(np.float32), np.rint(scene.left * 255).astype(np.uint8)
+    size = float(np.median(points_m[:, 2])) / 400 if len(points_m) else 0.01
+    server.scene.add_point_cloud("/cloud", points_m, scene.cloud.colours, point_size=size)
     for number, (K, E, (width, height)) in enumerate(scene.cameras):
         x, y, z, w = Rotation.from_matrix(E[:3, :3]).as_quat()
-        server.scene.add_camera_frustum(
-            f"/camera {number}",
-            fov=2 * float(np.arctan(height / (2 * K[1, 1]))),
-            aspect=width / height,
-            scale=20 * size,
-            wxyz=(w, x, y, z),
-            position=E[:3, 3],
-            image=np.rint(scene.left * 255).astype(np.uint8) if number == 0 else None,
-        )
+        view = {"fov": 2 * float(np.arctan(height / (2 * K[1, 1]))), "aspect": width / height}
+        pose = {"wxyz": (w, x, y, z), "position": E[:3, 3], "image": left if number == 0 else None}
+        server.scene.add_camera_frustum(f"/camera {number}", scale=20 * size, **view, **pose)
     say(f"viser serves the cloud at http://localhost:{server.get_port()}; Ctrl-C ends it.")
     server.sleep_forever()
 

@@ -8,14 +8,12 @@ import torch
 from huggingface_hub import CacheNotFound, scan_cache_dir
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.cli.depth import loading_bars
+from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.cli.terminal import print_lines
 from geodiff_plugin.options import SPACES
 from geodiff_plugin.priors import BUNDLED_FOLDER, PRIORS, FoundPrior, find_adapter, find_prior
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import versions
-
-__all__ = ["run_info"]
 
 
 def _megabytes(size_bytes: int) -> str:
@@ -39,25 +37,18 @@ def _bundled() -> str:
 def _cached() -> list[str]:
     """Pipelines and models in the hub cache, whatever they are; only those with an adapter can be guided."""
     try:
-        repositories = scan_cache_dir().repos
+        models = [repo for repo in scan_cache_dir().repos if repo.repo_type == "model"]
     except CacheNotFound:
-        return []
-    models = sorted(
-        (repo for repo in repositories if repo.repo_type == "model"), key=lambda repo: repo.repo_id
-    )
-    return [f"{repo.repo_id} ({_megabytes(repo.size_on_disk)})" for repo in models]
+        models = []
+    return sorted(f"{repo.repo_id} ({_megabytes(repo.size_on_disk)})" for repo in models) or ["nothing"]
 
 
 def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
     """What the adapter of a prior found, once its weights are read."""
     pipe = found.load(space=space)
     adapter = find_adapter(pipe)(pipe)
-    parameters = sum(
-        weight.numel()
-        for part in pipe.components.values()
-        if isinstance(part, torch.nn.Module)
-        for weight in part.parameters()
-    )
+    parts = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
+    parameters = sum(weight.numel() for part in parts for weight in part.parameters())
     most = "" if adapter.max_steps is None else f", at most {adapter.max_steps}"
     gradients = "denoised, full" if adapter.network_input is not None else "denoised"
     options = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
@@ -97,11 +88,11 @@ def run_info(prior: str | None, space: str | None = None) -> None:
             bad_value("--space", "given with --prior, the prior that it describes", repr(space))
     described = []
     if prior is not None:
-        with loading_bars(prior):
+        with no_bars():
             described = _describe(find_prior(prior), space)
     rows = [*versions().items()]
     rows += [("device", line) for line in _devices()]
     rows += [("adapters", ", ".join(PRIORS)), ("bundled prior", _bundled())]
-    rows += [("cached", line) for line in _cached() or ["nothing"]]
+    rows += [("cached", line) for line in _cached()]
     rows += [("package", str(Path(__file__).resolve().parents[1])), *described]
     print_lines(rows)

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from geodiff_plugin._camera_checks import (
-    check_baseline,
     check_calibrated_size,
     check_intrinsics,
     check_intrinsics_fit,
     check_pose,
 )
-from geodiff_plugin._checks import bad_value, check_number, warn
-from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, calibration_way, intrinsics_way
+from geodiff_plugin._checks import bad_value, warn
+from geodiff_plugin.cli.options import PARAMETERS, DepthOptions
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
@@ -33,12 +33,8 @@ from geodiff_plugin.formats.points import depth_of_disparity, read_confidence
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.guidance.evidence import cleaned
 from geodiff_plugin.guidance.guidance import GeometryGuidance, assume_same_centre
-from geodiff_plugin.options import check_positive
 from geodiff_plugin.types import Distortion, Rig
 
-__all__ = ["Inputs", "lenses_of", "pinhole", "read_inputs", "read_rig"]
-
-MOST_PIXELS = 1e6
 Size = tuple[int, int]
 Lenses = tuple[Distortion | None, ...]
 """One entry a photograph, the left one first; ``None`` for a pinhole camera."""
@@ -79,49 +75,46 @@ def read_inputs(
     views = options.photographs()
     images = list(frames or map(_read_view, views.values(), views))
     sizes = [(image.shape[1], image.shape[0]) for image in images]
-    rig = None
+    way, rig, poses = options.cameras_way(), None, []
     if options.estimate_pose:
-        Ks = [_intrinsics(options, path, i, sizes[i]) for i, path in enumerate(views.values())]
-        poses = []
+        Ks = [_intrinsics(options, way, path, i, sizes[i]) for i, path in enumerate(views.values())]
     else:
         rig = read_rig(options, *sizes[:2])
         if frames is None:
             for K, (name, path) in zip((rig.K_left, rig.K_right), list(views.items())[:2], strict=False):
                 warn_of_other_lens(path, K, name)
-        further = [_further_camera(options, i, rig.K_left, size) for i, size in enumerate(sizes[2:])]
+        further = [_further_camera(options, i, rig.K_left) for i in range(len(options.view))]
         Ks = [rig.K_left, rig.K_right, *(K for K, _ in further)][: len(images)]
         poses = [np.eye(4), rig.E, *(E for _, E in further)]
     lenses = lenses_of(options, rig)
     images = [pinhole(*each, config) for each in zip(images, Ks, lenses, strict=False)]
-    points, cropped = _read_known(options, Ks[0], lenses[0], sizes[0], rig), options.cropped
-    confidence = _read_confidence(options, lenses[0])
+    known: dict[str, Any] = {
+        "points": _read_known(options, Ks[0], lenses[0], sizes[0], rig),
+        "points_confidence": _read_confidence(options, lenses[0]),
+        "cropped": options.cropped,
+    }
     if rig is None:
-        if options.baseline is not None:
-            check_positive(options.baseline, "--baseline", "metres")
         guidance = GeometryGuidance.from_photographs(
             images,
             K=Ks,
             baseline_m=options.baseline,
             known_length=_known_length(options.known_length, Ks[0], lenses[0]),
-            points=points,
-            points_confidence=confidence,
             matcher=options.matcher or "sift",
-            cropped=cropped,
+            **known,
             config=config,
         )
         rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
     elif len(images) == 1:
-        known = {"points": points, "points_confidence": confidence}
-        guidance = GeometryGuidance(None, rig.K_left, **known, cropped=cropped, config=config)
+        if not options.cropped:
+            check_intrinsics_fit(rig.K_left, *sizes[0], "K", "LEFT")
+        guidance = GeometryGuidance(None, rig.K_left, **known, config=config)
     else:
-        posed = list(zip([None, *images[1:]], Ks, poses, strict=True))
-        lengths = {"unit": rig.unit, "measured_baseline": rig.measured, "points_confidence": confidence}
-        guidance = GeometryGuidance.from_views(
-            posed, points=points, cropped=cropped, **lengths, config=config
-        )
-    typed = not options.estimate_pose and calibration_way(options) in ("parameters", "matrices")
-    if typed and options.k_right is None:
-        assume_same_centre(guidance)
+        lengths = {"unit": rig.unit, "measured_baseline": rig.measured}
+        posed = list(zip(images, Ks, poses, strict=True))
+        guidance = GeometryGuidance.from_views(posed, **known, **lengths, config=config)
+    if way in ("parameters", "matrices") and options.k_right is None and options.cx_right is None:
+        if not options.estimate_pose:
+            assume_same_centre(guidance)
     prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
     if prior_map is not None and lenses[0] is not None:
         cure = "Run the other model on undistorted.png, and give that image and its map."
@@ -147,7 +140,7 @@ def read_rig(options: DepthOptions, left_size: Size, right_size: Size | None = N
     Raises:
         InputError: no calibration or more than one, a file that is none, K for images of another size.
     """
-    way, alone = calibration_way(options), right_size is None and options.disparity is None
+    way, alone = options.cameras_way(), right_size is None and options.disparity is None
     if way == "file":
         rig = read_calibration(
             options.calib,
@@ -160,44 +153,33 @@ def read_rig(options: DepthOptions, left_size: Size, right_size: Size | None = N
         )
     else:
         rig = (_rig_from_parameters if way == "parameters" else _rig_from_matrices)(options, left_size, alone)
-    for side, K, calibrated, size, path in (
-        ("left", rig.K_left, rig.size_left, left_size, options.left),
-        ("right", rig.K_right, rig.size_right, right_size, options.right),
+    for side, calibrated, size, path in (
+        ("left", rig.size_left, left_size, options.left),
+        ("right", rig.size_right, right_size, options.right),
     ):
-        if size is None:
-            continue
         cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
-        check_calibrated_size(size, calibrated, f"the {side} image {path}", rig.source, cure)
-        if not options.cropped:
-            check_intrinsics_fit(
-                K, *size, f"K of the {side} camera ({rig.source})", f"the {side} image {path}"
-            )
+        if size is not None:
+            check_calibrated_size(size, calibrated, f"the {side} image {path}", rig.source, cure)
     return replace(rig, size_left=left_size, size_right=right_size)
 
 
 def _rig_from_parameters(options: DepthOptions, size: Size, alone: bool) -> Rig:
     names = PARAMETERS[:-1] if alone else PARAMETERS
-    values = {name: getattr(options, name) for name in names}
-    missing = [f"--{name}" for name, value in values.items() if value is None]
+    missing = [name for name in names if getattr(options, name) is None]
     if missing:
         bad_value(
-            " ".join(missing),
-            "given as well, with " + " ".join(f"--{name}" for name in names if f"--{name}" not in missing),
+            " ".join(f"--{name}" for name in missing),
+            "given as well, with " + " ".join(f"--{name}" for name in names if name not in missing),
             "nothing",
             f"--fy is --fx where pixels are square; --cx, --cy are near the centre, here "
             f"{(size[0] - 1) / 2:g} and {(size[1] - 1) / 2:g}; --baseline is the distance of the cameras in "
             "metres.",
         )
-    for name in ("fx", "fy"):
-        check_positive(values[name], f"--{name}", "pixels")
-    for name in ("cx", "cy"):
-        check_number(values[name], f"--{name}", -MOST_PIXELS, MOST_PIXELS)
+    values = [getattr(options, name) for name in PARAMETERS]
     if alone:
-        K = intrinsics(*values.values())
+        K = rig_from_parameters(*values[:-1], 1.0).K_left
         return Rig(K, K, np.eye(4))
-    cure = "Two views from one place tell no scale; if the right camera is the left one, swap the images."
-    check_positive(values["baseline"], "--baseline", "metres", cure)
-    return rig_from_parameters(*values.values())
+    return rig_from_parameters(*values, cx_right=options.cx_right)
 
 
 def _matrix(path: Path, option: str) -> np.ndarray:
@@ -212,37 +194,28 @@ def _rig_from_matrices(options: DepthOptions, _size: Size, alone: bool) -> Rig:
             bad_value(option, "given as well", "nothing", "--K and --E go together; --K-right is optional.")
     assert options.k is not None
     K, source = _matrix(options.k, "--K"), str(options.k)
-    if alone:
+    if options.e is None:
         return Rig(K, K, np.eye(4), source=source)
     K_right = K if options.k_right is None else _matrix(options.k_right, "--K-right")
     E = check_pose(read_matrix(options.e, "--E"), "--E")
     return Rig(K, K_right, E, source=source, measured=False)
 
 
-def _further_camera(
-    options: DepthOptions, i: int, K_left: np.ndarray, size: Size
-) -> tuple[np.ndarray, np.ndarray]:
-    """K and pose of a ``--view``, checked under its own name."""
-    option, K, pose = f"--view {options.view[i]}", K_left, options.view_e[i]
-    if options.view_k:
-        K = _matrix(options.view_k[i], "--view-K")
-    if not options.cropped:
-        check_intrinsics_fit(K, *size, f"K of {option}", "its image")
-    E = check_pose(read_matrix(pose, "--view-E"), f"--view-E {pose}")
-    check_baseline(E, f"--view-E {pose}")
-    return K, E
+def _further_camera(options: DepthOptions, i: int, K_left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """K and pose of a ``--view``."""
+    K = _matrix(options.view_k[i], "--view-K") if options.view_k else K_left
+    pose = options.view_e[i]
+    return K, check_pose(read_matrix(pose, "--view-E"), f"--view-E {pose}")
 
 
-def _intrinsics(options: DepthOptions, path: Path, i: int, size: Size) -> np.ndarray:
+def _intrinsics(options: DepthOptions, way: str, path: Path, i: int, size: Size) -> np.ndarray:
     """K of photograph ``i`` without a pose, 0 being the left one, from the options, else from its EXIF."""
-    way = intrinsics_way(options)
     if i > 1 and options.view_k:
         return _matrix(options.view_k[i - 2], "--view-K")
     if way == "matrices":
-        if i > 0 and options.k_right is not None:
-            return _matrix(options.k_right, "--K-right")
         assert options.k is not None
-        return _matrix(options.k, "--K")
+        right = i > 0 and options.k_right is not None
+        return _matrix(options.k_right, "--K-right") if right else _matrix(options.k, "--K")  # type: ignore[arg-type]
     if way == "parameters":
         return intrinsics(*(getattr(options, name) for name in PARAMETERS[:-1]))
     if options.fov is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import errno
 import json
-import os
 import sys
 import threading
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.cli.depth import guided_call, load_guided_prior, write_result
 from geodiff_plugin.cli.exports import check_image_names
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
-from geodiff_plugin.cli.options import CAMERA_FILES, MODEL_FILES, DepthOptions, check_files, out_folder_of
+from geodiff_plugin.cli.options import DepthOptions, check_files, out_folder_of
 from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, assumption, options_of
 from geodiff_plugin.cli.report import build_report
 from geodiff_plugin.cli.terminal import (
@@ -46,16 +45,15 @@ from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.pipeline import native_images
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["JOURNAL", "Stages", "finished_row", "run_many"]
-
 #: What became of every pair, as it is known to all processes of a run.
 JOURNAL = ".pairs.jsonl"
 #: A table of more pairs than this has only those that want to be looked at.
 MOST_ROWS = 20
-#: Options by which a finished result is no other one.
+#: Options that a result does not depend on.
 NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "show", "strict", "device", "encoding"}
 #: The next pair cannot be written either.
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+RESUMES = "Finished pairs stay; the same command goes on with the rest."
 
 Row = dict[str, Any]
 
@@ -66,7 +64,7 @@ class _EndsRun(BaseException):
 
 @dataclass(eq=False)
 class _Job:
-    """A pair on its way through the stages, and what is known of it so far."""
+    """A pair on its way through the stages, and what they have made of it so far."""
 
     ref: PairRef
     options: DepthOptions
@@ -131,27 +129,22 @@ class Stages:
             try:
                 job.out = job.held.enter_context(out_folder_of(job.options))
             except InputError as error:
-                if _is_full(error):
-                    raise _EndsRun from error
+                _end_if_full(error)
                 raise
-            job.digests = _file_digests(job.options)  # before: what changes later is another version
+            job.digests = _digests(job.options)  # before: what changes later is another version
             frames = None if ref.frame is None else self._frames(ref, ref.frame)
             job.inputs = read_inputs(job.options, job.options.config(), frames)
             check_image_names(job.options, job.inputs)
         return job
 
     def _frames(self, ref: PairRef, frame: int) -> Sequence[np.ndarray]:
-        views = [self._video(path).read(frame) for path in (ref.left, ref.right) if path is not None]
-        return both_halves(views[0], "LEFT") if ref.right is None else views
-
-    def _video(self, path: Path) -> VideoReader | BagReader:
-        if path not in self._videos:
+        for path in {ref.left, ref.right or ref.left} - set(self._videos):
+            reader: Any = VideoReader(path)
             if is_bag(path):
-                reader: Any = BagReader(path, self._options.bag_topics(), self._options.tolerance)
-            else:
-                reader = VideoReader(path)
+                reader = BagReader(path, self._options.bag_topics(), self._options.tolerance)
             self._videos[path] = self._held.enter_context(reader)
-        return self._videos[path]
+        left = self._videos[ref.left].read(frame)
+        return both_halves(left, "LEFT") if ref.right is None else (left, self._videos[ref.right].read(frame))
 
     def evidence(self, job: _Job) -> _Job:
         """What the views say by themselves, into a store of the pair's own, where the call finds it."""
@@ -201,17 +194,12 @@ class Stages:
         assert job.inputs is not None and job.output is not None and job.out is not None
         job.warnings += [w for w in job.output.warnings if w not in job.warnings]
         report = build_report(job.inputs, job.output, self._pipe, job.options, job.warnings)
-        report["pair"] = {
-            "name": job.ref.name,
-            "frame": job.ref.frame,
-            "began_from": job.began_from,
-            "sha256": job.digests,
-        }
+        pair = {"name": job.ref.name, "frame": job.ref.frame, "began_from": job.began_from}
+        report["pair"] = pair | {"sha256": job.digests}
         try:
             write_result(job.options, job.out, job.inputs, job.output, report, job.watch)
         except OSError as error:
-            if _is_full(error):
-                raise _EndsRun from error
+            _end_if_full(error)
             raise
         return _row(report)
 
@@ -222,23 +210,19 @@ class Stages:
             job.held.close()
 
 
-def _is_full(error: BaseException | None) -> bool:
-    """Whether a full disk is behind an error."""
-    while error is not None and getattr(error, "errno", None) not in DISK_FULL:
-        error = error.__cause__ or error.__context__
-    return error is not None
+def _end_if_full(error: Exception) -> None:
+    """End the run where a full disk is behind an error."""
+    cause: BaseException | None = error
+    while cause is not None and getattr(cause, "errno", None) not in DISK_FULL:
+        cause = cause.__cause__ or cause.__context__
+    if isinstance(cause, OSError):
+        raise _EndsRun from InputError(f"The disk of --out is full ({reason_of(cause)}). {RESUMES}")
 
 
-def _file_digests(options: DepthOptions) -> dict[str, str]:
-    """SHA-256 by path of the readable files that a pair is made from; of a COLMAP model, of its texts."""
-    paths = [path for path in (options.left, options.right, options.prior_map) if path is not None]
-    for name in CAMERA_FILES:
-        value = getattr(options, name)
-        for path in value if isinstance(value, tuple) else (value,):
-            if path is not None:
-                paths += [path / file for file in MODEL_FILES] if path.is_dir() else [path]
+def _digests(options: DepthOptions) -> dict[str, str]:
+    """SHA-256 by path of the readable files that a pair is made from."""
     digests = {}
-    for path in paths:
+    for path in options.read_files():
         with suppress(OSError):  # its reader says why
             digests[str(path)] = file_digest(path)
     return digests
@@ -264,30 +248,20 @@ def finished_row(options: DepthOptions) -> Row | None:
         return None
     if not whole:
         return None
-    wanted = options.as_json()
+    wanted, of_fields = options.as_json(), DepthOptions.__dataclass_fields__
     others = [n for n in wanted if n not in NOT_OF_THE_RESULT and wanted[n] != made.get(n, wanted[n])]
     if others:
-        earlier, now = (", ".join(_as_typed(name, of[name]) for name in others) for of in (made, wanted))
-        got = f"{options.out}, made {earlier} and now asked for {now}"
-        bad_value(
-            "--out", "a folder of results of the same options", got, "Name another --out, or add --overwrite."
-        )
+        changes = ", ".join(f"{flag_of(of_fields[n])} {made[n]} instead of {wanted[n]}" for n in others)
+        cure = "Name another --out, or add --overwrite."
+        expected, got = "a folder of results of the same options", f"{options.out}, made with {changes}"
+        bad_value("--out", expected, got, cure)
     digests = report.get("pair", {}).get("sha256", {})
-    changed = [path for path, digest in _file_digests(options).items() if digests.get(path, digest) != digest]
+    changed = [path for path, digest in _digests(options).items() if digests.get(path, digest) != digest]
     if changed:
         got = f"{options.out}, made before {' and '.join(changed)} changed"
         cure = "Name another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
         bad_value("--out", "a folder of results of the same files", got, cure)
     return _row(report)
-
-
-def _as_typed(name: str, value: Any) -> str:
-    """An option, or one of the views, as it stands on the command line."""
-    flag = flag_of(DepthOptions.__dataclass_fields__[name])
-    if value is None or value is False or value == []:
-        return f"without {flag}"
-    shown = " ".join(map(str, value)) if isinstance(value, list) else str(value)
-    return f"with {flag}" if value is True else f"with {flag} {shown}"
 
 
 def _row(report: dict[str, Any]) -> Row:
@@ -345,12 +319,10 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     assert options.out is not None
     _refuse_one_length(options, refs)
     device, _ = pick_device(options.device), options.config()
-    there: dict[str, Row] = {}
-    if not options.overwrite:
-        rows = {ref.name: finished_row(options_of(ref, options)) for ref in refs}
-        there = {name: row for name, row in rows.items() if row is not None}
+    rows = {} if options.overwrite else {ref.name: finished_row(options_of(ref, options)) for ref in refs}
+    there = {name: row for name, row in rows.items() if row is not None}
 
-    def is_whole(item: Item, _: Row) -> bool:
+    def is_whole(item: Item, _: Row) -> bool:  # looked at again: another process may have finished it
         return not options.overwrite and finished_row(options_of(item.payload, options)) is not None
 
     journal = Journal(options.out / JOURNAL)
@@ -378,44 +350,21 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
                 stages.read, stages.evidence, stages.guide, stages.write, release=stages.release
             )
     except _EndsRun as ended:
-        _raise_cause(ended, options.out)
-    except InputError:  # all of them, for one reason
-        _forget(journal)
-        raise
-    except KeyboardInterrupt:
-        say("geodiff: finished pairs stay; the same command goes on with the rest")
+        assert ended.__cause__ is not None
+        raise ended.__cause__ from None
+    except InputError:  # all of them, for one reason: no folder is left behind
+        if not journal.others_work():
+            with suppress(OSError):
+                journal.path.unlink()
+                journal.path.parent.rmdir()
         raise
     finally:
         stages.close()
-    rows_of_all = [_final(record, there.get(record["key"]), options) for record in records]
+    answers = [_final(record, there.get(record["key"]), options) for record in records]
     if process.index == 0:
-        _answer(rows_of_all, options)
-    if any(row["result"] == "failed" for row in rows_of_all):
+        _answer(answers, options)
+    if any(row["result"] == "failed" for row in answers):
         sys.exit(EXIT_SOME_FAILED)
-
-
-def _raise_cause(ended: _EndsRun, out: Path) -> None:
-    """Say why the run had to end."""
-    cause = ended.__cause__
-    assert cause is not None
-    if _is_full(cause):
-        got = f"{out} ({os.strerror(errno.ENOSPC)})"
-        bad_value(
-            "--out",
-            "on a disk with room",
-            got,
-            "Finished pairs stay; the same command goes on with the rest.",
-        )
-    raise cause
-
-
-def _forget(journal: Journal) -> None:
-    """Leave no folder behind where nothing was computed."""
-    if journal.others_work():
-        return
-    with suppress(OSError):
-        journal.path.unlink()
-        journal.path.parent.rmdir()
 
 
 def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:
@@ -445,7 +394,6 @@ def _answer(rows: Sequence[Row], options: DepthOptions) -> None:
         _print(rows, options.out)
     path = options.out / SUMMARY
     try:
-        options.out.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()
@@ -456,21 +404,19 @@ def _answer(rows: Sequence[Row], options: DepthOptions) -> None:
 
 def _print(rows: Sequence[Row], out: Path) -> None:
     """The table and what it comes to."""
-    shown = [row for row in rows if row["result"] == "failed" or row["verdict"] not in (None, "trusted")]
-    shown = list(rows) if len(rows) <= MOST_ROWS else shown
+    doubtful = [row for row in rows if row["verdict"] not in (None, "trusted")]
+    shown = [r for r in rows if len(rows) <= MOST_ROWS or r["result"] == "failed" or r in doubtful]
     if shown:
         table = new_table(("pair", "result", "near m", "median m", "far m", "confidence", "s"))
         for row in shown:
             numbers = [row[name] for name in ("near_m", "median_m", "far_m", "confidence", "seconds")]
-            result = row["result"] if row["verdict"] in (None, "trusted") else row["verdict"]
+            result = row["verdict"] if row in doubtful else row["result"]
             table.add_row(row["pair"], result, *("-" if v is None else f"{v:.2f}" for v in numbers))
         show(table)
-    counts = {kind: sum(row["result"] == kind for row in rows) for kind in ("done", "there", "failed")}
-    doubtful = sum(row["verdict"] not in (None, "trusted") for row in rows)
+    done, there, failed = (sum(row["result"] == kind for row in rows) for kind in ("done", "there", "failed"))
     number = "1 pair" if len(rows) == 1 else f"{len(rows)} pairs"
-    totals = [f"{number}: {counts['done']} done, {counts['there']} there already"]
-    totals.append(f"{counts['failed']} failed, {doubtful} not trusted -> {out}/")
-    show(Text(", ".join(totals)))
+    totals = f"{number}: {done} done, {there} there already, {failed} failed, {len(doubtful)} not trusted"
+    show(Text(f"{totals} -> {out}/"))
     for row in shown:
         if row["result"] == "failed":
             show(Text(f"{row['pair']}: {row['message']}"))

@@ -9,41 +9,17 @@ from dataclasses import MISSING, dataclass, fields
 from functools import partial
 from pathlib import Path
 
-from PIL import Image, UnidentifiedImageError
-
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.files import check_file, open_image
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.options import CAMERAS, OUTPUT, RunOptions, declare, flag_of
 
-__all__ = [
-    "CAMERA_FILES",
-    "MODEL_FILES",
-    "PARAMETERS",
-    "DepthOptions",
-    "calibration_way",
-    "check_files",
-    "demo_options",
-    "intrinsics_way",
-    "out_folder_of",
-    "start_pair",
-    "undistorted_name",
-]
-
-#: What a run writes, or may write by its prior and its lenses.
-FILES = (
-    *("depth.npy", "depth_mm.png", "depth.png", "overview.png", "visible.png", "photometric_error.npy"),
-    *("uncertainty.npy", "confidence.npy", "confidence.png", "normals.npy", "cloud.ply", "undistorted.png"),
-    "report.json",
-)
 #: What is read of a COLMAP model, the one kind of calibration that is a folder.
 MODEL_FILES = ("cameras.txt", "images.txt")
-#: What ``--export`` adds.
-EXPORT_FILES = {"glb": ("cloud.glb",), "colmap": (*MODEL_FILES, "points3D.txt")}
 _camera, _output = partial(declare, panel=CAMERAS), partial(declare, panel=OUTPUT)
 PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
-#: Fields that name the files that cameras are read from.
-CAMERA_FILES = ("calib", "k", "e", "k_right")
+#: Fields that hold paths, but not of files that are read beside the photographs.
+PHOTOGRAPHS_AND_OUT = ("left", "right", "view", "out")
 
 
 def undistorted_name(number: int) -> str:
@@ -79,6 +55,9 @@ class DepthOptions(RunOptions):
     cy: float | None = _camera(None, "Principal point, pixels.")
     baseline: float | None = _camera(
         None, "Distance of the cameras, metres, right one to the right; replaces that of --calib."
+    )
+    cx_right: float | None = _camera(
+        None, "Principal point of the right camera of a rectified pair (cx + doffs); --cx if not given."
     )
     k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
     e: Path | None = _camera(None, "4x4 pose of the right camera in the left one's frame, metres.", "--E")
@@ -147,7 +126,7 @@ class DepthOptions(RunOptions):
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")
     strict: bool = _output(False, "End with an error if the result is not to be trusted.")
     export: tuple[str, ...] = _output(
-        (), "Also write the cloud and cameras as glb or colmap; repeatable.", choices=tuple(EXPORT_FILES)
+        (), "Also write the cloud and cameras as glb or colmap; repeatable.", choices=("glb", "colmap")
     )
     show: str | None = _output(
         None,
@@ -168,23 +147,17 @@ class DepthOptions(RunOptions):
 
     def other_files(self) -> list[tuple[str, Path]]:
         """Name and path of every input that is no photograph."""
-        named = [("calibration" if name == "calib" else name, getattr(self, name)) for name in CAMERA_FILES]
-        others = ("view_k", "view_e", "points", "points_calib", "disparity", "points_confidence", "prior_map")
-        named += [(name, getattr(self, name)) for name in others]
-        flags = {field.name: flag_of(field) for field in fields(self)}
+        read = [f for f in fields(self) if "Path" in str(f.type) and f.name not in PHOTOGRAPHS_AND_OUT]
         return [
-            (flags.get(name, name), path)
-            for name, value in named
-            for path in (value if isinstance(value, tuple) else (value,))
-            if path is not None
+            ("calibration" if field.name == "calib" else flag_of(field), path)
+            for field in read
+            for path in _listed(getattr(self, field.name))
         ]
 
-    def output_files(self) -> set[str]:
-        """Names of all files that a run with these options may write."""
-        names = {*FILES, *(name for kind in self.export for name in EXPORT_FILES[kind])}
-        if "colmap" in self.export:
-            names.update(undistorted_name(number) for number in range(2, 3 + len(self.view)))
-        return names
+    def read_files(self) -> list[Path]:
+        """Every file that a run reads; of a COLMAP model its texts."""
+        paths = [*self.photographs().values(), *(path for _, path in self.other_files())]
+        return [f for p in paths for f in ([p / name for name in MODEL_FILES] if p.is_dir() else [p])]
 
     def refuse(self, names: Iterable[str], expected: str, got: str, cure: str = "") -> None:
         """Refuse every option of these that was given.
@@ -218,8 +191,8 @@ class DepthOptions(RunOptions):
             return None
         parts = self.cameras.split(",")
         if len(parts) != 2 or not all(part.strip().isdecimal() and len(part) < 10 for part in parts):
-            cure = repr(self.cameras)
-            bad_value("--cameras", "two camera numbers with a comma, left first, such as 2,3", cure)
+            expected = "two camera numbers with a comma, left first, such as 2,3"
+            bad_value("--cameras", expected, repr(self.cameras))
         left, right = (int(part) for part in parts)
         if left == right:
             bad_value("--cameras", "two different cameras", repr(self.cameras))
@@ -271,93 +244,74 @@ class DepthOptions(RunOptions):
             bad_value("RIGHT", "given, or --points instead of it", "neither", cure)
         expected, got, cure = "given with RIGHT", "no RIGHT", "It belongs to a second view."
         if self.disparity is None:  # which is of a rig
-            self.refuse(("baseline",), expected, got, cure)
+            self.refuse(("baseline", "cx_right"), expected, got, cure)
         self.refuse(("e", "k_right", "view", "estimate_pose"), expected, got, cure)
         if self.preset == "paper":
             bad_value("--preset paper", expected, got, cure)
 
+    def cameras_way(self) -> str:
+        """How the cameras are given: ``"file"``, ``"parameters"`` or ``"matrices"``.
 
-def demo_options(out: Path, overwrite: bool, quiet: bool) -> DepthOptions:
-    """``geodiff depth`` on the pair that ships with the package (``bundled.demo_pair``)."""
-    pair = Path(__file__).resolve().parents[1] / "bundled" / "pair"
-    return DepthOptions(
-        left=pair / "left.png",
-        right=pair / "right.png",
-        calib=(pair / "calib.txt",),
-        device="cpu",
-        out=out,
-        overwrite=overwrite,
-        quiet=quiet,
-    )
+        With ``--estimate-pose`` how K is given: ``"parameters"``, ``"matrices"``, ``"--fov"`` or ``"EXIF"``.
+
+        Raises:
+            InputError: in no way, in more than one, in parts, or beside options that belong to another.
+        """
+        return self._intrinsics_way() if self.estimate_pose else self._calibration_way()
+
+    def _given(self, names: Iterable[str]) -> list[bool]:
+        return [getattr(self, name) is not None for name in names]
+
+    def _calibration_way(self) -> str:
+        # --baseline beside --calib gives a file its unit, as COLMAP's models need it.
+        parameters = PARAMETERS[:-1] if self.calib else PARAMETERS
+        ways = {
+            "file": bool(self.calib),
+            "parameters": any(self._given((*parameters, "cx_right"))),
+            "matrices": any(self._given(("k", "e", "k_right"))),
+        }
+        numbers, matrices = "--fx --fy --cx --cy", "--K FILE"
+        if self.right is not None or self.disparity is not None:
+            numbers, matrices = f"{numbers} --baseline", f"{matrices} --E FILE"
+        known = f"--calib FILE, or {numbers}, or {matrices}"
+        cure = "Without cameras two images do not tell metres."
+        way = _only("calibration", ways, known) or bad_value("calibration", f"given: {known}", "none", cure)
+        if way != "file":
+            cure = "It chooses among the cameras of a file."
+            self.refuse(["cameras"], "given with --calib only", "no --calib", cure)
+        return way
+
+    def _intrinsics_way(self) -> str:
+        cure = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
+        others = ("calib", "cameras", "e", "view_e", "cx_right")
+        self.refuse(others, "left out with --estimate-pose", "both", cure)
+        parameters = self._given(PARAMETERS[:-1])
+        ways = {
+            "matrices": any(self._given(("k", "k_right"))),
+            "parameters": any(parameters),
+            "--fov": self.fov is not None,
+        }
+        way = _only("K", ways, "--K FILE, or --fx --fy --cx --cy, or --fov, or EXIF") or "EXIF"
+        if self.k_right is not None and self.k is None:
+            bad_value("--K", "given with --K-right", "--K-right alone", "It is K of LEFT.")
+        if way == "parameters" and not all(parameters):
+            bad_value("--fx --fy --cx --cy", "given all together", "some of them")
+        if self.cropped and way in ("--fov", "EXIF") and not self.view_k:
+            cure = "A field of view, or EXIF, does not tell where the principal point of a crop is."
+            bad_value("--cropped", "given with --K, or --fx --fy --cx --cy", f"K by {way}", cure)
+        return way
 
 
-def calibration_way(options: DepthOptions) -> str:
-    """Which of the three ways was taken: ``"file"``, ``"parameters"`` or ``"matrices"``.
+def _listed(value: Path | tuple[Path, ...] | None) -> tuple[Path, ...]:
+    return value if isinstance(value, tuple) else () if value is None else (value,)
 
-    Raises:
-        InputError: none, or more than one.
-    """
-    # --baseline beside --calib gives a file its unit, as COLMAP's models need it.
-    parameters = PARAMETERS[:-1] if options.calib else PARAMETERS
-    ways = {
-        "file": bool(options.calib),
-        "parameters": any(getattr(options, name) is not None for name in parameters),
-        "matrices": any(path is not None for path in (options.k, options.e, options.k_right)),
-    }
+
+def _only(name: str, ways: dict[str, bool], known: str) -> str | None:
+    """The only way that was taken, or ``None``; more than one are refused."""
     taken = [way for way, is_taken in ways.items() if is_taken]
-    known = "--calib FILE, or --fx --fy --cx --cy --baseline, or --K FILE --E FILE"
-    if options.right is None and options.disparity is None:
-        known = known.replace(" --baseline", "").replace(" --E FILE", "")
-    if not taken:
-        bad_value("calibration", f"given: {known}", "none", "Without cameras two images do not tell metres.")
     if len(taken) > 1:
-        bad_value("calibration", f"given in one way: {known}", " and ".join(taken), "Drop the others.")
-    if taken != ["file"]:
-        cure = "It chooses among the cameras of a file."
-        options.refuse(["cameras"], "given with --calib only", "no --calib", cure)
-    return taken[0]
-
-
-def intrinsics_way(options: DepthOptions) -> str:
-    """How K of photographs without poses is given: as "matrices", "parameters", "--fov" or in "EXIF".
-
-    Raises:
-        InputError: in more than one way, in parts, or beside options that only given poses go with.
-    """
-    cure = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
-    options.refuse(("calib", "cameras", "e", "view_e"), "left out with --estimate-pose", "both", cure)
-    parameters = [getattr(options, name) is not None for name in PARAMETERS if name != "baseline"]
-    ways = {
-        "matrices": options.k is not None or options.k_right is not None,
-        "parameters": any(parameters),
-        "--fov": options.fov is not None,
-    }
-    taken = [way for way, is_taken in ways.items() if is_taken]
-    if len(taken) > 1:
-        known = "--K FILE, or --fx --fy --cx --cy, or --fov, or EXIF"
-        bad_value("K", f"given in one way: {known}", " and ".join(taken), "Drop the others.")
-    if options.k_right is not None and options.k is None:
-        bad_value("--K", "given with --K-right", "--K-right alone", "It is K of LEFT.")
-    if any(parameters) and not all(parameters):
-        bad_value("--fx --fy --cx --cy", "given all together", "some of them")
-    way = taken[0] if taken else "EXIF"
-    if options.cropped and way in ("--fov", "EXIF") and not options.view_k:
-        cure = "A field of view, or EXIF, does not tell where the principal point of a crop is."
-        bad_value("--cropped", "given with --K, or --fx --fy --cx --cy", f"K by {way}", cure)
-    return way
-
-
-def _check_photograph(name: str, path: Path) -> None:
-    file = check_file(path, name, "an image file")
-    try:
-        with Image.open(file):  # the head alone; the rest when it is read
-            pass
-    except (UnidentifiedImageError, Image.DecompressionBombError):
-        cure = "Convert it to PNG or JPEG."
-        bad_value(name, "an image file", f"{file}, which Pillow does not recognise as an image", cure)
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        cure = "Is it cut off? Fetch it again."
-        bad_value(name, "a whole image file", f"{file}, which does not decode ({error})", cure)
+        bad_value(name, f"given in one way: {known}", " and ".join(taken), "Drop the others.")
+    return taken[0] if taken else None
 
 
 def check_files(options: DepthOptions, photographs: bool = True) -> None:
@@ -373,7 +327,7 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
     if photographs:
         views = options.photographs()
         for name, path in views.items():
-            _check_photograph(name, path)
+            open_image(path, name).close()  # the head alone; the rest when it is read
         for (one, a), (other, b) in itertools.combinations(views.items(), 2):
             if a.samefile(b):
                 bad_value(other, f"another photograph than {one}", f"{b} for both")
@@ -384,11 +338,9 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
 
 
 def out_folder_of(options: DepthOptions) -> OutFolder:
-    """The output folder of one pair, which refuses to replace what the pair is made of."""
+    """The output folder of one pair, which may not hold what the pair is made of."""
     assert options.out is not None
-    inputs = [*options.photographs().values(), *(path for _, path in options.other_files())]
-    inputs += [path / name for path in options.calib for name in MODEL_FILES]
-    return OutFolder(options.out, options.output_files(), inputs=inputs, overwrite=options.overwrite)
+    return OutFolder(options.out, inputs=options.read_files(), overwrite=options.overwrite)
 
 
 def start_pair(options: DepthOptions) -> OutFolder:
@@ -402,6 +354,6 @@ def start_pair(options: DepthOptions) -> OutFolder:
     """
     options.refuse(["warm_start"], "given with many pairs", "one pair", "It goes on from the pair before.")
     options.check_all()
-    (intrinsics_way if options.estimate_pose else calibration_way)(options)
+    options.cameras_way()
     check_files(options)
     return out_folder_of(options)

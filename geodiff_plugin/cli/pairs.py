@@ -12,19 +12,16 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 from PIL import Image
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.options import DepthOptions, calibration_way, check_files, intrinsics_way
+from geodiff_plugin.cli.options import DepthOptions, check_files
 from geodiff_plugin.formats.bags import is_bag, list_pairs
 from geodiff_plugin.formats.files import check_file
-from geodiff_plugin.formats.out import check_out, reason_of
+from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.formats.video import VIDEOS, count_frames, is_video
-
-__all__ = ["COLUMNS", "SUMMARY", "PairRef", "assumption", "find_pairs", "is_many", "options_of", "start_many"]
 
 #: The table of a run, and its columns.
 SUMMARY = "pairs.csv"
@@ -85,50 +82,31 @@ def start_many(options: DepthOptions) -> list[PairRef]:
     first = options_of(refs[0], options)
     first = first if first.right is not None else replace(first, right=first.left)
     first.check_all()
-    if options.estimate_pose:
-        intrinsics_way(first)
-    elif all(ref.calib is None for ref in refs):
-        calibration_way(first)
+    if options.estimate_pose or all(ref.calib is None for ref in refs):
+        first.cameras_way()
     check_files(replace(options, prior_map=first.prior_map), photographs=False)
     _check_summary(options)
     return refs
 
 
 def _check_summary(options: DepthOptions) -> None:
-    """See that the table can be written when the pairs are done, and that no other file is lost by it.
-
-    Nothing is left behind, also no folder: several processes may look at the same time.
+    """See that the table of the run takes the place of no other file, and is no result of one pair.
 
     Raises:
-        InputError: the folder holds the result of one pair or cannot be written to; its ``pairs.csv`` is a
-            folder, or a file of the user's, such as the list of pairs.
+        InputError: ``--out`` holds the result of one pair, or a ``pairs.csv`` that is a folder, or a file of
+            the user's, such as the list of pairs.
     """
     assert options.out is not None
-    folder = check_out(options.out)
+    folder, path = check_out(options.out), options.out / SUMMARY
     if (folder / "report.json").exists():
         got = f"{options.out}, which holds the result of one pair"
         bad_value("--out", "a folder for the folders of many pairs", got, "Name another.")
-    path = options.out / SUMMARY
-    try:
-        if os.path.lexists(path) and not _is_summary(path):
-            got = f"{path}, which is {'a folder' if path.is_dir() else 'not the table of an earlier run'}"
-            cure = f"Name another --out, or move that {SUMMARY}: a table of the results takes its place."
-            bad_value("--out", f"a folder whose {SUMMARY} may be replaced", got, cure)
-        absolute = options.out.absolute()
-        there = next(path for path in (absolute, *absolute.parents) if path.exists())
-        with TemporaryFile(dir=there) as file:  # finds out whether the disk takes a byte
-            file.write(b"0")
-    except OSError as error:
-        cure = "Name another with --out, or free disk space and check its permissions."
-        bad_value("--out", "a folder that can be written to", f"{options.out} ({reason_of(error)})", cure)
-
-
-def _is_summary(path: Path) -> bool:
-    """Whether a file has the heading of our table."""
-    if not path.is_file():
-        return False
-    with open(path, encoding="utf-8", errors="replace") as file:
-        return file.readline().rstrip("\n") == ",".join(COLUMNS)
+    if path.is_file() and path.read_bytes().startswith(",".join(COLUMNS).encode()):
+        return
+    if os.path.lexists(path):
+        got = f"{path}, which is {'a folder' if path.is_dir() else 'not the table of an earlier run'}"
+        cure = f"Name another --out, or move that {SUMMARY}: a table of the results takes its place."
+        bad_value("--out", f"a folder whose {SUMMARY} may be replaced", got, cure)
 
 
 def find_pairs(options: DepthOptions) -> list[PairRef]:
@@ -139,16 +117,10 @@ def find_pairs(options: DepthOptions) -> list[PairRef]:
     """
     left, right = options.left, options.right
     if is_bag(left):
-        pairs = list_pairs(left, options.bag_topics(), options.tolerance)
-        return _frames(len(pairs), left, None)
+        return _frames(len(list_pairs(left, options.bag_topics(), options.tolerance)), left, None)
     if os.path.isdir(left):
         return _of_folders(left, right)
-    if is_video(left):
-        return _of_videos(left, right)
-    if right is not None:
-        cure = f"{left.name} is a text, so it is read as a list, which names both views of each pair."
-        bad_value("RIGHT", "left out where LEFT is a list of pairs", right, cure)
-    return _of_list(left)
+    return _of_videos(left, right) if is_video(left) else _of_list(left, right)
 
 
 def assumption(refs: Sequence[PairRef], options: DepthOptions) -> str | None:
@@ -240,21 +212,24 @@ def _frames(count: int, left: Path, right: Path | None) -> list[PairRef]:
     return [PairRef(f"{frame:0{digits}d}", left, right, frame=frame) for frame in range(count)]
 
 
-def _of_list(path: Path) -> list[PairRef]:
-    found = check_file(path, "LEFT", "a list of pairs")
+def _of_list(path: Path, right: Path | None) -> list[PairRef]:
+    if right is not None:
+        cure = f"{path.name} is a text, so it is read as a list, which names both views of each pair."
+        bad_value("RIGHT", "left out where LEFT is a list of pairs", right, cure)
+    file = check_file(path, "LEFT", "a list of pairs")
     try:
-        lines = found.read_text(encoding="utf-8-sig").splitlines()
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
         bad_value("LEFT", "an image, a folder, a video or a list of pairs", f"{path}, which is no text")
     rows: list[list[Path]] = []
     for number, line in enumerate(lines, 1):
         cells = _cells(line)
-        if not cells or (not rows and _is_heading(cells[0], found.parent)):
+        if not cells or (not rows and _is_heading(cells[0], file.parent)):
             continue
         if len(cells) not in (2, 3):
             cure = "Separate them by commas, tabs, or blanks where no name has one."
             bad_value(f"line {number} of {path}", "LEFT RIGHT [CALIB]", repr(line.strip()), cure)
-        rows.append([found.parent / cell for cell in cells])
+        rows.append([file.parent / cell for cell in cells])
     if not rows:
         bad_value("LEFT", "a list with a pair a line: LEFT,RIGHT[,CALIB]", f"{path}, which names none")
     names = _names([row[0] for row in rows])

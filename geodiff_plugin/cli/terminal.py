@@ -14,19 +14,6 @@ if TYPE_CHECKING:  # drawn by few commands
     from rich.console import Console, RenderableType
     from rich.table import Table
 
-__all__ = [
-    "EXIT_BAD_INPUT",
-    "EXIT_INTERRUPTED",
-    "EXIT_SOME_FAILED",
-    "StopWatch",
-    "collected_warnings",
-    "new_console",
-    "new_table",
-    "print_lines",
-    "say",
-    "show",
-]
-
 EXIT_BAD_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 2, 4, 130
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 #: Characters a line may have where nobody's terminal bounds it.
@@ -67,13 +54,11 @@ def collected_warnings(tell: Callable[[str], None]) -> Iterator[None]:
         warnings.filterwarnings("always", category=UserWarning, module=r"geodiff_plugin")
         shown_elsewhere = warnings.showwarning
 
-        def collect(
-            message: Any, category: Any, filename: str, lineno: int, file: Any = None, line: Any = None
-        ) -> None:
+        def collect(message: Any, category: Any, filename: str, *rest: Any, **named: Any) -> None:
             if PACKAGE_FOLDER in Path(filename).resolve().parents:
                 tell(str(message))
             else:
-                shown_elsewhere(message, category, filename, lineno, file, line)
+                shown_elsewhere(message, category, filename, *rest, **named)
 
         warnings.showwarning = collect
         yield
@@ -92,14 +77,13 @@ def new_console() -> Console:
 def show(*shown: RenderableType) -> None:
     """Print on the present standard output; lines of a file or a pipe do not end in blanks."""
     console = new_console()
-    if console.is_terminal:
-        for part in shown:
-            console.print(part)
-        return
     with console.capture() as captured:
         for part in shown:
             console.print(part)
-    sys.stdout.write("".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
+    text = captured.get()
+    if not console.is_terminal:
+        text = "".join(f"{line.rstrip()}\n" for line in text.splitlines())
+    sys.stdout.write(text)
 
 
 def new_table(header: Sequence[str], title: str = "") -> Table:
@@ -123,6 +107,6 @@ def print_lines(rows: Sequence[tuple[str, str]]) -> None:
     table = Table.grid(padding=(0, 2, 0, 0))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    for name, value in rows:
-        table.add_row(name, value)
+    for row in rows:
+        table.add_row(*row)
     show(table)

@@ -17,8 +17,6 @@ from geodiff_plugin.formats.files import read_npy
 from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.plotting import check_video, depth_frames, write_depth_video
 
-__all__ = ["run_video"]
-
 
 def _file(path: Path) -> Path:
     return path / "depth.npy" if os.path.isdir(path) else path
@@ -36,7 +34,7 @@ def _map(path: Path) -> np.ndarray:
 class _Maps(Sequence[np.ndarray]):
     """The maps of all frames, read whenever they are asked for: those of a long video exceed the memory."""
 
-    def __init__(self, frames: list[Path]) -> None:
+    def __init__(self, frames: Sequence[Path]) -> None:
         self._frames = frames
 
     def __len__(self) -> int:
@@ -46,18 +44,18 @@ class _Maps(Sequence[np.ndarray]):
         return _map(self._frames[number])
 
 
-def _has_unit(path: Path) -> bool:
-    """Whether a map is in metres, as maps are unless the report beside them says that they have no unit."""
+def _report(folder: Path) -> dict[str, Any]:
+    """The report of a result; empty where there is none, or none that can be read."""
     try:
-        report = json.loads((_file(path).parent / "report.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):  # no report, or one that says nothing
-        return True
-    return not isinstance(report, dict) or report.get("unit", "m") is not None
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return report if isinstance(report, dict) else {}
 
 
-def _unit(frames: list[Path]) -> str | None:
+def _unit(frames: Sequence[Path]) -> str | None:
     """``"m"``, or ``None`` where no map has a unit; one range of colours cannot show both kinds."""
-    in_metres = [_has_unit(path) for path in frames]
+    in_metres = [_report(_file(path).parent).get("unit", "m") is not None for path in frames]
     if any(in_metres) and not all(in_metres):
         with_unit, without = frames[in_metres.index(True)], frames[in_metres.index(False)]
         expected = "all in metres, or all without a unit"
@@ -65,32 +63,28 @@ def _unit(frames: list[Path]) -> str | None:
     return "m" if all(in_metres) else None
 
 
-def _picture(image_01: np.ndarray) -> Image.Image:
-    return Image.fromarray(np.rint(image_01 * 255).astype(np.uint8))
-
-
 def _photograph(folder: Path) -> Image.Image:
     """The left image that the depth of a result belongs to, where it lay when the result was made."""
-    report = check_file(folder / "report.json", "--photographs", "the report of a folder of geodiff depth")
+    expected = "the report of a folder of geodiff depth"
+    path, report = check_file(folder / "report.json", "--photographs", expected), _report(folder)
     try:
-        result = json.loads(report.read_text(encoding="utf-8"))
-        arguments, frame = result["arguments"], result.get("pair", {}).get("frame")
-        undistorted = result["undistorted"]
-        left = Path(arguments["left"])
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        bad_value("--photographs", "the report of a folder of geodiff depth", f"{report}, which is damaged")
-    if undistorted:
-        return _picture(read_image(folder / "undistorted.png", f"the undistorted left image of {folder}")[0])
-    if frame is not None:
+        left, right = Path(report["arguments"]["left"]), report["arguments"]["right"]
+        frame, undistorted = report.get("pair", {}).get("frame"), report["undistorted"]
+    except (KeyError, TypeError, AttributeError):
+        bad_value("--photographs", expected, f"{path}, which is damaged")
+    if frame is None or undistorted:
+        image, _ = read_image(
+            folder / "undistorted.png" if undistorted else left, f"the left image of {folder}"
+        )
+    else:
         with VideoReader(left, f"the left video of {folder}") as video:
             image = video.read(frame)
-        view = both_halves(image)[0] if arguments["right"] is None else image
-        return _picture(view)
-    return _picture(read_image(left, f"the left image of {folder}")[0])
+        image = both_halves(image)[0] if right is None else image
+    return Image.fromarray(np.rint(image * 255).astype(np.uint8))
 
 
 def run_video(
-    frames: list[Path], out: Path, fps: float, near: float | None, far: float | None, photographs: bool
+    frames: Sequence[Path], out: Path, fps: float, near: float | None, far: float | None, photographs: bool
 ) -> None:
     """Write the video and say what is in it.
 

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import InputError, bad_value, check_number, warn
-from geodiff_plugin.formats.images import open_image
+from geodiff_plugin.formats.files import open_image
 from geodiff_plugin.formats.rigs import intrinsics
 
 __all__ = ["intrinsics_from_exif", "intrinsics_from_fov", "warn_of_other_lens"]

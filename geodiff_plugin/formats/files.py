@@ -6,9 +6,11 @@ import codecs
 import hashlib
 import os
 import re
+import warnings
+import zlib
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from geodiff_plugin._checks import (
     FolderError,
@@ -19,10 +21,25 @@ from geodiff_plugin._checks import (
     quoted,
 )
 
-if TYPE_CHECKING:  # `geodiff --help` reads this module and starts without numpy
+if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
     import numpy as np
+    from PIL import Image
 
-__all__ = ["check_file", "file_digest", "read_matrix", "read_npy", "read_rows", "read_text"]
+__all__ = [
+    "DECODE_ERRORS",
+    "check_file",
+    "file_digest",
+    "open_image",
+    "read_matrix",
+    "read_npy",
+    "read_rows",
+    "read_text",
+    "refuse_damaged",
+]
+
+HEIC = (".heic", ".heif")
+#: What Pillow raises at a damaged file.
+DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, zlib.error)
 
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
@@ -61,6 +78,43 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
     if file.stat().st_size == 0:
         bad_value(name, what, f"{shown}, which is empty", "Was its download or copy cut off? Fetch it again.")
     return file
+
+
+def open_image(path: str | os.PathLike[str], name: str) -> Image.Image:
+    """Open an image file with Pillow, HEIC by pillow-heif where that is installed; no pixel is read yet.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
+        ValueError: not an image, or one of more pixels than Pillow takes.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    file = check_file(path, name, "an image file")
+    if file.suffix.lower() in HEIC:
+        try:
+            import pillow_heif
+        except ImportError:
+            cure = "Run: pip install pillow-heif, or convert it to PNG or JPEG."
+            bad_value(name, "an image file", f"{file}, which Pillow reads with pillow-heif only", cure)
+        pillow_heif.register_heif_opener()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # what is too large is an error
+            return Image.open(file)
+    except Image.DecompressionBombError:
+        expected = f"an image of at most {2 * (Image.MAX_IMAGE_PIXELS or 0) // 1_000_000} megapixels"
+        bad_value(name, expected, f"{file}, a larger one", "Scale it down first, and K with it.")
+    except UnidentifiedImageError:
+        cure = "Convert it to PNG or JPEG."
+        bad_value(name, "an image file", f"{file}, a format that Pillow does not read", cure)
+    except DECODE_ERRORS as error:
+        refuse_damaged(name, file, error)
+
+
+def refuse_damaged(name: str, path: object, error: Exception) -> NoReturn:
+    """Refuse an image file that does not decode, with the reason."""
+    cure = "Is it cut off? Fetch it again."
+    bad_value(name, "a whole image file", f"{path}, which does not decode ({error})", cure)
 
 
 def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file") -> str:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import os
-import warnings
-import zlib
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 
 from geodiff_plugin._checks import InputError, bad_type, bad_value, warn
-from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.files import DECODE_ERRORS, open_image, refuse_damaged
 
-__all__ = ["MIN_SIDE", "as_image_01", "open_image", "picture_size", "read_image"]
+__all__ = ["MIN_SIDE", "as_image_01", "picture_size", "read_image"]
 
 #: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
 MIN_SIDE = 32
@@ -35,42 +33,6 @@ DARK_16_BITS = 8192
 #: Formats of Pillow whose files may hold several frames or pages that are pictures of their own; what goes
 #: with a phone's JPEG is none.
 MANY_FRAMES = ("GIF", "PNG", "TIFF", "WEBP")
-HEIC = (".heic", ".heif")
-DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, zlib.error)
-
-
-def open_image(path: str | os.PathLike[str], name: str) -> Image.Image:
-    """Open an image file with Pillow, HEIC by pillow-heif where that is installed; no pixel is read yet.
-
-    Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: not an image, or one of more pixels than Pillow takes.
-    """
-    file = check_file(path, name, "an image file")
-    if file.suffix.lower() in HEIC:
-        try:
-            import pillow_heif
-        except ImportError:
-            cure = "Run: pip install pillow-heif, or convert it to PNG or JPEG."
-            bad_value(name, "an image file", f"{file}, which Pillow reads with pillow-heif only", cure)
-        pillow_heif.register_heif_opener()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # what is too large is an error
-            return Image.open(file)
-    except Image.DecompressionBombError:
-        expected = f"an image of at most {2 * (Image.MAX_IMAGE_PIXELS or 0) // 1_000_000} megapixels"
-        bad_value(name, expected, f"{file}, a larger one", "Scale it down first, and K with it.")
-    except UnidentifiedImageError:
-        cure = "Convert it to PNG or JPEG."
-        bad_value(name, "an image file", f"{file}, a format that Pillow does not read", cure)
-    except DECODE_ERRORS as error:
-        _refuse_damaged(name, file, error)
-
-
-def _refuse_damaged(name: str, path: object, error: Exception) -> NoReturn:
-    cure = "Is it cut off? Fetch it again."
-    bad_value(name, "a whole image file", f"{path}, which does not decode ({error})", cure)
 
 
 def _check_sides(width: int, height: int, name: str) -> None:
@@ -145,7 +107,7 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
     except InputError:
         raise
     except DECODE_ERRORS as error:
-        _refuse_damaged(name, path, error)
+        refuse_damaged(name, path, error)
     image_01, more = _of_pillow(upright, name, deep)
     if turn is not None:
         more.append(

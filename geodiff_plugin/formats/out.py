@@ -17,8 +17,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, NoReturn, Self, TypeVar
 
-from tqdm import tqdm
-
 from geodiff_plugin._checks import FolderError, InputFileError, MissingFileError, bad_value
 
 try:
@@ -168,8 +166,7 @@ class OutFolder:
 
     Args:
         path: as typed; it need not exist.
-        names: every file that the run may write.
-        inputs: files that the run reads, none of which it may replace or delete.
+        inputs: files that the run reads, none of which may lie in a folder that it overwrites.
         overwrite: take a folder that holds files. Those that its report lists as an earlier run's go where
             the new run does not write them; all others stay.
         option: what ``path`` was given as, for messages.
@@ -182,15 +179,13 @@ class OutFolder:
     def __init__(
         self,
         path: Path,
-        names: Collection[str] = (),
         *,
         inputs: Collection[Path] = (),
         overwrite: bool = False,
         option: str = "--out",
     ) -> None:
         self.path = Path(path)
-        self._names, self._inputs = set(names), inputs
-        self._overwrite, self._option = overwrite, option
+        self._inputs, self._overwrite, self._option = inputs, overwrite, option
         self._earlier: set[str] = set()
         self._stack = ExitStack()
 
@@ -208,7 +203,7 @@ class OutFolder:
                 self._make(self._staging, stack)
                 self._lock(stack)
                 if shutil.disk_usage(self._staging).free < LEAST_FREE_BYTES:
-                    self._refuse_place(os.strerror(errno.ENOSPC))
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             except OSError as error:
                 self._refuse_place(reason_of(error))
             self._stack = stack.pop_all()
@@ -224,12 +219,13 @@ class OutFolder:
         bad_value(self._option, "a folder that can be written to", f"{self.path} ({reason})", cure)
 
     def _refuse_inputs(self) -> None:
-        """Refuse a folder with an input of this run among the files that it replaces or deletes."""
-        written = [self._target / name for name in sorted(self._names | self._earlier)]
-        written = [path for path in written if path.exists()]
+        """Refuse a folder with an input of this run among its files, some of which it replaces or deletes."""
+        if not self._target.is_dir():
+            return
+        there = [entry for entry in self._target.iterdir() if entry.is_file()]
         for path in self._inputs:
-            if any(path.exists() and path.samefile(other) for other in written):
-                got = f"{self.path}, where the run would replace or delete {path}, which it reads"
+            if any(path.exists() and path.samefile(entry) for entry in there):
+                got = f"{self.path}, which holds {path}"
                 bad_value(self._option, "a folder that holds no input of the run", got, "Name another.")
 
     def _make(self, folder: Path, stack: ExitStack) -> None:
@@ -259,7 +255,7 @@ class OutFolder:
         if (self._staging / FILES).exists():  # we have the lock, so whoever made them is gone
             shutil.rmtree(self._staging / FILES)
             line = f"geodiff: removed what a run that was killed had left in {self._staging}"
-            tqdm.write(line, file=sys.stderr)  # above a progress bar, if there is one
+            print(line, file=sys.stderr, flush=True)
 
     def _refuse_held(self, hidden: Path) -> None:
         process = (hidden / LOCK).read_text(encoding="ascii", errors="replace").strip() or "unknown"

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_pose
-from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin._checks import bad_value, check_number, check_positive
 from geodiff_plugin.geometry import nearest_rotation
 from geodiff_plugin.types import Distortion, Rig
 
@@ -347,10 +347,9 @@ def rig_from_parameters(
     Raises:
         TypeError, ValueError: not finite numbers, or not above 0 where they must be.
     """
-    tiny = float(np.finfo(np.float64).tiny)
     cx_right = cx if cx_right is None else cx_right
-    for name, value in (("fx", fx), ("fy", fy), ("baseline", baseline_m)):
-        check_number(value, name, tiny, np.finfo(np.float64).max)
+    for name, value, unit in (("fx", fx, "pixels"), ("fy", fy, "pixels"), ("baseline", baseline_m, "metres")):
+        check_positive(value, name, unit)
     for name, value in (("cx", cx), ("cy", cy), ("cx_right", cx_right)):
         check_number(value, name, -1e9, 1e9)
     left, right = (Camera(intrinsics(fx, fy, x, cy), size) for x in (cx, cx_right))

@@ -30,8 +30,8 @@ from geodiff_plugin.types import MetricDepthOutput, Rig
 #: What is assumed of a rectified pair whose right camera has no K of its own.
 SAME_CENTRE = (
     "The right camera's cx is assumed to be the left one's. If it is not, every depth is off: each pixel of "
-    "difference (doffs) shifts all disparities by one. Give K=(K_left, K_right); on the command line --K, "
-    "--K-right and --E."
+    "difference (doffs) shifts all disparities by one. Give the right camera's cx, which is cx + doffs "
+    "(K_right, or --cx-right)."
 )
 #: Cosine of the angle below which two cameras count as parallel.
 PARALLEL = 0.9999

@@ -59,8 +59,9 @@ def visitor(chromium, address):
         if not request.url.startswith((address, "data:", "blob:")):
             foreign.append(request.url)
 
-    def come(height: int = 1000):
-        context = chromium.new_context(viewport={"width": 1400, "height": height}, accept_downloads=True)
+    def come(height: int = 1000, width: int = 1400, scheme: str = "light"):
+        size = {"width": width, "height": height}
+        context = chromium.new_context(viewport=size, color_scheme=scheme, accept_downloads=True)
         contexts.append(context)
         context.set_default_timeout(90_000)  # of a machine that does other things as well
         page = context.new_page()

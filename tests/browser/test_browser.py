@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -19,6 +20,13 @@ NUMBER = r"(\d+\.\d+)"
 def run(page) -> None:
     page.click("#run")
     page.wait_for_selector("#status .figures", timeout=RUN_MS)
+
+
+def shot(page, name: str) -> None:
+    """A picture for whoever wants to look at them: ``GEODIFF_SHOTS`` names their folder."""
+    if "GEODIFF_SHOTS" in os.environ:
+        page.wait_for_timeout(500)
+        page.screenshot(path=Path(os.environ["GEODIFF_SHOTS"]) / f"{name}.png", full_page=True)
 
 
 def tab(page, name: str) -> None:
@@ -81,7 +89,7 @@ def test_upload_run_slide_measure_and_take_home(visitor, plane_files, tmp_path):
     tab(page, "Measure")
     page.wait_for_selector("#measure-picture img")
     click_picture(page, 0.25, 0.5)
-    page.wait_for_selector("#readings >> text=Click a second point")
+    page.wait_for_selector("#readings >> text=Choose a second point")
     click_picture(page, 0.75, 0.625)
     words = page.wait_for_selector("#readings .distance").inner_text()
     rows = page.locator("#readings td").all_inner_texts()
@@ -108,6 +116,9 @@ def test_upload_run_slide_measure_and_take_home(visitor, plane_files, tmp_path):
     assert len(vertices) == count > 0.9 * depth_m.size
     assert vertices["xyz"][:, 2].max() == pytest.approx(depth_m.max(), rel=0.1)
     assert download(page, "cloud.glb", tmp_path).read_bytes()[:4] == b"glTF"
+    assert {"confidence.npy", "depth_mm.png"} <= set(
+        ZipFile(download(page, "everything.zip", tmp_path)).namelist()
+    )
 
     tab(page, "Point cloud")
     if not appears(page, "#scene canvas"):  # WebGL without a GPU at times gives up at the first try
@@ -118,26 +129,70 @@ def test_upload_run_slide_measure_and_take_home(visitor, plane_files, tmp_path):
     page.wait_for_selector("#points >> text=points")
 
 
-def test_a_bad_calibration_shows_its_sentence(visitor, plane_files, tmp_path):
+def is_stale(page) -> bool:
+    return "stale" in (page.locator("#results").get_attribute("class") or "").split()
+
+
+@pytest.mark.parametrize(
+    ("width", "scheme"), [(1280, "light"), (1280, "dark"), (390, "light"), (390, "dark")]
+)
+def test_a_result_is_judged_stale_after_a_change_and_gone_under_an_error(visitor, plane_files, width, scheme):
+    page = visitor(width=width, scheme=scheme)
+    upload(page, plane_files())
+    run(page)
+    assert page.locator("#status .verdict b").first.inner_text() in ("Trusted", "Not trusted", "Not judged")
+    assert "fx 120.0" in page.locator("#status .cameras").inner_text() and not is_stale(page)
+    shot(page, f"depth-{width}-{scheme}")
+    tab(page, "Measure")
+    page.wait_for_selector("#measure-picture img")
+    assert page.locator(".verdict:visible").count() == 2, "again where it matters"
+    page.locator("#pixel textarea, #pixel input").fill("32, 48")  # by keyboard
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#readings >> text=Choose a second point")
+    shot(page, f"measure-{width}-{scheme}")
+    tab(page, "Downloads")
+    assert page.locator(".verdict:visible").count() == 2
+    shot(page, f"downloads-{width}-{scheme}")
+    page.locator("#baseline_m textarea, #baseline_m input").fill("0.3")
+    page.keyboard.press("Tab")
+    page.wait_for_function("document.getElementById('results').classList.contains('stale')")
+    shot(page, f"stale-{width}-{scheme}")
+    page.get_by_text("Focal length and baseline").click()
+    page.click("#run")
+    sentence = page.wait_for_selector("#status .say-bad", timeout=RUN_MS).inner_text()
+    assert "must be" in sentence and "/tmp" not in sentence and "--" not in sentence and not is_stale(page)
+    tab(page, "Measure")
+    assert page.locator("#measure-picture img").count() == 0 and page.locator(".verdict").count() == 0
+    shot(page, f"error-{width}-{scheme}")
+
+
+def test_bad_input_shows_its_sentence(visitor, plane_files, tmp_path):
     bad = tmp_path / "notes.txt"
     bad.write_text("the rig on the roof\n")
-    page = visitor()
-    upload(page, [*plane_files()[:2], bad])
-    page.click("#run")
-    sentence = page.wait_for_selector("#status [role=alert]", timeout=RUN_MS).inner_text()
-    assert "calibration must be in a known format" in sentence and "notes.txt" in sentence
-
-
-def test_a_missing_photograph_and_a_word_for_a_number(visitor, plane_files):
     page = visitor()
     page.click("#run")
     sentence = page.wait_for_selector("#status [role=alert]").inner_text()
     assert "the left photograph must be given" in sentence
-    upload(page, plane_files()[:2])
+    upload(page, [*plane_files()[:2], bad])
+    page.click("#run")
+    page.wait_for_selector("#status >> text=calibration must be in a known format", timeout=RUN_MS)
+    assert "notes.txt" in page.locator("#status").inner_text()
     page.get_by_text("Focal length and baseline").click()
     page.locator("#fx textarea, #fx input").fill("about 700")
     page.click("#run")
     page.wait_for_selector("#status >> text=fx, px must be a number")
+
+
+def test_an_example_sets_every_field_and_runs(visitor):
+    page = visitor()
+    page.get_by_text("Focal length and baseline").click()
+    page.locator("#baseline_m textarea, #baseline_m input").fill("0.5")
+    page.locator("#examples button").nth(1).click()
+    page.wait_for_selector("#status .figures", timeout=RUN_MS)
+    assert page.locator("#baseline_m textarea, #baseline_m input").input_value() == ""
+    assert page.locator("#way input:checked").get_attribute("value") == "file"
+    assert "0.06 m away, right" in page.locator("#status .cameras").inner_text()
+    shot(page, "example")
 
 
 def test_two_visitors_at_once_do_not_mix(visitor, plane_files, tmp_path):
@@ -173,13 +228,12 @@ def test_stop(visitor, plane_files):
 @pytest.mark.skipif("GEODIFF_SCREENSHOT" not in os.environ, reason="GEODIFF_SCREENSHOT names no picture")
 def test_picture_for_the_docs(visitor):
     page = visitor(height=940)
-    page.get_by_text("A room, 12 cm apart").click()
-    page.wait_for_selector("#right img")
-    run(page)
+    page.locator("#examples button").first.click()
+    page.wait_for_selector("#status .figures", timeout=RUN_MS)
     tab(page, "Measure")
     page.wait_for_selector("#measure-picture img")
     click_picture(page, 0.34, 0.36)  # the bottle's top
-    page.wait_for_selector("#readings >> text=Click a second point")
+    page.wait_for_selector("#readings >> text=Choose a second point")
     click_picture(page, 0.355, 0.74)  # and its foot
     page.wait_for_selector("#readings .distance")
     page.mouse.move(5, 5)

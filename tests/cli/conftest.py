@@ -53,7 +53,7 @@ def write_pair(folder: Path, pair) -> PairFiles:
     return files
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def prior(make_pipeline, tmp_path_factory) -> Path:
     """Folder of a tiny random Marigold."""
     folder = tmp_path_factory.mktemp("prior")
@@ -68,15 +68,43 @@ def pair_files(tmp_path, textured_plane, monkeypatch) -> PairFiles:
     return write_pair(tmp_path, textured_plane)
 
 
+def call(words) -> int:
+    """Run the command in this process; its exit code."""
+    with pytest.raises(SystemExit) as leaving:
+        main([str(word) for word in words])
+    return leaving.value.code or 0
+
+
 @pytest.fixture
 def geodiff(capsys):
     """Call it with arguments; returns exit code, stdout and stderr."""
 
     def run(*arguments: object) -> Answer:
         capsys.readouterr()
-        with pytest.raises(SystemExit) as leaving:
-            main([str(argument) for argument in arguments])
+        code = call(arguments)
         captured = capsys.readouterr()
-        return Answer(leaving.value.code or 0, captured.out, captured.err)
+        return Answer(code, captured.out, captured.err)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def result(prior, textured_plane, tmp_path_factory):
+    """The folder of a pair and of its result ``geodiff-out``, made once: to be looked at, or copied."""
+    folder = tmp_path_factory.mktemp("result")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        write_pair(folder, textured_plane)
+        words = [
+            "depth",
+            "left.png",
+            "right.png",
+            "--calib",
+            "calib.txt",
+            "--prior",
+            prior,
+            "--device",
+            "cpu",
+        ]
+        assert call([*words, "--export", "glb", "--export", "colmap", "-q"]) == 0
+    return folder

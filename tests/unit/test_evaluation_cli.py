@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.cli.eval.app import eval_app
+from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.evaluation import experiment
 from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load

@@ -8,7 +8,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from geodiff_plugin.algorithm.terms import TERMS, Term
-from geodiff_plugin.cli.eval.app import eval_app
+from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.config import DEFAULT_WEIGHTS
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments

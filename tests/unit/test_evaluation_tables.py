@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from geodiff_plugin.cli.eval.app import eval_app
+from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.evaluation import cost, paper
 from geodiff_plugin.evaluation.baselines import (
     METHODS,

@@ -1,0 +1,85 @@
+"""The ``geodiff eval`` commands (S5, experiments): built from ``evaluation.options.COMMANDS``."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from geodiff_plugin.cli.commands import Command, new_group
+from geodiff_plugin.cli.terminal import new_table, print_lines, show
+from geodiff_plugin.evaluation.options import COMMANDS
+from geodiff_plugin.formats.out import check_out
+from geodiff_plugin.options import declare
+
+if TYPE_CHECKING:
+    from geodiff_plugin.evaluation.experiment import Page
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ListOptions:
+    data: Path | None = declare(None, "Folder to look into.")
+
+
+def _run(name: str, options: Any) -> None:
+    check_out(options.out)
+    result = COMMANDS[name](name, options)
+    if isinstance(result, Path) and not options.quiet:
+        typer.echo(result)
+    elif result is not None and not options.quiet:
+        _print_page(result)
+
+
+def _print_page(page: Page) -> None:
+    """Title, how the page was made, its remarks and its tables."""
+    from rich.text import Text
+
+    show(
+        Text(page.title, style="bold"),
+        Text(page.facts["command"], style="dim"),
+        Text(page.origin(), style="dim"),
+        *page.remarks,
+    )
+    for table in page.tables:
+        shown = new_table(table.full_header(), table.title)
+        for index, row in enumerate(table.rows):
+            shown.add_row(*row, end_section=index + 1 in table.rules)
+        show("", shown, Text(table.note, style="dim"))
+
+
+def _list(options: _ListOptions) -> None:
+    from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
+    from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
+
+    rows = []
+    for name, dataset in DATASETS.items():
+        count = 0 if options.data is None else len(find_pairs(options.data, [name]))
+        there = "not found" if options.data is not None else "no --data given"
+        if count or not dataset.needs_folder:
+            there = f"{count or 'any number of'} {'sample' if count == 1 else 'samples'}"
+        full = f" of {dataset.full_count}" if count and dataset.full_count else ""
+        rows.append((name, f"{there}{full}\n{dataset.obtain}"))
+    rows += [("", ""), *((name, method.summary) for name, method in METHODS.items())]
+    for name, family in FAMILIES.items():
+        summary = re.split(r"[.;]", family.__doc__ or " ", maxsplit=1)[0]
+        rows.append((f"{name}:...", f"{summary[0].lower()}{summary[1:]}"))
+    rows.append(("METHOD@PRIOR", "a method that uses a prior, with another one than --prior's first"))
+    rows.append(("METHOD#SEED", "the same with another seed than --seed; METHOD@PRIOR#SEED for both"))
+    print_lines(rows)
+
+
+eval_app = new_group(
+    "Measure this package and its peers on data sets in their official layouts.",
+    {name: Command(each.options, partial(_run, name), each.about) for name, each in COMMANDS.items()}
+    | {
+        "list": Command(
+            _ListOptions,
+            _list,
+            "Say for every data set whether it is there and how to obtain it, and list the methods.",
+        )
+    },
+)

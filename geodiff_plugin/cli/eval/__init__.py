@@ -1,4 +1,0 @@
-"""The ``geodiff eval`` commands: options, help, and tables on the terminal.
-
-Paper: S5 (experiments).
-"""
