@@ -169,9 +169,15 @@ def _settings(priors: Priors) -> dict[str, Any]:
 
 def build_form(priors: Priors) -> Form:
     """Draw the fields into the open gradio context."""
+    names = ", ".join(label.lower() for label in EXAMPLES.values())
+    gr.HTML(f'<div class="legend-caption">Try an example, rendered by this project: {names}.</div>')
     examples = gr.Gallery(
-        [(str(folder / f"left.{ending}"), label) for (folder, ending), label in EXAMPLES.items()],
-        label="Try an example, rendered by this project: one click runs it",
+        [
+            (str(folder / f"left.{ending}"), label.split(",")[0])
+            for (folder, ending), label in EXAMPLES.items()
+        ],
+        label="Examples: one click runs one",
+        show_label=False,
         columns=len(EXAMPLES),
         rows=1,
         height=150,

@@ -48,7 +48,9 @@ CSS = """
   background: #a16207; color: white; font-weight: 600; }
 #results.stale::before { display: block; }
 #results.stale > * { opacity: 0.45; }
-#examples .caption-label { font-size: 0.8rem; }
+#examples .caption-label { font-size: 0.75rem; max-width: none; }
+.tab-container button.selected { color: #0f766e !important; }
+.dark .tab-container button.selected { color: #5eead4 !important; }
 .figures { display: flex; flex-wrap: wrap; gap: 0.4rem 2rem; margin-top: 0.3rem; }
 .figures div { display: flex; flex-direction: column; }
 .figures b { font-size: 1.15rem; font-variant-numeric: tabular-nums; }

@@ -25,6 +25,7 @@ THEME = gr.themes.Base(
     block_info_text_color_dark="#b6c2d1",
     input_placeholder_color="#64748b",
     input_placeholder_color_dark="#9aa8b9",
+    link_text_color_dark="#93c5fd",
     block_label_text_color="#334155",
     block_label_text_color_dark="#cbd5e1",
 )

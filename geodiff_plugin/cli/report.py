@@ -179,6 +179,8 @@ def summary_line(report: dict[str, Any], where: str) -> str:
     signs = verdict["signs"]
     said = [metres, "trusted"]
     said[1] += "" if signs["confidence"] is None else f", confidence {signs['confidence']:.2f}"
+    error = report.get("expected_error_median_m")
+    said[1] += "" if error is None else f", expected error {_length(error, report['unit'])}"
     said[1] += "" if signs["matched"] is None else f", {100 * signs['matched']:.0f} % matched"
     said[1] += f", {signs['points']} known depths" if signs["points"] else ""
     if report["own_scale"] is not None:
