@@ -218,7 +218,11 @@ COMMANDS: dict[str, tuple[type | None, Callable[[Any], Any], str]] = {
     "info": (_Info, _Info.run, "Print versions, devices, priors and what is cached."),
     "bench": (_Bench, _Bench.run, "What guidance costs in seconds and memory, and a command's seconds."),
     "video": (_Video, _Video.run, "Join the depth maps of a sequence into a video, in one range of colours."),
-    "submit": (_Submit, _Submit.run, "Write disparities and times as Middlebury's and ETH3D's benchmarks do."),
+    "submit": (
+        _Submit,
+        _Submit.run,
+        "Write disparities and times as Middlebury and ETH3D take them.",
+    ),
     "app": (_Page, _Page.run, "Serve a web page: drop two photographs, and measure (needs the extra app)."),
     "convert": (
         _Convert,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import importlib.util
 import json
 import math
@@ -333,7 +335,9 @@ class TestWithGradio:
 
     @pytest.fixture(autouse=True)
     def gradio(self):
-        return pytest.importorskip("gradio", reason="gradio is in the extra app")
+        yield pytest.importorskip("gradio", reason="gradio is in the extra app")
+        asyncio.set_event_loop(None)  # what it leaves open is told here, not when all tests are done
+        gc.collect()
 
     def test_examples_are_whole_and_set_every_field(self, priors):
         from geodiff_plugin.app.form import EXAMPLES, build_form
