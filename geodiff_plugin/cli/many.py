@@ -139,9 +139,10 @@ class Stages:
 
     def _frames(self, ref: PairRef, frame: int) -> Sequence[np.ndarray]:
         for path in {ref.left, ref.right or ref.left} - set(self._videos):
-            reader: Any = VideoReader(path)
             if is_bag(path):
-                reader = BagReader(path, self._options.bag_topics(), self._options.tolerance)
+                reader: Any = BagReader(path, self._options.bag_topics(), self._options.tolerance)
+            else:
+                reader = VideoReader(path)
             self._videos[path] = self._held.enter_context(reader)
         left = self._videos[ref.left].read(frame)
         return both_halves(left, "LEFT") if ref.right is None else (left, self._videos[ref.right].read(frame))
