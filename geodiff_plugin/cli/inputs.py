@@ -254,7 +254,7 @@ def _known_length(
 
 
 def _read_known(
-    options: DepthOptions, K: np.ndarray, lens: Distortion | None, size: Size, rig: Rig | None
+    options: DepthOptions, K: np.ndarray, lens: Distortion | None, size: Size, rig: Rig | None = None
 ) -> np.ndarray | None:
     """The depths of ``--points`` or ``--disparity`` as the left image without lens distortion has them.
 
