@@ -126,9 +126,10 @@ def _cameras() -> dict[str, Any]:
         drawn["calibration"] = gr.File(label="Calibration file", height=140, elem_id="calibration")
         with gr.Accordion("One file per camera (MVSNet, ROS, COLMAP)", open=False):
             drawn["second_calibration"] = gr.File(label="Second file", height=140)
-    with gr.Row(visible=False) as lens:
-        for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
-            drawn[name] = _optional(name, placeholder)
+    with gr.Column(visible=False) as lens:
+        with gr.Row():
+            for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
+                drawn[name] = _optional(name, placeholder)
         note = "cx + doffs; if it is not cx and left empty, every depth is off"
         drawn["cx_right"] = _optional("cx_right", "assumed as cx", info=note)
     drawn["baseline_m"] = _optional("baseline_m", "as the calibration file says")

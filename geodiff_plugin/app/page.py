@@ -242,7 +242,9 @@ def _wire_run(
             api_name=name if name == "estimate" else False,
         ).then(None, js=look.RUN_ENDS, queue=False)
     form.stop.click(stop, outputs=panels.status, **QUICK)
-    gr.on([field.change for field in fields], None, js=look.CHANGED, queue=False)
+    by_hand = ("input", "upload", "clear")  # and not by an example
+    changes = [getattr(field, event) for field in fields for event in by_hand if hasattr(field, event)]
+    gr.on(changes, None, js=look.CHANGED, queue=False)
     return desk
 
 

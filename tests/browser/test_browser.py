@@ -197,6 +197,8 @@ def test_an_example_sets_every_field_and_runs(visitor):
     assert page.locator("#baseline_m textarea, #baseline_m input").input_value() == ""
     assert page.locator("#way input:checked").get_attribute("value") == "file"
     assert "0.06 m away, right" in page.locator("#status .cameras").inner_text()
+    page.wait_for_timeout(500)
+    assert not is_stale(page)
     shot(page, "example")
 
 
