@@ -130,9 +130,15 @@ class Capture:
         check_choice(poses, "poses", ("refined", "given"))
         if self._solved is None:
             K = np.stack([frame.K for frame in self.files.frames])
-            sizes, how = [frame.size for frame in self.files.frames], {"names": self.names, "poses": poses}
-            threads = threads or available_cores()
-            self._solved = solve_capture(self._greys(), K, self.poses, sizes, threads=threads, **how)
+            self._solved = solve_capture(
+                self._greys(),
+                K,
+                self.poses,
+                [frame.size for frame in self.files.frames],
+                threads=threads or available_cores(),
+                names=self.names,
+                poses=poses,
+            )
         return self._solved
 
     def adopt(self, solved: SolvedCapture) -> None:

@@ -41,8 +41,8 @@ Writer = Callable[[Path, MetricDepthOutput, np.ndarray], dict[str, Any]]
 POSES_FILE, SCALE_FILE, JOURNAL, REPORT = "poses.npz", "scale.json", "frames.jsonl", "report.json"
 #: What the poses depend on, and beside them the depth of a frame.
 OF_POSES = ("poses", "k", "fov", "trajectory")
-OF_FRAME = ("neighbours", "points", "metres_per_unit", "known_length", "distance", "prior", "prior_map")
-OF_FRAME += ("space", "steps", "seed")
+OF_SCALE = ("metres_per_unit", "known_length", "distance")
+OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "prior_map", "space", "steps", "seed")
 #: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
 PROCESS_BYTES = 1.5e9
 #: Captures with more frames are told how long they will take: seconds of a core and bytes a frame.
@@ -139,8 +139,9 @@ def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None
 def _pipe(options: CaptureOptions) -> Any:
     with no_bars():
         prior = "map" if options.prior_map is not None else options.prior
-        said = {} if options.space is None else {"space": options.space}
-        pipe = enable_geometry_guidance(load_prior(prior, **said).to(pick_device(options.device)))
+        pipe = enable_geometry_guidance(
+            load_prior(prior, space=options.space).to(pick_device(options.device))
+        )
     pipe.set_progress_bar_config(disable=True)
     return pipe
 

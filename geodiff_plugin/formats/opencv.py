@@ -124,7 +124,8 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     named = _named(entries)
     size = _size(named)
     if named.keys() >= {"P1", "P2"}:
-        return projected(*(_of_shape(named, name, (3, 4)) for name in ("P1", "P2")), size, size)
+        P_left, P_right = (_of_shape(named, name, (3, 4)) for name in ("P1", "P2"))  # noqa: N806
+        return projected(P_left, P_right, size, size)
     missing = [name for name in ("M1", "M2", "R", "T") if name not in named]
     if missing:
         expected = "an OpenCV calibration with P1, P2, or with M1, M2, R, T"

@@ -185,7 +185,7 @@ def of_size(by_size: Mapping[Size, Entry], choice: CameraChoice) -> Entry:
     """What a file has for images of ``choice.image_size``, or all that it has where that is one."""
     if choice.image_size is None and len(by_size) == 1:
         return next(iter(by_size.values()))
-    if choice.image_size not in by_size:
+    if choice.image_size is None or choice.image_size not in by_size:
         sizes = ", ".join("{}x{}".format(*size) for size in sorted(by_size)) or "none"
         got = "no image" if choice.image_size is None else "{}x{}".format(*choice.image_size)
         cure = "A side-by-side image is two."

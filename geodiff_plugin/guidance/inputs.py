@@ -88,9 +88,11 @@ def read_inputs(
     for i in range(count):
         label = "{}" if count == 1 else f"{{}}[{i}]"
         arguments = {"right": right, "K": K, "E": E, "points": points, "points_confidence": points_confidence}
-        *views, known, confidence = (_entry(value, name, i, count) for name, value in arguments.items())
-        known = None if known is None else as_points(known, label.format("points"), confidence)
-        inputs.append(_read_image(*views, known, label, cropped, unit))
+        entry = {name: _entry(value, name, i, count) for name, value in arguments.items()}
+        known = entry["points"]
+        if known is not None:
+            known = as_points(known, label.format("points"), entry["points_confidence"])
+        inputs.append(_read_image(entry["right"], entry["K"], entry["E"], known, label, cropped, unit))
     have_points = [entry.points is not None for entry in inputs]
     for name, given in (("right", [bool(entry.views) for entry in inputs]), ("points", have_points)):
         if any(given) and not all(given):

@@ -227,10 +227,10 @@ def _entries(file: Path) -> dict[str, Any]:
 
 def _size(folder: Path) -> tuple[int, int]:
     size = _entries(folder / "preprocessor_config.json").get("size")
-    sides = [size.get(side) for side in ("height", "width")] if isinstance(size, dict) else []
-    if len(sides) != 2 or not all(isinstance(side, int) for side in sides):
+    height, width = (size.get("height"), size.get("width")) if isinstance(size, dict) else (None, None)
+    if not isinstance(height, int) or not isinstance(width, int):
         return _SIZE
-    return min(max(sides[0], 16), 4096), min(max(sides[1], 16), 4096)
+    return min(max(height, 16), 4096), min(max(width, 16), 4096)
 
 
 def _load(folder: Path) -> Any:

@@ -201,8 +201,13 @@ def _indicators(
     order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())
     if evidence.sweep_matches is None and evidence.native:
         with suppress(InputError):  # views without overlap: not judged
-            views, how = (evidence.native_left, evidence.native, K_left), {"depth_range": config.depth_range}
-            volume = evidence.volume or build_cost_volume(*views, **how, config=config)
+            volume = evidence.volume or build_cost_volume(
+                evidence.native_left,
+                evidence.native,
+                K_left,
+                depth_range=config.depth_range,
+                config=config,
+            )
             matches = match_volume(volume)
             evidence = replace(evidence, sweep_matches=matches, sweep_points=None)
             order = float(order_agreement(relative, matches, run.prior.space))

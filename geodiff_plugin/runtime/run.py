@@ -206,8 +206,14 @@ class GuidedRun:
         self._results.append(None)
         self._step, self._timesteps, self._shown = 0, timesteps.tolist(), None
         if self.schedule is None:
-            how = {"rounds": self._rounds, "skipped": self._skipped, "encodes": self._tap is None}
-            self.schedule = make_schedule(self.config, plan, len(timesteps), **how)
+            self.schedule = make_schedule(
+                self.config,
+                plan,
+                len(timesteps),
+                rounds=self._rounds,
+                skipped=self._skipped,
+                encodes=self._tap is None,
+            )
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
             chunks = -(-len(self.owners) // self.batch_size)
             self._bar = tqdm(total=chunks * len(timesteps), **options)
