@@ -12,8 +12,7 @@ import numpy as np
 from geodiff_plugin._checks import bad_value, check_metres, check_number, warn
 from geodiff_plugin.formats.benchmarks import KITTI_ROW
 from geodiff_plugin.formats.depth import read_depth_png, read_map, read_pfm
-from geodiff_plugin.formats.files import check_file, read_npy, read_rows, read_text
-from geodiff_plugin.formats.images import open_image
+from geodiff_plugin.formats.files import check_file, open_image, read_npy, read_rows, read_text
 from geodiff_plugin.types import Rig
 
 __all__ = ["depth_of_disparity", "read_confidence", "read_ply_points", "read_points"]
