@@ -112,9 +112,9 @@ def read_inputs(
         lengths = {"unit": rig.unit, "measured_baseline": rig.measured}
         posed = list(zip(images, Ks, poses, strict=True))
         guidance = GeometryGuidance.from_views(posed, **known, **lengths, config=config)
-    if way in ("parameters", "matrices") and options.k_right is None and options.cx_right is None:
-        if not options.estimate_pose:
-            assume_same_centre(guidance)
+    right_given = options.k_right is not None or options.cx_right is not None
+    if way in ("parameters", "matrices") and not right_given and not options.estimate_pose:
+        assume_same_centre(guidance)
     prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
     if prior_map is not None and lenses[0] is not None:
         cure = "Run the other model on undistorted.png, and give that image and its map."
