@@ -58,14 +58,14 @@ def gradient_step(
             z = z.detach().requires_grad_()
         z0_hat = estimate.z0(z)  # Compute relative depth using Tweedie's formula
         z0 = z0_hat.detach().requires_grad_(moves)
-        D_z0 = estimate.decode(z0)  # noqa: N806
+        D_z0 = estimate.decode(z0)
         x0 = D_z0.detach().requires_grad_(moves)
         if is_first:
             state.prepare(x0.detach(), z0)
             state.find_hidden(x0.detach())
         s_hat, t_hat = (v.detach().requires_grad_() for v in (state.affine.s_hat, state.affine.t_hat))
         affine = replace(state.affine, s_hat=s_hat, t_hat=t_hat)
-        L_geo = state.loss(x0, affine, z0, anchor)  # noqa: N806  # Eq. 14 of Eq. 16's metric depth, with Eq. 17
+        L_geo = state.loss(x0, affine, z0, anchor)  # Eq. 14 of Eq. 16's metric depth, with Eq. 17
         inputs = (s_hat, t_hat, x0, z0) if moves else (s_hat, t_hat)
         total = L_geo.total.sum()  # samples do not mix, so its gradient is each one's own
         grad_s, grad_t, *grads = torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)

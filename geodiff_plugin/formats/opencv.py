@@ -124,7 +124,7 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     named = _named(entries)
     size = _size(named)
     if named.keys() >= {"P1", "P2"}:
-        P_left, P_right = (_of_shape(named, name, (3, 4)) for name in ("P1", "P2"))  # noqa: N806
+        P_left, P_right = (_of_shape(named, name, (3, 4)) for name in ("P1", "P2"))
         return projected(P_left, P_right, size, size)
     missing = [name for name in ("M1", "M2", "R", "T") if name not in named]
     if missing:
