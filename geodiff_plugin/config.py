@@ -148,72 +148,60 @@ class GuidanceConfig:
     Attributes:
         gradient: `full` goes through the U-Net to z_t; `denoised` stops at the clean latent and moves that:
             no U-Net backward.
-        weights: the terms of the loss; a term of weight 0, or of none, costs nothing (gamma of Eq. 17 is
-            `prior_pull`).
-        min_steps: denoising steps when the call names none and the pipeline's own default is lower; a
-            one-step prior does the rounds of all of them in its one step.
+        weights: the terms of the loss; a term of weight 0 costs nothing (gamma of Eq. 17 is `prior_pull`).
+        min_steps: denoising steps when the call names none and the pipeline's default is lower.
         respace: a leading DDIM schedule runs as trailing while guided.
         warm_start: share of the schedule that a call with `previous`, the output of the previous frame,
-            skips; with 0 it takes over the scale alone ([sequences](../how-to/sequences.md)).
+            skips; 0 takes over the scale alone ([sequences](../how-to/sequences.md)).
         loss_resolution: upper bound on the longer side of the grid that losses are computed on, px.
         depth_range: bounds of the sweep and of the nearest and farthest depth of the search.
-        pose: poses that leave matches more than 0.3 px off their epipolar lines (0.45 px if they are
-            rectified) are refined, all views together, and the right image is straightened
-            ([poses](../how-to/poses.md)).
-        clean_photographs: blocks of JPEG compression and strong sensor noise are removed before photographs
-            are compared; the prior sees the image as it is, except with `--distortion`, which undistorts
-            cleaned photographs.
-        decoder: what decodes and encodes between the steps: the prior's own autoencoder, the tiny one that is
-            published for its latent, or another `AutoencoderTiny`; the result is always decoded by the
-            prior's own ([priors](../reference/priors.md#a-tiny-decoder)).
+        pose: poses that do not fit the matches are refined ([poses](../how-to/poses.md#given-poses)).
+        clean_photographs: JPEG blocks and strong sensor noise are removed before photographs are compared;
+            the prior sees the image as it is, except with `--distortion`, which undistorts cleaned
+            photographs.
+        decoder: what decodes and encodes between the steps
+            ([priors](../reference/priors.md#a-tiny-decoder)).
         eta: SSIM against L1 in the photometric term (Eq. 14).
         pyramid_levels: levels of the image pyramid of the photometric term.
         exposure: photographs are compared in the left one's exposure: gain and bias per channel and a slow
             field, in closed form.
-        z_test: pixels that the estimate itself occludes in a right camera take no part in the photometric
-            term of updates, as the right image shows something else there.
+        z_test: pixels that the estimate occludes in a right camera take no part in the photometric term of
+            updates.
         min_visible: share in view below which the photometric term is off.
         pull_to: what `prior_pull` pulls s_hat, t_hat towards (Eq. 17): the search's result, or 0.
-        points_loss: error at points: Cauchy in inverse depth, in units of 1 % of the points' median inverse
-            depth, or L1 + L2 in metres (Marigold-DC, Eq. 4).
+        points_loss: error at points: Cauchy in inverse depth, in units of 1 % of the points' median, or
+            L1 + L2 in metres (Marigold-DC, Eq. 4).
         planes: upper bound on the number of planes of the sweep.
-        sweep_pixels: upper bound on the number of pixels of the sweep's grid: 828 x 250 for KITTI, 530 x 397
-            for 4:3.
-        search: joint (near, far) in a plane-sweep volume, then the basin that reliable matches prefer (a
-            robust fit to the points where there is no right view); the argmin over g_s (S7.3); or the nearest
-            and the farthest point (Marigold-DC).
+        sweep_pixels: upper bound on the pixels of the sweep's grid.
+        search: joint (near, far) in the cost volume, then the basin that reliable matches prefer (a robust
+            fit to the points without a right view); the argmin over g_s (S7.3); or the nearest and the
+            farthest point (Marigold-DC).
         positive: how raw scale and shift become positive (Eq. 13); `square` also clips the relative map to
             [0, 1] (Marigold-DC, Eq. 2).
         g_s_range: candidates of the one-number search.
-        g_s_candidates: how many of them; the paper's figures step through 1..80.
-        reject_reflections: matches that lie behind the prior's first estimate, over a region and by more than
-            the image's matches scatter around it, lose their weight: they are reflections in mirrors and
-            glass.
-        correct: in `corrections` of the steps the decoded map is fitted to its matches and points and the
-            change is encoded, before the updates; with `gradient="denoised"` only (after SteeredMarigold,
-            Gregorek and Nalpantidis 2024).
-        corrections: upper bound on the number of steps (or rounds of a prior with fewer steps) that are
-            corrected: the last, and the others spread over the second half of the schedule, or over more of
-            it if they do not fit there; a step with neither correction nor updates is left to the prior, and
-            is not decoded.
-        even_ensemble: the middle of an even number of ensemble members: the mean of the two middle ones, or
-            the lower of them (Marigold-DC).
-        crisp: the result is finished at full resolution: pixels that hang in the air between two surfaces
-            get the depth of one of them, the map is fitted to its matches and points once more, and for a
-            rectified pair matches, the image's colours and the map vote on every depth.
+        g_s_candidates: the number of these candidates.
+        reject_reflections: matches that lie behind the prior's first estimate over a region lose their
+            weight: they are reflections in mirrors and glass.
+        correct: the decoded map is fitted to its matches and points and the change is encoded, before the
+            updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek and Nalpantidis 2024).
+        corrections: upper bound on the number of steps (or rounds of a one-step prior) that are corrected:
+            the last, and the others spread over the second half of the schedule where they fit.
+        even_ensemble: median of an even number of members: the mean of the two middle ones, or the lower
+            (Marigold-DC).
+        crisp: the result is finished at full resolution
+            ([dataflow](../explanation/dataflow.md#how-edges-become-crisp)).
         smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
             long, for a prior that is wrong by 5 %; it falls with the fourth power of that error.
-        match_noise: relative error of a perfect match: below it one match is as good as another.
-        outlier_width: a match that differs from those of a wide region by more than this many standard
-            deviations, of its noise and of the prior's error, counts for less.
-        rule: how a gradient moves the latent, scale and shift: `plain`; `summed` is plain, and the latent
-            follows the sum of the loss over its pixels; `adam`; `norm` scales the gradient to a share of the
-            predicted noise; `adam-norm` scales it to the noise's norm before an Adam with the usual decays
-            (Marigold-DC).
+        match_noise: relative error of a perfect match.
+        outlier_width: a match that differs from those of its region by more than this many standard
+            deviations counts for less.
+        rule: how a gradient moves the latent, scale and shift: `plain`; `summed`, plain, but the latent
+            follows the sum of the loss over its pixels; `adam`; `norm`, a share of the predicted noise;
+            `adam-norm`, Adam on the gradient scaled to the noise's norm (Marigold-DC).
         step_latents: step size of `rule` on the latent.
         step_affine: step size of `rule` on raw s_hat, t_hat.
-        inner_steps: updates in each denoising step that makes any; with 0 only the search and the correction
-            remain; after a correction only the last quarter of the schedule makes any.
+        inner_steps: updates in each denoising step that makes any: all, or after a correction those of the
+            last quarter of the schedule.
         optimize_latents: `False` is Table 4's ablation: scale and shift only (S5.3).
         start: fraction of the schedule before which nothing is updated.
         stop: fraction after which nothing is updated.
@@ -226,17 +214,17 @@ class GuidanceConfig:
 
     gradient: str = _choice("denoised", "full")
     weights: Mapping[str, float] = _weights(DEFAULT_WEIGHTS)
-    min_steps: int = _integer(4, 1, 1000, paper="{} (not given)")
+    min_steps: int = _integer(4, 1, 1000, paper="{}, not given")
     respace: bool = _flag(True)
     warm_start: float = _number(0.25, 0.0, 0.99, paper="-")
-    loss_resolution: int = _integer(640, 32, 1 << 16, paper="{} (S9, without saying for what)")
+    loss_resolution: int = _integer(640, 32, 1 << 16, paper="{} (S9)")
     depth_range: tuple[float, float] | None = _pair(
         None, paper="-", unset="from the nearest plane to a shift of 0.3 px"
     )
     pose: str = _choice("refine", "given")
     clean_photographs: bool = _flag(True)
     decoder: str = _text("full", "`full`, `tiny`, a folder or a hub id", paper="-")
-    eta: float = _number(0.85, 0, 1, paper="{} (not given)")
+    eta: float = _number(0.85, 0, 1, paper="{}, not given")
     pyramid_levels: int = _integer(3, 1, 10)
     exposure: bool = _flag(True)
     z_test: bool = _flag(True)
@@ -247,13 +235,13 @@ class GuidanceConfig:
     sweep_pixels: int = _integer(210_000, 1024, 1 << 32, paper="-")
     search: str = _choice("volume", "one-number", "points-range")
     positive: str = _choice("softplus", "square")
-    g_s_range: tuple[float, float] = _pair((1.0, 80.0), paper='{} (a "predefined range")')
-    g_s_candidates: int = _integer(80, 2, 100_000, paper="{} (not given)")
+    g_s_range: tuple[float, float] = _pair((1.0, 80.0))
+    g_s_candidates: int = _integer(80, 2, 100_000, paper="{}, not given")
     reject_reflections: bool = _flag(True)
     correct: bool = _flag(True)
     corrections: int = _integer(2, 1, 10_000, paper="-")
     even_ensemble: str = _choice("mean", "lower", paper="-")
-    crisp: bool = _flag(True, paper="-")
+    crisp: bool = _flag(True)
     smoothness: float = _number(40.0, TINY, 1e6, paper="-")
     match_noise: float = _number(0.02, TINY, 1e3, paper="-")
     outlier_width: float = _number(3.0, TINY, 1e6, paper="-")

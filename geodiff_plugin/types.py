@@ -158,7 +158,7 @@ class MetricDepthOutput(BaseOutput):
             that matches the pixel best; 0 where not visible; ``None`` without a right view.
         confidence: [0, 1] probability that the depth is within 10 % of the truth, shaped as ``prediction``;
             from support, photometric error, ``prior_error`` and, if there is an ensemble, uncertainty.
-            ``None`` without ``refine``, or without matches and points.
+            ``None`` without ``crisp``, or without matches and points.
         support: [0, 1] how much matches and points, at the pixel or nearby on the same surface, determine the
             depth; shaped as ``prediction``. ``None`` where ``confidence`` is.
         prior_error: ``(N,)`` error of the prior alone, standard deviation in log depth, estimated from

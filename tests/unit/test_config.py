@@ -175,11 +175,12 @@ def tables():
     for described in dataclasses.fields(GuidanceConfig):
         name, knob = described.name, Knob.of(described)
         if name in SECTIONS:
-            lines += ["", f"### {SECTIONS[name]}", "", "| knob | default | paper | range | what it does |"]
-            lines += ["| --- | --- | --- | --- | --- |"]
+            lines += ["", f"### {SECTIONS[name]}", "", "| knob | default | what it does; range |", "| --- | --- | --- |"]
         default = f"`None`: {knob.unset}" if knob.unset else shown(described.default)
         paper = knob.paper.format(shown(value_of(name, PAPER)))
-        lines.append(f"| `{name}` | {default} | {paper} | {knob.values} | {said[name]} |")
+        default += f" (paper: {paper})" if paper not in ("-", shown(described.default)) else ""
+        values = "" if knob.values == "bool" else f"; {knob.values}"
+        lines.append(f"| `{name}` | {default} | {said[name]}{values} |")
     return "\n".join([*lines, ""])
 
 
