@@ -175,7 +175,8 @@ def tables():
     for described in dataclasses.fields(GuidanceConfig):
         name, knob = described.name, Knob.of(described)
         if name in SECTIONS:
-            lines += ["", f"### {SECTIONS[name]}", "", "| knob | default | what it does; range |", "| --- | --- | --- |"]
+            lines += ["", f"### {SECTIONS[name]}", ""]
+            lines += ["| knob | default | what it does; range |", "| --- | --- | --- |"]
         default = f"`None`: {knob.unset}" if knob.unset else shown(described.default)
         paper = knob.paper.format(shown(value_of(name, PAPER)))
         default += f" (paper: {paper})" if paper not in ("-", shown(described.default)) else ""
