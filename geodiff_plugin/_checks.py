@@ -81,24 +81,24 @@ def warn(sentence: str, *, doubt: bool = False, stacklevel: int = 2) -> None:
     A result with a ``doubt`` is not to be trusted. ``stacklevel`` is that of ``warnings.warn``, from the
     caller.
     """
-    said = _NOTED.get()
-    if said is not None:
-        said[sentence] = said.get(sentence, False) or doubt
+    warned = _NOTED.get()
+    if warned is not None:
+        warned[sentence] = warned.get(sentence, False) or doubt
     warnings.warn(sentence, stacklevel=stacklevel + 1)
 
 
 @contextmanager
 def noted() -> Iterator[dict[str, bool]]:
     """Every sentence that ``warn`` says inside, and whether it is a doubt; blocks may be nested."""
-    said: dict[str, bool] = {}
+    warned: dict[str, bool] = {}
     outer = _NOTED.get()
-    token = _NOTED.set(said)
+    token = _NOTED.set(warned)
     try:
-        yield said
+        yield warned
     finally:
         _NOTED.reset(token)
         if outer is not None:
-            outer.update(said)
+            outer.update(warned)
 
 
 def check_metres(array: np.ndarray, name: str, got: str = "") -> None:

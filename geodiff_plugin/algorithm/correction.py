@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -251,7 +251,7 @@ def refine_depth(
         target: matches or known points of the same images, on any grid.
         left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
         error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it, or a ``local_error`` on any grid: a
-            good prior is bent over wide regions only, and its matches are doubted where it contradicts them.
+            good prior is bent over wide regions only, and matches that contradict it count for less.
         config: the fit's numbers.
 
     Returns:
@@ -278,8 +278,10 @@ def refine_depth(
         part, weights = solve_robust(links, data, inertia, weights, robust, REWEIGHTINGS, SOLVER_STEPS)
         total, decided = total + part[:, :1], part[:, 1:]
     size = image_size(depth_m)
-    options: dict[str, Any] = {"mode": "bilinear", "align_corners": False, "antialias": size < target.size}
-    change, support = (F.interpolate(field, size, **options) for field in (total, decided))
+    change, support = (
+        F.interpolate(field, size, mode="bilinear", align_corners=False, antialias=size < target.size)
+        for field in (total, decided)
+    )
     refined_m = depth_m.float() * torch.exp(-change)
     return refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), total
 
@@ -289,7 +291,7 @@ def _levels(error: Tensor, config: GuidanceConfig) -> list[tuple[Tensor, Tensor]
     ratio = REFERENCE_ERROR / error
     last = (config.smoothness * ratio**STIFFNESS_POWER).clamp(LOOSEST, STIFFEST)
     broad = last.clamp_min(BROAD_SMOOTHNESS)
-    inertia = (INERTIA * ratio**4).clamp_max(MOST_INERTIA)
+    inertia = (INERTIA * ratio**STIFFNESS_POWER).clamp_max(MOST_INERTIA)
     levels = []
     for k in range(PASSES):
         share = k / (PASSES - 1)

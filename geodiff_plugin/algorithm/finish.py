@@ -117,14 +117,14 @@ class _Strip:
     def on_ramp(self) -> Tensor:
         """``(h, w)`` whether a pixel hangs between two surfaces."""
         centre = self._along((0, 0), 0)
-        found = torch.zeros_like(centre, dtype=torch.bool)
+        on_ramp = torch.zeros_like(centre, dtype=torch.bool)
         for way in DIRECTIONS:
             ahead, behind = self._along(way, 1) - centre, centre - self._along(way, -1)
             stepped = torch.minimum(ahead.abs(), behind.abs()) > STEP * centre
             ends = [(self._along(way, k + 1) - self._along(way, k - 1)).abs() for k in (-BESIDE, BESIDE)]
             steep = (ahead + behind).abs() > STEEPER * torch.maximum(*ends)
-            found |= (ahead * behind > 0) & stepped & steep
-        return found
+            on_ramp |= (ahead * behind > 0) & stepped & steep
+        return on_ramp
 
     def median(self, v: Tensor, u: Tensor) -> Tensor:
         """``(n,)`` metres, the weighted median in the windows of the pixels ``(v, u)``, ``(n,)`` each."""
@@ -169,7 +169,7 @@ def vote_depth(
         views: the further views; without a rectified one the map stays as it is.
         target: matches of the sweep, ``(1, 1, h', w')``.
         error: ``(1, 1, 1, 1)`` of the prior in log depth, as ``correction.prior_error`` measures it: matches
-            that contradict a good prior are doubted, and its own vote counts for more.
+            that contradict a good prior count for less, and its own vote counts for more.
 
     Returns:
         ``(1, 1, H, W)`` metres, within the range of ``depth_m``.
@@ -195,10 +195,11 @@ def vote_depth(
     error = error.flatten()[0].clamp_min(1e-3)
     # The confidence of a known point is a count.
     votes = (
-        _doubted(rows.shift, ROWS * rows.matched + FILLED * rows.filled, shift, error),
-        _doubted(px * inverse_depth, confidence.clamp(0.0, 1.0), shift, error),
+        _weigh_votes(rows.shift, ROWS * rows.matched + FILLED * rows.filled, shift, error),
+        _weigh_votes(px * inverse_depth, confidence.clamp(0.0, 1.0), shift, error),
     )
-    voted = _elected(votes, left[0], shift, MAP_VOTE * (WEAK / error).clamp_min(1.0) ** 3)
+    map_vote = MAP_VOTE * (WEAK / error).clamp_min(1.0) ** 3
+    voted = _vote_in_windows(votes, left[0], shift, map_vote)
     if size != full:
         voted = _enlarged(voted, left[0], _resized(left_01.float(), full)[0])
     out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(depth_m.amin(), depth_m.amax())
@@ -215,8 +216,11 @@ def _resized(image_01: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(image_01, size, mode="bilinear", antialias=True)
 
 
-def _doubted(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
-    """Votes, and their weight, less where they differ from a map with this error; ``(H, W)`` pixels each."""
+def _weigh_votes(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
+    """Votes with their weights, which fall where a vote differs from the map by more than its error.
+
+    ``votes`` and ``shift``, the map's, are ``(H, W)`` pixels; ``error`` is the prior's in log depth.
+    """
     noise = error.clamp_max(MOST_ERROR) ** 2 + 1.0 / shift**2  # of the map, and of a match: a pixel
     apart = (votes.clamp_min(0.1) / shift).log() ** 2 / (DIFFERS**2 * noise)
     return votes, weight / (1.0 + apart) ** 2
@@ -243,13 +247,13 @@ def weighted_median(values: Tensor, weight: Tensor, rounds: int = 7) -> Tensor:
     return 0.5 * (low + high)
 
 
-def _elected(
-    ballots: Sequence[tuple[Tensor, Tensor]], left: Tensor, shift: Tensor, map_vote: Tensor
+def _vote_in_windows(
+    voters: Sequence[tuple[Tensor, Tensor]], left: Tensor, shift: Tensor, map_vote: Tensor
 ) -> Tensor:
     """``(H, W)`` the mean of the votes near their weighted median, strip by strip.
 
     Args:
-        ballots: votes and their weights, ``(H, W)`` each, which count in the windows around.
+        voters: for each kind of match its votes, pixels, and their weights, ``(H, W)`` each.
         left: ``(3, H, W)`` in [0, 1]; neighbours of another colour count for less.
         shift: ``(H, W)`` of the map.
         map_vote: its weight, as a share of a window full of sure matches.
@@ -258,7 +262,7 @@ def _elected(
     halo = HALF * SPACING
     padded = [
         F.pad(each.view(1, -1, height, width), (halo,) * 4, mode="replicate")[0]
-        for each in (*(values for ballot in ballots for values in ballot), left)
+        for each in (*(values for pair in voters for values in pair), left)
     ]
     closeness = [math.exp(-(v**2 + u**2) / (2.0 * REACH**2)) for v, u in WINDOW]
     out = torch.empty_like(shift)
@@ -272,7 +276,7 @@ def _elected(
         unlike = torch.stack([colours for *_, colours in around]).sub_(left[:, rows]).abs_().mean(1)
         alike = unlike.div_(-BRIGHTNESS).exp_() * shift.new_tensor(closeness)[:, None, None]
         votes, weights = [shift[rows][None]], [(map_vote * sum(closeness)).expand_as(shift[rows])[None]]
-        for k in range(len(ballots)):
+        for k in range(len(voters)):
             votes.append(torch.cat([each[2 * k] for each in around]))
             weights.append(torch.cat([each[2 * k + 1] for each in around]).mul_(alike))
         out[rows] = _mean_near_median(torch.cat(votes), torch.cat(weights))

@@ -54,15 +54,15 @@ class FieldSystem:
         Links across a cell's border are halved: their ends are twice as far apart.
         """
         height, width = (-(-side // 2) for side in self.weight.shape[-2:])
-        across = _cells(self.across[..., 1::2], height, None, (height, width - 1))
-        down = _cells(self.down[..., 1::2, :], None, width, (height - 1, width))
-        weight, pull = (_cells(part, height, width, (height, width)) for part in (self.weight, self.pull))
+        across = _cells(self.across[..., 1::2], (2, 1), (height, width - 1))
+        down = _cells(self.down[..., 1::2, :], (1, 2), (height - 1, width))
+        weight, pull = (_cells(part, (2, 2), (height, width)) for part in (self.weight, self.pull))
         return FieldSystem(weight, pull, 0.5 * across, 0.5 * down)
 
 
-def _cells(x: Tensor, height: int | None, width: int | None, size: tuple[int, int]) -> Tensor:
-    """Sums over pairs of rows, of columns or both, on a grid of ``size``."""
-    rows, columns = (2 if height else 1), (2 if width else 1)
+def _cells(x: Tensor, cell: tuple[int, int], size: tuple[int, int]) -> Tensor:
+    """Sums over cells of so many rows and columns, on a grid of ``size``; zeros complete the last cells."""
+    rows, columns = cell
     x = F.pad(x, (0, size[1] * columns - x.shape[-1], 0, size[0] * rows - x.shape[-2]))
     return F.avg_pool2d(x, (rows, columns)) * (rows * columns)
 

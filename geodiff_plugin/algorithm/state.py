@@ -198,6 +198,14 @@ class Trajectory:
     def report(self, loss: Loss) -> None:
         """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
         terms = {name: value.detach() for name, value in loss.terms.items()}
-        numbers = self.affine.s_hat, self.affine.t_hat, self.affine.g_s
-        report = StepReport(*self.step, loss.total.detach(), terms, *numbers, loss.visible_fraction)
+        affine = self.affine
+        report = StepReport(
+            *self.step,
+            loss.total.detach(),
+            terms,
+            affine.s_hat,
+            affine.t_hat,
+            affine.g_s,
+            loss.visible_fraction,
+        )
         self.history.append(report)

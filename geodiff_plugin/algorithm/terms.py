@@ -41,7 +41,8 @@ class Compared(NamedTuple):
         affine: current scale, shift, g_s; carries the graph.
         affine_start: where the search put them; no graph.
         z0: ``(B, C, h, w)`` current clean latent, carries the graph.
-        z0_prior: ``(B, C, h, w)`` the network's own clean latent of this step; no graph.
+        z0_prior: ``(B, C, h, w)`` the network's clean latent of this step, moved by its corrections if it
+            has any; no graph.
         matches: those that are believed, or ``None``.
         points: depths that the user knows, or ``None``.
         config: the terms' numbers.
@@ -128,7 +129,7 @@ def prior_pull(compared: Compared) -> Tensor:
 
 
 def anchor(compared: Compared) -> Tensor:
-    """Mean squared distance of the clean latent from the network's own, ``(B,)``, less where matches are.
+    """Mean squared distance of the clean latent from ``z0_prior``, ``(B,)``, less where matches are.
 
     With several inner updates it keeps unmatched regions with the prior, and leaves matched ones to the
     matches: the proximal form of one diffusion posterior step (S3.2 takes a single gradient step instead).
@@ -204,15 +205,25 @@ class Objective:
         with torch.set_grad_enabled(torch.is_grad_enabled() and warps):
             warped_01, in_view = self._warp(depth_m)
         visible = in_view if hidden is None else in_view & ~hidden
-        left_01, config = self.views.left_01, self.config
-        anchored = affine, affine_start, z0, z0_prior
-        compared = Compared(depth_m, left_01, warped_01, visible, *anchored, matches, points, config)
+        compared = Compared(
+            depth_m=depth_m,
+            left_01=self.views.left_01,
+            warped_01=warped_01,
+            visible=visible,
+            affine=affine,
+            affine_start=affine_start,
+            z0=z0,
+            z0_prior=z0_prior,
+            matches=matches,
+            points=points,
+            config=self.config,
+        )
         visible_fraction = in_view.any(1).float().flatten(1).mean(1)
         total, values = torch.zeros_like(visible_fraction), {}
         for name, weight in active.items():
             value = TERMS[name].function(compared)
             if TERMS[name].needs == "views":
-                value = value * (visible_fraction >= config.min_visible)
+                value = value * (visible_fraction >= self.config.min_visible)
             values[name] = value
             total = total + weight * value
         return Loss(total, values, visible_fraction)

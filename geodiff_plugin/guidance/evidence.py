@@ -74,11 +74,11 @@ def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) 
 def make_evidence(
     left_01: Tensor, given: Inputs, config: GuidanceConfig, needs_matches: bool, measured: bool = False
 ) -> Evidence:
-    """What the views and points say of one left image.
+    """Clean the photographs, refine the poses, and prepare the ``Evidence`` of one left image.
 
     Args:
         left_01: ``(3, H, W)`` float32 in [0, 1], native size, on the device to compute on.
-        given: beside it.
+        given: its right views, their cameras, and points.
         config: hyperparameters.
         needs_matches: whether the volume is aggregated and checked against each view.
         measured: whether the lengths of the baselines are measured.
@@ -119,9 +119,16 @@ class EvidenceStore:
         views = [value for view in given.views for value in view]
         tensors = [left_01, torch.from_numpy(given.K_left), given.points, *views]
         settings = (
-            *(config.pose, config.clean_photographs, config.loss_resolution, config.depth_range),
-            *(config.planes, config.sweep_pixels, config.search == "volume"),
-            *(needs_matches, measured, given.unit),
+            config.pose,
+            config.clean_photographs,
+            config.loss_resolution,
+            config.depth_range,
+            config.planes,
+            config.sweep_pixels,
+            config.search == "volume",
+            needs_matches,
+            measured,
+            given.unit,
         )
         for held, made_with, evidence, seconds in self._entries:
             if made_with == settings and len(held) == len(tensors) and all(map(_equal, held, tensors)):

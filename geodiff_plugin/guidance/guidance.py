@@ -43,9 +43,9 @@ def _remembers_warnings(make: F) -> F:
 
     @functools.wraps(make)
     def made(*args: Any, **kwargs: Any) -> Any:
-        with noted() as said:
+        with noted() as warned:
             guidance = make(*args, **kwargs)
-        guidance.warned = said
+        guidance.warned = warned
         return guidance
 
     return cast(F, made)
@@ -198,8 +198,8 @@ class GeometryGuidance:
         if size is None and right is not None and not isinstance(right, (list, tuple)):
             size = picture_size(right, "right")  # the two cameras of a rig have one resolution
         rig = read_calibration(path, cameras, image_names=image_names, image_size=size, baseline_m=baseline_m)
-        of_rig = {"left_size": rig.size_left, "unit": rig.unit, "measured_baseline": rig.measured}
-        guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **of_rig | knobs)
+        defaults = {"left_size": rig.size_left, "unit": rig.unit, "measured_baseline": rig.measured}
+        guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **defaults | knobs)
         for image in guidance.rights:
             size = (image.shape[-1], image.shape[-2])
             cure = "Scale K with the images, or use these."
@@ -279,12 +279,27 @@ class GeometryGuidance:
         """
         photographs = list(left) if right is None and isinstance(left, (list, tuple)) else [left, right]
         Ks = K if K_right is None else [K, K_right]
-        scale_from = {"baseline_m": baseline_m, "known_length": known_length, "points": points}
-        rig = estimate_rig(photographs, K=Ks, fov=fov, matcher=matcher, cropped=cropped, **scale_from)
+        rig = estimate_rig(
+            photographs,
+            K=Ks,
+            fov=fov,
+            baseline_m=baseline_m,
+            known_length=known_length,
+            points=points,
+            matcher=matcher,
+            cropped=cropped,
+        )
         views = zip((None, *photographs[1:]), rig.Ks, (np.eye(4), *rig.Es), strict=True)
-        unit, lengths = rig.scale.unit, {"left_size": rig.size_left, "measured_baseline": True}
-        more = {"points": points if unit else None, "cropped": cropped, "unit": unit} | lengths
-        guidance = cls.from_views(list(views), **more, **knobs)
+        unit = rig.scale.unit
+        guidance = cls.from_views(
+            list(views),
+            points=points if unit else None,
+            left_size=rig.size_left,
+            cropped=cropped,
+            unit=unit,
+            measured_baseline=True,
+            **knobs,
+        )
         guidance.estimated = rig
         if K_right is None:
             assume_same_centre(guidance)
@@ -343,7 +358,7 @@ class GeometryGuidance:
         return requested if requested is not None else max(pipeline_default or 1, self.config.min_steps)
 
     def prepare(self, lefts_01: Tensor) -> list[Evidence]:
-        """Compute what the views say: a cost volume per image, and its matches if they are used.
+        """Compute the ``Evidence`` of every left image: its cost volume, and matches if they are used.
 
         Args:
             lefts_01: ``(N, 3, H, W)`` float32 in [0, 1], native size, on the device to compute on.

@@ -23,8 +23,8 @@ _EDGE_PX = 1e-2
 # a pixel. So it is while the rows drift by no more than this: calibrations put the baseline of a rectified
 # pair a little out of the row.
 _PHASES, _ROW_PHASES, _MOST_DRIFT_PX = 8, 4, 1.0
-# Said every time: where and as what else a tensor is made, the user's defaults decide.
-_HERE: dict[str, Any] = {"device": "cpu", "dtype": torch.float64}
+# Written out wherever a tensor is made: else the user's default device and dtype would apply.
+_CPU_FLOAT64: dict[str, Any] = {"device": "cpu", "dtype": torch.float64}
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class AlignedView:
         ``(D, count + 2 * margin)`` float32, canvas pixels, not clipped; the ``margin`` of lines beyond the
         grid on either side repeats its outermost.
         """
-        lines = torch.arange(-margin, count + margin, **_HERE).clamp_(0, count - 1)
+        lines = torch.arange(-margin, count + margin, **_CPU_FLOAT64).clamp_(0, count - 1)
         at = self.scale[:, None] * lines + self.shift[:, axis, None]
         return at.to(self.grey.device, torch.float32)
 
@@ -66,7 +66,7 @@ class AlignedView:
 
         The way back of ``positions``, rounded.
         """
-        lines = torch.arange(self.size[1 - axis], **_HERE)
+        lines = torch.arange(self.size[1 - axis], **_CPU_FLOAT64)
         scale = self.scale[:, None]
         at = ((lines - self.shift[:, axis, None]) / scale.clamp_min(1e-9)).round()
         seen = (scale > 0) & (at >= 0) & (at < count)
@@ -116,7 +116,7 @@ def _turned(
     image: torch.Tensor, to_right: torch.Tensor, low: torch.Tensor, high: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """A right image under a homography, from column and row ``low`` to ``high``, and what of it is inside."""
-    columns, rows = (torch.arange(int(a), int(b) + 1, **_HERE) for a, b in zip(low, high, strict=True))
+    columns, rows = (torch.arange(int(a), int(b) + 1, **_CPU_FLOAT64) for a, b in zip(low, high, strict=True))
     row, column = torch.meshgrid(rows, columns, indexing="ij")
     p = torch.stack([column, row, torch.ones_like(row)], dim=-1) @ to_right.T
     uv, ahead = p[..., :2] / p[..., 2:].clamp_min(1e-9), p[..., 2] > 1e-9
@@ -131,7 +131,7 @@ def _translation(to_right: torch.Tensor, size: tuple[int, int]) -> torch.Tensor 
     """The shift ``(2,)`` that a homography amounts to on the left grid, or ``None``."""
     height, width = size
     ends = [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]
-    corners = torch.tensor(ends, **_HERE)
+    corners = torch.tensor(ends, **_CPU_FLOAT64)
     p = corners @ to_right.T
     moved = p[:, :2] / p[:, 2:] - corners[:, :2]
     close = (p[:, 2] > 0).all() and (moved - moved.mean(0)).abs().amax() < _AS_IT_IS_PX
@@ -146,11 +146,11 @@ def _extent(
     shift: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """First and last column and row ``(2,)`` of the canvas, in pixels of the left grid at infinity."""
-    far = torch.tensor([size[1] - 1.0, size[0] - 1.0], **_HERE)
+    far = torch.tensor([size[1] - 1.0, size[0] - 1.0], **_CPU_FLOAT64)
     ends = torch.stack([shift, shift + scale[:, None] * far])[:, scale > 0].flatten(0, 1)
     low, high = (ends.amin(0), ends.amax(0)) if len(ends) else (torch.zeros_like(far), far)
     low, high = torch.maximum(low, -far), torch.minimum(high, 2 * far)
-    steps = torch.linspace(0, 1, 9, **_HERE)
+    steps = torch.linspace(0, 1, 9, **_CPU_FLOAT64)
     u, v = steps * (size_right[1] - 1), steps * (size_right[0] - 1)
     grid = torch.stack(torch.meshgrid(u, v, indexing="ij"), -1).flatten(0, 1)
     back = torch.nn.functional.pad(grid, (0, 1), value=1.0) @ torch.linalg.inv(to_right).T
@@ -210,11 +210,12 @@ class ComparedView:
         if (column, row) not in self._phases:
             self._phases = {key: votes for key, votes in self._phases.items() if key[1] == row}
             # Whole numbers would become positions of the user's default dtype.
-            there: dict[str, Any] = {"dtype": torch.float32, "device": self._columns.device}
-            lines = torch.arange(-MARGIN_PX, self._count + MARGIN_PX, **there)
-            rows = torch.arange(-MARGIN_PX, height + MARGIN_PX, **there).clamp_(0, height - 1)
-            at = rows + row / _ROW_PHASES, lines + (self._first + column / _PHASES)
-            self._phases[column, row] = census(_resampled(self._view.grey, *at)).to(torch.int8)
+            dtype, device = torch.float32, self._columns.device
+            rows = torch.arange(-MARGIN_PX, height + MARGIN_PX, dtype=dtype, device=device)
+            rows = rows.clamp_(0, height - 1) + row / _ROW_PHASES
+            columns = torch.arange(-MARGIN_PX, self._count + MARGIN_PX, dtype=dtype, device=device)
+            columns = columns + (self._first + column / _PHASES)
+            self._phases[column, row] = census(_resampled(self._view.grey, rows, columns)).to(torch.int8)
         return self._phases[column, row]
 
     def cost(self, plane: int) -> torch.Tensor:

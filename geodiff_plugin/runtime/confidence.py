@@ -93,9 +93,13 @@ def depth_confidence(
     if prior_error is not None and prior_error.shape[-1] > 1:
         prior_error = F.interpolate(prior_error, support.shape[-2:], mode="nearest-exact")
     for rows in row_strips(*support.shape[-2:]):  # evidence is five times as large as what it says
-        near, off, seen = (part[:, :, rows] for part in (support, error, visible))
-        of_prior = prior_error if prior_error is None or everywhere else prior_error[:, :, rows]
-        evidence = depth_evidence(near, off, seen, None if spread is None else spread[:, :, rows], of_prior)
+        evidence = depth_evidence(
+            support[:, :, rows],
+            error[:, :, rows],
+            visible[:, :, rows],
+            None if spread is None else spread[:, :, rows],
+            prior_error if prior_error is None or everywhere else prior_error[:, :, rows],
+        )
         confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
     return confidence
 

@@ -71,12 +71,12 @@ class MapCodec:
         if tiny is None:
             yield
             return
-        users = self._pipe.vae  # past ``__setattr__``, which would rewrite the pipeline's config
+        original = self._pipe.vae  # past ``__setattr__``, which would rewrite the pipeline's config
         object.__setattr__(self._pipe, "vae", tiny)
         try:
             yield
         finally:
-            object.__setattr__(self._pipe, "vae", users)
+            object.__setattr__(self._pipe, "vae", original)
 
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
         """Unclipped relative map ``(B, 1, H, W)`` float32 of a clean latent ``(B, C, h, w)``, differentiable.

@@ -86,7 +86,9 @@ def finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tenso
         return depth_m, None
     results = []
     for i, (depth, left) in enumerate(zip(depth_m.split(1), lefts.split(1), strict=True)):
-        result = finish(depth, run.evidence[i], *run.of_prior(i), left, _spacing(run, depth), run.config)
+        result = finish(
+            depth, run.evidence[i], *run.kept_and_error(i), left, _spacing(run, depth), run.config
+        )
         if result is None:
             return depth_m, None
         results.append(result)
@@ -110,7 +112,7 @@ def spread_of_members(run: GuidedRun, depth_m: Tensor, lefts: Tensor, call: Mapp
             members = run.within_range(members, i)
         left, spacing = lefts[i : i + 1], _spacing(run, depth_m)
         results = [
-            finish(member, run.evidence[i], *run.of_prior(i, m), left, spacing, run.config)
+            finish(member, run.evidence[i], *run.kept_and_error(i, m), left, spacing, run.config)
             for m, member in enumerate(members.split(1))
         ]
         finished = torch.cat([result[0] for result in results if result is not None])

@@ -244,15 +244,15 @@ class GuidedScheduler:
     ) -> None:
         self._pipe, self._respace, self._skipped = pipe, respace, skipped
         self._on_trajectory, self._on_step, self._on_done = on_trajectory, on_step, on_done
-        users = pipe.scheduler
-        is_patched = any(name in vars(users) for name in ("set_timesteps", "step"))
-        self._scheduler = users if is_patched else copy.copy(users)
+        original = pipe.scheduler
+        is_patched = any(name in vars(original) for name in ("set_timesteps", "step"))
+        self._scheduler = original if is_patched else copy.copy(original)
         self._inside = dict(vars(self._scheduler)) | self._wrapped()
 
     @contextmanager
     def attached(self) -> Iterator[None]:
         """The guided scheduler is on the pipeline; entered again in mid-call, its trajectory goes on."""
-        users, outside = self._pipe.scheduler, dict(vars(self._scheduler))
+        original, outside = self._pipe.scheduler, dict(vars(self._scheduler))
         _set_attributes(self._scheduler, self._inside)
         object.__setattr__(self._pipe, "scheduler", self._scheduler)
         try:
@@ -260,7 +260,7 @@ class GuidedScheduler:
         finally:
             self._inside = dict(vars(self._scheduler))
             _set_attributes(self._scheduler, outside)
-            object.__setattr__(self._pipe, "scheduler", users)
+            object.__setattr__(self._pipe, "scheduler", original)
 
     def release(self) -> None:
         """Let go of the call, after its end: the wrapped methods and this object hold each other."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -42,11 +43,15 @@ def _confidence(
     """``(N, 1, H, W)`` in [0, 1] from support and what the views show: visible, error; ``None`` without."""
     if support is None:
         return None
-    spread, nowhere, (visible, error) = None, torch.zeros_like(depth_m), shown
-    if uncertainty is not None:
-        spread = uncertainty / depth_m
-    seen = nowhere if error is None else error, nowhere.bool() if visible is None else visible
-    return depth_confidence(support, *seen, spread, prior_error)
+    visible, error = shown
+    nothing = torch.zeros_like(depth_m)
+    return depth_confidence(
+        support,
+        error=nothing if error is None else error,
+        visible=nothing.bool() if visible is None else visible,
+        spread=None if uncertainty is None else uncertainty / depth_m,
+        prior_error=prior_error,
+    )
 
 
 def assemble_output(
@@ -54,17 +59,16 @@ def assemble_output(
     run: GuidedRun,
     guidance: GeometryGuidance,
     call: Mapping[str, Any],
-    said: Mapping[str, bool],
+    warned: Mapping[str, bool],
 ) -> MetricDepthOutput:
     """Everything of ``MetricDepthOutput`` but ``latent``.
 
-    ``stock`` is the output of the stock call, already in metres, and ``call`` its arguments by name; ``said``
-    has what was warned of so far, and whether it forbids trust.
+    ``stock`` is the output of the stock call, already in metres, and ``call`` its arguments by name;
+    ``warned`` has the warnings so far, and whether each forbids trust.
     """
     natives = [evidence.native_left for evidence in run.evidence]
-    lefts_01 = (
-        natives[0][None] if len(natives) == 1 else torch.stack(natives)
-    )  # a large picture is not copied
+    # A single large picture is not copied.
+    lefts_01 = natives[0][None] if len(natives) == 1 else torch.stack(natives)
     count, size, has_unit = len(natives), image_size(lefts_01), guidance.unit is not None
     depth_m = run.within_range(_as_maps(stock.prediction).to(lefts_01.device))  # or the processing grid
     grid = image_size(depth_m)
@@ -81,15 +85,24 @@ def assemble_output(
     over_prior = _over_prior(run, depth_m)
     relative = torch.cat(run.relative)
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
+    doubts = tuple(sentence for sentence, forbids in warned.items() if forbids)
     verdicts = []
     for i, K_left in enumerate(Ks):
-        given: dict[str, Any] = {"doubts": tuple(sentence for sentence, forbids in said.items() if forbids)}
-        if confidence is not None:
-            given["confidence"] = float(confidence[i].mean())
+        own_ratio = math.nan
         if over_prior is not None and has_unit:
-            given["own_ratio"] = float(over_prior.reshape(count, -1)[i].median())
-        result = K_left, depth_m[i], relative[i : i + 1]
-        verdicts.append(judge(_indicators(run, i, *result, has_unit=has_unit, **given)))
+            own_ratio = float(over_prior.reshape(count, -1)[i].median())
+        indicators = _indicators(
+            run,
+            i,
+            K_left,
+            depth_m[i],
+            relative[i : i + 1],
+            has_unit=has_unit,
+            doubts=doubts,
+            confidence=math.nan if confidence is None else float(confidence[i].mean()),
+            own_ratio=own_ratio,
+        )
+        verdicts.append(judge(indicators))
     if confidence is not None:
         agreement = confidence.new_tensor([points_agreement(verdict.indicators) for verdict in verdicts])
         confidence = confidence * agreement.view(-1, 1, 1, 1)
@@ -126,7 +139,7 @@ def assemble_output(
         warnings=[
             *_warnings(run, visible, verdicts),
             *(() if estimated is None else estimated.warnings),
-            *(sentence for sentence, forbids in said.items() if not forbids),  # doubts are reasons already
+            *(sentence for sentence, forbids in warned.items() if not forbids),  # doubts are reasons already
         ],
         assumed=list(guidance.assumed),
         scale_from=None if estimated is None else estimated.scale.source,
@@ -193,7 +206,16 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> Metr
 
 
 def _indicators(
-    run: GuidedRun, image: int, K_left: Tensor, depth_m: Tensor, relative: Tensor, **more: Any
+    run: GuidedRun,
+    image: int,
+    K_left: Tensor,
+    depth_m: Tensor,
+    relative: Tensor,
+    *,
+    has_unit: bool,
+    doubts: tuple[str, ...],
+    confidence: float,
+    own_ratio: float,
 ) -> Indicators:
     """Indicators of one image; matches to judge it by are made here, where its run used none."""
     samples = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
@@ -211,9 +233,18 @@ def _indicators(
             matches = match_volume(volume)
             evidence = replace(evidence, sweep_matches=matches, sweep_points=None)
             order = float(order_agreement(relative, matches, run.prior.space))
-    more["on_edge"] = any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in samples)
-    given = config.depth_range is not None
-    return read_indicators(evidence, K_left, depth_m, range_given=given, order=order, **more)
+    return read_indicators(
+        evidence,
+        K_left,
+        depth_m,
+        range_given=config.depth_range is not None,
+        has_unit=has_unit,
+        order=order,
+        on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in samples),
+        doubts=doubts,
+        confidence=confidence,
+        own_ratio=own_ratio,
+    )
 
 
 def _as_maps(values: Any) -> Tensor:

@@ -92,16 +92,25 @@ class GuidedCall(_Stock):
             if guidance is None:
                 return super().__call__(image, *args, **kwargs)
             stock_call = super().__call__
-            extra = (guidance, callback_on_step_end, strict)
             _check_guided_call(guidance, callback_on_step_end)
-            with torch.inference_mode(False), torch.no_grad(), noted() as said:
-                return self._call_guided(stock_call, held, said, *extra, image, *args, **kwargs)
+            with torch.inference_mode(False), torch.no_grad(), noted() as warned:
+                return self._call_guided(
+                    stock_call,
+                    held,
+                    warned,
+                    guidance,
+                    callback_on_step_end,
+                    strict,
+                    image,
+                    *args,
+                    **kwargs,
+                )
 
     def _call_guided(
         self,
         stock_call: Callable[..., Any],
         held: Exclusive,
-        said: dict[str, bool],
+        warned: dict[str, bool],
         guidance: GeometryGuidance,
         callback: StepCallback | None,
         strict: bool,
@@ -132,8 +141,19 @@ class GuidedCall(_Stock):
             call |= {"latents": warm.latents, "generator": None}  # the latents hold the noise already
         if call["latents"] is not None:
             call["image"] = lefts_01  # beside latents Marigold takes no channels-last image
-        inputs = self, prior, guidance, evidence, call
-        run = GuidedRun(*inputs, grid, rounds, callback, tiny=tiny, held=held, warm=warm)
+        run = GuidedRun(
+            self,
+            prior,
+            guidance,
+            evidence,
+            call,
+            grid=grid,
+            rounds=rounds,
+            callback=callback,
+            tiny=tiny,
+            held=held,
+            warm=warm,
+        )
         try:
             with run:
                 stock = stock_call(**{**call, "return_dict": True, "output_latent": True})
@@ -141,7 +161,7 @@ class GuidedCall(_Stock):
             run.release()
         run.check_finite()
         with torch.autocast(device.type, enabled=False):
-            output = assemble_output(stock, run, guidance, call, guidance.warned | said)
+            output = assemble_output(stock, run, guidance, call, guidance.warned | warned)
         if strict and not output.verdict.trusted:
             refuse(output.verdict.sentence)
         output.latent = stock.latent if call["output_latent"] else None

@@ -92,8 +92,14 @@ class GuidedRun:
         self._tap = None
         if needs_network(guidance) and prior.network_input is not None:
             self._tap = DenoiserTap(*prior.network(), prior.network_input)
-        steps = self._on_trajectory, self._on_step, self._on_done
-        self._scheduler = GuidedScheduler(pipe, *steps, self.config.respace, self._skipped)
+        self._scheduler = GuidedScheduler(
+            pipe,
+            on_trajectory=self._on_trajectory,
+            on_step=self._on_step,
+            on_done=self._on_done,
+            respace=self.config.respace,
+            skipped=self._skipped,
+        )
 
     def __enter__(self) -> GuidedRun:
         with ExitStack() as stack:
@@ -161,8 +167,8 @@ class GuidedRun:
         )
         return depth_m.clamp_(near_m.amin(1, keepdim=True), far_m.amax(1, keepdim=True))
 
-    def of_prior(self, image: int, member: int | None = None) -> tuple[Tensor | None, Tensor | None]:
-        """What the prior's first estimates say of one image.
+    def kept_and_error(self, image: int, member: int | None = None) -> tuple[Tensor | None, Tensor | None]:
+        """What the prior's first estimates say of one image's matches, and the matches of the prior.
 
         Args:
             image: its index in the call.
@@ -183,8 +189,10 @@ class GuidedRun:
         return mean("kept"), local_error(mean("error"), mean("valid"))
 
     def prior_error(self) -> Tensor | None:
-        """Error of the prior in log depth, as ``of_prior``; ``None`` if it is not known of every image."""
-        errors = [error for i in range(len(self.evidence)) if (error := self.of_prior(i)[1]) is not None]
+        """Error of the prior in log depth; ``None`` unless ``kept_and_error`` has it for every image."""
+        errors = [
+            error for i in range(len(self.evidence)) if (error := self.kept_and_error(i)[1]) is not None
+        ]
         return torch.cat(errors) if len(errors) == len(self.evidence) else None
 
     def check_finite(self) -> None:
@@ -200,9 +208,18 @@ class GuidedRun:
         chunk = slice(first, first + self.batch_size)
         start = None if self._warm is None else (self._warm.near_m[chunk], self._warm.far_m[chunk])
         plan, prior = self._plan, self.prior
-        samples = self.config, self.evidence, self.owners[chunk], prior.space, plan.step_latents
-        ranges = prior.metric_range(chunk), start, prior.known(chunk)
-        self.trajectories.append(Trajectory(*samples, *ranges))
+        self.trajectories.append(
+            Trajectory(
+                self.config,
+                self.evidence,
+                self.owners[chunk],
+                prior.space,
+                step_latents=plan.step_latents,
+                prior_range=prior.metric_range(chunk),
+                start_range=start,
+                valid=prior.known(chunk),
+            )
+        )
         self._results.append(None)
         self._step, self._timesteps, self._shown = 0, timesteps.tolist(), None
         if self.schedule is None:

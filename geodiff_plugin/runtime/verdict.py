@@ -166,7 +166,7 @@ def _alike(image_01: Tensor, left_01: Tensor) -> bool:
     return largest < SAME_SHARE * float(brightest - darkest)
 
 
-def _of_points(matches: Matches, points: Matches) -> dict[str, float]:
+def _points_indicators(matches: Matches, points: Matches) -> dict[str, float]:
     """Median ratio of points to matched depths, and the share that contradicts; none for too few of them."""
     confident = (matches.confidence > CONFIDENT).float()
     window = (2 * REACH_PX + 1, 1, REACH_PX)
@@ -180,7 +180,7 @@ def _of_points(matches: Matches, points: Matches) -> dict[str, float]:
     return {"points_ratio": float(ratio.median()), "points_off": float(off)}
 
 
-def _of_matches(matches: Matches, depth_m: Tensor | None, planes: Tensor | None) -> dict[str, Any]:
+def _match_indicators(matches: Matches, depth_m: Tensor | None, planes: Tensor | None) -> dict[str, Any]:
     """Share matched, spread of the depths, how far the result lies from them, and how many on the ends."""
     confident = matches.confidence > CONFIDENT
     numbers: dict[str, Any] = {"matched": float(confident.float().mean())}
@@ -223,9 +223,9 @@ def read_indicators(
     matches, pose, rights = evidence.sweep_matches, evidence.pose, evidence.native
     if matches is not None:
         planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
-        more |= _of_matches(matches, depth_m, planes)
+        more |= _match_indicators(matches, depth_m, planes)
         if evidence.sweep_points is not None:
-            more |= _of_points(matches, evidence.sweep_points)
+            more |= _points_indicators(matches, evidence.sweep_points)
     if pose is not None:
         more["epipolar_px"] = max((px for px in pose.residual_px if not math.isnan(px)), default=math.nan)
         if pose.status == "mistaken":

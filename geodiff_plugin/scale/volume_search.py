@@ -64,7 +64,7 @@ def _lookup(
     step = (inverse_depth[-1] - inverse_depth[0]) / (planes - 1)
     position = (1.0 / depth_m - inverse_depth[0]) / step
     inside = (position >= 0) & (position <= planes - 1)
-    # NaN is no index; what computed it is named after the loop (``algorithm.gradient.FiniteWatch``).
+    # NaN is no index; what computed it is named after the loop (``algorithm.gradients.FiniteWatch``).
     position = position.clamp(0, planes - 1).nan_to_num(0.0)
     below = position.floor().clamp_max(planes - 2).long()
     weight = position - below
