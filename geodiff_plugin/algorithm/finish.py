@@ -12,6 +12,8 @@ import math
 from collections.abc import Sequence
 from functools import cached_property
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -55,6 +57,8 @@ MAP_VOTE, WEAK = 0.03, 0.2
 DIFFERS, MOST_ERROR = 2.0, 0.1
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
+#: Side of the last median, over pixels of the grid of the votes.
+MEDIAN = 5
 
 
 @torch.no_grad()
@@ -200,6 +204,9 @@ def vote_depth(
     )
     map_vote = MAP_VOTE * (WEAK / error).clamp_min(1.0) ** 3
     voted = _vote_in_windows(votes, left[0], shift, map_vote)
+    # Without ragged borders; a map that outvotes a window full of matches has none.
+    smooth = torch.from_numpy(cv2.medianBlur(np.ascontiguousarray(voted.cpu().numpy()), MEDIAN))
+    voted = torch.where(map_vote < 1.0, smooth.to(voted.device), voted)
     if size != full:
         voted = _enlarged(voted, left[0], _resized(left_01.float(), full)[0])
     out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(depth_m.amin(), depth_m.amax())

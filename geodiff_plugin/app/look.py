@@ -28,6 +28,8 @@ CHANGED = (
     "if (document.querySelector('#status .verdict')) "
     "document.getElementById('results').classList.add('stale'); }"
 )
+#: What a visitor types or chooses, as against what an example fills in, comes with the browser's event.
+WATCH_FORM = f"() => {{ document.getElementById('form').addEventListener('input', {CHANGED}); }}"
 RUN_ENDS = "() => { if (window.changed) document.getElementById('results').classList.add('stale'); }"
 
 CSS = """

@@ -242,8 +242,8 @@ def _wire_run(
             api_name=name if name == "estimate" else False,
         ).then(None, js=look.RUN_ENDS, queue=False)
     form.stop.click(stop, outputs=panels.status, **QUICK)
-    by_hand = ("input", "upload", "clear")  # and not by an example
-    changes = [getattr(field, event) for field in fields for event in by_hand if hasattr(field, event)]
+    files = [field for field in fields if hasattr(field, "upload")]
+    changes = [event for field in files for event in (field.upload, field.clear)]
     gr.on(changes, None, js=look.CHANGED, queue=False)
     return desk
 
@@ -308,7 +308,7 @@ def build_page(priors: Priors) -> gr.Blocks:
         state = gr.State(None, time_to_live=FORGET_AFTER_S, delete_callback=_forget)
         points, tab = gr.State([]), gr.State("")
         with gr.Row(equal_height=False):
-            with gr.Column(scale=5, min_width=340):
+            with gr.Column(scale=5, min_width=340, elem_id="form"):
                 form = build_form(priors)
             with gr.Column(scale=8, min_width=340, elem_id="results"):
                 panels = build_panels()
@@ -318,5 +318,6 @@ def build_page(priors: Priors) -> gr.Blocks:
         def close(request: gr.Request) -> None:
             desk.leave(request.session_hash)
 
+        page.load(None, js=look.WATCH_FORM)
         page.unload(close)
     return page

@@ -152,7 +152,7 @@ def test_a_weak_map_takes_its_edges_from_the_views_and_their_colours():
     assert wrong(moved, truth) > 0.05
     nothing = matches(truth, 0.0)
     assert wrong(voted(moved, left, view, nothing, 0.4), truth) < 0.4 * wrong(moved, truth)
-    assert wrong(voted(moved, left, view, matches(truth), 0.4), truth) < 0.1 * wrong(moved, truth)
+    assert wrong(voted(moved, left, view, matches(truth), 0.4), truth) < 0.12 * wrong(moved, truth)
 
 
 def test_a_good_map_keeps_its_edges_where_matches_are_fattened():
