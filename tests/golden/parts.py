@@ -385,10 +385,13 @@ def finished() -> dict[str, object]:
     left, true_m, K, views = scene()
     ramp = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(true_m, (2,) * 4, mode="replicate"), 5, 1)
     result: dict[str, object] = {"sharpened": (sharpen_edges(ramp, left[None]) / ramp).log()}
+    T = torch.eye(4)
+    T[0, 3] = -0.4
+    rectified = CameraView(torch.roll(left, -6, -1), K, T)
     for e in (0.03, 0.12):
         error = torch.full((1, 1, 1, 1), e)
-        result[f"alone_{e}"] = (vote_depth(depth_m, left[None], target, error) / depth_m).log()
-        result[f"views_{e}"] = (vote_depth(depth_m, left[None], target, error, views, K) / depth_m).log()
+        voted_m = vote_depth(depth_m, left[None], K, [*views, rectified], target, error)
+        result[f"voted_{e}"] = (voted_m / depth_m).log()
     return result
 
 
