@@ -204,9 +204,9 @@ def vote_depth(
     )
     map_vote = MAP_VOTE * (WEAK / error).clamp_min(1.0) ** 3
     voted = _vote_in_windows(votes, left[0], shift, map_vote)
-    # Without ragged borders; a map that outvotes a window full of matches has none.
+    # Without ragged borders; a map that outvotes a window full of matches has none, and a known point stays.
     smooth = torch.from_numpy(cv2.medianBlur(np.ascontiguousarray(voted.cpu().numpy()), MEDIAN))
-    voted = torch.where(map_vote < 1.0, smooth.to(voted.device), voted)
+    voted = torch.where((map_vote < 1.0) & (confidence <= 1.0), smooth.to(voted.device), voted)
     if size != full:
         voted = _enlarged(voted, left[0], _resized(left_01.float(), full)[0])
     out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(depth_m.amin(), depth_m.amax())
