@@ -49,9 +49,15 @@ QUICK: _Handling = {"queue": False, "show_progress": "hidden", "api_visibility":
 
 
 class _Desk:
-    """Who is being served: one job runs at a time, and each visitor stops only his own."""
+    """Who is being served: one job runs at a time, and each visitor stops only his own.
 
-    def __init__(self) -> None:
+    Args:
+        kept: files that the page itself shows. The cache names files by their content, so a visitor who runs
+            an example has the file of its thumbnail.
+    """
+
+    def __init__(self, kept: Iterable[str] = ()) -> None:
+        self._kept = {Path(path).resolve() for path in kept}
         self._turn = threading.Lock()
         self._stops: dict[str | None, threading.Event] = {}  # by session; a call over the API may have none
         self._uploads: dict[str | None, set[Path]] = {}
@@ -72,7 +78,7 @@ class _Desk:
         self.stop(visitor)
         temporary = Path(tempfile.gettempdir()).resolve()
         for path in self._uploads.pop(visitor, ()):
-            if temporary in path.resolve().parents:  # and no example of ours
+            if temporary in path.resolve().parents and path.resolve() not in self._kept:
                 rmtree(path.parent, ignore_errors=True)
 
     def serve(self, visitor: str | None, job: Callable[[threading.Event], Result]) -> Result:
@@ -182,7 +188,7 @@ def _scene(shown: Shown, least_confidence: float) -> tuple[Any, str]:
 def _wire_run(
     form: Form, panels: Panels, state: gr.State, points: gr.State, tab: gr.State, priors: Priors
 ) -> _Desk:
-    desk, fields = _Desk(), list(form.fields.values())
+    desk, fields = _Desk(form.examples.keep_in_cache), list(form.fields.values())
     controls = (panels.beside, panels.under, panels.least_confidence)
     fixed = (*controls, panels.tabs, panels.pixel, panels.add, panels.clear)
     shows = [component for component in vars(panels).values() if component not in fixed]

@@ -385,14 +385,15 @@ class TestWithGradio:
         from geodiff_plugin.app.page import _Desk
 
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "uploads"))
-        upload, other = tmp_path / "uploads" / "hash" / "left.png", tmp_path / "example" / "left.png"
-        for path in (upload, other):
+        upload, thumbnail = (tmp_path / "uploads" / name / "left.png" for name in ("hash", "of_an_example"))
+        other = tmp_path / "example" / "left.png"
+        for path in (upload, thumbnail, other):
             path.parent.mkdir(parents=True)
             path.touch()
-        desk = _Desk()
-        desk.note("me", [upload, other])
+        desk = _Desk([str(thumbnail)])
+        desk.note("me", [upload, thumbnail, other])
         desk.leave("me")
-        assert not upload.parent.exists() and other.exists()
+        assert not upload.parent.exists() and thumbnail.exists() and other.exists()
 
     def test_a_port_that_another_program_has_is_a_sentence(self, monkeypatch):
         def taken(*_args, **_options):
