@@ -41,6 +41,7 @@ from tqdm import tqdm
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.formats.files import file_digest
+from geodiff_plugin.formats.out import take_lock
 
 try:
     import fcntl
@@ -202,7 +203,7 @@ class Journal:
                 file = open(path, "ab")
             except FileNotFoundError:  # whoever was last to release has removed the folder in between
                 continue
-            if not _locked(file):
+            if not take_lock(file):
                 file.close()
                 return False
             # Who held it before has removed the file meanwhile: what we hold then is nobody's lock.
@@ -226,18 +227,9 @@ class Journal:
         """Whether another process holds an item of this job."""
         for path in set(self._claims.glob("*")) - set(self._mine):
             with suppress(FileNotFoundError), open(path, "rb") as file:
-                if not _locked(file):
+                if not take_lock(file):
                     return True
         return False
-
-
-def _locked(file: IO[bytes]) -> bool:
-    """Lock an open file until it is closed; ``False`` where somebody else has it."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 class Runner:

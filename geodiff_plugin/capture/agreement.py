@@ -9,8 +9,8 @@ import numpy as np
 
 __all__ = ["DepthFrame", "agreed", "seen_in"]
 
-#: Two depths of one point agree within this share; a point that comes back further off is another surface.
-SAME_SHARE, MOST_OFF_PX = 0.06, 2.0
+#: Two depths of one point agree within this share.
+SAME_SHARE = 0.06
 #: A frame's depth counts so many times that of another frame, whose pixels are resampled.
 OWN_WEIGHT = 2.0
 #: Every depth counts a little, however low its confidence.

@@ -15,7 +15,7 @@ from geodiff_plugin.cli.options import PARAMETERS, DepthOptions
 from geodiff_plugin.cli.pairs import start_many
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.formats.bags import BAG_SUFFIXES, Stamp, list_pairs, stereo_calibration, write_depth_bag
-from geodiff_plugin.formats.out import atomic_path
+from geodiff_plugin.formats.out import write_text
 
 
 def run_bag(options: DepthOptions) -> None:
@@ -66,8 +66,6 @@ def run_bag(options: DepthOptions) -> None:
 
 def _written(path: Path, text: str) -> Path:
     """A file with this text; one that has it already stays, so that results that were made by it count."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
-        with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(path, text)
     return path

@@ -31,8 +31,9 @@ from geodiff_plugin.evaluation.metrics import crop_mask
 from geodiff_plugin.evaluation.options import command_line
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.evaluation.tables import Table, headline
-from geodiff_plugin.formats import atomic_path, write_depth_npy
+from geodiff_plugin.formats import write_depth_npy
 from geodiff_plugin.formats.files import file_digest
+from geodiff_plugin.formats.out import write_text
 from geodiff_plugin.runner import Item, Journal, Record, Runner, fingerprint, this_process
 from geodiff_plugin.runtime.machine import PeakMemory, versions
 
@@ -56,13 +57,6 @@ def run_facts(command: str, options: Any) -> dict[str, Any]:
         "versions": used,
         "machine": machine,
     }
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all, making its folder where missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 @dataclass(frozen=True)

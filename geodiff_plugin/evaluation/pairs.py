@@ -12,8 +12,6 @@ from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs, label_of, pairs_tables, without_copies
 from geodiff_plugin.runner import Item, Record, this_process
 
-Remarks = Callable[[list[Record]], Sequence[str]]
-
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:
     """Cells of methods, with every further prior and seed of the options.

@@ -131,7 +131,14 @@ def free_folder(default: Path) -> Path:
     bad_value("--out", "given, as a new folder", f"{MOST_NUMBERED} folders {default}-N that hold files")
 
 
-def _take_lock(file: IO[bytes]) -> bool:
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all, making its folder where missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def take_lock(file: IO[bytes]) -> bool:
     """Lock an open file until it is closed; ``False`` where another process has it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -147,7 +154,7 @@ def _held(hidden: Path) -> bool:
         return False
     with open(lock, "rb") as file:
         try:
-            return not _take_lock(file)
+            return not take_lock(file)
         except OSError:  # a file system that knows no locks
             return True
 
@@ -243,7 +250,7 @@ class OutFolder:
             file = stack.enter_context(open(lock, "a+b", buffering=0))
             if not CAN_LOCK:
                 break
-            if not _take_lock(file):
+            if not take_lock(file):
                 self._refuse_held(self._staging)
             # A run that ended meanwhile has taken the file away: what we hold is then nobody's lock.
             if lock.exists() and os.path.samestat(os.fstat(file.fileno()), lock.stat()):

@@ -8,7 +8,7 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.depth import write_pfm
-from geodiff_plugin.formats.out import atomic_path
+from geodiff_plugin.formats.out import write_text
 
 __all__ = ["BENCHMARKS", "disparity_of_depth", "write_submission"]
 
@@ -69,6 +69,5 @@ def write_submission(
         files, text = (f"{scene.name}.pfm", f"{scene.name}.txt"), f"runtime {seconds:.2f}\n"
     place.mkdir(parents=True, exist_ok=True)
     write_pfm(place / files[0], disparity)
-    with atomic_path(place / files[1]) as temporary:
-        temporary.write_text(text, encoding="ascii")
+    write_text(place / files[1], text)
     return place / files[0]

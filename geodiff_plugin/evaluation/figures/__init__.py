@@ -7,12 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from geodiff_plugin._checks import check_choice
-from geodiff_plugin.evaluation.experiment import run_facts, write_text
+from geodiff_plugin.evaluation.experiment import run_facts
 from geodiff_plugin.evaluation.figures.canvas import Drawing, save_png
 from geodiff_plugin.evaluation.figures.curves import draw_exposure, draw_gs_sweep, draw_inner_steps
 from geodiff_plugin.evaluation.figures.maps import draw_ablation, draw_qualitative
 from geodiff_plugin.evaluation.figures.one_pair import draw_epipolar, draw_terms
 from geodiff_plugin.evaluation.options import FigureOptions
+from geodiff_plugin.formats.out import write_text
 
 FIGURES: dict[str, Callable[[FigureOptions], Drawing]] = {
     "gs-sweep": draw_gs_sweep,
