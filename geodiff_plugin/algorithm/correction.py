@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.solver import solve_robust
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry.cameras import image_size
+from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.scale.points import weighted_quantile
 
@@ -102,10 +102,9 @@ def _times(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Te
 
 
 def local_error(error: Tensor | None, valid: Tensor | None) -> Tensor | None:
-    """The error of a prior where it says something, and the largest elsewhere, ``(B, 1, H, W)``.
+    """A prior's ``error (B, 1, 1, 1)`` where it says something, the largest elsewhere, ``(B, 1, H, W)``.
 
-    ``error (B, 1, 1, 1)`` is that of ``prior_error``; ``valid (B, 1, H, W)`` is above 0 where the prior says
-    something, ``None`` for everywhere: then ``error`` itself is returned.
+    ``valid (B, 1, H, W)`` is above 0 where the prior says something; ``None`` returns ``error`` itself.
     """
     if error is None or valid is None:
         return error
@@ -135,9 +134,6 @@ def correction_target(
             are rejected; without it no match is used.
         error: of the prior, as ``refine_depth`` takes it, or ``None`` before it is measured.
         depth_m: ``(B, 1, H, W)`` metres, the estimate.
-
-    Returns:
-        On the grid of the matches; ``None`` where there are neither.
     """
     if matches is None or kept is None:
         return None if points is None else with_points(None, points)
@@ -154,8 +150,8 @@ def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
     """Matches with less confidence near the depth edges of a map, as far as the map knows where they are.
 
     A window of the matching that lies across an edge takes the nearer surface's depth for both. Known points
-    are measured on their own ray and do not belong here. ``depth_m (B, 1, H, W)`` metres may have any
-    resolution; a prior whose ``error`` is above ``EDGE_ERROR`` has its edges elsewhere than the scene.
+    are measured on their own ray and do not belong here. A prior whose ``error`` is above ``EDGE_ERROR`` has
+    its edges elsewhere than the scene.
     """
     size = target.size
     log_depth = _log_depth(depth_m, size)
@@ -190,7 +186,7 @@ def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: Guid
 def _spread(residual: Tensor, observed: _Observations) -> Tensor:
     """``(B, 1, 1, 1)`` robust standard deviation of residuals beyond the noise of their matches.
 
-    Matches that are expected to be wrong are taken for those with the largest residuals, and left out.
+    As many matches as are expected to be wrong, those with the largest residuals, are left out.
     """
     weight = observed.weight.flatten(1)
     largest = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.right_share)
@@ -203,20 +199,11 @@ def _spread(residual: Tensor, observed: _Observations) -> Tensor:
 def prior_error(
     depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig = DEFAULT
 ) -> Tensor:
-    """How far a prior is wrong, in log depth, as far as its matches can tell.
+    """How far a prior is wrong, in log depth, ``(B, 1, 1, 1)`` within ``LEAST_ERROR`` and ``MOST_ERROR``.
 
     Matches are left out in blocks, and predicted from those of the other blocks by the prior's map under a
     stiff correction: what the map itself is worth between matches, not how well it can be bent to them.
-
-    Args:
-        depth_m: ``(B, 1, H, W)`` metres, of a prior that no match has moved yet but for scale and shift.
-        target: matches of the same images.
-        left_01: ``(B, 3, h, w)`` in [0, 1].
-        config: the fit's numbers.
-
-    Returns:
-        ``(B, 1, 1, 1)``, the robust standard deviation of what is predicted wrongly, beyond the noise of
-        matches; within ``LEAST_ERROR`` and ``MOST_ERROR``, the latter for a sample without matches.
+    Arguments as ``refine_depth``, of a map that no match has moved yet but for scale and shift.
     """
     observed = _observations(depth_m, target, left_01, config)
     height, width = observed.residual.shape[-2:]
@@ -255,9 +242,8 @@ def refine_depth(
         config: the fit's numbers.
 
     Returns:
-        The fitted depth ``(B, 1, H, W)`` metres; its support ``(B, 1, H, W)`` in [0, 1], how far matches, at
-        the pixel or near on the same surface, decided it; and the field ``u (B, 1, h, w)`` on the grid of the
-        matches, log of the factor on inverse depth.
+        The fitted depth ``(B, 1, H, W)`` metres; its support ``(B, 1, H, W)`` in [0, 1], how far matches
+        decided it; and ``u (B, 1, h, w)`` on the grid of the matches, log of the factor on inverse depth.
     """
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)

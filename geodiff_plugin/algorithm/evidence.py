@@ -83,10 +83,7 @@ def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tenso
 
 
 def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
-    """A right image, ``(C, H, W)``, at no more pixels per radian than the left one, and the K of it.
-
-    Neither then aliases in the other.
-    """
+    """A right image, ``(C, H, W)``, at no more pixels per radian than the left one, and the K of it."""
     ratio = float(K_left[0, 0] / K_right[0, 0])
     return resize_long_edge(right_01, K_right, round(max(right_01.shape[-2:]) * min(1.0, ratio)))
 
@@ -107,12 +104,9 @@ def prepare_evidence(
         views: the further views, native, of any size.
         K_left: ``(3, 3)`` pixels of the native left image.
         points: as ``points_to_matches`` takes them, or ``None``.
-        config: says how large the grids are, what the sweep spans, and whether the search needs it.
+        config: how large the grids are, what the sweep spans, and whether the search needs it.
         needs_matches: aggregate the volume and check it against each view.
         pose: how the poses of the views came about.
-
-    Raises:
-        InputError: views that do not overlap; points of which none is in the image.
     """
     left, K_loss = resize_long_edge(left_01, K_left, config.loss_resolution)
     size, loss_size = image_size(left_01), image_size(left)
@@ -196,11 +190,10 @@ class Views:
 
 
 def chunk_views(evidence: Sequence[Evidence]) -> Views:
-    """Stack the views of a chunk of samples, one entry each.
+    """Stack the views of a chunk of samples, one entry each, images and K of one size.
 
-    Further images of different sizes are brought to the largest one, their K with them. An image with fewer
-    views than another repeats its first: the terms take the best view of each pixel, which a repetition does
-    not change.
+    An image with fewer views than another repeats its first: the terms take the best view of each pixel,
+    which a repetition does not change.
     """
     left = torch.stack([image.left_01 for image in evidence])
     K_left = torch.stack([image.K_left for image in evidence])

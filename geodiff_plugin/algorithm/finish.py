@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.formats.depth import row_strips
-from geodiff_plugin.geometry.cameras import image_size, is_rectified, resize_intrinsics
+from geodiff_plugin.geometry import image_size, is_rectified, resize_intrinsics
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.scale.points import weighted_quantile
@@ -63,7 +63,7 @@ MEDIAN = 5
 
 @torch.no_grad()
 def sharpen_edges(depth_m: Tensor, left_01: Tensor, spacing: int = 1) -> Tensor:
-    """Give every pixel on the ramp between two surfaces the depth of one of them.
+    """Give every pixel on the ramp between two surfaces the depth of one of them; leave others bit for bit.
 
     A pixel is on a ramp if its inverse depth lies between those of two opposite neighbours, with a step to
     each, and the ramp is steeper than the surfaces at its ends. A plane, however oblique, has the same slope
@@ -74,10 +74,6 @@ def sharpen_edges(depth_m: Tensor, left_01: Tensor, spacing: int = 1) -> Tensor:
         depth_m: ``(B, 1, H, W)`` metres, > 0.
         left_01: ``(B, 3, H, W)`` in [0, 1], the left images on the same grid.
         spacing: pixels of this grid to one of the grid that the map was decoded on, >= 1.
-
-    Returns:
-        ``(B, 1, H, W)`` metres: on a ramp the depth of a pixel in the window, elsewhere what was given, bit
-        for bit.
     """
     height, width = image_size(depth_m)
     halo = (BESIDE + 1) * spacing
@@ -99,13 +95,7 @@ def sharpen_edges(depth_m: Tensor, left_01: Tensor, spacing: int = 1) -> Tensor:
 
 
 class _Strip:
-    """Some rows of a map and its image, with a halo of ``BESIDE + 1`` spacings on every side.
-
-    Args:
-        depth_m: ``(h + 2 halo, w + 2 halo)`` metres.
-        image_01: ``(3, h + 2 halo, w + 2 halo)``.
-        spacing: as ``sharpen_edges``.
-    """
+    """Some rows of a map ``(h, w)`` and its image, with a halo of ``BESIDE + 1`` spacings on every side."""
 
     def __init__(self, depth_m: Tensor, image_01: Tensor, spacing: int) -> None:
         self.depth_m, self.image, self.spacing = depth_m, image_01, spacing
@@ -164,7 +154,8 @@ def vote_depth(
     """Give every pixel the depth that matches around it of the same colour, and the map, vote for.
 
     The weighted median of the votes chooses a surface; the mean of those near it is the depth. Rows of a
-    rectified view are matched again at this resolution, which sees edges that the sweep's grid does not.
+    rectified view are matched again at this resolution, which sees edges that the sweep's grid does not. The
+    result stays within the range of ``depth_m``.
 
     Args:
         depth_m: ``(1, 1, H, W)`` metres, > 0, fitted to the matches.
@@ -174,9 +165,6 @@ def vote_depth(
         target: matches of the sweep, ``(1, 1, h', w')``.
         error: ``(1, 1, 1, 1)`` of the prior in log depth, as ``correction.prior_error`` measures it: matches
             that contradict a good prior count for less, and its own vote counts for more.
-
-    Returns:
-        ``(1, 1, H, W)`` metres, within the range of ``depth_m``.
     """
     native = image_size(left_01)
     view = next((v for v in views if image_size(v.image_01) == native and _rectified(K_left, v)), None)
@@ -224,10 +212,7 @@ def _resized(image_01: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _weigh_votes(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
-    """Votes with their weights, which fall where a vote differs from the map by more than its error.
-
-    ``votes`` and ``shift``, the map's, are ``(H, W)`` pixels; ``error`` is the prior's in log depth.
-    """
+    """Votes ``(H, W)`` and their weights, lower where they differ from the map by more than the error."""
     noise = error.clamp_max(MOST_ERROR) ** 2 + 1.0 / shift**2  # of the map, and of a match: a pixel
     apart = (votes.clamp_min(0.1) / shift).log() ** 2 / (DIFFERS**2 * noise)
     return votes, weight / (1.0 + apart) ** 2
@@ -236,13 +221,7 @@ def _weigh_votes(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) ->
 def weighted_median(values: Tensor, weight: Tensor, rounds: int = 7) -> Tensor:
     """Weighted median over the first axis, to within ``2**-rounds`` of the values' range, by bisection.
 
-    Args:
-        values: ``(n, ...)``.
-        weight: ``(n, ...)``, >= 0.
-        rounds: halvings of the range.
-
-    Returns:
-        ``(...)``; where no value has weight, about the least.
+    Where no value has weight, about the least.
     """
     low, high, half = values.amin(0), values.amax(0), weight.sum(0) / 2.0
     room = torch.empty_like(weight)
@@ -259,11 +238,8 @@ def _vote_in_windows(
 ) -> Tensor:
     """``(H, W)`` the mean of the votes near their weighted median, strip by strip.
 
-    Args:
-        voters: for each kind of match its votes, pixels, and their weights, ``(H, W)`` each.
-        left: ``(3, H, W)`` in [0, 1]; neighbours of another colour count for less.
-        shift: ``(H, W)`` of the map.
-        map_vote: its weight, as a share of a window full of sure matches.
+    ``voters`` are pairs of votes and their weights, ``map_vote`` is the weight of the map's ``shift`` as a
+    share of a window full of sure matches; neighbours of another colour in ``left`` count for less.
     """
     height, width = shift.shape
     halo = HALF * SPACING

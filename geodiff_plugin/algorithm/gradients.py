@@ -18,10 +18,9 @@ from geodiff_plugin._checks import bad_value
 def pull_back(output: Tensor, source: Tensor, gradient: Tensor) -> Tensor:
     """The gradient in ``source`` of a loss whose gradient in ``output`` is given; frees the graph between.
 
-    Both tensors are ``(B, ...)``, ``source`` in float32 or wider. Inside the graph the largest entry of every
-    sample is between 1/2 and 1: the loss is a mean, so that a gradient in one pixel may be below float16's
-    least number, or above its greatest if any constant lifted it. The factor is a power of two, so in float32
-    the result is what it would be without it.
+    Inside the graph the largest entry of every sample is between 1/2 and 1: a gradient in one pixel of a mean
+    may be below float16's least number, or above its greatest if a constant lifted it. The factor is a power
+    of two, so in float32 the result is what it would be without it.
     """
     largest = gradient.detach().abs().flatten(1).amax(1)
     unit = torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent)
@@ -100,8 +99,7 @@ class NormMatched:
 class Adam:
     """Adam with bias correction, element-wise, so that samples of a batch do not see each other.
 
-    ``to_norm`` scales each sample's gradient to the norm of the reference first, which weighs the steps of a
-    schedule against each other in the moments.
+    ``to_norm`` scales each sample's gradient to the norm of the reference first.
     """
 
     def __init__(

@@ -59,8 +59,7 @@ def count_steps(wanted: int, requested: int | None, most: int | None) -> tuple[i
     """Denoising steps of a guided call, and rounds in each.
 
     A prior that takes at most ``most`` steps, fewer than the ``wanted``, makes the rounds of all of them in
-    those that it has, each with a search of its own, as a step would have. To request more of such a prior
-    raises ``InputError``.
+    those that it has. To request more of such a prior raises ``InputError``.
     """
     if most is None or wanted <= most:
         return wanted, 1
@@ -79,20 +78,13 @@ def make_schedule(
     skipped: int = 0,
     encodes: bool = True,
 ) -> Schedule:
-    """The schedule of a call.
+    """The schedule of so many steps of so many rounds, after ``skipped`` steps of a warm start.
 
     Early estimates are vague, and later corrections replace what earlier ones did. So the last active round
     is corrected, and the others are spread over the second half of the active rounds, or over more of them if
     they do not fit there. An estimate that was corrected in a round without updates is not corrected again in
-    the same step: it would be fitted to the same matches, which only follows their noise.
-
-    Args:
-        config: hyperparameters.
-        plan: number and start of the updates.
-        steps: denoising steps that run, ``rounds`` in each.
-        rounds: as ``count_steps`` gives them.
-        skipped: steps before them that a warm start leaves out; they count in fractions of the schedule.
-        encodes: whether corrected maps can be encoded: not where guidance moves z_t.
+    the same step: it would be fitted to the same matches, which only follows their noise. Nothing is
+    corrected where a map cannot be encoded (``encodes``), as guidance moves z_t.
     """
     count = (skipped + steps) * rounds
     active = [i for i in range(count) if config.start <= i / count < config.stop]

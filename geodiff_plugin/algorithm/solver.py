@@ -24,8 +24,9 @@ class FieldSystem:
     Attributes:
         weight: ``(B, 1, H, W)`` >= 0; with some above 0 in every part that links connect.
         pull: ``(B, C, H, W)`` weight times data.
-        across: ``(B, 1, H, W - 1)`` >= 0, links between horizontal neighbours.
-        down: ``(B, 1, H - 1, W)`` >= 0, links between vertical neighbours.
+        across: ``(B, 1, H, W - 1)`` >= 0, links between horizontal neighbours; ``down`` between vertical
+            ones.
+        down: ``(B, 1, H - 1, W)``.
     """
 
     weight: Tensor
@@ -68,12 +69,9 @@ def _cells(x: Tensor, cell: tuple[int, int], size: tuple[int, int]) -> Tensor:
 
 
 def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) -> Tensor:
-    """The field ``(B, C, H, W)`` of a system; a fixed amount of work, so that no device is waited for.
+    """The field ``(B, C, H, W)`` of a system, by so many conjugate-gradient steps on each finer grid.
 
-    Args:
-        system: of any size.
-        steps: conjugate-gradient steps on every grid but the coarsest.
-        start: a field that is near already; without one the coarser grids give it.
+    Without a ``start`` that is near already the coarser grids give it. A fixed amount of work.
     """
     height, width = system.weight.shape[-2:]
     if start is not None:
@@ -115,7 +113,7 @@ def solve_robust(
     rounds: int,
     steps: int,
 ) -> tuple[Tensor, Tensor]:
-    """The field of iteratively reweighted least squares.
+    """The field of iteratively reweighted least squares, and the weights of another round.
 
     Args:
         links: across and down, as in ``FieldSystem``.
@@ -125,9 +123,6 @@ def solve_robust(
         robust: the weights of the next round, from what the field of the first channel leaves of its data.
         rounds: >= 1.
         steps: as for ``solve_field``.
-
-    Returns:
-        ``(B, C, H, W)``, and the weights of another round.
     """
     field: Tensor | None = None
     for _ in range(rounds):

@@ -100,12 +100,7 @@ class Trajectory:
         self.watch.note(name, self.step[0], tensor)
 
     def prepare(self, x: Tensor, z0: Tensor) -> None:
-        """What an estimate decides before it is corrected or compared: scale, which matches to believe.
-
-        Args:
-            x: ``(B, 1, h, w)`` float32 relative map.
-            z0: ``(B, C, h, w)`` the clean latent that it was decoded from.
-        """
+        """What an estimate ``x``, decoded from ``z0``, decides first: the scale, which matches to believe."""
         self.note("the network's clean latent", z0)
         self.note("the decoded map", x)
         if self._prior_range is not None and self.prior_depth is None:
@@ -172,7 +167,7 @@ class Trajectory:
         return correction_target(self.matches, self.points, self.kept, error, depth_m)
 
     def find_hidden(self, x: Tensor) -> None:
-        """Find what a map ``x (B, 1, h, w)`` hides from the right cameras; it holds for a round's updates."""
+        """Find what a map hides from the right cameras; it holds for a round's updates."""
         compared = self.config.weights.get("photometric") and self.objective.views.further
         if self.config.z_test and compared:
             self.hidden = self.objective.hidden(x, self.affine)

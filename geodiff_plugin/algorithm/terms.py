@@ -1,11 +1,13 @@
-"""Guidance terms, their table, and their weighted sum: the loss of a relative map.
+"""The loss of a relative map: guidance terms, their table, and their weighted sum.
 
-Source: ``photometric`` and ``prior_pull`` are Eq. 14 (eq:geo-loss) and Eq. 17, on the metric depth of Eq. 16.
-The other terms go beyond the paper. A new term is a function and one line in ``TERMS``.
+``photometric`` and ``prior_pull`` are Eq. 14 (eq:geo-loss) and Eq. 17, on the metric depth of Eq. 16; the
+other terms go beyond the paper, as do the mask, the exposure and the pyramid of the photometric one. A new
+term is a function and one line in ``TERMS``.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,20 +16,138 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.evidence import Views
-from geodiff_plugin.algorithm.photometric import masked_mean, photometric
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.geometry import hidden_in_right, image_size, warp_right_to_left
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState, MetricMap
 
+#: A pyramid level with a shorter side than this says nothing that its parent does not.
+MIN_SIDE = 24
+#: SSIM's two constants for images in [0, 1].
+C1, C2 = 0.01**2, 0.03**2
+#: The 3 taps of its Gaussian window of 1.5 pixels, before they sum to 1.
+_TAP = math.exp(-0.5 / 1.5**2)
+TAP_BESIDE, TAP_CENTRE = _TAP / (1.0 + 2.0 * _TAP), 1.0 / (1.0 + 2.0 * _TAP)
+#: More than any error of a view that sees the pixel.
+UNSEEN = 2.0
+#: Added to a spread, so that a blank image divides nothing by zero.
+BLANK_SPREAD = 1e-3
+#: Gains beyond these say that two photographs do not show the same scene.
+GAINS = (0.2, 5.0)
+#: Rows and columns of the field of slow shading: vignetting, sun from one side; and the share of a cell in
+#: view that counts as much as the mean of the whole image.
+CELLS, CELL_PRIOR = (4, 5), 0.2
 #: Errors at points up to this share of the unit are float32's rounding and pull no more: a rule that gives
 #: every gradient the same length would follow their sign.
 ROUNDING = 1e-3
 #: Residual of matches, in planes, and of points, in their unit, from which their pull falls: a wrong match
 #: must not win against its neighbours, but a surface that the prior put far away must still feel where it is.
-CAUCHY = 5.0
+TERM_CAUCHY = 5.0
 #: Share of the anchor's pull that remains where every pixel is matched.
 ANCHOR_FLOOR = 0.05
+
+
+def masked_mean(value: Tensor, weight: Tensor) -> Tensor:
+    """Weighted mean ``(B,)`` of ``value (B, C, H, W)`` by ``weight (B, 1, H, W)`` >= 0; 0 where all are 0."""
+    weight = weight.to(value.dtype)
+    total = (value.mean(1, keepdim=True) * weight).flatten(1).sum(1)
+    return total / weight.flatten(1).sum(1).clamp_min(1e-6)
+
+
+def photometric_map(left_01: Tensor, warped_01: Tensor, eta: float) -> Tensor:
+    """Per-pixel ``eta (1 - SSIM) / 2 + (1 - eta) L1`` of two images ``(B, 3, H, W)``, in [0, 1] as they are.
+
+    Source: Eq. 14 (eq:geo-loss). The paper gives no window; 3x3 follows the works it cites.
+    """
+    return (
+        eta * ((1.0 - ssim(left_01, warped_01)) / 2.0).clamp(0.0, 1.0)
+        + (1.0 - eta) * (left_01 - warped_01).abs()
+    )
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Structural similarity of every pixel, in a Gaussian window of 3x3 pixels, reflected at the border.
+
+    As ``kornia.metrics.ssim(a, b, 3)``, which makes its window of a list at every call, and so waits for the
+    device. Source: Wang et al. 2004, "Image quality assessment", Eq. 13.
+    """
+    moments = F.pad(torch.cat([a, b, a * a, b * b, a * b], 1), (1, 1, 1, 1), mode="reflect")
+    moments = TAP_BESIDE * (moments[..., :-2] + moments[..., 2:]) + TAP_CENTRE * moments[..., 1:-1]
+    moments = TAP_BESIDE * (moments[..., :-2, :] + moments[..., 2:, :]) + TAP_CENTRE * moments[..., 1:-1, :]
+    mean_a, mean_b, square_a, square_b, product = moments.chunk(5, 1)
+    means, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
+    covariance, variances = product - means, square_a + square_b - squares
+    return (2.0 * means + C1) * (2.0 * covariance + C2) / ((squares + C1) * (variances + C2) + 1e-12)
+
+
+def _moments(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation per sample and channel, ``(B, C, 1, 1)`` each."""
+    total = weight.sum((-2, -1), keepdim=True).clamp_min(1.0)
+    mean = (image * weight).sum((-2, -1), keepdim=True) / total
+    square = ((image - mean) ** 2 * weight).sum((-2, -1), keepdim=True) / total
+    return mean, (square + BLANK_SPREAD**2).sqrt()
+
+
+def match_exposure(warped_01: Tensor, left_01: Tensor, visible: Tensor) -> Tensor:
+    """Bring warped right images to the left one's gain and bias per channel, and to its slow shading.
+
+    In closed form: gain and bias make mean and spread over the ``visible`` pixels agree. A least-squares fit
+    pixel by pixel would take every wrong depth for a lower gain. What remains of the difference in a coarse
+    grid of cells is added as a smooth field. Images are ``(B, C, H, W)`` in [0, 1]; differentiable. Beyond
+    the paper, which names illumination as a limit.
+    """
+    weight = visible.to(left_01.dtype)
+    mean_left, spread_left = _moments(left_01, weight)
+    mean_right, spread_right = _moments(warped_01, weight)
+    gain = (spread_left / spread_right).clamp(*GAINS)
+    matched = mean_left + gain * (warped_01 - mean_right)
+    share = F.adaptive_avg_pool2d(weight, CELLS)
+    field = F.adaptive_avg_pool2d((left_01 - matched) * weight, CELLS) / (share + CELL_PRIOR)
+    return matched + F.interpolate(field, left_01.shape[-2:], mode="bilinear", align_corners=False)
+
+
+def photometric(left_01: Tensor, warped_01: Tensor, visible: Tensor, config: GuidanceConfig) -> Tensor:
+    """Mean photometric error over the visible pixels, averaged over an image pyramid, ``(B,)`` in [0, 1].
+
+    With several right views each pixel takes the one that explains it best among those that see it: a view in
+    which something hides the pixel then does not count.
+
+    Args:
+        left_01: ``(B, 3, H, W)`` in [0, 1].
+        warped_01: ``(B, V, 3, H, W)`` every right image seen from the left; differentiable in it.
+        visible: ``(B, V, 1, H, W)`` bool, what is compared.
+        config: ``eta``, ``pyramid_levels`` (1 is the paper's; coarser levels widen the basin of attraction)
+            and ``exposure``.
+
+    Source: Eq. 14 (eq:geo-loss). Deviation: the mask (the paper's mean over all pixels rewards depths that
+        push pixels out of the right image) and the pyramid. Minimum over views: Godard et al. 2019, "Digging
+        into self-supervised monocular depth estimation", Eq. 4.
+    """
+    views = warped_01.shape[1]
+    left = left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), a view's pixels by themselves
+    warped, mask = warped_01.flatten(0, 1), visible.flatten(0, 1).to(left.dtype)
+    if config.exposure:
+        warped = match_exposure(warped, left, mask)
+    total, levels = left.new_zeros(()), 0
+    for level in range(config.pyramid_levels):
+        if level:
+            if min(left.shape[-2:]) < 2 * MIN_SIDE:
+                break
+            # Masked averaging: a coarse pixel is the mean of its visible fine ones.
+            seen = F.avg_pool2d(mask, 2)
+            left = F.avg_pool2d(left * mask, 2) / seen.clamp_min(1e-6)
+            warped = F.avg_pool2d(warped * mask, 2) / seen.clamp_min(1e-6)
+            mask = (seen > 0.5).to(left.dtype)
+        total = total + masked_mean(*_best_explained(photometric_map(left, warped, config.eta), mask, views))
+        levels += 1
+    return total / levels
+
+
+def _best_explained(error: Tensor, mask: Tensor, views: int) -> tuple[Tensor, Tensor]:
+    """Least error over the views that see a pixel, and whether any does, ``(B, 1, H, W)`` each."""
+    error = error.mean(1, keepdim=True).unflatten(0, (-1, views))
+    mask = mask.unflatten(0, (-1, views))
+    return torch.where(mask > 0, error, torch.full_like(error, UNSEEN)).amin(1), mask.amax(1)
 
 
 class Compared(NamedTuple):
@@ -41,8 +161,7 @@ class Compared(NamedTuple):
         affine: current scale, shift, g_s; carries the graph.
         affine_start: where the search put them; no graph.
         z0: ``(B, C, h, w)`` current clean latent, carries the graph.
-        z0_prior: ``(B, C, h, w)`` the network's clean latent of this step, moved by its corrections if it
-            has any; no graph.
+        anchor: ``(B, C, h, w)`` the network's clean latent of this step, moved by its corrections; no graph.
         matches: those that are believed, or ``None``.
         points: depths that the user knows, or ``None``.
         config: the terms' numbers.
@@ -55,7 +174,7 @@ class Compared(NamedTuple):
     affine: AffineState
     affine_start: AffineState
     z0: Tensor
-    z0_prior: Tensor
+    anchor: Tensor
     matches: Matches | None
     points: Matches | None = None
     config: GuidanceConfig = DEFAULT
@@ -71,9 +190,9 @@ class Term(NamedTuple):
     needs: str = ""
 
 
-def cauchy(e: Tensor, width: float) -> Tensor:
-    """``width^2 / 2 log(1 + (e / width)^2)``: ``e^2 / 2`` near 0, its gradient falls as 1 / e beyond."""
-    return 0.5 * width**2 * ((e / width) ** 2).log1p()
+def cauchy(e: Tensor) -> Tensor:
+    """``w^2 / 2 log(1 + (e / w)^2)``: ``e^2 / 2`` near 0, its gradient falls as 1 / e beyond ``w``."""
+    return 0.5 * TERM_CAUCHY**2 * ((e / TERM_CAUCHY) ** 2).log1p()
 
 
 def _relative_error(depth_m: Tensor, target: Matches) -> Tensor:
@@ -82,44 +201,40 @@ def _relative_error(depth_m: Tensor, target: Matches) -> Tensor:
 
 
 def photometric_term(compared: Compared) -> Tensor:
-    """``photometric`` of the right images seen from the left, over the pixels that some right camera sees."""
+    """``photometric`` of the right images seen from the left."""
     return photometric(compared.left_01, compared.warped_01, compared.visible, compared.config)
 
 
 def matches_term(compared: Compared) -> Tensor:
-    """Robust distance from the matches in inverse depth, ``(B,)``; 0 where a sample has no match.
-
-    In units of one plane of the sweep, which is one step of shift in the right image, so that far and near
-    pixels weigh alike.
-    """
+    """Robust distance from the matches in inverse depth, in planes of the sweep: far and near weigh alike."""
     target = compared.matches
     assert target is not None  # Term.needs
-    return masked_mean(cauchy(_relative_error(compared.depth_m, target), CAUCHY), target.confidence)
+    return masked_mean(cauchy(_relative_error(compared.depth_m, target)), target.confidence)
 
 
 def points_term(compared: Compared) -> Tensor:
-    """Error at depths that the user knows (lidar, structure from motion, a tape), ``(B,)``; 0 without any.
+    """Error at depths that the user knows (lidar, structure from motion, a tape).
 
-    ``points_loss="robust"`` is the Cauchy loss of the matches: far and near points weigh alike, and a wrong
-    one (seen through a window, or from the other side of an edge) does not win against the rest. ``"l1l2"``,
-    mean absolute plus mean squared error in metres, is that of Marigold-DC (Viola et al. 2024, Eq. 4).
+    ``points_loss="robust"`` is the Cauchy loss of the matches: a wrong point (seen through a window, or from
+    the other side of an edge) does not win against the rest. ``"l1l2"``, mean absolute plus mean squared
+    error in metres, is that of Marigold-DC (Viola et al. 2024, Eq. 4).
     """
     target = compared.points
     assert target is not None  # Term.needs
     if compared.config.points_loss == "robust":
         e = _relative_error(compared.depth_m, target)
-        return masked_mean(cauchy(F.hardshrink(e, ROUNDING), CAUCHY), target.confidence)
+        return masked_mean(cauchy(F.hardshrink(e, ROUNDING)), target.confidence)
     given = target.confidence > 0
     e = (compared.depth_m - 1.0 / target.inverse_depth.where(given, target.inverse_depth.new_ones(()))).abs()
     return masked_mean(e + e * e, given)
 
 
-def prior_pull(compared: Compared) -> Tensor:
-    """``||s_hat - s*||^2 + ||t_hat - t*||^2``, ``(B,)``, to be weighted by gamma.
+def prior_pull_term(compared: Compared) -> Tensor:
+    """``||s_hat - s*||^2 + ||t_hat - t*||^2``, to be weighted by gamma.
 
-    Source: Eq. 17, with ``pull_to="zero"``. Deviation: by default s*, t* are the search's result, because
-    the paper's pull of the raw values towards 0 makes softplus(0) = 0.693 of both: far / near = 2 for every
-    scene.
+    Source: Eq. 17, with ``pull_to="zero"``. Deviation: by default s*, t* are the search's result, because the
+        paper's pull of the raw values towards 0 makes softplus(0) = 0.693 of both: far / near = 2 for every
+        scene.
     """
     s, t = compared.affine.s_hat, compared.affine.t_hat
     if compared.config.pull_to == "start":
@@ -128,13 +243,13 @@ def prior_pull(compared: Compared) -> Tensor:
     return s * s + t * t
 
 
-def anchor(compared: Compared) -> Tensor:
-    """Mean squared distance of the clean latent from ``z0_prior``, ``(B,)``, less where matches are.
+def anchor_term(compared: Compared) -> Tensor:
+    """Mean squared distance of the clean latent from its anchor, less where matches are.
 
-    With several inner updates it keeps unmatched regions with the prior, and leaves matched ones to the
-    matches: the proximal form of one diffusion posterior step (S3.2 takes a single gradient step instead).
+    With several inner updates it keeps unmatched regions with the prior: the proximal form of one diffusion
+    posterior step (S3.2 takes a single gradient step instead).
     """
-    square = (compared.z0 - compared.z0_prior).pow(2).mean(1, keepdim=True)  # (B, 1, h, w)
+    square = (compared.z0 - compared.anchor).pow(2).mean(1, keepdim=True)  # (B, 1, h, w)
     if compared.matches is not None:
         matched = F.interpolate(compared.matches.confidence, square.shape[-2:], mode="area")
         square = square * (1.0 - matched).clamp_min(ANCHOR_FLOOR)
@@ -145,16 +260,13 @@ TERMS: dict[str, Term] = {
     "photometric": Term(photometric_term, "views"),
     "matches": Term(matches_term, "matches"),
     "points": Term(points_term, "points"),
-    "prior_pull": Term(prior_pull),
-    "anchor": Term(anchor),
+    "prior_pull": Term(prior_pull_term),
+    "anchor": Term(anchor_term),
 }
 
 
 class Loss(NamedTuple):
-    """One evaluation: ``total (B,)`` with its graph, the unweighted ``terms``, the share in view ``(B,)``.
-
-    A pixel is in view where any further camera has it in its picture.
-    """
+    """One evaluation: ``total (B,)`` with its graph, the unweighted ``terms``, the share in view."""
 
     total: Tensor
     terms: dict[str, Tensor]
@@ -164,12 +276,8 @@ class Loss(NamedTuple):
 class Objective:
     """The weighted sum of guidance terms for one chunk of samples.
 
-    Args:
-        views: what the cameras saw.
-        metric: the prior's metric parametrisation.
-        config: weights by name of ``TERMS``, of which one of weight 0 is not computed, the terms' numbers,
-            and ``min_visible``, the share in view below which a sample's photometric term is switched off: a
-            depth that pushes the scene out of the right image leaves nothing to compare and would win.
+    Below ``min_visible`` a sample's photometric term is off: a depth that pushes the scene out of the right
+    image leaves nothing to compare and would win.
     """
 
     def __init__(self, views: Views, metric: MetricMap, config: GuidanceConfig) -> None:
@@ -188,15 +296,15 @@ class Objective:
         affine: AffineState,
         affine_start: AffineState,
         z0: Tensor,
-        z0_prior: Tensor,
+        anchor: Tensor,
         matches: Matches | None,
         points: Matches | None = None,
         hidden: Tensor | None = None,
     ) -> Loss:
         """Loss of one estimate; differentiable in ``x``, ``z0`` and the affine state.
 
-        ``x (B, 1, h, w)`` is the unclipped relative map without padding, decoded from ``z0``; ``hidden
-        (B, V, 1, H, W)`` bool are pixels not to be compared. The other arguments are those of ``Compared``.
+        ``x (B, 1, h, w)`` is the unclipped relative map without padding, decoded from ``z0``; ``hidden (B, V,
+        1, H, W)`` bool are pixels not to be compared. Other arguments as in ``Compared``.
         """
         given = {"": True, "views": self.views.further, "matches": matches, "points": points}
         active = {name: w for name, w in self.config.weights.items() if w and given[TERMS[name].needs]}
@@ -213,7 +321,7 @@ class Objective:
             affine=affine,
             affine_start=affine_start,
             z0=z0,
-            z0_prior=z0_prior,
+            anchor=anchor,
             matches=matches,
             points=points,
             config=self.config,

@@ -21,7 +21,7 @@ from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.config import PRESETS, GuidanceConfig, UpdatePlan
 from geodiff_plugin.formats import picture_size, read_calibration
-from geodiff_plugin.geometry.cameras import image_size
+from geodiff_plugin.geometry import image_size
 from geodiff_plugin.guidance.evidence import EvidenceStore, make_evidence
 from geodiff_plugin.guidance.inputs import read_inputs, split_views
 from geodiff_plugin.guidance.photographs import EstimatedRig, estimate_rig

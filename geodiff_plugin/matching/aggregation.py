@@ -6,6 +6,7 @@ Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual informa
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from geodiff_plugin.matching.census import COST_LEVELS
 
@@ -20,11 +21,8 @@ NEVER = 20_000
 """Above any sum over the paths: in a place that is not to win."""
 
 
-def cells(planes: int, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    """Memory ``(planes, N, M)``, not filled, for ``size = (N, M)``; a row with all its planes is one piece.
-
-    So a path from row to row reads memory in order.
-    """
+def cells(planes: int, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Memory ``(planes, N, M)``, not filled, for ``size = (N, M)``, as a path from row to row reads it."""
     return torch.empty(size[0], planes, size[1], dtype=dtype, device=device).transpose(0, 1)
 
 
@@ -32,9 +30,9 @@ class Room:
     """Memory reused from one aggregation to the next: touching fresh memory costs as much as a path."""
 
     def __init__(self) -> None:
-        self._held: dict[str, torch.Tensor] = {}
+        self._held: dict[str, Tensor] = {}
 
-    def cells(self, name: str, planes: int, size: tuple[int, int], like: torch.Tensor) -> torch.Tensor:
+    def cells(self, name: str, planes: int, size: tuple[int, int], like: Tensor) -> Tensor:
         """``cells`` in the memory of this name; what it held before is lost."""
         count, held = planes * size[0] * size[1], self._held.get(name)
         if held is None or held.numel() < count:
@@ -42,12 +40,11 @@ class Room:
         return held[:count].view(size[0], planes, size[1]).transpose(0, 1)
 
 
-def _scan_rows(cost: torch.Tensor, p1: int, p2: torch.Tensor, total: torch.Tensor) -> None:
-    """Add the path from the first row down and that from the last row up to ``total``.
+def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor) -> None:
+    """Add the path from the first row down and that from the last row up to ``total (D, N, M)`` int16.
 
-    ``cost (D, N, M)`` uint8; paths run along N, side by side over M. ``p1`` is the penalty of a step of one
-    plane, ``p2 (N, M)`` int16 that of any larger step between row n - 1 and row n. ``total (D, N, M)`` int16
-    is changed in place.
+    ``cost (D, N, M)`` uint8; ``p1`` is the penalty of a step of one plane, ``p2 (N, M)`` int16 that of any
+    larger one between row n - 1 and row n.
     """
     planes, count, breadth = cost.shape
     # Both directions advance together, entry 0 down and entry 1 up; a plane more at either end never wins.
@@ -70,7 +67,7 @@ def _scan_rows(cost: torch.Tensor, p1: int, p2: torch.Tensor, total: torch.Tenso
             total[:, row] += path[i]
 
 
-def _limits(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _limits(grey: Tensor) -> tuple[Tensor, Tensor]:
     """Edge-adaptive P2 for vertical ``(H, W)`` and horizontal ``(W, H)`` paths: cheap jumps at edges."""
     limits = []
     for image in (grey, grey.T):
@@ -83,16 +80,11 @@ def _limits(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @torch.no_grad()
-def aggregate(levels: torch.Tensor, grey: torch.Tensor, *, room: Room | None = None) -> torch.Tensor:
-    """Semi-global aggregation along four paths (up, down, left, right); not differentiable.
+def aggregate(levels: Tensor, grey: Tensor, *, room: Room | None = None) -> Tensor:
+    """Sums ``(D, H, W)`` int16, below ``NEVER``, of costs ``(D, H, W)`` uint8 along four paths.
 
-    Args:
-        levels: ``(D, H, W)`` uint8, costs of 0 to ``COST_LEVELS``.
-        grey: ``(H, W)`` of the same view in [0, 1]: a brightness edge makes a jump in depth cheaper there.
-        room: memory to work in, which holds the result until its next use; its own by default.
-
-    Returns:
-        ``(D, H, W)`` int16, sum over the four paths, below ``NEVER``.
+    A brightness edge in ``grey (H, W)``, the same view in [0, 1], makes a jump in depth cheaper. ``room`` is
+    memory to work in, which holds the result until its next use.
 
     Source: Hirschmueller 2008, Eq. 13.
     """

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from geodiff_plugin.geometry import image_size, sample_at
 from geodiff_plugin.matching.census import MARGIN_PX, census, census_cost, grey_levels
@@ -41,38 +42,34 @@ class AlignedView:
         shift: ``(D, 2)`` float64 on the CPU, column and row.
     """
 
-    grey: torch.Tensor
-    valid: torch.Tensor | None
-    scale: torch.Tensor
-    shift: torch.Tensor
+    grey: Tensor
+    valid: Tensor | None
+    scale: Tensor
+    shift: Tensor
 
     @property
     def size(self) -> tuple[int, int]:
         """``(h, w)`` of the canvas."""
         return self.grey.shape[0], self.grey.shape[1]
 
-    def positions(self, count: int, axis: int, margin: int = 0) -> torch.Tensor:
-        """Where the left grid's ``count`` columns (``axis`` 0) or rows (``axis`` 1) lie.
+    def positions(self, count: int, axis: int, margin: int = 0) -> Tensor:
+        """Where the left grid's ``count`` columns (``axis`` 0) or rows (1) lie, ``(D, count + 2 * margin)``.
 
-        ``(D, count + 2 * margin)`` float32, canvas pixels, not clipped; the ``margin`` of lines beyond the
-        grid on either side repeats its outermost.
+        Canvas pixels, float32, not clipped; the lines beyond the grid on either side repeat its outermost.
         """
         lines = torch.arange(-margin, count + margin, **_CPU_FLOAT64).clamp_(0, count - 1)
         at = self.scale[:, None] * lines + self.shift[:, axis, None]
         return at.to(self.grey.device, torch.float32)
 
-    def sources(self, count: int, axis: int) -> torch.Tensor:
-        """The left line that each line of the canvas shows, ``(D, w or h)`` int64; ``count`` for none.
-
-        The way back of ``positions``, rounded.
-        """
+    def sources(self, count: int, axis: int) -> Tensor:
+        """The way back: the left line that each line of the canvas shows, ``(D, n)``; ``count`` for none."""
         lines = torch.arange(self.size[1 - axis], **_CPU_FLOAT64)
         scale = self.scale[:, None]
         at = ((lines - self.shift[:, axis, None]) / scale.clamp_min(1e-9)).round()
         seen = (scale > 0) & (at >= 0) & (at < count)
         return torch.where(seen, at, float(count)).long().to(self.grey.device)
 
-    def inside(self, positions: torch.Tensor, axis: int) -> torch.Tensor:
+    def inside(self, positions: Tensor, axis: int) -> Tensor:
         """Which of the ``positions`` are on the canvas, and not behind the right camera; ``(D, n)`` bool."""
         last = self.size[1 - axis] - 1
         on = (positions >= -_EDGE_PX) & (positions <= last + _EDGE_PX)
@@ -80,21 +77,16 @@ class AlignedView:
 
 
 def align_view(
-    right: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-    K_left: torch.Tensor,
+    right: tuple[Tensor, Tensor, Tensor],
+    K_left: Tensor,
     size: tuple[int, int],
-    inverse_depth: torch.Tensor,
+    inverse_depth: Tensor,
 ) -> AlignedView:
-    """Turn a right view parallel to the left one.
+    """Turn a right view parallel to the left one; a rectified right image is its own canvas.
 
-    The canvas covers what the planes see of the right image, at most three times as wide and high as the left
-    grid. A rectified right image is its own canvas.
-
-    Args:
-        right: ``(grey (1, Hr, Wr), K_right (3, 3), T_right_from_left (4, 4))``.
-        K_left: ``(3, 3)`` pixels of the left grid.
-        size: ``(H, W)`` of the left grid.
-        inverse_depth: ``(D,)`` 1/m, the planes, fronto-parallel in the left view.
+    ``right`` is ``(grey (1, Hr, Wr), K, T)``, ``size (H, W)`` the left grid, ``inverse_depth (D,)`` 1/m its
+    planes. The canvas covers what these see of the right image, at most three times as wide and high as the
+    left grid.
     """
     image, *matrices = right
     K_r, T, K = (matrix.detach().cpu().double() for matrix in (*matrices, K_left))
@@ -112,9 +104,7 @@ def align_view(
     return AlignedView(*_turned(image, to_right, low, high), scale, shift - low)
 
 
-def _turned(
-    image: torch.Tensor, to_right: torch.Tensor, low: torch.Tensor, high: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _turned(image: Tensor, to_right: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """A right image under a homography, from column and row ``low`` to ``high``, and what of it is inside."""
     columns, rows = (torch.arange(int(a), int(b) + 1, **_CPU_FLOAT64) for a, b in zip(low, high, strict=True))
     row, column = torch.meshgrid(rows, columns, indexing="ij")
@@ -127,7 +117,7 @@ def _turned(
     return turned, valid.to(image.device)
 
 
-def _translation(to_right: torch.Tensor, size: tuple[int, int]) -> torch.Tensor | None:
+def _translation(to_right: Tensor, size: tuple[int, int]) -> Tensor | None:
     """The shift ``(2,)`` that a homography amounts to on the left grid, or ``None``."""
     height, width = size
     ends = [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]
@@ -139,12 +129,12 @@ def _translation(to_right: torch.Tensor, size: tuple[int, int]) -> torch.Tensor 
 
 
 def _extent(
-    to_right: torch.Tensor,
+    to_right: Tensor,
     size: tuple[int, int],
     size_right: tuple[int, int],
-    scale: torch.Tensor,
-    shift: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
+    scale: Tensor,
+    shift: Tensor,
+) -> tuple[Tensor, Tensor]:
     """First and last column and row ``(2,)`` of the canvas, in pixels of the left grid at infinity."""
     far = torch.tensor([size[1] - 1.0, size[0] - 1.0], **_CPU_FLOAT64)
     ends = torch.stack([shift, shift + scale[:, None] * far])[:, scale > 0].flatten(0, 1)
@@ -161,7 +151,7 @@ def _extent(
     return low, torch.maximum(high.ceil(), low + 1)
 
 
-def _resampled(grey: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
+def _resampled(grey: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     """Grey levels, int16 ``(h, w)``, bilinear at these rows ``(h,)`` and columns ``(w,)``; edges repeat."""
     for axis, positions in enumerate((rows, columns)):
         last = grey.shape[axis] - 1
@@ -178,7 +168,7 @@ def _resampled(grey: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor) ->
 class ComparedView:
     """Costs of every plane between the left view and an aligned right view, and where it is seen."""
 
-    def __init__(self, left: torch.Tensor, view: AlignedView) -> None:
+    def __init__(self, left: Tensor, view: AlignedView) -> None:
         """Take ``left``, the ``census`` of the left view, ``(16, H, W)`` int16."""
         self._view, (_, height, width) = view, left.shape
         self._columns = view.positions(width, 0, MARGIN_PX)
@@ -189,7 +179,7 @@ class ComparedView:
         self._shifts = self._even_shifts(width)
         self._left = left if self._shifts is None else left.to(torch.int8)
         self._room = torch.empty_like(self._left)
-        self._phases: dict[tuple[int, int], torch.Tensor] = {}
+        self._phases: dict[tuple[int, int], Tensor] = {}
 
     def _even_shifts(self, width: int) -> list[tuple[int, int]] | None:
         """Column and row shift of every plane in phases, where they say everything; else ``None``."""
@@ -205,7 +195,7 @@ class ComparedView:
         rows = (shift[:, 1] * _ROW_PHASES).round().long()
         return list(zip(columns.tolist(), rows.tolist(), strict=True))
 
-    def _phase(self, column: int, row: int, height: int) -> torch.Tensor:
+    def _phase(self, column: int, row: int, height: int) -> Tensor:
         """``census`` of the right view for all shifts of a phase, int8; kept until the row changes."""
         if (column, row) not in self._phases:
             self._phases = {key: votes for key, votes in self._phases.items() if key[1] == row}
@@ -218,7 +208,7 @@ class ComparedView:
             self._phases[column, row] = census(_resampled(self._view.grey, rows, columns)).to(torch.int8)
         return self._phases[column, row]
 
-    def cost(self, plane: int) -> torch.Tensor:
+    def cost(self, plane: int) -> Tensor:
         """``(H, W)`` uint8, ``census_cost`` of a plane, whether seen or not."""
         if self._shifts is None:
             levels = _resampled(self._view.grey, self._rows[plane], self._columns[plane])
@@ -229,7 +219,7 @@ class ComparedView:
         begin = column // _PHASES - self._first
         return census_cost(votes[:, :, begin : begin + width], self._left, self._room)
 
-    def seen(self, plane: int) -> torch.Tensor:
+    def seen(self, plane: int) -> Tensor:
         """``(H, W)`` bool: what the right view sees of a plane."""
         seen = self._rows_inside[plane][:, None] & self._columns_inside[plane]
         if self._view.valid is None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import torch
 from kornia.geometry.linalg import inverse_transformation
+from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
@@ -41,8 +42,8 @@ _CLEARLY, _INVERSE_PIXELS, _PLAINLY = 1.25, 15_000, 0.4
 
 
 def _to_grid(
-    left: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, side: int, pixels: int
-) -> tuple[torch.Tensor, tuple[CameraView, ...], torch.Tensor]:
+    left: Tensor, rights: Sequence[CameraView], K_left: Tensor, side: int, pixels: int
+) -> tuple[Tensor, tuple[CameraView, ...], Tensor]:
     """Shrink the left view to its bounds, right ones to as many pixels per radian, so that none aliases."""
     size = image_size(left)
     factor = min(side / max(size), (pixels / (size[0] * size[1])) ** 0.5)
@@ -61,13 +62,13 @@ def _shrunk(size: tuple[int, int], rows: float, columns: float) -> tuple[int, in
 
 
 def _even_planes(
-    span: tuple[torch.Tensor, torch.Tensor],
+    span: tuple[Tensor, Tensor],
     size: tuple[int, int],
     rights: Sequence[CameraView],
-    K: torch.Tensor,
+    K: Tensor,
     step_px: float,
     most: int,
-) -> torch.Tensor:
+) -> Tensor:
     """Inverse depths over ``span``; from one to the next the median pixel moves by ``step_px``."""
     ends = torch.stack(list(span))
     shifts = [median_shift(plane_rays(K[None], K_r[None], T[None], size), ends) for _, K_r, T in rights]
@@ -80,7 +81,7 @@ def _even_planes(
 
 @torch.no_grad()
 def pilot_volume(
-    left_01: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, pixels: int = PILOT_PIXELS
+    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, pixels: int = PILOT_PIXELS
 ) -> CostVolume:
     """A coarse sweep of all depths from infinity to a shift of 40 % of the width.
 
@@ -96,9 +97,7 @@ def pilot_volume(
     return sweep_planes(left, small, K, planes)
 
 
-def _at_shift(
-    rights: Sequence[CameraView], K: torch.Tensor, size: tuple[int, int], fraction: float
-) -> torch.Tensor:
+def _at_shift(rights: Sequence[CameraView], K: Tensor, size: tuple[int, int], fraction: float) -> Tensor:
     """``(V,)`` inverse depths at which each view has moved by this fraction of the width."""
     nearest = []
     for v, (_, K_r, T) in enumerate(rights, 1):
@@ -108,7 +107,7 @@ def _at_shift(
     return torch.stack(nearest)
 
 
-def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
+def _nearest_inverse_depth(pilot: CostVolume) -> Tensor:
     """The inverse depth of the nearest surface, by a coarse sweep."""
     matches = match_volume(pilot)
     reliable, limit = matches.confidence > PILOT_CONFIDENCE, pilot.inverse_depth[-1]
@@ -121,9 +120,9 @@ def _nearest_inverse_depth(pilot: CostVolume) -> torch.Tensor:
 
 @torch.no_grad()
 def build_cost_volume(
-    left_01: torch.Tensor,
+    left_01: Tensor,
     rights: Sequence[CameraView],
-    K_left: torch.Tensor,
+    K_left: Tensor,
     *,
     depth_range: tuple[float, float] | None = None,
     config: GuidanceConfig = DEFAULT,
@@ -134,15 +133,12 @@ def build_cost_volume(
         left_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1].
         rights: one or several, images of any size. Costs are averaged over the views that see a pixel.
         K_left: ``(3, 3)`` pixels of ``left_01``.
-        depth_range: ``(near, far)`` metres, 0 < near < far, that the planes span. By default they reach from
-            infinity to somewhat nearer than anything that a coarse sweep is certain of, so that a street gets
-            finer planes than a table top.
-        config: bounds of the grid, to which larger images are shrunk, right ones to as many pixels per
-            radian, and of the number of planes.
+        depth_range: ``(near, far)`` metres, that the planes span. By default they reach from infinity to
+            somewhat nearer than anything that a coarse sweep is certain of.
+        config: bounds of the grid, to which larger images are shrunk, and of the number of planes.
 
     Raises:
-        InputError: ``depth_range`` not ascending, the views do not overlap, or both cameras stand at one
-            place.
+        InputError: the range is not ascending, views do not overlap, or both cameras stand at one place.
     """
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
@@ -159,14 +155,12 @@ def build_cost_volume(
 
 @torch.no_grad()
 def mirrored_pose_preferred(
-    left_01: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, matches: Matches | None = None
+    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, matches: Matches | None = None
 ) -> bool:
-    """Whether the inverse pose matches clearly more of the image than the pose as given.
+    """Whether the inverse pose, true where images were swapped, matches clearly more of the image.
 
-    The inverse is the pose that is true when the two images were swapped, and when a world-to-camera pose was
-    given for a camera-to-world one. For a rectified pair it is the baseline with the other sign. Two coarse
-    sweeps decide, or none where ``matches`` of the pose as given leave no doubt. Other arguments as for
-    ``build_cost_volume``.
+    It is also true where a world-to-camera pose was given. Two coarse sweeps decide, or none where
+    ``matches`` of the pose as given leave no doubt. Other arguments as for ``build_cost_volume``.
     """
     if matches is not None and float(matches.confidence.mean()) > _PLAINLY:
         return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 MARGIN_PX = 3
 """Half the window: how far an image must reach beyond the pixels that are described."""
@@ -20,18 +21,15 @@ COST_LEVELS = 2 * VOTE_LEVELS * _SIDE * _SIDE
 """The cost of two descriptions that differ in everything: 224."""
 
 
-def grey(image_01: torch.Tensor) -> torch.Tensor:
-    """Luma ``(1, H, W)`` float32 in [0, 1] of an image ``(3, H, W)``, or of what is grey already.
-
-    kornia's ``rgb_to_grayscale`` rounds another way (1e-7), which turns single votes.
-    """
+def grey(image_01: Tensor) -> Tensor:
+    """Luma ``(1, H, W)`` float32 in [0, 1] of an image ``(3, H, W)``, or of what is grey already."""
     image_01 = image_01.float()
     if image_01.shape[0] == 1:
         return image_01
     return (image_01 * image_01.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(dim=0, keepdim=True)
 
 
-def grey_levels(grey_01: torch.Tensor) -> torch.Tensor:
+def grey_levels(grey_01: Tensor) -> Tensor:
     """Grey in [0, 1] as int16 levels, of which ``VOTE_LEVELS`` count as a certain difference.
 
     About 1.2 of them are an 8-bit level.
@@ -39,15 +37,11 @@ def grey_levels(grey_01: torch.Tensor) -> torch.Tensor:
     return (grey_01 * (VOTE_LEVELS / _CONTRAST)).round().to(torch.int16)
 
 
-def census(levels: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-    """How the 16 neighbours of every pixel compare with it.
+def census(levels: Tensor, out: Tensor | None = None) -> Tensor:
+    """How the 16 neighbours of every pixel compare with it, ``(16, H, W)`` int16 up to ``VOTE_LEVELS``.
 
-    ``levels (H + 6, W + 6)``, contiguous, of ``grey_levels``, have a margin of ``MARGIN_PX`` all around.
-    ``out (16, H, W)`` int16 is written to: to touch fresh memory costs more than the work.
-
-    Returns:
-        ``(16, H, W)`` int16, within plus and minus ``VOTE_LEVELS``; unchanged by an offset in brightness,
-        nearly so by a gain.
+    ``levels (H + 6, W + 6)``, contiguous, of ``grey_levels``, have a margin of ``MARGIN_PX`` all around. The
+    result is unchanged by an offset in brightness, nearly so by a gain; it is written to ``out``.
     """
     height, width = (side - 2 * MARGIN_PX for side in levels.shape)
     stride = levels.shape[1]
@@ -59,12 +53,11 @@ def census(levels: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tenso
     return out.clamp_(-VOTE_LEVELS, VOTE_LEVELS)
 
 
-def census_cost(left: torch.Tensor, right: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+def census_cost(left: Tensor, right: Tensor, out: Tensor | None = None) -> Tensor:
     """Difference ``(H, W)`` uint8, 0 to ``COST_LEVELS``, between two results ``(16, H, W)`` of ``census``.
 
-    Both are int8 or int16. About 0.35 of ``COST_LEVELS`` for unrelated natural texture, 0.5 for unrelated
-    noise. ``out``, of the same shape and type, is worked in; it may be ``left`` where that is not needed any
-    more.
+    Both are int8 or int16. About 0.35 of the largest for unrelated natural texture, 0.5 for noise. ``out``,
+    of the same shape and type, is worked in; it may be ``left``.
     """
     apart = torch.sub(left, right, out=out).abs_()
     if apart.dtype == torch.int8:

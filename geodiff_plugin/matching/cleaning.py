@@ -10,6 +10,7 @@ import math
 
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 from geodiff_plugin.matching.census import grey
 
@@ -44,7 +45,7 @@ _SHIFTS = tuple((i, (3 * i + k) % _SIDE) for i in range(_SIDE) for k in (0, _SID
 _SHRUNK = 6.0
 
 
-def _basis(like: torch.Tensor) -> torch.Tensor:
+def _basis(like: Tensor) -> Tensor:
     """Orthonormal DCT-II, ``(frequency, pixel)``."""
     n = torch.arange(_SIDE, device=like.device, dtype=like.dtype)
     waves = torch.cos(math.pi * (2 * n[None] + 1) * n[:, None] / (2 * _SIDE)) * math.sqrt(2 / _SIDE)
@@ -52,30 +53,30 @@ def _basis(like: torch.Tensor) -> torch.Tensor:
     return waves
 
 
-def _to_blocks(levels: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
+def _to_blocks(levels: Tensor, basis: Tensor) -> Tensor:
     """Coefficients ``(h, w, 8, 8)`` of the whole blocks of ``(H, W)``."""
     rows, columns = (side // _SIDE for side in levels.shape)
     whole = levels[: rows * _SIDE, : columns * _SIDE]
     return basis @ whole.reshape(rows, _SIDE, columns, _SIDE).transpose(1, 2) @ basis.T
 
 
-def _from_blocks(coefficients: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
+def _from_blocks(coefficients: Tensor, basis: Tensor) -> Tensor:
     rows, columns = coefficients.shape[:2]
     return (basis.T @ coefficients @ basis).transpose(1, 2).reshape(rows * _SIDE, columns * _SIDE)
 
 
-def _table(like: torch.Tensor) -> torch.Tensor:
+def _table(like: Tensor) -> Tensor:
     return torch.tensor(_LUMA_STEPS, device=like.device, dtype=like.dtype).view(_SIDE, _SIDE)
 
 
-def _first_edge(levels: torch.Tensor, axis: int) -> int:
+def _first_edge(levels: Tensor, axis: int) -> int:
     """Where the blocks begin, 0 to 7: a crop begins within one."""
     steps = levels.diff(dim=axis).abs().clamp_max(_MOST_BLOCK_EDGE).mean(1 - axis)
     whole = steps[: steps.shape[0] // _SIDE * _SIDE].view(-1, _SIDE).mean(0)
     return (int(whole.argmax()) + 1) % _SIDE
 
 
-def _jpeg_scale(levels: torch.Tensor, basis: torch.Tensor) -> float:
+def _jpeg_scale(levels: Tensor, basis: Tensor) -> float:
     """The largest steps that the coefficients of a picture are whole multiples of."""
     rows, columns = zip(*_KEPT, strict=True)
     top, left = _first_edge(levels, 0), _first_edge(levels, 1)
@@ -94,25 +95,24 @@ def _jpeg_scale(levels: torch.Tensor, basis: torch.Tensor) -> float:
     return middle if agree >= _LEAST_VOTES else 0.0
 
 
-def _noise(levels: torch.Tensor, basis: torch.Tensor) -> float:
+def _noise(levels: Tensor, basis: Tensor) -> float:
     fine = _to_blocks(levels, basis)[..., _SIDE // 2 :, _SIDE // 2 :]
     energy = fine.square().mean((-1, -2)).flatten()
     return math.sqrt(float(torch.quantile(energy, _FLATTEST))) * _NOISE_OF_FLATTEST
 
 
-def find_flaws(image_01: torch.Tensor) -> tuple[float, float]:
-    """How coarsely a photograph was compressed, and how noisy it is; arguments as ``clean``.
+def find_flaws(image_01: Tensor) -> tuple[float, float]:
+    """How coarsely a photograph was compressed, and how noisy it is (standard deviation, levels of 255).
 
-    The steps of the JPEG quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at 80; 0 where no
-    trace of compression remains, as after resampling. And the standard deviation of the noise, grey levels of
-    255.
+    The former is the steps of the JPEG quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at
+    80; 0 where no trace of compression remains, as after resampling.
     """
     levels = grey(image_01)[0] * 255.0
     basis = _basis(levels)
     return _jpeg_scale(levels, basis), _noise(levels, basis)
 
 
-def _threshold(jpeg_scale: float, noise: float, like: torch.Tensor) -> torch.Tensor | None:
+def _threshold(jpeg_scale: float, noise: float, like: Tensor) -> Tensor | None:
     """Size ``(8, 8)`` below which coefficients are removed; ``None`` where nothing is to be removed."""
     low, high = _NOISE_RANGE
     noise *= min(max((noise - low) / (high - low), 0.0), 1.0)
@@ -124,19 +124,12 @@ def _threshold(jpeg_scale: float, noise: float, like: torch.Tensor) -> torch.Ten
 
 
 @torch.no_grad()
-def clean(image_01: torch.Tensor, grid_pixels: int) -> torch.Tensor:
+def clean(image_01: Tensor, grid_pixels: int) -> Tensor:
     """A photograph without the blocks of its compression and without sensor noise.
 
     Blocks stand at the same columns of both images, so that faint texture matches at shifts of 8 pixels;
-    noise hides it.
-
-    Args:
-        image_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1], at least 32 pixels a side.
-        grid_pixels: pixels of the grid that it is to be compared on; shrinking alone cleans a picture of
-            more than six times as many.
-
-    Returns:
-        The same shape, its colours as they were; the tensor that was given if there is nothing to remove.
+    noise hides it. What is not flawed, or has more than six times ``grid_pixels``, those of the grid that it
+    is compared on, is returned as it is.
     """
     if image_01.shape[-2] * image_01.shape[-1] > _SHRUNK * grid_pixels:
         return image_01

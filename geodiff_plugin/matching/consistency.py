@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 from geodiff_plugin.matching.aggregation import NEVER, PATHS, Room, aggregate
 from geodiff_plugin.matching.alignment import AlignedView
@@ -31,11 +32,8 @@ _EVERY_ROW = 2
 _PLANES = 1 << 12
 
 
-def _winner(total: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The best plane of sums over the paths ``(D, H, W)``, with a parabola through its neighbours.
-
-    Per pixel: the best plane, the position between planes, the ``(3, H, W)`` planes around it, its sum.
-    """
+def _winner(total: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The best plane of sums ``(D, H, W)``, the position between planes, the planes around it, its sum."""
     keys = torch.full_like(total[0], NEVER, dtype=torch.int32).mul_(_PLANES)
     plane_keys = torch.empty_like(keys)
     for plane in range(len(total)):
@@ -49,11 +47,10 @@ def _winner(total: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tens
     return index, position, around, best
 
 
-def _right_winners(volume: CostVolume, view: AlignedView, room: Room) -> torch.Tensor:
+def _right_winners(volume: CostVolume, view: AlignedView, room: Room) -> Tensor:
     """The position between planes that a right view takes for the best, ``(ceil(h / 2), w)`` of its canvas.
 
-    Its costs are those of the same sweep, looked up along its own pixels and aggregated along its own edges,
-    so that it needs no sweep of its own. Every second row is enough.
+    Its costs are those of the same sweep, looked up along its own pixels and aggregated along its own edges.
     """
     height, width = volume.size
     # One row and one column more: what a right view's pixel reads beside the left image.
@@ -67,11 +64,10 @@ def _right_winners(volume: CostVolume, view: AlignedView, room: Room) -> torch.T
     return _winner(aggregate(levels, view.grey[::_EVERY_ROW], room=room))[1]
 
 
-def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
+def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
     """Left-right difference ``(H, W)`` in planes; infinite where the right view does not see the match.
 
-    ``other`` are the right view's ``_right_winners``, ``position (H, W)`` those of the left view, between
-    planes.
+    ``other`` are the right view's ``_right_winners``, ``position (H, W)`` those of the left view.
     """
     device = position.device
     scale, shift = view.scale.to(device, torch.float32), view.shift.to(device, torch.float32)
@@ -95,7 +91,7 @@ def _disagreement(view: AlignedView, other: torch.Tensor, position: torch.Tensor
     return torch.where(inside, difference, torch.full_like(difference, torch.inf))
 
 
-def _contrast(volume: CostVolume, index: torch.Tensor, reach: int) -> torch.Tensor:
+def _contrast(volume: CostVolume, index: Tensor, reach: int) -> Tensor:
     """How much better than the mean plane the chosen one is, before aggregation, averaged over a window."""
     total, seen = (torch.zeros_like(index, dtype=torch.int32) for _ in range(2))
     for levels, in_view in zip(volume.levels, volume.in_view, strict=True):
@@ -109,16 +105,14 @@ def _contrast(volume: CostVolume, index: torch.Tensor, reach: int) -> torch.Tens
     return gain[0]
 
 
-_Candidates = tuple[torch.Tensor, torch.Tensor, Iterator[tuple[torch.Tensor, torch.Tensor]]]
+_Candidates = tuple[Tensor, Tensor, Iterator[tuple[Tensor, Tensor]]]
 
 
 def _candidates(volume: CostVolume, views: Sequence[AlignedView]) -> _Candidates:
-    """Aggregate, take the winner, and compare it with the matches of right views.
+    """Inverse depths ``(H, W)`` of the winners, their ``_contrast``, and the evidence of every right view.
 
-    Returns:
-        Inverse depths ``(H, W)``, 1/m; how much better than the mean plane they are (``_contrast``); and for
-        every view the evidence ``(4, H, W)``, in which the log-odds of a match are linear (1, logarithm of
-        the margin to the best plane elsewhere, cost, left-right difference), with that difference in planes.
+    The evidence ``(4, H, W)``, in which the log-odds of a match are linear, is 1, the logarithm of the margin
+    to the best plane elsewhere, cost, and left-right difference; with it comes that difference in planes.
     """
     room = Room()
     total = aggregate(volume.levels, volume.left_01[0], room=room)
@@ -127,7 +121,7 @@ def _candidates(volume: CostVolume, views: Sequence[AlignedView]) -> _Candidates
     unit = 1.0 / (PATHS * COST_LEVELS)
     margin, cost = ((second - best) * unit).clamp(0.0, 0.5), (best * unit).clamp(0.0, 0.8)
 
-    def evidence() -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    def evidence() -> Iterator[tuple[Tensor, Tensor]]:
         for view in views:
             difference = _disagreement(view, _right_winners(volume, view, room), position)
             differs = difference.clamp_max(AGREEMENT_PLANES)
@@ -137,7 +131,7 @@ def _candidates(volume: CostVolume, views: Sequence[AlignedView]) -> _Candidates
     return volume.inverse_depth[0] + position * volume.plane_step, contrast, evidence()
 
 
-def _confidence(evidence: torch.Tensor, difference: torch.Tensor, contrast: torch.Tensor) -> torch.Tensor:
+def _confidence(evidence: Tensor, difference: Tensor, contrast: Tensor) -> Tensor:
     """Probability ``(H, W)`` that the winner is right."""
     odds = torch.zeros_like(difference)
     for weight, x in zip(LOG_ODDS, evidence, strict=True):
@@ -147,12 +141,11 @@ def _confidence(evidence: torch.Tensor, difference: torch.Tensor, contrast: torc
 
 
 @torch.no_grad()
-def checked_matches(volume: CostVolume) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def checked_matches(volume: CostVolume) -> tuple[Tensor, Tensor, Tensor]:
     """What the confidence of matches is fitted on, by the first right view of a cost volume.
 
-    Returns:
-        Inverse depths ``(H, W)``, 1/m; evidence ``(4, H, W)``, in which the log-odds are linear; and
-        ``(H, W)`` bool: the right view agrees, and there is texture to agree on.
+    Inverse depths ``(H, W)``, evidence ``(4, H, W)`` as ``LOG_ODDS`` weighs it, and ``(H, W)`` bool: the
+    right view agrees, and there is texture to agree on.
     """
     inverse_depth, contrast, views = _candidates(volume, volume.aligned[:1])
     ((evidence, difference),) = views

@@ -46,7 +46,7 @@ class Matches:
 
     @classmethod
     def stack(cls, images: Sequence[Self | None]) -> Self | None:
-        """Matches of several images as a chunk, all on grids of one size; ``None`` if some image has none."""
+        """Matches of several images on grids of one size as a chunk; ``None`` if some image has none."""
         given = [matches for matches in images if matches is not None]
         if len(given) < len(images):
             return None
@@ -64,11 +64,7 @@ class Matches:
         return replace(self, confidence=self.confidence * inside.view_as(self.confidence))
 
     def above(self, confidence: float) -> Tensor:
-        """``(P,)`` flat indices of the pixels of one image with more confidence than that.
-
-        Counting them waits for the device, so it is done once; ``prepare_evidence`` does it for every
-        threshold that the loop asks for.
-        """
+        """Flat indices ``(P,)`` of one image's pixels of more confidence; counted once, as a device waits."""
         if confidence not in self._above:
             self._above[confidence] = (self.confidence.flatten() > confidence).nonzero()[:, 0]
         return self._above[confidence]
@@ -80,16 +76,15 @@ def points_to_matches(
     """Put known depths on a grid of the left view; where several fall on one pixel, the nearest wins.
 
     Args:
-        points: ``(N, 3)`` float32, metres, in the left camera's frame (x right, y down, z forward), or ``(N,
-            4)`` with their confidence in (0, 1]; or a map ``(H, W)`` of ``size``, metres, 0 where unknown, or
-            ``(H, W, 2)`` with its confidence.
+        points: ``(N, 3)`` float32, metres, in the left camera's frame, or ``(N, 4)`` with their confidence in
+            (0, 1]; or a map ``(H, W)`` of ``size``, metres, 0 where unknown, or ``(H, W, 2)`` with its
+            confidence.
         K_left: ``(3, 3)`` pixels of the left image.
         size: ``(H, W)`` of the left image.
         size_grid: ``(h, w)`` of the grid.
 
     Returns:
-        ``Matches`` of the grid, with the points' confidence (1 without any) where a depth is known and 0
-        elsewhere, and how many of the points are left out: behind the camera, or outside the image.
+        ``Matches`` with the points' confidence (1 without any), and how many of the points are left out.
 
     Raises:
         InputError: no point is left, or a map is not of the image's size.
@@ -131,12 +126,11 @@ def points_to_matches(
 
 
 def with_points(matches: Matches | None, points: Matches) -> Matches:
-    """Matches with known points in their place: what the refinement follows.
+    """Matches, or ``None``, with known points in their place: what the refinement follows.
 
-    Both are of one image or of a chunk of samples, on one grid; ``matches`` may be ``None``. The confidence
-    of a point is the number of pixels that it stands for: few points then decide as much as many, and one
-    that a poor prior contradicts is not taken for an outlier, as a match would be. A match stays where it is
-    more confident than a point.
+    The confidence of a point is the number of pixels that it stands for: few points then decide as much as
+    many, and one that a poor prior contradicts is not taken for an outlier, as a match would be. A match
+    stays where it is more confident than a point.
     """
     given = points.confidence > 0
     share = given.float().mean((-2, -1), keepdim=True)
@@ -153,7 +147,7 @@ def with_points(matches: Matches | None, points: Matches) -> Matches:
 
 @torch.no_grad()
 def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
-    """What remains of each match, given the depth that the prior saw before any match moved it.
+    """The share in [0, 1] that remains of each match, given the depth that the prior saw before any moved it.
 
     One-sided: a reflection and what is seen through glass lie behind the surface, never before it. A prior
     that is right to 5 % can name a reflection, a prior that errs by 30 % cannot.
@@ -161,10 +155,6 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     Args:
         matches: of a chunk of samples, ``(B, 1, H, W)``.
         depth_m: ``(B, 1, H, W)`` metres, > 0, the prior's first estimate with the search's scale.
-
-    Returns:
-        ``(B, 1, H, W)`` in [0, 1]; 1 where a match, or the region around it, is not behind the prior by more
-        than chance.
     """
     weight = matches.confidence.float()
     behind = -(matches.inverse_depth * depth_m).clamp_min(1e-6).log().clamp(-LARGEST, LARGEST)

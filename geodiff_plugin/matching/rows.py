@@ -64,13 +64,9 @@ def pad_columns(image: np.ndarray, count: int) -> np.ndarray:
 def fill_background(shift: np.ndarray) -> np.ndarray:
     """Fill holes with the farther of the two neighbours in the row, as KITTI's development kit does.
 
-    Args:
-        shift: ``(H, W)`` float, smaller is farther (pixels or 1/m), NaN in holes.
-
-    Returns:
-        ``(H, W)`` without holes: within a row the smaller of the nearest known values to either side, the
-        only one at the row's ends; an empty row copies the nearest filled one above, else below. All NaN
-        where nothing is known.
+    ``shift (H, W)`` is smaller for what is farther (pixels or 1/m), NaN in holes. At a row's ends the only
+    neighbour counts; an empty row copies the nearest filled one above, else below. All NaN where nothing is
+    known.
     """
     known = np.isfinite(shift)
     columns = np.arange(shift.shape[1])[None]
@@ -87,16 +83,13 @@ def fill_background(shift: np.ndarray) -> np.ndarray:
 
 
 def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: float) -> RowMatches:
-    """Match a rectified pair of images of one size.
+    """Match a rectified pair of one size, ``left_01 (3, H, W)`` in [0, 1] and ``view`` on either side.
 
-    Args:
-        left_01: ``(3, H, W)`` in [0, 1].
-        view: the other one, rectified with it, to its right or to its left.
-        K_left: ``(3, 3)`` pixels.
-        nearest_px: largest shift that is looked for, pixels.
+    ``nearest_px`` is the largest shift that is looked for.
 
     Returns:
-        On the device of ``left_01``.
+        Three ``(H, W)``: the shift in pixels from where the point would be at infinity; 1 where both views
+        agree, else 0; 1 in a gap between two matches, where the shift is that of the farther one.
     """
     images = [(grey(image) * 255.0).round().byte()[0].cpu().numpy() for image in (left_01, view.image_01)]
     infinity = float(K_left[0, 2] - view.K[0, 2])

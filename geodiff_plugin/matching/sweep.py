@@ -8,6 +8,7 @@ from functools import cached_property
 
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import NEAREST_M, PlaneRays, image_size, is_rectified, plane_rays
@@ -38,20 +39,20 @@ class CostVolume:
         aligned: the same, turned parallel to the left view.
     """
 
-    levels: torch.Tensor
-    in_view: torch.Tensor
-    inverse_depth: torch.Tensor
-    K: torch.Tensor
-    left_01: torch.Tensor
+    levels: Tensor
+    in_view: Tensor
+    inverse_depth: Tensor
+    K: Tensor
+    left_01: Tensor
     rights: tuple[CameraView, ...]
     aligned: tuple[AlignedView, ...]
 
     @property
-    def cost(self) -> torch.Tensor:
+    def cost(self) -> Tensor:
         """``(D, H, W)`` float32 in [0, 1], the costs of all cells: four times the volume's own memory."""
         return self.levels.float() / COST_LEVELS
 
-    def at_pixels(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def at_pixels(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """``cost (D, P)`` in [0, 1] and ``in_view (D, P)`` bool of pixels ``(P,)``: ``row * W + column``."""
         row, column = index // self.size[1], index % self.size[1]
         return self.levels[:, row, column].float() / COST_LEVELS, self.in_view[:, row, column]
@@ -62,7 +63,7 @@ class CostVolume:
         return self.levels.shape[1], self.levels.shape[2]
 
     @property
-    def plane_step(self) -> torch.Tensor:
+    def plane_step(self) -> Tensor:
         """``()`` float32, 1/m between neighbouring planes."""
         return self.inverse_depth[1] - self.inverse_depth[0]
 
@@ -79,26 +80,19 @@ class CostVolume:
         return 1.0 / float(self.inverse_depth[-1]), farthest
 
 
-def _plane_uv(rays: PlaneRays, inverse_depth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _plane_uv(rays: PlaneRays, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
     """Right pixels ``(D, 2, N)`` of every left pixel on every plane, and ``(D, N)`` if it is in front."""
     p = rays.A + inverse_depth[:, None, None] * rays.b  # z * A + b, divided by z
     in_front = p[:, 2] > NEAREST_M
     return p[:, :2] / torch.where(in_front, p[:, 2], torch.ones_like(p[:, 2]))[:, None], in_front
 
 
-def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor, name: str = "E") -> torch.Tensor:
-    """How far the median pixel lies, in the right view, from where it would be at infinity.
+def median_shift(rays: PlaneRays, inverse_depth: Tensor, name: str = "E") -> Tensor:
+    """How far the median pixel lies, in the right view, from where it would be at infinity, ``(N,)`` pixels.
 
-    ``(N,)`` pixels for ``inverse_depth (N,)`` 1/m, >= 0; infinite where the plane passes behind the right
-    camera. Measured from infinity, so that a rotation, which moves all depths alike, does not count.
-
-    Args:
-        rays: ``plane_rays`` of any grid of left pixels, batch of 1.
-        inverse_depth: of the planes.
-        name: of the pose, for messages.
-
-    Raises:
-        InputError: no pixel's point at infinity is in front of the right camera.
+    A rotation, which moves all depths alike, does not count. Infinite where the plane of ``inverse_depth
+    (N,)`` passes behind the right camera. ``InputError`` that names the pose where no pixel's point at
+    infinity is in front of it.
     """
     stride = max(1, rays.A.shape[-1] // 1024)
     some = PlaneRays(rays.A[..., ::stride], rays.b)
@@ -112,12 +106,12 @@ def median_shift(rays: PlaneRays, inverse_depth: torch.Tensor, name: str = "E") 
     return shift[:, ahead[0]].median(dim=1).values
 
 
-def inverse_depth_at_shift(rays: PlaneRays, shift_px: float, name: str = "E") -> torch.Tensor:
+def inverse_depth_at_shift(rays: PlaneRays, shift_px: float, name: str = "E") -> Tensor:
     """The inverse depth, ``()`` 1/m within 1 %, at which ``median_shift`` reaches ``shift_px`` > 0.
 
     A camera that stands behind the other one sees no pixel move further than to the epipole: there, at most
-    the depth at which it has gone half of that way. Raises ``InputError`` if the views do not overlap, or
-    both cameras stand at one place.
+    the depth at which it has gone half of that way. ``InputError`` also where both cameras stand at one
+    place.
     """
     exponents = rays.A.new_tensor([-8.0, 5.0])
     most = float(median_shift(rays, 10.0 ** exponents[1:], name))
@@ -135,19 +129,13 @@ def inverse_depth_at_shift(rays: PlaneRays, shift_px: float, name: str = "E") ->
 
 @torch.no_grad()
 def sweep_planes(
-    left_01: torch.Tensor, rights: Sequence[CameraView], K_left: torch.Tensor, inverse_depth: torch.Tensor
+    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, inverse_depth: Tensor
 ) -> CostVolume:
-    """Compare the left view with the right views on every plane, at the resolution as given.
+    """Compare the left view ``(1, H, W)``, grey in [0, 1], with the right views on every plane.
 
-    Planes go one by one, so memory is that of the result, two bytes a cell, and of what describes the right
-    views. Not differentiable.
-
-    Args:
-        left_01: ``(1, H, W)`` float32 grey in [0, 1].
-        rights: one or several, grey, of about as many pixels per radian as the left view. Costs are averaged
-            over the views that see a pixel.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
-        inverse_depth: ``(D,)`` 1/m, ascending, evenly spaced, D >= 2.
+    All are used at the resolution as given, the right ones at about as many pixels per radian; their costs
+    are averaged over those that see a pixel. ``inverse_depth (D,)`` 1/m is ascending and even, D >= 2. Planes
+    go one by one, so memory is that of the result, two bytes a cell.
     """
     size = image_size(left_01)
     aligned = tuple(align_view(right, K_left, size, inverse_depth) for right in rights)
@@ -163,7 +151,7 @@ def sweep_planes(
     return CostVolume(levels, in_view, inverse_depth, K_left, left_01, tuple(rights), aligned)
 
 
-def _mean(costs: list[torch.Tensor], seen: list[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+def _mean(costs: list[Tensor], seen: list[Tensor]) -> tuple[Tensor, Tensor]:
     """Mean cost over the views that see a pixel, uint8, and whether any does."""
     total, count = (torch.zeros_like(costs[0], dtype=torch.float32) for _ in range(2))
     for cost, of_view in zip(costs, seen, strict=True):

@@ -14,7 +14,7 @@ from torch import Tensor
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.finish import sharpen_edges
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
-from geodiff_plugin.geometry.cameras import image_size
+from geodiff_plugin.geometry import image_size
 from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout

@@ -18,7 +18,7 @@ from geodiff_plugin.algorithm.correction import correction_target, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
+from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.runtime.run import GuidedRun
 

@@ -15,7 +15,7 @@ from diffusers.pipelines.marigold import MarigoldDepthOutput
 from torch import Tensor
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.geometry.cameras import image_size, resize_intrinsics
+from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import build_cost_volume, match_volume
 from geodiff_plugin.pose.mistakes import INVERSE

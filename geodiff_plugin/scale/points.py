@@ -58,7 +58,7 @@ def reliable_matches(matches: Matches) -> Matches | None:
 def fit_to_points(
     x: Tensor, points: Matches, metric: MetricMap, current: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Depths of the two ends of a relative map that explain the points best.
+    """Metres ``(B,)`` of the two ends of a relative map that explain the points best.
 
     The best of 1128 log-spaced pairs in mean Cauchy cost of inverse depth, so that some points may be wrong.
     Coarse: ``refine_to_matches`` does the rest.
@@ -68,9 +68,6 @@ def fit_to_points(
         points: of that image.
         metric: the prior's metric parametrisation.
         current: ``(near_m, far_m)``, ``(B,)`` each, in use; they stay unless a better basin shows up.
-
-    Returns:
-        ``near_m, far_m``, ``(B,)``.
     """
     at = points.above(0.0)
     at = at[:: max(1, -(-len(at) // BASIN_SAMPLES))]
@@ -101,24 +98,13 @@ def fit_to_points(
 def refine_to_matches(
     x: Tensor, matches: Matches, near_m: Tensor, far_m: Tensor, space: str
 ) -> tuple[Tensor, Tensor]:
-    """Robust fit of the two ends of a relative map to matches, started from the search's result.
+    """Metres ``(B,)`` of both ends of one image's relative maps ``x (B, 1, h, w)``: a robust fit to matches.
 
-    Matches alone have outliers, so they refine what the lookup found and never replace it: far stays within a
-    factor of 2 of the start. Residuals are in the logarithm of inverse depth and the noise of a match
-    together: relative where matches are exact, even for noise of either sign near infinity, where a plain
-    logarithm favours matches that err towards the camera. Each is in units of its match's own noise and of
-    what the map leaves over, which is measured at every iteration: a map that is right is fitted to the noise
-    of its matches, a map that errs as a whole.
-
-    Args:
-        x: ``(B, 1, h, w)`` relative maps of one image.
-        matches: of that image; or known points.
-        near_m: ``(B,)`` metres, start.
-        far_m: ``(B,)`` metres, start.
-        space: as in ``search_scale``.
-
-    Returns:
-        ``near_m, far_m``, ``(B,)``.
+    Matches have outliers, so they refine ``near_m`` and ``far_m``, the search's result, and never replace it.
+    Residuals are in the logarithm of inverse depth and the noise of a match together: relative where matches
+    are exact, even for noise of either sign near infinity, where a plain logarithm favours matches that err
+    towards the camera. Each is in units of its match's own noise and of what the map leaves over, measured at
+    every iteration: a map that is right is fitted to the noise of its matches, a map that errs as a whole.
     """
     at = matches.above(0.0)  # points are few: not one may be missed
     if not len(at):
@@ -207,15 +193,9 @@ def _ranks(values: Tensor) -> Tensor:
 
 @torch.no_grad()
 def order_agreement(x: Tensor, matches: Matches, space: str) -> Tensor:
-    """Spearman's rank correlation of nearness, as the map and as matches or points have it.
+    """Spearman's rank correlation of nearness ``(B,)``, as relative maps and matches of one image have it.
 
-    Args:
-        x: ``(B, 1, h, w)`` relative maps of one image, of the prior alone: before any match moved them.
-        matches: matches or points of that image, on any grid.
-        space: what ``x`` is affine in, key of ``SPACES``.
-
-    Returns:
-        ``(B,)`` in [-1, 1]; NaN where fewer than 40 matches are reliable.
+    ``x (B, 1, h, w)`` is of the prior alone. NaN where fewer than 40 matches are reliable.
 
     Convention:
         Cameras in the wrong order turn near into far: -1 where +1 is right.
@@ -235,10 +215,7 @@ def _values_at(x: Tensor, size: tuple[int, int], at: Tensor) -> Tensor:
 
 
 def weighted_quantile(values: Tensor, weight: Tensor, share: float | Tensor) -> Tensor:
-    """``(B,)`` of rows ``(B, P)`` with weights >= 0 of the same shape; ``share`` .5 is the median.
-
-    ``share`` may be ``(B, 1)``, another for each row.
-    """
+    """``(B,)`` of rows ``(B, P)`` with weights >= 0; ``share``, .5 for the median, may be ``(B, 1)``."""
     values, order = values.sort(dim=1)
     below = weight.gather(1, order).cumsum(1)
     at = torch.searchsorted(below, share * below[:, -1:]).clamp_max(values.shape[1] - 1)

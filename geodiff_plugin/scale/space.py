@@ -22,9 +22,9 @@ FLOOR_EPS = 0.001
 def smooth_floor(x: Tensor, eps: float = FLOOR_EPS) -> Tensor:
     """Keep relative values ``x``, about [0, 1] but unbounded, above 0 with a gradient that is never zero.
 
-    ``(x + sqrt(x^2 + 4 eps^2)) / 2`` is ``eps`` at 0; far above 0 it exceeds ``x`` by ``eps**2 / x``. Its
-    slope falls only as ``(eps / x)^2`` below 0, so that a clipped pixel can still be pulled back (a softplus
-    would underflow). Not in the paper, which needs ``D(z) >= 0`` for Eq. 13 and never says why it would be.
+    ``(x + sqrt(x^2 + 4 eps^2)) / 2``, whose slope falls only as ``(eps / x)^2`` below 0, so that a clipped
+    pixel can still be pulled back (a softplus would underflow). Not in the paper, which needs ``D(z) >= 0``
+    for Eq. 13.
     """
     root = torch.sqrt(x * x + 4.0 * eps * eps)
     # Below 0 the sum would cancel, and neighbouring values become equal in float32.
@@ -148,18 +148,12 @@ SQUARE = "square"
 
 @dataclass(frozen=True)
 class MetricMap:
-    """The metric parametrisation of one prior.
+    """The metric parametrisation of one prior, whose map is affine in ``space``, a key of ``SPACES``.
 
-    Attributes:
-        space: key of ``SPACES``: what the prior's output is affine in. With ``s = softplus(s_hat)``
-            and ``t = softplus(t_hat)``: depth ``g_s (s x + t)``, disparity ``g_s / (s x + t)``,
-            log ``g_s exp(s x + t)``, log1p ``g_s (exp(s x + t) - 1)``, sqrt_disparity
-            ``g_s / (s x + t)^2``. All positive and monotone.
-        positive: ``"softplus"`` with the smooth floor, or ``"square"`` with ``x`` clipped to [0, 1], whose
-            gradient is zero where it clips.
-
-    Raises:
-        InputError: unknown space.
+    With ``s = softplus(s_hat)`` and ``t = softplus(t_hat)``: depth ``g_s (s x + t)``, disparity ``g_s / (s x
+    + t)``, log ``g_s exp(s x + t)``, log1p ``g_s (exp(s x + t) - 1)``, sqrt_disparity ``g_s / (s x + t)^2``.
+    All positive and monotone. ``positive`` is ``"softplus"`` with the smooth floor, or ``"square"`` with
+    ``x`` clipped to [0, 1], whose gradient is zero where it clips. ``InputError`` for an unknown space.
 
     Source: Eq. 16 with Eq. 13 (eq:metric). Deviation: the smooth floor, and the spaces beside depth.
     """
@@ -184,10 +178,7 @@ class MetricMap:
         return SPACES[self.space].forward(s * confined + t, g)
 
     def relative(self, depth_m: Tensor, affine: AffineState) -> Tensor:
-        """The relative map of a metric depth ``(B, 1, H, W)``; inverse of the call.
-
-        It is below 0 no further than where the smooth floor has lost half of its height.
-        """
+        """The relative map of a metric depth ``(B, 1, H, W)``; inverse of the call, bounded below 0."""
         s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
         floored = (SPACES[self.space].inverse(depth_m / g) - t) / s
         if self.positive == SQUARE:
@@ -196,11 +187,7 @@ class MetricMap:
         return floored - FLOOR_EPS**2 / floored
 
     def from_range(self, near_m: Tensor, far_m: Tensor) -> AffineState:
-        """The affine state under which the two ends of a map have the depths, ``(B,)`` metres.
-
-        ``near_m`` is that of ``x = 0`` where the space grows with depth, of ``x = 1`` where it falls; ``g_s``
-        is as ``Space.from_ends`` chooses it.
-        """
+        """The affine state under which the two ends of a map have the depths, ``(B,)`` metres."""
         s, t, g = SPACES[self.space].from_ends(*SPACES[self.space].ends(near_m.float(), far_m.float()))
         tiny = 1e-4  # a flat map is legal; softplus cannot reach 0
         s, t = s.clamp_min(tiny), t.clamp_min(tiny)

@@ -49,7 +49,7 @@ class ScaleSearch(NamedTuple):
 
 
 def _sample_positions(height: int, width: int, samples: int, device: torch.device) -> Tensor:
-    """Flat indices of about ``samples`` pixels on a regular, offset grid: the same ones every time."""
+    """Flat indices of about ``samples`` pixels on a regular, offset grid."""
     stride = max(1, round((height * width / samples) ** 0.5))
     rows = torch.arange(stride // 2, height, stride, device=device)
     columns = torch.arange(stride // 2, width, stride, device=device)
@@ -95,8 +95,7 @@ def search_scale(
         volume: plane-sweep costs of the image.
         x: ``(B, 1, h, w)`` relative maps of that image, about [0, 1], >= 0.
         space: what ``x`` is affine in, key of ``SPACES``; in disparity spaces ``x = 1`` is near.
-        depth_range: ``(near, far)`` metres, bounds of the search; by default from the volume's nearest
-            plane to where the shift is 0.3 px.
+        depth_range: ``(near, far)`` metres, bounds of the search; by default ``volume.reach_m``.
         current: nearest and farthest depth in use, ``(B,)`` each, to be kept unless a better basin shows up.
         valid: ``(1, 1, H, W)`` bool, the pixels of the maps that count; ``None`` for all.
 
@@ -157,9 +156,9 @@ def _coarse_to_fine(
 
 
 def argmin_over(candidates: Tensor, cost: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """The candidate ``(M,)`` of least cost per sample ``(B,)``, and whether it is the first or the last.
+    """The candidate of least ``cost`` per sample, ``(B,)``, and whether it is the first or the last.
 
-    ``cost`` takes a candidate (0-d) and gives ``(B,)``. Source: S7.3, ``g_s* = argmin L_geo``.
+    Source: S7.3, ``g_s* = argmin L_geo``.
     """
     with torch.no_grad():
         index = torch.stack([cost(c) for c in candidates]).argmin(0)

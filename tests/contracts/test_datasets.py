@@ -511,7 +511,7 @@ def real_refs():
 
 def photometric_error(sample, factor):
     """Mean absolute difference to the left image of the right one, warped by ``factor`` times the truth."""
-    from geodiff_plugin.geometry.warping import warp_right_to_left
+    from geodiff_plugin.geometry import warp_right_to_left
 
     left, right = (
         torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1)[None]

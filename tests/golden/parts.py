@@ -25,9 +25,8 @@ from geodiff_plugin.algorithm.correction import (
 from geodiff_plugin.algorithm.evidence import chunk_views, prepare_evidence
 from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
 from geodiff_plugin.algorithm.gradients import RULES
-from geodiff_plugin.algorithm.photometric import match_exposure, photometric, ssim
 from geodiff_plugin.algorithm.schedule import make_schedule
-from geodiff_plugin.algorithm.terms import Objective
+from geodiff_plugin.algorithm.terms import Objective, match_exposure, photometric, ssim
 from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
 from geodiff_plugin.formats.exif import intrinsics_from_exif
 from geodiff_plugin.geometry import (

@@ -9,7 +9,7 @@ from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_fr
 from geodiff_plugin.algorithm.evidence import Views
 from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.geometry.projection import plane_rays
+from geodiff_plugin.geometry import plane_rays
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.scale.space import AffineState, MetricMap

@@ -36,8 +36,8 @@ def test_later_rounds_are_anchored_to_the_network_and_all_corrections(textured_p
 
     def spy(estimate):
         if estimate.z0.requires_grad:
-            seen.append((estimate.z0.detach().clone(), estimate.z0_prior.clone()))
-        return (estimate.z0 - estimate.z0_prior).square().flatten(1).mean(1)
+            seen.append((estimate.z0.detach().clone(), estimate.anchor.clone()))
+        return (estimate.z0 - estimate.anchor).square().flatten(1).mean(1)
 
     monkeypatch.setitem(TERMS, "spy", Term(spy))
     monkeypatch.setitem(RULES, "constant", Constant)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from geodiff_plugin.algorithm import correction
-from geodiff_plugin.algorithm.photometric import photometric_map
+from geodiff_plugin.algorithm.terms import photometric_map
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.census import census, census_cost, grey_levels

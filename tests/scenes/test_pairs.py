@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.geometry.warping import warp_right_to_left
+from geodiff_plugin.geometry import warp_right_to_left
 from tests.scenes import CameraEffects, Material, render_mono, render_pair
 from tests.scenes.cameras import intrinsics
 

@@ -8,8 +8,16 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from geodiff_plugin.algorithm.photometric import masked_mean, match_exposure, photometric_map, ssim
-from geodiff_plugin.algorithm.terms import ANCHOR_FLOOR, CAUCHY, TERMS, Compared
+from geodiff_plugin.algorithm.terms import (
+    ANCHOR_FLOOR,
+    TERM_CAUCHY,
+    TERMS,
+    Compared,
+    masked_mean,
+    match_exposure,
+    photometric_map,
+    ssim,
+)
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState
@@ -51,7 +59,7 @@ def test_values_are_the_formulas(knobs, matched):
     compared = compared._replace(affine_start=start, config=DEFAULT.changed(**knobs))
     d, w, c = (x.numpy() for x in (depth, inverse, confidence))
     e = (1 / d - w) / unit.numpy()[:, None, None, None]
-    robust = CAUCHY**2 / 2 * np.log1p((e / CAUCHY) ** 2)
+    robust = TERM_CAUCHY**2 / 2 * np.log1p((e / TERM_CAUCHY) ** 2)
     metres, known = np.abs(d - 1 / w), c > 0
 
     def mean(x, weight):

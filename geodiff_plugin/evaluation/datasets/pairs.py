@@ -31,7 +31,7 @@ from geodiff_plugin.evaluation.datasets.sample import (
     read_rgb,
 )
 from geodiff_plugin.formats import read_calibration, read_disparity_kitti_png, read_pfm
-from geodiff_plugin.geometry.cameras import resize_intrinsics
+from geodiff_plugin.geometry import resize_intrinsics
 from geodiff_plugin.types import Rig
 
 

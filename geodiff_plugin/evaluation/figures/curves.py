@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from geodiff_plugin.algorithm.photometric import masked_mean, photometric_map
+from geodiff_plugin.algorithm.terms import masked_mean, photometric_map
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample
 from geodiff_plugin.evaluation.datasets.changed import changed_ref

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.algorithm.state import Trajectory
-from geodiff_plugin.algorithm.terms import CAUCHY
+from geodiff_plugin.algorithm.terms import TERM_CAUCHY
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, posed_views, prior_space
 from geodiff_plugin.evaluation.datasets import StereoSample, load
@@ -234,7 +234,7 @@ def _maps(figure: Any, sample: StereoSample, parts: TermByTerm, abs_rel: dict[st
     drawn = [show_map(a, known_depth(m), scale, t) for a, (m, t) in zip(upper[1:], depths, strict=True)]
     colour_bar(figure, drawn[0], upper, scale)
     difference = value_scale("inferno", 0.0, WORST_DIFFERENCE, "mean absolute difference")
-    planes = value_scale("RdBu_r", -CAUCHY, CAUCHY, "planes of the sweep")
+    planes = value_scale("RdBu_r", -TERM_CAUCHY, TERM_CAUCHY, "planes of the sweep")
     weight = value_scale("viridis", 0.0, 1.0, "confidence, 0 for reflections")
     probability = value_scale("viridis", 0.0, 1.0, "probability of an error < 10 %")
     compared = (

@@ -1,0 +1,292 @@
+"""Two pinhole cameras: intrinsics, projection, backward warping, what is hidden (S3.3, S7.2).
+
+Rigid transforms are kornia's (``kornia.geometry.linalg``). Where kornia has something else of it as well, a
+comment says why ours is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from kornia.geometry.depth import unproject_meshgrid
+from kornia.geometry.linalg import transform_points
+from torch import Tensor
+
+#: Two cameras count as rectified to a milliradian, and to a baseline that is sideways to 1 %.
+ANGLE_TOLERANCE, SIDEWAYS_TOLERANCE = 1e-3, 0.01
+#: ``(4, 4)``, from a camera's frame with y down and z forward to one with y up and z backward, and back.
+#: OpenGL, Blender, NeRF and glTF use the latter. kornia's ``camtoworld_graphics_to_vision_4x4`` turns the
+#: axes of a pose in the world; a relative pose needs both sides.
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+# Nearer than this a point counts as behind the camera: its pixel would be a division by almost 0.
+NEAREST_M = 1e-4
+# Where such a point is put: finite, and outside of any image.
+_BEHIND_PX = -1e6
+# Rounding of float32 at image edges: the last pixel centre itself must count as inside.
+_EDGE_PX = 1e-2
+
+
+def image_size(image: Tensor) -> tuple[int, int]:
+    """``(H, W)`` of an image or a map ``(..., H, W)``."""
+    return image.shape[-2], image.shape[-1]
+
+
+def resize_intrinsics(K: Tensor, size_from: tuple[int, int], size_to: tuple[int, int]) -> Tensor:
+    """``K (B, 3, 3)`` after its image is resized between two ``(H, W)``, per axis, with the half-pixel shift.
+
+    Convention:
+        An integer is a pixel centre, so an image keeps its outer edges at -0.5 and ``W - 0.5``: ``cx =
+        319.5`` of 640 columns becomes 159.5 of 320.
+    """
+    scale = K.new_tensor([size_to[1] / size_from[1], size_to[0] / size_from[0], 1.0])
+    half = K.new_tensor([0.5, 0.5, 0.0])
+    resized = K * scale[:, None]
+    centre = (K[:, :, 2] + half) * scale - half
+    return torch.cat([resized[:, :, :2], centre[:, :, None]], dim=2)
+
+
+def resize_image(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """An image ``(C, H, W)`` at another ``size`` (antialiased), and the ``K (3, 3)`` that belongs to it."""
+    before = image_size(image_01)
+    if before == size:
+        return image_01, K
+    resized = F.interpolate(image_01[None], size, mode="bilinear", align_corners=False, antialias=True)[0]
+    return resized, resize_intrinsics(K[None], before, size)[0]
+
+
+def nearest_rotation(matrix: Tensor) -> Tensor:
+    """The proper rotation nearest to a matrix ``(..., 3, 3)`` (orthogonal Procrustes)."""
+    u, _, vh = torch.linalg.svd(matrix)
+    sign = torch.ones_like(matrix[..., 0])
+    sign[..., 2] = torch.linalg.det(u @ vh).sign()
+    return (u * sign[..., None, :]) @ vh
+
+
+def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> Tensor:
+    """Whether disparity along rows says everything, ``(...)`` bool, of ``(..., 3, 3)`` and ``(..., 4, 4)``.
+
+    The rotation is the identity to 1e-3 an entry, ``|t_y|`` and ``|t_z|`` are below 1 % of ``|t_x|``, f
+    agrees to 0.1 %, skew and cy to 0.1 % of f; cx may differ. Both K have as many pixels per radian.
+    """
+    identity = torch.eye(3, dtype=T_right_from_left.dtype, device=T_right_from_left.device)
+    turned = (T_right_from_left[..., :3, :3] - identity).abs().amax((-2, -1))
+    t = T_right_from_left[..., :3, 3].abs()
+    uneven = (K_left - K_right).abs()[..., [0, 0, 1, 1], [0, 1, 1, 2]].amax(-1)
+    sideways = t[..., 1:].amax(-1) < SIDEWAYS_TOLERANCE * t[..., 0]
+    return (turned <= ANGLE_TOLERANCE) & sideways & (uneven <= ANGLE_TOLERANCE * K_left[..., 1, 1])
+
+
+class PlaneRays(NamedTuple):
+    """Where a left pixel goes in the right view, as a line in its depth: ``p = z * A + b``.
+
+    Attributes:
+        A: ``(B, 3, H * W)``, homogeneous right pixel of the left pixel's point at infinity.
+        b: ``(B, 3, 1)``, homogeneous right pixel of the left camera's centre (the epipole).
+    """
+
+    A: Tensor
+    b: Tensor
+
+
+def made_there(like: Tensor, *values: float) -> Tensor:
+    """A small constant of ``like``'s dtype, made on its device: a list would be copied there, every time."""
+    return torch.stack([like.new_full((), value) for value in values])
+
+
+def unproject(depth_m: Tensor, K: Tensor) -> Tensor:
+    """Points ``(B, H, W, 3)`` metres of a depth map ``(B, 1, H, W)`` in its camera's frame; differentiable.
+
+    ``K (B, 3, 3)`` is in pixels of the map's grid; a skew ``K[0, 1]`` is obeyed, here and everywhere.
+
+    Convention:
+        The pixel at the principal point has ``x = y = 0``; one focal length to its right has ``x = z``.
+    """
+    return _rays(image_size(depth_m), K.to(depth_m.dtype)) * depth_m[:, 0, ..., None]
+
+
+def _rays(size: tuple[int, int], K: Tensor) -> Tensor:
+    """Points at z = 1 behind every pixel, ``(B, H, W, 3)``."""
+    rays = unproject_meshgrid(*size, K, device=K.device, dtype=K.dtype)
+    slant = (K[:, 0, 1] / K[:, 0, 0])[:, None, None]  # kornia's know no skew
+    return torch.cat([rays[..., :1] - (slant * rays[..., 1])[..., None], rays[..., 1:]], dim=-1)
+
+
+def transform(points: Tensor, T: Tensor) -> Tensor:
+    """Points ``(B, H, W, 3)`` of frame b in frame a, by ``T (B, 4, 4)``, ``T_a_from_b``; differentiable."""
+    return transform_points(T, points.flatten(1, 2)).view_as(points)
+
+
+def _in_front(z: Tensor) -> tuple[Tensor, Tensor]:
+    """Mask of points in front of the camera, and a z that is safe to divide by everywhere."""
+    in_front = z > NEAREST_M
+    return in_front, torch.where(in_front, z, torch.ones_like(z))
+
+
+# kornia's ``project_points`` knows no skew, and mirrors points behind the camera into the image.
+def project(points: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels ``uv (B, H, W, 2)`` and ``z (B, H, W)`` metres of points ``(B, H, W, 3)`` in a camera's frame.
+
+    At or behind the camera (``z <= NEAREST_M``) ``uv`` is a finite place outside of any image, with zero
+    gradient.
+    """
+    z = points[..., 2]
+    in_front, z_safe = _in_front(z)
+    x, y = (points[..., i] / z_safe for i in (0, 1))
+    fx, skew, cx, fy, cy = (K[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+    uv = torch.stack([fx * x + skew * y + cx, fy * y + cy], dim=-1)
+    return torch.where(in_front[..., None], uv, torch.full_like(uv, _BEHIND_PX)), z
+
+
+def plane_rays(
+    K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor, size: tuple[int, int]
+) -> PlaneRays:
+    """Everything of the projection from a left grid ``(H, W)`` to the right image that does not need depth.
+
+    ``K_left (B, 3, 3)`` is in pixels of that grid, ``K_right`` in pixels of the right image. The pixel with
+    depth z has the homogeneous right pixel ``z * A + b``, whose third component is its depth in the right
+    view.
+
+    Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
+    """
+    rays = _rays(size, K_left).flatten(1, 2).transpose(1, 2)  # (B, 3, H * W)
+    M = K_right @ T_right_from_left[:, :3, :3]
+    A = (M[..., None] * rays[:, None]).sum(2)  # not a matrix product, which TF32 rounds by a quarter pixel
+    b = K_right @ T_right_from_left[:, :3, 3:]
+    return PlaneRays(A, b)
+
+
+def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:
+    """Pixels ``(B, H, W, 2)`` and depth in the right view ``(B, H, W)`` of a left depth map, as ``project``.
+
+    ``depth_m (B, 1, H, W)`` metres lies on the grid of the rays; differentiable in it.
+    """
+    height, width = depth_m.shape[-2:]
+    p = depth_m.flatten(2) * rays.A + rays.b  # (B, 3, H * W)
+    z = p[:, 2]
+    in_front, z_safe = _in_front(z)
+    uv = torch.where(in_front[:, None], p[:, :2] / z_safe[:, None], torch.full_like(p[:, :2], _BEHIND_PX))
+    return uv.transpose(1, 2).unflatten(1, (height, width)), z.unflatten(1, (height, width))
+
+
+@dataclass(frozen=True)
+class Warped:
+    """The right image on the left grid.
+
+    Attributes:
+        image: ``(B, C, H, W)``, the right image's values; its edge repeated where not visible.
+        visible: ``(B, 1, H, W)`` bool, in front of the right camera and within its pixel centres.
+        uv: ``(B, H, W, 2)`` pixels of the right image.
+        z_right: ``(B, H, W)`` metres, depth in the right view.
+    """
+
+    image: Tensor
+    visible: Tensor
+    uv: Tensor
+    z_right: Tensor
+
+
+def sample_at(image: Tensor, uv: Tensor, *, mode: str = "bilinear") -> Tensor:
+    """Values ``(B, C, h, w)`` of an image ``(B, C, H, W)`` at ``uv (B, h, w, 2)`` pixels, its edge repeated.
+
+    Differentiable in the image and, inside of it and for ``mode="bilinear"``, in ``uv``.
+
+    Convention:
+        (0, 0) is the centre of the first pixel. A ``uv`` that grows by 1 in its first component reads one
+        pixel further right.
+    """
+    height, width = image.shape[-2:]
+    # align_corners=True: -1 and 1 are the centres of the first and the last pixel, where uv counts from.
+    # Like kornia's ``remap``, whose places differ by up to 6e-5 px; and it sends points behind the camera on.
+    last = made_there(uv, max(width - 1, 1), max(height - 1, 1))
+    grid = (2.0 * uv / last - 1.0).clamp(-2.0, 2.0)
+    return F.grid_sample(image, grid, mode=mode, padding_mode="border", align_corners=True)
+
+
+def _inside(uv: Tensor, z: Tensor, size: tuple[int, int]) -> Tensor:
+    """``(B, 1, H, W)`` bool: in front of the camera and within the pixel centres of an image of ``size``."""
+    u, v = uv[..., 0], uv[..., 1]
+    in_columns = (u >= -_EDGE_PX) & (u <= size[1] - 1 + _EDGE_PX)
+    in_rows = (v >= -_EDGE_PX) & (v <= size[0] - 1 + _EDGE_PX)
+    return (in_columns & in_rows & (z > NEAREST_M))[:, None]
+
+
+def warp_right_to_left(
+    right: Tensor,
+    depth_m: Tensor,
+    K_left: Tensor,
+    K_right: Tensor,
+    T_right_from_left: Tensor,
+    *,
+    rays: PlaneRays | None = None,
+) -> Warped:
+    """Re-render the left image from the right one by the left depth (bilinear backward warp).
+
+    As kornia's ``warp_frame_depth`` where that is defined: it takes one K, and does not say what is visible.
+
+    Args:
+        right: ``(B, C, Hr, Wr)`` float image, of any size.
+        depth_m: ``(B, 1, H, W)`` metres on the left grid. The image is differentiable in it where visible.
+        K_left: ``(B, 3, 3)`` float, pixels of the left grid.
+        K_right: ``(B, 3, 3)``, pixels of ``right``.
+        T_right_from_left: ``(B, 4, 4)``.
+        rays: ``plane_rays`` of these cameras, where they are used again and again.
+
+    Convention:
+        A right camera ``b`` metres to the right (``T[0, 3] = -b``): the left pixel ``u`` with depth z reads
+        the right image at ``u - f * b / z``.
+
+    Source: S7.2, with the map of Eq. 25 (eq:forward-warp_supp); Eq. 26 (eq:back-warp_supp) has the poses the
+        wrong way round for camera-to-world matrices (docs/reference/paper-map.md, E1).
+    """
+    if rays is None:
+        rays = plane_rays(K_left, K_right, T_right_from_left, image_size(depth_m))
+    uv, z_right = project_rays(depth_m, rays)
+    visible = _inside(uv, z_right, image_size(right))
+    return Warped(sample_at(right, uv), visible, uv, z_right)
+
+
+@torch.no_grad()
+def hidden_in_right(
+    depth_m: Tensor,
+    K_left: Tensor,
+    K_right: Tensor,
+    T_right_from_left: Tensor,
+    size_right: tuple[int, int],
+    *,
+    margin: float = 0.05,
+    rays: PlaneRays | None = None,
+) -> Tensor:
+    """Left pixels that another part of the left surface hides from the right camera, ``(B, 1, H, W)`` bool.
+
+    The surface is splatted into a depth buffer of the right view, of ``size_right (Hr, Wr)``; a pixel is
+    hidden where the buffer is nearer by more than the relative ``margin``, and never outside of the right
+    image.
+    """
+    batch, _, height, width = depth_m.shape
+    if rays is None:
+        rays = plane_rays(K_left, K_right, T_right_from_left, (height, width))
+    uv, z = project_rays(depth_m, rays)
+    seen = _inside(uv, z, size_right)[:, 0]  # (B, H, W)
+    # No finer than the left grid, else the splatted surface has holes that show what is behind it.
+    rows, columns = min(size_right[0], height), min(size_right[1], width)
+    scale = made_there(uv, columns / size_right[1], rows / size_right[0])
+    cell = (uv + 0.5) * scale - 0.5
+    far = torch.finfo(z.dtype).max
+    z_seen = torch.where(seen, z, torch.full_like(z, far))
+
+    def index(at: Tensor) -> Tensor:
+        column, row = at[..., 0].clamp(0, columns - 1).long(), at[..., 1].clamp(0, rows - 1).long()
+        return (row * columns + column).flatten(1)
+
+    buffer = z.new_full((batch, rows * columns), far)
+    for step in ((0, 0), (1, 0), (0, 1), (1, 1)):  # every cell within 3/4 px: slopes leave no holes
+        target = cell.floor() + made_there(cell, *step)
+        near = ((target - cell).abs() <= 0.75).all(dim=-1)
+        z_splat = torch.where(near, z_seen, torch.full_like(z, far))
+        buffer.scatter_reduce_(1, index(target), z_splat.flatten(1), "amin")
+    nearest = buffer.gather(1, index(cell.round())).view(batch, height, width)
+    return ((z_seen > nearest * (1.0 + margin)) & seen)[:, None]
