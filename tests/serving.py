@@ -1,4 +1,4 @@
-"""A program that serves a page, for the length of a test."""
+"""A program that serves a page, for the length of a test, and files for a visitor of it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
+from tests.conftest import plane_pair
+
 STARTS_S = 600
 
 
@@ -18,6 +23,17 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+def write_plane(folder: Path, baseline_m: float = 0.12) -> tuple[Path, Path, Path, np.ndarray]:
+    """Photographs of a tilted plane 12 cm apart, a calibration that says so or not, and the true depth."""
+    pair = plane_pair(size=(96, 128), focal=120.0, baseline=0.12)
+    left, right, calibration = (folder / name for name in ("left.png", "right.png", "K.txt"))
+    Image.fromarray(pair.left).save(left)
+    Image.fromarray(pair.right).save(right)
+    numbers = " ".join(f"{value:g}" for value in pair.K.ravel())
+    calibration.write_text(f"{numbers}\n{baseline_m}\n")
+    return left, right, calibration, pair.depth_m
 
 
 @contextmanager

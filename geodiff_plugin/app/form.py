@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gradio as gr
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields
-from geodiff_plugin.app.job import LIMITS, Priors, Request
+from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors, Request
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.options import PRESETS, RunOptions, help_of
 
@@ -26,7 +25,6 @@ NUMBERS = {
     "near": "Nearest depth, m",
     "far": "Farthest depth, m",
 }
-CAMERA_NAMES = tuple(field.name for field in fields(CameraFields))
 RUN_NAMES = ("prior", "preset", "steps", "ensemble", "resolution", "near", "far", "seed")
 PAIRS_FOLDER = Path(__file__).resolve().parent / "pairs"
 #: Folder, ending of its images -> what the page calls it; ``tests.scenes.make_examples`` renders them anew.
@@ -42,7 +40,7 @@ class Form:
     """The components, and how their values become a request.
 
     Attributes:
-        fields: by the name of what they fill in, of ``Request``, ``CameraFields`` or ``RunOptions``.
+        fields: by the name of what they fill in, of ``Request`` or ``RunOptions``.
         untouched: the values that they begin with.
         examples: the gallery of ``EXAMPLES``.
         run: starts a job.
@@ -60,17 +58,17 @@ class Form:
         named = dict(zip(self.fields, values, strict=True))
         for name, label in NUMBERS.items():
             named[name] = _number(named[name], label)
-        cameras = CameraFields(**{name: named.pop(name) or None for name in CAMERA_NAMES})
         run = {name: named.pop(name) for name in RUN_NAMES}
         run |= {name: int(run[name] or 0) for name in ("steps", "ensemble", "resolution", "seed")}
         run |= {name: run[name] or None for name in ("steps", "resolution")}  # 0: the prior's own
-        return Request(**named, cameras=cameras, run=RunOptions(**run))
+        named["calibration"] = tuple(named["calibration"] or ())
+        return Request(**named, run=RunOptions(**run))
 
     def example(self, number: int) -> list[Any]:
         """A value for every field: the files of an example, and all others as they began."""
         folder, ending = list(EXAMPLES)[number]
-        files = {side: str(folder / f"{side}.{ending}") for side in ("left", "right")}
-        files["calibration"] = str(folder / "calib.txt")
+        files: dict[str, Any] = {side: str(folder / f"{side}.{ending}") for side in ("left", "right")}
+        files["calibration"] = [str(folder / "calib.txt")]
         return list((self.untouched | files).values())
 
 
@@ -102,30 +100,22 @@ def photograph_field(label: str, name: str) -> gr.Image:
     )
 
 
-def _photographs() -> dict[str, Any]:
+def _views() -> dict[str, Any]:
+    """The photographs and their cameras."""
     drawn: dict[str, Any] = {}
     with gr.Row():
         for name, label in (("left", "Left photograph"), ("right", "Right photograph")):
             drawn[name] = photograph_field(label, name)
-    with gr.Accordion("A third photograph", open=False):
-        drawn["third"] = photograph_field("Third photograph, of the left camera", "third")
-        drawn["third_pose"] = gr.Textbox(
-            label="Its pose in the left camera's frame, metres",
-            info="4x4, row by row: a camera 0.1 m higher has -0.1 as the fourth number of the second row.",
-            placeholder="1 0 0 0    0 1 0 -0.1    0 0 1 0    0 0 0 1",
-            lines=2,
-        )
-    return drawn
-
-
-def _cameras() -> dict[str, Any]:
-    ways = [(way.label, name) for name, way in CAMERA_WAYS.items()]
-    way = gr.Radio(ways, value=ways[0][1], label="Where the cameras are", elem_id="way")
-    drawn: dict[str, Any] = {"way": way}
-    with gr.Column(visible=True) as files:
-        drawn["calibration"] = gr.File(label="Calibration file", height=140, elem_id="calibration")
-        with gr.Accordion("One file per camera (MVSNet, ROS, COLMAP)", open=False):
-            drawn["second_calibration"] = gr.File(label="Second file", height=140)
+    ways = [(label, name) for name, (label, _) in CAMERA_WAYS.items()]
+    way = gr.Radio(ways, value="file", label="Where the cameras are", elem_id="way")
+    drawn["way"] = way
+    calibration = gr.File(
+        label="Calibration file, or one per camera (MVSNet, ROS, COLMAP)",
+        file_count="multiple",
+        height=140,
+        elem_id="calibration",
+    )
+    drawn["calibration"] = calibration
     with gr.Column(visible=False) as lens:
         with gr.Row():
             for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
@@ -135,10 +125,9 @@ def _cameras() -> dict[str, Any]:
     drawn["baseline_m"] = _optional("baseline_m", "as the calibration file says")
 
     def show(chosen: str) -> tuple[Any, Any]:
-        asked = CAMERA_WAYS[chosen].fields
-        return gr.update(visible="calibration" in asked), gr.update(visible="fx" in asked)
+        return gr.update(visible=chosen == "file"), gr.update(visible=chosen != "file")
 
-    way.change(show, way, [files, lens], queue=False, api_visibility="private")
+    way.change(show, way, [calibration, lens], queue=False, api_visibility="private")
     return drawn
 
 
@@ -162,9 +151,6 @@ def _settings(priors: Priors) -> dict[str, Any]:
             drawn["seed"] = gr.Number(0, precision=0, minimum=0, label="Seed", min_width=90)
         with gr.Row():
             drawn |= {name: _optional(name, "unknown") for name in ("near", "far")}
-        drawn["show_prior"] = gr.Checkbox(
-            True, label="Also show what the prior says alone (one more plain call)"
-        )
     return drawn
 
 
@@ -188,7 +174,7 @@ def build_form(priors: Priors) -> Form:
         object_fit="cover",
         elem_id="examples",
     )
-    drawn = _photographs() | _cameras() | _settings(priors)
+    drawn = _views() | _settings(priors)
     untouched = {name: component.value for name, component in drawn.items()}
     with gr.Row():
         run = gr.Button("Estimate depth", variant="primary", scale=3, elem_id="run")

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image, ImageOps
 
+from geodiff_plugin._camera_checks import check_calibrated_size
 from geodiff_plugin._checks import bad_value, check_choice, check_number
-from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
 from geodiff_plugin.cli.report import single_map
 from geodiff_plugin.cli.terminal import collected_warnings
-from geodiff_plugin.formats import read_image
+from geodiff_plugin.formats import read_calibration, read_image, rig_from_parameters
+from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.formats.files import open_image
-from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.guidance.guidance import GeometryGuidance, assume_same_centre
 from geodiff_plugin.options import RunOptions
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
-from geodiff_plugin.types import MetricDepthOutput
+from geodiff_plugin.types import MetricDepthOutput, Rig
 
 #: What the page allows of an option, where that is less than the command does.
 LIMITS = {"steps": 100, "ensemble": 20, "resolution": 4096}
@@ -61,31 +64,56 @@ class Priors:
 
 @dataclass(frozen=True)
 class Request:
-    """What a visitor filled in.
+    """What a visitor filled in; ``None`` is an empty field.
 
     Attributes:
         left: path of the left photograph.
         right: path of the right one.
-        third: path of a third one, or ``None``.
         way: key of ``CAMERA_WAYS``.
-        cameras: what was filled in about cameras.
+        calibration: paths of the calibration file, or of one file a camera.
+        fx: focal length, pixels; fy is the same where it is empty.
+        cx: principal point, pixels, with cy; the middle of the image where it is empty.
+        cx_right: the right image's cx; empty means that it is the left one's.
+        baseline_m: distance of the cameras, metres.
         run: prior and settings.
-        show_prior: also run the prior without guidance, to show what it says alone.
     """
 
     left: str | None
     right: str | None
-    third: str | None = None
     way: str = "file"
-    cameras: CameraFields = field(default_factory=CameraFields)
+    calibration: tuple[str, ...] = ()
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    cx_right: float | None = None
+    baseline_m: float | None = None
     run: RunOptions = field(default_factory=RunOptions)
-    show_prior: bool = True
 
-    def files(self) -> Iterator[Path]:
+    def files(self) -> list[Path]:
         """What was uploaded."""
-        cameras = self.cameras
-        paths = (self.left, self.right, self.third, cameras.calibration, cameras.second_calibration)
-        return (Path(path) for path in paths if path is not None)
+        return [Path(path) for path in (self.left, self.right, *self.calibration) if path is not None]
+
+    @property
+    def photographs(self) -> tuple[str, str]:
+        """Paths of the left and the right one.
+
+        Raises:
+            InputError: one is missing.
+        """
+        for path, name in ((self.left, "the left photograph"), (self.right, "the right photograph")):
+            if path is None:
+                bad_value(name, "given", "nothing", "Drop a picture into its field.")
+        assert self.left is not None and self.right is not None
+        return self.left, self.right
+
+    def K(self, size: tuple[int, int]) -> np.ndarray:
+        """``(3, 3)`` of a photograph of ``size`` ``(width, height)``."""
+        fy = self.fx if self.fy is None else self.fy
+        cx, cy = (
+            (side - 1) / 2 if c is None else c for c, side in zip((self.cx, self.cy), size, strict=True)
+        )
+        return np.array([[self.fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,22 +121,22 @@ class Result:
     """What is shown and measured.
 
     Attributes:
-        views: the photographs.
+        left: ``(H, W, 3)`` float32 in [0, 1], the left photograph.
         guidance: with the cameras as understood.
         output: of the guided call, at the left photograph's size.
-        prior_map: ``(H, W)`` the prior's own map without guidance, or ``None``.
         warnings: sentences, what was assumed among them.
         seconds: by stage.
         request: what was asked.
+        folder: of its files.
     """
 
-    views: Views
+    left: np.ndarray
     guidance: GeometryGuidance
     output: MetricDepthOutput
-    prior_map: np.ndarray | None
     warnings: list[str]
     seconds: dict[str, float]
     request: Request
+    folder: Path
 
     def map(self, name: str) -> np.ndarray | None:
         """``(H, W)`` of a map of the output, or ``None``."""
@@ -126,24 +154,78 @@ class Result:
         return np.asarray(self.output.K)[0].astype(np.float64)
 
 
-def _read(path: str | None, name: str) -> tuple[np.ndarray, list[str]]:
-    if path is None:
-        bad_value(name, "given", "nothing", "Drop a picture into its field.")
+def _guidance_of_rig(request: Request, left: np.ndarray, right: np.ndarray, rig: Rig) -> GeometryGuidance:
+    cure = "Use the photographs that the calibration is for, or give the numbers scaled to these."
+    sides = (("left", left, rig.K_left, rig.size_left), ("right", right, rig.K_right, rig.size_right))
+    for path, (side, image, K, size) in zip(request.photographs, sides, strict=True):
+        name = f"the {side} photograph"
+        check_calibrated_size(image.shape[1::-1], size, name, Path(rig.source).name, cure)
+        warn_of_other_lens(path, K, name)
+    posed = [(left, rig.K_left, np.eye(4)), (right, rig.K_right, rig.E)]
+    return GeometryGuidance.from_views(posed, config=request.run.config())
+
+
+def _from_file(request: Request, left: np.ndarray, right: np.ndarray) -> GeometryGuidance:
+    if not request.calibration:
+        cure = "Choose one, or give focal length and baseline."
+        bad_value("calibration", "a calibration file", "none", cure)
+    # The page keeps what is dropped in a folder of its own, so only the names themselves say something.
+    first, second = (Path(path).name for path in request.photographs)
+    rig = read_calibration(
+        list(request.calibration),
+        image_names=(first, second),
+        image_size=left.shape[1::-1],
+        baseline_m=request.baseline_m,
+    )
+    if rig.unit is None:  # lengths are what the page is for
+        cure = "This file has no unit: measure how far the two cameras were from each other, in metres."
+        bad_value("the distance of the cameras", "given", "nothing", cure)
+    return _guidance_of_rig(request, left, right, rig)
+
+
+def _from_numbers(request: Request, left: np.ndarray, right: np.ndarray) -> GeometryGuidance:
+    given = {"fx": request.fx, "baseline": request.baseline_m}
+    if missing := [name for name, value in given.items() if value is None]:
+        bad_value(" and ".join(missing), "given", "nothing", "fx is in pixels, the baseline in metres.")
+    K = request.K(left.shape[1::-1])
+    lens = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    rig = rig_from_parameters(*lens, request.baseline_m, cx_right=request.cx_right)
+    guidance = _guidance_of_rig(request, left, right, rig)
+    if request.cx_right is None:
+        assume_same_centre(guidance)
+    return guidance
+
+
+def _from_photographs(request: Request, left: np.ndarray, _: np.ndarray) -> GeometryGuidance:
+    if request.baseline_m is None:
+        cure = "Photographs have no unit: measure how far the two cameras were from each other, in metres."
+        bad_value("the distance of the cameras", "given", "nothing", cure)
+    K, more = None, dict[str, Any]()  # without fx, K of the EXIF of the photographs
+    if request.fx is not None:
+        K = request.K(left.shape[1::-1])
+        if request.cx_right is not None:
+            more["K_right"] = np.array([[K[0, 0], 0, request.cx_right], K[1], K[2]])
+    photographs = [ImageOps.exif_transpose(Image.open(path)) for path in request.photographs]
+    known = {"baseline_m": request.baseline_m, "K": K, "config": request.run.config()}
+    return GeometryGuidance.from_photographs(photographs, **known, **more)
+
+
+#: Ways to give the cameras, in the order of the page: what it calls them, and
+#: ``(request, left, right) -> GeometryGuidance`` of photographs ``(H, W, 3)`` in [0, 1].
+CAMERA_WAYS = {
+    "file": ("Calibration file", _from_file),
+    "numbers": ("Focal length and baseline", _from_numbers),
+    "photographs": ("Estimate from the photographs", _from_photographs),
+}
+
+
+def _read(path: str, name: str) -> tuple[np.ndarray, list[str]]:
     with open_image(path, name) as image:  # the head alone
         width, height = image.size
     if width * height > MOST_MEGAPIXELS * 1_000_000:
         expected = f"an image of at most {MOST_MEGAPIXELS} megapixels"
         bad_value(name, expected, f"{width}x{height}", "Scale it down first, and K with it.")
     return read_image(path, name)
-
-
-def _views(request: Request) -> tuple[Views, list[str]]:
-    left, notes = _read(request.left, "the left photograph")
-    right, of_right = _read(request.right, "the right photograph")
-    third, of_third = (None, []) if request.third is None else _read(request.third, "the third photograph")
-    assert request.left is not None and request.right is not None
-    views = Views(left, right, third, (request.left, request.right), request.third)
-    return views, [*notes, *of_right, *of_third]
 
 
 def run_job(request: Request, priors: Priors, stop: threading.Event, report: Report) -> Result:
@@ -165,15 +247,18 @@ def run_job(request: Request, priors: Priors, stop: threading.Event, report: Rep
             raise Stopped
         report(share, name)
 
-    run, warnings = request.run, list[str]()
-    seconds, started = {}, time.perf_counter()
+    run, warnings, seconds = request.run, list[str](), dict[str, float]()
+    started = time.perf_counter()
     with collected_warnings(warnings.append):
         stage(0.0, "Reading the photographs and cameras")
         for name, most in LIMITS.items():
             check_number(getattr(run, name) or 0, FIELD_NAMES.get(name, name), 0, most, integer=True)
         run.check(lambda field: FIELD_NAMES.get(field.name, field.name))
-        views, notes = _views(request)
-        guidance = CAMERA_WAYS[request.way].guide(views, request.cameras, {"config": run.config()})
+        paths = request.photographs
+        (left, notes), (right, more) = (
+            _read(path, f"the {side} photograph") for path, side in zip(paths, ("left", "right"), strict=True)
+        )
+        guidance = CAMERA_WAYS[request.way][1](request, left, right)
         stage(0.05, "Loading the prior")
         pipe = priors.get(run.prior)
         total = guidance.denoising_steps(run.steps, pipe.default_denoising_steps) * run.ensemble
@@ -184,20 +269,13 @@ def run_job(request: Request, priors: Priors, stop: threading.Event, report: Rep
         def show(_pipe: Any, _step: int, _timestep: Any, _now: dict[str, Any]) -> dict[str, Any]:
             nonlocal done
             done += 1
-            stage(0.2 + 0.6 * min(done / total, 1.0), f"Guided step {min(done, total)} of {total}")
+            stage(0.2 + 0.7 * min(done / total, 1.0), f"Guided step {min(done, total)} of {total}")
             return {}
 
-        def call(**more: Any) -> MetricDepthOutput:
-            return pipe(views.left, generator=torch.Generator("cpu").manual_seed(run.seed), **more)
-
-        output = call(guidance=guidance, callback_on_step_end=show, **run.call())
-        seconds["guided call"] = time.perf_counter() - started - sum(seconds.values())
-        prior_map = None
-        if request.show_prior:
-            stage(0.85, "The prior alone")
-            plain = run.call() | {"output_uncertainty": False}
-            prior_map = single_map(call(**plain).prediction).astype(np.float32)
-            seconds["prior alone"] = time.perf_counter() - started - sum(seconds.values())
+        generator = torch.Generator("cpu").manual_seed(run.seed)
+        output = pipe(left, guidance=guidance, generator=generator, callback_on_step_end=show, **run.call())
+        seconds["guided call"] = time.perf_counter() - started - seconds["prepare"]
         stage(0.95, "Drawing")
-    sentences = list(dict.fromkeys([*notes, *warnings, *output.warnings, *output.assumed]))
-    return Result(views, guidance, output, prior_map, sentences, seconds, request)
+    sentences = list(dict.fromkeys([*notes, *more, *warnings, *output.warnings, *output.assumed]))
+    folder = Path(tempfile.mkdtemp(prefix="geodiff-"))
+    return Result(left, guidance, output, sentences, seconds, request, folder)

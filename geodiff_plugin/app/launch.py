@@ -24,14 +24,6 @@ SESSIONS_KEPT = 200
 LARGEST_FILE = "40mb"
 
 
-def _check_gradio() -> None:
-    if importlib.util.find_spec("gradio") is None:
-        refuse(
-            "geodiff app needs gradio, which is not installed. "
-            "Install it with: pip install 'geodiff-plugin[app]'."
-        )
-
-
 class _OwnOnly:
     """ASGI middleware: adds the policy to every page, and refuses requests that another site's page makes."""
 
@@ -80,15 +72,16 @@ def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **
     Raises:
         OSError, ValueError: gradio is missing, no such device, or the first prior cannot be loaded.
     """
-    _check_gradio()
+    if importlib.util.find_spec("gradio") is None:
+        cure = "Install it with: pip install 'geodiff-plugin[app]'."
+        refuse(f"geodiff app needs gradio, which is not installed. {cure}")
     os.environ.update(QUIET)  # gradio looks at it when it is imported
     _own_folder()
     from starlette.middleware import Middleware
 
     from geodiff_plugin.app.job import Priors
     from geodiff_plugin.app.look import CSS
-    from geodiff_plugin.app.page import build_page
-    from geodiff_plugin.app.panels import THEME
+    from geodiff_plugin.app.page import THEME, build_page
     from geodiff_plugin.runtime.machine import pick_device
 
     offered = Priors(priors, pick_device(device))
@@ -106,16 +99,7 @@ def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **
 
 
 def run_app(priors: tuple[str, ...], device: str, host: str, port: int | None, browser: bool) -> None:
-    """Serve until Ctrl-C, or until the process is asked to end.
-
-    Args:
-        priors: as in ``launch_page``.
-        device: as in ``launch_page``.
-        host: address to listen on; 0.0.0.0 lets others in.
-        port: to listen on; ``None`` takes the first free one from 7860 on.
-        browser: open the page in a browser.
-    """
-    _check_gradio()
+    """Serve until Ctrl-C, or until the process is asked to end; arguments as ``geodiff app`` takes them."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that what visitors gave is deleted
     where = {"server_name": host, "server_port": port, "inbrowser": browser, "share": False}
     try:

@@ -1,4 +1,4 @@
-"""Texts, theme and style sheet of the page."""
+"""Texts, scripts and style sheet of the page."""
 
 from __future__ import annotations
 
@@ -77,14 +77,12 @@ def _box(kind: str, role: str, body: str) -> str:
     return f'<div class="{kind}" role="{role}">{body}</div>'
 
 
+STOPPED = _box("say say-quiet", "status", "Stopped.")
+
+
 def failed(sentence: str) -> str:
     """A box that says what was wrong with the input, or that there is a defect."""
     return _box("say say-bad", "alert", f"<b>That did not work.</b> {html.escape(sentence)}")
-
-
-def stopped() -> str:
-    """A box after the visitor's own stop."""
-    return _box("say say-quiet", "status", "Stopped.")
 
 
 def banner(status: str, more: str = "") -> str:
@@ -93,9 +91,7 @@ def banner(status: str, more: str = "") -> str:
     return _box(f"verdict {status.replace(' ', '-')}", role, f"<b>{status.capitalize()}</b>{more}")
 
 
-def finished(
-    status: str, figures: Sequence[tuple[str, str]], sentences: Sequence[str], cameras: str = ""
-) -> str:
+def finished(status: str, figures: Sequence[tuple[str, str]], sentences: Sequence[str], cameras: str) -> str:
     """The banner with numbers and their names, sentences, and the cameras as understood.
 
     Where the result is not trusted the sentences come first, and the numbers stand back behind them.

@@ -66,14 +66,10 @@ def read_pixel(
     confidence: np.ndarray | None = None,
     uncertainty_m: np.ndarray | None = None,
 ) -> Reading:
-    """The point that a pixel shows.
+    """The point that a pixel ``(x, y)`` shows.
 
-    Args:
-        depth_m: ``(H, W)`` metres.
-        K: ``(3, 3)`` pixels of this map.
-        pixel: ``(x, y)`` from the top left corner.
-        confidence: ``(H, W)`` in [0, 1], or ``None``.
-        uncertainty_m: ``(H, W)`` metres, median absolute deviation of the members, or ``None``.
+    ``depth_m`` and ``uncertainty_m``, the median absolute deviation of the members, are ``(H, W)`` metres,
+    ``confidence`` is ``(H, W)`` in [0, 1], ``K`` ``(3, 3)`` in pixels of these maps.
 
     Raises:
         ValueError: a pixel outside the map, or one without depth.
@@ -85,20 +81,16 @@ def read_pixel(
     z = float(depth_m[y, x])
     if not (np.isfinite(z) and z > 0):
         bad_value("pixel", "one with a depth", (x, y))
-    sure = None if confidence is None else float(confidence[y, x])
-    spread_m = None if uncertainty_m is None else float(uncertainty_m[y, x])
-    point_m = z * (np.linalg.inv(K) @ (x, y, 1.0))
-    return Reading((x, y), point_m, _spread(sure, spread_m, z), sure)
+    sure, off_m = (None if map is None else float(map[y, x]) for map in (confidence, uncertainty_m))
+    return Reading((x, y), z * (np.linalg.inv(K) @ (x, y, 1.0)), _spread(sure, off_m, z), sure)
 
 
 def distance_m(a: Reading, b: Reading) -> tuple[float, float | None]:
     """How far two points are from each other, and the standard deviation of that, in metres.
 
     An error of depth moves a point along its own ray; the errors of the two points are taken as independent,
-    so a scale that is wrong as a whole is counted as if each point had its own.
-
-    Returns:
-        Distance and its spread; the spread is ``None`` where that of either point is.
+    so a scale that is wrong as a whole is counted as if each point had its own. The spread is ``None`` where
+    that of either point is.
     """
     between = b.point_m - a.point_m
     length = float(np.linalg.norm(between))
@@ -110,3 +102,9 @@ def distance_m(a: Reading, b: Reading) -> tuple[float, float | None]:
         float(between @ each.point_m) / length * spread for each, spread in ((a, a.spread), (b, b.spread))
     )
     return length, float(np.hypot(of_a, of_b))
+
+
+def metres(value: float, spread: float | None = None) -> str:
+    """``2.31 m`` or ``2.31 ± 0.07 m``; to the millimetre where the spread is below half a centimetre."""
+    decimals = 3 if spread is not None and spread < 0.005 else 2
+    return f"{value:.{decimals}f}{'' if spread is None else f' ± {spread:.{decimals}f}'} m"

@@ -1,4 +1,4 @@
-"""The page: its layout, and what happens on every click."""
+"""The page: its panels, and what happens on every click."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from shutil import rmtree
+from types import SimpleNamespace
 from typing import Any, Literal, TypedDict
 
 import gradio as gr
@@ -19,14 +20,15 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.app import look
 from geodiff_plugin.app.form import Form, build_form
 from geodiff_plugin.app.job import Priors, Result, Stopped, run_job
-from geodiff_plugin.app.panels import CLOUD_TAB, Panels, build_panels
-from geodiff_plugin.app.pictures import legend_of_depth, legend_of_share
 from geodiff_plugin.app.results import (
+    MOST_POINTS_SHOWN,
     NAMES,
     Pixels,
-    Shown,
+    legend_of_confidence,
+    legend_of_depth,
     measurement,
-    readings_csv,
+    picture,
+    scale_of,
     write_files,
     write_scene,
 )
@@ -34,8 +36,30 @@ from geodiff_plugin.cli.report import depth_summary
 
 #: A visitor's uploads, result and files are deleted after this long, and when the tab is closed.
 FORGET_AFTER_S = 600
-#: Where the cloud is looked at from: degrees around it and down from above, and a share of its depth.
-VIEW_ANGLES, VIEW_FROM = (90, 75), 1.05
+#: The cloud: points of this confidence, looked at from so many degrees around it and down from above, and
+#: from a share of its depth.
+LEAST_CONFIDENCE, VIEW_ANGLES, VIEW_FROM = 0.5, (90, 75), 1.05
+CLOUD_TAB, PANEL_HEIGHT, NIGHT = "Point cloud", 560, (0.09, 0.1, 0.12, 1.0)
+THEME = gr.themes.Base(
+    primary_hue="teal",
+    neutral_hue="slate",
+    font=["system-ui", "sans-serif"],
+    font_mono=["ui-monospace", "monospace"],
+).set(
+    button_primary_background_fill="#0f5c66",
+    button_primary_background_fill_dark="#0f5c66",
+    button_primary_background_fill_hover="#0b464e",
+    button_primary_text_color="white",
+    body_text_color_subdued="#475569",
+    body_text_color_subdued_dark="#b6c2d1",
+    block_info_text_color="#475569",
+    block_info_text_color_dark="#b6c2d1",
+    input_placeholder_color="#64748b",
+    input_placeholder_color_dark="#9aa8b9",
+    link_text_color_dark="#93c5fd",
+    block_label_text_color="#334155",
+    block_label_text_color_dark="#cbd5e1",
+)
 
 
 class _Handling(TypedDict):
@@ -90,9 +114,9 @@ class _Desk:
             self._stops.pop(visitor, None)
 
 
-def _forget(shown: Shown | None) -> None:
-    if shown is not None:
-        rmtree(shown.folder, ignore_errors=True)
+def _forget(result: Result | None) -> None:
+    if result is not None:
+        rmtree(result.folder, ignore_errors=True)
 
 
 def for_visitors(sentence: str, paths: Iterable[Path]) -> str:
@@ -117,8 +141,10 @@ def _figures(result: Result) -> list[tuple[str, str]]:
     seconds = (f"{sum(result.seconds.values()):.1f} s", "computing")
     if not result.output.verdict.trusted:
         return [(f"{depth['median_m']:.2f} m, unconfirmed", "median depth"), seconds]
-    figures = [(f"{depth['min_m']:.2f} m to {depth['max_m']:.2f} m", "nearest and farthest")]
-    figures.append((f"{depth['median_m']:.2f} m", "median depth"))
+    figures = [
+        (f"{depth['min_m']:.2f} m to {depth['max_m']:.2f} m", "nearest and farthest"),
+        (f"{depth['median_m']:.2f} m", "median depth"),
+    ]
     if visible is not None:
         figures.append((f"{100 * visible.mean():.0f} %", "seen by both cameras"))
     if confidence is not None:
@@ -128,69 +154,49 @@ def _figures(result: Result) -> list[tuple[str, str]]:
 
 def _cameras(result: Result) -> str:
     """The cameras as understood."""
-    K, sentences = result.K, []
-    for name, rig in zip(("right", "third"), result.guidance.rigs, strict=False):
-        x, y, z = rig.E[:3, 3]
-        ways = {"right": x, "left": -x, "below": y, "above": -y, "before": z, "behind": -z}
-        way = max(ways, key=lambda side: ways[side])
-        sentences.append(f"the {name} one {np.linalg.norm(rig.E[:3, 3]):.3g} m away, {way}")
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    return f"Left camera: fx {fx:.1f}, fy {fy:.1f}, cx {cx:.1f}, cy {cy:.1f} px; {'; '.join(sentences)}."
+    (fx, _, cx), (_, fy, cy), _ = result.K
+    x, y, z = apart = result.guidance.rigs[0].E[:3, 3]
+    ways = {"right": x, "left": -x, "below": y, "above": -y, "before": z, "behind": -z}
+    way, away = max(ways, key=lambda side: ways[side]), np.linalg.norm(apart)
+    lens = f"fx {fx:.1f}, fy {fy:.1f}, cx {cx:.1f}, cy {cy:.1f} px"
+    return f"Left camera: {lens}; the right one {away:.3g} m away, {way}."
 
 
-def _everything(panels: Panels, shown: Shown, beside: str, under: str) -> dict[Any, Any]:
+def _everything(panels: SimpleNamespace, result: Result) -> dict[Any, Any]:
     """Every panel's value for a new result, but the cloud's, which is drawn when its tab is opened."""
-    result, paths = shown.result, list(shown.result.request.files())
-    verdict = result.output.verdict
-    sentences = list(dict.fromkeys([*verdict.reasons, *result.warnings]))
-    sentences = [s for s in sentences if s != verdict.sentence]
-    picture, words = measurement(shown, [], under)
-    values: dict[Any, Any] = {
-        panels.status: look.finished(
-            verdict.status,
-            _figures(result),
-            [for_visitors(sentence, paths) for sentence in sentences],
-            _cameras(result),
-        ),
+    verdict, paths = result.output.verdict, result.request.files()
+    sentences = dict.fromkeys([*verdict.reasons, *result.warnings])
+    told = [for_visitors(sentence, paths) for sentence in sentences if sentence != verdict.sentence]
+    marked, words = measurement(result, [])
+    sure = picture(result, "confidence")
+    return {
+        panels.status: look.finished(verdict.status, _figures(result), told, _cameras(result)),
         panels.measure_verdict: look.banner(verdict.status),
         panels.files_verdict: look.banner(verdict.status),
-        panels.slider: (shown.picture(beside), shown.picture("depth")),
+        panels.slider: (picture(result, "photograph"), picture(result, "depth")),
         panels.depth_legend: legend_of_depth(result.depth_m),
-        panels.picture: picture,
+        panels.picture: marked,
         panels.readings: words,
-        panels.files: [str(path) for path in write_files(shown.folder, result)],
-        panels.table: None,
+        panels.files: [str(path) for path in write_files(result)],
+        panels.confidence: sure,
+        panels.confidence_legend: "" if sure is None else legend_of_confidence(),
     }
-    captions = {
-        "confidence": (1.0, "Confidence: probability that a depth is within 10 % of the truth"),
-        "photometric_error": (
-            shown.most_error,
-            "Difference between the photograph and the other view brought to it; dark where they agree",
-        ),
-    }
-    for name, (most, caption) in captions.items():
-        drawn = shown.picture(name)
-        values[getattr(panels, name)] = drawn
-        values[getattr(panels, f"{name}_legend")] = "" if drawn is None else legend_of_share(most, caption)
-    return values
 
 
-def _scene(shown: Shown, least_confidence: float) -> tuple[Any, str]:
+def _scene(result: Result) -> tuple[Any, str]:
     """The view of the cloud of confident points from behind the cameras, and a line about it."""
-    path = shown.folder / f"scene-{round(100 * least_confidence)}.glb"
-    count = write_scene(path, shown.result, least_confidence)
-    share = 100 * count / shown.result.depth_m.size
-    away = VIEW_FROM * float(np.percentile(shown.result.depth_m, 90))
+    path = result.folder / "scene.glb"
+    count = write_scene(path, result, LEAST_CONFIDENCE, MOST_POINTS_SHOWN)
+    share, away = 100 * count / result.depth_m.size, VIEW_FROM * float(np.percentile(result.depth_m, 90))
     view = gr.Model3D(str(path), camera_position=(*VIEW_ANGLES, away))
     return view, f'<div class="legend-caption">{count:,} points, {share:.0f} % of the pixels</div>'
 
 
 def _wire_run(
-    form: Form, panels: Panels, state: gr.State, points: gr.State, tab: gr.State, priors: Priors
+    form: Form, panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State, priors: Priors
 ) -> _Desk:
     desk, fields = _Desk(form.examples.keep_in_cache), list(form.fields.values())
-    controls = (panels.beside, panels.under, panels.least_confidence)
-    fixed = (*controls, panels.tabs, panels.pixel, panels.add, panels.clear)
+    fixed = (panels.tabs, panels.pixel, panels.add, panels.clear)
     shows = [component for component in vars(panels).values() if component not in fixed]
 
     def come(request: gr.Request) -> str:
@@ -199,12 +205,11 @@ def _wire_run(
 
     def stop(request: gr.Request) -> str:
         desk.stop(request.session_hash)
-        return look.stopped()
+        return look.STOPPED
 
     def nothing(status: str) -> dict[Any, Any]:
         """No result, and why."""
-        empty = dict.fromkeys(shows)
-        empty |= {each: "" for each in shows if isinstance(each, gr.HTML)}
+        empty = {each: "" if isinstance(each, gr.HTML) else None for each in shows}
         return {**empty, panels.readings: look.HOW_TO_MEASURE, panels.status: status, state: None, points: []}
 
     def estimate(
@@ -213,23 +218,22 @@ def _wire_run(
         *values: Any,
     ) -> dict[Any, Any]:
         """Depth in metres of the left photograph, with its files."""
-        *filled, before, beside, under, least, tab = values
+        *filled, before, opened = values
         _forget(before)
         uploads: list[Path] = []
         try:
             wanted = form.request(tuple(filled))
-            uploads = list(wanted.files())
+            uploads = wanted.files()
             desk.note(request.session_hash, uploads)
             result = desk.serve(request.session_hash, lambda stop: run_job(wanted, priors, stop, progress))
-            shown = Shown(result, Path(tempfile.mkdtemp(prefix="geodiff-")))
-            desk.note(request.session_hash, [shown.folder / "everything.zip"])
-            values_now = {state: shown, points: [], **_everything(panels, shown, beside, under)}
+            desk.note(request.session_hash, [result.folder / "everything.zip"])
+            values_now = {state: result, points: [], **_everything(panels, result)}
         except Stopped:
-            return nothing(look.stopped())
+            return nothing(look.STOPPED)
         except Exception as error:  # whatever it is, the visitor reads a sentence
             return nothing(look.failed(_sentence(error, uploads)))
-        if tab == CLOUD_TAB:
-            values_now[panels.scene], values_now[panels.points] = _scene(shown, least)
+        if opened == CLOUD_TAB:
+            values_now[panels.scene], values_now[panels.points] = _scene(result)
         return values_now
 
     def take(event: gr.SelectData) -> list[Any]:
@@ -239,7 +243,7 @@ def _wire_run(
     for name, begins in (("estimate", form.run.click), ("example", chosen.then)):
         begins(come, outputs=panels.status, js=look.RUN_BEGINS, **QUICK).then(
             estimate,
-            [*fields, state, *controls, tab],
+            [*fields, state, tab],
             [*shows, state, points],
             concurrency_limit=1,
             concurrency_id="job",
@@ -254,56 +258,93 @@ def _wire_run(
     return desk
 
 
-def _wire_panels(panels: Panels, state: gr.State, points: gr.State, tab: gr.State) -> None:
-    def compare(shown: Shown | None, beside: str) -> Any:
-        return gr.skip() if shown is None else (shown.picture(beside), shown.picture("depth"))
+def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State) -> None:
+    def redraw(result: Result | None, pixels: Pixels) -> tuple[Any, ...]:
+        if result is None:
+            return gr.skip(), gr.skip(), gr.skip()
+        return pixels, *measurement(result, pixels)
 
-    def redraw(shown: Shown | None, pixels: Pixels, under: str) -> tuple[Any, ...]:
-        if shown is None:
-            return gr.skip(), gr.skip(), gr.skip(), gr.skip()
-        path = shown.folder / "measurements.csv"
-        path.write_text(readings_csv(shown, pixels), encoding="utf-8")
-        return pixels, *measurement(shown, pixels, under), str(path) if pixels else None
+    def click(result: Result | None, pixels: Pixels, event: gr.SelectData) -> tuple[Any, ...]:
+        return redraw(result, [*pixels, tuple(event.index)][-len(NAMES) :])
 
-    def click(shown: Shown | None, pixels: Pixels, under: str, event: gr.SelectData) -> tuple[Any, ...]:
-        return redraw(shown, [*pixels, tuple(event.index)][-len(NAMES) :], under)
-
-    def add(shown: Shown | None, pixels: Pixels, under: str, typed: str) -> tuple[Any, ...]:
+    def add(result: Result | None, pixels: Pixels, typed: str) -> tuple[Any, ...]:
         numbers = [int(word) for word in re.findall(r"\d{1,6}", typed or "")]
-        if shown is None or len(numbers) != 2:
-            return gr.skip(), gr.skip(), "Type two whole numbers: x, y." if shown else gr.skip(), gr.skip()
-        at = (round(numbers[0] * shown.scale), round(numbers[1] * shown.scale))
-        return redraw(shown, [*pixels, at][-len(NAMES) :], under)
+        if result is None or len(numbers) != 2:
+            return gr.skip(), gr.skip(), "Type two whole numbers: x, y." if result else gr.skip()
+        x, y = (round(number * scale_of(result)) for number in numbers)
+        return redraw(result, [*pixels, (x, y)][-len(NAMES) :])
 
-    def clear(shown: Shown | None, under: str) -> tuple[Any, ...]:
-        return redraw(shown, [], under)
+    def clear(result: Result | None) -> tuple[Any, ...]:
+        return redraw(result, [])
 
-    def thin(shown: Shown | None, least: float) -> tuple[Any, Any]:
-        return (gr.skip(), gr.skip()) if shown is None else _scene(shown, least)
-
-    def turn(shown: Shown | None, least: float, event: gr.SelectData) -> tuple[Any, Any, Any]:
+    def turn(result: Result | None, event: gr.SelectData) -> tuple[Any, Any, Any]:
         # A 3D view that gets its file while it is hidden stays empty (gradio 6.31).
-        drawn = thin(shown, least) if event.value == CLOUD_TAB else (gr.skip(), gr.skip())
-        return (event.value, *drawn)
+        if result is None or event.value != CLOUD_TAB:
+            return event.value, gr.skip(), gr.skip()
+        return (event.value, *_scene(result))
 
-    measured = [points, panels.picture, panels.readings, panels.table]
-    panels.beside.change(compare, [state, panels.beside], panels.slider, **QUICK)
-    panels.picture.select(click, [state, points, panels.under], measured, **QUICK)
-    panels.under.change(redraw, [state, points, panels.under], measured, **QUICK)
-    typed = [state, points, panels.under, panels.pixel]
-    gr.on([panels.add.click, panels.pixel.submit], add, typed, measured, **QUICK)
-    panels.clear.click(clear, [state, panels.under], measured, **QUICK)
-    cloud = [panels.scene, panels.points]
-    panels.least_confidence.release(thin, [state, panels.least_confidence], cloud, **QUICK)
-    panels.tabs.select(turn, [state, panels.least_confidence], [tab, *cloud], **QUICK)
+    measured = [points, panels.picture, panels.readings]
+    panels.picture.select(click, [state, points], measured, **QUICK)
+    gr.on([panels.add.click, panels.pixel.submit], add, [state, points, panels.pixel], measured, **QUICK)
+    panels.clear.click(clear, state, measured, **QUICK)
+    panels.tabs.select(turn, state, [tab, panels.scene, panels.points], **QUICK)
+
+
+def _image(label: str, **more: Any) -> gr.Image:
+    return gr.Image(
+        label=label, show_label=False, interactive=False, format="png", buttons=["fullscreen"], **more
+    )
+
+
+def _build_panels() -> SimpleNamespace:
+    """Draw the result side of the page, tab by tab, into the open gradio context."""
+    panels = SimpleNamespace(status=gr.HTML(look.WAITING, elem_id="status"))
+    with gr.Tabs() as panels.tabs:
+        with gr.Tab("Depth"):
+            panels.slider = gr.ImageSlider(
+                label="Drag: photograph | metric depth",
+                show_label=False,
+                interactive=False,
+                format="png",
+                max_height=PANEL_HEIGHT,
+                buttons=["fullscreen"],
+                elem_id="slider",
+            )
+            panels.depth_legend = gr.HTML(elem_id="depth-legend")
+        with gr.Tab("Measure"):
+            panels.measure_verdict = gr.HTML()
+            with gr.Row():
+                with gr.Column(scale=5, min_width=300):
+                    panels.picture = _image("Click points", elem_id="measure-picture")
+                with gr.Column(scale=3, min_width=260):
+                    panels.readings = gr.HTML(look.HOW_TO_MEASURE, elem_id="readings")
+                    label = "A point by its pixel: x, y"
+                    panels.pixel = gr.Textbox(
+                        label=label, placeholder="320, 240", max_lines=1, elem_id="pixel"
+                    )
+                    with gr.Row():
+                        panels.add = gr.Button("Add point", size="sm", elem_id="add-point")
+                        panels.clear = gr.Button("Clear points", size="sm")
+        with gr.Tab(CLOUD_TAB):
+            panels.scene = gr.Model3D(
+                label="Drag to turn, scroll to come nearer",
+                interactive=False,
+                clear_color=NIGHT,
+                height=PANEL_HEIGHT,
+                elem_id="scene",
+            )
+            panels.points = gr.HTML(elem_id="points")
+        with gr.Tab("How sure"):
+            panels.confidence, panels.confidence_legend = _image("Confidence"), gr.HTML()
+        with gr.Tab("Downloads"):
+            panels.files_verdict = gr.HTML()
+            label = "All in one, depth, cloud and report"
+            panels.files = gr.File(label=label, interactive=False, elem_id="files")
+    return panels
 
 
 def build_page(priors: Priors) -> gr.Blocks:
-    """The whole page; launch it with ``theme=THEME, css=look.CSS``.
-
-    Args:
-        priors: what a visitor may choose.
-    """
+    """The whole page with what a visitor may choose; launch it with ``theme=THEME, css=look.CSS``."""
     with gr.Blocks(
         title="Depth in metres from two photographs",
         analytics_enabled=False,
@@ -317,7 +358,7 @@ def build_page(priors: Priors) -> gr.Blocks:
             with gr.Column(scale=5, min_width=340, elem_id="form"):
                 form = build_form(priors)
             with gr.Column(scale=8, min_width=340, elem_id="results"):
-                panels = build_panels()
+                panels = _build_panels()
         desk = _wire_run(form, panels, state, points, tab, priors)
         _wire_panels(panels, state, points, tab)
 

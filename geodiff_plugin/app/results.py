@@ -1,108 +1,136 @@
-"""Contents of the result panels of the page, and the files to take home."""
+"""Contents of the result panels: coloured maps with legends, measured points, and files to take home."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from geodiff_plugin.app import look
 from geodiff_plugin.app.job import Result
-from geodiff_plugin.app.measure import Reading, distance_m, read_pixel
-from geodiff_plugin.app.pictures import colour_relative, marked, metres
+from geodiff_plugin.app.measure import Reading, distance_m, metres, read_pixel
 from geodiff_plugin.cli.exports import cameras_of, write_maps
 from geodiff_plugin.cli.report import plain, result_entries
 from geodiff_plugin.formats import flying_points, make_cloud, write_glb
-from geodiff_plugin.plotting import colour_depth, colour_share
+from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
 
 #: Pictures on the page are no larger than this; files to take home have every pixel.
 LARGEST_SIDE = 1600
 #: More points than this make a browser slow; the files to take home hold all.
 MOST_POINTS_SHOWN = 250_000
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+LEGEND_STOPS = 24
+MARK = "#c2410c"
 Pixels = list[tuple[int, int]]
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """A result and where its files lie, for one visitor.
-
-    Attributes:
-        result: of the job.
-        folder: of its own.
-    """
-
-    result: Result
-    folder: Path
-
-    @property
-    def scale(self) -> float:
-        """Size of the pictures on the page / size of the maps."""
-        return min(1.0, LARGEST_SIDE / max(self.result.depth_m.shape))
-
-    def picture(self, name: str) -> np.ndarray | None:
-        """``(h, w, 3)`` uint8, as large as the page shows it; ``None`` where the result has no such map."""
-        full = self._full(name)
-        if full is None or self.scale == 1:
-            return full
-        size = (round(full.shape[1] * self.scale), round(full.shape[0] * self.scale))
-        return np.asarray(Image.fromarray(full).resize(size, Image.Resampling.LANCZOS))
-
-    def _full(self, name: str) -> np.ndarray | None:
-        result = self.result
-        if name == "photograph" or (name == "prior" and result.prior_map is None):
-            return np.rint(np.clip(result.views.left, 0, 1) * 255).astype(np.uint8)
-        if name == "prior":
-            assert result.prior_map is not None
-            return colour_relative(result.prior_map, result.depth_m)
-        if name == "depth":
-            return colour_depth(result.depth_m)
-        values = result.map(name)
-        most = self.most_error if name == "photometric_error" else 1.0
-        return None if values is None else colour_share(values, most)
-
-    @property
-    def most_error(self) -> float:
-        """The error at the upper end of its colours."""
-        error = self.result.map("photometric_error")
-        return 1.0 if error is None else max(float(np.percentile(error, 99)), 1e-3)
-
-    def reading(self, pixel: tuple[int, int]) -> Reading:
-        """What the map says at a pixel of a picture on the page."""
-        result = self.result
-        height, width = result.depth_m.shape
-        x, y = (round((value + 0.5) / self.scale - 0.5) for value in pixel)
-        inside = (min(max(x, 0), width - 1), min(max(y, 0), height - 1))
-        return read_pixel(
-            result.depth_m, result.K, inside, result.map("confidence"), result.map("uncertainty")
-        )
+def scale_of(result: Result) -> float:
+    """Size of the pictures on the page / size of the maps."""
+    return min(1.0, LARGEST_SIDE / max(result.depth_m.shape))
 
 
-def measurement(shown: Shown, pixels: Pixels, under: str) -> tuple[np.ndarray, str]:
-    """The picture with the points of these pixels, and what they say as HTML; every two are a segment."""
-    readings = [shown.reading(pixel) for pixel in pixels]
-    picture = shown.picture(under)
-    assert picture is not None
-    picture = marked(picture, list(zip(pixels, NAMES, readings, strict=False)))
-    return picture, _words(readings) if readings else look.HOW_TO_MEASURE
+def picture(result: Result, name: str) -> np.ndarray | None:
+    """``(h, w, 3)`` uint8 of ``photograph``, ``depth`` or ``confidence``; ``None`` without such a map."""
+    if name == "photograph":
+        full = np.rint(np.clip(result.left, 0, 1) * 255).astype(np.uint8)
+    elif name == "depth":
+        full = colour_depth(result.depth_m)
+    else:
+        confidence = result.map("confidence")
+        if confidence is None:
+            return None
+        full = colour_share(confidence)
+    if (scale := scale_of(result)) == 1:
+        return full
+    size = (round(full.shape[1] * scale), round(full.shape[0] * scale))
+    return np.asarray(Image.fromarray(full).resize(size, Image.Resampling.LANCZOS))
+
+
+def reading(result: Result, pixel: tuple[int, int]) -> Reading:
+    """What the map says at a pixel of a picture on the page."""
+    height, width = result.depth_m.shape
+    x, y = (round((value + 0.5) / scale_of(result) - 0.5) for value in pixel)
+    inside = (min(max(x, 0), width - 1), min(max(y, 0), height - 1))
+    return read_pixel(result.depth_m, result.K, inside, result.map("confidence"), result.map("uncertainty"))
+
+
+def _legend(colours: np.ndarray, marks: Sequence[tuple[float, str]], caption: str) -> str:
+    stops = ", ".join(
+        f"rgb({r},{g},{b}) {100 * i / (len(colours) - 1):.1f}%" for i, (r, g, b) in enumerate(colours)
+    )
+    words = "".join(f'<span style="left:{100 * share:.2f}%">{text}</span>' for share, text in marks)
+    bar = f"background:linear-gradient(90deg, {stops})"
+    return (
+        f'<div class="legend"><div class="legend-bar" style="{bar}"></div>'
+        f'<div class="legend-ticks">{words}</div><div class="legend-caption">{caption}</div></div>'
+    )
+
+
+def legend_of_depth(depth_m: np.ndarray) -> str:
+    """A bar from near to far with depths in metres under it, as HTML."""
+    near, far = depth_range(depth_m)
+    shares = np.linspace(0, 1, LEGEND_STOPS)
+    colours = colour_depth((near * (far / near) ** shares)[None], near=near, far=far)[0]
+    marks = [(math.log(value / near) / math.log(far / near), f"{value:g} m") for value in ticks(near, far, 7)]
+    return _legend(colours, marks, "depth in metres; equal steps of colour are equal factors")
+
+
+def legend_of_confidence() -> str:
+    """A bar with percentages under it, as HTML."""
+    colours = colour_share(np.linspace(0, 1, LEGEND_STOPS)[None])[0]
+    marks = [(share, f"{100 * share:.0f} %") for share in (0, 0.25, 0.5, 0.75, 1)]
+    return _legend(colours, marks, "Confidence: probability that a depth is within 10 % of the truth")
+
+
+def measurement(result: Result, pixels: Pixels) -> tuple[np.ndarray, str]:
+    """The photograph with the points of these pixels, and what they say as HTML; every two are a segment."""
+    readings, photograph = [reading(result, pixel) for pixel in pixels], picture(result, "photograph")
+    assert photograph is not None
+    return marked(photograph, pixels, readings), _words(readings) if readings else look.HOW_TO_MEASURE
+
+
+def marked(photograph: np.ndarray, pixels: Pixels, readings: Sequence[Reading]) -> np.ndarray:
+    """A copy of a photograph ``(h, w, 3)`` uint8 with these pixels, and the distance of every two of them."""
+    image = Image.fromarray(photograph)
+    draw = ImageDraw.Draw(image)
+    unit = max(image.size) / 100
+    radius, font = max(3.0, 0.8 * unit), ImageFont.load_default(size=max(11.0, 2.8 * unit))
+
+    def label(x: float, y: float, text: str) -> None:
+        left, top, right, bottom = draw.textbbox((x, y), text, font=font, anchor="mm")
+        draw.rounded_rectangle((left - 3, top - 2, right + 3, bottom + 2), radius=3, fill=(20, 20, 20))
+        draw.text((x, y), text, font=font, fill="white", anchor="mm")
+
+    segments = list(zip(pixels[::2], pixels[1::2], readings[::2], readings[1::2], strict=False))
+    for a, b, *_ in segments:
+        draw.line([a, b], fill="black", width=max(3, round(0.7 * unit)))
+        draw.line([a, b], fill="white", width=max(1, round(0.3 * unit)))
+    for (x, y), name in zip(pixels, NAMES, strict=False):
+        box = (x - radius, y - radius, x + radius, y + radius)
+        draw.ellipse(box, fill=MARK, outline="white", width=max(1, round(0.25 * unit)))
+        label(x, y - 2.6 * radius, name)
+    for a, b, first, second in segments:
+        middle = (a[0] + b[0]) / 2, (a[1] + b[1]) / 2 - 2.2 * radius
+        label(*middle, f"{distance_m(first, second)[0]:.2f} m")
+    return np.asarray(image)
 
 
 def _words(readings: list[Reading]) -> str:
     rows = "".join(
-        f"<tr><td><b>{name}</b></td><td>{metres(reading.depth_m, reading.spread_m)}</td>"
-        f"<td>{'unknown' if reading.confidence is None else f'{100 * reading.confidence:.0f} %'}</td></tr>"
-        for name, reading in zip(NAMES, readings, strict=False)
+        f"<tr><td><b>{name}</b></td><td>{metres(each.depth_m, each.spread_m)}</td>"
+        f"<td>{'unknown' if each.confidence is None else f'{100 * each.confidence:.0f} %'}</td></tr>"
+        for name, each in zip(NAMES, readings, strict=False)
     )
     table = f'<table class="readings"><tr><th></th><th>depth</th><th>confidence</th></tr>{rows}</table>'
+    pairs = zip(NAMES[::2], NAMES[1::2], readings[::2], readings[1::2], strict=False)
     segments = "".join(
-        f'<div>Distance {names}</div><div class="distance">{metres(*distance_m(a, b))}</div>'
-        for names, a, b in _segments(readings)
+        f'<div>Distance {a} to {b}</div><div class="distance">{metres(*distance_m(first, second))}</div>'
+        for a, b, first, second in pairs
     )
     note = (
         "± is one standard deviation of the depth, from its confidence and the spread of the members. Errors "
@@ -112,70 +140,37 @@ def _words(readings: list[Reading]) -> str:
     return f'<div class="say">{segments}{table}{more}<p class="legend-caption">{note}</p></div>'
 
 
-def _segments(readings: list[Reading]) -> list[tuple[str, Reading, Reading]]:
-    named = list(zip(NAMES, readings, strict=False))
-    pairs = zip(named[::2], named[1::2], strict=False)
-    return [(f"{a} to {b}", first, second) for (a, first), (b, second) in pairs]
-
-
-def readings_csv(shown: Shown, pixels: Pixels) -> str:
-    """The points and segments as CSV: pixels of the photograph, metres."""
-    readings = [shown.reading(pixel) for pixel in pixels]
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(("name", "x_px", "y_px", "x_m", "y_m", "z_m", "spread_m", "confidence", "distance_m"))
-    for name, each in zip(NAMES, readings, strict=False):
-        point = (f"{value:.4f}" for value in each.point_m)
-        writer.writerow((name, *each.pixel, *point, each.spread_m, each.confidence, ""))
-    for name, a, b in _segments(readings):
-        length, spread = distance_m(a, b)
-        writer.writerow((name, *[""] * 5, spread, "", f"{length:.4f}"))
-    return text.getvalue()
-
-
-def write_scene(path: Path, result: Result, least_confidence: float, most: int = MOST_POINTS_SHOWN) -> int:
-    """Cloud and cameras as GLB, by default light enough for a browser; how many points there are in all."""
+def write_scene(path: Path, result: Result, least_confidence: float, most: int) -> int:
+    """Cloud and cameras as GLB with so many points at most; how many there are in all."""
     keep, confidence = ~flying_points(result.depth_m), result.map("confidence")
     if confidence is not None:
         keep &= confidence >= least_confidence
-    cloud = make_cloud(result.depth_m, result.views.left, result.K, keep)
+    cloud = make_cloud(result.depth_m, result.left, result.K, keep)
     write_glb(path, cloud.thinned(most), cameras_of(result.output, result.guidance))
     return len(cloud.points_m)
 
 
-def write_files(folder: Path, result: Result) -> list[Path]:
-    """Write everything that can be downloaded.
-
-    Returns:
-        The files, most wanted first: ``everything.zip`` has all.
-    """
-    counts = write_maps(folder, result.output, result.views.left)
+def write_files(result: Result) -> list[Path]:
+    """Write everything that can be downloaded: the files, most wanted first; ``everything.zip`` has all."""
+    folder = result.folder
+    counts = write_maps(folder, result.output, result.left)
     write_scene(folder / "cloud.glb", result, 0.0, result.depth_m.size)
-    rigs = result.guidance.rigs
+    posed = cameras_of(result.output, result.guidance)[1:]
     report = result_entries(result.output, result.guidance) | {
         "warnings": result.warnings,
         "cameras": [
-            {"K": rig.K_right, "E": E}
-            for rig, (_, E, _) in zip(rigs, cameras_of(result.output, result.guidance)[1:], strict=True)
+            {"K": rig.K_right, "E": E} for rig, (_, E, _) in zip(result.guidance.rigs, posed, strict=True)
         ],
-        "photographs": [Path(name).name for name in result.views.names],
+        "photographs": [Path(name).name for name in result.request.photographs],
         "settings": result.request.run.as_json(),
         "seconds": {name: round(value, 3) for name, value in result.seconds.items()},
         "files": counts,
     }
     text = json.dumps(plain(report), indent=2, allow_nan=False, default=str)
     (folder / "report.json").write_text(f"{text}\n", encoding="utf-8")
-    first = [
-        "depth_mm.png",
-        "depth.npy",
-        "depth.png",
-        "confidence.npy",
-        "cloud.ply",
-        "cloud.glb",
-        "report.json",
-    ]
-    others = sorted(path.name for path in folder.iterdir() if path.name not in first)
-    paths = [folder / name for name in (*first, *others) if (folder / name).is_file()]
+    wanted = "depth_mm.png depth.npy depth.png confidence.npy cloud.ply cloud.glb report.json".split()
+    others = sorted(path.name for path in folder.iterdir() if path.name not in wanted)
+    paths = [folder / name for name in (*wanted, *others) if (folder / name).is_file()]
     with ZipFile(folder / "everything.zip", "w", ZIP_STORED) as archive:
         for path in paths:
             archive.write(path, path.name)

@@ -8,10 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from tests.conftest import plane_pair
-from tests.serving import free_port, served
+from tests.serving import free_port, served, write_plane
 
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = [
@@ -59,9 +57,9 @@ def visitor(chromium, address):
         if not request.url.startswith((address, "data:", "blob:")):
             foreign.append(request.url)
 
-    def come(height: int = 1000, width: int = 1400, scheme: str = "light"):
+    def come(height: int = 1000, width: int = 1400):
         size = {"width": width, "height": height}
-        context = chromium.new_context(viewport=size, color_scheme=scheme, accept_downloads=True)
+        context = chromium.new_context(viewport=size, accept_downloads=True)
         contexts.append(context)
         context.set_default_timeout(90_000)  # of a machine that does other things as well
         page = context.new_page()
@@ -84,13 +82,9 @@ def plane_files(tmp_path_factory):
     def make(baseline_m: float = 0.12) -> list[Path]:
         if baseline_m not in made:
             folder = tmp_path_factory.mktemp("plane")
-            pair = plane_pair(size=(96, 128), focal=120.0, baseline=0.12)
-            Image.fromarray(pair.left).save(folder / "left.png")
-            Image.fromarray(pair.right).save(folder / "right.png")
-            numbers = " ".join(f"{value:g}" for value in pair.K.ravel())
-            (folder / "K.txt").write_text(f"{numbers}\n{baseline_m}\n")
-            np.save(folder / "depth.npy", pair.depth_m * baseline_m / 0.12)
-            made[baseline_m] = [folder / name for name in ("left.png", "right.png", "K.txt", "depth.npy")]
+            *files, depth_m = write_plane(folder, baseline_m)
+            np.save(folder / "depth.npy", depth_m * baseline_m / 0.12)
+            made[baseline_m] = [*files, folder / "depth.npy"]
         return made[baseline_m]
 
     return make

@@ -1,4 +1,4 @@
-"""The page in a real browser: upload, run, slide, measure, download; bad input; two visitors at once.
+"""The page in a real browser: upload, run, measure, download; bad input; two visitors at once.
 
 ``GEODIFF_SCREENSHOT=docs/images/app.png pytest tests/browser`` also makes the picture of the docs.
 """
@@ -22,29 +22,13 @@ def run(page) -> None:
     page.wait_for_selector("#status .figures", timeout=RUN_MS)
 
 
-def shot(page, name: str) -> None:
-    """A picture for whoever wants to look at them: ``GEODIFF_SHOTS`` names their folder."""
-    if "GEODIFF_SHOTS" in os.environ:
-        page.wait_for_timeout(500)
-        page.screenshot(path=Path(os.environ["GEODIFF_SHOTS"]) / f"{name}.png", full_page=True)
-
-
 def tab(page, name: str) -> None:
     shown = page.get_by_role("tab", name=name)
-    if not shown.first.is_visible():  # on a phone some are behind three dots
+    if shown.first.is_visible():
+        shown.first.click()
+    else:  # on a phone some are behind three dots
         page.locator(".overflow-menu > button").click()
         page.locator(".overflow-dropdown button", has_text=name).click()
-        return
-    shown.first.click()
-
-
-def appears(page, selector: str, within_ms: int = 60_000) -> bool:
-    """Whether an element is shown in time."""
-    try:
-        page.wait_for_selector(selector, timeout=within_ms)
-    except pytest.importorskip("playwright.sync_api").TimeoutError:
-        return False
-    return True
 
 
 def upload(page, paths) -> None:
@@ -57,12 +41,8 @@ def upload(page, paths) -> None:
 
 def download(page, name: str, folder: Path) -> Path:
     tab(page, "Downloads")
-    stem = name.rpartition(".")[0]
-    link = page.locator("#files a", has_text=re.compile(r"\d")).locator(
-        f"xpath=self::*[contains(@href, '{stem}')]"
-    )
     with page.expect_download() as started:
-        link.locator(f"xpath=self::*[contains(@href, '{name}')]").first.click()
+        page.locator(f"#files a[href*='{name}']", has_text=re.compile(r"\d")).first.click()
     started.value.save_as(folder / name)
     return folder / name
 
@@ -73,21 +53,12 @@ def click_picture(page, x: float, y: float) -> None:
     page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
 
 
-def test_upload_run_slide_measure_and_take_home(visitor, plane_files, tmp_path):
+def test_upload_run_measure_and_take_home(visitor, plane_files, tmp_path):
     files = plane_files()
     page = visitor()
     upload(page, files)
     run(page)
 
-    # The slider.
-    handle = page.locator("#slider [role=slider], #slider .outer").first
-    box = handle.bounding_box()
-    before = page.locator("#slider").inner_html()
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    page.mouse.down()
-    page.mouse.move(box["x"] - 100, box["y"] + box["height"] / 2, steps=5)
-    page.mouse.up()
-    assert page.locator("#slider").inner_html() != before
     assert " m</span>" in page.locator("#depth-legend").inner_html()
 
     # Two points, against the map that the visitor takes home.
@@ -107,30 +78,16 @@ def test_upload_run_slide_measure_and_take_home(visitor, plane_files, tmp_path):
     points = [depth_m[y, x] * np.linalg.inv(K) @ (x, y, 1) for x, y in pixels]
     slope = 2 * float(np.abs(np.gradient(depth_m)).max())  # a click may be a pixel off
     shown = [float(re.search(NUMBER, text).group(1)) for text in rows if "m" in text]
-    for value, (x, y) in zip(shown, pixels, strict=True):
-        assert value == pytest.approx(depth_m[y, x], abs=slope + 0.01)
+    assert shown == pytest.approx([depth_m[y, x] for x, y in pixels], abs=slope + 0.01)
     distance, spread = map(float, re.search(rf"{NUMBER} ± {NUMBER} m", words).groups())
     assert distance == pytest.approx(np.linalg.norm(points[0] - points[1]), abs=2 * slope + 0.05)
     assert 0 < spread < distance
 
-    # The cloud.
-    raw = download(page, "cloud.ply", tmp_path).read_bytes()
-    head, _, body = raw.partition(b"end_header\n")
-    count = int(re.search(rb"element vertex (\d+)", head).group(1))
-    vertices = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    assert len(vertices) == count > 0.9 * depth_m.size
-    assert vertices["xyz"][:, 2].max() == pytest.approx(depth_m.max(), rel=0.1)
+    assert download(page, "cloud.ply", tmp_path).read_bytes()[:4] == b"ply\n"
     assert download(page, "cloud.glb", tmp_path).read_bytes()[:4] == b"glTF"
-    assert {"confidence.npy", "depth_mm.png"} <= set(
-        ZipFile(download(page, "everything.zip", tmp_path)).namelist()
-    )
-
+    everything = ZipFile(download(page, "everything.zip", tmp_path)).namelist()
+    assert {"confidence.npy", "depth_mm.png"} <= set(everything)
     tab(page, "Point cloud")
-    if not appears(page, "#scene canvas"):  # WebGL without a GPU at times gives up at the first try
-        tab(page, "Measure")
-        tab(page, "Point cloud")
-        if not appears(page, "#scene canvas"):
-            pytest.skip("this browser's software WebGL did not start; all but the view of the cloud passed")
     page.wait_for_selector("#points >> text=points")
 
 
@@ -138,37 +95,30 @@ def is_stale(page) -> bool:
     return "stale" in (page.locator("#results").get_attribute("class") or "").split()
 
 
-@pytest.mark.parametrize(
-    ("width", "scheme"), [(1280, "light"), (1280, "dark"), (390, "light"), (390, "dark")]
-)
-def test_a_result_is_judged_stale_after_a_change_and_gone_under_an_error(visitor, plane_files, width, scheme):
-    page = visitor(width=width, scheme=scheme)
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_result_is_judged_stale_after_a_change_and_gone_under_an_error(visitor, plane_files, width):
+    page = visitor(width=width)
     upload(page, plane_files())
     run(page)
     assert page.locator("#status .verdict b").first.inner_text() in ("Trusted", "Not trusted", "Not judged")
     assert "fx 120.0" in page.locator("#status .cameras").inner_text() and not is_stale(page)
-    shot(page, f"depth-{width}-{scheme}")
     tab(page, "Measure")
     page.wait_for_selector("#measure-picture img")
     assert page.locator(".verdict:visible").count() == 2, "again where it matters"
     page.locator("#pixel textarea, #pixel input").fill("32, 48")  # by keyboard
     page.keyboard.press("Enter")
     page.wait_for_selector("#readings >> text=Choose a second point")
-    shot(page, f"measure-{width}-{scheme}")
     tab(page, "Downloads")
     assert page.locator(".verdict:visible").count() == 2
-    shot(page, f"downloads-{width}-{scheme}")
     page.locator("#baseline_m textarea, #baseline_m input").fill("0.3")
     page.keyboard.press("Tab")
     page.wait_for_function("document.getElementById('results').classList.contains('stale')")
-    shot(page, f"stale-{width}-{scheme}")
     page.get_by_text("Focal length and baseline").click()
     page.click("#run")
     sentence = page.wait_for_selector("#status .say-bad", timeout=RUN_MS).inner_text()
     assert "must be" in sentence and "/tmp" not in sentence and "--" not in sentence and not is_stale(page)
     tab(page, "Measure")
     assert page.locator("#measure-picture img").count() == 0 and page.locator(".verdict").count() == 0
-    shot(page, f"error-{width}-{scheme}")
 
 
 def test_bad_input_shows_its_sentence(visitor, plane_files, tmp_path):
@@ -199,7 +149,6 @@ def test_an_example_sets_every_field_and_runs(visitor):
     assert "0.06 m away, right" in page.locator("#status .cameras").inner_text()
     page.wait_for_timeout(500)
     assert not is_stale(page)
-    shot(page, "example")
 
 
 def test_two_visitors_at_once_do_not_mix(visitor, plane_files, tmp_path):

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from tests.conftest import plane_pair
-from tests.serving import free_port, served
+from tests.serving import free_port, served, write_plane
 
 SPACE = Path(__file__).resolve().parents[2] / "examples" / "space"
 
@@ -41,26 +39,23 @@ def test_card_has_what_a_space_needs():
 @pytest.mark.filterwarnings("ignore")  # the client's own
 def test_it_answers_the_client(address, tmp_path):
     client_module = pytest.importorskip("gradio_client")
-    pair = plane_pair(size=(96, 128), focal=120.0)
-    Image.fromarray(pair.left).save(tmp_path / "left.png")
-    Image.fromarray(pair.right).save(tmp_path / "right.png")
-    numbers = " ".join(f"{value:g}" for value in pair.K.ravel())
-    (tmp_path / "K.txt").write_text(f"{numbers}\n0.12\n")
+    *files, true_m = write_plane(tmp_path)
+    left, right, K = (client_module.handle_file(str(path)) for path in files)
     client = client_module.Client(address, verbose=False, download_files=str(tmp_path / "home"))
     asked = client.view_api(return_format="dict")["named_endpoints"]["/estimate"]["parameters"]
     by_label = {entry["label"]: entry["parameter_name"] for entry in asked}
+    calibration = next(name for label, name in by_label.items() if label.startswith("Calibration file"))
     given = {entry["parameter_name"]: None for entry in asked if not entry["parameter_has_default"]}
     given |= {
-        by_label["Left photograph"]: client_module.handle_file(str(tmp_path / "left.png")),
-        by_label["Right photograph"]: client_module.handle_file(str(tmp_path / "right.png")),
-        by_label["Calibration file"]: client_module.handle_file(str(tmp_path / "K.txt")),
+        by_label["Left photograph"]: left,
+        by_label["Right photograph"]: right,
+        calibration: [K],
     }
     answer = client.predict(**given, api_name="/estimate")
     client.close()
-    status = answer[0]
-    assert "median depth" in str(status)
+    assert "median depth" in str(answer[0])
     files = next(
         entry for entry in answer if isinstance(entry, list) and any("depth.npy" in str(e) for e in entry)
     )
     depth_m = np.load(next(path for path in files if str(path).endswith("depth.npy")))
-    assert np.median(np.abs(depth_m - pair.depth_m) / pair.depth_m) < 0.1
+    assert np.median(np.abs(depth_m - true_m) / true_m) < 0.1

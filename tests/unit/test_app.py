@@ -18,12 +18,10 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import enable_geometry_guidance
-from geodiff_plugin.app import cameras, job, launch
-from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
-from geodiff_plugin.app.job import Priors, Request, Stopped, run_job
-from geodiff_plugin.app.measure import distance_m, read_pixel
-from geodiff_plugin.app.pictures import colour_relative, legend_of_depth, legend_of_share, marked, metres
-from geodiff_plugin.app.results import Shown, measurement, readings_csv, write_files
+from geodiff_plugin.app import job, launch
+from geodiff_plugin.app.job import CAMERA_WAYS, Priors, Request, Stopped, run_job
+from geodiff_plugin.app.measure import distance_m, metres, read_pixel
+from geodiff_plugin.app.results import legend_of_confidence, legend_of_depth, marked, measurement, write_files
 from geodiff_plugin.formats import read_calibration, read_image
 from geodiff_plugin.options import RunOptions
 
@@ -35,28 +33,28 @@ CALIBRATION = (
 )
 
 
-# Measure
-
-
 def test_a_point_is_where_its_ray_ends():
     reading = read_pixel(DEPTH, K, (61, 23))
     np.testing.assert_allclose(reading.point_m, [2 * 29.5 / 60, -0.5 / 30, 2])
     assert reading.depth_m == 2 and reading.spread is None and reading.confidence is None
     a, b = (read_pixel(DEPTH, K, pixel) for pixel in ((1, 10), (61, 10)))
     assert distance_m(a, b) == (pytest.approx(2.0), None)
+    for outside in ((64, 0), (0, 48), (-1, 0)):
+        with pytest.raises(ValueError, match="inside the map of 64x48"):
+            read_pixel(DEPTH, K, outside)
 
 
 def test_spread_is_that_of_a_normal_error_with_this_confidence():
     reading = read_pixel(DEPTH, K, (3, 4), np.full((48, 64), 0.6827))
     assert reading.spread == pytest.approx(0.1, rel=1e-3)  # one standard deviation holds 68.27 %
-    assert reading.spread_m == pytest.approx(0.2, rel=1e-3)
     sure, wide = np.full((48, 64), 0.999), np.full((48, 64), 0.5)
     assert read_pixel(DEPTH, K, (0, 0), sure, wide).spread_m == pytest.approx(1.4826 * 0.5), "the larger"
+    assert metres(2.314) == "2.31 m" and metres(2.314, 0.07) == "2.31 ± 0.07 m"
+    assert metres(0.3141, 0.002) == "0.314 ± 0.002 m"
 
 
 def test_spread_of_a_distance_agrees_with_drawn_errors():
-    confidence = np.full((48, 64), 0.9)
-    depth_m = DEPTH.copy()
+    depth_m, confidence = DEPTH.copy(), np.full((48, 64), 0.9)
     depth_m[:, 32:] = 3.0
     a, b = (read_pixel(depth_m, K, pixel, confidence) for pixel in ((10, 10), (50, 40)))
     rng = np.random.default_rng(0)
@@ -69,101 +67,73 @@ def test_spread_of_a_distance_agrees_with_drawn_errors():
     assert length == 0 and spread > 0
 
 
-@pytest.mark.parametrize("pixel", [(64, 0), (0, 48), (-1, 0)])
-def test_outside_the_map(pixel):
-    with pytest.raises(ValueError, match="inside the map of 64x48"):
-        read_pixel(DEPTH, K, pixel)
+def guided(way, photographs=("left.png", "right.png"), **fields):
+    left, right = np.random.default_rng(0).random((2, 48, 64, 3), dtype=np.float32)
+    return CAMERA_WAYS[way][1](Request(*photographs, **fields), left, right)
 
 
-# Cameras
-
-
-@pytest.fixture
-def views():
-    rng = np.random.default_rng(0)
-    left, right = rng.random((2, 48, 64, 3), dtype=np.float32)
-    return Views(left, right, None, ("left.png", "right.png"))
-
-
-def guided(way, views, **fields):
-    return CAMERA_WAYS[way].guide(views, CameraFields(**fields), {})
-
-
-def test_numbers_fill_what_is_left_empty_and_say_so(views):
-    guidance = guided("numbers", views, fx=60.0, baseline_m=0.12)
+def test_numbers_fill_what_is_left_empty_and_say_so():
+    guidance = guided("numbers", fx=60.0, baseline_m=0.12)
     np.testing.assert_allclose(guidance.rigs[0].K_left, K)
     assert guidance.rigs[0].E[0, 3] == pytest.approx(0.12) and "cx is assumed" in guidance.assumed[0]
-    guidance = guided("numbers", views, fx=60.0, baseline_m=0.12, cx_right=35.5)
+    guidance = guided("numbers", fx=60.0, baseline_m=0.12, cx_right=35.5)
     assert guidance.rigs[0].K_right[0, 2] == 35.5 and not guidance.assumed
-    with pytest.raises(ValueError, match="fx and baseline must be given"):
-        guided("numbers", views)
-    with pytest.raises(ValueError, match="baseline must be a finite number of metres above 0; got -1"):
-        guided("numbers", views, fx=60.0, baseline_m=-1.0)
 
 
-def test_a_calibration_of_another_size_is_refused(views, tmp_path):
-    (tmp_path / "calib.txt").write_text(CALIBRATION.format(640))
-    with pytest.raises(ValueError, match="the left photograph must be of 640x48 pixels, as calib.txt says"):
-        guided("file", views, calibration=str(tmp_path / "calib.txt"))
+@pytest.mark.parametrize(
+    ("way", "fields", "said"),
+    [
+        ("numbers", {}, "fx and baseline must be given"),
+        ("numbers", {"fx": 60.0, "baseline_m": -1.0}, "baseline must be a finite number of metres above 0"),
+        ("photographs", {}, "the distance of the cameras must be given"),
+        ("file", {}, "calibration must be a calibration file"),
+        ("file", {"calibration": 640}, "the left photograph must be of 640x48 pixels, as calib.txt says"),
+    ],
+)
+def test_cameras_that_are_refused(way, fields, said, tmp_path):
+    if "calibration" in fields:
+        (tmp_path / "calib.txt").write_text(CALIBRATION.format(fields["calibration"]))
+        fields = {"calibration": (str(tmp_path / "calib.txt"),)}
+    with pytest.raises(ValueError, match=said):
+        guided(way, **fields)
 
 
 @pytest.mark.filterwarnings("ignore:.*has no unit")
-def test_a_calibration_without_a_unit_needs_the_distance(views, tmp_path):
-    frames = [{"file_path": Path(name).name, "transform_matrix": np.eye(4).tolist()} for name in views.names]
+def test_a_calibration_without_a_unit_needs_the_distance(tmp_path):
+    frames = [
+        {"file_path": f"{side}.png", "transform_matrix": np.eye(4).tolist()} for side in ("left", "right")
+    ]
     frames[1]["transform_matrix"][0][3] = 0.5
     lens = {"fl_x": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(lens | {"frames": frames}))
     with pytest.raises(ValueError, match="the distance of the cameras must be given.*has no unit"):
-        guided("file", views, calibration=str(path))
-    guidance = guided("file", views, calibration=str(path), baseline_m=0.12)
+        guided("file", calibration=(str(path),))
+    guidance = guided("file", calibration=(str(path),), baseline_m=0.12)
     assert guidance.unit == "m" and guidance.rigs[0].E[0, 3] == pytest.approx(0.12)
 
 
-@pytest.mark.parametrize("way", ["file", "numbers"])
-def test_a_K_that_the_photographs_contradict_is_told(views, tmp_path, way):
+def test_a_K_that_the_photographs_contradict_is_told(tmp_path):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 65  # mm in 35 mm equivalent: 120 px for 64x48
     paths = [str(tmp_path / f"{side}.jpg") for side in ("left", "right")]
     Image.new("L", (64, 48)).save(paths[0], exif=exif)
     Image.new("L", (64, 48)).save(paths[1])
-    (tmp_path / "calib.txt").write_text(CALIBRATION.format(64))
-    fields = {
-        "file": {"calibration": str(tmp_path / "calib.txt")},
-        "numbers": {"fx": 60.0, "baseline_m": 0.1},
-    }
     with pytest.warns(UserWarning, match="60 px for the left photograph, 0.50 times the 120 px of its EXIF"):
-        guided(way, replace(views, names=tuple(paths)), **fields[way])
+        guided("numbers", paths, fx=60.0, baseline_m=0.1)
 
 
-def test_a_third_view_and_its_pose(views):
-    third, lens = replace(views, third=views.right), {"fx": 60.0, "baseline_m": 0.12}
-    guidance = guided("numbers", third, **lens, third_pose="1 0 0 0, 0 1 0 -0.1, 0 0 1 0")
-    assert guidance.rigs[1].E[1, 3] == pytest.approx(-0.1)
-    with pytest.raises(ValueError, match="last row .* Is it transposed"):
-        guided("numbers", third, **lens, third_pose="1 0 0 0  0 1 0 0  0 0 1 0  0 -0.1 0 1")
-    with pytest.raises(ValueError, match="12 or 16 numbers; got 2 words"):
-        guided("numbers", third, **lens, third_pose="up 0.1")
-
-
-def test_photographs_alone_need_the_distance_of_the_cameras(views, monkeypatch, tmp_path):
+def test_photographs_alone_are_estimated_from(monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(
-        cameras.GeometryGuidance, "from_photographs", lambda p, **more: asked.append((p, more))
-    )
+    monkeypatch.setattr(job.GeometryGuidance, "from_photographs", lambda p, **more: asked.append((p, more)))
     paths = [str(tmp_path / f"{number}.png") for number in range(2)]
     for path in paths:
         Image.new("RGB", (64, 48)).save(path)
-    named = replace(views, names=tuple(paths))
-    with pytest.raises(ValueError, match="the distance of the cameras must be given"):
-        guided("photographs", named)
-    guided("photographs", named, baseline_m=0.3)
+    guided("photographs", paths, baseline_m=0.3, fx=60.0, cx_right=30.0)
     ((photographs, more),) = asked
-    assert [photograph.size for photograph in photographs] == [(64, 48)] * 2
-    assert more == {"baseline_m": 0.3, "K": None}
-
-
-# Jobs
+    assert [photograph.size for photograph in photographs] == [(64, 48)] * 2 and more["baseline_m"] == 0.3
+    np.testing.assert_allclose(more["K"], K)
+    assert more["K_right"][0, 2] == 30
 
 
 @pytest.fixture(scope="module")
@@ -178,11 +148,8 @@ def asked(textured_plane, tmp_path_factory):
     folder = tmp_path_factory.mktemp("visitor")
     for side in ("left", "right"):
         Image.fromarray(getattr(textured_plane, side)).save(folder / f"{side}.png")
-    fields = CameraFields(fx=60.0, baseline_m=0.12)
-    run = RunOptions(prior="tiny", steps=1)
-    return Request(
-        str(folder / "left.png"), str(folder / "right.png"), way="numbers", cameras=fields, run=run
-    )
+    paths = (str(folder / "left.png"), str(folder / "right.png"))
+    return Request(*paths, way="numbers", fx=60.0, baseline_m=0.12, run=RunOptions(prior="tiny", steps=1))
 
 
 def ignore(*_):
@@ -200,28 +167,29 @@ def result(priors, asked):
     return done
 
 
-def test_a_job_and_its_files(result, tmp_path):
-    assert result.depth_m.shape == result.prior_map.shape == result.map("uncertainty").shape == (48, 64)
-    paths = write_files(tmp_path, result)
+def test_a_job_and_its_files(result):
+    assert result.depth_m.shape == result.map("uncertainty").shape == (48, 64)
+    paths = write_files(result)
     names = [path.name for path in paths]
     assert names[:3] == ["everything.zip", "depth_mm.png", "depth.npy"] and "confidence.npy" in names
     assert sorted(ZipFile(paths[0]).namelist()) == sorted(names[1:])
-    np.testing.assert_array_equal(np.load(tmp_path / "depth.npy"), result.depth_m)
-    report = json.loads((tmp_path / "report.json").read_text())
+    np.testing.assert_array_equal(np.load(result.folder / "depth.npy"), result.depth_m)
+    report = json.loads((result.folder / "report.json").read_text())
     assert report["cameras"][0]["E"][0][3] == pytest.approx(0.12)
     assert report["settings"]["ensemble"] == 2 and report["photographs"] == ["left.png", "right.png"]
     assert report["depth"]["median_m"] == pytest.approx(float(np.median(result.depth_m)))
     assert report["verdict"]["status"] == result.output.verdict.status
 
 
-def test_several_segments_as_picture_words_and_csv(result, tmp_path):
-    shown = Shown(result, tmp_path)
-    picture, words = measurement(shown, [(5, 5), (50, 40), (20, 20)], "photograph")
+def test_points_are_marked_where_they_were_clicked_and_told_in_words(result):
+    picture, words = measurement(result, [(5, 5), (50, 40), (20, 20)])
     assert picture.shape == (48, 64, 3) and "Distance A to B" in words and "second point" in words
-    rows = readings_csv(shown, [(5, 5), (50, 40)]).splitlines()
-    assert rows[0].startswith("name,x_px") and rows[1].startswith("A,5,5,") and rows[3].startswith("A to B,")
-    a, b = (shown.reading(pixel) for pixel in ((5, 5), (50, 40)))
-    assert float(rows[3].split(",")[-1]) == pytest.approx(distance_m(a, b)[0], abs=1e-3)
+    black, pixels = np.zeros((100, 200, 3), np.uint8), [(20, 50), (180, 50)]
+    drawn = marked(black, pixels, [read_pixel(np.full((100, 200), 2.0), K, pixel) for pixel in pixels])
+    assert drawn[50, 20].tolist() == drawn[50, 180].tolist() == [0xC2, 0x41, 0x0C]
+    assert drawn[50, 100].tolist() == [255, 255, 255] and not black.any()
+    assert ">5 m</span>" in legend_of_depth(np.geomspace(1, 10, 1000).reshape(20, 50))
+    assert ">50 %</span>" in legend_of_confidence()
 
 
 def test_a_stop_ends_a_job_between_steps(priors, asked):
@@ -244,11 +212,9 @@ def test_a_stop_ends_a_job_between_steps(priors, asked):
         ({"near": 1.0}, "the farthest depth must be given together with the nearest depth"),
         ({"near": 3.0, "far": 2.0}, "the nearest depth must be less than the farthest depth; got 3 and 2"),
         ({"near": math.nan, "far": 5.0}, "the nearest depth must be a finite number .* above 0; got nan"),
-        ({"near": 1.0, "far": math.inf}, "the farthest depth must be a finite number .* above 0; got inf"),
         ({"steps": 1000}, "steps must be between"),
         ({"ensemble": 21}, "members must be between 0 and 20"),
         ({"resolution": 10_000}, "resolution must be between"),
-        ({"resolution": 33}, "resolution must be a multiple of 8"),
         ({"seed": 2**70}, "seed must be between"),
     ],
 )
@@ -271,37 +237,6 @@ def test_photographs_that_a_job_refuses(priors, asked, tmp_path, monkeypatch):
         run_job(asked, priors, threading.Event(), ignore)
 
 
-# Pictures
-
-
-def test_metres_are_written_to_what_the_spread_leaves():
-    assert metres(2.314) == "2.31 m"
-    assert metres(2.314, 0.07) == "2.31 ± 0.07 m"
-    assert metres(0.3141, 0.002) == "0.314 ± 0.002 m"
-
-
-def test_legends_name_their_unit_and_near_has_one_colour_whatever_the_prior_predicts():
-    assert ">5 m</span>" in legend_of_depth(np.geomspace(1, 10, 1000).reshape(20, 50))
-    assert ">50 %</span>" in legend_of_share(1.0, "sure")
-    depth_m = np.linspace(1, 5, 48 * 64).reshape(48, 64)
-    colours = [colour_relative(values, depth_m)[0, 0] for values in (depth_m, 1 / depth_m)]
-    np.testing.assert_array_equal(*colours)
-
-
-def test_marks_stand_where_they_were_clicked():
-    picture = np.zeros((100, 200, 3), np.uint8)
-    depth_m = np.full((100, 200), 2.0, np.float32)
-    points = [
-        (pixel, "AB"[i], read_pixel(depth_m, K, pixel)) for i, pixel in enumerate(((20, 50), (180, 50)))
-    ]
-    drawn = marked(picture, points)
-    assert drawn[50, 20].tolist() == drawn[50, 180].tolist() == [0xC2, 0x41, 0x0C]
-    assert drawn[50, 100].tolist() == [255, 255, 255] and not picture.any()
-
-
-# What ships, and what is served
-
-
 def test_without_gradio_it_says_what_to_install(monkeypatch):
     spec = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "gradio" else spec(n, *a))
@@ -310,21 +245,12 @@ def test_without_gradio_it_says_what_to_install(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("origin", "host", "foreign"),
-    [
-        ("", "a:1", False),
-        ("http://a:1", "a:1", False),
-        ("http://b", "a:1", True),
-        ("null", "a:1", True),
-        ("http://a", "a:1", True),
-    ],
+    ("origin", "foreign"),
+    [("", False), ("http://a:1", False), ("http://b", True), ("null", True), ("http://a", True)],
 )
-def test_requests_of_other_sites_are_foreign(origin, host, foreign):
-    headers = {b"host": host.encode()} | ({b"origin": origin.encode()} if origin else {})
+def test_requests_of_other_sites_are_foreign(origin, foreign):
+    headers = {b"host": b"a:1"} | ({b"origin": origin.encode()} if origin else {})
     assert launch._is_foreign(headers) == foreign
-
-
-def test_nothing_else_may_be_talked_to():
     assert "ws:" not in launch.POLICY and "http" not in launch.POLICY
 
 
@@ -339,19 +265,18 @@ class TestWithGradio:
         asyncio.set_event_loop(None)  # what it leaves open is told here, not when all tests are done
         gc.collect()
 
-    def test_examples_are_whole_and_set_every_field(self, priors):
+    def test_examples_are_whole_and_set_every_field(self, priors, gradio):
         from geodiff_plugin.app.form import EXAMPLES, build_form
 
-        with pytest.importorskip("gradio").Blocks():
+        with gradio.Blocks():
             form = build_form(priors)
         for number, (folder, _) in enumerate(EXAMPLES):
-            values = dict(zip(form.fields, form.example(number), strict=True))
-            assert values["baseline_m"] == form.untouched["baseline_m"] and values["way"] == "file"
-            assert set(values) == set(form.fields)
-            rig = read_calibration(values["calibration"])
-            for side in ("left", "right"):
-                image, notes = read_image(values[side], "image")
-                assert image.shape[1::-1] == rig.size_left and notes == [] and str(folder) in values[side]
+            request = form.request(tuple(form.example(number)))
+            assert request.baseline_m is None and request.way == "file"
+            rig = read_calibration(list(request.calibration))
+            for path in request.photographs:
+                image, notes = read_image(path, "image")
+                assert image.shape[1::-1] == rig.size_left and notes == [] and str(folder) in path
 
     def test_the_page_hands_on_photographs_as_they_are(self, tmp_path):
         from gradio.data_classes import ImageData

@@ -14,7 +14,7 @@ import pytest
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.app.cameras import CAMERA_WAYS, CameraFields, Views
+from geodiff_plugin.app.job import CAMERA_WAYS, Request
 from geodiff_plugin.cli.inputs import read_rig
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.formats import read_calibration, rig_from_parameters
@@ -491,6 +491,9 @@ def test_every_pair_of_a_folder_has_its_own_cameras(tmp_path, kind):
 def test_the_page_knows_photographs_by_their_names_alone(tmp_path):
     (tmp_path / "transforms.json").write_text(factory.NERF)
     image = np.random.default_rng(0).random((480, 640, 3)).astype(np.float32)
-    views = Views(image, image, None, ("/tmp/page/0f/left.jpg", "/tmp/page/3a/right.jpg"))
-    fields = CameraFields(calibration=str(tmp_path / "transforms.json"), baseline_m=0.12)
-    assert float(CAMERA_WAYS["file"].guide(views, fields, {}).rigs[0].E[0, 3]) == pytest.approx(0.12)
+    paths, calibration = (
+        ("/tmp/page/0f/left.jpg", "/tmp/page/3a/right.jpg"),
+        str(tmp_path / "transforms.json"),
+    )
+    request = Request(*paths, calibration=(calibration,), baseline_m=0.12)
+    assert float(CAMERA_WAYS["file"][1](request, image, image).rigs[0].E[0, 3]) == pytest.approx(0.12)
