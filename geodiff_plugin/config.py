@@ -153,7 +153,7 @@ class GuidanceConfig:
         respace: a leading DDIM schedule runs as trailing while guided.
         warm_start: share of the schedule that a call with `previous`, the output of the previous frame,
             skips; 0 takes over the scale alone ([sequences](../how-to/sequences.md)).
-        loss_resolution: upper bound on the longer side of the grid that losses are computed on, px.
+        sweep_pixels: upper bound on the pixels of the grid of matches, corrections and losses.
         depth_range: bounds of the sweep and of the nearest and farthest depth of the search.
         pose: poses that do not fit the matches are refined ([poses](../how-to/poses.md#given-poses)).
         clean_photographs: JPEG blocks and strong sensor noise are removed before photographs are compared;
@@ -172,7 +172,6 @@ class GuidanceConfig:
         points_loss: error at points: Cauchy in inverse depth, in units of 1 % of the points' median, or
             L1 + L2 in metres (Marigold-DC, Eq. 4).
         planes: upper bound on the number of planes of the sweep.
-        sweep_pixels: upper bound on the pixels of the sweep's grid.
         search: joint (near, far) in the cost volume, then the basin that reliable matches prefer (a robust
             fit to the points without a right view); the argmin over g_s (S7.3); or the nearest and the
             farthest point (Marigold-DC).
@@ -217,7 +216,7 @@ class GuidanceConfig:
     min_steps: int = _integer(4, 1, 1000, paper="{}, not given")
     respace: bool = _flag(True)
     warm_start: float = _number(0.25, 0.0, 0.99, paper="-")
-    loss_resolution: int = _integer(640, 32, 1 << 16, paper="{} (S9)")
+    sweep_pixels: int = _integer(210_000, 1024, 1 << 32, paper="{} (768 px, S9)")
     depth_range: tuple[float, float] | None = _pair(
         None, paper="-", unset="from the nearest plane to a shift of 0.3 px"
     )
@@ -232,7 +231,6 @@ class GuidanceConfig:
     pull_to: str = _choice("start", "zero")
     points_loss: str = _choice("robust", "l1l2", paper="-")
     planes: int = _integer(160, 24, 4096, paper="-")
-    sweep_pixels: int = _integer(210_000, 1024, 1 << 32, paper="-")
     search: str = _choice("volume", "one-number", "points-range")
     positive: str = _choice("softplus", "square")
     g_s_range: tuple[float, float] = _pair((1.0, 80.0))
@@ -342,7 +340,13 @@ FORMER_STAGES = ("terms", "sweep", "matching", "search", "fit", "reflections", "
 FORMER: dict[str, Any] = {
     **{"exposure_gain": (0.2, 5.0), "exposure_rows": 4, "exposure_columns": 5, "exposure_prior": 0.2},
     **{"matches_cauchy": 5.0, "points_cauchy": 5.0, "anchor_floor": 0.05, "options": {}},
-    **{"plane_step_px": 0.75, "sweep_side": 828, "pilot_pixels": 20_000, "pilot_planes": 160},
+    **{
+        "plane_step_px": 0.75,
+        "sweep_side": 828,
+        "loss_resolution": 640,
+        "pilot_pixels": 20_000,
+        "pilot_planes": 160,
+    },
     **{"pilot_step_px": 1.0, "pilot_shift": 0.4, "pilot_sure": 0.8, "pilot_quantile": 0.995},
     **{"pilot_least_sure": 0.03, "headroom": 1.25, "least_shift": 0.03},
     **{"step_penalty": 0.15, "jump_penalty": 1.2, "jump_contrast": 0.1, "agreement_planes": 1.5},
@@ -384,7 +388,7 @@ PAPER = DEFAULT.changed(
     min_visible=0.0,
     pull_to="zero",
     search="one-number",
-    loss_resolution=768,
+    sweep_pixels=768 * 576,
     pose="given",
     clean_photographs=False,
     correct=False,
@@ -413,7 +417,7 @@ MARIGOLD_DC = DEFAULT.changed(
     search="points-range",
     step_from="updated",
     even_ensemble="lower",
-    loss_resolution=1 << 16,
+    sweep_pixels=1 << 32,
     correct=False,
     crisp=False,
 )

@@ -58,6 +58,19 @@ def resize_image(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Te
     return resized, resize_intrinsics(K[None], before, size)[0]
 
 
+def as_fine_as(
+    image_01: torch.Tensor, K: torch.Tensor, K_left: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """A further image ``(C, H, W)`` at no more pixels per radian than the left one, and the K of it.
+
+    Neither then aliases in the other. Axis by axis: whole pixels round each differently, and a rectified pair
+    must stay one.
+    """
+    height, width = image_size(image_01)
+    rows, columns = (min(1.0, float(K_left[i, i] / K[i, i])) for i in (1, 0))
+    return resize_image(image_01, K, (max(1, round(height * rows)), max(1, round(width * columns))))
+
+
 def nearest_rotation(matrix: Tensor) -> Tensor:
     """The proper rotation nearest to a matrix ``(..., 3, 3)`` (orthogonal Procrustes)."""
     u, _, vh = torch.linalg.svd(matrix)

@@ -94,7 +94,6 @@ def test_what_the_page_adds_works(page, textured_plane, tmp_path):
         weights={"photometric": 1.0, "far_pull": 0.1},
         inner_steps=2,
         min_steps=2,
-        loss_resolution=64,
     )
     out = pipe(Image.fromarray(textured_plane.left), guidance=guidance)
     assert (out.prediction > 0).all() and np.isfinite(out.prediction).all()

@@ -1,6 +1,7 @@
 """What the views and points say of one left image, once a call; and the views of a chunk of samples.
 
-Two grids: that of the losses, on which the loop works, and that of the sweep, which is finer for wide images.
+All of it lies on one grid, ``sweep_pixels`` large: matches, corrections and losses. The result is made at the
+image's own size from there.
 Source: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
 """
 
@@ -10,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.config import GuidanceConfig
@@ -22,6 +22,7 @@ from geodiff_plugin.matching import (
     match_volume,
     mirrored_pose_preferred,
     points_to_matches,
+    to_grid,
 )
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
@@ -30,7 +31,7 @@ from geodiff_plugin.types import CameraView, PoseReport
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the views and points say before any diffusion step, on the grid of the losses.
+    """What the views and points say before any diffusion step, on the grid of the evidence.
 
     Attributes:
         left_01: ``(3, H, W)`` in [0, 1].
@@ -39,9 +40,7 @@ class Evidence:
         views: the further views, at as many pixels per radian; none where only points are known.
         volume: plane-sweep costs, or ``None`` where the configuration does not search it.
         matches: aggregated, left-right checked, or ``None`` where no term asks.
-        sweep_matches: the same on the grid of the sweep, which is finer for wide images.
         points: depths that the user knows, in the form of matches, or ``None``.
-        sweep_points: the same on the grid of ``sweep_matches``, where there are any.
         reliable: ``matches`` as points for the search, where enough are reliable; else ``None``.
         native: the further views as everything downstream sees them, at their native sizes.
         pose: how their poses fit; ``None`` where only points are known.
@@ -54,9 +53,7 @@ class Evidence:
     views: tuple[CameraView, ...]
     volume: CostVolume | None
     matches: Matches | None
-    sweep_matches: Matches | None
     points: Matches | None = None
-    sweep_points: Matches | None = None
     reliable: Matches | None = None
     native: tuple[CameraView, ...] = ()
     pose: PoseReport | None = None
@@ -73,19 +70,6 @@ def within(evidence: Evidence, valid: Tensor) -> Evidence:
         points = evidence.points
     reliable = None if matches is None else reliable_matches(matches)
     return replace(evidence, matches=matches, points=points, reliable=reliable)
-
-
-def resize_long_edge(image_01: Tensor, K: Tensor, long_edge: int) -> tuple[Tensor, Tensor]:
-    """An image ``(C, H, W)`` whose longer side is at most ``long_edge`` pixels, and the K of it."""
-    height, width = image_size(image_01)
-    factor = min(1.0, long_edge / max(height, width))
-    return resize_image(image_01, K, (max(1, round(height * factor)), max(1, round(width * factor))))
-
-
-def as_fine_as(right_01: Tensor, K_right: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
-    """A right image, ``(C, H, W)``, at no more pixels per radian than the left one, and the K of it."""
-    ratio = float(K_left[0, 0] / K_right[0, 0])
-    return resize_long_edge(right_01, K_right, round(max(right_01.shape[-2:]) * min(1.0, ratio)))
 
 
 def prepare_evidence(
@@ -108,22 +92,17 @@ def prepare_evidence(
         needs_matches: aggregate the volume and check it against each view.
         pose: how the poses of the views came about.
     """
-    left, K_loss = resize_long_edge(left_01, K_left, config.loss_resolution)
-    size, loss_size = image_size(left_01), image_size(left)
-    volume, sweep_matches, matches, targets, sweep_targets = None, None, None, None, None
+    left, further, K = to_grid(left_01, views, K_left, config.sweep_pixels)
+    volume, matches, targets = None, None, None
     warnings: list[str] = [] if pose is None else list(pose.warnings)
     if views and (config.search == "volume" or needs_matches):
-        # The sweep chooses its own grid, finer than that of the losses for wide images.
         volume = build_cost_volume(left_01, views, K_left, depth_range=config.depth_range, config=config)
         if needs_matches:
-            sweep_matches = match_volume(volume)
-            matches = _on_grid(sweep_matches, loss_size)
-        if mirrored_pose_preferred(left_01, views, K_left, sweep_matches):
+            matches = match_volume(volume)
+        if mirrored_pose_preferred(left_01, views, K_left, matches):
             warnings.append(INVERSE)
     if points is not None:
-        targets, left_out = points_to_matches(points, K_left, size, loss_size)
-        sweep_size = loss_size if sweep_matches is None else sweep_matches.size
-        sweep_targets, _ = points_to_matches(points, K_left, size, sweep_size)
+        targets, left_out = points_to_matches(points, K_left, image_size(left_01), image_size(left))
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
     reliable = None if matches is None else reliable_matches(matches)
@@ -131,13 +110,11 @@ def prepare_evidence(
     return Evidence(
         left,
         left_01,
-        K_loss,
-        tuple(CameraView(*as_fine_as(v.image_01, v.K, K_loss), v.T_right_from_left) for v in views),
+        K,
+        further,
         volume,
         matches,
-        sweep_matches,
         targets,
-        sweep_targets,
         reliable,
         tuple(views),
         pose,
@@ -152,18 +129,6 @@ def _read_back_once(volume: CostVolume | None, targets: Sequence[Matches | None]
     for target in targets:
         if target is not None:
             _ = target.above(0.0), target.above(RELIABLE)
-
-
-def _on_grid(matches: Matches, size: tuple[int, int]) -> Matches:
-    """Matches of the sweep's grid on another one."""
-    if matches.size == size:
-        return matches
-    # Nearest centre: a mean of two inverse depths across an edge is the depth of neither surface.
-    inverse_depth, confidence = (
-        F.interpolate(m[None], size, mode="nearest-exact")[0]
-        for m in (matches.inverse_depth, matches.confidence)
-    )
-    return Matches(inverse_depth, confidence, matches.plane_step)
 
 
 @dataclass(frozen=True)
@@ -185,7 +150,7 @@ class Views:
 
     @property
     def size(self) -> tuple[int, int]:
-        """``(H, W)`` of the loss grid."""
+        """``(H, W)`` of the grid."""
         return image_size(self.left_01)
 
 

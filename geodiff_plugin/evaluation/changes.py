@@ -72,7 +72,7 @@ _NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "pa
 
 NUMBERS = (
     *("min_steps", "corrections", "outlier_width", "match_noise", "smoothness"),
-    *("weights.photometric", "weights.matches", "weights.anchor", "loss_resolution"),
+    *("weights.photometric", "weights.matches", "weights.anchor", "sweep_pixels"),
 )
 """The numbers that decide the default's result, by knob."""
 

@@ -121,7 +121,6 @@ class EvidenceStore:
         settings = (
             config.pose,
             config.clean_photographs,
-            config.loss_resolution,
             config.depth_range,
             config.planes,
             config.sweep_pixels,

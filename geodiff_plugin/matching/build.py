@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import image_size, plane_rays, resize_image
+from geodiff_plugin.geometry import as_fine_as, image_size, plane_rays, resize_image
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -22,9 +22,6 @@ from geodiff_plugin.types import CameraView
 _FEWEST_PLANES = 24
 #: How far the median pixel moves from one plane to the next, px: below a pixel, for positions between planes.
 PLANE_STEP_PX = 0.75
-#: Upper bound on the longer side of the sweep's grid, px; wide images would exceed it within
-#: ``sweep_pixels``.
-SWEEP_SIDE = 828
 # The coarse sweep that finds how near the planes must reach: pixels, planes, and the median step of one, px.
 PILOT_PIXELS, PILOT_PLANES, PILOT_STEP_PX = 20_000, 160, 1.0
 # Shift of the nearest depth that it looks at, in image widths, of the view that moves least: a near surface
@@ -41,24 +38,16 @@ HEADROOM, LEAST_SHIFT = 1.25, 0.03
 _CLEARLY, _INVERSE_PIXELS, _PLAINLY = 1.25, 15_000, 0.4
 
 
-def _to_grid(
-    left: Tensor, rights: Sequence[CameraView], K_left: Tensor, side: int, pixels: int
+def to_grid(
+    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, pixels: int
 ) -> tuple[Tensor, tuple[CameraView, ...], Tensor]:
-    """Shrink the left view to its bounds, right ones to as many pixels per radian, so that none aliases."""
-    size = image_size(left)
-    factor = min(side / max(size), (pixels / (size[0] * size[1])) ** 0.5)
-    left, K = resize_image(left, K_left, _shrunk(size, factor, factor))
-    # Axis by axis: whole pixels round each differently, and a rectified pair must stay one.
-    small = []
-    for image, K_r, T in rights:
-        smaller = _shrunk(image_size(image), float(K[1, 1] / K_r[1, 1]), float(K[0, 0] / K_r[0, 0]))
-        small.append(CameraView(*resize_image(image, K_r, smaller), T))
-    return left, tuple(small), K
-
-
-def _shrunk(size: tuple[int, int], rows: float, columns: float) -> tuple[int, int]:
-    """``(H, W)`` times two factors, but not larger than it is."""
-    return max(1, round(size[0] * min(1.0, rows))), max(1, round(size[1] * min(1.0, columns)))
+    """The left view ``(C, H, W)`` in at most ``pixels``, right ones at as many pixels per radian, its K."""
+    height, width = image_size(left_01)
+    factor = min(1.0, (pixels / (height * width)) ** 0.5)
+    size = max(1, round(height * factor)), max(1, round(width * factor))
+    left, K = resize_image(left_01, K_left, size)
+    small = tuple(CameraView(*as_fine_as(image, K_r, K), T) for image, K_r, T in rights)
+    return left, small, K
 
 
 def _even_planes(
@@ -88,7 +77,7 @@ def pilot_volume(
     Its grid has at most ``pixels`` pixels. Other arguments and errors as for ``build_cost_volume``.
     """
     views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
-    left, small, K = _to_grid(grey(left_01), views, K_left.float(), pixels, pixels)
+    left, small, K = to_grid(grey(left_01), views, K_left.float(), pixels)
     size = image_size(left)
     each = _at_shift(small, K, size, PILOT_SHIFT)
     limit = torch.minimum(each.amax(), MOST_NEARER * each.amin())
@@ -143,7 +132,7 @@ def build_cost_volume(
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
     views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
-    left, small, K = _to_grid(grey(left_01), views, K_left.float(), SWEEP_SIDE, config.sweep_pixels)
+    left, small, K = to_grid(grey(left_01), views, K_left.float(), config.sweep_pixels)
     if depth_range is None:
         nearest = _nearest_inverse_depth(pilot_volume(left, small, K))
         span = (torch.zeros_like(nearest), nearest)

@@ -12,10 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.evidence import as_fine_as
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.formats.depth import row_strips
-from geodiff_plugin.geometry import warp_right_to_left
+from geodiff_plugin.geometry import as_fine_as, warp_right_to_left
 from geodiff_plugin.types import CameraView
 
 #: Standard deviation of a good match, pixels of the left image.

@@ -53,7 +53,7 @@ def finish(
         ``(1, 1, H, W)`` metres, and the support by matches and points in [0, 1]; ``None`` where there are
         none.
     """
-    matches, points = Matches.stack([evidence.sweep_matches]), Matches.stack([evidence.sweep_points])
+    matches, points = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
     if matches is not None or points is not None:
         depth_m = sharpen_edges(depth_m, left, spacing)
     target = correction_target(matches, points, kept, error, depth_m)

@@ -221,7 +221,7 @@ def _indicators(
     samples = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
     evidence, config = run.evidence[image], run.config
     order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())
-    if evidence.sweep_matches is None and evidence.native:
+    if evidence.matches is None and evidence.native:
         with suppress(InputError):  # views without overlap: not judged
             volume = evidence.volume or build_cost_volume(
                 evidence.native_left,
@@ -231,7 +231,7 @@ def _indicators(
                 config=config,
             )
             matches = match_volume(volume)
-            evidence = replace(evidence, sweep_matches=matches, sweep_points=None)
+            evidence = replace(evidence, matches=matches, points=None)
             order = float(order_agreement(relative, matches, run.prior.space))
     return read_indicators(
         evidence,

@@ -220,12 +220,12 @@ def read_indicators(
         has_unit: whether lengths are in metres, so that the length of a baseline means something.
         **more: indicators that do not follow from these, by name.
     """
-    matches, pose, rights = evidence.sweep_matches, evidence.pose, evidence.native
+    matches, pose, rights = evidence.matches, evidence.pose, evidence.native
     if matches is not None:
         planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
         more |= _match_indicators(matches, depth_m, planes)
-        if evidence.sweep_points is not None:
-            more |= _points_indicators(matches, evidence.sweep_points)
+        if evidence.points is not None:
+            more |= _points_indicators(matches, evidence.points)
     if pose is not None:
         more["epipolar_px"] = max((px for px in pose.residual_px if not math.isnan(px)), default=math.nan)
         if pose.status == "mistaken":

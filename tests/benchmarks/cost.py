@@ -109,11 +109,10 @@ def measure(
     torch.set_num_threads(1)
     pair = read_demo_pair()
     left, right, (K_left, K_right) = _resized(pair, side)
-    # The grids and the number of planes follow the bounds that are measured, and nothing else.
-    build.SWEEP_SIDE = side
+    # The grid and the number of planes follow the bounds that are measured, and nothing else.
     if "planes" in (knobs or {}):
         build.PLANE_STEP_PX = 0.05
-    grids = {"loss_resolution": side, "sweep_pixels": side * side}
+    grids = {"sweep_pixels": side * side}
     K = K_left, *[K_right] * views
     E = np.eye(4), *[pair.rig.E] * views
     guidance = GeometryGuidance((right,) * views, K, E, pose="given", **grids | (knobs or {}))

@@ -16,7 +16,7 @@ pytest.importorskip("poselib")
 
 SIZE = (240, 320)
 #: As little of the guided call as there is: what is tested is everything before and after it.
-QUICK = ["--steps", 1, "--knob", "inner_steps=0", "--knob", "loss_resolution=64", "--device", "cpu", "-q"]
+QUICK = ["--steps", 1, "--knob", "inner_steps=0", "--device", "cpu", "-q"]
 
 
 @pytest.fixture(scope="module")

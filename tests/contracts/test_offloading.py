@@ -36,7 +36,7 @@ def test_a_guided_call_is_what_it_is_without(key, textured_plane):
     pipe = enable_geometry_guidance(TINY[key]())
 
     def depth_m():
-        pair, knobs = textured_plane, {"inner_steps": 1, "min_steps": 1, "loss_resolution": 64}
+        pair, knobs = textured_plane, {"inner_steps": 1, "min_steps": 1}
         guidance, call = GeometryGuidance(pair.right, pair.K, pair.E, **knobs), CALL.get(key, {})
         return pipe(pair.left, guidance=guidance, generator=torch.manual_seed(0), **call).prediction
 

@@ -19,7 +19,7 @@ from geodiff_plugin.priors.map import DepthMapPipeline
 from geodiff_plugin.scale.space import SPACES
 from tests.contracts.tiny_priors import CALL, TINY
 
-FAST = {"inner_steps": 3, "min_steps": 2, "loss_resolution": 64, "weights": {"photometric": 1.0}}
+FAST = {"inner_steps": 3, "min_steps": 2, "weights": {"photometric": 1.0}}
 
 
 @pytest.fixture

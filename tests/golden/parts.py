@@ -506,7 +506,7 @@ def exif() -> dict[str, object]:
 def intermediate_images() -> dict[str, object]:
     """Evidence of a call whose losses are computed on a smaller grid than the sweep's."""
     left, _, K, views = scene()
-    evidence = prepare_evidence(left, views, K, _points(), replace(DEFAULT, loss_resolution=64), True)
+    evidence = prepare_evidence(left, views, K, _points(), replace(DEFAULT, sweep_pixels=64 * 48), True)
     assert evidence.matches is not None and evidence.points is not None
     return {
         "left": evidence.left_01,

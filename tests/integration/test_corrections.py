@@ -13,7 +13,7 @@ from tests.integration.test_tiny_decoder import Counted
 
 def guided(pipe, pair, steps=5, **knobs):
     call = {name: knobs.pop(name) for name in ("output_latent", "callback_on_step_end") if name in knobs}
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, loss_resolution=64, **knobs)
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, **knobs)
     generator = torch.Generator().manual_seed(0)
     return enable_geometry_guidance(pipe)(
         pair.left, guidance=guidance, generator=generator, num_inference_steps=steps, **call

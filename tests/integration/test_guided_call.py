@@ -32,7 +32,7 @@ from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.runtime.run import GuidedRun
 from tests.conftest import SCHEDULER, plane_pair
 
-FAST = {"inner_steps": 2, "min_steps": 1, "loss_resolution": 64}
+FAST = {"inner_steps": 2, "min_steps": 1}
 PHOTOMETRIC = {"photometric": 1.0}  # alone: matches would also correct the map
 BOTH_GRADIENTS = pytest.mark.parametrize("gradient", ["denoised", "full"])
 

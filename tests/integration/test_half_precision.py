@@ -43,9 +43,7 @@ def test_white_of_16_bits_is_no_overflow(make_pipeline, textured_plane):
 def test_an_overflow_of_the_decoder_names_step_tensor_and_cure(make_pipeline, textured_plane):
     pipe = enable_geometry_guidance(make_pipeline().to(torch.float16))
     pipe.vae.decoder.conv_out.weight.data.fill_(6e4)
-    guidance = GeometryGuidance(
-        textured_plane.right, textured_plane.K, textured_plane.E, inner_steps=1, loss_resolution=64
-    )
+    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, inner_steps=1)
     with pytest.raises(ValueError, match=r"decoded map of denoising step 3 .* float16.*bfloat16"):
         pipe(textured_plane.left, guidance=guidance)
 

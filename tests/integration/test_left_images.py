@@ -13,7 +13,7 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance, InputError, enable_geometry_guidance
 from geodiff_plugin.runtime.checks import check_left_images
 
-FAST = {"inner_steps": 0, "min_steps": 1, "loss_resolution": 64, "correct": False, "crisp": False}
+FAST = {"inner_steps": 0, "min_steps": 1, "correct": False, "crisp": False}
 LEFT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
 FLOATS = LEFT.astype(np.float32) / 255
 ALPHA = np.dstack([LEFT, np.full(LEFT.shape[:2], 7, np.uint8)])

@@ -18,7 +18,7 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from tests.contracts.tiny_depthmaster import make_depthmaster
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "modular"
-KNOBS = {"inner_steps": 1, "min_steps": 1, "loss_resolution": 64}
+KNOBS = {"inner_steps": 1, "min_steps": 1}
 
 
 @pytest.fixture(scope="module")

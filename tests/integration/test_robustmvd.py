@@ -13,7 +13,7 @@ import torch
 from examples.robustmvd.model import GeoDiffModel, benchmark_metrics
 from geodiff_plugin import GeometryGuidance
 
-FAST = {"inner_steps": 0, "min_steps": 1, "loss_resolution": 64, "pose": "given"}
+FAST = {"inner_steps": 0, "min_steps": 1, "pose": "given"}
 
 
 @pytest.fixture

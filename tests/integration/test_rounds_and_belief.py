@@ -49,7 +49,6 @@ def test_later_rounds_are_anchored_to_the_network_and_all_corrections(textured_p
         inner_steps=1,
         min_steps=3,
         weights={"matches": 1.0, "spy": 1.0},
-        loss_resolution=64,
     )
     pipe(Image.fromarray(pair.left), guidance=guidance)
     assert len(seen) == 3

@@ -27,9 +27,7 @@ def tiny_folder(path, channels=4, stages=2):
 
 
 def guided(pipe, pair, decoder, **call):
-    guidance = GeometryGuidance(
-        pair.right, pair.K, pair.E, decoder=decoder, loss_resolution=64, corrections=3
-    )
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, decoder=decoder, corrections=3)
     call = {"generator": torch.Generator().manual_seed(0), "num_inference_steps": 3} | call
     return enable_geometry_guidance(pipe)(pair.left, guidance=guidance, **call)
 
@@ -103,9 +101,7 @@ def test_a_tiny_autoencoder_with_the_same_weights_in_the_loop_changes_nothing(
 def test_updates_go_through_the_tiny_decoder(make_pipeline, textured_plane, tmp_path):
     folder = tiny_folder(tmp_path / "tiny")
     pair = textured_plane
-    guidance = GeometryGuidance(
-        pair.right, pair.K, pair.E, decoder=folder, loss_resolution=64, inner_steps=2, correct=False
-    )
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, decoder=folder, inner_steps=2, correct=False)
     pipe = enable_geometry_guidance(make_pipeline())
     found = pipe(pair.left, guidance=guidance, generator=torch.Generator().manual_seed(0), output_latent=True)
     assert np.isfinite(found.prediction).all()

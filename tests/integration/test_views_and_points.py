@@ -15,7 +15,7 @@ from tests.scenes import Camera, render_views, sample_scene
 from tests.scenes.cameras import intrinsics
 
 SIZE = (72, 96)
-FAST = {"inner_steps": 4, "min_steps": 1, "loss_resolution": 96}
+FAST = {"inner_steps": 4, "min_steps": 1}
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ STEPS = 2
 
 
 def waits_of(pipe, pair, monkeypatch, points=None, **call):
-    knobs = {"loss_resolution": 64} | call.pop("knobs", {})
+    knobs = call.pop("knobs", {})
     guidance = GeometryGuidance(pair.right, pair.K, pair.E, points=points, **knobs)
     with pretended(enable_geometry_guidance(pipe), guidance, monkeypatch) as waits, pytest.raises(Reached):
         pipe(pair.left, guidance=guidance, num_inference_steps=STEPS, **call)

@@ -69,7 +69,7 @@ def test_automatic_choices_are_settled_when_asked_and_never_saved():
 
 def test_a_configuration_does_not_change():
     with pytest.raises(dataclasses.FrozenInstanceError):
-        DEFAULT.loss_resolution = 2
+        DEFAULT.planes = 2
     with pytest.raises(TypeError, match="does not change"):
         DEFAULT.weights["matches"] = 0.0
     assert DEFAULT.changed(weights=DEFAULT.weights | {"matches": 0.0}).weights["matches"] == 0.0

@@ -41,7 +41,7 @@ def test_uncertainty_is_of_the_refined_map(make_pipeline, textured_plane):
     """Each member alone, refined as it is: the spread of those around the ensemble's result."""
     pipe = enable_geometry_guidance(make_pipeline())
     pair, left = textured_plane, Image.fromarray(textured_plane.left)
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, inner_steps=1, loss_resolution=64)
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, inner_steps=1)
     latents = torch.randn(3, 4, 24, 32, generator=torch.Generator().manual_seed(0))
     call = {"guidance": guidance, "num_inference_steps": 1}
     alone = [pipe(left, latents=one[None], **call).prediction for one in latents]

@@ -52,7 +52,7 @@ def test_equal_values_are_made_once_and_any_other_anew(made):
     ]
     for image, changes in [(left + 0.1, {}), (left[:, :, :6], {}), *((left, c) for c in others)]:
         store.get(image, replace(given, **changes), *SETTINGS)
-    for changes in ({"loss_resolution": 320}, {"planes": 80}):
+    for changes in ({"sweep_pixels": 50_000}, {"planes": 80}):
         store.get(left, given, GuidanceConfig(**changes), True)
     store.get(left, given, *SETTINGS, True)  # a measured baseline
     assert len(made) == 6 + len(others)

@@ -334,7 +334,7 @@ def test_automatic_choices_are_settled_for_what_is_given(textured_plane):
     left_01 = torch.from_numpy(pair.left).permute(2, 0, 1)[None] / 255
     for crisp in (True, False):  # the last stage alone asks for matches too
         (evidence,) = GeometryGuidance(pair.right, pair.K, pair.E, **knobs, crisp=crisp).prepare(left_01)
-        assert (evidence.sweep_matches is not None) == crisp
+        assert (evidence.matches is not None) == crisp
 
 
 def test_the_numbers_of_published_presets():

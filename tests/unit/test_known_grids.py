@@ -1,4 +1,4 @@
-"""What is known of a view, on the grid of the losses: images larger than the grid, little overlap."""
+"""What is known of a view, on the grid of the evidence: images larger than the grid, little overlap."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def wide_pair(size_right, focal_right, at_m=0.1):
     images = [torch.from_numpy(image).permute(2, 0, 1).float() / 255 for image in (left, right)]
     T = torch.from_numpy(np.linalg.inv(E)).float()
     views = [CameraView(images[1], torch.from_numpy(K_right).float(), T)]
-    config = GuidanceConfig().changed(loss_resolution=640, search="one-number")
+    config = GuidanceConfig().changed(sweep_pixels=96 * 640, search="one-number")
     K_left = torch.from_numpy(K).float()
     return prepare_evidence(images[0], views, K_left, None, config, needs_matches=False)
 
@@ -40,7 +40,7 @@ def wide_pair(size_right, focal_right, at_m=0.1):
 @pytest.mark.parametrize(
     ("size_right", "focal_right"), [((120, 800), 600.0), ((180, 1200), 900.0), ((96, 640), 480.0)]
 )
-def test_above_640_pixels_the_truth_still_explains_the_left_image(size_right, focal_right):
+def test_above_the_grid_the_truth_still_explains_the_left_image(size_right, focal_right):
     """Neither K may stay that of the image as given, nor the right image be finer than the left one."""
     views = chunk_views([wide_pair(size_right, focal_right)])
     assert views.size == (96, 640)

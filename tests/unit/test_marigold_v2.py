@@ -14,7 +14,7 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline, frame_of
 
-FAST = {"min_steps": 1, "loss_resolution": 64}
+FAST = {"min_steps": 1}
 IMAGE = np.random.default_rng(0).random((53, 70, 3), np.float32)
 
 

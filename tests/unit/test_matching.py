@@ -233,12 +233,11 @@ def test_other_size_and_intrinsics_of_the_right_view():
     assert errors.numel() > 0.4 * visible.sum() and errors.median() < 0.5
 
 
-def test_large_images_are_shrunk_and_K_with_them(monkeypatch):
+def test_large_images_are_shrunk_and_K_with_them():
     left, (texture, K, T), _, _, _ = scene()
     bounded = m.build_cost_volume(left, [(texture, K, T)], K, config=DEFAULT.changed(sweep_pixels=4000))
     assert bounded.size[0] * bounded.size[1] <= 4100
-    monkeypatch.setattr(build, "SWEEP_SIDE", 72)
-    volume = m.build_cost_volume(left, [(texture, K, T)], K)
+    volume = m.build_cost_volume(left, [(texture, K, T)], K, config=DEFAULT.changed(sweep_pixels=48 * 72))
     assert volume.size == (48, 72) and volume.left_01.shape == (1, 48, 72)
     torch.testing.assert_close(volume.K, g.resize_intrinsics(K[None], SIZE, (48, 72))[0])
     assert volume.rights[0][0].shape == (1, 48, 72)

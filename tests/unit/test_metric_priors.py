@@ -12,13 +12,13 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.algorithm.evidence import prepare_evidence
 from geodiff_plugin.cli.report import summary_line
-from geodiff_plugin.config import DEFAULT, GuidanceConfig
+from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.runtime.start import PROMPT_LONG_EDGE, depth_prompt
 from geodiff_plugin.types import CameraView
 from tests.contracts.tiny_transformers import make_transformers
 from tests.scenes import render_pair
 
-FAST = {"inner_steps": 1, "min_steps": 1, "loss_resolution": 64}
+FAST = {"inner_steps": 1, "min_steps": 1}
 
 
 def knows(pipe, depth_m, factor=1.0):
@@ -108,9 +108,8 @@ def evidence_of(pair, points=None, rights=True):
 
     T = torch.tensor(np.linalg.inv(pair.E)).float()
     right = CameraView(image(pair.right), torch.tensor(pair.K).float(), T)
-    config = GuidanceConfig(loss_resolution=512)
     K_left = torch.tensor(pair.K).float()
-    return prepare_evidence(image(pair.left), [right] if rights else [], K_left, points, config, rights)
+    return prepare_evidence(image(pair.left), [right] if rights else [], K_left, points, DEFAULT, rights)
 
 
 def test_matches_become_a_dense_prompt(textured_plane):
@@ -128,7 +127,7 @@ def test_points_alone_become_a_prompt_and_nothing_becomes_none(textured_plane):
     middle = float(np.median(textured_plane.depth_m))
     assert prompt.isfinite().all() and float(prompt.median()) == pytest.approx(middle, rel=0.01)
     bare = evidence_of(textured_plane, points, rights=False)
-    assert depth_prompt([bare, replace(bare, points=None, sweep_points=None)], DEFAULT) is None
+    assert depth_prompt([bare, replace(bare, points=None)], DEFAULT) is None
 
 
 def test_prompt_depth_anything_is_given_what_is_known(textured_plane):

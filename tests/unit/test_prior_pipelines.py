@@ -159,7 +159,7 @@ def test_one_step_makes_the_updates_of_all(textured_plane, monkeypatch, start, r
 
     monkeypatch.setitem(RULES, "counted", Counted)
     views = textured_plane.right, textured_plane.K, textured_plane.E
-    knobs = {"inner_steps": 2, "min_steps": 3, "loss_resolution": 64, "weights": {"photometric": 1.0}}
+    knobs = {"inner_steps": 2, "min_steps": 3, "weights": {"photometric": 1.0}}
     guidance = GeometryGuidance(*views, rule="counted", start=start, **knobs)
     out = enable_geometry_guidance(make_e2e_ft())(Image.fromarray(textured_plane.left), guidance=guidance)
     assert len(steps) == 2 * rounds and len(out.history) == rounds

@@ -22,7 +22,7 @@ from geodiff_plugin.types import MetricDepthOutput
 from tests.contracts.tiny_geowizard import make_geowizard
 from tests.scenes import render_sequence
 
-FAST = {"inner_steps": 0, "loss_resolution": 64, "corrections": 4}
+FAST = {"inner_steps": 0, "corrections": 4}
 
 
 @pytest.fixture(scope="module")

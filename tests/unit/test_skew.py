@@ -14,14 +14,14 @@ import torch
 import geodiff_plugin
 from geodiff_plugin import GeometryGuidance, geometry
 from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit, warn_of_other_size
-from geodiff_plugin.algorithm.evidence import as_fine_as, prepare_evidence, resize_long_edge
+from geodiff_plugin.algorithm.evidence import prepare_evidence
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.figures.maps import render_cloud
 from geodiff_plugin.formats.clouds import write_ply
 from geodiff_plugin.matching import build_cost_volume, match_volume, points_to_matches
 from geodiff_plugin.matching.alignment import align_view
-from geodiff_plugin.matching.build import mirrored_pose_preferred, pilot_volume
+from geodiff_plugin.matching.build import mirrored_pose_preferred, pilot_volume, to_grid
 from geodiff_plugin.matching.sweep import sweep_planes
 from geodiff_plugin.types import CameraView
 from tests.conftest import textured
@@ -58,11 +58,11 @@ HAND_ON = {
 
 def test_shrinking_keeps_the_skew_of_the_image():
     image = torch.rand(3, *SIZE)
-    small, K_small = resize_long_edge(image, tensor(K)[0], 32)
+    small, _, K_small = to_grid(image, [], tensor(K)[0], 24 * 32)
     assert small.shape[-2:] == (24, 32)
     np.testing.assert_allclose(K_small, geometry.resize_intrinsics(tensor(K), SIZE, (24, 32))[0])
     twice = tensor(K)[0] * torch.tensor([2.0, 2.0, 1.0]).view(3, 1)
-    small, K_small = as_fine_as(image, twice, tensor(K)[0])
+    small, K_small = geometry.as_fine_as(image, twice, tensor(K)[0])
     assert small.shape[-2:] == (24, 32) and float(K_small[0, 1] / K_small[0, 0]) == pytest.approx(14 / 60)
 
 
@@ -94,9 +94,9 @@ def test_the_sweep_and_all_that_is_made_of_it():
         build_cost_volume(left, rights, camera),
         sweep_planes(left.mean(0, keepdim=True), grey, camera, planes),
     )
-    config = GuidanceConfig().changed(loss_resolution=48)
+    config = GuidanceConfig().changed(sweep_pixels=36 * 48)
     evidence = prepare_evidence(left, rights, camera, None, config, needs_matches=True)
-    for matches in (*(match_volume(v) for v in volumes), evidence.sweep_matches):
+    for matches in (*(match_volume(v) for v in volumes), evidence.matches):
         reliable = matches.confidence > 0.5
         assert reliable.float().mean() > 0.3
         assert float((1 / matches.inverse_depth[reliable]).median()) == pytest.approx(2.0, rel=0.04)
@@ -154,7 +154,7 @@ def test_no_function_that_takes_a_camera_matrix_is_left_out():
         for f in (
             *(geometry.unproject, geometry.project, geometry.plane_rays, geometry.warp_right_to_left),
             *(geometry.hidden_in_right, geometry.resize_intrinsics, geometry.resize_image),
-            *(geometry.is_rectified, resize_long_edge, as_fine_as, build_cost_volume, sweep_planes),
+            *(geometry.is_rectified, to_grid, geometry.as_fine_as, build_cost_volume, sweep_planes),
             *(align_view, points_to_matches, write_ply, render_cloud),
             *(disparity_to_depth, depth_to_disparity),
         )

@@ -101,9 +101,7 @@ def test_the_likeliest_reason_comes_first_and_figures_do_not_contradict():
 
 
 def signs_of(pose) -> Indicators:
-    evidence = SimpleNamespace(
-        sweep_matches=None, sweep_points=None, volume=None, points=None, warnings=(), pose=pose
-    )
+    evidence = SimpleNamespace(matches=None, volume=None, points=None, warnings=(), pose=pose)
     evidence.native_left, evidence.native = torch.zeros(3, 8, 8), ()
     return read_indicators(evidence, torch.eye(3), order=math.nan)
 
