@@ -504,7 +504,7 @@ def exif() -> dict[str, object]:
 
 @part
 def intermediate_images() -> dict[str, object]:
-    """Evidence of a call whose losses are computed on a smaller grid than the sweep's."""
+    """Evidence of a call whose grid is smaller than its images."""
     left, _, K, views = scene()
     evidence = prepare_evidence(left, views, K, _points(), replace(DEFAULT, sweep_pixels=64 * 48), True)
     assert evidence.matches is not None and evidence.points is not None
