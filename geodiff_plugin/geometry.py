@@ -58,9 +58,7 @@ def resize_image(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Te
     return resized, resize_intrinsics(K[None], before, size)[0]
 
 
-def as_fine_as(
-    image_01: torch.Tensor, K: torch.Tensor, K_left: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def as_fine_as(image_01: Tensor, K: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
     """A further image ``(C, H, W)`` at no more pixels per radian than the left one, and the K of it.
 
     Neither then aliases in the other. Axis by axis: whole pixels round each differently, and a rectified pair
