@@ -373,7 +373,7 @@ def pose_line(capture: Capture) -> str:
     if solved.status == "estimated":
         count = int(solved.connected.sum())
         return f"poses estimated: {count} of {len(capture)} frames, {solved.residual_px:.2f} px"
-    moved, turned = np.median(solved.moved), np.median(solved.turned_deg)
+    moved, turned = map(np.median, solved.moved())
     return (
         f"poses solved: residual {solved.residual_px_given:.2f} -> {solved.residual_px:.2f} px, cameras "
         f"moved {moved:.3f} {unit} and turned {turned:.1f} degrees in the median, scale known to "
@@ -387,11 +387,11 @@ def pose_report(capture: Capture) -> dict[str, Any]:
     numbers = {
         "residual_px_given": solved.residual_px_given,
         "residual_px": solved.residual_px,
-        "scale_by_positions": solved.scale_trajectory[0],
-        "scale_by_depth": solved.scale_depth[0],
+        "scale_by_positions": solved.scale_trajectory,
+        "scale_by_depth": solved.scale_depth,
         "scale_spread": solved.scale_spread,
     }
-    each = zip(capture.names, solved.connected, solved.moved, solved.turned_deg, strict=True)
+    each = zip(capture.names, solved.connected, *solved.moved(), strict=True)
     frames = {
         name: {"connected": bool(c), "moved": round(float(m), 5), "turned_deg": round(float(t), 3)}
         for name, c, m, t in each

@@ -43,8 +43,6 @@ def load_solved(path: Path, key: str) -> SolvedCapture | None:
         values: dict[str, Any] = {n: a.item() if a.ndim == 0 else a for n, a in arrays.items()}
         values["E_given"] = values["E_given"] if values["E_given"].size else None
         values["notes"] = tuple(str(note) for note in values["notes"])
-        for name in ("scale_trajectory", "scale_depth"):
-            values[name] = tuple(values[name].tolist())
         return SolvedCapture(seen=tuple(map(Observations, px, point)), **values)
     except (OSError, ValueError, KeyError, TypeError):
         return None

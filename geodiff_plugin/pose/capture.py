@@ -20,8 +20,6 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.pose.reconstruction import FEWEST_FOR_FOCAL, Match, Reconstruction, pycolmap
 
-__all__ = ["Observations", "SolvedCapture", "candidate_pairs", "some_names", "solve_capture"]
-
 #: Frames that a frame is matched with: so many after it, and so many others that look at the same place.
 AFTER, ELSEWHERE, MOST_TURN_DEG = 6, 5, 50.0
 #: Fewer observations than this connect no frame; frames with this share of the usual features are blurred.
@@ -47,12 +45,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Where one frame sees points of the solve.
-
-    Attributes:
-        px: ``(n, 2)`` pixels of the frame.
-        point: ``(n,)`` rows of ``SolvedCapture.points``.
-    """
+    """Where one frame sees points of the solve: ``px (n, 2)`` of the frame, rows ``point (n,)`` of them."""
 
     px: np.ndarray
     point: np.ndarray
@@ -74,7 +67,7 @@ class SolvedCapture:
         seen: of every frame.
         residual_px_given: median distance of matches from their epipolar lines under the given poses.
         residual_px: the same under these.
-        scale_trajectory: factor from the adjusted lengths to those of the given positions, with its spread.
+        scale_trajectory: factor from the adjusted lengths to those of the given positions.
         scale_depth: the same to the depth of the scene under the given poses.
         scale_spread: relative standard deviation of the scale in use.
         notes: sentences for the user.
@@ -89,8 +82,8 @@ class SolvedCapture:
     seen: tuple[Observations, ...]
     residual_px_given: float = math.nan
     residual_px: float = math.nan
-    scale_trajectory: tuple[float, float] = (1.0, math.nan)
-    scale_depth: tuple[float, float] = (1.0, math.nan)
+    scale_trajectory: float = 1.0
+    scale_depth: float = 1.0
     scale_spread: float = math.nan
     notes: tuple[str, ...] = ()
 
@@ -101,20 +94,13 @@ class SolvedCapture:
             E = self.E_given
         return np.linalg.inv(E[of]) @ E[beside]
 
-    @property
-    def moved(self) -> np.ndarray:
-        """``(N,)`` how far each camera moved from its given position."""
+    def moved(self) -> tuple[np.ndarray, np.ndarray]:
+        """How far each camera moved from its given pose, ``(N,)``, and turned, ``(N,)`` degrees."""
         if self.E_given is None:
-            return np.zeros(len(self.E))
-        return np.linalg.norm(self.E[:, :3, 3] - self.E_given[:, :3, 3], axis=1)
-
-    @property
-    def turned_deg(self) -> np.ndarray:
-        """``(N,)`` how far each camera turned from its given rotation, degrees."""
-        if self.E_given is None:
-            return np.zeros(len(self.E))
+            return np.zeros(len(self.E)), np.zeros(len(self.E))
         given, solved = (Rotation.from_matrix(E[:, :3, :3]) for E in (self.E_given, self.E))
-        return np.degrees((given.inv() * solved).magnitude())
+        apart = np.linalg.norm(self.E[:, :3, 3] - self.E_given[:, :3, 3], axis=1)
+        return apart, np.degrees((given.inv() * solved).magnitude())
 
 
 def solve_capture(
@@ -150,7 +136,7 @@ def solve_capture(
         blurred = np.flatnonzero(base.features < BLURRED_SHARE * np.median(base.features))
         notes = []
         if len(blurred):
-            these = some_names([names[int(i)] for i in blurred])
+            these = _some_names([names[int(i)] for i in blurred])
             notes.append(f"{these}: blurred or without texture; they are no good neighbours of others.")
         if E is None:
             return _from_nothing(base, notes, names)
@@ -158,7 +144,7 @@ def solve_capture(
         return _from_given(base, given, notes + more, names, poses == "refined")
 
 
-def some_names(names: Sequence[str]) -> str:
+def _some_names(names: Sequence[str]) -> str:
     """Names for a sentence, the first few of many."""
     more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
     return ", ".join(names[:MOST_NAMES]) + more
@@ -253,8 +239,12 @@ def _from_given(
     """Triangulate by the given poses, adjust, triangulate again; keep what is better, frame by frame."""
     matches = base.matches
     before = _residuals_px(given, base.K_given, matches)
-    start = base.triangulated(base.model(given), ROUNDS[0][0])
     as_given = (_median_px(before),) * 2
+
+    def started() -> Any:
+        return base.triangulated(base.model(given), ROUNDS[0][0])
+
+    start = started()
     if not refine or start.num_points3D() < FEWEST_OBSERVATIONS:
         return _noted(replace(_found(base, start, "given", given, as_given), E=given), notes, names)
     by_given = base.depths(start)
@@ -262,12 +252,11 @@ def _from_given(
     model = _adjusted(base, start, given, focal)
     if focal and np.abs(base.K(model)[:, 0, 0] / base.K_given[:, 0, 0] - 1).max() > MOST_FOCAL:
         notes.append("The focal length that fits best is far from the given one, which is kept.")
-        model = _adjusted(base, base.triangulated(base.model(given), ROUNDS[0][0]), given, False)
+        model = _adjusted(base, started(), given, False)
     after = _residuals_px(base.poses(model), base.K(model), matches)
     if not _median_px(after) < LEAST_GAIN * as_given[0]:
         notes.append(f"The given poses fit as well as any ({as_given[0]:.2f} px) and are kept.")
-        start = base.triangulated(base.model(given), ROUNDS[0][0])
-        return _noted(replace(_found(base, start, "kept", given, as_given), E=given), notes, names)
+        return _noted(replace(_found(base, started(), "kept", given, as_given), E=given), notes, names)
     found = _found(base, model, "solved", given, (as_given[0], _median_px(after)))
     worse = _of_frames(matches, after, len(base)) > _of_frames(matches, before, len(base))
     found = replace(found, connected=found.connected & ~worse)
@@ -294,16 +283,19 @@ def _scaled(
         logs = [math.log(a[k] / b[k]) for k in a.keys() & b.keys()]
         if len(logs) >= FEWEST_OBSERVATIONS:
             ratios[i] = np.median(logs)
+
+    def middle(kept: np.ndarray) -> float:
+        known = ratios[kept][np.isfinite(ratios[kept])]
+        return float(np.median(known)) if len(known) else 0.0
+
     blocks = np.array_split(np.arange(len(centres)), min(8, len(centres)))
-    depth = _jackknifed(lambda kept: _middle(ratios[kept]), blocks)
+    depth = _jackknifed(middle, blocks) if np.isfinite(ratios).any() else (0.0, math.inf)
     trajectory = _jackknifed(lambda kept: math.log(_similarity(centres[kept], given[kept])[0]), blocks)
-    if not np.isfinite(ratios).any():
-        depth = 0.0, math.inf
     spreads = [math.hypot(depth[1], SCALE_FLOOR_DEPTH), math.hypot(trajectory[1], SCALE_FLOOR_TRAJECTORY)]
     weights = np.array([s**-2.0 if math.isfinite(s) else 0.0 for s in spreads])
     values = np.nan_to_num([depth[0], trajectory[0]])
     scale = math.exp(float((weights * values).sum() / max(weights.sum(), 1e-12)))
-    _, Q, _ = _similarity(centres, given)
+    _, Q = _similarity(centres, given)
     turned = scale * centres @ Q.T
     shift = np.median(given - turned, axis=0)
     E = found.E.copy()
@@ -312,15 +304,10 @@ def _scaled(
         found,
         E=E,
         points=scale * found.points @ Q.T + shift,
-        scale_trajectory=(math.exp(trajectory[0]), spreads[1]),
-        scale_depth=(math.exp(depth[0]), spreads[0]),
+        scale_trajectory=math.exp(trajectory[0]),
+        scale_depth=math.exp(depth[0]),
         scale_spread=float(weights.sum() ** -0.5),
     )
-
-
-def _middle(values: np.ndarray) -> float:
-    """Median of what is known; 0 where nothing is."""
-    return float(np.median(values[np.isfinite(values)])) if np.isfinite(values).any() else 0.0
 
 
 def _jackknifed(
@@ -335,8 +322,8 @@ def _jackknifed(
     return value, float(np.sqrt((len(blocks) - 1) / len(blocks) * ((left - left.mean()) ** 2).sum()))
 
 
-def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation and shift that bring points ``a`` to ``b``, robust against single wrong ones."""
+def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
+    """Scale and rotation that bring points ``a`` to ``b``, robust against single wrong ones."""
     weights = np.ones(len(a))
     for _ in range(10):
         share = weights / weights.sum()
@@ -348,7 +335,7 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.nda
         scale = float((D * signs).sum() / max((share * (x**2).sum(1)).sum(), 1e-18))
         off = np.linalg.norm(y - scale * x @ Q.T, axis=1)
         weights = 1 / (1 + (off / max(2.0 * float(np.median(off)), 1e-9)) ** 2)
-    return scale, Q, mean_b - scale * Q @ mean_a
+    return scale, Q
 
 
 def _found(
@@ -380,7 +367,7 @@ def _noted(found: SolvedCapture, notes: Sequence[str], names: Sequence[str]) -> 
     """The capture with sentences on its scale and on frames that are not connected."""
     remarks, spread = list(notes), found.scale_spread
     if found.status == "solved":
-        ratio = found.scale_trajectory[0] / found.scale_depth[0]
+        ratio = found.scale_trajectory / found.scale_depth
         if abs(math.log(ratio)) > DISAGREES:
             remarks.append(
                 "The given positions and the depth of the scene under the given poses disagree on the scale, "
@@ -394,7 +381,7 @@ def _noted(found: SolvedCapture, notes: Sequence[str], names: Sequence[str]) -> 
         kept = "have no pose and are skipped" if found.E_given is None else "keep their poses as given"
         remarks.append(
             f"{len(lost)} of {len(names)} frames share too few points with others, or fit no better "
-            f"where the others put them, and {kept}: {some_names(lost)}."
+            f"where the others put them, and {kept}: {_some_names(lost)}."
         )
     return replace(found, notes=tuple(remarks))
 

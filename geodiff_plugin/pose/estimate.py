@@ -40,7 +40,7 @@ class EstimatedPose:
         inliers: ``(N,)`` bool, the tracks that it explains.
         parallax_deg: median angle between the two rays of an inlier.
         residual_px: median distance of the inliers from their epipolar lines.
-        rectified: whether the pair is rectified, which no two photographs by hand are by chance.
+        rectified: whether all rows agree, which those of two photographs by hand do not by chance.
         warnings: sentences for the user.
     """
 
@@ -60,41 +60,30 @@ def _poselib() -> Any:
         bad_value("PoseLib", "installed, to estimate poses", "no module poselib", cure)
 
 
-def _camera(K: np.ndarray) -> dict[str, Any]:
-    width, height = (max(1, int(2 * c + 1)) for c in K[:2, 2])
-    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    return {"model": "PINHOLE", "width": width, "height": height, "params": params}
-
-
-def _unskewed(px: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Pixels ``(N, 2)`` of the same rays in a camera without skew: PoseLib's models have none."""
-    return np.stack([px[:, 0] - K[0, 1] * (px[:, 1] - K[1, 2]) / K[1, 1], px[:, 1]], axis=1)
-
-
 def _right_rays(tracks: Tracks) -> np.ndarray:
     pixels = np.c_[tracks.right_px[0], np.ones(len(tracks))]
     return np.linalg.solve(tracks.K_rights[0], pixels.T).T
 
 
-def parallax_deg(tracks: Tracks, R: np.ndarray) -> np.ndarray:
+def _parallax_deg(tracks: Tracks, R: np.ndarray) -> np.ndarray:
     """Angle ``(N,)`` degrees between the two rays of every track of a view, by ``R (3, 3)`` of its pose."""
     left, right = tracks.rays @ R.T, _right_rays(tracks)
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(left, right), axis=1), (left * right).sum(1)))
 
 
-def estimate_pose(tracks: Tracks, name: str = "the two photographs", mirrored: int = 0) -> EstimatedPose:
-    """Rotation and direction of the baseline of one right view.
-
-    Args:
-        tracks: of one right view, outliers among them.
-        name: what they are of, for messages.
-        mirrored: how many matches there are once the right image is mirrored, for the message.
+def estimate_pose(tracks: Tracks, name: str = "the two photographs") -> EstimatedPose:
+    """Rotation and direction of the baseline of one right view, of tracks with outliers.
 
     Raises:
         InputError: PoseLib is not installed; no pose is to be had: too few matches or inliers, a pure
             rotation, too little parallax, two motions.
     """
-    _check_matches(len(tracks), name, mirrored)
+    if len(tracks) < FEWEST_INLIERS:
+        cure = (
+            "Are they of the same place, sharp and well lit, none of them a mirror image (a selfie)? Half of "
+            "what one shows should be in the other."
+        )
+        bad_value(name, f"alike enough for at least {FEWEST_INLIERS} matches", f"{len(tracks)}", cure)
     T = _five_points(tracks)
     sideways = _rectified(tracks, residuals_px(tracks, T[None])[0] < INLIER_PX)
     T = T if sideways is None else sideways
@@ -107,7 +96,7 @@ def estimate_pose(tracks: Tracks, name: str = "the two photographs", mirrored: i
         got = f"{count} matches of {len(tracks)} that one pose explains"
         cure = "Are they of the same place, taken at the same time, neither mirrored nor edited? Is K right?"
         bad_value(name, "of one scene that stands still, seen by two cameras", got, cure)
-    parallax = float(np.median(parallax_deg(tracks, T[:3, :3])[inliers]))
+    parallax = float(np.median(_parallax_deg(tracks, T[:3, :3])[inliers]))
     _check_parallax(tracks, near, parallax, name)
     warnings = _of_second_motion(tracks, T, inliers, name)
     if parallax < LITTLE_PARALLAX_DEG:
@@ -136,12 +125,7 @@ def estimate_poses(views: GreyViews, matcher: Matcher) -> tuple[Tracks, list[Est
     tracks, poses = matcher(views), []
     for v in range(len(views.rights)):
         name = "the two photographs" if len(views.rights) == 1 else f"the left and right photograph {v + 1}"
-        seen_here, mirrored = tracks.view(v), 0
-        if len(seen_here) < 30:
-            flipped, K_right = views.rights[v][:, ::-1].copy(), views.K_rights[v : v + 1]
-            turned = replace(views, rights=(flipped,), K_rights=K_right)
-            mirrored = len(matcher(turned))
-        poses.append(estimate_pose(seen_here, name, mirrored))
+        poses.append(estimate_pose(tracks.view(v), name))
     seen = tracks.seen.copy()
     for v, pose in enumerate(poses):
         seen[v, tracks.seen[v]] = pose.inliers
@@ -163,14 +147,15 @@ def _same_unit(tracks: Tracks, poses: Sequence[EstimatedPose], v: int) -> Estima
 
 def _five_points(tracks: Tracks) -> np.ndarray:
     """``T_right_from_left`` that explains the most tracks, its baseline of length 1."""
-    pose, _ = _poselib().estimate_relative_pose(
-        _unskewed(tracks.left_px, tracks.K_left),
-        _unskewed(tracks.right_px[0], tracks.K_rights[0]),
-        _camera(tracks.K_left),
-        _camera(tracks.K_rights[0]),
-        {"max_epipolar_error": INLIER_PX / 2, "seed": 0, "min_iterations": 1000},
-        {},
-    )
+    pixels, cameras = [], []
+    for px, K in ((tracks.left_px, tracks.K_left), (tracks.right_px[0], tracks.K_rights[0])):
+        width, height = (max(1, int(2 * c + 1)) for c in K[:2, 2])
+        params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+        cameras.append({"model": "PINHOLE", "width": width, "height": height, "params": params})
+        # The same rays in a camera without skew: PoseLib's models have none.
+        pixels.append(np.c_[px[:, 0] - K[0, 1] * (px[:, 1] - K[1, 2]) / K[1, 1], px[:, 1]])
+    options = {"max_epipolar_error": INLIER_PX / 2, "seed": 0, "min_iterations": 1000}
+    pose, _ = _poselib().estimate_relative_pose(*pixels, *cameras, options, {})
     T = np.eye(4)
     T[:3] = pose.Rt
     T[:3, 3] /= max(float(np.linalg.norm(T[:3, 3])), 1e-12)
@@ -214,15 +199,6 @@ def _rectified(tracks: Tracks, near: np.ndarray) -> np.ndarray | None:
         if fits and (solve_inverse_depth(inliers, T[None]) > 0).mean() > SIMPLER:
             return T
     return None
-
-
-def _check_matches(count: int, name: str, mirrored: int) -> None:
-    if count >= FEWEST_INLIERS:
-        return
-    cure = "Are they of the same place, sharp and well lit? Half of what one shows should be in the other."
-    if mirrored >= max(2 * count, FEWEST_INLIERS):
-        cure = f"With the right one mirrored there are {mirrored}: is one of them a mirror image (a selfie)?"
-    bad_value(name, f"alike enough for at least {FEWEST_INLIERS} matches", f"{count}", cure)
 
 
 def _check_parallax(tracks: Tracks, near: np.ndarray, parallax: float, name: str) -> None:

@@ -32,9 +32,8 @@ MATCHERS = {
     "superglue": "magic-leap-community/superglue_outdoor",
 }
 _CLASSES = {"lightglue": "LightGlueForKeypointMatching", "superglue": "SuperGlueForKeypointMatching"}
-# Learned matchers see both photographs at this (height, width) where their folder names no other. Left points
-# of two pairs that agree to this share of a pixel are one point.
-_SIZE, _SAME_PX = (480, 640), 0.25
+# Left points of two pairs that agree to this share of a pixel are one point.
+_SAME_PX = 0.25
 
 FirstDepth = Callable[[Sequence[CameraView]], Tensor]
 """Right views with poses -> a rough depth ``(1, 1, h, w)`` of the left image, metres, without holes."""
@@ -42,13 +41,9 @@ FirstDepth = Callable[[Sequence[CameraView]], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class GreyViews:
-    """Grey images on the grid of the matches.
+    """Grey images ``(H, W)`` uint8 on the grid of the matches, all at about as many pixels per radian.
 
-    Attributes:
-        left: ``(H, W)`` uint8.
-        rights: ``(Hr, Wr)`` uint8 each, at about as many pixels per radian.
-        K_left: ``(3, 3)`` float64.
-        K_rights: ``(V, 3, 3)`` float64.
+    Beside them ``K_left (3, 3)`` and ``K_rights (V, 3, 3)`` float64.
     """
 
     left: np.ndarray
@@ -86,10 +81,9 @@ def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) ->
 
 
 def sift_features(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a grey image ``(H, W)`` uint8, the centre of its first pixel at (0, 0), with RootSIFT.
+    """Points ``(N, 2)`` float64 of a grey image ``(H, W)`` uint8, the centre of its first pixel at (0, 0).
 
-    Pixels ``(N, 2)`` float64, and descriptors ``(N, 128)`` float32 of unit length (Arandjelovic and Zisserman
-    2012).
+    With RootSIFT ``(N, 128)`` float32 of unit length (Arandjelovic and Zisserman 2012).
     """
     sift = cv2.SIFT.create(nfeatures=_MOST_POINTS, contrastThreshold=_CONTRAST)
     points, descriptors = sift.detectAndCompute(grey, None)
@@ -100,10 +94,7 @@ def sift_features(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def match_features(left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Indices ``(M, 2)`` of points of ``sift_features`` that are each other's nearest.
-
-    By the ratio test from the left.
-    """
+    """Indices ``(M, 2)`` of features that are each other's nearest and pass the ratio test from the left."""
     if min(len(left[0]), len(right[0])) < 2:
         return np.zeros((0, 2), int)
     alike = left[1] @ right[1].T  # unit vectors: distance^2 = 2 - 2 alike
@@ -163,8 +154,8 @@ def _dense_matches(
 def dense_tracks(views: GreyViews, depth_m: Tensor, Ts: np.ndarray) -> Tracks:
     """The centres of the left image's cells with their places by optical flow in the right images.
 
-    ``depth_m (1, 1, H, W)`` is rough, on the left grid, without holes; ``Ts (V, 4, 4)``,
-    ``T_right_from_left``, are the poses that it goes with.
+    ``depth_m (1, 1, H, W)`` is rough, on the left grid, without holes, and goes with the poses ``Ts
+    (V, 4, 4)``, ``T_right_from_left``.
     """
     size = views.left.shape
     rows, columns = (np.arange(_CELL_PX // 2, side, _CELL_PX) for side in size)
@@ -192,8 +183,8 @@ def find_matcher(name: str) -> Matcher:
     if name == "sift":
         return sparse_tracks
     folder = _folder(name)
-    model = _load(folder)
-    size = _size(folder)
+    model, asked = _load(folder), _entries(folder / "preprocessor_config.json").get("size", {})
+    size = asked.get("height", 480), asked.get("width", 640)
 
     def matched(views: GreyViews) -> Tracks:
         pairs = [_learned_pair(model, views.left, right, size) for right in views.rights]
@@ -219,42 +210,26 @@ def _folder(name: str) -> Path:
 def _entries(file: Path) -> dict[str, Any]:
     """The entries of a JSON file; none where it cannot be read."""
     try:
-        entries = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return dict(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
         return {}
-    return entries if isinstance(entries, dict) else {}
-
-
-def _size(folder: Path) -> tuple[int, int]:
-    size = _entries(folder / "preprocessor_config.json").get("size")
-    height, width = (size.get("height"), size.get("width")) if isinstance(size, dict) else (None, None)
-    if not isinstance(height, int) or not isinstance(width, int):
-        return _SIZE
-    return min(max(height, 16), 4096), min(max(width, 16), 4096)
 
 
 def _load(folder: Path) -> Any:
-    config = _entries(folder / "config.json")
-    kind, points = config.get("model_type"), config.get("keypoint_detector_config")
-    detector = points.get("model_type") if isinstance(points, dict) else None
-    if kind not in _CLASSES or detector not in (None, "superpoint"):
-        got = f"one of type {kind!r}" + ("" if detector is None else f" on points of type {detector!r}")
-        bad_value(f"matcher in {folder}", f"one of {' or '.join(_CLASSES)}, on SuperPoint's points", got)
-    weights = f"weights of the matcher in {folder}"
-    if not any(folder.glob("*.safetensors")):
-        bad_value(weights, "safetensors", "none of them")
+    kind = _entries(folder / "config.json").get("model_type")
+    if kind not in _CLASSES:
+        bad_value(f"matcher in {folder}", f"one of {' or '.join(_CLASSES)}", f"one of type {kind!r}")
     import transformers
 
+    weights = f"weights of the matcher in {folder}"
     try:
         model, loading = getattr(transformers, _CLASSES[kind]).from_pretrained(
             str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
         )
     except Exception as error:  # whatever a damaged file makes of it
-        bad_value(weights, "readable", f"{type(error).__name__}: {error}")
-    missing = sorted(loading["missing_keys"])
-    if missing or loading.get("mismatched_keys"):
-        got = f"{len(missing)} missing, such as {missing[0]}" if missing else "some of another shape"
-        bad_value(weights, "those of its config, name by name", got)
+        bad_value(weights, "readable safetensors", f"{type(error).__name__}: {error}")
+    if missing := sorted(loading["missing_keys"]):
+        bad_value(weights, "those of its config", f"{len(missing)} missing, such as {missing[0]}")
     return model.eval()
 
 

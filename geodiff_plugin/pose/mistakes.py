@@ -1,8 +1,4 @@
-"""Which usual mistake of a given pose or K would explain its misfit; nothing is repaired.
-
-What only the user knows is what was meant. Epipolar lines do not show the unit of a translation, nor K of a
-rectified pair.
-"""
+"""Which usual mistake of a given pose or K would explain its misfit; nothing is repaired."""
 
 from __future__ import annotations
 
@@ -39,32 +35,31 @@ _FOCAL_SCALED = (
     "for images of {size} the width and height of these, with its principal point set to the middle."
 )
 _FACTORS = {
-    0.25: "4 times",
+    1 / 4: "4 times",
     1 / 3: "3 times",
-    0.5: "twice",
+    1 / 2: "twice",
     2 / 3: "1.5 times",
-    1.5: "two thirds of",
-    2.0: "half",
-    3.0: "a third of",
-    4.0: "a quarter of",
+    3 / 2: "two thirds of",
+    2: "half",
+    3: "a third of",
+    4: "a quarter of",
 }
-# Within so many pixels of its line, and in front of both cameras, a match speaks for a pose. Coarsely, for a
-# mistaken pose may be inexact as well; and finely, for where the cameras are close together a wrong K or pose
+# Within so many pixels of its line, and in front of both cameras, a match speaks for a pose: coarsely, for a
+# mistaken pose may be inexact as well, and finely, for where the cameras are close together a wrong K or pose
 # too leaves most matches within a few pixels of their lines.
 _NEAR_PX = (4.0, 1.5)
 # A mistake explains so many times the matches that the given pose does, this share of all, and this share of
 # what the pose nearby does.
 _CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
-# What else may look so is an inexact pose, which another K or other axes can bring near the matches, but not
-# onto them. So either the median residual must be that of the pose nearby, but for this factor, or the
-# candidate must lie this far from the given pose, in degrees or shares of the baseline, or have another K.
-# Where only the fine shares tell it from the given pose, both must hold.
+# An inexact pose may look so too: another K or other axes can bring it near the matches, but not onto them.
+# So either the median residual must be that of the pose nearby, but for this factor, or the candidate must
+# lie this far from the given pose, in degrees or shares of the baseline, or have another K. Where only the
+# fine shares tell it from the given pose, both must hold.
 _AS_EXACT, _FAR_DEG, _FAR_SHIFT = 1.2, 5.0, 0.8
 # Candidates whose share is this near the largest are told apart by a finer measure.
 _ALIKE = 0.95
 #: A baseline from this on may be centimetres or millimetres, where what it shows is as large.
 SUSPECT_BASELINE_M = 5.0
-
 
 _Fit = tuple[tuple[float, ...], float]
 """Shares of the matches that speak for a pose, coarsely and finely, and their median residual, pixels."""
@@ -76,15 +71,6 @@ def _fit(tracks: Tracks, T: np.ndarray) -> _Fit:
     off_px = residuals_px(tracks, T[None])[0]
     shares = tuple(float((ahead & (off_px < near_px)).mean()) for near_px in _NEAR_PX)
     return shares, float(np.median(off_px))
-
-
-def _scaled(K: np.ndarray, factor: float, centred: bool) -> np.ndarray:
-    """``K`` of an image of another size, its principal point scaled with it or not."""
-    K = K.copy()
-    K[..., :2, :2] *= factor
-    if not centred:
-        K[..., :2, 2] = (K[..., :2, 2] + 0.5) * factor - 0.5
-    return K
 
 
 def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np.ndarray]]:
@@ -100,17 +86,20 @@ def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np
     if not np.allclose(tracks.K_left, tracks.K_rights[0], rtol=0.02):
         yield _K_SWAPPED, replace(tracks, K_left=tracks.K_rights[0], K_rights=tracks.K_left[None]), T
     for factor, size in _FACTORS.items():
-        for sentence, centred in ((_K_SCALED, False), (_FOCAL_SCALED, True)):
-            K_left, K_rights = (_scaled(K, factor, centred) for K in (tracks.K_left, tracks.K_rights))
-            other = replace(tracks, K_left=K_left, K_rights=K_rights)
-            yield sentence.format(factor=factor, size=size), other, T
+        for sentence in (_K_SCALED, _FOCAL_SCALED):
+            Ks = np.stack([tracks.K_left, *tracks.K_rights])
+            Ks[:, :2, :2] *= factor
+            if sentence == _K_SCALED:
+                Ks[:, :2, 2] = (Ks[:, :2, 2] + 0.5) * factor - 0.5
+            yield (
+                sentence.format(factor=factor, size=size),
+                replace(tracks, K_left=Ks[0], K_rights=Ks[1:]),
+                T,
+            )
 
 
 def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far poses ``Ts (V, 4, 4)`` lie from the given ones: ``(V,)`` turns in degrees, and shifts.
-
-    Shifts are shares of the given baselines.
-    """
+    """How far poses ``Ts (V, 4, 4)`` lie from the given ones: ``(V,)`` degrees, shares of the baselines."""
     change = Ts @ np.linalg.inv(given)
     cosines = (np.trace(change[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     shifts = np.linalg.norm(change[:, :3, 3], axis=1) / np.linalg.norm(given[:, :3, 3], axis=1)
@@ -118,7 +107,7 @@ def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _likeliest(tracks: Tracks, T: np.ndarray) -> tuple[str, _Fit, bool]:
-    """The mistake with the largest share of matches; of several alike the one that also fits more finely.
+    """The mistake with the largest share of matches, of several alike the one that also fits more finely.
 
     With its fit, and whether the given pose is too far from it to be an inexact one.
     """
@@ -154,9 +143,9 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
 def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
     """A sentence where baseline and scene are both a hundred or a thousand times too large, or ``None``.
 
-    Epipolar lines do not know the unit of a translation; only the size of what comes out does. A baseline
-    above ``LONG_BASELINE_M`` was warned of when it was given. Nearer scenes are left in peace: from 100 m
-    above the ground a drone moves on by as much as centimetres taken for metres would be.
+    Only the size of what comes out shows the unit of a translation. A baseline above ``LONG_BASELINE_M`` was
+    warned of when it was given. Nearer scenes are left in peace: from 100 m above the ground a drone moves on
+    by as much as centimetres taken for metres would be.
     """
     baseline = float(np.linalg.norm(T[:3, 3]))
     inverse_depth = solve_inverse_depth(tracks, T[None])

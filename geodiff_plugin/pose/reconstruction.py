@@ -13,8 +13,6 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 
-__all__ = ["FEWEST_FOR_FOCAL", "Match", "Reconstruction", "pycolmap"]
-
 #: Longer side of the images that features are sought in, pixels, and how many are kept of an image.
 LONG_SIDE, MOST_FEATURES = 800, 2000
 #: Fewer inliers than this are no match of two frames.
@@ -29,11 +27,7 @@ Match = tuple[int, int, np.ndarray, np.ndarray]
 
 
 def pycolmap() -> Any:
-    """The package, quiet.
-
-    Raises:
-        ValueError: it is not installed.
-    """
+    """The package, quiet; ``InputError`` where it is not installed."""
     try:
         import pycolmap
     except ImportError:
@@ -44,18 +38,10 @@ def pycolmap() -> Any:
 
 
 class Reconstruction:
-    """COLMAP's data base of one capture, and the models that are made from it.
+    """COLMAP's data base of one capture, in the folder ``work``, and the models that are made from it.
 
-    Args:
-        work: folder for the data base and what COLMAP writes.
-        K: ``(N, 3, 3)`` pixels of the frames.
-        sizes: ``(width, height)`` of every frame.
-        threads: of features, matching and adjustment.
-
-    Attributes:
-        K_given: as the argument.
-        features: ``(N,)`` how many features each frame has, after ``extract``.
-        matches: of all pairs that match, after ``match``.
+    ``K (N, 3, 3)`` pixels and ``sizes`` ``(width, height)`` are those of the frames. ``features (N,)``, how
+    many each frame has, are there after ``extract``, ``matches`` of all pairs that match after ``match``.
     """
 
     def __init__(self, work: Path, K: np.ndarray, sizes: Sequence[tuple[int, int]], threads: int) -> None:
@@ -151,15 +137,12 @@ class Reconstruction:
         rules = options.triangulation
         rules.complete_max_reproj_error = rules.merge_max_reproj_error = error_px
         focal = float(np.median(self.K_given[:, 0, 0] * self._factors))
-        rules.create_max_angle_error = rules.continue_max_angle_error = max(
-            0.3, math.degrees(error_px / focal)
-        )
+        angle_deg = max(0.3, math.degrees(error_px / focal))
+        rules.create_max_angle_error = rules.continue_max_angle_error = angle_deg
         rules.min_angle = 1.0
-        out = self._work / "model"
+        work, out = str(self._work), self._work / "model"
         out.mkdir(exist_ok=True)
-        return pycolmap().triangulate_points(
-            model, self._path, str(self._work), str(out), True, options, False
-        )
+        return pycolmap().triangulate_points(model, self._path, work, str(out), True, options, False)
 
     def adjust(self, model: Any, given: np.ndarray, loss_px: float, focal: bool) -> None:
         """Bundle adjustment with the given positions as robust priors, and the focal length if wanted."""
@@ -215,14 +198,14 @@ class Reconstruction:
         return E
 
     def depths(self, model: Any) -> list[dict[int, float]]:
-        """For every frame the depth of its features that are points of a model."""
+        """For every frame the depth of its features that are points of a model and lie in front of it."""
         xyz = {number: point.xyz for number, point in model.points3D.items()}
         depths: list[dict[int, float]] = []
         for i in range(len(self)):
             image = model.image(i + 1)
             T = image.cam_from_world().matrix()
-            of = {k: p.point3D_id for k, p in enumerate(image.points2D) if p.has_point3D()}
-            z = {k: float(T[2, :3] @ xyz[number] + T[2, 3]) for k, number in of.items()}
+            of = {k: xyz[p.point3D_id] for k, p in enumerate(image.points2D) if p.has_point3D()}
+            z = {k: float(T[2, :3] @ point + T[2, 3]) for k, point in of.items()}
             depths.append({k: value for k, value in z.items() if value > 0})
         return depths
 

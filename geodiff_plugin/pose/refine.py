@@ -90,7 +90,7 @@ def refine_views(
             a rectified rig do; otherwise they are weighed against the scene's depth under the given poses.
 
     Returns:
-        The right views and the report. The views are the very ones that were given where the poses fit, where
+        The right views, and the report. They are the very ones that were given where the poses fit, where
         there are too few matches, where a mistake explains the misfit, or where no better pose is near.
     """
     views, given = grey_views(left_01, rights, K_left), _poses(rights)
@@ -114,12 +114,12 @@ def refine_views(
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     before = median_residuals(tracks, given)
     Ts, free = settle_poses(tracks, given, near, before, rig)
-    after = median_residuals(tracks, Ts)
+    after, worst = median_residuals(tracks, Ts), int(np.argmax(np.nan_to_num(before)))
     residual_px, matches = tuple(before.tolist()), tuple(map(float, tracks.seen.sum(1)))
     report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
     doubts, spread = undecided(tracks, Ts, free), None
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
-        told = _told(before, None, ", and no pose near it leaves clearly less. ")
+        told = _told(before, worst, ", and no pose near it leaves clearly less. ")
         return tuple(rights), replace(report, status="kept", warnings=told + doubts + units)
     if far := _too_far(before, after, *pose_change(given, Ts)):
         return tuple(rights), replace(report, status="kept", warnings=(*filter(None, far), *units))
@@ -130,14 +130,15 @@ def refine_views(
         None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views.rights[v].shape)
         for v, T in enumerate(Ts)
     ]
-    worst = int(np.argmax(np.nan_to_num(before)))
+    pairs = zip(tracks.right_px, bends, strict=True)
+    straight = np.stack([px if bend is None else px + bend.at(px) for px, bend in pairs])
     report = replace(
         report,
         status="refined",
         warnings=_told(before, worst, f", a refined one {after[worst]:.1f} px. ") + doubts + units,
         scale_spread=spread,
         E=_as_E(Ts),
-        residual_px=tuple(_straight_medians(tracks, Ts, bends).tolist()),
+        residual_px=tuple(median_residuals(replace(tracks, right_px=straight), Ts).tolist()),
         straightened_px=tuple(0.0 if bend is None else bend.rms_px for bend in bends),
     )
     return _applied(rights, Ts, bends), report
@@ -148,12 +149,8 @@ def polished(
 ) -> tuple[np.ndarray, Tracks]:
     """Estimated poses fitted once more, to all matches of all views together.
 
-    ``rights`` have the poses that the ``sparse`` tracks, inliers of the estimation, gave; other arguments as
-    for ``refine_views``.
-
-    Returns:
-        ``(V, 4, 4)``, ``T_right_from_left``, the lengths of the baselines as they were but for their ratios;
-        and all matches.
+    ``rights`` have the poses of the ``sparse`` tracks, inliers of the estimation. Returns ``(V, 4, 4)``,
+    ``T_right_from_left``, the first baseline as long as it was; and all matches.
     """
     views, Ts = grey_views(left_01, rights, K_left), _poses(rights)
     tracks = merge_tracks([sparse, dense_tracks(views, _on_grid(first_depth(rights), views.left.shape), Ts)])
@@ -171,10 +168,10 @@ def _rescaled(
 ) -> tuple[np.ndarray, float, tuple[str, ...]]:
     """Refined poses of a tracker, scaled by both baselines and scene; the spread of the scale; a warning."""
     refined, shifts = solve_inverse_depth(tracks, Ts), []
-    for v, (K, T) in enumerate(zip(tracks.K_rights, Ts, strict=True)):
-        rays, w = tracks.rays[tracks.seen[v]], refined[tracks.seen[v]]
-        moved = project_tracks(rays, w, K, T).px - project_tracks(rays, np.zeros_like(w), K, T).px
-        shifts.append(np.linalg.norm(moved, axis=1))
+    depths = refined, np.zeros_like(refined)
+    for seen, K, T in zip(tracks.seen, tracks.K_rights, Ts, strict=True):
+        here, far = (project_tracks(tracks.rays[seen], w[seen], K, T).px for w in depths)
+        shifts.append(np.linalg.norm(here - far, axis=1))
     misfit = float(np.nanmean(before) / max(np.median(np.concatenate(shifts)), 1e-6))
     factor, spread = refined_scale(refined, solve_inverse_depth(tracks, given), misfit)
     if not np.isfinite(factor):
@@ -194,13 +191,10 @@ def _rescaled(
 
 @dataclass(frozen=True, eq=False)
 class Displacement:
-    """A cubic displacement of a right image.
+    """A cubic displacement of a right image of ``size`` ``(H, W)``.
 
-    Attributes:
-        coefficients: ``(10, 2)`` pixels of the image of ``size``.
-        size: ``(H, W)`` that it was fitted at.
-        most_px: no pixel moves further.
-        rms_px: of the displacement at the matches.
+    ``coefficients (10, 2)`` are pixels; no pixel moves further than ``most_px``; ``rms_px`` is that of the
+    matches.
     """
 
     coefficients: np.ndarray
@@ -233,11 +227,10 @@ def _fit_cubic(basis: np.ndarray, normals: np.ndarray, off: np.ndarray) -> np.nd
 
 
 def fit_displacement(tracks: Tracks, T: np.ndarray, size: tuple[int, int]) -> Displacement | None:
-    """The displacement that brings matches of one right view to their epipolar lines.
+    """The displacement that brings matches of one right view of ``size`` ``(H, W)`` to their epipolar lines.
 
     ``None`` where there are few matches, nothing smooth is left, or left-out matches do not agree. Only for a
-    refined pose ``T (4, 4)``: a residual that depends on depth is a pose's, and bending the image, of
-    ``size`` ``(H, W)``, for it ruins it.
+    refined pose ``T (4, 4)``: a residual that depends on depth is a pose's.
     """
     if len(tracks) < _FEWEST_BENT:
         return None
@@ -287,12 +280,6 @@ def _as_E(Ts: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(np.linalg.inv(T) for T in Ts)
 
 
-def _straight_medians(tracks: Tracks, Ts: np.ndarray, bends: Sequence[Displacement | None]) -> np.ndarray:
-    pairs = zip(tracks.right_px, bends, strict=True)
-    right_px = np.stack([px if bend is None else px + bend.at(px) for px, bend in pairs])
-    return median_residuals(replace(tracks, right_px=right_px), Ts)
-
-
 def _applied(
     rights: Sequence[CameraView], Ts: np.ndarray, bends: Sequence[Displacement | None] | None = None
 ) -> tuple[CameraView, ...]:
@@ -323,9 +310,8 @@ def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ..
     )
 
 
-def _told(before: np.ndarray, v: int | None, rest: str) -> tuple[str, ...]:
-    """A sentence on the misfit of view ``v``, or of the worst, where it is large; ``rest`` ends it."""
-    v = int(np.argmax(np.nan_to_num(before))) if v is None else v
+def _told(before: np.ndarray, v: int, rest: str) -> tuple[str, ...]:
+    """A sentence on the misfit of view ``v``, where one is large; ``rest`` ends it."""
     if not np.nanmax(before) > WARNS_PX:
         return ()
     pose = "The pose as given" if len(before) == 1 else f"The pose of right view {v + 1} as given"

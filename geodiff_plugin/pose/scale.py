@@ -27,13 +27,11 @@ _NEAR_PX = 40.0
 
 @dataclass(frozen=True)
 class Scale:
-    """Metres per unit of an estimated pose, and where they come from.
+    """Metres per unit of an estimated pose.
 
-    Attributes:
-        source: ``"baseline"``, ``"known length"``, ``"points"`` or ``"none"``.
-        factor: metres a unit of the estimation; 1 without a source.
-        spread: relative standard error of it as the matches show; ``None`` where they cannot.
-        warnings: sentences for the user.
+    ``source`` is ``"baseline"``, ``"known length"``, ``"points"`` or ``"none"``; ``factor`` is 1 without one;
+    ``spread`` is its relative standard error as the matches show, ``None`` where they cannot; ``warnings``
+    are sentences for the user.
     """
 
     source: str
@@ -73,16 +71,12 @@ def find_scale(
 ) -> Scale:
     """Metres per unit, from whichever length is given.
 
-    Args:
-        tracks: the matches.
-        Ts: ``(V, 4, 4)``, ``T_right_from_left`` in units.
-        factor: pixels of the tracks' grid a pixel of the left photograph.
-        baseline_m: distance of the first right camera, or ``None``.
-        known_length: ``(x1, y1, x2, y2, metres)`` in the left photograph, or ``None``.
-        points: ``(N, 3)`` metres in the left camera's frame, or ``None``.
+    ``Ts (V, 4, 4)`` are ``T_right_from_left`` in units; ``factor`` is pixels of the tracks' grid a pixel of
+    the left photograph; ``baseline_m`` the distance of the first right camera; ``known_length``
+    ``(x1, y1, x2, y2, metres)`` in the left photograph; ``points`` ``(N, 3)`` metres in the left frame.
 
     Raises:
-        InputError: two of the first three, or ends of a length where nothing is matched.
+        InputError: baseline and length together, or ends of a length where nothing is matched.
     """
     given = [name for name, v in (("baseline", baseline_m), ("known length", known_length)) if v is not None]
     if len(given) > 1:
@@ -120,21 +114,12 @@ def _by_points(tracks: Tracks, inverse_depth: np.ndarray, points: np.ndarray) ->
     return Scale("points", factor, spread)
 
 
-def refined_scale(
-    refined: np.ndarray,
-    given: np.ndarray,
-    misfit: float,
-    *,
-    length_spread: float = LENGTH_SPREAD,
-    depth_spread: float = DEPTH_SPREAD,
-) -> tuple[float, float]:
+def refined_scale(refined: np.ndarray, given: np.ndarray, misfit: float) -> tuple[float, float]:
     """By how much to multiply refined translations, which matches alone determine only up to scale.
 
     Two lengths survive the refinement of a tracker's pose: that of the baseline, and the depth of the scene.
     A tracker errs in turn and shift together, so that the scene stays where it was seen and the baseline is
-    too long or too short. The result is the mean of both, weighted by their uncertainties. Nothing here is
-    about a single pair: for a capture, concatenate the points of all frames, and lower ``length_spread``,
-    because the errors of many baselines cancel.
+    too long or too short. The result is the mean of both, weighted by their uncertainties.
 
     Args:
         refined: ``(N,)`` inverse depths of matches under the refined poses, with baselines as long as given;
@@ -143,8 +128,6 @@ def refined_scale(
         misfit: how wrongly the given poses predict places in the images: median distance of the matches from
             their epipolar lines as a share of their median parallax. As much error is expected along the
             lines, where it changes depth.
-        length_spread: relative standard deviation of the given baselines' lengths.
-        depth_spread: the same of the scene's median depth under given poses without a misfit.
 
     Returns:
         The factor (1 keeps the baselines, another the median inverse depth), and its relative standard
@@ -154,7 +137,7 @@ def refined_scale(
     if not ahead.any():
         return float("nan"), float("nan")
     by_depth = float(np.median(np.log(refined[ahead] / given[ahead])))
-    of_length, of_depth = length_spread**2, depth_spread**2 + misfit**2
+    of_length, of_depth = LENGTH_SPREAD**2, DEPTH_SPREAD**2 + misfit**2
     weight = of_length / (of_length + of_depth)
     # The variance of the weighted mean, and what the two lengths disagree by.
     variance = weight * of_depth + weight * (1.0 - weight) * by_depth**2

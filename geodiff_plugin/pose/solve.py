@@ -56,16 +56,12 @@ _Terms = tuple[float, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Prior:
-    """How far the poses as given are believed.
+    """How far the poses as given are believed, as standard deviations.
 
-    What two views cannot determine, above all the length of the baseline and a turn that a shift compensates,
+    ``moved_px (V,)`` is of where the tracks' points project to, ``turned_rad`` of the rotation,
+    ``shifted_share`` of the camera's centre and ``longer_share`` of the baseline's length, both as shares of
+    the baseline. What two views cannot determine, above all that length and a turn that a shift compensates,
     stays as given: such a move costs here and gains nothing in the residuals.
-
-    Attributes:
-        moved_px: ``(V,)``, standard deviation of where the tracks' points project to.
-        turned_rad: of the rotation.
-        shifted_share: of the camera's centre, as a share of the baseline.
-        longer_share: of the baseline's length, likewise.
     """
 
     moved_px: np.ndarray
@@ -92,15 +88,12 @@ def _jacobian(at: Projected, inverse_depth: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Whitened:
+class _Whitened:
     """Residuals of tracks and their derivatives, each times the root of its robust weight; n = 2 V.
 
-    Attributes:
-        cost: sum of log(1 + (residual / scale)^2).
-        inverse_depth: ``(N,)`` 1/m that fits the track best.
-        residuals: ``(N, n)``.
-        by_pose: ``(N, n, 6V)``, by ``_turned``'s step of every view.
-        by_depth: ``(N, n)``, by inverse depth.
+    ``cost``, the sum of log(1 + (residual / scale)^2); ``inverse_depth (N,)`` 1/m that fits a track best;
+    ``residuals (N, n)``; their derivatives ``by_pose (N, n, 6V)``, by ``_turned``'s step of every view, and
+    ``by_depth (N, n)``, by inverse depth.
     """
 
     cost: float
@@ -126,11 +119,8 @@ class Whitened:
         return self.by_pose - along[..., None] * self.depth_by_pose[:, None]
 
 
-def whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> Whitened:
-    """What the tracks say about the poses near ``Ts (V, 4, 4)``, ``T_right_from_left``.
-
-    From a residual of ``scale_px``, pixels of the right view, an observation counts for less.
-    """
+def _whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> _Whitened:
+    """What the tracks say about poses ``Ts``; from ``scale_px`` on an observation counts for less."""
     views = len(Ts)
     w = solve_inverse_depth(tracks, Ts)
     for _ in range(2 if views > 1 else 0):
@@ -145,14 +135,7 @@ def whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> Whitened:
     r = (offs * np.sqrt(weights)[..., None]).transpose(1, 0, 2).reshape(len(tracks), -1)
     J, j = by_pose.reshape(len(tracks), 2 * views, -1), by_depth.reshape(len(tracks), -1)
     cost = np.log1p((offs**2).sum(-1) / scale_px**2)[tracks.seen].sum()
-    return Whitened(float(cost), w, r, J, j)
-
-
-def _data_terms(tracks: Tracks, Ts: np.ndarray, scale: float) -> _Terms:
-    """Cost, gradient and normal matrix of the residuals with the inverse depths eliminated."""
-    at = whitened(tracks, Ts, scale)
-    J = at.left_by_pose
-    return at.cost, np.einsum("nkp,nk->p", J, at.residuals), np.einsum("nkp,nkq->pq", J, J)
+    return _Whitened(float(cost), w, r, J, j)
 
 
 def _weights(
@@ -198,22 +181,20 @@ def solve_poses(
     scale_px: float = 1.0,
     trust: float = 1.0,
 ) -> np.ndarray:
-    """The poses ``(V, 4, 4)`` that fit the tracks best under the prior.
+    """The poses ``(V, 4, 4)`` that fit the tracks of V right views best under the prior.
 
-    Args:
-        tracks: of V right views.
-        given: ``(V, 4, 4)``, ``T_right_from_left`` as given: the middle of the prior.
-        prior: how far they are believed.
-        start: where to begin; ``None`` for ``given``.
-        scale_px: residual from which on an observation counts for less, pixels of the right view.
-        trust: what the residuals count against the prior, (0, 1]; see ``tracks.split_residuals``.
+    ``given (V, 4, 4)``, ``T_right_from_left``, is the middle of the prior, ``start`` where to begin if not
+    there; from a residual of ``scale_px``, pixels of the right view, an observation counts for less; the
+    residuals count ``trust``, (0, 1], against the prior (``tracks.split_residuals``).
     """
     Ts = np.array(given if start is None else start, dtype=np.float64)
     w_start = np.clip(solve_inverse_depth(tracks, Ts), 0.0, None)
 
     def terms(at: np.ndarray) -> _Terms:
-        data, held = _data_terms(tracks, at, scale_px), _prior_terms(tracks, at, given, w_start, prior)
-        return trust * data[0] + held[0], trust * data[1] + held[1], trust * data[2] + held[2]
+        data, held = _whitened(tracks, at, scale_px), _prior_terms(tracks, at, given, w_start, prior)
+        J = data.left_by_pose  # with the inverse depths eliminated
+        gradient, normal = np.einsum("nkp,nk->p", J, data.residuals), np.einsum("nkp,nkq->pq", J, J)
+        return trust * data.cost + held[0], trust * gradient + held[1], trust * normal + held[2]
 
     damping, (cost, gradient, normal) = 1e-3, terms(Ts)
     for _ in range(_STEPS):
@@ -232,8 +213,7 @@ def solve_poses(
 
 def is_rig(tracks: Tracks, given: np.ndarray) -> bool:
     """Whether all poses as given ``(V, 4, 4)`` are those of a rectified rig."""
-    cameras = (torch.as_tensor(m, device="cpu") for m in (tracks.K_left, tracks.K_rights, given))
-    return bool(is_rectified(*cameras).all())
+    return bool(is_rectified(*map(torch.as_tensor, (tracks.K_left, tracks.K_rights, given))).all())
 
 
 def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -250,12 +230,8 @@ def settle_poses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses that fit all matches, held as firmly as the given ones turn out to deserve.
 
-    Args:
-        tracks: all matches of V right views.
-        given: ``(V, 4, 4)``, ``T_right_from_left`` as given.
-        near: likewise, poses that fit roughly.
-        before: ``(V,)`` pixels, ``median_residuals`` of the poses as given.
-        rig: whether these are those of a rectified rig, see ``is_rig``.
+    ``given`` and ``near (V, 4, 4)``, which fit roughly, are ``T_right_from_left``; ``before (V,)`` pixels,
+    ``median_residuals`` of the poses as given; ``rig`` whether these are those of a rectified rig.
 
     Returns:
         ``(V, 4, 4)``: free where they explain nearly all of the residual, near the given ones where the
@@ -284,14 +260,14 @@ def settle_poses(
 
 
 def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
-    """The relative standard deviation of a track's depth caused by errors of free poses; 0.05 for 5 %.
+    """The relative standard deviation of a track's depth caused by errors of free poses ``Ts (V, 4, 4)``.
 
-    In the median of the tracks; ``inf`` where none lies in front of the cameras. The covariance of the poses
-    is the sandwich of robust statistics (Huber 1967; White 1982), with blocks of the image as what is
-    independent: residuals of neighbours are alike. ``tracks`` are those that the poses ``Ts (V, 4, 4)``,
-    which fit them best, explain and some that they do not; the unit of length is taken as exact.
+    In the median of the tracks, which the poses fit best, outliers among them; ``inf`` where none lies in
+    front of the cameras. The covariance of the poses is the sandwich of robust statistics (Huber 1967; White
+    1982), with blocks of the image as what is independent: residuals of neighbours are alike. The unit of
+    length is taken as exact.
     """
-    at = whitened(tracks, Ts, SCALE_PX)
+    at = _whitened(tracks, Ts, SCALE_PX)
     ahead = at.inverse_depth > 0
     if not ahead.any():
         return float("inf")

@@ -18,14 +18,10 @@ _TINY = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Points seen in the left image and in one right image or several.
+    """Points seen in the left image and in V right images.
 
-    Attributes:
-        left_px: ``(N, 2)`` float64, pixels of the left image.
-        right_px: ``(V, N, 2)`` float64, pixels of every right image.
-        seen: ``(V, N)`` bool, where ``right_px`` says something.
-        K_left: ``(3, 3)`` float64, pixels of the left image.
-        K_rights: ``(V, 3, 3)`` float64.
+    ``left_px (N, 2)`` and ``right_px (V, N, 2)`` are float64 pixels; ``seen (V, N)`` says where ``right_px``
+    holds; ``K_left (3, 3)``, ``K_rights (V, 3, 3)``.
     """
 
     left_px: np.ndarray
@@ -49,8 +45,8 @@ class Tracks:
 
     def alone(self, v: int) -> Tracks:
         """All tracks, with right view ``v`` alone."""
-        kept = slice(v, v + 1)
-        return replace(self, right_px=self.right_px[kept], seen=self.seen[kept], K_rights=self.K_rights[kept])
+        at = slice(v, v + 1)
+        return replace(self, right_px=self.right_px[at], seen=self.seen[at], K_rights=self.K_rights[at])
 
     def view(self, v: int) -> Tracks:
         """The tracks that right view ``v`` sees, of that view alone."""
@@ -72,13 +68,11 @@ def merge_tracks(parts: Sequence[Tracks]) -> Tracks:
 
 
 class Projected(NamedTuple):
-    """Tracks in one right view, at given inverse depths: pixels and their derivatives.
+    """Tracks in one right view, at given inverse depths.
 
-    Attributes:
-        px: ``(N, 2)``.
-        scaled: ``(N, 3)``, the points in the right frame times their inverse left depth.
-        by_point: ``(N, 2, 3)``, derivative of ``px`` by ``scaled``.
-        by_inverse_depth: ``(N, 2)``, derivative of ``px`` by inverse depth.
+    ``px (N, 2)``; ``scaled (N, 3)``, the points in the right frame times their inverse left depth; the
+    derivatives of ``px`` by ``scaled``, ``by_point (N, 2, 3)``, and by inverse depth,
+    ``by_inverse_depth (N, 2)``.
     """
 
     px: np.ndarray
@@ -88,10 +82,9 @@ class Projected(NamedTuple):
 
 
 def project_tracks(rays: np.ndarray, inverse_depth: np.ndarray, K: np.ndarray, T: np.ndarray) -> Projected:
-    """Where a right camera sees points on left rays.
+    """Where a right camera ``K (3, 3)``, ``T_right_from_left (4, 4)`` sees points on left rays.
 
-    ``rays (N, 3)`` have z = 1, ``inverse_depth (N,)`` is in 1/m, 0 for infinity; ``K (3, 3)`` pixels of the
-    right view, ``T (4, 4)`` its ``T_right_from_left``.
+    ``rays (N, 3)`` have z = 1, ``inverse_depth (N,)`` is in 1/m, 0 for infinity.
     """
     scaled = rays @ T[:3, :3].T + inverse_depth[:, None] * T[:3, 3]
     z = scaled[:, 2]
@@ -116,23 +109,15 @@ def _linear_inverse_depth(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
     return above / np.maximum(below, _TINY)
 
 
-def solve_inverse_depth(
-    tracks: Tracks, Ts: np.ndarray, weights: np.ndarray | None = None, steps: int = 3
-) -> np.ndarray:
-    """The inverse depth of every track that fits its right pixels best.
+def solve_inverse_depth(tracks: Tracks, Ts: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """The inverse depth ``(N,)`` 1/m of every track that fits its right pixels best, by Gauss and Newton.
 
-    Args:
-        tracks: of V right views.
-        Ts: ``(V, 4, 4)``, ``T_right_from_left``.
-        weights: ``(V, N)`` of the observations, or ``None`` for equal ones.
-        steps: of Gauss and Newton, after a linear start.
-
-    Returns:
-        ``(N,)`` 1/m; negative where the rays diverge.
+    ``Ts (V, 4, 4)`` are ``T_right_from_left``, ``weights (V, N)`` of the observations; negative where the
+    rays diverge.
     """
     weights = tracks.seen.astype(float) if weights is None else weights * tracks.seen
     inverse_depth = _linear_inverse_depth(tracks, Ts)
-    for _ in range(steps):
+    for _ in range(3):
         above, below = np.zeros(len(tracks)), np.full(len(tracks), _TINY)
         for v, T in enumerate(Ts):
             at = project_tracks(tracks.rays, inverse_depth, tracks.K_rights[v], T)
@@ -144,11 +129,9 @@ def solve_inverse_depth(
 
 
 def residuals_px(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
-    """How far every observation lies from where the poses ``(V, 4, 4)`` can put it.
+    """How far observations lie from where the poses ``(V, 4, 4)`` can put them; NaN where not seen.
 
-    ``(V, N)`` pixels of the right views, NaN where not seen. With one right view that is the distance from
-    the epipolar line of the left pixel, as in kornia's ``left_to_right_epipolar_distance``, which knows no
-    point seen in several views.
+    ``(V, N)`` pixels of the right views; with one right view that is the distance from the epipolar line.
     """
     inverse_depth = solve_inverse_depth(tracks, Ts)
     off = [
@@ -182,18 +165,13 @@ def across_lines(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
     """Tell noise of single matches from what the residuals of neighbours have in common.
 
-    Residuals of neighbours are alike where a pose cannot explain them (a rolling shutter, lens distortion,
-    K), and then a thousand matches hold a pose no better than a few. Blocks of the image show it: the mean of
-    ``n`` independent residuals varies by ``1 / n`` of what a single residual does.
+    Residuals of neighbours are alike where no pose explains them (a rolling shutter, lens distortion, K), and
+    then a thousand matches hold a pose no better than a few. Blocks of the image show it: the mean of ``n``
+    independent residuals varies by ``1 / n`` of what a single residual does.
 
-    Args:
-        tracks: of one right view, at least one.
-        T: ``(4, 4)``, ``T_right_from_left``, that fits them.
-
-    Returns:
-        How much of a match counts, in (0, 1], 1 where residuals of neighbours have nothing in common; and
-        the standard deviation, pixels, of what they have in common: that of the means of blocks beyond what
-        noise of single matches leaves in them, or of all residuals if the matches lie in too few blocks.
+    ``tracks`` are of one right view, which ``T (4, 4)`` fits. Returns how much of a match counts, in (0, 1];
+    and the standard deviation, pixels, of what neighbours have in common: that of the means of blocks beyond
+    what noise leaves in them, or of all residuals if the matches lie in too few blocks.
     """
     off, _ = across_lines(tracks, T)
     scale = max(1.4826 * float(np.median(np.abs(off))), 1e-3)

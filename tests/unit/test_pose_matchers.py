@@ -11,9 +11,8 @@ from transformers import LightGlueConfig, LightGlueForKeypointMatching, SuperGlu
 from transformers import SuperGlueForKeypointMatching as SuperGlue
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.guidance.photographs import estimate_rig
 from geodiff_plugin.pose import matches as matchers
-from geodiff_plugin.pose.matches import MATCHERS, GreyViews, find_matcher, sparse_tracks
+from geodiff_plugin.pose.matches import MATCHERS, GreyViews, find_matcher
 
 K = np.array([[200.0, 0, 79.5], [0, 200.0, 59.5], [0, 0, 1]])
 
@@ -32,24 +31,11 @@ def detector() -> SuperPointConfig:
 def tiny(kind: str):
     torch.manual_seed(0)
     if kind == "superglue":
-        config = SuperGlueConfig(
-            keypoint_detector_config=detector(),
-            hidden_size=16,
-            keypoint_encoder_sizes=[16],
-            gnn_layers_types=["self", "cross"],
-            num_attention_heads=2,
-            sinkhorn_iterations=5,
-            matching_threshold=0.0,
-        )
-        return SuperGlue(config).eval()
-    config = LightGlueConfig(
-        keypoint_detector_config=detector(),
-        descriptor_dim=16,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        filter_threshold=0.0,
-    )
-    return LightGlueForKeypointMatching(config).eval()
+        sizes = {"hidden_size": 16, "keypoint_encoder_sizes": [16], "gnn_layers_types": ["self", "cross"]}
+        rest = {"num_attention_heads": 2, "sinkhorn_iterations": 5, "matching_threshold": 0.0}
+        return SuperGlue(SuperGlueConfig(keypoint_detector_config=detector(), **sizes, **rest)).eval()
+    sizes = {"descriptor_dim": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "filter_threshold": 0.0}
+    return LightGlueForKeypointMatching(LightGlueConfig(keypoint_detector_config=detector(), **sizes)).eval()
 
 
 def saved(kind: str, folder):
@@ -97,30 +83,20 @@ def test_pixels_are_those_of_the_image(tmp_path, views, monkeypatch) -> None:
     np.testing.assert_allclose(tracks.right_px, [expected, expected])
 
 
-def test_the_default_is_sift() -> None:
-    assert find_matcher("sift") is sparse_tracks
-
-
-@pytest.mark.parametrize("name", ["lightglue", "superglue", "no/such-matcher", "not a name!"])
-def test_weights_that_are_not_here(name, monkeypatch, tmp_path) -> None:
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(InputError, match=r"matcher must be 'sift'.*hf download"):
-        find_matcher(name)
-
-
-def test_folders_that_hold_no_matcher(tmp_path) -> None:
-    with pytest.raises(InputError, match="one of type None"):
-        find_matcher(str(tmp_path))
-    (tmp_path / "config.json").write_text('{"model_type": "efficientloftr"}')
-    with pytest.raises(InputError, match="lightglue or superglue"):
-        find_matcher(str(tmp_path))
-    points = '{"model_type": "lightglue", "keypoint_detector_config": {"model_type": "disk"}}'
-    (tmp_path / "config.json").write_text(points)
-    with pytest.raises(InputError, match="'disk'"):
-        find_matcher(str(tmp_path))
-    (tmp_path / "config.json").write_text('{"model_type": "lightglue"}')
-    with pytest.raises(InputError, match="safetensors"):
-        find_matcher(str(tmp_path))
+def test_folders_and_names_that_hold_no_matcher(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
+    for name in ("lightglue", "no/such-matcher", "not a name!"):
+        with pytest.raises(InputError, match=r"matcher must be 'sift'.*hf download"):
+            find_matcher(name)
+    for config, said in (
+        (None, "one of type None"),
+        ('{"model_type": "efficientloftr"}', "lightglue or superglue"),
+        ('{"model_type": "lightglue"}', "safetensors"),
+    ):
+        if config is not None:
+            (tmp_path / "config.json").write_text(config)
+        with pytest.raises(InputError, match=said):
+            find_matcher(str(tmp_path))
     (tmp_path / "model.safetensors").write_bytes(b"cut off")
     with pytest.raises(InputError, match="readable"):
         find_matcher(str(tmp_path))
@@ -132,9 +108,3 @@ def test_weights_of_another_architecture(tmp_path) -> None:
     (tmp_path / "config.json").write_text(json.dumps(config))
     with pytest.raises(InputError, match="missing"):
         find_matcher(str(tmp_path))
-
-
-def test_the_name_reaches_the_estimation(monkeypatch) -> None:
-    image = np.zeros((120, 160, 3), np.uint8)
-    with pytest.raises(InputError, match="matcher must be"):
-        estimate_rig([image, image], K=K, matcher="no/such")
