@@ -15,54 +15,38 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors see; at run time names are imported on first use
-    from geodiff_plugin._checks import InputError
-    from geodiff_plugin.bundled import load_bundled_prior
-    from geodiff_plugin.capture.capture import Capture
-    from geodiff_plugin.config import GuidanceConfig
-    from geodiff_plugin.formats.reading import read_calibration
-    from geodiff_plugin.guidance.guidance import GeometryGuidance
-    from geodiff_plugin.priors import PRIORS, load_prior
-    from geodiff_plugin.runtime.pipeline import (
-        GuidedMarigoldDepthPipeline,
-        disable_geometry_guidance,
-        enable_geometry_guidance,
-    )
-    from geodiff_plugin.types import MetricDepthOutput, Rig
+    from geodiff_plugin._checks import InputError as InputError
+    from geodiff_plugin.bundled import load_bundled_prior as load_bundled_prior
+    from geodiff_plugin.capture.capture import Capture as Capture
+    from geodiff_plugin.config import GuidanceConfig as GuidanceConfig
+    from geodiff_plugin.formats.reading import read_calibration as read_calibration
+    from geodiff_plugin.guidance.guidance import GeometryGuidance as GeometryGuidance
+    from geodiff_plugin.priors import PRIORS as PRIORS
+    from geodiff_plugin.priors import load_prior as load_prior
+    from geodiff_plugin.runtime.pipeline import GuidedMarigoldDepthPipeline as GuidedMarigoldDepthPipeline
+    from geodiff_plugin.runtime.pipeline import disable_geometry_guidance as disable_geometry_guidance
+    from geodiff_plugin.runtime.pipeline import enable_geometry_guidance as enable_geometry_guidance
+    from geodiff_plugin.types import MetricDepthOutput as MetricDepthOutput
+    from geodiff_plugin.types import Rig as Rig
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "PRIORS",
-    "Capture",
-    "GeometryGuidance",
-    "GuidanceConfig",
-    "GuidedMarigoldDepthPipeline",
-    "InputError",
-    "MetricDepthOutput",
-    "Rig",
-    "disable_geometry_guidance",
-    "enable_geometry_guidance",
-    "load_bundled_prior",
-    "load_prior",
-    "read_calibration",
-]
-
-#: Public name -> module, imported on first use so that ``import geodiff_plugin`` stays quick.
-_MODULE_OF = {
-    "Capture": "geodiff_plugin.capture.capture",
-    "GeometryGuidance": "geodiff_plugin.guidance.guidance",
-    "GuidanceConfig": "geodiff_plugin.config",
-    "GuidedMarigoldDepthPipeline": "geodiff_plugin.runtime.pipeline",
-    "InputError": "geodiff_plugin._checks",
-    "MetricDepthOutput": "geodiff_plugin.types",
-    "PRIORS": "geodiff_plugin.priors",
-    "Rig": "geodiff_plugin.types",
-    "disable_geometry_guidance": "geodiff_plugin.runtime.pipeline",
-    "enable_geometry_guidance": "geodiff_plugin.runtime.pipeline",
-    "load_bundled_prior": "geodiff_plugin.bundled",
-    "load_prior": "geodiff_plugin.priors",
-    "read_calibration": "geodiff_plugin.formats.reading",
+#: Module -> its public names, imported on first use so that ``import geodiff_plugin`` stays quick.
+_NAMES_OF = {
+    "_checks": "InputError",
+    "bundled": "load_bundled_prior",
+    "capture.capture": "Capture",
+    "config": "GuidanceConfig",
+    "formats.reading": "read_calibration",
+    "guidance.guidance": "GeometryGuidance",
+    "priors": "PRIORS load_prior",
+    "runtime.pipeline": "GuidedMarigoldDepthPipeline disable_geometry_guidance enable_geometry_guidance",
+    "types": "MetricDepthOutput Rig",
 }
+_MODULE_OF = {
+    name: f"geodiff_plugin.{module}" for module, names in _NAMES_OF.items() for name in names.split()
+}
+__all__ = sorted(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:

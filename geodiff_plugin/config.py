@@ -1,6 +1,6 @@
 """Every number and switch of the guidance: one flat, frozen configuration, and its presets.
 
-S5.1 and Algorithm 1 name some of them; docs/reference/knobs.md, which is made from this module, says which.
+docs/reference/knobs.md, which is made from this module, says which of them S5.1 and Algorithm 1 name.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import difflib
 import inspect
 import json
 import re
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from pathlib import Path
@@ -128,10 +127,9 @@ def _weights(default: Mapping[str, float]) -> Any:
 
 
 class UpdatePlan(NamedTuple):
-    """Gradient updates of a call, with automatic choices resolved.
+    """Gradient updates of a call: so many in each denoising step that makes any, with this step size.
 
-    ``inner_steps`` in each denoising step that makes any; none in steps that end by the fraction
-    ``updates_from`` of the schedule; ``step_latents`` is the step size of the rule.
+    Steps that end by the fraction ``updates_from`` of the schedule make none.
     """
 
     inner_steps: int
@@ -195,8 +193,8 @@ class GuidanceConfig:
         outlier_width: a match that differs from those of its region by more than this many standard
             deviations counts for less.
         rule: how a gradient moves the latent, scale and shift: `plain`; `summed`, plain, but the latent
-            follows the sum of the loss over its pixels; `adam`; `norm`, a share of the predicted noise;
-            `adam-norm`, Adam on the gradient scaled to the noise's norm (Marigold-DC).
+            follows the sum of the loss over its pixels; `adam`; `adam-norm`, Adam on the gradient scaled to
+            the noise's norm (Marigold-DC).
         step_latents: step size of `rule` on the latent.
         step_affine: step size of `rule` on raw s_hat, t_hat.
         inner_steps: updates in each denoising step that makes any: all, or after a correction those of the
@@ -280,43 +278,15 @@ class GuidanceConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by knob; inverse of ``from_dict``."""
-        return {name: _plain(getattr(self, name)) for name in KNOBS}
+        values = {name: getattr(self, name) for name in KNOBS}
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()} | {
+            "weights": dict(self.weights)
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """What ``to_dict`` gave, or the nested form of former versions; what is missing is as in the default.
-
-        Raises:
-            InputError: a name that does not exist, or a value that it cannot have.
-
-        Warns:
-            UserWarning: names of former versions whose values differ from the constants that replaced them.
-        """
-        flat: dict[str, Any] = {}
-        for name, value in _mapping(values, "the configuration").items():
-            if name in FORMER_STAGES and not (name in KNOBS and isinstance(value, str)):
-                flat |= _mapping(value, name)
-            else:
-                flat[name] = value
-        if "refine" in flat:  # what is now the first half of ``crisp``
-            refine = check_flag(flat.pop("refine"), "refine")
-            flat["crisp"] = flat.get("crisp", True) if refine else False
-        for name in flat:
-            if name not in KNOBS and name not in FORMER:
-                bad_value("a name in the configuration", "a knob", repr(name), close_names(name, KNOBS))
-        config = cls().changed(**{name: value for name, value in flat.items() if name in KNOBS})
-        plans = [config.plan_updates(given).updates_from for given in (False, True)]
-        same: dict[str, list[Any]] = {"affine_rule": [config.rule], "updates_from": [None, *plans]}
-        dropped = [
-            f"{name}={value}"
-            for name, value in flat.items()
-            if name in FORMER and _plain(value) not in same.get(name, [_plain(FORMER[name])])
-        ]
-        if dropped:
-            names = ", ".join(dropped)
-            said = f"The configuration sets numbers that are fixed now, and are left out: {names}."
-            warnings.warn(said, stacklevel=2)
-        return config
+        """What ``to_dict`` gave; what is missing is as in the default. ``InputError`` as ``changed``."""
+        return cls().changed(**_mapping(values, "the configuration"))
 
     def save(self, path: str | Path) -> None:
         """Write a JSON file."""
@@ -324,7 +294,7 @@ class GuidanceConfig:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what ``save`` wrote, also in former versions; ``InputError`` as ``from_dict``."""
+        """Read what ``save`` wrote; ``InputError`` as ``from_dict``."""
         try:
             values = json.loads(Path(path).read_text(encoding="utf-8"))
         except ValueError as error:
@@ -334,41 +304,6 @@ class GuidanceConfig:
 
 #: All knobs, in the order of the tables.
 KNOBS = tuple(described.name for described in fields(GuidanceConfig))
-#: Stages of the nested configurations of former versions.
-FORMER_STAGES = ("terms", "sweep", "matching", "search", "fit", "reflections", "correction", "updates")
-#: Numbers that were knobs in former versions, with the values that they are fixed at now.
-FORMER: dict[str, Any] = {
-    **{"exposure_gain": (0.2, 5.0), "exposure_rows": 4, "exposure_columns": 5, "exposure_prior": 0.2},
-    **{"matches_cauchy": 5.0, "points_cauchy": 5.0, "anchor_floor": 0.05, "options": {}},
-    **{
-        "plane_step_px": 0.75,
-        "sweep_side": 828,
-        "loss_resolution": 640,
-        "pilot_pixels": 20_000,
-        "pilot_planes": 160,
-    },
-    **{"pilot_step_px": 1.0, "pilot_shift": 0.4, "pilot_sure": 0.8, "pilot_quantile": 0.995},
-    **{"pilot_least_sure": 0.03, "headroom": 1.25, "least_shift": 0.03},
-    **{"step_penalty": 0.15, "jump_penalty": 1.2, "jump_contrast": 0.1, "agreement_planes": 1.5},
-    **{"contrast_reach": 15, "least_contrast": 0.03},
-    **{"cost_clamp": 0.35, "search_samples": 6000, "coarse_samples": 1500, "coarse_grid": 48},
-    **{"fine_grid": 13, "keep_margin": 2e-3, "min_in_view_rectified": 0.6, "min_in_view_posed": 0.25},
-    **{"basin_candidates": 48, "basin_reach": 4.0, "basin_samples": 1500, "basin_cauchy": 32.0},
-    **{"basin_keep": 1.05, "sure_confidence": 0.5, "min_sure": 50, "fit_iterations": 12},
-    **{"fit_samples": 20_000, "fit_noise": 0.5, "fit_floor": 4e-3, "fit_cauchy": 2.0},
-    **{"fit_near_reach": 1.4, "fit_far_reach": 0.7},
-    **{"reflection_region": 0.08, "reflection_spreads": 2.0, "reflection_floor": 0.2},
-    **{"reflection_least_spread": 0.05, "reflection_gone": 1.6, "reflection_limit": 1.5},
-    **{"reflection_sure": 0.3},
-    **{"correction_scale": 1.0, "ramp_step": 0.02, "ramp_contrast": 2.0, "ramp_slope": 0.04},
-    **{"sharpen_colour": 0.12, "sharpen_reach": 1.5, "correction_cauchy": 2.5, "stiffness_power": 4.0},
-    **{"loosest": 0.03, "stiffest": 100.0, "inertia": 0.015, "least_inertia": 5e-4, "most_inertia": 0.03},
-    **{"broad_smoothness": 50.0, "broad_inertia": 1e-4, "passes": 3, "stiff_smoothness": 400.0},
-    **{"stiff_inertia": 1.3e-3, "block": 0.08, "least_error": 0.01, "most_error": 0.5},
-    **{"image_edge": 0.1, "depth_edge": 0.1, "edge_reach": 0.006, "edge_step": 0.3, "edge_error": 0.11},
-    **{"least_link": 1e-3, "reweightings": 3, "solver_steps": 12},
-    **{"affine_rule": "adam", "updates_from": None, "sharpen": True},
-}
 
 DEFAULT = GuidanceConfig()
 
@@ -440,17 +375,11 @@ def close_names(name: str, names: Iterable[str]) -> str:
     return f"{hint}There are: {', '.join(names)}."
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return dict(value)
-    return list(value) if isinstance(value, tuple) else value
-
-
 def config_from_text(entries: Iterable[str], base: GuidanceConfig, name: str) -> GuidanceConfig:
-    """``base`` with knobs set otherwise, as they are written on a command line, by the option ``name``.
+    """``base`` with knobs set otherwise, ``KNOB=VALUE`` each, as typed behind the option ``name``.
 
-    ``KNOB=VALUE`` each, where a value is JSON, or text where it is none; ``weights.TERM=VALUE`` changes one
-    weight. ``InputError`` for another form, a knob that does not exist, a value that it cannot have.
+    A value is JSON, or text where it is none; ``weights.TERM=VALUE`` changes one weight. ``InputError`` for
+    another form, a knob that does not exist, a value that it cannot have.
     """
     changes: dict[str, Any] = {}
     for entry in entries:

@@ -27,7 +27,7 @@ NEAREST_M = 1e-4
 # Where such a point is put: finite, and outside of any image.
 _BEHIND_PX = -1e6
 # Rounding of float32 at image edges: the last pixel centre itself must count as inside.
-_EDGE_PX = 1e-2
+EDGE_PX = 1e-2
 
 
 def image_size(image: Tensor) -> tuple[int, int]:
@@ -220,8 +220,8 @@ def sample_at(image: Tensor, uv: Tensor, *, mode: str = "bilinear") -> Tensor:
 def _inside(uv: Tensor, z: Tensor, size: tuple[int, int]) -> Tensor:
     """``(B, 1, H, W)`` bool: in front of the camera and within the pixel centres of an image of ``size``."""
     u, v = uv[..., 0], uv[..., 1]
-    in_columns = (u >= -_EDGE_PX) & (u <= size[1] - 1 + _EDGE_PX)
-    in_rows = (v >= -_EDGE_PX) & (v <= size[0] - 1 + _EDGE_PX)
+    in_columns = (u >= -EDGE_PX) & (u <= size[1] - 1 + EDGE_PX)
+    in_rows = (v >= -EDGE_PX) & (v <= size[0] - 1 + EDGE_PX)
     return (in_columns & in_rows & (z > NEAREST_M))[:, None]
 
 

@@ -1,4 +1,4 @@
-"""Records shared by all layers: ``Rig``, ``CameraView``, reports, and ``MetricDepthOutput``."""
+"""Records shared by all layers."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from diffusers.utils import BaseOutput
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
-    """Lens distortion of one camera.
+    """Lens distortion of one camera: ``coefficients`` in OpenCV's order.
 
-    ``model`` is ``"opencv"`` (k1, k2, p1, p2, k3 and so on) or ``"fisheye"`` (k1 to k4), ``coefficients`` are
-    in OpenCV's order.
+    ``model`` is ``"opencv"`` (k1, k2, p1, p2, k3 and so on) or ``"fisheye"`` (k1 to k4).
     """
 
     model: str
@@ -77,8 +76,8 @@ class PoseReport:
         residual_px: the same with the poses, and images, as used.
         matches: number of matches of each right view.
         straightened_px: root mean square displacement applied to the right images; 0 for none.
-        scale_spread: relative standard deviation of the scale of refined poses, and with it of the depth;
-            ``None`` where the length of the baseline is measured, and where the poses are used as given.
+        scale_spread: relative standard deviation of the scale of refined poses; ``None`` where the length of
+            the baseline is measured, and where the poses are used as given.
         warnings: sentences for the user.
     """
 
@@ -94,12 +93,10 @@ class PoseReport:
 
 
 class CameraView(NamedTuple):
-    """An image beside the left one, and its camera.
+    """An image ``(C, H, W)`` float32 in [0, 1] beside the left one, C = 3, or 1 for grey, and its camera.
 
-    Attributes:
-        image_01: ``(C, H, W)`` float32 in [0, 1], C = 3, or 1 for grey.
-        K: ``(3, 3)`` float32, pixels of this image.
-        T_right_from_left: ``(4, 4)`` float32, metres; maps points of the left camera's frame to this one's.
+    ``K (3, 3)`` is in pixels of this image; ``T_right_from_left (4, 4)``, metres, maps points of the left
+    camera's frame to this one's.
     """
 
     image_01: torch.Tensor
@@ -117,7 +114,7 @@ class StepReport:
         loss: ``(B,)`` total loss at the start of the step's updates.
         terms: ``(B,)`` unweighted value of every term, by name.
         s_hat: ``(B,)`` raw scale before softplus, after the step.
-        t_hat: ``(B,)`` raw shift before softplus, after the step.
+        t_hat: ``(B,)`` raw shift likewise.
         g_s: ``(B,)`` global scale in use, metres.
         visible_fraction: ``(B,)`` share of the pixels that a right view sees; 0 without one.
     """
@@ -136,49 +133,44 @@ class StepReport:
 class MetricDepthOutput(BaseOutput):
     """Metric depth with confidence, diagnostics and warnings.
 
-    ``N`` images, ``E`` ensemble members, ``H W`` the resolution of the input image (or of the
-    processing grid with ``match_input_resolution=False``).
+    ``N`` images, ``E`` ensemble members, ``H W`` the resolution of the input image (or of the processing grid
+    with ``match_input_resolution=False``). Maps are shaped as ``prediction`` unless said otherwise.
 
     Attributes:
         prediction: metres; ``(N, H, W, 1)`` numpy or ``(N, 1, H, W)`` torch, as ``output_type`` says.
-        uncertainty: metres, median absolute deviation of the ensemble members from ``prediction``, each
-            refined like it; shaped as ``prediction``. ``None`` without ``output_uncertainty=True``, or with
-            fewer than two members.
+        uncertainty: metres, median absolute deviation of the ensemble members, each refined like
+            ``prediction``, from it; ``None`` without ``output_uncertainty=True``, or with fewer than two
+            members.
         latent: ``(N * E, 4, h, w)`` final latents, with ``output_latent=True``.
-        relative: median unclipped relative depth, about [0, 1], shaped as ``prediction``.
+        relative: median unclipped relative depth, about [0, 1].
         space: what the prior's relative map is affine in, a key of ``SPACES``, as ``"depth"``.
         scale: ``(N, E)`` softplus of the learnt scale.
         shift: ``(N, E)`` softplus of the learnt shift.
         global_scale: ``(N, E)`` metres, the pre-selected g_s of Eq. 16.
-        own_scale: ``(N, E)`` for a metric prior, the factor from its metres to the result, median over the
-            pixels; ``None`` for a relative prior.
-        visible: boolean, in front of a right camera and inside its image, shaped as ``prediction``; ``None``
-            without a right view.
+        own_scale: ``(N, E)`` median factor from a metric prior's metres to the result; ``None`` for a
+            relative one.
+        visible: boolean, in front of a right camera and inside its image; ``None`` without a right view.
         photometric_error: [0, 1] mean absolute difference between the left image and the right view, warped,
             that matches the pixel best; 0 where not visible; ``None`` without a right view.
-        confidence: [0, 1] probability that the depth is within 10 % of the truth, shaped as ``prediction``;
-            from support, photometric error, ``prior_error`` and, if there is an ensemble, uncertainty.
-            ``None`` without ``crisp``, or without matches and points.
+        confidence: [0, 1] probability that the depth is within 10 % of the truth, from support, photometric
+            error, ``prior_error`` and, if there is an ensemble, uncertainty; ``None`` without ``crisp``, or
+            without matches and points.
         support: [0, 1] how much matches and points, at the pixel or nearby on the same surface, determine the
-            depth; shaped as ``prediction``. ``None`` where ``confidence`` is.
+            depth; ``None`` where ``confidence`` is.
         prior_error: ``(N,)`` error of the prior alone, standard deviation in log depth, estimated from
             left-out matches or points; ``None`` where none were compared.
         K: ``(N, 3, 3)`` intrinsics of the output grid, pixels.
         history: one ``StepReport`` per guided step and batch chunk.
         poses: one ``PoseReport`` per image with right views.
-        extras: further maps of the prior by name (GeoWizard's ``"normals"``), shaped as ``prediction`` except
-            for the channels.
-        verdicts: one ``runtime.verdict.Verdict`` per image: whether the depth can be trusted, and why
-            not.
+        extras: further maps of the prior by name (GeoWizard's ``"normals"``), but for their channels.
+        verdicts: one ``runtime.verdict.Verdict`` per image: whether the depth can be trusted, and why not.
         unit: ``"m"``, or ``None`` if no length is known; lengths are then in the unit of the given poses, or
             in units of the first baseline where poses were estimated.
         scale_from: source of the scale of estimated poses: ``"baseline"``, ``"known length"``, ``"points"``,
             ``"prior"`` or ``"none"``; ``None`` for given poses, but ``"prior"`` where they had no unit.
         scale_spread: relative spread of that scale over matches or the prior's map; ``None`` if unknown.
-        rescaled: factor from the lengths of ``GeometryGuidance`` to metres, if only the prior knows the unit;
-            else 1.
-        warnings: sentences for the user about this result, including those of the verdicts and those that
-            the guidance gave when it was made.
+        rescaled: factor from the lengths of ``GeometryGuidance`` to metres, if only the prior knows the unit.
+        warnings: sentences for the user about this result, and those that the guidance gave when it was made.
         assumed: sentences on what nobody gave, such as the right camera's principal point.
     """
 

@@ -22,30 +22,36 @@ REFERENCE_SIDE = 512.0
 REFERENCE_ERROR, STIFFNESS_POWER = 0.05, 4.0
 #: Bounds of the smoothness, however wrong or right the prior is.
 LOOSEST, STIFFEST = 0.03, 100.0
-#: Weight of the correction itself, so that what is far from every match keeps its depth, and its bounds.
-INERTIA, LEAST_INERTIA, MOST_INERTIA = 0.015, 5e-4, 0.03
-#: Passes of a fit, in even ratios from this smoothness to the prior's own, and the least inertia of the
-#: first: it corrects whole regions, with the pixels far from every match.
-PASSES, BROAD_SMOOTHNESS, BROAD_INERTIA = 3, 50.0, 1e-4
+#: Weight of the correction itself, so that what is far from every match keeps its depth.
+INERTIA = 0.015
+#: Its bounds in the last pass.
+LEAST_INERTIA, MOST_INERTIA = 5e-4, 0.03
+#: Passes of a fit, in even ratios from a broad smoothness to the prior's own.
+PASSES = 3
+#: Smoothness and least inertia of the first: it corrects whole regions, far from any match too.
+BROAD_SMOOTHNESS, BROAD_INERTIA = 50.0, 1e-4
 #: Smoothness, and inertia as a share of it, of the fit that measures the prior and finds outliers.
 STIFF_SMOOTHNESS, STIFF_INERTIA = 400.0, 1.3e-3
 #: Robustly reweighted solves, and conjugate-gradient steps of each on every level of its pyramid.
 REWEIGHTINGS, SOLVER_STEPS = 3, 12
 #: Residual, in standard deviations of a match, from which it counts for less.
-CAUCHY = 2.5
-#: Side of the blocks of matches left out to measure the prior, in image sides, and bounds of the error that
-#: is assumed of it, in log depth.
-BLOCK, LEAST_ERROR, MOST_ERROR = 0.08, 0.01, 0.5
-#: Steps in brightness and in log depth across which a correction does not spread, and the share of the
-#: smoothness that remains across any edge.
-IMAGE_EDGE, DEPTH_EDGE, LEAST_LINK = 0.1, 0.1, 1e-3
-#: Matches this close to a depth edge have less weight, a share of the longer side; half of it beside this
-#: step in log depth, which grows with the third power of an error of the prior above the last number: such a
-#: prior does not know where edges are.
-EDGE_REACH, EDGE_STEP, EDGE_ERROR = 0.006, 0.3, 0.11
+RESIDUAL_CAUCHY = 2.5
+#: Side of the blocks of matches left out to measure the prior, in image sides.
+BLOCK = 0.08
+#: Bounds of the error that is assumed of a prior, in log depth.
+LEAST_ERROR, MOST_ERROR = 0.01, 0.5
+#: Steps in brightness and in log depth across which a correction does not spread.
+IMAGE_EDGE, DEPTH_EDGE = 0.1, 0.1
+#: Share of the smoothness that remains across any edge.
+LEAST_LINK = 1e-3
+#: Smoothness and least inertia of the first: it corrects whole regions, far from any match too.
+#: log depth.
+EDGE_REACH, EDGE_STEP = 0.006, 0.3
+#: The step grows with the third power of an error of the prior above this: it does not know where edges are.
+EDGE_ERROR = 0.11
 #: Share of the right matches' residuals by which the prior is measured, and the normal distribution's
 #: quantile of their size there: the median would not see that a fifth of the scene is on a wrong surface.
-SHARE, DEVIATIONS = 0.8, 1.2816
+SHARE, NORMAL_QUANTILE = 0.8, 1.2816
 
 
 class _Observations(NamedTuple):
@@ -191,7 +197,7 @@ def _spread(residual: Tensor, observed: _Observations) -> Tensor:
     weight = observed.weight.flatten(1)
     largest = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.right_share)
     noise = weighted_quantile(observed.noise.flatten(1), weight, 0.5)
-    beyond = ((largest / DEVIATIONS) ** 2 - noise**2 / 4.0).clamp_min(0.0).sqrt() * (weight.sum(1) > 0)
+    beyond = ((largest / NORMAL_QUANTILE) ** 2 - noise**2 / 4.0).clamp_min(0.0).sqrt() * (weight.sum(1) > 0)
     return beyond.view(-1, 1, 1, 1)
 
 
@@ -251,7 +257,7 @@ def refine_depth(
     trusted = observed.weight * _robust(broad - observed.residual, observed.noise, error, config)
 
     def robust(left_over: Tensor) -> Tensor:
-        return trusted / (1.0 + (left_over / (CAUCHY * observed.noise)) ** 2)
+        return trusted / (1.0 + (left_over / (RESIDUAL_CAUCHY * observed.noise)) ** 2)
 
     total, weights = torch.zeros_like(observed.residual), trusted
     decided = torch.zeros_like(total)

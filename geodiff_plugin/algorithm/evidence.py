@@ -42,7 +42,7 @@ class Evidence:
         matches: aggregated, left-right checked, or ``None`` where no term asks.
         points: depths that the user knows, in the form of matches, or ``None``.
         reliable: ``matches`` as points for the search, where enough are reliable; else ``None``.
-        native: the further views as everything downstream sees them, at their native sizes.
+        native_views: the further views as everything downstream sees them, at their native sizes.
         pose: how their poses fit; ``None`` where only points are known.
         warnings: sentences for the user.
     """
@@ -55,7 +55,7 @@ class Evidence:
     matches: Matches | None
     points: Matches | None = None
     reliable: Matches | None = None
-    native: tuple[CameraView, ...] = ()
+    native_views: tuple[CameraView, ...] = ()
     pose: PoseReport | None = None
     warnings: tuple[str, ...] = ()
 

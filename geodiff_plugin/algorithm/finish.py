@@ -25,17 +25,19 @@ from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.scale.points import weighted_quantile
 from geodiff_plugin.types import CameraView
 
-__all__ = ["sharpen_edges", "vote_depth", "weighted_median"]
-
 #: Samples of a window to each side of its centre.
 HALF = 2
 #: Difference in brightness at which a neighbour's weight falls to a third; a Gaussian over the window, in
 #: samples, does the rest.
 BRIGHTNESS, REACH = 0.1, 1.5
-#: Where the surfaces beside a ramp are looked for, in pixels of the prior's grid; the least relative step in
-#: inverse depth from a pixel on a ramp to each of two opposite neighbours; how many times steeper than the
-#: surfaces on both sides it must be there; the slope in log depth at which a neighbour counts half.
-BESIDE, STEP, STEEPER, SLOPE = 3, 0.02, 2.0, 0.04
+#: Where the surfaces beside a ramp are looked for, in pixels of the prior's grid.
+BESIDE = 3
+#: The least relative step in inverse depth from a pixel on a ramp to each of two opposite neighbours.
+STEP = 0.02
+#: How many times steeper than the surfaces on both sides a ramp must be.
+STEEPER = 2.0
+#: The slope in log depth at which a neighbour of a ramp counts half.
+SLOPE = 0.04
 #: Difference in brightness at which a neighbour's weight falls to a third, at ramps.
 RAMP_BRIGHTNESS = 0.12
 #: Two opposite neighbours: across, down, and both diagonals.
@@ -50,11 +52,11 @@ SPACING = 4
 #: Weight of a match of rows, and of the farther surface beside a gap, against a sure match of the sweep.
 ROWS, FILLED = 1.5, 0.5
 #: Vote of the map itself, as a share of a window full of sure matches, for a prior whose measured error is
-#: ``WEAK`` or more. It grows as the cube of a smaller one: a good prior knows where edges are.
-MAP_VOTE, WEAK = 0.03, 0.2
+#: ``WEAK_PRIOR`` or more. It grows as the cube of a smaller one: a good prior knows where edges are.
+MAP_VOTE, WEAK_PRIOR = 0.03, 0.2
 #: A match counts for a quarter where it differs from the map by this many errors of the prior; a larger error
 #: than the second number counts as that.
-DIFFERS, MOST_ERROR = 2.0, 0.1
+DIFFERS, ERROR_OF_VOTES = 2.0, 0.1
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
 #: Side of the last median, over pixels of the grid of the votes.
@@ -183,14 +185,16 @@ def vote_depth(
     px = (K[0, 0] * view.T_right_from_left[0, 3]).abs()  # shift of a depth of 1 m
     shift = px / small_m
     nearest = torch.maximum(inverse_depth.amax(), 1.0 / small_m.amin()) * px
-    rows = match_rows(left[0], CameraView(right[0], K_right, view.T_right_from_left), K, float(nearest))
+    of_rows, matched, filled = match_rows(
+        left[0], CameraView(right[0], K_right, view.T_right_from_left), K, float(nearest)
+    )
     error = error.flatten()[0].clamp_min(1e-3)
     # The confidence of a known point is a count.
     votes = (
-        _weigh_votes(rows.shift, ROWS * rows.matched + FILLED * rows.filled, shift, error),
+        _weigh_votes(of_rows, ROWS * matched + FILLED * filled, shift, error),
         _weigh_votes(px * inverse_depth, confidence.clamp(0.0, 1.0), shift, error),
     )
-    map_vote = MAP_VOTE * (WEAK / error).clamp_min(1.0) ** 3
+    map_vote = MAP_VOTE * (WEAK_PRIOR / error).clamp_min(1.0) ** 3
     voted = _vote_in_windows(votes, left[0], shift, map_vote)
     # Without ragged borders; a map that outvotes a window full of matches has none, and a known point stays.
     smooth = torch.from_numpy(cv2.medianBlur(np.ascontiguousarray(voted.cpu().numpy()), MEDIAN))
@@ -213,7 +217,7 @@ def _resized(image_01: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _weigh_votes(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
     """Votes ``(H, W)`` and their weights, lower where they differ from the map by more than the error."""
-    noise = error.clamp_max(MOST_ERROR) ** 2 + 1.0 / shift**2  # of the map, and of a match: a pixel
+    noise = error.clamp_max(ERROR_OF_VOTES) ** 2 + 1.0 / shift**2  # of the map, and of a match: a pixel
     apart = (votes.clamp_min(0.1) / shift).log() ** 2 / (DIFFERS**2 * noise)
     return votes, weight / (1.0 + apart) ** 2
 

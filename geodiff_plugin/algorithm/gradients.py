@@ -84,18 +84,6 @@ class Plain:
         return -self.rate * gradient
 
 
-class NormMatched:
-    """``-rate * gradient * |reference| / |gradient|`` per sample: a fixed share of the predicted noise."""
-
-    def __init__(self, rate: float) -> None:
-        self.rate = rate
-
-    def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
-        """As ``Rule``; without ``reference`` the step has length 1. A zero gradient gives a zero step."""
-        length = _per_sample_norm(reference) if reference is not None else 1.0
-        return -self.rate * gradient * (length / _per_sample_norm(gradient).clamp_min(1e-12))
-
-
 class Adam:
     """Adam with bias correction, element-wise, so that samples of a batch do not see each other.
 
@@ -128,6 +116,5 @@ RULES: dict[str, Callable[[float], Rule]] = {
     "plain": Plain,
     SUMMED: Plain,
     "adam": Adam,
-    "norm": NormMatched,
     "adam-norm": partial(Adam, betas=(0.9, 0.999), eps=1e-8, to_norm=True),
 }

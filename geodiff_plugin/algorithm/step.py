@@ -22,7 +22,7 @@ class Estimate(Protocol):
 
     Attributes:
         latent: ``(B, C, h, w)`` float32, what guidance moves: z_t ("full") or z0_hat ("denoised").
-        eps: ``(B, C, h, w)`` the predicted noise, the yardstick of the norm-matched rule.
+        eps: ``(B, C, h, w)`` the predicted noise, the yardstick of the rule ``adam-norm``.
         latent_is_read: whether anyone reads the latent after this step; the last map itself is the result.
     """
 

@@ -41,10 +41,7 @@ def pose_views(
     unit: str | None = "m",
     measured: bool = False,
 ) -> tuple[tuple[CameraView, ...], PoseReport]:
-    """The right views with the poses of the knob ``pose``, and the report on them.
-
-    ``left_01`` has its native size; other arguments as for ``refine_views``.
-    """
+    """The right views with the poses of the knob ``pose``, and the report; arguments as ``refine_views``."""
     if config.pose == "given":
         return untouched(rights)
 
@@ -55,10 +52,7 @@ def pose_views(
 
 
 def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> Tensor:
-    """A rough, smooth depth without holes, ``(1, 1, h, w)`` metres: a coarse sweep, its matches spread.
-
-    ``left_01 (3, H, W)`` in [0, 1] with its ``K_left (3, 3)``, and right views with poses that fit roughly.
-    """
+    """A rough, smooth depth without holes, ``(1, 1, h, w)`` metres: a coarse sweep, its matches spread."""
     matches = match_volume(pilot_volume(left_01, rights, K_left))
     weight = matches.confidence[None] ** 2 + 1e-9
     values = matches.inverse_depth[None] * weight
@@ -76,12 +70,8 @@ def make_evidence(
 ) -> Evidence:
     """Clean the photographs, refine the poses, and prepare the ``Evidence`` of one left image.
 
-    Args:
-        left_01: ``(3, H, W)`` float32 in [0, 1], native size, on the device to compute on.
-        given: its right views, their cameras, and points.
-        config: hyperparameters.
-        needs_matches: whether the volume is aggregated and checked against each view.
-        measured: whether the lengths of the baselines are measured.
+    ``left_01 (3, H, W)`` float32 in [0, 1] has its native size; ``needs_matches`` is whether the volume is
+    aggregated and checked against each view, ``measured`` whether the baselines' lengths are measured.
     """
     views, K_left, points = given.on(left_01.device)
     if not views:

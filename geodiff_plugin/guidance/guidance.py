@@ -1,14 +1,10 @@
-"""``GeometryGuidance``: right views, cameras, points and hyperparameters, as the user gives them.
-
-S3.3, S4.2, S5.1; ``preset="paper"`` is Algorithm 1 with its printed numbers.
-"""
+"""``GeometryGuidance``: right views, cameras, points and hyperparameters, as the user gives them (S3.3)."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast
+from typing import Any, Self
 
 import numpy as np
 from torch import Tensor
@@ -35,20 +31,6 @@ SAME_CENTRE = (
 )
 #: Cosine of the angle below which two cameras count as parallel.
 PARALLEL = 0.9999
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def _remembers_warnings(make: F) -> F:
-    """Let a constructor also remember the warnings given before it calls ``__init__``."""
-
-    @functools.wraps(make)
-    def made(*args: Any, **kwargs: Any) -> Any:
-        with noted() as warned:
-            guidance = make(*args, **kwargs)
-        guidance.warned = warned
-        return guidance
-
-    return cast(F, made)
 
 
 class GeometryGuidance:
@@ -65,8 +47,8 @@ class GeometryGuidance:
             of images for several further views; ``None`` with ``points`` alone.
         K: ``(3, 3)`` intrinsics in pixels of the image they belong to; one matrix for all views, or a tuple
             ``(K_left, K_right, ...)``.
-        E: ``(4, 4)`` pose of the right camera in the left camera's frame, metres; or a tuple
-            ``(E_left, E_right, ...)`` of camera-to-world poses; ``None`` without a right view.
+        E: ``(4, 4)`` pose of the right camera in the left camera's frame, metres; or a tuple ``(E_left,
+            E_right, ...)`` of camera-to-world poses; ``None`` without a right view.
         points: known depths, metres: a sparse map ``(H, W)`` of the left image's size (0, NaN and infinity
             mean unknown), or ``(N, 3)`` points in the left camera's frame; floats.
         points_confidence: of the points in [0, 1], ``(H, W)`` or ``(N,)``; ``None`` takes all as measured. A
@@ -83,19 +65,17 @@ class GeometryGuidance:
         preset: hyperparameters by name: ``"default"``, ``"paper"``, ``"marigold-dc"``, ``"search-only"`` or
             ``"prior-fit"``.
         config: hyperparameters in place of a preset.
-        **knobs: hyperparameters to change in them, such as ``inner_steps=10``;
-            docs/reference/knobs.md and ``geodiff info --knobs`` list them.
+        **knobs: hyperparameters to change in them, such as ``inner_steps=10``; docs/reference/knobs.md and
+            ``geodiff info --knobs`` list them.
 
     Attributes:
         inputs: the checked input, one entry per left image.
         config: the hyperparameters as given; ``None`` where they are chosen automatically.
-        unit: as the argument.
         evidence_store: cache of cost volumes and matches for further calls with the same images, cameras and
             settings; ``None``, the default, for no cache.
+        estimated: cameras estimated by ``from_photographs``; ``None`` where poses were given.
         warned: every warning of the construction, and whether a result with it is not to be trusted.
         assumed: sentences on what nobody gave.
-        previous: as the argument; it may be set before every call.
-        measured_baseline: likewise.
 
     Raises:
         InputError: an argument of the wrong type, rank, size or range, or a pose that is not rigid. It is a
@@ -153,23 +133,22 @@ class GeometryGuidance:
         _check_sufficient(self.config, self.updates, views=bool(self.rights), points=has_points)
 
     @classmethod
-    def from_baseline(cls, right: Any, K: Any, baseline_m: float, K_right: Any = None, **knobs: Any) -> Self:
-        """A rectified rig: the right camera is ``baseline_m`` metres to the right, with parallel axes.
+    def from_baseline(
+        cls, right: Any, K: Any, baseline_m: float, K_right: Any = None, **arguments: Any
+    ) -> Self:
+        """A rectified rig: the right camera is ``baseline_m`` metres to the right, left if negative.
 
-        Args:
-            right: as in the constructor.
-            K: ``(3, 3)`` intrinsics of the left image, pixels.
-            baseline_m: metres; negative if the "right" camera is on the left.
-            K_right: ``(3, 3)`` of the right image; ``None`` if it is the same.
-            **knobs: further arguments of the constructor.
+        ``K (3, 3)`` is the left image's, and the right one's without ``K_right``; ``right`` and further
+        arguments are as in the constructor.
         """
         check_number(baseline_m, "baseline_m", -1e6, 1e6)
         E = np.eye(4)
         E[0, 3] = baseline_m
-        return cls(right, K if K_right is None else (K, K_right), E, **{"measured_baseline": True} | knobs)
+        return cls(
+            right, K if K_right is None else (K, K_right), E, **{"measured_baseline": True} | arguments
+        )
 
     @classmethod
-    @_remembers_warnings
     def from_calibration(
         cls,
         right: Any,
@@ -178,7 +157,7 @@ class GeometryGuidance:
         *,
         image_names: tuple[str, str] | None = None,
         baseline_m: float | None = None,
-        **knobs: Any,
+        **arguments: Any,
     ) -> Self:
         """Read K and E from a calibration file, or from one file per view; the format is recognised.
 
@@ -188,18 +167,22 @@ class GeometryGuidance:
             cameras: (left, right) numbers, for a file with more than two cameras, such as KITTI's.
             image_names: names of both images in a COLMAP model or a transforms.json.
             baseline_m: measured distance between the cameras in metres; replaces that of the file.
-            **knobs: further arguments of the constructor.
+            **arguments: further arguments of the constructor.
 
         Raises:
             InputError: also for images whose size is not that of the calibration; the left one is checked
                 when the pipeline is called.
         """
-        size = knobs.get("left_size")
-        if size is None and right is not None and not isinstance(right, (list, tuple)):
-            size = picture_size(right, "right")  # the two cameras of a rig have one resolution
-        rig = read_calibration(path, cameras, image_names=image_names, image_size=size, baseline_m=baseline_m)
-        defaults = {"left_size": rig.size_left, "unit": rig.unit, "measured_baseline": rig.measured}
-        guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **defaults | knobs)
+        size = arguments.get("left_size")
+        with noted() as warned:
+            if size is None and right is not None and not isinstance(right, (list, tuple)):
+                size = picture_size(right, "right")  # the two cameras of a rig have one resolution
+            rig = read_calibration(
+                path, cameras, image_names=image_names, image_size=size, baseline_m=baseline_m
+            )
+            defaults = {"left_size": rig.size_left, "unit": rig.unit, "measured_baseline": rig.measured}
+            guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **defaults | arguments)
+        guidance.warned = warned
         for image in guidance.rights:
             size = (image.shape[-1], image.shape[-2])
             cure = "Scale K with the images, or use these."
@@ -207,35 +190,32 @@ class GeometryGuidance:
         return guidance
 
     @classmethod
-    @_remembers_warnings
-    def from_views(cls, views: Sequence[tuple[Any, Any, Any]], **knobs: Any) -> Self:
+    def from_views(cls, views: Sequence[tuple[Any, Any, Any]], **arguments: Any) -> Self:
         """Two or more posed views of one scene, the left (reference) view first.
 
         Args:
-            views: ``(image, K, E)`` each, with ``E`` a camera-to-world pose in metres, all in one frame. The
-                first image is the one that the pipeline is called with. Only its size is used here, and it
-                may be ``None``.
-            **knobs: further arguments of the constructor.
+            views: ``(image, K, E)`` each, with ``E`` a camera-to-world pose in metres, all in one frame. Of
+                the first image, which the pipeline is called with, only the size is used; it may be ``None``.
+            **arguments: further arguments of the constructor.
 
         Convention:
             If the first pose is the identity, the others are poses in the left camera's frame.
         """
-        left_size, images, Ks, Es = split_views(views, cropped=knobs.get("cropped", False))
-        return cls(images, Ks, Es, **{"left_size": left_size} | knobs)
+        with noted() as warned:
+            left_size, images, Ks, Es = split_views(views, cropped=arguments.get("cropped", False))
+            guidance = cls(images, Ks, Es, **{"left_size": left_size} | arguments)
+        guidance.warned = warned
+        return guidance
 
     @classmethod
-    def from_points(cls, points: Any, K: Any, **knobs: Any) -> Self:
+    def from_points(cls, points: Any, K: Any, **arguments: Any) -> Self:
         """Known depths instead of a second view. To use both, give ``points=`` to any other constructor.
 
-        Args:
-            points: as in the constructor.
-            K: ``(3, 3)`` intrinsics of the left image, pixels.
-            **knobs: further arguments of the constructor.
+        ``K (3, 3)`` are the left image's; points and further arguments are as in the constructor.
         """
-        return cls(None, K, None, points=points, **knobs)
+        return cls(None, K, None, points=points, **arguments)
 
     @classmethod
-    @_remembers_warnings
     def from_photographs(
         cls,
         left: Any,
@@ -249,7 +229,7 @@ class GeometryGuidance:
         points: Any = None,
         matcher: str = "sift",
         cropped: bool = False,
-        **knobs: Any,
+        **arguments: Any,
     ) -> Self:
         """Two or more photographs without poses, which are estimated from matches (extra ``pose``).
 
@@ -264,10 +244,9 @@ class GeometryGuidance:
             known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left photograph, and the distance
                 between the two points in the scene; instead of ``baseline_m``.
             points: ``(N, 3)`` as in the constructor; they give the scale if nothing else does.
-            matcher: feature matcher: ``"sift"``, or ``"lightglue"``, ``"superglue"`` or a folder with weights
-                of either, if they are on this machine.
-            cropped: as in the constructor; the principal point of a K that is given may lie outside.
-            **knobs: further arguments of the constructor.
+            matcher: ``"sift"``, or ``"lightglue"``, ``"superglue"`` or a folder with weights of either.
+            cropped: as in the constructor.
+            **arguments: further arguments of the constructor.
 
         Returns:
             A guidance with the cameras in ``estimated``. Its ``unit`` is ``None`` if no length is known; then
@@ -279,46 +258,38 @@ class GeometryGuidance:
         """
         photographs = list(left) if right is None and isinstance(left, (list, tuple)) else [left, right]
         Ks = K if K_right is None else [K, K_right]
-        rig = estimate_rig(
-            photographs,
-            K=Ks,
-            fov=fov,
-            baseline_m=baseline_m,
-            known_length=known_length,
-            points=points,
-            matcher=matcher,
-            cropped=cropped,
-        )
-        views = zip((None, *photographs[1:]), rig.Ks, (np.eye(4), *rig.Es), strict=True)
-        unit = rig.scale.unit
-        guidance = cls.from_views(
-            list(views),
-            points=points if unit else None,
-            left_size=rig.size_left,
-            cropped=cropped,
-            unit=unit,
-            measured_baseline=True,
-            **knobs,
-        )
-        guidance.estimated = rig
+        known = {"baseline_m": baseline_m, "known_length": known_length, "points": points}
+        with noted() as warned:
+            rig = estimate_rig(photographs, K=Ks, fov=fov, matcher=matcher, cropped=cropped, **known)
+            views = zip((None, *photographs[1:]), rig.Ks, (np.eye(4), *rig.Es), strict=True)
+            guidance = cls.from_views(
+                list(views),
+                points=points if rig.scale.unit else None,
+                left_size=rig.size_left,
+                cropped=cropped,
+                unit=rig.scale.unit,
+                measured_baseline=True,
+                **arguments,
+            )
+        guidance.warned, guidance.estimated = warned, rig
         if K_right is None:
             assume_same_centre(guidance)
         return guidance
 
     @classmethod
-    def marigold_dc(cls, points: Any, K: Any, **knobs: Any) -> Self:
+    def marigold_dc(cls, points: Any, K: Any, **arguments: Any) -> Self:
         """Marigold-DC as published, depth completion from points; with ``prediction_type="depth"``."""
-        return cls.from_points(points, K, preset="marigold-dc", **knobs)
+        return cls.from_points(points, K, preset="marigold-dc", **arguments)
 
     @classmethod
-    def paper(cls, right: Any, K: Any, E: Any, **knobs: Any) -> Self:
+    def paper(cls, right: Any, K: Any, E: Any, **arguments: Any) -> Self:
         """Algorithm 1 as printed; docs/reference/paper-map.md settles what the paper leaves open."""
-        return cls(right, K, E, preset="paper", **knobs)
+        return cls(right, K, E, preset="paper", **arguments)
 
     @classmethod
-    def search_only(cls, right: Any, K: Any, E: Any, **knobs: Any) -> Self:
+    def search_only(cls, right: Any, K: Any, E: Any, **arguments: Any) -> Self:
         """Only the scale and shift that the search finds: no correction, no gradient updates."""
-        return cls(right, K, E, preset="search-only", **knobs)
+        return cls(right, K, E, preset="search-only", **arguments)
 
     @property
     def previous(self) -> MetricDepthOutput | None:
@@ -358,14 +329,7 @@ class GeometryGuidance:
         return requested if requested is not None else max(pipeline_default or 1, self.config.min_steps)
 
     def prepare(self, lefts_01: Tensor) -> list[Evidence]:
-        """Compute the ``Evidence`` of every left image: its cost volume, and matches if they are used.
-
-        Args:
-            lefts_01: ``(N, 3, H, W)`` float32 in [0, 1], native size, on the device to compute on.
-
-        Raises:
-            InputError: another number of left images than of entries; ``K`` of another image size.
-        """
+        """The ``Evidence`` of every left image ``(N, 3, H, W)`` in [0, 1], native, on the device to use."""
         count, size = lefts_01.shape[0], image_size(lefts_01)
         if len(self.inputs) != count:
             name, kind = ("right", "images") if self.rights else ("points", "entries")

@@ -68,11 +68,7 @@ def read_inputs(
     cropped: bool = False,
     unit: str | None = "m",
 ) -> list[Inputs]:
-    """Arguments of ``GeometryGuidance`` in any of their forms, checked: one entry per left image.
-
-    Raises:
-        InputError: anything of the wrong rank, size, number or rigidity, naming the argument.
-    """
+    """Arguments of ``GeometryGuidance`` in any of their forms, checked: one entry per left image."""
     if right is None and points is None:
         bad_value("right", "an image, or None together with points", "None without points")
     if points is None and points_confidence is not None:
@@ -188,8 +184,7 @@ def _poses(E: Any, name: str, views: int, unit: str | None) -> list[np.ndarray]:
 def as_points(value: Any, name: str, confidence: Any = None) -> Tensor:
     """``(N, 3)`` of finite rows, or ``(H, W)`` with 0 where unknown, float32, metres.
 
-    With a ``confidence`` in [0, 1], ``(N,)`` or ``(H, W)``, that is the last channel: ``(N, 4)``, ``(H, W,
-    2)``. What has none is unknown.
+    A ``confidence`` in [0, 1], ``(N,)`` or ``(H, W)``, becomes the last channel; what has none is unknown.
     """
     forms = "a sparse depth map (H, W) or points (N, 3) in the left camera's frame, metres"
     if isinstance(value, Tensor):
@@ -243,11 +238,7 @@ def _as_confidence(value: Any, points: np.ndarray, name: str) -> np.ndarray:
 def split_views(
     views: Any, *, cropped: bool = False
 ) -> tuple[tuple[int, int] | None, tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
-    """Views of ``GeometryGuidance.from_views``, left one first: its size, the right images, all K's and E's.
-
-    Raises:
-        InputError: not at least two triples; a left K that is not for its image.
-    """
+    """Views of ``from_views``, left one first: its size, the right images, all K's and E's."""
     form = "a list [(image, K, E), ...] with the left view first"
     if not isinstance(views, (list, tuple)):
         bad_type("views", form, views)

@@ -104,11 +104,7 @@ def estimate_rig(
     matcher: str = "sift",
     cropped: bool = False,
 ) -> EstimatedRig:
-    """Cameras of two photographs or more, left one first; arguments as ``GeometryGuidance.from_photographs``.
-
-    Raises:
-        InputError: PoseLib is not installed; no K, or no pose to be had (``pose.estimate``).
-    """
+    """Cameras of two photographs or more, left one first; arguments as ``from_photographs``."""
     if len(photographs) < 2:
         bad_type("photographs", "two images or more", photographs)
     names = ["left", *(f"right photograph {i}" for i in range(1, len(photographs)))]

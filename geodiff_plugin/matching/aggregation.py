@@ -10,15 +10,14 @@ from torch import Tensor
 
 from geodiff_plugin.matching.census import COST_LEVELS
 
-#: Cost of a step of one plane between neighbouring pixels, in units of the largest matching cost, and of any
-#: larger step where the image is flat; the difference in brightness that halves the latter.
-STEP_PENALTY, JUMP_PENALTY, JUMP_CONTRAST = 0.15, 1.2, 0.1
-
+#: Cost of a step of one plane between neighbouring pixels, in units of the largest matching cost.
+STEP_PENALTY = 0.15
+#: Of any larger step where the image is flat, and the difference in brightness that halves it.
+JUMP_PENALTY, JUMP_CONTRAST = 1.2, 0.1
+#: Up, down, left and right.
 PATHS = 4
-"""Up, down, left and right."""
-
+#: Above any sum over the paths: in a place that is not to win.
 NEVER = 20_000
-"""Above any sum over the paths: in a place that is not to win."""
 
 
 def cells(planes: int, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -11,19 +11,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from geodiff_plugin.geometry import image_size, sample_at
+from geodiff_plugin.geometry import EDGE_PX, image_size, sample_at
 from geodiff_plugin.matching.census import MARGIN_PX, census, census_cost, grey_levels
 
 # A view that needs no turning to within this is taken as it is.
 _AS_IT_IS_PX = 0.02
 # Planes that come nearer to the right camera's plane than this share of their depth are not seen.
 _LEAST_RATIO = 0.02
-# Rounding at image edges: the last pixel centre itself must count as inside.
-_EDGE_PX = 1e-2
 # Where many planes are plain shifts along the rows, the right image is described once at this many positions
-# a pixel. So it is while the rows drift by no more than this: calibrations put the baseline of a rectified
-# pair a little out of the row.
-_PHASES, _ROW_PHASES, _MOST_DRIFT_PX = 8, 4, 1.0
+# a pixel, along the row and across.
+_PHASES, _ROW_PHASES = 8, 4
+# So it is while the rows drift by no more than this: calibrations put a baseline a little out of the row.
+_MOST_DRIFT_PX = 1.0
 # Written out wherever a tensor is made: else the user's default device and dtype would apply.
 _CPU_FLOAT64: dict[str, Any] = {"device": "cpu", "dtype": torch.float64}
 
@@ -72,7 +71,7 @@ class AlignedView:
     def inside(self, positions: Tensor, axis: int) -> Tensor:
         """Which of the ``positions`` are on the canvas, and not behind the right camera; ``(D, n)`` bool."""
         last = self.size[1 - axis] - 1
-        on = (positions >= -_EDGE_PX) & (positions <= last + _EDGE_PX)
+        on = (positions >= -EDGE_PX) & (positions <= last + EDGE_PX)
         return on & (self.scale > 0).to(positions.device)[:, None]
 
 
@@ -111,7 +110,7 @@ def _turned(image: Tensor, to_right: Tensor, low: Tensor, high: Tensor) -> tuple
     p = torch.stack([column, row, torch.ones_like(row)], dim=-1) @ to_right.T
     uv, ahead = p[..., :2] / p[..., 2:].clamp_min(1e-9), p[..., 2] > 1e-9
     last = uv.new_tensor([image.shape[-1] - 1, image.shape[-2] - 1])
-    valid = ahead & ((uv >= -_EDGE_PX) & (uv <= last + _EDGE_PX)).all(dim=-1)
+    valid = ahead & ((uv >= -EDGE_PX) & (uv <= last + EDGE_PX)).all(dim=-1)
     # Bicubic, since what is read here is interpolated once more on every plane.
     turned = sample_at(image[None], uv[None].to(image), mode="bicubic")[0, 0].clamp(0.0, 1.0)
     return turned, valid.to(image.device)

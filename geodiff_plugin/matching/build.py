@@ -22,20 +22,25 @@ from geodiff_plugin.types import CameraView
 _FEWEST_PLANES = 24
 #: How far the median pixel moves from one plane to the next, px: below a pixel, for positions between planes.
 PLANE_STEP_PX = 0.75
-# The coarse sweep that finds how near the planes must reach: pixels, planes, and the median step of one, px.
-PILOT_PIXELS, PILOT_PLANES, PILOT_STEP_PX = 20_000, 160, 1.0
+# The coarse sweep that finds how near the planes must reach: pixels, planes.
+PILOT_PIXELS, PILOT_PLANES = 20_000, 160
+# And the median step of a plane.
+PILOT_STEP_PX = 1.0
 # Shift of the nearest depth that it looks at, in image widths, of the view that moves least: a near surface
 # leaves the view that moves most while others still show it. It looks no more than so many times nearer than
 # that depth of the view that moves most.
 PILOT_SHIFT, MOST_NEARER = 0.4, 3.0
-# Its matches above this confidence count; this quantile of their inverse depths is taken for the nearest,
-# unless they are less than this share of the pixels: then the planes reach as near as the sweep looked.
-PILOT_CONFIDENCE, PILOT_QUANTILE, PILOT_LEAST_SHARE = 0.8, 0.995, 0.03
+# Its matches above this confidence count; this quantile of their inverse depths is taken for the nearest.
+PILOT_CONFIDENCE, PILOT_QUANTILE = 0.8, 0.995
+# Where they are less than this share of the pixels, the planes reach as near as the sweep looked.
+PILOT_LEAST_SHARE = 0.03
 # The planes reach this factor nearer than that, and at least to the depth of this shift, in image widths.
 HEADROOM, LEAST_SHIFT = 1.25, 0.03
 # The inverse pose must match this many times as much of the image as the given one, in sweeps of so many
-# pixels; where the given one matches this share of the image, it is not asked.
-_CLEARLY, _INVERSE_PIXELS, _PLAINLY = 1.25, 15_000, 0.4
+# pixels.
+_CLEARLY, _INVERSE_PIXELS = 1.25, 15_000
+# Where the given one matches this share of the image, it is not asked.
+_PLAINLY = 0.4
 
 
 def to_grid(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from geodiff_plugin.matching.census import grey
 
-_SIDE = 8
+_BLOCK = 8
 _LUMA_STEPS = (
     *(16, 11, 10, 16, 24, 40, 51, 61),
     *(12, 12, 14, 19, 26, 58, 60, 55),
@@ -28,18 +28,23 @@ _LUMA_STEPS = (
 # Coefficients that even a strongly compressed picture keeps, and how many of them must tell the same step.
 _KEPT = ((0, 1), (1, 0), (2, 0), (1, 1), (0, 2), (0, 3), (1, 2), (2, 1), (3, 0))
 _LEAST_VOTES, _ALIKE = 5, 0.3
-_MOST_STEP, _MOST_BLOCKS, _LEAST_VALUES, _LEAST_FIT = 100, 2048, 32, 0.5
+# Steps that are tried, and blocks that are looked at, at most.
+_MOST_STEP, _MOST_BLOCKS = 100, 2048
+# As many values must be multiples of a step, and as well.
+_LEAST_VALUES, _LEAST_FIT = 32, 0.5
 # A step of more grey levels than this between two pixels is the scene's, not the edge of a block.
 _MOST_BLOCK_EDGE = 8.0
 # Noise is read from the finest coefficients of the flattest tenth of the blocks, which contain less of it
-# than the others: the factor is that of normally distributed noise. Up to the first number of grey levels
-# it does not disturb the comparison, and fine texture may be taken for it; from the second on all is removed.
-_FLATTEST, _NOISE_OF_FLATTEST, _NOISE_RANGE = 0.1, 1.0 / 0.77, (1.7, 2.8)
+# than the others: the factor is that of normally distributed noise.
+_FLATTEST, _NOISE_OF_FLATTEST = 0.1, 1.0 / 0.77
+# Up to the first number of grey levels it does not disturb the comparison, and fine texture may be taken for
+# it; from the second on all is removed.
+_NOISE_RANGE = (1.7, 2.8)
 # Coefficients below so many steps, or so many standard deviations of the noise, are not the scene's. On
 # rendered pairs wrong matches are as few from half to twice these.
 _STEPS, _DEVIATIONS = 1.2, 3.6
 # 16 of the 64 positions of the blocks, every row and column twice.
-_SHIFTS = tuple((i, (3 * i + k) % _SIDE) for i in range(_SIDE) for k in (0, _SIDE // 2))
+_SHIFTS = tuple((i, (3 * i + k) % _BLOCK) for i in range(_BLOCK) for k in (0, _BLOCK // 2))
 # Shrinking averages a picture of more than so many times the pixels of the grid that it is compared on:
 # 1280 x 960 still gains from cleaning.
 _SHRUNK = 6.0
@@ -47,40 +52,40 @@ _SHRUNK = 6.0
 
 def _basis(like: Tensor) -> Tensor:
     """Orthonormal DCT-II, ``(frequency, pixel)``."""
-    n = torch.arange(_SIDE, device=like.device, dtype=like.dtype)
-    waves = torch.cos(math.pi * (2 * n[None] + 1) * n[:, None] / (2 * _SIDE)) * math.sqrt(2 / _SIDE)
+    n = torch.arange(_BLOCK, device=like.device, dtype=like.dtype)
+    waves = torch.cos(math.pi * (2 * n[None] + 1) * n[:, None] / (2 * _BLOCK)) * math.sqrt(2 / _BLOCK)
     waves[0] /= math.sqrt(2)
     return waves
 
 
 def _to_blocks(levels: Tensor, basis: Tensor) -> Tensor:
     """Coefficients ``(h, w, 8, 8)`` of the whole blocks of ``(H, W)``."""
-    rows, columns = (side // _SIDE for side in levels.shape)
-    whole = levels[: rows * _SIDE, : columns * _SIDE]
-    return basis @ whole.reshape(rows, _SIDE, columns, _SIDE).transpose(1, 2) @ basis.T
+    rows, columns = (side // _BLOCK for side in levels.shape)
+    whole = levels[: rows * _BLOCK, : columns * _BLOCK]
+    return basis @ whole.reshape(rows, _BLOCK, columns, _BLOCK).transpose(1, 2) @ basis.T
 
 
 def _from_blocks(coefficients: Tensor, basis: Tensor) -> Tensor:
     rows, columns = coefficients.shape[:2]
-    return (basis.T @ coefficients @ basis).transpose(1, 2).reshape(rows * _SIDE, columns * _SIDE)
+    return (basis.T @ coefficients @ basis).transpose(1, 2).reshape(rows * _BLOCK, columns * _BLOCK)
 
 
 def _table(like: Tensor) -> Tensor:
-    return torch.tensor(_LUMA_STEPS, device=like.device, dtype=like.dtype).view(_SIDE, _SIDE)
+    return torch.tensor(_LUMA_STEPS, device=like.device, dtype=like.dtype).view(_BLOCK, _BLOCK)
 
 
 def _first_edge(levels: Tensor, axis: int) -> int:
     """Where the blocks begin, 0 to 7: a crop begins within one."""
     steps = levels.diff(dim=axis).abs().clamp_max(_MOST_BLOCK_EDGE).mean(1 - axis)
-    whole = steps[: steps.shape[0] // _SIDE * _SIDE].view(-1, _SIDE).mean(0)
-    return (int(whole.argmax()) + 1) % _SIDE
+    whole = steps[: steps.shape[0] // _BLOCK * _BLOCK].view(-1, _BLOCK).mean(0)
+    return (int(whole.argmax()) + 1) % _BLOCK
 
 
 def _jpeg_scale(levels: Tensor, basis: Tensor) -> float:
     """The largest steps that the coefficients of a picture are whole multiples of."""
     rows, columns = zip(*_KEPT, strict=True)
     top, left = _first_edge(levels, 0), _first_edge(levels, 1)
-    blocks = _to_blocks(levels[top:, left:], basis).reshape(-1, _SIDE, _SIDE)
+    blocks = _to_blocks(levels[top:, left:], basis).reshape(-1, _BLOCK, _BLOCK)
     value = blocks[:: math.ceil(len(blocks) / _MOST_BLOCKS), rows, columns].abs()[..., None]
     step = torch.arange(2, _MOST_STEP, device=levels.device, dtype=levels.dtype)
     counts = value > 0.6 * step  # 0 is a multiple of everything
@@ -96,7 +101,7 @@ def _jpeg_scale(levels: Tensor, basis: Tensor) -> float:
 
 
 def _noise(levels: Tensor, basis: Tensor) -> float:
-    fine = _to_blocks(levels, basis)[..., _SIDE // 2 :, _SIDE // 2 :]
+    fine = _to_blocks(levels, basis)[..., _BLOCK // 2 :, _BLOCK // 2 :]
     energy = fine.square().mean((-1, -2)).flatten()
     return math.sqrt(float(torch.quantile(energy, _FLATTEST))) * _NOISE_OF_FLATTEST
 
@@ -139,11 +144,11 @@ def clean(image_01: Tensor, grid_pixels: int) -> Tensor:
     if threshold is None:
         return image_01
     height, width = levels.shape
-    sides = _SIDE, _SIDE + (-width) % _SIDE, _SIDE, _SIDE + (-height) % _SIDE
+    sides = _BLOCK, _BLOCK + (-width) % _BLOCK, _BLOCK, _BLOCK + (-height) % _BLOCK
     wide = F.pad(levels[None, None], sides, mode="reflect")[0, 0]
     total = torch.zeros_like(levels)
     for row, column in _SHIFTS:
         blocks = _to_blocks(wide[row:, column:], basis)
         kept = _from_blocks(blocks * (blocks.abs() >= threshold), basis)
-        total += kept[_SIDE - row :, _SIDE - column :][:height, :width]
+        total += kept[_BLOCK - row :, _BLOCK - column :][:height, :width]
     return (image_01 + (total / len(_SHIFTS) - levels) / 255.0).clamp(0.0, 1.0)

@@ -19,8 +19,6 @@ RIGHT_WITHIN_PLANES = 3.0
 #: Log-odds that a checked match is right, linear in its evidence, by logistic regression on pairs with truth
 #: (``python -m tests.benchmarks.confidence`` refits them).
 LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
-#: Which sign each of them may have; 0 for any.
-SIGNS = (0, 1, -1, -1)
 #: Planes by which the matches of the two views may differ.
 AGREEMENT_PLANES = 1.5
 #: Half the window, px, over which a match's plane must be better than the mean plane, and by how much, as a
@@ -105,10 +103,10 @@ def _contrast(volume: CostVolume, index: Tensor, reach: int) -> Tensor:
     return gain[0]
 
 
-_Candidates = tuple[Tensor, Tensor, Iterator[tuple[Tensor, Tensor]]]
+Candidates = tuple[Tensor, Tensor, Iterator[tuple[Tensor, Tensor]]]
 
 
-def _candidates(volume: CostVolume, views: Sequence[AlignedView]) -> _Candidates:
+def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
     """Inverse depths ``(H, W)`` of the winners, their ``_contrast``, and the evidence of every right view.
 
     The evidence ``(4, H, W)``, in which the log-odds of a match are linear, is 1, the logarithm of the margin
@@ -141,25 +139,13 @@ def _confidence(evidence: Tensor, difference: Tensor, contrast: Tensor) -> Tenso
 
 
 @torch.no_grad()
-def checked_matches(volume: CostVolume) -> tuple[Tensor, Tensor, Tensor]:
-    """What the confidence of matches is fitted on, by the first right view of a cost volume.
-
-    Inverse depths ``(H, W)``, evidence ``(4, H, W)`` as ``LOG_ODDS`` weighs it, and ``(H, W)`` bool: the
-    right view agrees, and there is texture to agree on.
-    """
-    inverse_depth, contrast, views = _candidates(volume, volume.aligned[:1])
-    ((evidence, difference),) = views
-    return inverse_depth, evidence, (difference <= AGREEMENT_PLANES) & (contrast >= LEAST_CONTRAST)
-
-
-@torch.no_grad()
 def match_volume(volume: CostVolume) -> Matches:
     """Matches of a cost volume: aggregate, take the winner, and check it against every right view.
 
     Confidence is 0 where no right view agrees, else about the probability that the match is within
     ``RIGHT_WITHIN_PLANES`` of the truth, by the right view that is most certain of it.
     """
-    inverse_depth, contrast, views = _candidates(volume, volume.aligned)
+    inverse_depth, contrast, views = candidates(volume, volume.aligned)
     confidence = torch.zeros_like(inverse_depth)
     for evidence, difference in views:
         confidence = torch.maximum(confidence, _confidence(evidence, difference, contrast))

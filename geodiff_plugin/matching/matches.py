@@ -19,10 +19,12 @@ UNIT = 0.01
 #: gaps that the prior misses would be taken for reflections.
 REGION = 0.08
 #: How far behind the prior a reflection lies: in spreads of the matches around the prior's log depth, and at
-#: least, in log depth; from there to a multiple of it, a match's weight falls to nothing.
-SPREADS, LEAST_DISTANCE, MULTIPLE = 2.0, 0.2, 1.6
+#: least, in log depth.
+SPREADS, LEAST_DISTANCE = 2.0, 0.2
+#: From there to this multiple of it, a match's weight falls to nothing.
+MULTIPLE = 1.6
 #: Confidence above which a match counts in that spread, and the least spread that is assumed, in log depth.
-SPREAD_CONFIDENCE, LEAST_SPREAD = 0.3, 0.05
+SPREAD_CONFIDENCE, SPREAD_FLOOR = 0.3, 0.05
 #: Larger differences in log depth count as this one.
 LARGEST = 1.5
 
@@ -161,7 +163,7 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     counted = torch.where(weight > SPREAD_CONFIDENCE, behind, torch.full_like(behind, torch.nan)).flatten(1)
     middle = counted.nanmedian(1, keepdim=True).values
     spread = 1.4826 * (counted - middle).abs().nanmedian(1).values
-    spread = spread.nan_to_num(LARGEST).clamp_min(LEAST_SPREAD)
+    spread = spread.nan_to_num(LARGEST).clamp_min(SPREAD_FLOOR)
     least = (SPREADS * spread).clamp_min(LEAST_DISTANCE)[:, None, None, None]
     radius = max(1, round(REGION * max(depth_m.shape[-2:])))
     region = _window_mean(behind * weight, radius) / _window_mean(weight, radius).clamp_min(1e-6)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,8 +11,6 @@ from torch import Tensor
 
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.types import CameraView
-
-__all__ = ["PARAMETERS", "RowMatches", "fill_background", "make_matcher", "match_rows", "pad_columns"]
 
 #: Of the matcher: only what both views agree on, and no speckles.
 PARAMETERS = {
@@ -25,21 +23,6 @@ PARAMETERS = {
 #: Matches with a smaller shift, in pixels, say nothing of depth. Shares of the width that shifts reach at
 #: most.
 MIN_SHIFT_PX, MAX_SHIFT = 0.3, 0.3
-
-
-class RowMatches(NamedTuple):
-    """Matches of a left image, ``(H, W)`` each.
-
-    Attributes:
-        shift: pixels, from where the point would be at infinity; defined everywhere, read where one of the
-            others says so.
-        matched: 1 where both views agree, else 0.
-        filled: 1 in a gap between two matches, where ``shift`` is that of the farther one.
-    """
-
-    shift: Tensor
-    matched: Tensor
-    filled: Tensor
 
 
 def make_matcher(lowest: int, count: int, channels: int) -> Any:
@@ -82,7 +65,9 @@ def fill_background(shift: np.ndarray) -> np.ndarray:
     return filled[full_rows[np.maximum(above, 0)]].astype(shift.dtype)
 
 
-def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: float) -> RowMatches:
+def match_rows(
+    left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Match a rectified pair of one size, ``left_01 (3, H, W)`` in [0, 1] and ``view`` on either side.
 
     ``nearest_px`` is the largest shift that is looked for.
@@ -106,7 +91,8 @@ def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: fl
     known = (raw > 16 * (lowest - 1)) & (shift >= MIN_SHIFT_PX)
     between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
     shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
-    maps = [shift, known.astype(np.float32), (between & ~known).astype(np.float32)]
-    return RowMatches(
-        *(torch.from_numpy(each[:, ::-1].copy() if mirrored else each).to(left_01.device) for each in maps)
-    )
+    maps = [
+        torch.from_numpy(each[:, ::-1].copy() if mirrored else each).to(left_01.device)
+        for each in (shift, known.astype(np.float32), (between & ~known).astype(np.float32))
+    ]
+    return maps[0], maps[1], maps[2]

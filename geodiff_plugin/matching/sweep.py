@@ -17,10 +17,8 @@ from geodiff_plugin.matching.alignment import AlignedView, ComparedView, align_v
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, census, grey_levels
 from geodiff_plugin.types import CameraView
 
+#: Cost of a plane on which no right view sees the pixel: that of unrelated texture, neither good nor bad.
 UNSEEN_LEVEL = 78
-UNSEEN_COST = UNSEEN_LEVEL / COST_LEVELS
-"""Cost of a plane on which no right view sees the pixel: that of unrelated texture, neither good nor bad."""
-
 _LEAST_SHIFT_PX = 0.3
 
 
@@ -30,7 +28,7 @@ class CostVolume:
 
     Attributes:
         levels: ``(D, H, W)`` uint8, mean census difference to the right views that see the pixel, 0 to
-            ``COST_LEVELS``; that of ``UNSEEN_COST`` where none does.
+            ``COST_LEVELS``; ``UNSEEN_LEVEL`` where none does.
         in_view: ``(D, H, W)`` bool, at least one right view sees the pixel on this plane.
         inverse_depth: ``(D,)`` float32, 1/m, ascending and evenly spaced.
         K: ``(3, 3)`` pixels of this grid.

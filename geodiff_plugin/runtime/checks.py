@@ -42,18 +42,9 @@ def check_named_arguments(pipeline: type) -> None:
 
 
 def check_arguments(call: Mapping[str, Any], images: int) -> None:
-    """Refuse arguments of the call that no pipeline takes, in our own words.
+    """Refuse arguments of the call by name that no pipeline takes, for so many left images, in our own words.
 
     What the stock pipeline refuses in a sentence that names the argument is left to it.
-
-    Args:
-        call: arguments of the stock call by name.
-        images: number of left images.
-
-    Raises:
-        InputError: another output type than ``"np"`` and ``"pt"``; a number of steps, a resolution, a batch
-            or ensemble size that is no whole number or too small; a way of resampling that does not exist; no
-            generator, or a list of another number than that of all members; latents that are not finite.
     """
     check_choice(call["output_type"], "output_type", ("np", "pt"))
     check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
@@ -79,19 +70,14 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
 
 
 def check_left_images(image: Any) -> tuple[Any, int]:
-    """Check left images as ``GeometryGuidance`` checks right ones.
+    """Check left images as ``GeometryGuidance`` checks right ones, and count them.
 
-    Args:
-        image: PIL image, numpy ``(H, W, C)``, ``(H, W)`` or ``(N, H, W, C)``, torch ``(C, H, W)``, ``(H, W)``
-            or ``(N, C, H, W)``, or a list of them.
+    ``image`` is a PIL image, numpy ``(H, W, C)``, ``(H, W)`` or ``(N, H, W, C)``, torch ``(C, H, W)``, ``(H,
+    W)`` or ``(N, C, H, W)``, or a list of them.
 
     Returns:
         The same object if the stock call reads it as it is meant, so that guidance changes nothing of what
-        the prior sees; else (alpha, a palette, CMYK, a little overshoot) a ``(3, H, W)`` tensor in [0, 1], or
-        a list of them. And the number of images.
-
-    Raises:
-        InputError: as ``as_image_01``, naming ``image`` or ``image[i]``; no image, or of several sizes.
+        the prior sees; else (alpha, a palette, CMYK, a little overshoot) tensors ``(3, H, W)`` in [0, 1].
     """
     named = list(_named(image, "image"))
     if not named:

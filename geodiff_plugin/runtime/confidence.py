@@ -30,8 +30,10 @@ BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
 #: Which sign each of them may have; 0 for any. Agreement can only raise confidence, and a pixel that no right
 #: camera sees has none, so not being in view can never raise it.
 SIGNS = (0, 1, 1, 1, -1)
-# Photometric errors beyond these tell nothing more, nor do errors of the prior as a whole.
-_LEAST_ERROR, _MOST_ERROR, _STRONG, _WEAK = 0.01, 0.1, 0.03, 0.15
+# Photometric errors beyond these tell nothing more.
+_LEAST_DIFFERENCE, _MOST_DIFFERENCE = 0.01, 0.1
+# Nor do errors of the prior as a whole.
+_STRONG, _WEAK = 0.03, 0.15
 # Nor does the error of the prior that is left to a depth, beyond these: where it is largest many depths are
 # right all the same, and log-odds that fell on would promise too little.
 _LEAST_LEFT, _MOST_LEFT = 0.0005, 0.05
@@ -45,17 +47,15 @@ _HALF_KNOWN = 0.1
 def depth_evidence(
     support: Tensor, error: Tensor, visible: Tensor, spread: Tensor | None, prior_error: Tensor | None = None
 ) -> Tensor:
-    """What the log-odds of ``depth_confidence``, whose arguments these are, are linear in.
+    """What the log-odds of ``depth_confidence``, whose arguments these are, are linear in: ``(B, 5, H, W)``.
 
-    Returns:
-        ``(B, 5, H, W)``: 1, certainty, strength, agreement, spread. The measured error of the prior
-        counts only as far as the pixel has support; without any the prior counts as useless. Certainty is the
-        log of .05 over what is left of that error, ``(1 - support) * error``: from 0 (.05 and more) to 4.6
-        (.0005 and less). Strength is the log of .15 over it, from 0 to 1.6: with a good prior wrong matches
-        lose their weight, a poor one follows them. Agreement is how far the log of the photometric error lies
-        below that of .1: from 0 (error .1 and more, or not seen) to 2.3 (error .01 and less).
+    1, certainty, strength, agreement, spread. The measured error of the prior counts only as far as the pixel
+    has support; without any the prior counts as useless. Certainty is the log of .05 over what is left of
+    that error, ``(1 - support) * error``, strength that of .15 over it: with a good prior wrong matches lose
+    their weight, a poor one follows them. Agreement is how far the log of the photometric error lies below
+    that of .1.
     """
-    agreement = -(error.clamp(_LEAST_ERROR, _MOST_ERROR) / _MOST_ERROR).log()
+    agreement = -(error.clamp(_LEAST_DIFFERENCE, _MOST_DIFFERENCE) / _MOST_DIFFERENCE).log()
     measured = support.new_tensor(_USELESS) if prior_error is None else prior_error.clamp(_BEST, _USELESS)
     share = support / (support + _HALF_KNOWN)
     left_to_prior = measured**share * _USELESS ** (1.0 - share)
@@ -73,18 +73,15 @@ def depth_evidence(
 def depth_confidence(
     support: Tensor, error: Tensor, visible: Tensor, spread: Tensor | None, prior_error: Tensor | None = None
 ) -> Tensor:
-    """Probability that a depth is within 10 % of the truth.
+    """Probability ``(B, 1, H, W)`` that a depth is within 10 % of the truth.
 
     Args:
         support: ``(B, 1, H, W)`` in [0, 1], of ``algorithm.correction.refine_depth``.
         error: ``(B, 1, H, W)`` photometric error in [0, 1], in the left image's exposure.
         visible: ``(B, 1, H, W)`` bool, whether a right camera sees the pixel.
-        spread: ``(B, 1, H, W)`` relative spread of the ensemble's members, >= 0, or ``None`` for one member.
-        prior_error: ``(B, 1, 1, 1)`` of the prior in log depth, as ``algorithm.correction.prior_error``
-            measures it, or a ``local_error`` on any grid; ``None`` where unknown, which counts as useless.
-
-    Returns:
-        ``(B, 1, H, W)`` in (0, 1).
+        spread: ``(B, 1, H, W)`` relative spread of the ensemble's members, ``None`` for one member.
+        prior_error: ``(B, 1, 1, 1)`` of the prior in log depth, or a ``local_error`` on any grid; ``None``
+            where unknown, which counts as useless.
     """
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
@@ -107,12 +104,7 @@ def expected_error(depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.n
     """What the geometry alone lets a matched depth be off: ``z^2 sigma_d / (f b)`` of a rectified pair.
 
     In general ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|`` by the pixel's ray ``r`` and the right camera's
-    centre ``t``; its rotation moves no point relative to another.
-
-    Args:
-        depth_m: ``(H, W)`` metres.
-        K_left: ``(3, 3)`` pixels of that map.
-        poses: ``(4, 4)`` of the right cameras in the left camera's frame, metres; the best of them counts.
+    centre ``t``, the best of ``poses (4, 4)``; its rotation moves no point relative to another.
 
     Returns:
         ``(H, W)`` metres, standard deviation at ``MATCH_NOISE_PX``; infinite where no camera moves.
@@ -132,16 +124,8 @@ def reprojection(
 ) -> tuple[Tensor, Tensor]:
     """Where any right view sees the pixel, and the least mean absolute error to the re-rendered left image.
 
-    The error is that of the view that explains the pixel best, compared in the left image's exposure.
-
-    Args:
-        views: the right views of one image, native.
-        depth_m: ``(1, 1, H, W)`` metres.
-        left_01: ``(1, 3, H, W)`` in [0, 1].
-        K_left: ``(1, 3, 3)`` pixels of that grid.
-
-    Returns:
-        ``(1, 1, H, W)`` bool and float in [0, 1], 0 where no view sees the pixel.
+    ``depth_m (1, 1, H, W)`` metres and ``left_01 (1, 3, H, W)`` lie on one grid, ``views`` are native. ``(1,
+    1, H, W)`` bool and float in [0, 1], in the left image's exposure, 0 where no view sees the pixel.
     """
     best, visible = torch.full_like(depth_m, torch.inf), torch.zeros_like(depth_m, dtype=torch.bool)
     for image, K_right, T in views:

@@ -1,8 +1,11 @@
-"""The result of a finished call: ``MetricDepthOutput``, all on the grid of the output, with a verdict."""
+"""From decoded maps to ``MetricDepthOutput``: ensembles reduced, maps finished, confidence and verdict.
+
+Ensembles are of metric maps (S5.1): median and median absolute deviation, without alignment. Marigold's own
+``ensemble_depth`` renormalises to [0, 1], which would lose the metres.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -12,16 +15,18 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from diffusers.pipelines.marigold import MarigoldDepthOutput
+from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from torch import Tensor
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._checks import InputError, check_choice
+from geodiff_plugin.algorithm.correction import correction_target, refine_depth
+from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
 from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.matching import build_cost_volume, match_volume
+from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.scale import NO_UNIT
 from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
-from geodiff_plugin.runtime.finish import finish_images, median, spread_of_members
 from geodiff_plugin.runtime.run import GuidedRun
 from geodiff_plugin.runtime.verdict import Indicators, Verdict, judge, points_agreement, read_indicators
 from geodiff_plugin.scale.points import order_agreement
@@ -33,25 +38,91 @@ LITTLE_OVERLAP = 0.3
 LEAST_M = 1e-6
 
 
-def _confidence(
-    support: Tensor | None,
-    depth_m: Tensor,
-    shown: tuple[Tensor | None, Tensor | None],
-    uncertainty: Tensor | None,
-    prior_error: Tensor | None,
-) -> Tensor | None:
-    """``(N, 1, H, W)`` in [0, 1] from support and what the views show: visible, error; ``None`` without."""
-    if support is None:
+def _finish(
+    run: GuidedRun, image: int, depth_m: Tensor, left: Tensor, member: int | None = None
+) -> tuple[Tensor, Tensor] | None:
+    """The result of a decoded map of an image or a member, ``(1, 1, H, W)`` metres, and its support.
+
+    Ramps first: a fit that finds edges steep does not carry the depth of a surface over to the next one. Then
+    the fit, and the votes of matches, colours and the fitted map. ``left (1, 3, H, W)`` is on the map's grid.
+    ``None`` where there are neither matches nor points.
+    """
+    evidence, (kept, error) = run.evidence[image], run.kept_and_error(image, member)
+    matches, points = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
+    if matches is not None or points is not None:
+        spacing = max(1, round(max(image_size(depth_m)) / max(run.grid.content)))
+        depth_m = sharpen_edges(depth_m, left, spacing)
+    target = correction_target(matches, points, kept, error, depth_m)
+    if target is None or error is None:
         return None
-    visible, error = shown
-    nothing = torch.zeros_like(depth_m)
-    return depth_confidence(
-        support,
-        error=nothing if error is None else error,
-        visible=nothing.bool() if visible is None else visible,
-        spread=None if uncertainty is None else uncertainty / depth_m,
-        prior_error=prior_error,
-    )
+    native = evidence.native_left[None]
+    fitted_m, support, _ = refine_depth(depth_m, target, native, error, run.config)
+    if matches is not None:
+        target = correction_target(matches, points, kept, error, fitted_m)
+        assert target is not None  # there are matches
+        K = resize_intrinsics(evidence.K_left[None], image_size(evidence.left_01), image_size(native))[0]
+        measured = error.amin((2, 3), keepdim=True)  # where the prior says something
+        fitted_m = vote_depth(fitted_m, native, K, evidence.native_views, target, measured)
+    return fitted_m, support
+
+
+def _finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tensor, Tensor | None]:
+    """The result ``(N, 1, H, W)`` of every image, and its support; as it was where one has no matches."""
+    results = []
+    for i, (depth, left) in enumerate(zip(depth_m.split(1), lefts.split(1), strict=True)):
+        result = _finish(run, i, depth, left) if run.config.crisp else None
+        if result is None:
+            return depth_m, None
+        results.append(result)
+    depths, supports = zip(*results, strict=True)
+    return torch.cat(depths), torch.cat(supports)
+
+
+def _spread_of_members(run: GuidedRun, depth_m: Tensor, lefts: Tensor, call: Mapping[str, Any]) -> Tensor:
+    """How far the members of every ensemble, finished one by one, lie from its result: ``(N, 1, H, W)`` m.
+
+    It costs a fit per member: their spread before it is that of a map that is not given out.
+    """
+    size, method = image_size(depth_m), call["resample_method_output"]
+    reduction = (call["ensembling_kwargs"] or {}).get("reduction", "median")
+    spreads = []
+    for i, members in enumerate(run.members):
+        members = members.float().to(depth_m.device)
+        if image_size(members) != size:  # as the stock call brings the ensemble to its output
+            members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
+            members = run.within_range(members, i)
+        results = [_finish(run, i, one, lefts[i : i + 1], m) for m, one in enumerate(members.split(1))]
+        finished = torch.cat([result[0] for result in results if result is not None])
+        spreads.append(_spread_around(depth_m[i : i + 1], finished, reduction))
+    return torch.cat(spreads)
+
+
+def ensemble_metric(depth_m: Tensor, reduction: str = "median", lower: bool = False) -> tuple[Tensor, Tensor]:
+    """Reduce members ``(E, 1, H, W)`` metres pixel by pixel to a map and its uncertainty, ``(1, 1, H, W)`` m.
+
+    ``"median"`` has the median absolute deviation, ``"mean"`` the standard deviation.
+    """
+    check_choice(reduction, "ensembling_kwargs['reduction']", ("median", "mean"))
+    middle = depth_m.mean(0, keepdim=True) if reduction == "mean" else median(depth_m, 0, lower)[None]
+    return middle, _spread_around(middle, depth_m, reduction)
+
+
+def _spread_around(middle: Tensor, depth_m: Tensor, reduction: str) -> Tensor:
+    """How far members ``(E, 1, H, W)`` lie from a map ``(1, 1, H, W)``, pixel by pixel, metres."""
+    away = depth_m - middle
+    if reduction == "mean":
+        return away.square().mean(0, keepdim=True).sqrt()
+    return median(away.abs(), 0)[None]
+
+
+def median(x: Tensor, dim: int, lower: bool = False) -> Tensor:
+    """The median along ``dim``, which is dropped: of an even number the mean of the middle two, or the lower.
+
+    ``torch.median``, and so Marigold-DC, takes the lower, which makes metres too near.
+    """
+    ordered, count = x.sort(dim=dim).values, x.shape[dim]
+    below = ordered.select(dim, (count - 1) // 2)
+    return below if lower else 0.5 * (below + ordered.select(dim, count // 2))
 
 
 def assemble_output(
@@ -73,36 +144,27 @@ def assemble_output(
     depth_m = run.within_range(_as_maps(stock.prediction).to(lefts_01.device))  # or the processing grid
     grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
-    depth_m, support = finish_images(run, depth_m, lefts)
+    depth_m, support = _finish_images(run, depth_m, lefts)
     uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
     if uncertainty is not None and support is not None:
-        uncertainty = spread_of_members(run, depth_m, lefts, call)
-    Ks = [torch.as_tensor(i.K_left, dtype=torch.float32, device=depth_m.device) for i in guidance.inputs]
-    K = resize_intrinsics(torch.stack(Ks), size, grid)
+        uncertainty = _spread_of_members(run, depth_m, lefts, call)
+    Ks = torch.stack([torch.as_tensor(i.K_left, dtype=torch.float32) for i in guidance.inputs]).to(depth_m)
+    K = resize_intrinsics(Ks, size, grid)
     visible, error = _reprojected(run, depth_m, lefts, K)
     prior_error = run.prior_error()  # (N, 1, 1, 1), or of every pixel with the measured one as the least
-    confidence = _confidence(support, depth_m, (visible, error), uncertainty, prior_error)
-    over_prior = _over_prior(run, depth_m)
+    confidence, over_prior = None, _over_prior(run, depth_m)
+    if support is not None:
+        confidence = _confidence(support, depth_m, visible, error, uncertainty, prior_error)
     relative = torch.cat(run.relative)
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
-    doubts = tuple(sentence for sentence, forbids in warned.items() if forbids)
+    told: dict[str, Any] = {
+        "doubts": tuple(sentence for sentence, forbids in warned.items() if forbids),
+        "has_unit": has_unit,
+    }
     verdicts = []
     for i, K_left in enumerate(Ks):
-        own_ratio = math.nan
-        if over_prior is not None and has_unit:
-            own_ratio = float(over_prior.reshape(count, -1)[i].median())
-        indicators = _indicators(
-            run,
-            i,
-            K_left,
-            depth_m[i],
-            relative[i : i + 1],
-            has_unit=has_unit,
-            doubts=doubts,
-            confidence=math.nan if confidence is None else float(confidence[i].mean()),
-            own_ratio=own_ratio,
-        )
-        verdicts.append(judge(indicators))
+        told |= _means(i, confidence, over_prior if has_unit else None, count)
+        verdicts.append(judge(_indicators(run, i, K_left, depth_m[i], relative[i : i + 1], **told)))
     if confidence is not None:
         agreement = confidence.new_tensor([points_agreement(verdict.indicators) for verdict in verdicts])
         confidence = confidence * agreement.view(-1, 1, 1, 1)
@@ -142,12 +204,27 @@ def assemble_output(
             *(sentence for sentence, forbids in warned.items() if not forbids),  # doubts are reasons already
         ],
         assumed=list(guidance.assumed),
-        scale_from=None if estimated is None else estimated.scale.source,
-        scale_spread=None if estimated is None else estimated.scale.spread,
     )
+    if estimated is not None:
+        output.scale_from, output.scale_spread = estimated.scale.source, estimated.scale.spread
     if not has_unit and over_prior is not None:
         return _in_the_priors_metres(output, over_prior)
     return output
+
+
+def _confidence(
+    support: Tensor,
+    depth_m: Tensor,
+    visible: Tensor | None,
+    error: Tensor | None,
+    uncertainty: Tensor | None,
+    prior_error: Tensor | None,
+) -> Tensor:
+    """``depth_confidence`` with zeros for what no view shows."""
+    error = torch.zeros_like(depth_m) if error is None else error
+    visible = torch.zeros_like(depth_m, dtype=torch.bool) if visible is None else visible
+    spread = None if uncertainty is None else uncertainty / depth_m
+    return depth_confidence(support, error, visible, spread, prior_error)
 
 
 def _reprojected(
@@ -155,14 +232,22 @@ def _reprojected(
 ) -> tuple[Tensor, Tensor] | tuple[None, None]:
     """Visibility and photometric error of every image, ``(N, 1, H, W)``; nothing where no view is."""
     maps = [
-        reprojection(evidence.native, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1])
+        reprojection(evidence.native_views, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1])
         for i, evidence in enumerate(run.evidence)
-        if evidence.native
+        if evidence.native_views
     ]
     if not maps:
         return None, None
     visible, error = zip(*maps, strict=True)
     return torch.cat(visible), torch.cat(error)
+
+
+def _means(image: int, confidence: Tensor | None, over_prior: Tensor | None, count: int) -> dict[str, float]:
+    """Mean confidence of an image, and its median factor over a metric prior, where there are any."""
+    means = {} if confidence is None else {"confidence": float(confidence[image].mean())}
+    if over_prior is not None:
+        means["own_ratio"] = float(over_prior.reshape(count, -1)[image].median())
+    return means
 
 
 def _over_prior(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
@@ -206,29 +291,17 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> Metr
 
 
 def _indicators(
-    run: GuidedRun,
-    image: int,
-    K_left: Tensor,
-    depth_m: Tensor,
-    relative: Tensor,
-    *,
-    has_unit: bool,
-    doubts: tuple[str, ...],
-    confidence: float,
-    own_ratio: float,
+    run: GuidedRun, image: int, K_left: Tensor, depth_m: Tensor, relative: Tensor, **more: Any
 ) -> Indicators:
     """Indicators of one image; matches to judge it by are made here, where its run used none."""
     samples = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
     evidence, config = run.evidence[image], run.config
     order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())
-    if evidence.matches is None and evidence.native:
+    if evidence.matches is None and evidence.native_views:
         with suppress(InputError):  # views without overlap: not judged
+            views = evidence.native_left, evidence.native_views, K_left
             volume = evidence.volume or build_cost_volume(
-                evidence.native_left,
-                evidence.native,
-                K_left,
-                depth_range=config.depth_range,
-                config=config,
+                *views, depth_range=config.depth_range, config=config
             )
             matches = match_volume(volume)
             evidence = replace(evidence, matches=matches, points=None)
@@ -238,12 +311,9 @@ def _indicators(
         K_left,
         depth_m,
         range_given=config.depth_range is not None,
-        has_unit=has_unit,
         order=order,
         on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in samples),
-        doubts=doubts,
-        confidence=confidence,
-        own_ratio=own_ratio,
+        **more,
     )
 
 

@@ -30,9 +30,8 @@ from geodiff_plugin.runtime.checks import (
     check_named_arguments,
 )
 from geodiff_plugin.runtime.estimate import ProcessingGrid
-from geodiff_plugin.runtime.finish import ensemble_metric
 from geodiff_plugin.runtime.hooks import Exclusive, exclusive_call
-from geodiff_plugin.runtime.output import assemble_output
+from geodiff_plugin.runtime.output import assemble_output, ensemble_metric
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback
 from geodiff_plugin.runtime.start import depth_prompt, plan_warm_start
 

@@ -51,7 +51,6 @@ class GuidedRun:
         warm: the start from the previous frame, or ``None``.
 
     Attributes:
-        schedule: what happens at each step; ``None`` before the first one.
         trajectories: one per chunk.
         relative: decoded maps of the final latents, one per chunk, without padding.
         members: of every image with an ensemble, ``(E, 1, H, W)`` metres without padding.
@@ -119,10 +118,7 @@ class GuidedRun:
             self._bar.close()
 
     def release(self) -> None:
-        """Undo what ties the run and its hooks together, so that its memory is free once nobody needs it.
-
-        Python's collector of cycles comes late, and knows nothing of a device's memory.
-        """
+        """Undo what ties the run and its hooks together: the collector of cycles knows no device."""
         self._scheduler.release()
         del self._scheduler
 
@@ -137,11 +133,7 @@ class GuidedRun:
             self.__enter__()
 
     def metric_prediction(self, latents: Tensor) -> Tensor:
-        """Metric depth of the next chunk of final latents, instead of the clipping decode.
-
-        ``latents (B, C, h, w)`` come in the order in which they were denoised; the result is ``(B, 1, H, W)``
-        metres on the padded processing grid, in float32.
-        """
+        """Metric depth ``(B, 1, H, W)`` of the next chunk of final latents, on the padded processing grid."""
         chunk = len(self.relative)
         trajectory, x = self.trajectories[chunk], self._results[chunk]
         if x is None:
@@ -155,10 +147,9 @@ class GuidedRun:
         return depth_m
 
     def within_range(self, depth_m: Tensor, image: int | None = None) -> Tensor:
-        """Keep maps brought to another size in the range that they had: bicubic enlargement overshoots.
+        """Keep maps brought to another size in the range that they had, in place: enlarging overshoots.
 
-        ``depth_m (M, 1, H, W)`` metres, of all images, or of the members of one ``image``, is changed in
-        place.
+        ``depth_m (M, 1, H, W)`` metres is of all images, or of the members of one ``image``.
         """
         samples = [i for i, owner in enumerate(self.owners) if image in (None, owner)]
         near_m, far_m = (
@@ -168,16 +159,10 @@ class GuidedRun:
         return depth_m.clamp_(near_m.amin(1, keepdim=True), far_m.amax(1, keepdim=True))
 
     def kept_and_error(self, image: int, member: int | None = None) -> tuple[Tensor | None, Tensor | None]:
-        """What the prior's first estimates say of one image's matches, and the matches of the prior.
+        """What the first estimates say of one image's matches, of one member or in the mean of all.
 
-        Args:
-            image: its index in the call.
-            member: index of the ensemble member; ``None`` for the mean of all.
-
-        Returns:
-            ``(1, 1, h, w)`` on the grid of the losses, the share of each match's confidence that remains once
-            reflections are rejected; and the prior's error in log depth, as ``correction.local_error`` gives
-            it. ``None`` where it was not measured.
+        ``(1, 1, h, w)``, the share of each match's confidence that remains once reflections are rejected, and
+        the prior's error in log depth, as ``correction.local_error`` gives it; ``None`` where not measured.
         """
         samples = [(t, i) for t in self.trajectories for i, owner in enumerate(t.owners) if owner == image]
         chosen = samples if member is None else samples[member : member + 1]
@@ -196,10 +181,7 @@ class GuidedRun:
         return torch.cat(errors) if len(errors) == len(self.evidence) else None
 
     def check_finite(self) -> None:
-        """Check, once and after the loop, that everything computed in it is finite.
-
-        Raises ``InputError`` that names the step, the tensor and the cure.
-        """
+        """Raise ``InputError`` on the first tensor of the loop that was not finite; once, after the loop."""
         for trajectory in self.trajectories:
             trajectory.watch.check(self.pipe.dtype)
 

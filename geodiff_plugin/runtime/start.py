@@ -36,11 +36,8 @@ PROMPT_LONG_EDGE = 256
 class WarmStart:
     """Where a call starts, after the frame before.
 
-    Attributes:
-        near_m: ``(N * E,)`` metres, depth of the nearest end of the relative map.
-        far_m: ``(N * E,)`` metres, depth of its farthest end.
-        skipped: steps of the schedule that are left out.
-        latents: ``(N * E, C, h, w)`` what the first remaining step begins with; ``None`` for noise.
+    ``near_m`` and ``far_m``, ``(N * E,)`` metres, are the ends of the relative map. ``skipped`` steps of the
+    schedule are left out; the first remaining one begins with ``latents (N * E, C, h, w)``, or noise.
     """
 
     near_m: Tensor
@@ -55,14 +52,7 @@ def plan_warm_start(
     """The start that ``guidance.previous`` gives to a call; ``None`` without it.
 
     The latent is taken over by a DDIM of two steps or more. Other schedulers, and priors of a single step,
-    take over the scale alone.
-
-    Args:
-        pipe: the live pipeline.
-        prior: its adapter.
-        guidance: with the output of the frame before, and ``warm_start``.
-        call: arguments of the stock call by name, the number of steps settled.
-        size: ``(H, W)`` of the padded processing grid.
+    take over the scale alone. ``size (H, W)`` is the padded processing grid.
 
     Raises:
         InputError: an output of another number of images or members, of a prior of another space, or of
@@ -133,8 +123,7 @@ def _ends(previous: MetricDepthOutput, space: str) -> tuple[Tensor, Tensor]:
 def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
     """Confident matches and points, spread along surfaces, for priors that take a depth prompt.
 
-    ``evidence`` has an entry per image, all of the same size. The result is ``(N, 1, h, w)`` metres, with the
-    median depth where no match or point is near; ``None`` if some image has neither.
+    ``(N, 1, h, w)`` metres; ``None`` if some image has neither.
     """
     maps = [depth_m for image in evidence if (depth_m := _spread(image, config)) is not None]
     return torch.cat(maps) if len(maps) == len(evidence) else None

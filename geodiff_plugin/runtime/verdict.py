@@ -31,14 +31,16 @@ FEWEST_MATCHES = 40
 OFF_MATCHES = math.log(1.2)
 #: Log of the ratio of the 95 % and the 5 % quantile of depth below which a scene may be one plane.
 FLAT = 0.2
-#: Below these a run is not to be trusted: mean confidence, share matched; and a rank correlation of near and
-#: far that is this far below 0. Right pairs, real and rendered, had .66 to .98, .32 to .96 and +.18 to +.97;
-#: where nothing is matched, confidence is about .45.
-LEAST_CONFIDENCE, LEAST_MATCHED, MOST_EXCHANGED = 0.5, 0.12, -0.2
+#: Below this mean confidence, and this share matched, a run is not to be trusted. Right pairs, real and
+#: rendered, had .66 to .98 and .32 to .96; where nothing is matched, confidence is about .45.
+LEAST_CONFIDENCE, LEAST_MATCHED = 0.5, 0.12
+#: The same of a rank correlation of near and far, which was +.18 to +.97.
+MOST_EXCHANGED = -0.2
 #: No agreement on near and far is bad where few pixels are matched; with many, a poor prior may be at fault.
 LEAST_ORDER, MATCHED_ENOUGH = 0.2, 0.5
-#: Two weak signs together weigh as much as one that is bad.
-WEAK_CONFIDENCE, WEAK_MATCHED, WEAK_ORDER = 0.6, 0.4, 0.45
+#: Two weak signs together weigh as much as one that is bad; so does an epipolar distance, in pixels.
+WEAK_CONFIDENCE, WEAK_MATCHED = 0.6, 0.4
+WEAK_ORDER, WEAK_EPIPOLAR_PX = 0.45, 1.0
 #: A rank correlation says nothing of a scene whose matched depths all lie within this (log of 95 % over 5 %).
 LEAST_SPREAD = 0.15
 #: Points and matches that differ by the first factor are reported; by the second, the result is not trusted.
@@ -53,9 +55,9 @@ LEAST_BASELINE_M, VIEWS_DEG = 1e-3, (15.0, 120.0)
 TOO_WIDE_DEG = 150.0
 #: Factor over a metric prior's own metres from which the difference is reported.
 OWN_METRES = math.log(1.9)
-#: Distance of matches from their epipolar lines, under the best pose near the given one, from which they
-#: count as weak, are reported, and are not trusted; pixels of the grid of the matches.
-EPIPOLAR_WEAK, EPIPOLAR_PX, EPIPOLAR_WRONG = 1.0, 2.0, 4.0
+#: Distance of matches from their epipolar lines, under the best pose near the given one, from which they are
+#: reported, and are not trusted; pixels of the grid of the matches.
+EPIPOLAR_PX, EPIPOLAR_WRONG = 2.0, 4.0
 #: Known depths that fix a scale and a shift, and show when one of them is wrong.
 LEAST_POINTS = 3
 #: Share of the matches on the first or last plane of a range from which it is too narrow.
@@ -210,17 +212,17 @@ def read_indicators(
     has_unit: bool = True,
     **more: Any,
 ) -> Indicators:
-    """The indicators of one image.
+    """The indicators of one image, of the result ``depth_m (1, H, W)`` in the unit of the poses.
 
     Args:
         evidence: of it.
         K_left: ``(3, 3)`` pixels of the native left image.
-        depth_m: ``(1, H, W)`` the result, in the unit of the poses.
+        depth_m: the result, or ``None``.
         range_given: whether the user gave the range of the search.
         has_unit: whether lengths are in metres, so that the length of a baseline means something.
         **more: indicators that do not follow from these, by name.
     """
-    matches, pose, rights = evidence.matches, evidence.pose, evidence.native
+    matches, pose, rights = evidence.matches, evidence.pose, evidence.native_views
     if matches is not None:
         planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
         more |= _match_indicators(matches, depth_m, planes)
@@ -296,7 +298,7 @@ def _why_matches(run: Indicators) -> str:
         return ""
     few = run.matched < LEAST_MATCHED
     weak = (run.matched < WEAK_MATCHED, run.confidence < WEAK_CONFIDENCE, run.order < WEAK_ORDER)
-    count = sum(weak) + (run.epipolar_px > EPIPOLAR_WEAK)
+    count = sum(weak) + (run.epipolar_px > WEAK_EPIPOLAR_PX)
     if not (few or run.confidence < LEAST_CONFIDENCE or count > 1):
         return ""
     shares = [f"{100 * run.matched:.0f} % of the left image is matched"] if few or weak[0] else []

@@ -19,17 +19,20 @@ from geodiff_plugin.scale.space import SPACES, MetricMap, Space
 
 #: Matches above this confidence are reliable; as few of them make a basin or a quantile.
 RELIABLE, FEWEST_RELIABLE = 0.5, 50
-#: Values of near, and of far, that are tried against reliable matches or points, how far beyond the points'
-#: own range they reach, as a factor, and the points that tell basins apart.
-BASIN_CANDIDATES, BASIN_REACH, BASIN_SAMPLES = 48, 4.0, 1500
+#: Values of near, and of far, that are tried against reliable matches or points, and the points that tell
+#: basins apart.
+BASIN_CANDIDATES, BASIN_SAMPLES = 48, 1500
+#: How far beyond the points' own range the values reach, as a factor.
+BASIN_REACH = 4.0
 #: Width of their Cauchy cost in units of the points, about a prior's own error; a current state within this
 #: factor of the best cost stays.
 BASIN_CAUCHY, BASIN_KEEP = 32.0, 1.05
 #: Reweighted Gauss-Newton steps on near and far, and matches that the fit looks at.
 FIT_ITERATIONS, FIT_SAMPLES = 12, 20_000
-#: Standard deviation of a match of confidence .96, planes; the least one in log depth, for what a map leaves
-#: over; width of the Cauchy weight, in standard deviations of both.
-FIT_NOISE, FIT_FLOOR, FIT_CAUCHY = 0.5, 4e-3, 2.0
+#: Standard deviation of a match of confidence .96, planes; the least one in log depth, of what a map leaves.
+FIT_NOISE, FIT_FLOOR = 0.5, 4e-3
+#: Width of the Cauchy weight, in standard deviations of both.
+FIT_CAUCHY = 2.0
 #: How far near and far may move, as log factors.
 NEAR_REACH, FAR_REACH = 1.4, 0.7
 #: Reliable matches that the order of near and far is read from; fewer than the last number say nothing.

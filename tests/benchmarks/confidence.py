@@ -43,6 +43,9 @@ __all__ = [
     "promised",
 ]
 
+#: Which sign each coefficient of ``consistency.LOG_ODDS`` may have; 0 for any.
+MATCH_SIGNS = (0, 1, -1, -1)
+
 
 def promised(evidence: np.ndarray, coefficients: Sequence[float] | np.ndarray) -> np.ndarray:
     """Probability ``(N,)`` of evidence ``(N, F)`` under coefficients ``(F,)``."""
@@ -175,10 +178,13 @@ def observe_matches(sample: StereoSample, settings: Settings, priors: PriorCache
         priors: not used.
     """
     volume = sweep(sample, settings.device)
-    inverse_depth, evidence, checked = consistency.checked_matches(volume)
+    with torch.no_grad():
+        inverse_depth, contrast, views = consistency.candidates(volume, volume.aligned[:1])
+        ((evidence, difference),) = views
+    agreed, textured = difference <= consistency.AGREEMENT_PLANES, contrast >= consistency.LEAST_CONTRAST
     truth = torch.from_numpy(np.where(sample.valid, sample.depth_m, 0.0)).float()[None, None]
     truth_m = F.interpolate(truth, volume.size, mode="nearest-exact")[0, 0].numpy()
-    known = checked.cpu().numpy() & (truth_m > 0)
+    known = (agreed & textured).cpu().numpy() & (truth_m > 0)
     error = np.abs(inverse_depth.cpu().numpy() - 1.0 / np.where(truth_m > 0, truth_m, 1.0))
     right = error <= consistency.RIGHT_WITHIN_PLANES * float(volume.plane_step)
     return _drawn(evidence.cpu().numpy(), right, known, settings.seed)
@@ -277,7 +283,7 @@ def main(
     kinds: dict[str, tuple[Callable[..., Observed], tuple[Any, ...]]] = {
         "matches": (
             observe_matches,
-            ("matching/consistency.py", "LOG_ODDS", consistency.SIGNS, consistency.LOG_ODDS),
+            ("matching/consistency.py", "LOG_ODDS", MATCH_SIGNS, consistency.LOG_ODDS),
         ),
         "depth": (
             observe_depth,

@@ -123,7 +123,7 @@ def test_evidence_is_of_cleaned_photographs(pair: SyntheticPair, switched_on: bo
     config = GuidanceConfig(pose="given", clean_photographs=switched_on)
     made = make_evidence(left, Inputs(pair.K_left.numpy(), views, (), None), config, False)
     assert torch.equal(made.left_01, clean(left, GRID) if switched_on else left)
-    assert torch.equal(made.native[0].image_01, clean(right, GRID) if switched_on else right)
+    assert torch.equal(made.native_views[0].image_01, clean(right, GRID) if switched_on else right)
 
 
 def test_a_photograph_is_cleaned_before_it_is_undistorted(pair: SyntheticPair) -> None:

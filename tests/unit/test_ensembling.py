@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.runtime.finish import ensemble_metric, median
+from geodiff_plugin.runtime.output import ensemble_metric, median
 
 
 @pytest.mark.parametrize(

@@ -372,10 +372,10 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     left = pair.left.image_01.float()[None]
     (refined,) = GeometryGuidance(pair.right.image_01, Ks, wrong).prepare(left)
     (given,) = GeometryGuidance(pair.right.image_01, Ks, wrong, pose="given").prepare(left)
-    E = np.linalg.inv(refined.native[0][2].numpy())
+    E = np.linalg.inv(refined.native_views[0][2].numpy())
     for T in (refined.views[0][2], refined.volume.rights[0][2]):
         assert np.allclose(np.linalg.inv(T.numpy()), E, atol=1e-6)
-    assert np.allclose(np.linalg.inv(given.native[0][2].numpy()), wrong, atol=1e-5)
+    assert np.allclose(np.linalg.inv(given.native_views[0][2].numpy()), wrong, atol=1e-5)
     assert refined.pose.status == "refined" and refined.warnings
     with pytest.raises(ValueError, match="pose"):
         GeometryGuidance(pair.right.image_01, Ks, wrong, pose="guess")

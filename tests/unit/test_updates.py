@@ -1,14 +1,11 @@
+"""Gradient rules, and gradients through networks of half precision."""
+
 from __future__ import annotations
 
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, NormMatched, Plain, pull_back
-
-
-def test_plain_is_algorithm_1():
-    gradient = torch.randn(2, 3)
-    torch.testing.assert_close(Plain(1e-2).step(gradient), -1e-2 * gradient)
+from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, pull_back
 
 
 def test_adam_equals_torch_adam():
@@ -24,62 +21,32 @@ def test_adam_equals_torch_adam():
     torch.testing.assert_close(ours, theirs.detach())
 
 
-def test_norm_matched_length_is_a_share_of_the_reference_per_sample():
-    gradient, reference = torch.randn(2, 4, 3, 3) * 1e-6, torch.randn(2, 4, 3, 3)
-    step = NormMatched(0.05).step(gradient, reference)
-    torch.testing.assert_close(step.flatten(1).norm(dim=1), 0.05 * reference.flatten(1).norm(dim=1))
-    assert ((step * gradient).flatten(1).sum(1) < 0).all()
-
-
 @pytest.mark.parametrize("name", RULES)
-def test_samples_do_not_see_each_other(name):
+def test_a_rule_goes_downhill_sample_by_sample_and_a_zero_gradient_moves_nothing(name):
     gradient, reference = torch.randn(3, 4, 2, 2), torch.randn(3, 4, 2, 2)
     together, alone = RULES[name](0.1), RULES[name](0.1)
     for _ in range(3):
         a, b = together.step(gradient, reference), alone.step(gradient[1:2], reference[1:2])
     torch.testing.assert_close(a[1:2], b)
-
-
-@pytest.mark.parametrize("name", RULES)
-def test_zero_gradient_moves_nothing(name):
-    zero = torch.zeros(2, 4, 3, 3)
-    assert RULES[name](0.1).step(zero, torch.randn(2, 4, 3, 3)).abs().max() == 0
-
-
-@pytest.mark.parametrize("name", RULES)
-def test_scalars_per_sample(name):
-    step = RULES[name](0.1).step(torch.tensor([1.0, -2.0]))
+    assert ((a * gradient).flatten(1).sum(1) < 0).all()
+    assert RULES[name](0.1).step(torch.zeros_like(gradient), reference).abs().max() == 0
+    step = RULES[name](0.1).step(torch.tensor([1.0, -2.0]))  # scalars per sample
     assert step.shape == (2,) and step[0] < 0 < step[1]
 
 
-def _in_half(z: torch.Tensor) -> torch.Tensor:
-    """A network in float16 between float32 tensors, with a derivative of 3."""
-    return (z.half() * 3.0).float()
-
-
-@pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
-def test_a_gradient_of_any_size_passes_float16_and_comes_out_at_its_own(size):
+@pytest.mark.parametrize("sizes", [(1e-12, 1e-12), (1.0, 1.0), (1e-9, 1e9)])
+def test_a_gradient_of_any_size_passes_float16_and_comes_out_at_its_own(sizes):
     z = torch.randn(2, 4, 3, 3, requires_grad=True)
-    gradient = size * torch.randn(2, 4, 3, 3)
-    pulled = pull_back(_in_half(z), z, gradient)
-    torch.testing.assert_close(pulled, 3.0 * gradient, rtol=2e-3, atol=2e-3 * size)
-
-
-def test_samples_of_different_size_do_not_see_each_other():
-    z = torch.randn(2, 4, 3, 3, requires_grad=True)
-    gradient = torch.randn(2, 4, 3, 3) * torch.tensor([1e-9, 1e9]).view(2, 1, 1, 1)
-    pulled = pull_back(_in_half(z), z, gradient)
+    gradient = torch.randn(2, 4, 3, 3) * torch.tensor(sizes).view(2, 1, 1, 1)
+    pulled = pull_back((z.half() * 3.0).float(), z, gradient)
     torch.testing.assert_close(pulled / gradient, torch.full_like(pulled, 3.0), rtol=0.02, atol=0.0)
 
 
-def test_in_float32_it_is_the_gradient_bit_for_bit():
+def test_in_float32_it_is_the_gradient_bit_for_bit_and_infinity_is_not_hidden():
     z = torch.randn(2, 4, 3, 3, requires_grad=True)
     gradient = 1e-5 * torch.randn(2, 4, 3, 3)
     (plain,) = torch.autograd.grad((z**3).sin(), z, gradient)
     assert torch.equal(pull_back((z**3).sin(), z, gradient), plain)
-
-
-def test_no_gradient_stays_none_and_infinity_is_not_hidden():
     z = torch.ones(2, 1, requires_grad=True)
     pulled = pull_back(2.0 * z, z, torch.tensor([[0.0], [torch.inf]]))
     assert pulled[0] == 0.0 and not torch.isfinite(pulled[1])
@@ -87,7 +54,6 @@ def test_no_gradient_stays_none_and_infinity_is_not_hidden():
 
 def test_the_first_that_is_not_finite_is_named_with_its_step_and_the_cure():
     watch = FiniteWatch()
-    watch.check(torch.float16)
     watch.note("the decoded map", 0, torch.ones(3))
     watch.check(torch.float16)
     watch.note("the encoded correction", 1, torch.tensor([1.0, torch.nan]))

@@ -102,7 +102,7 @@ def test_the_likeliest_reason_comes_first_and_figures_do_not_contradict():
 
 def signs_of(pose) -> Indicators:
     evidence = SimpleNamespace(matches=None, volume=None, points=None, warnings=(), pose=pose)
-    evidence.native_left, evidence.native = torch.zeros(3, 8, 8), ()
+    evidence.native_left, evidence.native_views = torch.zeros(3, 8, 8), ()
     return read_indicators(evidence, torch.eye(3), order=math.nan)
 
 
