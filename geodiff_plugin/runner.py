@@ -1,4 +1,4 @@
-"""One runner for long jobs: ``geodiff depth`` over many pairs, captures and the evaluation.
+"""One resumable loop for long jobs: ``geodiff depth`` over many pairs, captures and the evaluation.
 
 A job is a list of ``Item``; its results are lines of a ``Journal``, a JSONL file. ``Runner.run`` takes every
 item without a result through the stages of the work and appends one record each::
@@ -7,9 +7,8 @@ item without a result through the stages of the work and appends one record each
     runner = Runner(items, Journal(out / "samples.jsonl"), noun="sample")
     records = runner.run(lambda item: {"abs_rel": measure(item.payload)})
 
-- **Resuming.** A key is the fingerprint of all inputs, so an item whose inputs did not change has its record
-  already. Where a result has a place with a name, such as a folder for each pair, the key is that name, and
-  ``Item.inputs`` is the fingerprint.
+- **Resuming.** An item whose key, and ``inputs``, are those of a record is done. One of them is the
+  fingerprint of what it is made from.
 - **Several processes**, started by ``torchrun``, ``accelerate launch`` or in two terminals, share a job by
   sharing its journal. Each claims an item before the work, with a lock that the kernel gives back when the
   process ends, however it ends. The first process waits for what others have claimed, takes it over should
@@ -29,23 +28,26 @@ import json
 import os
 import sys
 import threading
+import time
 import traceback
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+import weakref
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
-from typing import IO, Any
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.formats.out import take_lock
 
 try:
     import fcntl
-except ImportError:  # no flock: processes keep to their shares, and two runs of one job do its work twice
+except ImportError:  # no locks: processes keep to their shares, and two runs of one job do its work twice
     CAN_LOCK = False
 else:
     CAN_LOCK = True
@@ -57,7 +59,7 @@ Stage = Callable[[Any], Any]
 
 #: ``status`` of an item that failed.
 BROKEN = "broken"
-#: Seconds between two looks at what other processes have finished, and at whether to stop.
+#: Seconds between two looks at what other processes have finished.
 POLL_S = 0.2
 #: Names that a sentence about several failures gives.
 MOST_NAMES = 5
@@ -86,8 +88,7 @@ def _readable(part: Any) -> Any:
     return [_readable(value) for value in part] if isinstance(part, (list, tuple)) else part
 
 
-@dataclass(frozen=True)
-class Process:
+class Process(NamedTuple):
     """Which of how many processes of a launcher this one is, from 0, and its index on its own machine."""
 
     index: int
@@ -106,7 +107,7 @@ class Item:
     """One piece of work.
 
     Attributes:
-        key: its name, no two items of a job share one.
+        key: no two items of a job share one.
         payload: what the first stage works on.
         inputs: fingerprint of its inputs, unless ``key`` is it; a record of other inputs does not count.
         name: in messages; ``key`` by default.
@@ -131,41 +132,38 @@ class Item:
 class Journal:
     """Records of a job in a JSONL file that several processes may append to.
 
-    Records of failures that the file holds at first do not count, so that they are tried again.
+    Records of failures that the file holds at first do not count, so that they are tried again. An item is
+    claimed by a lock on a byte of the file that its key names. The system drops these locks as soon as the
+    process closes the file anywhere: it stays open, and nothing else may open it during a run.
 
     Args:
         path: the file; its folder is made where it is missing, and ``ValueError`` says where it cannot be.
-        option: what the folder was given as, for messages.
     """
 
-    def __init__(self, path: Path, option: str = "--out") -> None:
-        self.path = path
-        self._claims = path.with_name(f".{path.name}.claims")
-        self._mine: dict[Path, IO[bytes]] = {}
+    def __init__(self, path: Path) -> None:
+        self.path, self._read_bytes = path, 0
         self._records: dict[tuple[str, str], Record] = {}
-        self._read_bytes, self._lock = 0, threading.RLock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with open(path, "ab"):
-                pass
+            self._file = open(path, "a+b", buffering=0)
         except OSError as error:
             cure = "Name another, or free disk space and check its permissions."
             got = f"{path.parent} ({error.strerror or error})"
-            bad_value(option, "a folder that can be written to", got, cure)
+            bad_value("--out", "a folder that can be written to", got, cure)
+        weakref.finalize(self, self._file.close)
         self.refresh()
         self._records = {key: r for key, r in self._records.items() if r.get("status") != BROKEN}
 
     def refresh(self) -> None:
         """Read what was appended since the last time; lines that a killed process left torn are skipped."""
-        with self._lock, open(self.path, "rb") as file:
-            file.seek(self._read_bytes)
-            *lines, torn = file.read().split(b"\n")
-            self._read_bytes = file.tell() - len(torn)
-            for line in lines:
-                with suppress(ValueError):
-                    record = json.loads(line)
-                    if isinstance(record, dict) and "key" in record:
-                        self._records[record["key"], record.get("inputs", "")] = record
+        self._file.seek(self._read_bytes)
+        *lines, torn = self._file.read().split(b"\n")
+        self._read_bytes = self._file.tell() - len(torn)
+        for line in lines:
+            with suppress(ValueError):
+                record = json.loads(line)
+                if isinstance(record, dict) and "key" in record:
+                    self._records[record["key"], record.get("inputs", "")] = record
 
     def get(self, item: Item) -> Record | None:
         """The last record of an item; ``None`` where it is still to be made."""
@@ -175,61 +173,47 @@ class Journal:
         """Let the record of an item not count, so that it is made again."""
         self._records.pop((item.key, item.inputs), None)
 
-    def put(self, item: Item, record: Record) -> Record:
-        """Append the record of an item, forced to the disk, and return it with its key."""
+    def put(self, item: Item, record: Record) -> None:
+        """Append the record of an item, forced to the disk."""
         record = {"key": item.key} | ({"inputs": item.inputs} if item.inputs else {}) | {**item.head} | record
         line = (json.dumps(record) + "\n").encode()
-        with self._lock, open(self.path, "a+b", buffering=0) as file:
-            if CAN_LOCK:
-                fcntl.flock(file, fcntl.LOCK_EX)  # until it is closed
-            if file.seek(0, os.SEEK_END) > 0:
-                file.seek(-1, os.SEEK_END)
-                line = line if file.read(1) == b"\n" else b"\n" + line
-            if file.write(line) < len(line):
+        self._lock(0, wait=True)
+        try:
+            if self._file.seek(0, os.SEEK_END) > 0:
+                self._file.seek(-1, os.SEEK_END)
+                line = line if self._file.read(1) == b"\n" else b"\n" + line
+            if self._file.write(line) < len(line):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
-            os.fsync(file.fileno())
-            self._records[item.key, item.inputs] = record
-        return record
+            os.fsync(self._file.fileno())
+        finally:
+            self._unlock(0)
+        self._records[item.key, item.inputs] = record
 
-    def _claim_path(self, item: Item) -> Path:
-        return self._claims / fingerprint(item.key, item.inputs)
+    def _lock(self, byte: int, wait: bool = False) -> bool:
+        """Lock a byte of the file, there or not; ``False`` where another process has it."""
+        if CAN_LOCK:
+            try:
+                fcntl.lockf(self._file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, byte)
+            except (BlockingIOError, PermissionError):
+                return False
+        return True
+
+    def _unlock(self, byte: int) -> None:
+        if CAN_LOCK:
+            fcntl.lockf(self._file, fcntl.LOCK_UN, 1, byte)
 
     def claim(self, item: Item) -> bool:
-        """Hold an item until ``release``; ``False`` where another process, or thread, has it."""
-        path = self._claim_path(item)
-        while CAN_LOCK:
-            self._claims.mkdir(exist_ok=True)
-            try:
-                file = open(path, "ab")
-            except FileNotFoundError:  # whoever was last to release has removed the folder in between
-                continue
-            if not take_lock(file):
-                file.close()
-                return False
-            # Who held it before has removed the file meanwhile: what we hold then is nobody's lock.
-            with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                    self._mine[path] = file
-                    break
-            file.close()
-        return True
+        """Hold an item until ``release``; ``False`` where another process has it."""
+        return self._lock(_byte(item))
 
     def release(self, item: Item) -> None:
         """Give a claimed item back."""
-        file = self._mine.pop(self._claim_path(item), None)
-        if file is not None:
-            self._claim_path(item).unlink(missing_ok=True)
-            file.close()
-        with suppress(OSError):  # others hold claims
-            self._claims.rmdir()
+        self._unlock(_byte(item))
 
-    def others_work(self) -> bool:
-        """Whether another process holds an item of this job."""
-        for path in set(self._claims.glob("*")) - set(self._mine):
-            with suppress(FileNotFoundError), open(path, "rb") as file:
-                if not take_lock(file):
-                    return True
-        return False
+
+def _byte(item: Item) -> int:
+    """The byte of a journal that stands for an item; the first one is for appending."""
+    return 1 + int(fingerprint(item.key, item.inputs)[:15], 16)
 
 
 class Runner:
@@ -243,9 +227,6 @@ class Runner:
         progress: show a bar with the time left, in the first process.
         show: what the bar says of the records so far, such as running means.
         whole: whether what a record stands for is still there, such as files beside it; else it is made anew.
-        in_order: an item goes on from the one before, so a process takes items of another's share only when
-            no other process works any more.
-        say: prints a sentence about failures; by default on stderr.
     """
 
     def __init__(
@@ -258,22 +239,22 @@ class Runner:
         progress: bool = True,
         show: Callable[[Sequence[Record]], dict[str, str]] | None = None,
         whole: Callable[[Item, Record], bool] | None = None,
-        in_order: bool = False,
-        say: Callable[[str], None] | None = None,
     ) -> None:
         self.items, self.journal, self.process = list(items), journal, this_process()
         if len({(item.key, item.inputs) for item in self.items}) < len(self.items):
             bad_value("items", "of different keys", f"{len(self.items)} {noun}s, some of one key")
         if self.process.count > 1 and not CAN_LOCK:
-            bad_value("the number of processes", "1 on a system without flock", self.process.count)
+            bad_value("the number of processes", "1 on a system without fcntl", self.process.count)
         for item in self.items:
             record = journal.get(item)
             if record is not None and whole is not None and not whole(item, record):
                 journal.forget(item)
-        self._noun, self._survives, self._show, self._in_order = noun, survives, show, in_order
+        self._noun, self._survives, self._show = noun, survives, show
         self._progress = progress and self.process.index == 0
-        self._failures = _Failures(noun, len(self.items), say or _say)
-        self._begun, self._stop = set[Item](), threading.Event()
+        self._failures, self._begun = _Failures(noun, len(self.items)), set[Item]()
+        low, high = (len(items) * (self.process.index + i) // self.process.count for i in (0, 1))
+        # Of another's share from the end on: an item may start from the result of the one before.
+        self._left = deque(self.items[low:high] + self.items[:low][::-1] + self.items[high:][::-1])
 
     def run(
         self, *stages: Stage, release: Callable[[Item], None] | None = None, most: int = 4
@@ -284,7 +265,7 @@ class Runner:
             stages: the first takes an item, every other one what the stage before returned; the last returns
                 the body of the record. Several run side by side, a thread each, on different items.
             release: called with every item that was begun, once it is through or has failed.
-            most: items on the way at a time.
+            most: items on the way at a time, where there are several stages.
 
         Returns:
             The records that are there, in the order of ``items``; in the first process those of all items.
@@ -295,26 +276,33 @@ class Runner:
         """
 
         def leave(item: Item) -> None:
-            on_the_way.discard(item)
             if release is not None:
                 release(item)
             self.journal.release(item)
 
-        on_the_way: set[Item] = set()
-        done, total, unit = len(self._records()), len(self.items), f" {self._noun}"
-        work = _in_turn if len(stages) == 1 else _side_by_side
-        bar = tqdm(total=total, initial=done, unit=unit, file=sys.stderr, disable=not self._progress)
+        most = most if len(stages) > 1 else 1
+        on_the_way: deque[tuple[Item, Callable[[], Record]]] = deque()
+        pipeline, done, unit = _Pipeline(stages), len(self._records()), f" {self._noun}"
+        disable = not self._progress
+        bar = tqdm(total=len(self.items), initial=done, unit=unit, file=sys.stderr, disable=disable)
         try:
-            with bar, closing(work(self._todo(on_the_way), stages, self._stop, most)) as results:
-                for item, result in results:
-                    self._record(item, result)
-                    leave(item)
+            while True:
+                item = self._next() if len(on_the_way) < most else None
+                if item is not None:
+                    on_the_way.append((item, pipeline.begin(item)))
+                elif on_the_way:
+                    self._record(*on_the_way[0])
+                    leave(on_the_way.popleft()[0])
                     records = self._records()
                     if self._show is not None:
                         bar.set_postfix(self._show(records), refresh=False)
                     bar.update(len(records) - bar.n)
+                elif not self._look_again():
+                    break
         finally:
-            for item in tuple(on_the_way):
+            bar.close()
+            pipeline.end()
+            for item, _ in on_the_way:
                 leave(item)
         self._failures.report()
         return self._records()
@@ -323,137 +311,66 @@ class Runner:
         self.journal.refresh()
         return [record for item in self.items if (record := self.journal.get(item)) is not None]
 
-    def _record(self, item: Item, result: Any) -> None:
-        if not isinstance(result, _Failed):
-            self.journal.put(item, result)
-            self._failures.passed()
-        elif isinstance(result.error, self._survives):
-            self.journal.put(item, {"status": BROKEN, "error": self._failures.add(item, result.error)})
+    def _record(self, item: Item, result: Callable[[], Record]) -> None:
+        try:
+            record = result()
+        except self._survives as error:
+            record = {"status": BROKEN, "error": self._failures.add(item, error)}
         else:
-            raise result.error
+            self._failures.passed()
+        self.journal.put(item, record)
 
-    def _todo(self, on_the_way: set[Item]) -> Iterator[Item]:
-        """Items without a record, claimed: of this process's share, then what others leave or have lost."""
-        index, count = self.process.index, self.process.count
-        low, high = (len(self.items) * i // count for i in (index, index + 1))
-        left = self.items[low:high]
-        left += [] if self._in_order else self.items[high:] + self.items[:low]
-        while True:
-            for item in left:
-                if self._stop.is_set():
-                    return
-                if self._take(item):
-                    on_the_way.add(item)
-                    yield item
-            if index > 0:
-                return
-            while True:
-                self.journal.refresh()
-                left = [i for i in self.items if i not in self._begun and self.journal.get(i) is None]
-                if not left or self._stop.wait(POLL_S):
-                    return
-                if not (self._in_order and self.journal.others_work()):
-                    break
+    def _next(self) -> Item | None:
+        """Claim the next item without a record; ``None`` where there is none at present."""
+        while self._left:
+            item = self._left.popleft()
+            if item in self._begun or self.journal.get(item) is not None or not self.journal.claim(item):
+                continue
+            self.journal.refresh()
+            if self.journal.get(item) is None:
+                self._begun.add(item)
+                return item
+            self.journal.release(item)  # another process finished it a moment ago
+        return None
 
-    def _take(self, item: Item) -> bool:
-        if item in self._begun or self.journal.get(item) is not None or not self.journal.claim(item):
-            return False
+    def _look_again(self) -> bool:
+        """Wait for what others have claimed, and take it if they have lost it; ``False``: nothing is left."""
         self.journal.refresh()
-        if self.journal.get(item) is not None:  # another process finished it a moment ago
-            self.journal.release(item)
+        left = [i for i in self.items if i not in self._begun and self.journal.get(i) is None]
+        if not left or self.process.index > 0:
             return False
-        self._begun.add(item)
+        time.sleep(POLL_S)
+        self._left.extend(left)
         return True
 
 
-@dataclass(frozen=True)
-class _Failed:
-    """What a stage raised, on its way to the thread that records it."""
+class _Pipeline:
+    """Stages side by side, a thread each; a single one runs in the thread that asks for its result."""
 
-    error: BaseException
+    def __init__(self, stages: Sequence[Stage]) -> None:
+        self._stages, self._stop = stages, threading.Event()
+        self._pools = [ThreadPoolExecutor(1) for _ in stages] if len(stages) > 1 else []
 
+    def begin(self, item: Item) -> Callable[[], Record]:
+        """Send an item on its way; what is returned waits for its record."""
+        if not self._pools:
+            return partial(self._stages[0], item)
+        future = self._pools[0].submit(self._stages[0], item)
+        for pool, stage in zip(self._pools[1:], self._stages[1:], strict=True):
+            future = pool.submit(self._follow, stage, future)
+        return future.result
 
-Results = Generator[tuple[Item, Any], None, None]
-
-
-def _attempt(stage: Stage, value: Any) -> Any:
-    try:
+    def _follow(self, stage: Stage, before: Future[Any]) -> Any:
+        value = before.result()
+        if self._stop.is_set():
+            raise CancelledError
         return stage(value)
-    except BaseException as error:  # raised again where the items are recorded, unless the run survives it
-        return _Failed(error)
 
-
-def _in_turn(items: Iterable[Item], stages: Sequence[Stage], stop: threading.Event, most: int) -> Results:
-    """Every item with the result of the only stage, in this thread."""
-    try:
-        for item in items:
-            yield item, _attempt(stages[0], item)
-    finally:
-        stop.set()
-
-
-#: What ends a queue; in the place of an item, what stands beside it is the error of the source.
-_END: Any = object()
-
-
-def _side_by_side(
-    items: Iterable[Item], stages: Sequence[Stage], stop: threading.Event, most: int
-) -> Results:
-    """Every item with what the last stage returned, or ``_Failed``; in order, each stage in its thread.
-
-    Closing the generator lets every stage end what it is at and no more. What ``items`` itself raises is
-    raised behind the items before.
-    """
-    queues: list[SimpleQueue[Any]] = [SimpleQueue() for _ in range(len(stages) + 1)]
-    room = threading.Semaphore(most)
-    jobs: list[tuple[Callable[..., None], tuple[Any, ...]]] = [(_feed, (items, queues, room, stop))]
-    jobs += [(_work, (stage, *ends, stop)) for stage, *ends in zip(stages, queues, queues[1:], strict=False)]
-    workers = [threading.Thread(target=target, args=args, daemon=True) for target, args in jobs]
-    for worker in workers:
-        worker.start()
-    source_error: BaseException | None = None
-    try:
-        while (entry := queues[-1].get()) is not _END:
-            if entry[0] is _END:
-                source_error = entry[1]
-                continue
-            yield entry
-            room.release()
-        if source_error is not None:
-            raise source_error
-    finally:
-        stop.set()
-        for worker in workers:
-            worker.join()
-
-
-def _feed(
-    items: Iterable[Item],
-    queues: Sequence[SimpleQueue[Any]],
-    room: threading.Semaphore,
-    stop: threading.Event,
-) -> None:
-    """Put items into the first queue as long as there is room; an error goes to the last one."""
-    try:
-        for item in items:
-            queues[0].put((item, item))
-            while not room.acquire(timeout=POLL_S):
-                if stop.is_set():
-                    return
-    except BaseException as error:  # told where the items are taken, not in a thread that nobody watches
-        queues[-1].put((_END, error))
-    finally:
-        queues[0].put(_END)
-
-
-def _work(stage: Stage, before: SimpleQueue[Any], after: SimpleQueue[Any], stop: threading.Event) -> None:
-    """Take every value of one queue through a stage into the next one."""
-    while (entry := before.get()) is not _END:
-        item, value = entry
-        if not isinstance(value, _Failed) and not stop.is_set():
-            value = _attempt(stage, value)
-        after.put((item, value))
-    after.put(_END)
+    def end(self) -> None:
+        """Let every stage end what it is at and no more."""
+        self._stop.set()
+        for pool in self._pools:
+            pool.shutdown(cancel_futures=True)
 
 
 def _say(sentence: str) -> None:
@@ -464,11 +381,10 @@ def _say(sentence: str) -> None:
 class _Failures:
     """Says why items failed: each cause once, and at the end how many items it struck."""
 
-    def __init__(self, noun: str, total: int, say: Callable[[str], None]) -> None:
-        self._noun, self._total, self._say = noun, total, say
+    def __init__(self, noun: str, total: int) -> None:
+        self._noun, self._total, self._any_passed = noun, total, False
         self._labels: dict[str, list[str]] = {}
-        self._unsaid: str | None = None  # the first message, as long as every item fails as the first one did
-        self._any_passed = False
+        self._unsaid: list[str] = []  # the first message, as long as every item fails as the first one did
 
     def add(self, item: Item, error: Exception) -> str:
         """Note a failure, say it unless its cause has been said, and return the message."""
@@ -476,16 +392,14 @@ class _Failures:
         message = str(error) if is_plain else f"{type(error).__name__}: {error}"
         cause = message
         for word in sorted(item.words or (item.label,), key=len, reverse=True):
-            cause = cause.replace(word, "") if word else cause
-        is_new = cause not in self._labels
+            cause = cause.replace(word, "")
+        if cause not in self._labels:
+            self._unsaid.append(f"{item.label}: {message}")
+            if not is_plain:  # a defect of ours
+                _say("".join(traceback.format_exception(error)).rstrip())
         self._labels.setdefault(cause, []).append(item.label)
-        if is_new and not is_plain:  # a defect of ours
-            self._say("".join(traceback.format_exception(error)).rstrip())
-        if is_new and len(self._labels) == 1 and not self._any_passed:
-            self._unsaid = f"{item.label}: {message}"
-        elif is_new:
+        if self._any_passed or len(self._labels) > 1:
             self._flush()
-            self._say(f"geodiff: {item.label}: {message}")
         return message
 
     def passed(self) -> None:
@@ -494,9 +408,9 @@ class _Failures:
         self._flush()
 
     def _flush(self) -> None:
-        if self._unsaid is not None:
-            self._say(f"geodiff: {self._unsaid}")
-        self._unsaid = None
+        for message in self._unsaid:
+            _say(f"geodiff: {message}")
+        self._unsaid.clear()
 
     def report(self) -> None:
         """Say how many items each cause struck, where several.
@@ -504,13 +418,13 @@ class _Failures:
         Raises:
             ValueError: all items of the run failed, for one cause.
         """
-        if self._unsaid is not None and sum(map(len, self._labels.values())) == self._total > 1:
+        if self._unsaid and sum(map(len, self._labels.values())) == self._total > 1:
             everywhere = f"The same holds for all {self._total} {self._noun}s; nothing was computed."
-            raise InputError(f"{self._unsaid} {everywhere}")
+            raise InputError(f"{self._unsaid[0]} {everywhere}")
         self._flush()
         for labels in self._labels.values():
             if len(labels) > 1:
                 names = ", ".join(labels[:MOST_NAMES])
                 names += f" and {len(labels) - MOST_NAMES} more" if len(labels) > MOST_NAMES else ""
                 count = f"{len(labels)} of {self._total} {self._noun}s"
-                self._say(f"geodiff: {count} failed for one reason: {names}.")
+                _say(f"geodiff: {count} failed for one reason: {names}.")

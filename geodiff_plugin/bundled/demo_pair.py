@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin.formats import read_calibration, read_depth_mm_png, read_image
+from geodiff_plugin.formats import read_calibration, read_depth_png, read_image
 from geodiff_plugin.types import Rig
 
 #: ``left.png``, ``right.png``, ``calib.txt`` (Middlebury's format), ``depth_mm.png``.
@@ -35,7 +35,7 @@ class DemoPair:
 
 def read_demo_pair() -> DemoPair:
     """Read the pair that ships with the package."""
-    depth_m, valid = read_depth_mm_png(DEMO_PAIR_FOLDER / "depth_mm.png")
+    depth_m, valid = read_depth_png(DEMO_PAIR_FOLDER / "depth_mm.png")
     return DemoPair(
         left=read_image(DEMO_PAIR_FOLDER / "left.png")[0],
         right=read_image(DEMO_PAIR_FOLDER / "right.png")[0],

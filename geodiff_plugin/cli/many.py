@@ -334,9 +334,7 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
         noun="pair",
         survives=(Exception,),
         whole=is_whole,
-        in_order=options.warm_start,
         progress=not options.quiet,
-        say=say,
     )
     process = runner.process
     if device.type == "cuda" and device.index is None:
@@ -354,10 +352,9 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
         assert ended.__cause__ is not None
         raise ended.__cause__ from None
     except InputError:  # all of them, for one reason: no folder is left behind
-        if not journal.others_work():
-            with suppress(OSError):
-                journal.path.unlink()
-                journal.path.parent.rmdir()
+        with suppress(OSError):
+            journal.path.unlink()
+            journal.path.parent.rmdir()
         raise
     finally:
         stages.close()

@@ -327,7 +327,8 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
     if photographs:
         views = options.photographs()
         for name, path in views.items():
-            open_image(path, name).close()  # the head alone; the rest when it is read
+            with open_image(path, name):  # the head alone; the rest when it is read
+                pass
         for (one, a), (other, b) in itertools.combinations(views.items(), 2):
             if a.samefile(b):
                 bad_value(other, f"another photograph than {one}", f"{b} for both")

@@ -10,10 +10,18 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.cli.terminal import say
+from geodiff_plugin.formats import write_pfm
+from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.files import check_file, read_npy
-from geodiff_plugin.formats.submissions import BENCHMARKS, disparity_of_depth, write_submission
+from geodiff_plugin.formats.out import write_text
 
 __all__ = ["run_submit"]
+
+#: Benchmarks by name, and where their files lie below the folder of a submission.
+BENCHMARKS = {
+    "middlebury": "SET/SCENE/disp0METHOD.pfm (disp0METHOD_s.pfm with holes), timeMETHOD.txt",
+    "eth3d": "low_res_two_view/SCENE.pfm, SCENE.txt",
+}
 
 
 def run_submit(results: Sequence[Path], benchmark: str, out: Path, method: str) -> None:
@@ -22,7 +30,7 @@ def run_submit(results: Sequence[Path], benchmark: str, out: Path, method: str) 
     Args:
         results: folders of ``geodiff depth``, of one pair or of many each; the folder of a pair's left image
             names the scene.
-        benchmark: of ``formats.submissions.BENCHMARKS``.
+        benchmark: of ``BENCHMARKS``.
         out: folder of the submission.
         method: name of the method in Middlebury's files.
 
@@ -45,5 +53,26 @@ def run_submit(results: Sequence[Path], benchmark: str, out: Path, method: str) 
             got = f"two of {scene}"
             bad_value("RESULT", "one pair of every scene, whose folder its left image lies in", got)
         scenes.add(scene)
-        write_submission(out, benchmark, scene, method, disparity, report["seconds"]["guided call"])
+        _write(out, benchmark, scene, method, disparity, report["seconds"]["guided call"])
     say(f"{out}: {len(reports)} pairs for {benchmark} ({BENCHMARKS[benchmark]})")
+
+
+def _write(
+    folder: Path, benchmark: str, scene: Path, method: str, disparity: np.ndarray, seconds: float
+) -> None:
+    """The disparity, infinity where unknown, and the time of the pair in a data set's folder ``scene``.
+
+    Source: upload-format.html of Middlebury's evaluation, version 3; ETH3D's documentation, "Result
+        submission".
+    """
+    if benchmark == "middlebury":
+        if not method.isalnum():
+            bad_value("--method", "letters and digits", repr(method))
+        place = folder / scene.parent.name / scene.name
+        holes = "_s" if np.isinf(disparity).any() else ""
+        name, times, text = f"disp0{method}{holes}.pfm", f"time{method}.txt", f"{seconds:.2f}\n"
+    else:
+        place = folder / "low_res_two_view"
+        name, times, text = f"{scene.name}.pfm", f"{scene.name}.txt", f"runtime {seconds:.2f}\n"
+    write_text(place / times, text)
+    write_pfm(place / name, disparity)

@@ -7,6 +7,7 @@ import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -23,12 +24,10 @@ __all__ = ["Cloud", "flying_points", "make_cloud", "write_glb", "write_ply"]
 RELATIVE_STEP = 0.04
 #: A corner of a flat surface has three neighbours on it, a one-pixel ramp along an edge has two.
 FEWEST_NEIGHBOURS = 3
-AXES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
-VERTEX = np.dtype([(axis, "<f4") for axis in AXES] + [(channel, "u1") for channel in CHANNELS])
-#: Of binary glTF: the marks of its head and chunks, and the types of numbers by numpy's.
+#: Of binary glTF: the marks of its head and chunks, the types of numbers by numpy's, of lists and of meshes.
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 COMPONENTS = {"f": 5126, "B": 5121, "I": 5125}
-POINTS, LINES = 0, 1
+ATTRIBUTES, INDICES, POINTS, LINES = 34962, 34963, 0, 1
 #: A camera's pyramid is drawn to this share of the cloud's median depth.
 PYRAMID_SHARE = 0.08
 CAMERA_COLOURS = ((255, 255, 255), (255, 170, 0), (0, 200, 255), (160, 255, 120))
@@ -41,39 +40,27 @@ def _usable(depth_m: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
     return use if valid is None else use & np.asarray(valid, dtype=bool)
 
 
-def flying_points(
-    depth_m: np.ndarray,
-    valid: np.ndarray | None = None,
-    *,
-    relative_step: float = RELATIVE_STEP,
-    reach: int = 1,
-) -> np.ndarray:
+def flying_points(depth_m: np.ndarray) -> np.ndarray:
     """Points that hang in the air between a near and a far surface, ``(H, W)`` boolean.
 
-    A pixel flies when fewer than three of its eight neighbours have its depth, within ``relative_step`` of
-    the nearer of the two. Both sides of a clean edge stay. Things one pixel wide and surfaces seen at a
-    grazing angle (a road near the horizon) go too.
-
-    Args:
-        depth_m: ``(H, W)`` metres.
-        valid: ``(H, W)`` boolean; what is not valid or not above 0 supports no neighbour and never flies.
-        relative_step: allowed depth change between neighbours, > 0.
-        reach: distance of the eight neighbours in pixels, >= 1: by how much a map was enlarged.
+    A pixel of ``depth_m``, ``(H, W)`` metres, flies when fewer than three of its eight neighbours have its
+    depth, within 4 % of the nearer of the two. Both sides of a clean edge stay. Things one pixel wide and
+    surfaces seen at a grazing angle (a road near the horizon) go too. What is not finite or not above 0
+    supports no neighbour and never flies.
     """
     depth_m = np.asarray(depth_m, dtype=np.float32)
-    use = _usable(depth_m, valid)
+    use = _usable(depth_m, None)
     height, width = depth_m.shape
     # NaN compares false with everything, so what is unknown or outside the image supports nobody.
-    padded = np.pad(np.where(use, depth_m, np.nan), reach, constant_values=np.nan)
-    flying, shifts = np.empty(depth_m.shape, dtype=bool), (0, reach, 2 * reach)
+    padded = np.pad(np.where(use, depth_m, np.nan), 1, constant_values=np.nan)
+    flying = np.empty(depth_m.shape, dtype=bool)
     for rows in row_strips(height, width):
-        count = rows.stop - rows.start
-        strip = padded[rows.start : rows.stop + 2 * reach]
-        centre = strip[reach : reach + count, reach : reach + width]
+        count, strip = rows.stop - rows.start, padded[rows.start : rows.stop + 2]
+        centre = strip[1:-1, 1:-1]
         support = np.zeros(centre.shape, dtype=np.int8)
-        for dy, dx in ((dy, dx) for dy in shifts for dx in shifts if (dy, dx) != (reach, reach)):
+        for dy, dx in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
             neighbour = strip[dy : dy + count, dx : dx + width]
-            support += np.abs(centre - neighbour) <= relative_step * np.minimum(centre, neighbour)
+            support += np.abs(centre - neighbour) <= RELATIVE_STEP * np.minimum(centre, neighbour)
         flying[rows] = use[rows] & (support < FEWEST_NEIGHBOURS)
     return flying
 
@@ -160,49 +147,17 @@ def write_ply(
         "format binary_little_endian 1.0",
         f"comment camera frame: x right, y down, z forward, {'metres' if unit else 'no unit'}",
         f"element vertex {count}",
-        *(f"property float {name}" for name in AXES),
-        *(f"property uchar {name}" for name in CHANNELS),
+        *(f"property float {name}" for name in ("x", "y", "z")),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
         "end_header\n",
     ]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(lines).encode("ascii"))
         for cloud in _cloud_strips(depth_m, image_01, K, valid):
-            vertices = np.empty(len(cloud.points_m), dtype=VERTEX)
-            for columns, names in ((cloud.points_m, AXES), (cloud.colours, CHANNELS)):
-                for column, name in enumerate(names):
-                    vertices[name] = columns[:, column]
+            vertices = np.empty(len(cloud.points_m), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+            vertices["xyz"], vertices["rgb"] = cloud.points_m, cloud.colours
             file.write(vertices.tobytes())
     return count
-
-
-class _Buffer:
-    """The binary chunk of a GLB while it grows, with the accessors into it."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.views: list[dict[str, int]] = []
-        self.accessors: list[dict[str, object]] = []
-
-    def add(self, array: np.ndarray, kind: str, **more: object) -> int:
-        """Append an array; returns the number of its accessor."""
-        target = 34963 if kind == "SCALAR" else 34962  # indices, attributes
-        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes, "target": target}
-        component = COMPONENTS[array.dtype.char]
-        entry = {"bufferView": len(self.views), "componentType": component, "count": len(array), "type": kind}
-        self.data += array.tobytes() + b"\0" * (-array.nbytes % 4)
-        self.views.append(view)
-        self.accessors.append(entry | more)
-        return len(self.accessors) - 1
-
-    def vertices(self, points_m: np.ndarray, colours: np.ndarray) -> dict[str, int]:
-        """Attributes of coloured vertices given in the left camera's frame."""
-        positions = (points_m @ OPENGL_FROM_OPENCV[:3, :3]).astype("<f4")
-        rgba = np.pad(colours.astype(np.uint8), ((0, 0), (0, 1)), constant_values=255)
-        bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
-        return {
-            "POSITION": self.add(positions, "VEC3", **bounds),
-            "COLOR_0": self.add(rgba, "VEC4", normalized=True),
-        }
 
 
 def _pyramid(K: np.ndarray, E: np.ndarray, size: tuple[int, int], length_m: float) -> np.ndarray:
@@ -231,18 +186,37 @@ def write_glb(
     Convention:
         glTF's axes, in metres: a point 1 m to the right of, above and before the camera is (1, 1, -1).
     """
-    buffer, meshes = _Buffer(), []
+    arrays: list[np.ndarray] = []
+    accessors: list[dict[str, Any]] = []
+
+    def add(array: np.ndarray, kind: str, **more: Any) -> int:
+        entry = {"bufferView": len(arrays), "componentType": COMPONENTS[array.dtype.char]}
+        accessors.append(entry | {"count": len(array), "type": kind} | more)
+        arrays.append(array)
+        return len(arrays) - 1
+
+    def mesh(name: str, mode: int, points_m: np.ndarray, colours: np.ndarray, **more: Any) -> dict[str, Any]:
+        positions = (points_m @ OPENGL_FROM_OPENCV[:3, :3]).astype("<f4")
+        bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+        rgba = np.pad(colours.astype(np.uint8), ((0, 0), (0, 1)), constant_values=255)
+        attributes = {"POSITION": add(positions, "VEC3", **bounds)}
+        attributes["COLOR_0"] = add(rgba, "VEC4", normalized=True)
+        return {"name": name, "primitives": [{"attributes": attributes, "mode": mode, "material": 0} | more]}
+
+    meshes, length_m = [], 1.0
     if len(cloud.points_m):
-        primitive = {"attributes": buffer.vertices(cloud.points_m, cloud.colours), "mode": POINTS}
-        meshes.append({"name": "cloud", "primitives": [primitive | {"material": 0}]})
-    length_m = PYRAMID_SHARE * float(np.median(cloud.points_m[:, 2])) if len(cloud.points_m) else 1.0
+        meshes.append(mesh("cloud", POINTS, cloud.points_m, cloud.colours))
+        length_m = PYRAMID_SHARE * float(np.median(cloud.points_m[:, 2]))
     for number, (K, E, size) in enumerate(cameras):
-        colour = np.tile(np.array(CAMERA_COLOURS[number % len(CAMERA_COLOURS)], dtype=np.uint8), (5, 1))
+        colours = np.tile(CAMERA_COLOURS[number % len(CAMERA_COLOURS)], (5, 1))
         corners = _pyramid(np.asarray(K), np.asarray(E), size, length_m)
-        primitive = {"attributes": buffer.vertices(corners, colour), "mode": LINES}
-        primitive |= {"indices": buffer.add(EDGES, "SCALAR"), "material": 0}
-        meshes.append({"name": f"camera {number}", "primitives": [primitive]})
-    scene = {
+        meshes.append(mesh(f"camera {number}", LINES, corners, colours, indices=add(EDGES, "SCALAR")))
+    views, data = [], b""
+    for array, accessor in zip(arrays, accessors, strict=True):
+        target = INDICES if accessor["type"] == "SCALAR" else ATTRIBUTES
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
+        data += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    scene: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "geodiff-plugin"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
@@ -250,18 +224,13 @@ def write_glb(
         "materials": [{"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {}}],
     }
     if meshes:
-        scene |= {
-            "nodes": [{"name": mesh["name"], "mesh": i} for i, mesh in enumerate(meshes)],
-            "meshes": meshes,
-            "buffers": [{"byteLength": len(buffer.data)}],
-            "bufferViews": buffer.views,
-            "accessors": buffer.accessors,
-        }
+        scene |= {"nodes": [{"name": m["name"], "mesh": i} for i, m in enumerate(meshes)], "meshes": meshes}
+        scene |= {"buffers": [{"byteLength": len(data)}], "bufferViews": views, "accessors": accessors}
     # Each chunk is padded to 4 bytes: JSON with blanks, binary with zeros.
     text = json.dumps(scene, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), JSON_CHUNK) + text
-    if buffer.data:
-        chunks += struct.pack("<II", len(buffer.data), BINARY_CHUNK) + buffer.data
+    if data:
+        chunks += struct.pack("<II", len(data), BINARY_CHUNK) + data
     with atomic_path(path) as temporary:
         temporary.write_bytes(struct.pack("<III", MAGIC, VERSION, 12 + len(chunks)) + chunks)

@@ -1,4 +1,4 @@
-"""Depth and disparity maps: PFM, npy, 16-bit PNG in millimetres or KITTI's 1/256; strips of large maps."""
+"""Depth and disparity maps: PFM, npy, 16-bit PNG; one from the other; strips of large maps."""
 
 from __future__ import annotations
 
@@ -6,21 +6,26 @@ import os
 import zipfile
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.files import check_file, read_npy
+from geodiff_plugin.formats.files import check_file, open_image, read_npy
 from geodiff_plugin.formats.out import atomic_path
 
+if TYPE_CHECKING:  # which imports torch
+    from geodiff_plugin.types import Rig
+
 __all__ = [
-    *("STRIP_PIXELS", "depth_mm", "read_depth_mm_png", "read_depth_png", "read_disparity_kitti_png"),
-    *("read_map", "read_pfm", "row_strips", "write_depth_mm", "write_depth_npy", "write_pfm"),
+    *("STRIP_PIXELS", "depth_mm", "depth_of_disparity", "disparity_of_depth", "read_depth_png", "read_map"),
+    *("read_pfm", "row_strips", "write_depth_mm", "write_depth_npy", "write_pfm"),
 ]
 
 PathLike = str | os.PathLike[str]
-LARGEST_MM = 65535
+LARGEST_MM, KITTI_UNITS = 65535, 256.0
 #: Pixels of a strip: a map of float64 of so many is 8 MB.
 STRIP_PIXELS = 1 << 20
 #: What depth models are read from.
@@ -133,7 +138,9 @@ def write_depth_mm(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None
     return int((whole == 0).sum())
 
 
-def read_depth_png(path: PathLike, units_per_m: float, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
+def read_depth_png(
+    path: PathLike, units_per_m: float = 1000.0, name: str = "depth"
+) -> tuple[np.ndarray, np.ndarray]:
     """Read a 16-bit PNG of depth or disparity with so many units in a metre or pixel (KITTI has 256).
 
     Returns:
@@ -142,28 +149,12 @@ def read_depth_png(path: PathLike, units_per_m: float, name: str = "depth") -> t
     Raises:
         OSError, ValueError: no readable file, not a 16-bit PNG, or cut off.
     """
-    file = check_file(path, name, "a 16-bit PNG file")
-    try:
-        with Image.open(file) as image:
-            image.load()
-            mode, values = image.mode, np.asarray(image)
-    except (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError) as error:
-        got = f"{file}, which does not decode ({error})"
-        bad_value(name, "a whole 16-bit PNG file", got, "Is it cut off?")
+    with open_image(path, name, "a 16-bit PNG file") as image:
+        mode, values = image.mode, np.asarray(image)
     if not mode.startswith("I"):
         cure = "An 8-bit copy has lost the values."
-        bad_value(name, "a 16-bit grey PNG file", f"{file} of mode {mode}", cure)
+        bad_value(name, "a 16-bit grey PNG file", f"{path} of mode {mode}", cure)
     return values.astype(np.float32) / np.float32(units_per_m), values > 0
-
-
-def read_disparity_kitti_png(path: PathLike, name: str = "disparity") -> tuple[np.ndarray, np.ndarray]:
-    """Read KITTI's 16-bit PNG of disparity * 256, in pixels; otherwise as ``read_depth_png``."""
-    return read_depth_png(path, 256.0, name)
-
-
-def read_depth_mm_png(path: PathLike, name: str = "depth") -> tuple[np.ndarray, np.ndarray]:
-    """Read a 16-bit PNG of millimetres, as metres; otherwise as ``read_depth_png``."""
-    return read_depth_png(path, 1000.0, name)
 
 
 def read_map(path: PathLike, name: str = "map") -> np.ndarray:
@@ -197,3 +188,65 @@ def read_map(path: PathLike, name: str = "map") -> np.ndarray:
     if values.ndim != 2 or values.dtype.kind not in "fiu":
         bad_value(name, MAP_FILES, f"{file} of shape {values.shape}", "Save one map of the left image.")
     return np.where(np.isfinite(values), values, np.nan)
+
+
+def _baseline(E: np.ndarray, name: str, got: str) -> float:
+    """Distance of the cameras of a rectified rig; others are refused."""
+    others = E - np.eye(4)
+    others[0, 3] = 0.0
+    if E[0, 3] <= 0 or np.abs(others).max() > 1e-3 * max(E[0, 3], 1.0):
+        cure = "Its right camera stands to the right, and a disparity goes along rows."
+        bad_value(name, "of a rectified pair", got, cure)
+    return float(E[0, 3])
+
+
+def disparity_of_depth(
+    depth_m: np.ndarray, K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray
+) -> np.ndarray:
+    """Disparity in pixels of a rectified rig, ``fx baseline / Z - doffs``; infinity where depth is unknown.
+
+    ``depth_m`` is ``(H, W)`` in the unit of ``E``; the intrinsics are in its pixels.
+
+    Raises:
+        ValueError: a rig that is not rectified.
+    """
+    shift = K_left[0, 0] * _baseline(E, "a submission", "a pair with another pose")
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    inverse = np.where(known, 1.0 / np.where(known, depth_m, 1.0), np.inf)
+    return (shift * inverse - (K_right[0, 2] - K_left[0, 2])).astype(np.float32)
+
+
+def depth_of_disparity(
+    path: PathLike, rig: Rig, size: tuple[int, int], name: str = "disparity"
+) -> np.ndarray:
+    """Depths by a disparity map of the left image, from a stereo network or a sensor.
+
+    Args:
+        path: of ``read_map``; a PNG holds 256 units a pixel, as KITTI's.
+        rig: rectified, in metres; its K are for images of ``size``.
+        size: ``(width, height)`` of the left image. A map of another size is one of the image scaled to it:
+            its disparities grow with its width, and every pixel takes the nearest.
+        name: the argument that it came in, for messages.
+
+    Returns:
+        ``(H, W)`` float32 metres, ``fx baseline / (d + doffs)``; 0 where the disparity is not finite or 0, or
+        nothing is in front of the cameras.
+
+    Raises:
+        OSError, ValueError: no map; a rig that is not rectified, or a map of another shape.
+    """
+    baseline_m = _baseline(rig.E, name, f"the rig of {rig.source}")
+    if rig.unit is None:
+        bad_value(name, "of a rig in metres", f"the rig of {rig.source}, which has no unit")
+    values = read_map(path, name) / (KITTI_UNITS if Path(path).suffix.lower() == ".png" else 1.0)
+    (width, height), (rows, columns) = size, values.shape
+    scale = width / columns
+    if abs(height / (scale * rows) - 1.0) > 0.02:
+        got = f"{path} of {columns}x{rows}"
+        bad_value(name, f"a map of the shape of the left image, {width}x{height} pixels", got)
+    nearest = [((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ((height, rows), (width, columns))]
+    disparity = values[np.ix_(*nearest)] * scale
+    shift = disparity + rig.K_right[0, 2] - rig.K_left[0, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth_m = rig.K_left[0, 0] * baseline_m / shift
+    return np.where(np.isfinite(depth_m) & (shift > 0) & (disparity != 0), depth_m, 0.0).astype(np.float32)

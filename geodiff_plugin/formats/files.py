@@ -8,13 +8,16 @@ import os
 import re
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from geodiff_plugin._checks import (
     FolderError,
     ForbiddenFileError,
+    InputError,
     MissingFileError,
     bad_type,
     bad_value,
@@ -26,27 +29,14 @@ if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
     from PIL import Image
 
 __all__ = [
-    "DECODE_ERRORS",
-    "check_file",
-    "file_digest",
-    "open_image",
-    "read_matrix",
-    "read_npy",
-    "read_rows",
-    "read_text",
-    "refuse_damaged",
+    *("check_file", "file_digest", "open_image", "read_matrix", "read_npy", "read_rows", "read_text"),
 ]
 
 HEIC = (".heic", ".heif")
-#: What Pillow raises at a damaged file.
-DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, zlib.error)
-
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
-
 #: No calibration file is near this size; a larger one is something else.
 LARGEST_TEXT_BYTES = 16_000_000
-
 #: Shape of a matrix that is written in one row, by the count of its numbers.
 FLAT = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 MATRIX = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
@@ -80,41 +70,41 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
     return file
 
 
-def open_image(path: str | os.PathLike[str], name: str) -> Image.Image:
+@contextmanager
+def open_image(path: str | os.PathLike[str], name: str, what: str = "an image file") -> Iterator[Image.Image]:
     """Open an image file with Pillow, HEIC by pillow-heif where that is installed; no pixel is read yet.
 
     Raises:
         FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: not an image, or one of more pixels than Pillow takes.
+        ValueError: not an image, one of more pixels than Pillow takes, or damage that shows in the block.
     """
     from PIL import Image, UnidentifiedImageError
 
-    file = check_file(path, name, "an image file")
+    file = check_file(path, name, what)
     if file.suffix.lower() in HEIC:
         try:
             import pillow_heif
         except ImportError:
             cure = "Run: pip install pillow-heif, or convert it to PNG or JPEG."
-            bad_value(name, "an image file", f"{file}, which Pillow reads with pillow-heif only", cure)
+            bad_value(name, what, f"{file}, which Pillow reads with pillow-heif only", cure)
         pillow_heif.register_heif_opener()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # what is too large is an error
-            return Image.open(file)
+            image = Image.open(file)
+        with image:
+            yield image
+    except InputError:
+        raise
     except Image.DecompressionBombError:
         expected = f"an image of at most {2 * (Image.MAX_IMAGE_PIXELS or 0) // 1_000_000} megapixels"
         bad_value(name, expected, f"{file}, a larger one", "Scale it down first, and K with it.")
     except UnidentifiedImageError:
         cure = "Convert it to PNG or JPEG."
-        bad_value(name, "an image file", f"{file}, a format that Pillow does not read", cure)
-    except DECODE_ERRORS as error:
-        refuse_damaged(name, file, error)
-
-
-def refuse_damaged(name: str, path: object, error: Exception) -> NoReturn:
-    """Refuse an image file that does not decode, with the reason."""
-    cure = "Is it cut off? Fetch it again."
-    bad_value(name, "a whole image file", f"{path}, which does not decode ({error})", cure)
+        bad_value(name, what, f"{file}, a format that Pillow does not read", cure)
+    except (OSError, SyntaxError, ValueError, EOFError, zlib.error) as error:
+        cure = "Is it cut off? Fetch it again."
+        bad_value(name, "a whole image file", f"{file}, which does not decode ({error})", cure)
 
 
 def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file") -> str:
@@ -184,14 +174,12 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
     """
     import numpy as np
 
-    reason: str | None = None
     try:
         value = np.load(path, allow_pickle=False)
     except Exception as error:  # a damaged head is parsed as Python, which may fail in any way
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         if "pickle" in reason:  # numpy's own words tell how to run what is in there
             reason = "pickled objects, which are never loaded"
-    if reason is not None:
         bad_value(name, expected, f"{path}, which numpy cannot load ({reason})", "Save it with numpy.save.")
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
         cure = "Save one array with numpy.save."
@@ -215,18 +203,15 @@ def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarra
     if file.suffix.lower() == ".npy":
         matrix = read_npy(file, name, MATRIX).astype(np.float64)
     else:
-        rows = [
-            [number for word in row if (number := word.strip("[]()"))]  # brackets of Python and JSON
+        rows = [  # without the brackets of Python and JSON
+            [number for word in row if (number := word.strip("[]()"))]
             for row in read_rows(file, name, MATRIX)
         ]
-        lengths = [len(row) for row in rows]
-        if len(set(lengths)) != 1:
-            bad_value(name, MATRIX, f"{path} with rows of {lengths or 'no'} numbers", "Is it cut off?")
         try:
-            matrix = np.array([[float(word) for word in row] for row in rows])
+            matrix = np.array(rows, dtype=np.float64)
         except ValueError:
-            cure = "A calibration file with words goes to --calib."
-            bad_value(name, MATRIX, f"{path} with words in it", cure)
+            cure = "Is it cut off? A calibration file with words goes to --calib."
+            bad_value(name, MATRIX, f"{path} with words in it, or rows of several lengths", cure)
     matrix = np.squeeze(matrix)
     if matrix.ndim == 1 and matrix.size in FLAT:
         matrix = matrix.reshape(FLAT[matrix.size])

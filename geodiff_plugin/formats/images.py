@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from PIL import Image, ImageOps
 
-from geodiff_plugin._checks import InputError, bad_type, bad_value, warn
-from geodiff_plugin.formats.files import DECODE_ERRORS, open_image, refuse_damaged
+from geodiff_plugin._checks import bad_type, bad_value, warn
+from geodiff_plugin.formats.files import open_image
 
 __all__ = ["MIN_SIDE", "as_image_01", "picture_size", "read_image"]
 
@@ -18,18 +18,11 @@ __all__ = ["MIN_SIDE", "as_image_01", "picture_size", "read_image"]
 MIN_SIDE = 32
 #: Resampling may overshoot [0, 1] by a little; more than this is another range.
 OVERSHOOT = 1e-3
-EXIF_ORIENTATION = 0x0112
-TURNS = {
-    2: "mirrored left to right",
-    3: "turned by 180 degrees",
-    4: "mirrored top to bottom",
-    5: "mirrored and turned by 90 degrees",
-    6: "turned by 90 degrees clockwise",
-    7: "mirrored and turned by 90 degrees",
-    8: "turned by 90 degrees counter-clockwise",
-}
+#: EXIF's tag, and its values for an image that is to be turned or mirrored.
+ORIENTATION, TURNS = 0x0112, range(2, 9)
 #: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
 DARK_16_BITS = 8192
+CHANNELS = (1, 3, 4)
 #: Formats of Pillow whose files may hold several frames or pages that are pictures of their own; what goes
 #: with a phone's JPEG is none.
 MANY_FRAMES = ("GIF", "PNG", "TIFF", "WEBP")
@@ -41,47 +34,59 @@ def _check_sides(width: int, height: int, name: str) -> None:
         bad_value(name, expected, f"{width}x{height}", "Is this a thumbnail or a latent?")
 
 
-def _has_16_bits(image: Image.Image) -> bool:
-    """Whether an image has 16 bits; of a coloured one Pillow loads the upper 8, and tells only before."""
-    raw_modes = (str(tile[3]) for tile in getattr(image, "tile", ()))
-    return image.mode.startswith("I") or any(";16" in mode for mode in raw_modes)
-
-
 def _frame_notes(image: Image.Image, name: str) -> list[str]:
     frames = getattr(image, "n_frames", 1) if image.format in MANY_FRAMES else 1
     return [f"{name} holds {frames} frames or pages; only the first is taken."] if frames > 1 else []
 
 
-def _dark_notes(most: int, name: str) -> list[str]:
-    """A sentence if a camera of 10 or 12 bits filled the lowest of an image's 16; else nothing."""
-    if most >= DARK_16_BITS:
-        return []
-    return [
-        f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
-        "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
-    ]
+def _has_16_bits(image: Image.Image) -> bool:
+    """Whether a coloured image has 16 bits: Pillow loads the upper 8, and tells only before."""
+    return any(";16" in str(tile[3]) for tile in getattr(image, "tile", ()))
 
 
-def _alpha_notes(has_alpha: bool, name: str) -> list[str]:
-    return [f"{name} has an alpha channel; it is dropped."] if has_alpha else []
-
-
-def _of_pillow(image: Image.Image, name: str, deep: bool) -> tuple[np.ndarray, list[str]]:
-    """``(H, W, 3)`` float32 in [0, 1] of an image in any mode that Pillow has, and what to say of it."""
+def _array_of(image: Image.Image, name: str) -> np.ndarray:
+    """``(H, W)`` floats or uint16, or ``(H, W, C)`` uint8, of an image in any mode that Pillow has."""
     _check_sides(*image.size, name)
     if image.mode == "F":
-        grey = _checked_floats(np.asarray(image, dtype=np.float32), name)
-        return np.repeat(grey[..., None], 3, axis=-1), []
+        return np.asarray(image, dtype=np.float32)
     if image.mode.startswith("I"):  # 16-bit grey: I;16, I;16B, or I in files that Pillow widens
-        grey = np.asarray(image).astype(np.float32)
+        grey = np.asarray(image)
         if grey.min() < 0 or grey.max() > 65535:
             bad_value(name, "an image of 8 or 16 bits", f"values from {grey.min():g} to {grey.max():g}")
-        notes = _dark_notes(int(grey.max()), name) if deep else []
-        return np.repeat(grey[..., None] / 65535.0, 3, axis=-1), notes
+        return grey.astype(np.uint16)
     alpha = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
-    rgb = np.asarray((image.convert("RGBA") if alpha else image).convert("RGB"))
-    notes = _alpha_notes(alpha, name) + (_dark_notes(int(rgb.max()) * 257, name) if deep else [])
-    return rgb.astype(np.float32) / 255.0, notes
+    return np.asarray(image.convert("RGBA" if alpha else "RGB"))
+
+
+def _to_01(value: np.ndarray, name: str, has_16_bits: bool = False) -> tuple[np.ndarray, list[str]]:
+    """``(H, W, 3)`` float32 in [0, 1] of ``(H, W)`` or ``(H, W, C)`` numbers, and what to say of them."""
+    value, notes = value[..., None] if value.ndim == 2 else value, []
+    if value.shape[-1] == 4:
+        value, notes = value[..., :3], [f"{name} has an alpha channel; it is dropped."]
+    if value.dtype in (np.uint8, np.uint16):
+        most = int(value.max()) * (1 if value.dtype == np.uint16 else 257)
+        if most < DARK_16_BITS and (has_16_bits or value.dtype == np.uint16):
+            notes.append(
+                f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
+                "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
+            )
+        value = value.astype(np.float32) / np.iinfo(value.dtype).max
+    elif value.dtype.kind == "f":
+        value = _checked_floats(value, name)
+    else:
+        cure = f"Convert it with astype('uint8'){' * 255' if value.dtype == bool else ''}."
+        bad_value(name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", cure)
+    return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value, notes
+
+
+def _checked_floats(values: np.ndarray, name: str) -> np.ndarray:
+    if not np.isfinite(values).all():
+        bad_value(name, "finite", "NaN or infinity in it", "Mask or fill those pixels first.")
+    low, high = float(values.min()), float(values.max())
+    if low < -OVERSHOOT or high > 1 + OVERSHOOT:
+        cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
+        bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
+    return values.astype(np.float32, copy=False).clip(0.0, 1.0)
 
 
 def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.ndarray, list[str]]:
@@ -97,55 +102,37 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
     Raises:
         OSError, ValueError: no readable file; not an image, cut off, or a side under 32 pixels.
     """
-    try:
-        with open_image(path, name) as image:
-            deep, notes = _has_16_bits(image), _frame_notes(image, name)
-            image.seek(0)
-            image.load()
-            turn = TURNS.get(image.getexif().get(EXIF_ORIENTATION, 1))
-            upright = ImageOps.exif_transpose(image)
-    except InputError:
-        raise
-    except DECODE_ERRORS as error:
-        refuse_damaged(name, path, error)
-    image_01, more = _of_pillow(upright, name, deep)
-    if turn is not None:
+    with open_image(path, name) as image:
+        deep, notes = _has_16_bits(image), _frame_notes(image, name)
+        image.seek(0)
+        image.load()
+        is_turned = image.getexif().get(ORIENTATION) in TURNS
+        upright = ImageOps.exif_transpose(image)
+    image_01, more = _to_01(_array_of(upright, name), name, deep)
+    if is_turned:
         more.append(
-            f"{name} was {turn} to {upright.width}x{upright.height}, as its EXIF orientation says; "
-            "K must belong to the turned image."
+            f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF orientation "
+            "says; K must belong to the turned image."
         )
     return image_01, notes + more
-
-
-def _checked_floats(values: np.ndarray, name: str) -> np.ndarray:
-    if not np.isfinite(values).all():
-        bad_value(name, "finite", "NaN or infinity in it", "Mask or fill those pixels first.")
-    low, high = float(values.min()), float(values.max())
-    if low < -OVERSHOOT or high > 1 + OVERSHOOT:
-        cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
-        bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
-    return values.astype(np.float32, copy=False).clip(0.0, 1.0)
 
 
 def _hwc(value: Any, name: str) -> np.ndarray:
     """``(H, W, C)``, C of 1, 3 or 4, of an array with channels last or a tensor with channels first."""
     if isinstance(value, torch.Tensor):
-        batch, flat = "Take one image of the batch: value[0].", "Add a channel axis: value[None]."
-        first, last, shape, place = 0, -1, "(3, H, W)", "first"
-        turn = "torch images start with channels: value.permute(2, 0, 1)."
+        channels, shape = 0, "(3, H, W)"
+        cures = {4: "Take one image of the batch: value[0].", 2: "Add a channel axis: value[None]."}
+        cures[3] = "torch images start with channels: value.permute(2, 0, 1)."
     elif isinstance(value, np.ndarray):
-        batch, flat = "Take one image of the batch.", ""
-        first, last, shape, place = -1, 0, "(H, W, 3) or (H, W)", "last"
-        turn = "numpy images end in channels: value.transpose(1, 2, 0)."
         value = value[..., None] if value.ndim == 2 else value
+        channels, shape = -1, "(H, W, 3) or (H, W)"
+        cures = {4: "Take one image of the batch."}
+        cures[3] = "numpy images end in channels: value.transpose(1, 2, 0)."
     else:
         bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
-    if value.ndim != 3:
-        cure = batch if value.ndim == 4 else flat
-        bad_value(name, f"an image of shape {shape}", f"shape {tuple(value.shape)}", cure)
-    if value.shape[first] not in (1, 3, 4):
-        cure = turn if value.shape[last] in (1, 3, 4) else ""
-        bad_value(name, f"an image with 1, 3 or 4 channels {place}", f"shape {tuple(value.shape)}", cure)
+    if value.ndim != 3 or value.shape[channels] not in CHANNELS:
+        expected = f"an image of shape {shape}, of 1, 3 or 4 channels"
+        bad_value(name, expected, f"shape {tuple(value.shape)}", cures.get(value.ndim, ""))
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu()
         value = value.float() if value.dtype == torch.bfloat16 else value  # numpy has no bfloat16
@@ -153,21 +140,6 @@ def _hwc(value: Any, name: str) -> np.ndarray:
     _check_sides(value.shape[1], value.shape[0], name)
     # Readers of TIFF and PGM leave the file's byte order, which says nothing about the values.
     return value.astype(value.dtype.newbyteorder("="), copy=False)
-
-
-def _of_array(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
-    """``(H, W, 3)`` float32 in [0, 1] of ``(H, W, C)`` uint8, uint16 or floats, and what to say of it."""
-    notes = _alpha_notes(value.shape[-1] == 4, name)
-    value = value[..., :3]
-    notes += _dark_notes(int(value.max()), name) if value.dtype == np.uint16 else []
-    if value.dtype in (np.uint8, np.uint16):
-        scaled = value.astype(np.float32) / np.iinfo(value.dtype).max
-    elif value.dtype.kind == "f":
-        scaled = _checked_floats(value, name)
-    else:
-        cure = f"Convert it with astype('uint8'){' * 255' if value.dtype == bool else ''}."
-        bad_value(name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", cure)
-    return np.repeat(scaled, 3, axis=-1) if scaled.shape[-1] == 1 else scaled, notes
 
 
 def picture_size(value: Any, name: str) -> tuple[int, int]:
@@ -204,15 +176,15 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
     """
     if isinstance(value, Image.Image):
         deep, notes = _has_16_bits(value), _frame_notes(value, name)
-        if value.getexif().get(EXIF_ORIENTATION) in TURNS:
+        if value.getexif().get(ORIENTATION) in TURNS:
             notes.append(
                 f"{name} carries an EXIF orientation that is not applied; "
                 "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image."
             )
-        hwc, more = _of_pillow(value, name, deep)
+        hwc, more = _to_01(_array_of(value, name), name, deep)
         notes += more
     else:
-        hwc, notes = _of_array(_hwc(value, name), name)
+        hwc, notes = _to_01(_hwc(value, name), name)
     for note in notes:
         warn(note, stacklevel=3)
     return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))

@@ -6,6 +6,7 @@ Nothing here imports torch: what is wrong with a folder is said at once.
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
 import secrets
@@ -14,8 +15,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import IO, NoReturn, Self, TypeVar
+from typing import IO, Self, TypeVar
 
 from geodiff_plugin._checks import FolderError, InputFileError, MissingFileError, bad_value
 
@@ -26,13 +26,12 @@ except ImportError:  # where there is no flock, two runs with one folder are not
 else:
     CAN_LOCK = True
 
-__all__ = ["PARTIAL", "OutFolder", "atomic_path", "check_out", "free_folder", "reason_of"]
+__all__ = ["PARTIAL", "OutFolder", "atomic_path", "check_out", "free_folder", "reason_of", "write_text"]
 
 #: The hidden folder of a run that is under way, with its lock and its files.
 PARTIAL, LOCK, FILES = ".geodiff-partial", "process", "files"
 #: Lists what a run wrote, and is written last.
 REPORT = "report.json"
-MOST_NUMBERED = 10_000
 #: A disk with less room takes no result, however small its picture.
 LEAST_FREE_BYTES = 8 << 20
 
@@ -41,11 +40,9 @@ Result = TypeVar("Result")
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path to write to; rename it to ``path`` when the block ends well.
+    """Give a temporary path beside ``path``, of its suffix; rename it to ``path`` when the block ends well.
 
-    The temporary file lies in the same folder (a rename across file systems is a copy) and keeps the
-    suffix, from which writers guess the format. On any error, Ctrl-C included, it is removed and an older
-    file at ``path`` stays as it was.
+    On any error, Ctrl-C included, it is removed, and an older file at ``path`` stays as it was.
 
     Raises:
         FileNotFoundError, IsADirectoryError: no folder to write into, or ``path`` is one.
@@ -66,13 +63,20 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all, making its folder where missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def reason_of(error: OSError) -> str:
     """The system's words for what went wrong, without the path."""
     return error.strerror or str(error)
 
 
 def _beside(target: Path) -> Path:
-    return target.with_name(f".{target.name}{PARTIAL}")
+    return target.parent / f".{target.name}{PARTIAL}"
 
 
 def _hidden(target: Path) -> Path:
@@ -83,36 +87,20 @@ def _hidden(target: Path) -> Path:
     return target / PARTIAL if target.is_dir() else _beside(target)
 
 
-def _absolute(path: Path, name: str) -> Path:
-    try:
-        return path.absolute()
-    except FileNotFoundError:
-        cure = "Change to one that is there."
-        bad_value(name, "below a working folder that exists", f"{path}, and that folder was removed", cure)
-
-
 def check_out(path: Path, name: str = "--out") -> Path:
     """The place that an output folder has or will have, links followed; messages call it ``name``.
 
     Raises:
-        ValueError: a file, a link to nothing, below a file, or a name that the file system refuses.
+        ValueError: a file, or a name that the file system refuses.
     """
     try:
-        if path.is_symlink() and not path.exists():
-            cure = "Make that folder, or remove the link."
-            bad_value(name, "a folder", f"{path}, a link to {os.readlink(path)}, which does not exist", cure)
-        target = _absolute(path, name) if not path.exists() else path.resolve()
-        if target.exists() and not target.is_dir():
-            bad_value(name, "a folder", f"the file {path}", "Name a folder.")
-        if not target.name:
-            bad_value(name, "a folder below the root", str(path), "Name a folder.")
-        os.stat(_beside(target))  # the longest name that will be needed
-    except FileNotFoundError:
-        pass
-    except NotADirectoryError:
-        bad_value(name, "a folder that can be made", f"{path}, which lies below a file")
+        target = path.resolve()
+        with suppress(FileNotFoundError):
+            os.stat(_beside(target))  # the longest name that will be needed
     except OSError as error:
         bad_value(name, "a folder that can be made", f"{path} ({reason_of(error)})", "Name another.")
+    if target.exists() and not target.is_dir():
+        bad_value(name, "a folder", f"the file {path}", "Name a folder.")
     return target
 
 
@@ -123,40 +111,30 @@ def _holds_files(target: Path) -> bool:
 
 def free_folder(default: Path) -> Path:
     """A folder for a run that named none: ``default``, or ``default-2`` and so on where that is taken."""
-    for number in range(1, MOST_NUMBERED):
+    for number in itertools.count(1):
         path = default if number == 1 else default.with_name(f"{default.name}-{number}")
         taken = os.path.lexists(path) and (not path.is_dir() or _holds_files(path))
-        if not taken and not _held(_hidden(_absolute(path, "--out"))):
-            return path
-    bad_value("--out", "given, as a new folder", f"{MOST_NUMBERED} folders {default}-N that hold files")
+        if not taken and not _held(_hidden(path)):
+            break
+    return path
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all, making its folder where missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-def take_lock(file: IO[bytes]) -> bool:
+def _take_lock(file: IO[bytes]) -> bool:
     """Lock an open file until it is closed; ``False`` where another process has it."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
+    if CAN_LOCK:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
     return True
 
 
 def _held(hidden: Path) -> bool:
     """Whether the process that writes there is alive."""
-    lock = hidden / LOCK
-    if not (CAN_LOCK and lock.is_file()):
+    if not (hidden / LOCK).is_file():
         return False
-    with open(lock, "rb") as file:
-        try:
-            return not take_lock(file)
-        except OSError:  # a file system that knows no locks
-            return True
+    with open(hidden / LOCK, "rb") as file:
+        return not _take_lock(file)
 
 
 def _files_of_report(folder: Path) -> set[str]:
@@ -193,7 +171,6 @@ class OutFolder:
     ) -> None:
         self.path = Path(path)
         self._inputs, self._overwrite, self._option = inputs, overwrite, option
-        self._earlier: set[str] = set()
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -201,43 +178,37 @@ class OutFolder:
         if _holds_files(self._target) and not self._overwrite:
             cure = "Name another, or add --overwrite."
             bad_value(self._option, "a new or empty folder", f"{self.path}, which holds files", cure)
-        if self._overwrite:
-            self._earlier = _files_of_report(self._target)
-            self._refuse_inputs()
+        self._earlier = _files_of_report(self._target)
+        self._refuse_inputs()
         self._staging = _hidden(self._target)
         with ExitStack() as stack:
             try:
-                self._make(self._staging, stack)
+                self._make_staging(stack)
                 self._lock(stack)
                 if shutil.disk_usage(self._staging).free < LEAST_FREE_BYTES:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             except OSError as error:
-                self._refuse_place(reason_of(error))
+                cure = "Name another with --out, or free disk space and check its permissions."
+                got = f"{self.path} ({reason_of(error)})"
+                bad_value(self._option, "a folder that can be written to", got, cure)
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
-
-    def _refuse_place(self, reason: str) -> NoReturn:
-        cure = "Name another with --out, or free disk space and check its permissions."
-        bad_value(self._option, "a folder that can be written to", f"{self.path} ({reason})", cure)
 
     def _refuse_inputs(self) -> None:
         """Refuse a folder with an input of this run among its files, some of which it replaces or deletes."""
-        if not self._target.is_dir():
-            return
-        there = [entry for entry in self._target.iterdir() if entry.is_file()]
+        there = [e for e in self._target.iterdir() if e.is_file()] if self._target.is_dir() else []
         for path in self._inputs:
             if any(path.exists() and path.samefile(entry) for entry in there):
                 got = f"{self.path}, which holds {path}"
                 bad_value(self._option, "a folder that holds no input of the run", got, "Name another.")
 
-    def _make(self, folder: Path, stack: ExitStack) -> None:
-        """Make a folder and those above it; new ones go in the end if they are still empty."""
-        for path in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
+    def _make_staging(self, stack: ExitStack) -> None:
+        """Make the folders down to it; new ones go in the end if they are still empty."""
+        missing = [path for path in (self._staging, *self._staging.parents) if not path.exists()]
+        for path in reversed(missing):
             path.mkdir(exist_ok=True)
             stack.callback(_remove_empty, path)
 
@@ -246,16 +217,10 @@ class OutFolder:
         beside, lock = _beside(self._target), self._staging / LOCK
         if self._staging != beside and _held(beside):  # a run that began before the folder was there
             self._refuse_held(beside)
-        while True:
-            file = stack.enter_context(open(lock, "a+b", buffering=0))
-            if not CAN_LOCK:
-                break
-            if not take_lock(file):
-                self._refuse_held(self._staging)
-            # A run that ended meanwhile has taken the file away: what we hold is then nobody's lock.
-            if lock.exists() and os.path.samestat(os.fstat(file.fileno()), lock.stat()):
-                break
-            self._staging.mkdir(exist_ok=True)
+        file = stack.enter_context(open(lock, "a+b", buffering=0))
+        # A run that ended meanwhile may have removed the file: what we hold is then nobody's lock.
+        if not _take_lock(file) or os.fstat(file.fileno()).st_nlink == 0:
+            self._refuse_held(self._staging)
         stack.callback(shutil.rmtree, self._staging, ignore_errors=True)
         file.truncate(0)
         file.write(f"{os.getpid()}\n".encode())  # says who, and finds out whether the disk takes a byte
@@ -294,12 +259,8 @@ class OutFolder:
 
     def _move(self, files: Path) -> None:
         if not self._target.is_dir():
-            try:
-                os.rename(files, self._target)
-                return
-            except OSError:
-                if not self._target.is_dir():  # else somebody made it meanwhile
-                    raise
+            os.rename(files, self._target)
+            return
         written = {path.name for path in files.iterdir()}
         for name in sorted(written - {REPORT}):
             os.replace(files / name, self._target / name)

@@ -304,8 +304,6 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "points-of-pixels": _points("u,v,depth\n10,20,3\n"),
     "points-with-words": _points("1 2 3\n1 2 car\n"),
     "points-with-too-few-cells": _points("id,x,y,z\n0,1,2,3\n1,2\n"),
-    "points-colmap": _points("1 0.1 -0.2 2.5 90 80 70 0.4 1 4 2 7\n", "points3D.txt"),
-    "points-pcd": _points("VERSION 0.7\nFIELDS x y z\nDATA ascii\n1 2 3\n", "points.pcd"),
     "points-missing": _with("--points", "nothing.npy"),
     "points-empty": _points(b""),
     "points-words": _points("lidar\n"),
@@ -317,18 +315,15 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "points-unknown": _points(np.zeros((48, 64)), "points.npy"),
     "points-ply": _points("ply\nformat ascii 1.0\nend_header\n", "points.ply"),
     "points-bin": _points(bytes(16), "points.bin"),
-    "points-jpeg": _points(b"\xff\xd8", "points.jpg"),
     "points-8-bit": _with("--points", "left.png"),
     "points-scale-zero": _points("0 0 2\n", "points.txt", "--points-scale", 0),
     # output
     "out-file": _with("--out", "left.png"),
     "out-below-file": _with("--out", "left.png/out"),
     "out-full": _with("--out", "."),
-    "out-root": _with("--out", "/"),
     "out-long": _with("--out", "x" * 300),
     "out-of-its-input": lambda f: [
         *_out(lambda f: (f / "res").mkdir() or np.save(f / "res" / "depth.npy", np.ones((48, 64))), "res")(f),
         *("--points", "res/depth.npy", "--overwrite"),
     ],
-    "out-dangling": _out(lambda f: (f / "link").symlink_to("nothing"), "link"),
 }

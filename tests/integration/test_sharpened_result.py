@@ -9,12 +9,12 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER as PAIR
-from geodiff_plugin.formats import flying_points, read_depth_mm_png
+from geodiff_plugin.formats import flying_points, read_depth_png
 
 
 @pytest.mark.slow
 def test_the_demo_pair_has_fewer_flying_points_with_it():
-    truth_m, known = read_depth_mm_png(PAIR / "depth_mm.png")
+    truth_m, known = read_depth_png(PAIR / "depth_mm.png")
     pipe = enable_geometry_guidance(load_prior("bundled"))
     pipe.set_progress_bar_config(disable=True)
     flying, error = {}, {}

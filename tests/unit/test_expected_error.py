@@ -16,13 +16,7 @@ def pose(x: float, y: float, z: float) -> np.ndarray:
     return E
 
 
-def test_a_rectified_pair_has_the_textbooks_error():
-    depth_m = np.linspace(0.5, 60.0, 24 * 40).reshape(24, 40)
-    expected = depth_m**2 * MATCH_NOISE_PX / (80.0 * 0.12)
-    np.testing.assert_allclose(expected_error(depth_m, K, [pose(0.12, 0, 0)]), expected)
-
-
-@pytest.mark.parametrize("moved", [(0.1, 0, 0), (0, -0.2, 0), (0.1, 0.05, 0.3), (0.02, 0.01, -0.4)])
+@pytest.mark.parametrize("moved", [(0.12, 0, 0), (0, -0.2, 0), (0.1, 0.05, 0.3), (0.02, 0.01, -0.4)])
 def test_a_match_shifted_by_its_noise_gives_it(moved):
     E, row, column, z = pose(*moved), 3, 35, 4.0
 
@@ -30,15 +24,13 @@ def test_a_match_shifted_by_its_noise_gives_it(moved):
         x = np.linalg.inv(K) @ [column, row, 1] * depth - E[:3, 3]
         return (K @ x / x[2])[:2]
 
-    step = 1e-5
-    pixels_a_metre = np.linalg.norm(seen(z + step) - seen(z - step)) / (2 * step)
+    pixels_a_metre = np.linalg.norm(seen(z + 1e-5) - seen(z - 1e-5)) / 2e-5
     error = expected_error(np.full((24, 40), z), K, [E])[row, column]
     assert error == pytest.approx(MATCH_NOISE_PX / pixels_a_metre, rel=1e-6)
 
 
 def test_the_best_of_several_views_counts_and_none_knows_nothing():
-    depth_m = np.full((4, 6), 3.0)
-    near, far = pose(0.1, 0, 0), pose(0.4, 0, 0)
-    both = expected_error(depth_m, K, [near, far])
+    depth_m, far = np.full((4, 6), 3.0), pose(0.4, 0, 0)
+    both = expected_error(depth_m, K, [pose(0.1, 0, 0), far])
     np.testing.assert_array_equal(both, expected_error(depth_m, K, [far]))
     assert np.isinf(expected_error(depth_m, K, [])).all()

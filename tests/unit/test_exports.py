@@ -11,14 +11,9 @@ import pytest
 from geodiff_plugin.formats import Cloud, make_cloud, read_calibration, write_colmap, write_glb
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
-
-
-def right_pose() -> np.ndarray:
-    E = np.eye(4)
-    c, s = np.cos(0.1), np.sin(0.1)
-    E[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-    E[0, 3] = 0.12
-    return E
+C, S = np.cos(0.1), np.sin(0.1)
+E = np.array([[C, 0, S, 0.12], [0, 1, 0, 0], [-S, 0, C, 0], [0, 0, 0, 1]])
+LEFT, EMPTY = (K, np.eye(4), (64, 48)), Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
 def parse_glb(path) -> tuple[dict, bytes]:
@@ -50,18 +45,20 @@ def test_glb_turns_the_axes_and_keeps_colours(tmp_path):
     write_glb(tmp_path / "a.glb", cloud)
     scene, data = parse_glb(tmp_path / "a.glb")
     primitive = scene["meshes"][0]["primitives"][0]
+    positions, colours = (primitive["attributes"][name] for name in ("POSITION", "COLOR_0"))
     assert primitive["mode"] == 0
-    positions = accessor(scene, data, primitive["attributes"]["POSITION"])
-    assert positions.tolist() == [[1, 1, -1], [0, 0, -2]]
-    colours = accessor(scene, data, primitive["attributes"]["COLOR_0"])
-    assert colours.tolist() == [[255, 0, 9, 255], [1, 2, 3, 255]]
-    bounds = scene["accessors"][primitive["attributes"]["POSITION"]]
+    assert accessor(scene, data, positions).tolist() == [[1, 1, -1], [0, 0, -2]]
+    assert accessor(scene, data, colours).tolist() == [[255, 0, 9, 255], [1, 2, 3, 255]]
+    bounds = scene["accessors"][positions]
     assert bounds["min"] == [0, 0, -2] and bounds["max"] == [1, 1, -1]
+    write_glb(tmp_path / "a.glb", EMPTY)
+    scene, data = parse_glb(tmp_path / "a.glb")
+    assert scene["scenes"] == [{}] and data == b""
 
 
 def test_glb_cameras_look_at_the_cloud(tmp_path):
     cloud = make_cloud(np.full((48, 64), 2.0), np.zeros((48, 64, 3)), K)
-    write_glb(tmp_path / "a.glb", cloud, [(K, np.eye(4), (64, 48)), (K, right_pose(), (64, 48))])
+    write_glb(tmp_path / "a.glb", cloud, [LEFT, (K, E, (64, 48))])
     scene, data = parse_glb(tmp_path / "a.glb")
     assert [mesh["name"] for mesh in scene["meshes"]] == ["cloud", "camera 0", "camera 1"]
     lines = scene["meshes"][2]["primitives"][0]
@@ -70,19 +67,12 @@ def test_glb_cameras_look_at_the_cloud(tmp_path):
     np.testing.assert_allclose(corners[0], [0.12, 0, 0], atol=1e-6)
     assert (corners[1:, 2] < 0).all()  # before the camera is -z
     middle = corners[1:].mean(0) - corners[0]
-    np.testing.assert_allclose(middle / np.linalg.norm(middle), [np.sin(0.1), 0, -np.cos(0.1)], atol=1e-6)
-
-
-def test_glb_of_nothing_is_an_empty_scene(tmp_path):
-    write_glb(tmp_path / "a.glb", Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)))
-    scene, data = parse_glb(tmp_path / "a.glb")
-    assert scene["scenes"] == [{}] and data == b""
+    np.testing.assert_allclose(middle / np.linalg.norm(middle), [S, 0, -C], atol=1e-6)
 
 
 def test_colmap_comes_back_through_the_reader(tmp_path):
     cloud = make_cloud(np.full((48, 64), 2.0), np.full((48, 64, 3), 0.5), K)
-    E = right_pose()
-    write_colmap(tmp_path, [("left.png", K, np.eye(4), (64, 48)), ("right.png", K, E, (64, 48))], cloud)
+    write_colmap(tmp_path, [("left.png", *LEFT), ("right.png", K, E, (64, 48))], cloud)
     rig = read_calibration(tmp_path, image_names=("left.png", "right.png"), baseline_m=0.12)
     np.testing.assert_allclose(rig.K_left, K)
     np.testing.assert_allclose(rig.E, E, atol=1e-9)
@@ -90,16 +80,11 @@ def test_colmap_comes_back_through_the_reader(tmp_path):
     lines = [line for line in (tmp_path / "points3D.txt").read_text().splitlines() if line[0] != "#"]
     assert len(lines) == 48 * 64
     assert lines[0].split()[3:] == ["2.00000", "128", "128", "128", "0"]
-
-
-def test_colmap_names_have_no_blanks(tmp_path):
-    cloud = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     with pytest.raises(ValueError, match="without blanks"):
-        write_colmap(tmp_path, [("my left.png", K, np.eye(4), (64, 48))], cloud)
+        write_colmap(tmp_path, [("my left.png", *LEFT)], EMPTY)
 
 
 def test_thinned_keeps_first_and_last():
     cloud = Cloud(np.arange(30.0).reshape(10, 3), np.zeros((10, 3), np.uint8))
-    thin = cloud.thinned(4)
-    assert thin.points_m[:, 0].tolist() == [0, 9, 18, 27]
+    assert cloud.thinned(4).points_m[:, 0].tolist() == [0, 9, 18, 27]
     assert cloud.thinned(10) is cloud

@@ -6,6 +6,7 @@ import io
 import sys
 import warnings
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,152 +15,141 @@ from PIL import Image
 from geodiff_plugin.formats import as_image_01, picture_size, read_image
 
 H, W = 40, 48
+V, U = np.mgrid[0:H, 0:W]
+#: ``(H, W, 3)`` uint8 whose corners all differ.
+RAMP = np.stack([U * 5, V * 6, 10 + U + V], axis=-1).astype(np.uint8)
+X = RAMP.astype(np.float32) / 255
+RGBA = np.dstack([RAMP, np.full((H, W), 7, np.uint8)])
+PIL = Image.fromarray(RAMP)
 
 
-def ramp():
-    """``(H, W, 3)`` uint8 whose corners all differ."""
-    v, u = np.mgrid[0:H, 0:W]
-    return np.stack([u * 5, v * 6, 10 + u + v], axis=-1).astype(np.uint8)
+def saved(folder, image, name="x.png", **options):
+    image.save(folder / name, **options)
+    return folder / name
 
 
-def saved(tmp_path, image, name="x.png", **options):
-    image.save(tmp_path / name, **options)
-    return tmp_path / name
+def heard(value) -> list[str]:
+    """The warnings of ``as_image_01``, which ``picture_size`` does not repeat."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        as_image_01(value, "left")
+        picture_size(value, "left")
+    return [str(w.message) for w in said]
 
 
-def test_rgb_png_is_exact(tmp_path):
-    image, notes = read_image(saved(tmp_path, Image.fromarray(ramp())))
-    assert image.dtype == np.float32 and notes == []
-    np.testing.assert_array_equal(image, ramp().astype(np.float32) / 255)
+#: EXIF orientation -> the upright image, by the definition of the eight.
+UPRIGHT = {
+    1: X,
+    2: X[:, ::-1],
+    3: X[::-1, ::-1],
+    4: X[::-1],
+    5: X.transpose(1, 0, 2),
+    6: X[::-1].transpose(1, 0, 2),
+    7: X[::-1, ::-1].transpose(1, 0, 2),
+    8: X[:, ::-1].transpose(1, 0, 2),
+}
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("orientation", UPRIGHT)
 def test_exif_orientation_is_applied_and_told(tmp_path, orientation):
-    """Against the definition of the eight orientations, written out as flips."""
     exif = Image.Exif()
     exif[0x0112] = orientation
-    image, notes = read_image(saved(tmp_path, Image.fromarray(ramp()), exif=exif), "right")
-    x = ramp().astype(np.float32) / 255
-    upright = {
-        1: x,
-        2: x[:, ::-1],
-        3: x[::-1, ::-1],
-        4: x[::-1],
-        5: x.transpose(1, 0, 2),
-        6: x[::-1].transpose(1, 0, 2),
-        7: x[::-1, ::-1].transpose(1, 0, 2),
-        8: x[:, ::-1].transpose(1, 0, 2),
-    }[orientation]
-    np.testing.assert_array_equal(image, upright)
-    if orientation == 1:
-        assert notes == []
-    else:
-        assert len(notes) == 1 and notes[0].startswith("right was ") and "K must belong" in notes[0]
+    image, notes = read_image(saved(tmp_path, PIL, exif=exif), "right")
+    assert image.dtype == np.float32
+    np.testing.assert_array_equal(image, UPRIGHT[orientation])
+    assert len(notes) == (orientation > 1)
+    assert all(note.startswith("right was turned") and "K must belong" in note for note in notes)
+    buffer = io.BytesIO()
+    PIL.save(buffer, format="PNG", exif=exif)
+    with Image.open(buffer) as pending:
+        assert ["exif_transpose" in sentence for sentence in heard(pending)] == [True] * (orientation > 1)
 
 
-def test_alpha_is_dropped_and_told(tmp_path):
-    rgba = np.dstack([ramp(), np.full((H, W), 7, np.uint8)])
-    image, notes = read_image(saved(tmp_path, Image.fromarray(rgba)))
-    np.testing.assert_array_equal(image, ramp().astype(np.float32) / 255)
-    assert notes == ["left has an alpha channel; it is dropped."]
-    assert read_image(saved(tmp_path, Image.fromarray(rgba[..., 2:])))[1] == notes
+@pytest.mark.parametrize(
+    ("image", "expected", "notes"),
+    [
+        (Image.fromarray(RGBA), X, 1),
+        (Image.fromarray(RGBA[..., 2:]), X[..., 2:], 1),
+        (Image.fromarray(RAMP[..., 0].astype(np.uint16) * 257), X[..., :1], 0),
+        *((PIL.convert(mode), None, 0) for mode in ("L", "1", "P")),
+    ],
+)
+def test_other_modes_become_rgb_and_alpha_is_dropped(tmp_path, image, expected, notes):
+    read, said = read_image(saved(tmp_path, image))
+    assert read.shape == (H, W, 3) and read.min() >= 0 and read.max() <= 1
+    if expected is not None:
+        np.testing.assert_allclose(read, np.broadcast_to(expected, read.shape), atol=1e-6)
+    assert said == ["left has an alpha channel; it is dropped."] * notes == heard(image)
 
 
-def test_16_bit_grey(tmp_path):
-    grey = ramp()[..., 0].astype(np.uint16) * 257
-    image, notes = read_image(saved(tmp_path, Image.fromarray(grey)))
-    assert notes == []
-    np.testing.assert_allclose(image, np.repeat(ramp()[..., :1] / 255.0, 3, axis=-1), atol=1e-6)
+def test_cmyk_and_a_palette_with_transparency(tmp_path):
+    assert read_image(saved(tmp_path, PIL.convert("CMYK"), "x.tif"))[1] == []
+    assert len(read_image(saved(tmp_path, PIL.convert("P"), transparency=0))[1]) == 1
 
 
-def test_12_bits_in_16_are_told(tmp_path):
-    grey = ramp()[..., 0].astype(np.uint16) * 16
-    _, notes = read_image(saved(tmp_path, Image.fromarray(grey)))
-    assert len(notes) == 1
-    assert f"its values reach {grey.max()} of 65535" in notes[0] and "multiply them by 16" in notes[0]
-
-
-@pytest.mark.parametrize("channels", [3, 4])
-def test_12_bits_in_16_of_a_coloured_file_are_told(tmp_path, channels):
-    """Pillow keeps the upper 8 bits of these, which leaves 16 levels and no mode that tells."""
-    cv2 = pytest.importorskip("cv2")
-    deep = np.full((H, W, channels), 65535, np.uint16)
-    deep[..., :3] = ramp()[..., ::-1]
-    for times, told in ((16, True), (257, False)):
-        path = tmp_path / f"{times}.png"
-        values = np.concatenate([deep[..., :3] * np.uint16(times), deep[..., 3:]], axis=-1)
-        assert cv2.imwrite(str(path), values)
+@pytest.mark.parametrize(("times", "told"), [(4, True), (16, True), (257, False)])
+def test_10_and_12_bits_in_16_are_told_once(tmp_path, times, told):
+    """Of coloured files Pillow keeps the upper 8 bits, which leaves 16 levels and no mode that tells."""
+    colour = RAMP.astype(np.uint16) * times
+    grey, deep = colour[..., 0], np.dstack([colour, np.full((H, W), 65535, np.uint16)])
+    path = saved(tmp_path, Image.fromarray(grey), "grey.png")
+    said = read_image(path)[1]
+    assert len(said) == told
+    if told:
+        assert f"its values reach {grey.max()} of 65535" in said[0] and "multiply them by 16" in said[0]
+    for value in (grey, colour, torch.from_numpy(colour).permute(2, 0, 1), Image.fromarray(grey)):
+        assert ["nearly black" in sentence for sentence in heard(value)] == [True] * told
+    assert len(heard(Image.fromarray(grey.astype(np.int32)))) == told and heard(RAMP // 8) == []
+    for channels in (3, 4):
+        path = tmp_path / f"{channels}.png"
+        assert cv2.imwrite(str(path), deep[..., :channels])
         notes = [note for note in read_image(path)[1] if "alpha" not in note]
-        assert len(notes) == told and all("is a 16-bit image that is nearly black" in note for note in notes)
-        with warnings.catch_warnings(record=True) as said, Image.open(path) as image:
-            warnings.simplefilter("always")
-            as_image_01(image, "left")
-        assert [str(w.message) for w in said if "alpha" not in str(w.message)] == notes
-
-
-@pytest.mark.parametrize("mode", ["L", "1", "P", "CMYK"])
-def test_other_modes_become_rgb(tmp_path, mode):
-    name = "x.tif" if mode == "CMYK" else "x.png"
-    image, notes = read_image(saved(tmp_path, Image.fromarray(ramp()).convert(mode), name))
-    assert image.shape == (H, W, 3) and image.min() >= 0 and image.max() <= 1 and notes == []
-
-
-def test_palette_with_transparency(tmp_path):
-    path = saved(tmp_path, Image.fromarray(ramp()).convert("P"), transparency=0)
-    image, notes = read_image(path)
-    assert image.shape == (H, W, 3) and len(notes) == 1
+        assert ["is a 16-bit image that is nearly black" in note for note in notes] == [True] * told
+        with Image.open(path) as image:
+            assert [sentence for sentence in heard(image) if "alpha" not in sentence] == notes
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "webp"])
+@pytest.mark.filterwarnings("ignore")  # Pillow's remarks about broken TIFF tags
 def test_a_cut_off_image_is_a_sentence(tmp_path, suffix):
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
-    path = saved(tmp_path, Image.fromarray(noise), f"whole.{suffix}")
-    whole = path.read_bytes()
-    refused = 0
+    whole = saved(tmp_path, Image.fromarray(noise), f"whole.{suffix}").read_bytes()
     for share in (0.02, 0.3, 0.6, 0.9):
         cut = tmp_path / f"cut.{suffix}"
         cut.write_bytes(whole[: int(len(whole) * share)])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's own remarks about broken TIFF tags
-            with pytest.raises(ValueError, match=r"left must be .*cut\."):
-                read_image(cut)
-        refused += 1
-    assert refused == 4
+        with pytest.raises(ValueError, match=r"left must be .*cut\."):
+            read_image(cut)
 
 
 def test_file_errors(tmp_path):
-    with pytest.raises(FileNotFoundError, match="right must be an image file"):
-        read_image(tmp_path / "nope.png", "right")
-    with pytest.raises(IsADirectoryError, match="left"):
-        read_image(tmp_path)
     (tmp_path / "a.png").write_text("hello")
-    with pytest.raises(ValueError, match="a format that Pillow does not read"):
-        read_image(tmp_path / "a.png")
     (tmp_path / "empty.png").write_bytes(b"")
-    with pytest.raises(ValueError, match="empty"):
-        read_image(tmp_path / "empty.png")
-    with pytest.raises(ValueError, match="at least 32 pixels a side; got 48x31"):
-        read_image(saved(tmp_path, Image.fromarray(ramp()[:31])))
-    with pytest.raises(TypeError, match="left"):
-        read_image(5)
+    for path, error, said in (
+        (tmp_path / "nope.png", FileNotFoundError, "left must be an image file"),
+        (tmp_path, IsADirectoryError, "left"),
+        (tmp_path / "a.png", ValueError, "a format that Pillow does not read"),
+        (tmp_path / "empty.png", ValueError, "empty"),
+        (saved(tmp_path, PIL.crop((0, 0, 48, 31))), ValueError, "at least 32 pixels a side; got 48x31"),
+        (5, TypeError, "left"),
+    ):
+        with pytest.raises(error, match=said):
+            read_image(path)
 
 
 @pytest.mark.parametrize("name", ["x.gif", "x.png", "x.tiff", "x.webp"])
 def test_only_the_first_of_several_frames_is_taken_and_told(tmp_path, name):
-    first, second = (Image.fromarray(value) for value in (ramp(), ramp()[::-1]))
     more = {"lossless": True} if name == "x.webp" else {}
-    path = saved(tmp_path, first, name, save_all=True, append_images=[second], **more)
+    path = saved(tmp_path, PIL, name, save_all=True, append_images=[Image.fromarray(RAMP[::-1])], **more)
     image, notes = read_image(path)
     assert notes == ["left holds 2 frames or pages; only the first is taken."]
-    tolerance = 0.15 if name == "x.gif" else 0  # 256 colours
-    np.testing.assert_allclose(image, ramp().astype(np.float32) / 255, atol=tolerance)
-    with Image.open(path) as opened, pytest.warns(UserWarning, match="left holds 2 frames"):
-        as_image_01(opened, "left")
-    assert read_image(saved(tmp_path, first, "one.gif"))[1] == []
+    np.testing.assert_allclose(image, X, atol=0.15 if name == "x.gif" else 0)  # 256 colours
+    with Image.open(path) as opened:
+        assert heard(opened) == notes
+    assert read_image(saved(tmp_path, PIL, "one.gif"))[1] == []
 
 
 def test_an_image_beyond_pillows_limit_says_so(tmp_path, monkeypatch):
-    path = saved(tmp_path, Image.fromarray(ramp()))
+    path = saved(tmp_path, PIL)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", H * W - 1)
     assert read_image(path)[1] == []  # beyond Pillow's warning alone
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", H * W // 3)
@@ -175,66 +165,53 @@ def test_heic_is_read_where_pillow_heif_is(tmp_path, monkeypatch):
         read_image(path)
     monkeypatch.undo()
     heif = pytest.importorskip("pillow_heif")
-    heif.from_pillow(Image.fromarray(ramp())).save(path, quality=-1)
+    heif.from_pillow(PIL).save(path, quality=-1)
     image, notes = read_image(path)
-    assert notes == [] and np.abs(image - ramp() / 255).mean() < 0.02
+    assert notes == [] and np.abs(image - X).mean() < 0.02
 
 
-def test_as_image_01_all_kinds_agree():
-    x = ramp()
-    expected = torch.from_numpy(x.astype(np.float32) / 255).permute(2, 0, 1)
-    kinds = {
-        "pil": Image.fromarray(x),
-        "uint8": x,
-        "uint16": x.astype(np.uint16) * 257,
-        "uint16 of another byte order": (x.astype(np.uint16) * 257).astype(">u2"),
-        "float64": x / 255.0,
-        "torch_uint8": torch.from_numpy(x).permute(2, 0, 1),
-        "torch": expected.clone().requires_grad_(True),
-    }
-    for kind, value in kinds.items():
-        image = as_image_01(value, "right")
-        assert image.dtype == torch.float32 and image.shape == (3, H, W) and not image.requires_grad, kind
-        torch.testing.assert_close(image, expected, rtol=0, atol=1e-6)
-    half = as_image_01(expected.bfloat16(), "right")
-    torch.testing.assert_close(half, expected, rtol=0, atol=4e-3)
+TENSOR = torch.from_numpy(X).permute(2, 0, 1)
 
 
-def test_as_image_01_grey_is_repeated():
-    grey = ramp()[..., 0]
+@pytest.mark.parametrize(
+    ("value", "atol"),
+    [
+        (PIL, 0),
+        (RAMP, 0),
+        (RAMP.astype(np.uint16) * 257, 1e-6),
+        ((RAMP.astype(np.uint16) * 257).astype(">u2"), 1e-6),  # another byte order
+        (RAMP / 255.0, 1e-6),
+        (torch.from_numpy(RAMP).permute(2, 0, 1), 0),
+        (TENSOR.clone().requires_grad_(True), 0),
+        (TENSOR.bfloat16(), 4e-3),
+    ],
+)
+def test_all_kinds_of_images_in_memory_agree(value, atol):
+    image = as_image_01(value, "right")
+    assert image.dtype == torch.float32 and image.shape == (3, H, W) and not image.requires_grad
+    torch.testing.assert_close(image, TENSOR, rtol=0, atol=atol)
+    assert picture_size(value, "right") == (W, H)
+    image.zero_()
+    assert not isinstance(value, torch.Tensor) or value.any(), "memory is not shared"
+
+
+def test_grey_is_repeated_and_alpha_dropped_with_a_warning():
+    grey = RAMP[..., 0]
     for value in (grey, grey[..., None], torch.from_numpy(grey)[None], Image.fromarray(grey)):
         image = as_image_01(value, "right")
-        assert image.shape == (3, H, W)
-        assert torch.equal(image[0], image[2])
-
-
-def test_as_image_01_does_not_share_memory():
-    source = torch.rand(3, H, W)
-    before = source.clone()
-    as_image_01(source, "right").zero_()
-    assert torch.equal(source, before)
-
-
-def test_as_image_01_drops_alpha_with_a_warning():
-    rgba = np.dstack([ramp(), np.full((H, W), 7, np.uint8)])
-    for value in (rgba, Image.fromarray(rgba), torch.from_numpy(rgba).permute(2, 0, 1)):
-        with pytest.warns(UserWarning, match="right has an alpha channel"):
-            assert as_image_01(value, "right").shape == (3, H, W)
-
-
-def test_as_image_01_warns_of_a_pending_exif_turn():
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    buffer = io.BytesIO()
-    Image.fromarray(ramp()).save(buffer, format="PNG", exif=exif)
-    with Image.open(buffer) as image, pytest.warns(UserWarning, match="exif_transpose"):
-        assert as_image_01(image, "right").shape == (3, H, W)
+        assert image.shape == (3, H, W) and torch.equal(image[0], image[2])
+    for value in (RGBA, torch.from_numpy(RGBA).permute(2, 0, 1)):
+        assert heard(value) == ["left has an alpha channel; it is dropped."]
 
 
 def with_value(value):
     image = np.full((H, W, 3), 0.5, dtype=np.float32)
     image[3, 4, 1] = value
     return image
+
+
+def test_resampling_overshoot_is_clipped():
+    assert as_image_01(with_value(1.0005), "right").max() == 1.0
 
 
 @pytest.mark.parametrize(
@@ -259,52 +236,6 @@ def with_value(value):
         (None, TypeError, "right"),
     ],
 )
-def test_as_image_01_errors(value, error, match):
+def test_what_is_no_image(value, error, match):
     with pytest.raises(error, match=match):
         as_image_01(value, "right")
-
-
-def test_resampling_overshoot_is_clipped():
-    image = as_image_01(with_value(1.0005), "right")
-    assert image.max() == 1.0
-
-
-@pytest.mark.parametrize("times", [4, 16])
-@pytest.mark.parametrize("kind", ["numpy", "colour", "torch", "pil", "pil I"])
-def test_as_image_01_tells_of_10_or_12_bits_in_16_once(kind, times):
-    colour = ramp().astype(np.uint16) * times
-    grey = colour[..., 0]
-    value = {
-        "numpy": grey,
-        "colour": colour,
-        "torch": torch.from_numpy(colour).permute(2, 0, 1),
-        "pil": Image.fromarray(grey),
-        "pil I": Image.fromarray(grey.astype(np.int32)),
-    }[kind]
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        as_image_01(value, "right")
-        picture_size(value, "right")
-    (sentence,) = (str(w.message) for w in said)
-    most = int(np.max(colour if kind in ("colour", "torch") else grey))
-    assert sentence.startswith(
-        f"right is a 16-bit image that is nearly black: its values reach {most} of 65535."
-    )
-    assert "12 bits, multiply them by 16; with 10 bits, by 64." in sentence
-
-
-def test_as_image_01_says_nothing_of_full_16_bits():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        as_image_01(ramp().astype(np.uint16) * 257, "right")
-        as_image_01(ramp() // 8, "right")  # dark, but not by its number of bits
-
-
-def test_picture_size_is_that_of_the_image():
-    x = ramp()
-    for value in (x, x[..., 0], Image.fromarray(x), torch.from_numpy(x).permute(2, 0, 1)):
-        assert picture_size(value, "right") == (W, H)
-    with pytest.raises(ValueError, match="at least 32 pixels a side; got 48x31"):
-        picture_size(x[:31], "right")
-    with pytest.raises(TypeError, match="right must be a PIL image.*got str"):
-        picture_size("right.png", "right")

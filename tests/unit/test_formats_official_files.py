@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geodiff_plugin.formats import read_calibration, read_disparity_kitti_png, read_image, read_pfm
+from geodiff_plugin.formats import read_calibration, read_depth_png, read_image, read_pfm
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 pytestmark = [
@@ -46,7 +46,7 @@ def test_kitti2015_colour_pair():
     rig = read_calibration(calibration, image_folder_hint=str(folder / "image_2"))
     assert 0.532 <= rig.E[0, 3] <= 0.54
     assert rig.size_left == size_of(folder / "image_2" / "000000_10.png")
-    disparity, known = read_disparity_kitti_png(folder / "disp_occ_0" / "000000_10.png")
+    disparity, known = read_depth_png(folder / "disp_occ_0" / "000000_10.png", 256.0)
     depth = rig.E[0, 3] * rig.K_left[0, 0] / disparity[known]
     assert 1.0 < depth.min() < 10.0 and 20.0 < depth.max() < 250.0
 

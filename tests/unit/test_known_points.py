@@ -1,60 +1,92 @@
+"""Known points on the grid of the losses, their confidence, and what contradicts the views."""
+
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from geodiff_plugin.matching import Matches, points_to_matches, with_points
+from geodiff_plugin import GeometryGuidance
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.formats import rig_from_parameters, write_pfm
+from geodiff_plugin.formats.depth import depth_of_disparity
+from geodiff_plugin.guidance.inputs import as_points
+from geodiff_plugin.matching import points_to_matches, with_points
+from geodiff_plugin.runtime.verdict import Indicators, judge
 from geodiff_plugin.scale.points import depth_span, fit_to_points
 from geodiff_plugin.scale.space import SPACES, MetricMap
 
-K = torch.tensor([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
-SIZE = (48, 64)
+K = torch.tensor([[60.0, 0, 31.5], [0, 66.0, 23.5], [0, 0, 1]])
+SIZE, GRID = (48, 64), (24, 32)
 
 
-def test_points_land_on_their_pixels_and_the_nearest_wins():
-    at_centre = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 5.0]]) + torch.tensor([0.02, 0.02, 0.0])
-    one_focal_right = torch.tensor([[30.0 / 60.0 * 4.0, 0.0, 4.0]])
-    found, left_out = points_to_matches(torch.cat([at_centre, one_focal_right]), K, SIZE, SIZE)
-    assert left_out == 0 and found.confidence.sum() == 2
-    assert [float(m) for m in depth_span(found)] == pytest.approx([2.0, 4.0])
-    assert found.inverse_depth[0, 24, 32] == 0.5  # (31.5 + 0.6, 23.5 + 0.6), not the one at 5 m
-    assert found.inverse_depth[0, 24, 62] == 0.25 or found.inverse_depth[0, 23, 61] == 0.25
-    assert found.plane_step == pytest.approx(0.01 * 0.25)
+def test_the_nearest_point_of_a_cell_brings_its_confidence() -> None:
+    """Against a loop over all points, with unequal sizes and anisotropic pixels."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, 300), rng.uniform(-0.8, 0.8, 300), rng.uniform(2, 9, 300)])
+    weight = rng.uniform(0.1, 1.0, 300)
+    given = as_points(points.astype(np.float32), "points", weight)
+    matches, left_out = points_to_matches(given, K, SIZE, GRID)
+    depth, expected, outside = np.full(GRID, np.inf), np.zeros(GRID), 0
+    for (x, y, z), w in zip(points.astype(np.float32), weight, strict=True):
+        u, v = 60.0 * x / z + 31.5, 66.0 * y / z + 23.5
+        column, row = int(np.floor((u + 0.5) / 2)), int(np.floor((v + 0.5) / 2))
+        if not (0 <= column < 32 and 0 <= row < 24):
+            outside += 1
+        elif z < depth[row, column]:
+            depth[row, column], expected[row, column] = z, w
+    assert left_out == outside > 0
+    np.testing.assert_allclose(matches.confidence[0], expected, atol=1e-6)
+    np.testing.assert_allclose(matches.inverse_depth[0], 1 / depth, rtol=1e-5)
+    assert [float(m) for m in depth_span(matches)] == pytest.approx([depth.min(), depth[depth < 99].max()])
 
 
-def test_a_map_of_the_grid_stays_as_it_is():
-    depth_m = torch.zeros(SIZE)
-    depth_m[3, 4], depth_m[47, 63] = 2.0, 8.0
-    found, left_out = points_to_matches(depth_m, K, SIZE, SIZE)
-    assert left_out == 0
-    assert torch.equal(found.confidence[0] > 0, depth_m > 0)
-    torch.testing.assert_close(found.inverse_depth[0][depth_m > 0], torch.tensor([0.5, 0.125]))
+def test_a_map_with_confidence_is_its_points_with_theirs() -> None:
+    rng = np.random.default_rng(1)
+    depth = np.where(rng.random(SIZE) < 0.3, rng.uniform(2, 9, SIZE), 0.0).astype(np.float32)
+    confidence = rng.random(SIZE).astype(np.float32)
+    confidence[::3], confidence[1::3, ::2] = 0.0, np.nan
+    (rows, columns), inverse = np.nonzero(depth), np.linalg.inv(K.double().numpy())
+    xyz = np.stack([columns, rows, np.ones_like(rows)], 1) @ inverse.T * depth[rows, columns, None]
+    ones = (as_points(depth, "points", confidence), as_points(xyz, "points", confidence[rows, columns]))
+    of_map, of_list = (points_to_matches(given, K, SIZE, SIZE)[0] for given in ones)
+    torch.testing.assert_close(of_map.confidence, of_list.confidence)
+    torch.testing.assert_close(of_map.inverse_depth, of_list.inverse_depth)
+    plain, left_out = points_to_matches(as_points(depth, "points"), K, SIZE, SIZE)
+    full, _ = points_to_matches(as_points(depth, "points", np.ones(SIZE)), K, SIZE, SIZE)
+    assert torch.equal(plain.confidence, full.confidence) and plain.plane_step == full.plane_step
+    assert left_out == 0 and torch.equal(plain.confidence[0] > 0, torch.from_numpy(depth > 0))
 
 
 def test_a_smaller_grid_keeps_every_pixel_inside():
     depth_m = torch.zeros(SIZE)
     depth_m[0, 0] = depth_m[-1, -1] = depth_m[0, -1] = 3.0
-    found, _ = points_to_matches(depth_m, K, SIZE, (17, 23))
-    known = found.confidence[0] > 0
+    matches, _ = points_to_matches(depth_m, K, SIZE, (17, 23))
+    known = matches.confidence[0] > 0
     assert known[0, 0] and known[-1, -1] and known[0, -1] and known.sum() == 3
 
 
 def test_points_outside_are_counted_and_none_left_is_an_error():
     points = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [9.0, 0.0, 2.0]])
-    _, left_out = points_to_matches(points, K, SIZE, SIZE)
-    assert left_out == 2
+    assert points_to_matches(points, K, SIZE, SIZE)[1] == 2
     with pytest.raises(ValueError, match="2 of 2 behind it or outside"):
         points_to_matches(points[1:], K, SIZE, SIZE)
     with pytest.raises(ValueError, match="points must be a map of the left image's 64x48 pixels"):
         points_to_matches(torch.ones(24, 32), K, SIZE, SIZE)
 
 
-def test_points_take_the_place_of_matches():
-    points, _ = points_to_matches(torch.tensor([[0.0, 0.0, 2.0]]), K, SIZE, SIZE)
+def test_points_take_the_place_of_matches_of_less_confidence() -> None:
+    depth, confidence = np.zeros(SIZE, np.float32), np.zeros(SIZE)
+    depth[0, :3], confidence[0, :3] = 4.0, (0.2, 0.9, 1.0)
+    points, _ = points_to_matches(as_points(depth, "points", confidence), K, SIZE, SIZE)
     half = torch.full((1, *SIZE), 0.5)
-    both = with_points(Matches(0.2 * half, half, torch.tensor(0.01)), points)
-    assert (both.inverse_depth == 0.5).sum() == 1 and (both.confidence == 48 * 64).sum() == 1
+    both = with_points(replace(points, inverse_depth=half, confidence=half), points)
+    assert both.inverse_depth[0, 0, :4].tolist() == [0.5, 0.25, 0.25, 0.5]
+    share = 48 * 64 / 3
+    np.testing.assert_allclose(both.confidence[0, 0, :4], [0.5, 0.9 * share, share, 0.5], rtol=1e-5)
     assert torch.equal(with_points(None, points).inverse_depth, points.inverse_depth)
 
 
@@ -63,14 +95,63 @@ def test_fit_finds_the_ends_in_spite_of_wrong_points(space):
     rng = np.random.default_rng(0)
     x = torch.from_numpy(rng.random((1, 1, *SIZE), dtype=np.float32)) * 0.9 + 0.05
     metric = MetricMap(space)
-    ends = torch.tensor([1.5, 1.5]), torch.tensor([9.0, 9.0])
-    truth = metric(x, metric.from_range(*(e[:1] for e in ends)))
+    ends = torch.tensor([1.5]), torch.tensor([9.0])
+    truth = metric(x, metric.from_range(*ends))
     sparse = torch.where(torch.from_numpy(rng.random(SIZE) < 0.05), truth[0, 0], torch.zeros(SIZE))
     wrong = torch.from_numpy(rng.random(SIZE) < 0.1) & (sparse > 0)
     points, _ = points_to_matches(torch.where(wrong, 3 * sparse, sparse), K, SIZE, SIZE)
     near, far = fit_to_points(x.expand(2, -1, -1, -1), points, metric)
     assert near.shape == (2,) and torch.equal(near[0], near[1])
-    found = metric(x, metric.from_range(near[:1], far[:1]))
-    assert ((found - truth).abs() / truth).median() < 0.1
-    kept = fit_to_points(x, points, metric, (ends[0][:1], ends[1][:1]))
-    assert float(kept[0]) == 1.5 and float(kept[1]) == 9.0
+    fitted = metric(x, metric.from_range(near[:1], far[:1]))
+    assert ((fitted - truth).abs() / truth).median() < 0.1
+    assert [float(end) for end in fit_to_points(x, points, metric, ends)] == [1.5, 9.0]
+
+
+@pytest.mark.parametrize(
+    ("confidence", "said"),
+    [
+        (np.ones((3, 4)), r"must be of shape \(48, 64\), as the points; got shape \(3, 4\)"),
+        (np.full(SIZE, 100), r"points_confidence must be in \[0, 1\]; got values from 100 to 100"),
+        ("high", "points_confidence must be numbers"),
+        (np.zeros(SIZE), "at least one of them known"),
+    ],
+)
+def test_what_is_no_confidence(confidence, said) -> None:
+    with pytest.raises(InputError, match=said):
+        GeometryGuidance.from_points(np.ones(SIZE, np.float32), K, points_confidence=confidence)
+    with pytest.raises(InputError, match="points_confidence must be given with points; got no points"):
+        GeometryGuidance.from_baseline(
+            np.zeros((*SIZE, 3), np.uint8), K, 0.1, points_confidence=np.ones(SIZE)
+        )
+
+
+def test_disparities_of_any_size_become_depths(tmp_path) -> None:
+    rig = rig_from_parameters(60, 66, 31.5, 23.5, 0.12, cx_right=33.0)
+    disparity = np.random.default_rng(2).uniform(1, 12, SIZE).astype(np.float32)
+    disparity[0, 0], disparity[0, 1] = np.inf, 0.0
+    finite = np.where(np.isfinite(disparity), disparity, 0)
+    expected = np.where(finite > 0, 60 * 0.12 / (finite + 1.5), 0)
+    write_pfm(tmp_path / "d.pfm", disparity)
+    Image.fromarray((256 * finite).astype(np.uint16)).save(tmp_path / "d.png")
+    np.testing.assert_allclose(depth_of_disparity(tmp_path / "d.pfm", rig, (64, 48)), expected, rtol=1e-6)
+    np.testing.assert_allclose(depth_of_disparity(tmp_path / "d.png", rig, (64, 48)), expected, rtol=2e-3)
+    np.save(tmp_path / "half.npy", disparity[::2, ::2] / 2)
+    half = depth_of_disparity(tmp_path / "half.npy", rig, (64, 48))
+    np.testing.assert_allclose(half[:2, 2:4], np.full((2, 2), expected[0, 2]), rtol=1e-6)
+    with pytest.raises(InputError, match="of the shape of the left image, 64x60"):
+        depth_of_disparity(tmp_path / "half.npy", rig, (64, 60))
+    E = rig.E.copy()
+    E[1, 3] = 0.05
+    for other in (replace(rig, E=E), replace(rig, unit=None)):
+        with pytest.raises(InputError, match="disparity must be of a r"):
+            depth_of_disparity(tmp_path / "d.pfm", other, (64, 48))
+
+
+@pytest.mark.parametrize(
+    ("off", "status", "said"), [(0.1, "trusted", 0), (0.3, "trusted", 1), (0.6, "not trusted", 1)]
+)
+def test_points_that_contradict_the_views_are_told_and_judged(off, status, said) -> None:
+    run = Indicators(confidence=0.8, matched=0.7, order=0.8, spread=1.0, points=900, points_ratio=1.01)
+    verdict = judge(replace(run, points_off=off))
+    sentences = [s for s in (*verdict.reasons, *verdict.remarks) if "contradict what both views match" in s]
+    assert verdict.status == status and len(sentences) == said

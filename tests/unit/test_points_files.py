@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.formats import read_points, write_depth_mm, write_pfm, write_ply
+from geodiff_plugin.formats.points import read_confidence
 
 MAP = np.zeros((6, 8), np.float32)
 MAP[1, 2], MAP[4, 5] = 1.25, 3.5
@@ -23,61 +25,27 @@ def test_maps_of_every_kind_are_the_same(tmp_path):
         np.testing.assert_allclose(read, MAP, atol=5e-4)
 
 
-def test_lists_of_points(tmp_path):
-    np.save(tmp_path / "points.npy", POINTS)
-    np.savetxt(tmp_path / "points.txt", POINTS, header="x y z")
-    np.savetxt(tmp_path / "one.xyz", POINTS[:1])
-    np.testing.assert_allclose(read_points(tmp_path / "points.npy"), POINTS)
-    np.testing.assert_allclose(read_points(tmp_path / "points.txt"), POINTS, rtol=1e-6)
-    assert read_points(tmp_path / "one.xyz").shape == (1, 3)
+TEXTS = {
+    "commas": "0.1,-0.2,2.0\n0.4,0.3,5.5\n",
+    "heading": "x,y,z\n0.1, -0.2, 2.0\n0.4, 0.3, 5.5\n",
+    "more columns": "X Y Z intensity\n0.1 -0.2 2.0 .5\n0.4 0.3 5.5 .1\n",
+    "remarks": "# a remark\n0.1;-0.2;2.0\n\n0.4;0.3;5.5 # the last\n",
+    "other order": "id,z,y,x\n0,2.0,-0.2,0.1\n1,5.5,0.3,0.4\n",
+    "words in another column": "label;x[m];y[m];z[m]\ncar;0.1;-0.2;2\ntree;0.4;0.3;5.5\n",
+    "quotes": '"X_m","Y_m","Z_m"\n"0.1","-0.2","2.0"\n"0.4","0.3","5.5"\n',
+    "title": "two points\n0.1 -0.2 2.0\n0.4 0.3 5.5\n",
+    "colours": "//X Y Z R G B\r\n0.1\t-0.2\t2.0\t255\t0\t0\r\n0.4\t0.3\t5.5\t0\t0\t9\r\n",
+}
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("words.txt", b"lidar\n"),
-        ("cut.npy", b"\x93NUMPY\x01"),
-        ("pickle.npy", b"\x80\x04K\x01."),
-        ("binary.xyz", b"\xff\xfe\x00"),
-    ],
-)
-def test_what_is_none_is_named_with_what_would_be(tmp_path, name, content):
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=rf"--points must be .*metres.*{name}"):
-        read_points(tmp_path / name, "--points")
-
-
-def test_a_cube_is_no_map(tmp_path):
-    np.save(tmp_path / "cube.npy", np.zeros((2, 3, 4)))
-    with pytest.raises(ValueError, match=r"map \(H, W\) or points \(N, 3\)"):
-        read_points(tmp_path / "cube.npy")
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "0.1,-0.2,2.0\n0.4,0.3,5.5\n",
-        "x,y,z\n0.1, -0.2, 2.0\n0.4, 0.3, 5.5\n",
-        "X Y Z intensity\n0.1 -0.2 2.0 .5\n0.4 0.3 5.5 .1\n",
-        "# a remark\n0.1;-0.2;2.0\n\n0.4;0.3;5.5 # the last\n",
-        "id,z,y,x\n0,2.0,-0.2,0.1\n1,5.5,0.3,0.4\n",
-        "label;x [m];y [m];z [m]\n".replace(" ", "") + "car;0.1;-0.2;2\ntree;0.4;0.3;5.5\n",
-        '"X_m","Y_m","Z_m"\n"0.1","-0.2","2.0"\n"0.4","0.3","5.5"\n',
-        "two points\n0.1 -0.2 2.0\n0.4 0.3 5.5\n",
-        "//X Y Z R G B\r\n0.1\t-0.2\t2.0\t255\t0\t0\r\n0.4\t0.3\t5.5\t0\t0\t9\r\n",
-    ],
-)
-def test_text_as_people_have_it(tmp_path, text):
-    (tmp_path / "points.csv").write_text(text)
+@pytest.mark.parametrize("kind", [*TEXTS, "Windows' shell"])
+def test_text_as_people_have_it(tmp_path, kind):
+    encoding = "utf-8" if kind in TEXTS else "utf-16"
+    (tmp_path / "points.csv").write_text(TEXTS.get(kind, TEXTS["commas"]), encoding=encoding)
     np.testing.assert_allclose(read_points(tmp_path / "points.csv"), POINTS)
 
 
-def test_text_of_windows_shell(tmp_path):
-    (tmp_path / "points.txt").write_text("0.1 -0.2 2.0\n0.4 0.3 5.5\n", encoding="utf-16")
-    np.testing.assert_allclose(read_points(tmp_path / "points.txt"), POINTS)
-
-
-@pytest.mark.parametrize("columns", [4, 6])
+@pytest.mark.parametrize("columns", [3, 4, 6])
 def test_columns_beyond_the_third_do_not_count(tmp_path, columns):
     wide = np.concatenate([POINTS, np.full((2, columns - 3), 7.0)], axis=1)
     np.save(tmp_path / "points.npy", wide)
@@ -102,37 +70,53 @@ def test_binary_ply(tmp_path, order):
     (tmp_path / "points.ply").write_bytes(head.encode() + rows.tobytes() + b"\x03" + bytes(12))
     np.testing.assert_allclose(read_points(tmp_path / "points.ply"), POINTS, rtol=1e-6)
     (tmp_path / "points.ply").write_bytes(head.encode() + rows.tobytes()[:-1])
-    with pytest.raises(ValueError, match="points must be 2 points of 17 bytes.*cut off"):
+    with pytest.raises(ValueError, match="points must be a PLY file with all its 2 points.*cut off"):
         read_points(tmp_path / "points.ply")
 
 
-def test_ascii_ply_and_our_own_cloud(tmp_path):
+def test_ascii_ply_and_our_cloud(tmp_path):
     head = PLY.format(kind="ascii", properties=PROPERTIES, more="")
     (tmp_path / "points.ply").write_text(head + "0.1 255 -0.2 2.0\n0.4 0 0.3 5.5\n")
     np.testing.assert_allclose(read_points(tmp_path / "points.ply"), POINTS)
     K = np.array([[8.0, 0, 3.5], [0, 8.0, 2.5], [0, 0, 1]])
     write_ply(tmp_path / "cloud.ply", MAP, np.zeros((6, 8, 3)), K)
-    cloud = read_points(tmp_path / "cloud.ply")
-    np.testing.assert_allclose(sorted(cloud[:, 2]), [1.25, 3.5])
+    np.testing.assert_allclose(sorted(read_points(tmp_path / "cloud.ply")[:, 2]), [1.25, 3.5])
+
+
+XYZ = b"property float x\nproperty float y\nproperty float z\n"
+BEGIN = b"ply\nformat ascii 1.0\n"
 
 
 @pytest.mark.parametrize(
-    "head",
+    ("name", "content", "said"),
     [
-        b"ply\nformat ascii 1.0\nelement vertex 2\n",
-        b"pl\nend_header\n",
-        b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n2\n",
-        b"ply\nformat odd 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-        b"end_header\n",
-        b"ply\nformat ascii 1.0\nelement vertex 999999999999999\nproperty float x\nproperty float y\n"
-        b"property float z\nend_header\n",
-        b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int i\nelement vertex 2\nend_header\n",
+        ("words.txt", b"lidar\n", "points must be points in metres"),
+        ("words.txt", b"1 2 3\n1 2 car\n", "points must be points in metres"),
+        ("cut.npy", b"\x93NUMPY\x01", "points must be .*metres.*cut.npy"),
+        ("pickle.npy", b"\x80\x04K\x01.", "points must be .*metres.*pickle.npy"),
+        ("binary.xyz", b"\xff\xfe\x00", "points must be .*metres.*binary.xyz"),
+        ("cube.npy", np.zeros((2, 3, 4)), r"map \(H, W\) or points \(N, 3\)"),
+        ("points.npy", (POINTS * 1000).astype(np.int32), "metres as floats; got .*int32. Divide millimetres"),
+        ("cut.ply", BEGIN + b"element vertex 2\n", "PLY"),
+        ("none.ply", b"pl\nend_header\n", "PLY"),
+        ("x.ply", BEGIN + b"element vertex 2\nproperty float x\nend_header\n1\n2\n", "PLY"),
+        ("odd.ply", b"ply\nformat odd 1.0\nelement vertex 1\n" + XYZ + b"end_header\n", "PLY"),
+        ("many.ply", BEGIN + b"element vertex 999999999999\n" + XYZ + b"end_header\n", "PLY"),
+        ("few.ply", BEGIN + b"element vertex 2\n" + XYZ + b"end_header\n1 2 3\n", "PLY .* cut off"),
+        (
+            "face.ply",
+            BEGIN + b"element face 1\nproperty list uchar int i\nelement vertex 2\nend_header\n",
+            "PLY",
+        ),
     ],
 )
-def test_what_is_no_ply(tmp_path, head):
-    (tmp_path / "points.ply").write_bytes(head)
-    with pytest.raises(ValueError, match="points must be"):
-        read_points(tmp_path / "points.ply")
+def test_what_is_none_is_named_with_what_would_be(tmp_path, name, content, said):
+    if isinstance(content, bytes):
+        (tmp_path / name).write_bytes(content)
+    else:
+        np.save(tmp_path / name, content)
+    with pytest.raises(ValueError, match=said):
+        read_points(tmp_path / name)
 
 
 #: The scanner looks along x, its y to the left, z up; the camera sits 0.27 m before it.
@@ -141,45 +125,40 @@ P2 = "700 0 600 70 0 700 180 0 0 0 1 0"
 EYE = "1 0 0 0 1 0 0 0 1"
 
 
-def scan(folder):
+@pytest.fixture
+def scan(tmp_path):
     """One point 10 m before the scanner and 1 m to the left, one behind it."""
     rows = np.array([[10.0, 1.0, 0.5, 0.3], [-5.0, 0.0, 0.0, 0.1]], "<f4")
-    (folder / "0.bin").write_bytes(rows.tobytes())
-    return folder / "0.bin"
+    (tmp_path / "0.bin").write_bytes(rows.tobytes())
+    return tmp_path / "0.bin"
 
 
-def test_a_velodyne_scan_with_either_calibration(tmp_path):
+def test_a_velodyne_scan_with_either_calibration(tmp_path, scan):
     (tmp_path / "object.txt").write_text(f"P2: {P2}\nR0_rect: {EYE}\n{TR}")
     (tmp_path / "velo.txt").write_text("calib_time: 1-Jan\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 -0.27\n")
     (tmp_path / "cams.txt").write_text(f"R_rect_00: {EYE}\nP_rect_02: {P2}\n")
     expected = [[-1.0 + 70 / 700, -0.5, 9.73]]  # camera 2 stands 0.1 m to the left of camera 0
     for files in ([tmp_path / "object.txt"], [tmp_path / "velo.txt", tmp_path / "cams.txt"]):
-        np.testing.assert_allclose(read_points(scan(tmp_path), calibration=files), expected, rtol=1e-5)
+        np.testing.assert_allclose(read_points(scan, calibration=files), expected, rtol=1e-5)
 
 
-def test_a_velodyne_scan_that_cannot_be_placed(tmp_path):
-    path = scan(tmp_path)
-    (tmp_path / "calib.txt").write_text(f"P2: {P2}\n")
+def test_a_velodyne_scan_that_cannot_be_placed(tmp_path, scan):
+    calib = tmp_path / "calib.txt"
+    calib.write_text(f"P2: {P2}\n")
     with pytest.raises(ValueError, match="points-calib must be given with a .bin"):
-        read_points(path)
+        read_points(scan)
     with pytest.raises(ValueError, match="points-calib must be KITTI's"):
-        read_points(path, calibration=[tmp_path / "calib.txt"])
-    np.save(tmp_path / "points.npy", POINTS)
+        read_points(scan, calibration=[calib])
     with pytest.raises(ValueError, match="points-calib must be given with a velodyne .bin"):
-        read_points(tmp_path / "points.npy", calibration=[tmp_path / "calib.txt"])
-    path.write_bytes(path.read_bytes()[:-3])
+        read_points(calib, calibration=[calib])
+    scan.write_bytes(scan.read_bytes()[:-3])
     with pytest.raises(ValueError, match="cut off"):
-        read_points(path, calibration=[tmp_path / "calib.txt"])
+        read_points(scan, calibration=[calib])
 
 
-def test_units_by_name_and_by_number(tmp_path):
-    folder = tmp_path / "proj_depth" / "groundtruth"
-    folder.mkdir(parents=True)
-    for path in (tmp_path / "map.png", folder / "map.png"):
-        write_depth_mm(path, MAP * 0.256)  # the integers of KITTI's 1/256 m
+def test_units_by_number(tmp_path):
+    write_depth_mm(tmp_path / "map.png", MAP * 0.256)  # the integers of KITTI's 1/256 m
     np.testing.assert_allclose(read_points(tmp_path / "map.png", scale=256), MAP, atol=4e-3)
-    with pytest.warns(UserWarning, match="KITTI's units of 1/256 m"):
-        np.testing.assert_allclose(read_points(folder / "map.png"), MAP, atol=4e-3)
     np.save(tmp_path / "mm.npy", (1000 * MAP).astype(np.uint16))
     np.testing.assert_allclose(read_points(tmp_path / "mm.npy", scale=1000), MAP, atol=1e-3)
     np.save(tmp_path / "points.npy", 1000 * POINTS)
@@ -193,40 +172,19 @@ def test_millimetres_that_look_like_metres(tmp_path):
     (tmp_path / "points.txt").write_text("0 0 1800\n100 0 2500\n0 0 -1\n")
     np.save(tmp_path / "map.npy", 1000 * MAP)
     for name, nearest in (("points.txt", 1800), ("map.npy", 1250)):
-        for scale in (None, 1):
-            with pytest.warns(
-                UserWarning, match=f"points has depths of {nearest} m and more.*--points-scale 1000"
-            ):
-                GeometryGuidance.from_points(read_points(tmp_path / name, scale=scale), np.eye(3))
+        said = f"points has depths of {nearest} m and more.*--points-scale 1000"
+        with pytest.warns(UserWarning, match=said):
+            GeometryGuidance.from_points(read_points(tmp_path / name, scale=1), np.eye(3))
         GeometryGuidance.from_points(read_points(tmp_path / name, scale=1000), np.eye(3))
-    (tmp_path / "points.txt").write_text("0 0 1800\n0 0 180\n")  # a mountain behind a house
-    read_points(tmp_path / "points.txt")
-    (tmp_path / "points.txt").write_text("0 0 -1800\n")  # another mistake, which is told elsewhere
-    read_points(tmp_path / "points.txt")
 
 
-def test_the_points_of_a_colmap_model_are_named(tmp_path):
-    """Of equal length they would pass for a map, and of several for a broken list."""
-    line = "{} 0.1 -0.2 2.5 90 80 70 0.4 1 {} 2 7"
-    head = "# 3D point list with one line of data per point:\n"
-    lines = [line.format(number, number + 3) for number in range(1, 5)]
-    for name, text in (
-        ("points3D.txt", "\n".join(lines)),
-        ("renamed.txt", head + "\n".join(lines)),
-        ("points3D.txt", head + "\n".join([*lines, lines[0] + " 3 9"])),
-    ):
-        (tmp_path / name).write_text(text)
-        with pytest.raises(ValueError, match=f"--points must be .*{name}, the points of a COLMAP model"):
-            read_points(tmp_path / name, "--points")
-        (tmp_path / name).unlink()
-    (tmp_path / "points3D.txt").write_text("0.1 -0.2 2.0\n0.4 0.3 5.5\n")
-    np.testing.assert_allclose(read_points(tmp_path / "points3D.txt"), POINTS)
-
-
-def test_integers_are_refused_without_a_unit(tmp_path):
-    np.save(tmp_path / "points.npy", (POINTS * 1000).astype(np.int32))
-    with pytest.raises(
-        ValueError, match="points must be metres as floats; got .*of int32. Divide millimetres"
-    ):
-        read_points(tmp_path / "points.npy")
-    np.testing.assert_allclose(read_points(tmp_path / "points.npy", scale=1000), POINTS, atol=1e-3)
+def test_confidence_from_files(tmp_path) -> None:
+    values = np.random.default_rng(3).random(MAP.shape).astype(np.float32)
+    np.save(tmp_path / "c.npy", values)
+    write_pfm(tmp_path / "c.pfm", values)
+    Image.fromarray(np.rint(values * 65535).astype(np.uint16)).save(tmp_path / "c.png")
+    for name, atol in (("c.npy", 0), ("c.pfm", 0), ("c.png", 1e-5)):
+        np.testing.assert_allclose(read_confidence(tmp_path / name), values, atol=atol)
+    Image.new("RGB", (64, 48)).save(tmp_path / "rgb.png")
+    with pytest.raises(ValueError, match="a grey PNG of 8 or 16 bits"):
+        read_confidence(tmp_path / "rgb.png")

@@ -39,7 +39,7 @@ HAS_GRADIO = importlib.util.find_spec("gradio") is not None
 #: ``test_geometry``.
 HAND_ON = {
     *("_camera_checks.check_intrinsics_fit", "_camera_checks.check_size_of"),  # the principal point alone
-    "formats.submissions.disparity_of_depth",  # of rectified pairs: along rows
+    "formats.depth.disparity_of_depth",  # of rectified pairs: along rows
     *("_camera_checks.warn_of_other_size", "formats.exif.warn_of_other_lens"),  # or the focal length
     *("algorithm.evidence.prepare_evidence", "algorithm.finish.vote_depth", "matching.rows.match_rows"),
     "capture.fusion.normals_of",

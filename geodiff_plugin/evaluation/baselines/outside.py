@@ -27,7 +27,7 @@ from geodiff_plugin.evaluation.baselines.guided import (
     guided_prediction,
 )
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth, read_depth_m, read_npy
-from geodiff_plugin.formats import read_disparity_kitti_png, read_pfm
+from geodiff_plugin.formats import read_depth_png, read_pfm
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 
 
@@ -75,7 +75,7 @@ def _read(path: Path, kind: str) -> np.ndarray:
     if kind == "depth":
         values = read_depth_m(path, "map")
     elif path.suffix == ".png":
-        values, _ = read_disparity_kitti_png(path, "map")
+        values, _ = read_depth_png(path, 256.0, "map")
     else:
         values = read_pfm(path, "map") if path.suffix == ".pfm" else read_npy(path, "map")
         signed = kind.startswith("relative")

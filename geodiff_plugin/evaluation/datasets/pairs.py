@@ -30,7 +30,7 @@ from geodiff_plugin.evaluation.datasets.sample import (
     read_npy,
     read_rgb,
 )
-from geodiff_plugin.formats import read_calibration, read_disparity_kitti_png, read_pfm
+from geodiff_plugin.formats import read_calibration, read_depth_png, read_pfm
 from geodiff_plugin.geometry import resize_intrinsics
 from geodiff_plugin.types import Rig
 
@@ -109,11 +109,11 @@ def _load_kitti(ref: SampleRef) -> StereoSample:
     """Read one KITTI pair; ``occluded`` where both kinds of truth exist."""
     files = ref.files
     images, rig = read_pair(ref, cameras=files["cameras"])
-    disparity, valid = read_disparity_kitti_png(files["disparity"], "true disparity")
+    disparity, valid = read_depth_png(files["disparity"], 256.0, "true disparity")
     check_size(files["disparity"], disparity.shape, images[0].shape)
     occluded = None
     if files.get("noc") is not None:
-        _, seen_twice = read_disparity_kitti_png(files["noc"], "disparity of the pixels seen twice")
+        _, seen_twice = read_depth_png(files["noc"], 256.0, "disparity of the pixels seen twice")
         check_size(files["noc"], seen_twice.shape, images[0].shape)
         occluded = valid & ~seen_twice
     depth_m = np.where(valid, disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E), 0)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin._checks import bad_value, check_metres
-from geodiff_plugin.formats import check_file, files, read_depth_mm_png, read_image, read_pfm
+from geodiff_plugin.formats import check_file, files, read_depth_png, read_image, read_pfm
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.types import Rig
 
@@ -177,7 +177,7 @@ def read_depth_m(path: Path, name: str) -> np.ndarray:
         ValueError: it is damaged, or an npy file of integers.
     """
     if path.suffix == ".png":
-        return read_depth_mm_png(path, name)[0]
+        return read_depth_png(path, name=name)[0]
     if path.suffix == ".pfm":
         return read_pfm(path, name)
     values = read_npy(path, name)
