@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.config import SEARCH_ONLY
 from tests.integration.test_tiny_decoder import Counted
 
 
@@ -31,21 +30,6 @@ def test_a_step_that_is_not_corrected_is_the_priors_own(
     assert looked == {1: [4], 3: [2, 3, 4]}[corrections]
     # A correction decodes once and encodes twice, the last one not at all; the stock call encodes the image.
     assert (counted.decoded, counted.encoded) == (len(looked), 1 + 2 * (corrections - 1))
-
-
-def test_a_preset_that_neither_corrects_nor_updates_is_a_plain_call_to_the_last_step(
-    make_pipeline, textured_plane, monkeypatch
-):
-    pipe = make_pipeline()
-    counted = Counted(pipe.vae, monkeypatch)
-    found = guided(pipe, textured_plane, config=SEARCH_ONLY, output_latent=True)
-    # Which matches are reflections and how wrong the prior is are judged by its last word, not by noise.
-    assert [report.step for report in found.history] == [4] and counted.encoded == 1
-    generator = torch.Generator().manual_seed(0)
-    plain = make_pipeline()(
-        textured_plane.left, num_inference_steps=5, generator=generator, output_latent=True
-    )
-    torch.testing.assert_close(found.latent, plain.latent, rtol=0, atol=1e-5)
 
 
 def test_the_result_does_not_depend_on_whether_the_latent_is_asked_for(make_pipeline, textured_plane):

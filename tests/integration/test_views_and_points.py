@@ -78,43 +78,6 @@ def abs_rel(out, group):
     return np.mean(np.abs(out.prediction[0, ..., 0] / group.depth_m - 1.0)[known])
 
 
-def test_a_third_view_sees_what_the_second_does_not(of_views, group):
-    two, three = of_views(2), of_views(3)
-    assert three.visible.mean() > two.visible.mean()
-    assert abs_rel(three, group) < 0.2 and three.history[0].visible_fraction > two.history[0].visible_fraction
-    best = np.where(two.visible, two.photometric_error, 1.0)
-    assert three.photometric_error[three.visible].mean() < best[three.visible].mean()
-
-
-def test_a_repeated_view_changes_nothing(pipe, group, of_views):
-    left, right = views(group, 2)
-    twice = run(pipe, group, GeometryGuidance.from_views([left, right, right], **FAST))
-    np.testing.assert_allclose(twice.prediction, of_views(2).prediction, rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_a_batch_of_images_with_two_and_with_three_views(pipe, group):
-    noise = torch.randn(1, *_latent_shape(pipe, group), generator=torch.Generator().manual_seed(0))
-    first, second, third = views(group, 3)
-    both = GeometryGuidance(
-        [(second[0],), (second[0], third[0])],
-        group.K,
-        [(first[2], second[2]), (first[2], second[2], third[2])],
-        **FAST,
-    )
-    lefts = [Image.fromarray(group.images[0])] * 2
-    out = pipe(lefts, guidance=both, latents=noise.repeat(2, 1, 1, 1), num_inference_steps=1, batch_size=2)
-    for i, count in enumerate((2, 3)):
-        alone = GeometryGuidance.from_views(views(group, count), **FAST)
-        single = pipe(lefts[0], guidance=alone, latents=noise, num_inference_steps=1)
-        np.testing.assert_allclose(out.prediction[i : i + 1], single.prediction, rtol=5e-3)
-
-
-def _latent_shape(pipe, group):
-    image = Image.fromarray(group.images[0])
-    return pipe(image, num_inference_steps=1, output_latent=True).latent.shape[1:]
-
-
 def test_points_instead_of_a_second_view(of_points, group):
     out = of_points
     assert out.visible is None and out.photometric_error is None and not out.warnings

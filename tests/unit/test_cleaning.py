@@ -12,10 +12,7 @@ from PIL import Image
 from geodiff_plugin import GuidanceConfig
 from geodiff_plugin.cli.inputs import pinhole
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
-from geodiff_plugin.guidance.evidence import make_evidence
-from geodiff_plugin.guidance.inputs import Inputs
 from geodiff_plugin.matching import build_cost_volume, clean, match_volume
-from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.cleaning import find_flaws
 from geodiff_plugin.types import CameraView
 from tests.scenes import SyntheticPair, render_pair
@@ -55,11 +52,6 @@ def test_the_steps_of_a_compression_are_found(
     assert found == pytest.approx(expected, rel=0.25)
 
 
-@pytest.mark.parametrize("levels", [4.0, 8.0])
-def test_the_noise_is_found(pair: SyntheticPair, levels: float) -> None:
-    assert find_flaws(noisy(pair.left.image_01, levels))[1] == pytest.approx(levels, rel=0.25)
-
-
 @pytest.mark.parametrize("channels", [1, 3])
 def test_without_its_noise_a_photograph_is_closer_to_the_scene(pair: SyntheticPair, channels: int) -> None:
     scene = pair.left.image_01[:channels]
@@ -67,38 +59,6 @@ def test_without_its_noise_a_photograph_is_closer_to_the_scene(pair: SyntheticPa
     after = clean(before, GRID)
     assert after.shape == before.shape
     assert distance(after, scene) < 0.5 * distance(before, scene)
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-def test_blocks_vanish(pair: SyntheticPair, channels: int) -> None:
-    def block_edges(image_01: torch.Tensor) -> float:
-        steps = grey(image_01)[0].diff(dim=1).abs().mean(0)
-        return float(steps[7::8].mean() / steps[3::8].mean())
-
-    image = compressed(pair.left.image_01, 40)[:channels]
-    assert block_edges(image) > 1.2
-    assert block_edges(clean(image, GRID)) < 1.1
-
-
-def test_a_good_photograph_stays_as_it_is(pair: SyntheticPair) -> None:
-    for image in (pair.left.image_01, noisy(pair.left.image_01, 1.0), torch.full((3, 64, 48), 0.5)):
-        assert clean(image, GRID) is image
-
-
-def test_a_resampled_picture_has_no_blocks(pair: SyntheticPair) -> None:
-    turned = torch.rot90(compressed(pair.left.image_01, 50), 1, (1, 2))
-    small = torch.nn.functional.interpolate(turned[None], scale_factor=0.8, mode="bilinear", antialias=True)[
-        0
-    ]
-    assert find_flaws(turned)[0] == pytest.approx(1.0, rel=0.25)  # a quarter turn moves no pixel
-    assert find_flaws(small)[0] == 0
-
-
-def test_a_picture_that_is_shrunk_anyway_stays_as_it_is(pair: SyntheticPair) -> None:
-    image = compressed(pair.left.image_01, 40)
-    pixels = image.shape[1] * image.shape[2]
-    assert clean(image, pixels // 6 - 1) is image
-    assert clean(image, pixels // 6) is not image
 
 
 @pytest.mark.parametrize("flawed", [lambda x: compressed(x, 40), lambda x: noisy(x, 8.0)])
@@ -114,16 +74,6 @@ def test_fewer_matches_are_wrong(pair: SyntheticPair, flawed) -> None:
         return float(off[seen].sum() / matches.confidence[seen].sum())
 
     assert wrong((clean(left, GRID), clean(right, GRID))) < 0.9 * wrong((left, right))
-
-
-@pytest.mark.parametrize("switched_on", [True, False])
-def test_evidence_is_of_cleaned_photographs(pair: SyntheticPair, switched_on: bool) -> None:
-    left, right = (compressed(view.image_01, 40) for view in (pair.left, pair.right))
-    views = (CameraView(right, pair.K_right.float(), torch.linalg.inv(pair.E).float()),)
-    config = GuidanceConfig(pose="given", clean_photographs=switched_on)
-    made = make_evidence(left, Inputs(pair.K_left.numpy(), views, (), None), config, False)
-    assert torch.equal(made.left_01, clean(left, GRID) if switched_on else left)
-    assert torch.equal(made.native_views[0].image_01, clean(right, GRID) if switched_on else right)
 
 
 def test_a_photograph_is_cleaned_before_it_is_undistorted(pair: SyntheticPair) -> None:

@@ -53,12 +53,3 @@ def test_a_good_prior_is_believed_beside_its_matches_and_not_far_from_them():
     assert bool((good >= poor).all()) and good[2] > poor[2] + 0.2 and good[3] > poor[3]
     # Its error is measured where matches are: it says nothing of what is far from all of them.
     assert good[0] == poor[0] and good[1] < 0.6
-
-
-def test_a_weak_prior_needs_more_support_than_a_good_one():
-    """What is left of its error decides, so nine tenths of support are little where the rest is useless."""
-    good, poor = (
-        depth_confidence(_maps(0.9), _maps(0.05), SEEN[..., :1], None, torch.full((1, 1, 1, 1), own)).item()
-        for own in (0.05, 0.5)
-    )
-    assert good > 0.85 and poor < 0.6

@@ -6,9 +6,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.algorithm.correction import correction_target, off_edges, prior_error, refine_depth
+from geodiff_plugin.algorithm.correction import correction_target, off_edges, refine_depth
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.scale.space import SPACES, AffineState, MetricMap, inverse_softplus
 
 SIZE = (40, 60)
 WEAK, STRONG = (torch.full((1, 1, 1, 1), error) for error in (0.3, 0.02))
@@ -20,13 +19,6 @@ def _target(depth_m: torch.Tensor, confidence: torch.Tensor) -> Matches:
 
 def _grey(value: float = 0.5) -> torch.Tensor:
     return torch.full((1, 3, *SIZE), value)
-
-
-def test_without_a_match_nothing_moves():
-    depth = torch.linspace(2.0, 4.0, SIZE[1]).expand(1, 1, *SIZE)
-    depth_m, support, _ = refine_depth(depth, _target(depth, torch.zeros_like(depth)), _grey(), WEAK)
-    assert torch.equal(depth_m, depth)
-    assert support.max() == 0.0
 
 
 def test_a_correction_spreads_over_its_surface_and_stops_at_an_edge():
@@ -57,21 +49,6 @@ def test_samples_of_a_batch_do_not_mix_and_any_resolution_comes_back():
     assert depth_m[1].mean() == pytest.approx(3.3, rel=1e-5)
 
 
-def _wavy(truth: torch.Tensor, error: float) -> torch.Tensor:
-    rows = torch.linspace(0, 12.0, SIZE[0])[:, None]
-    return truth * torch.exp(error * torch.sin(rows + torch.linspace(0, 15.0, SIZE[1])))
-
-
-def test_the_error_of_a_prior_is_measured_where_it_was_not_fitted():
-    truth = torch.full((1, 1, *SIZE), 2.0)
-    target = _target(truth, torch.ones_like(truth))
-    found = [float(prior_error(_wavy(truth, error), target, _grey())) for error in (0.0, 0.1, 0.4)]
-    assert found[0] == pytest.approx(0.01) and found[0] < found[1] < found[2]
-    assert 0.03 < found[1] < 0.15 and 0.15 < found[2] < 0.5
-    nothing = _target(truth, torch.zeros_like(truth))
-    assert float(prior_error(truth, nothing, _grey())) == 0.5
-
-
 def test_beside_an_edge_of_a_good_map_a_match_counts_for_less():
     depth = torch.full((1, 1, *SIZE), 2.0)
     depth[..., 30:] = 4.0
@@ -84,22 +61,6 @@ def test_beside_an_edge_of_a_good_map_a_match_counts_for_less():
     # Nor is a slope an edge.
     slope = torch.linspace(2.0, 4.0, SIZE[1]).expand(1, 1, *SIZE)
     assert off_edges(target, slope, STRONG).confidence.min() > 0.95
-
-
-@pytest.mark.parametrize("space", sorted(SPACES))
-@pytest.mark.parametrize("positive", ["softplus", "square"])
-def test_relative_is_the_inverse_of_the_metric_map(space, positive):
-    metric, x = MetricMap(space, positive), torch.linspace(0.05, 0.95, 12).view(1, 1, 3, 4)
-    near, far = torch.tensor([1.5]), torch.tensor([9.0])
-    affine = metric.from_range(near, far)
-    assert torch.allclose(metric.relative(metric(x, affine), affine), x, atol=1e-4)
-
-
-def test_relative_of_a_depth_before_the_nearest_one_is_bounded():
-    metric = MetricMap("depth")
-    one = inverse_softplus(torch.ones(1))
-    x = metric.relative(torch.full((1, 1, 1, 1), 1e-6), AffineState(one, one, torch.ones(1)))
-    assert -0.1 < float(x) < 0.0
 
 
 FINE, COARSE = (24, 32), (12, 16)
@@ -122,20 +83,6 @@ def depth(metres: float) -> torch.Tensor:
     return torch.full((1, 1, *COARSE), metres)
 
 
-def test_matches_of_images_stack_unless_one_has_none():
-    image = Matches(torch.ones(1, 2, 3), torch.ones(1, 2, 3), torch.tensor(0.01))
-    stacked = Matches.stack([image, image])
-    assert stacked.confidence.shape == (2, 1, 2, 3) and stacked.size == (2, 3)
-    assert stacked.plane_step.shape == (2,) and Matches.stack([image, None]) is None
-
-
-def test_shares_of_one_grid_hold_on_another():
-    kept = torch.zeros(1, 1, *COARSE)
-    kept[..., :8] = 1.0
-    fine = correction_target(matches_at(2.0, FINE), None, kept, None, depth(2.0))
-    assert (fine.confidence[..., :14] == 1).all() and (fine.confidence[..., 18:] == 0).all()
-
-
 def test_no_match_counts_before_the_first_estimate():
     assert correction_target(matches_at(2.0), None, None, None, depth(2.0)) is None
     assert correction_target(None, None, None, ERROR, depth(2.0)) is None
@@ -151,10 +98,3 @@ def test_points_count_in_full_beside_an_edge():
         for m in (edge, depth(2.1))
     )
     assert beside[6, 8] == away[6, 8] and beside[5, 8] < 0.3 * away[5, 8]
-
-
-def test_an_estimate_is_fitted_to_matches_and_points():
-    target = correction_target(matches_at(2.0), one_point(2.2), KEPT, ERROR, depth(2.1))
-    assert float(target.inverse_depth[0, 0, 6, 8]) == pytest.approx(1 / 2.2)
-    depth_m, support, _ = refine_depth(depth(2.1), target, GREY, ERROR)
-    assert float(depth_m.median()) == pytest.approx(2.0, rel=0.1) and (support > 0.8).all()

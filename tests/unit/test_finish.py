@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from geodiff_plugin.algorithm import finish
-from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth, weighted_median
+from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.types import CameraView
@@ -90,18 +87,6 @@ def test_sharpening_gives_depths_that_are_there_whatever_the_strips(monkeypatch)
     assert torch.equal(sharpen_edges(soft, left, 2), whole)
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.integers(1, 30), st.integers(0, 1000))
-def test_the_median_is_numpys(count, seed):
-    rng = np.random.default_rng(seed)
-    values, weight = rng.normal(size=(count, 6)), rng.uniform(0.01, 1.0, (count, 6))
-    found = weighted_median(torch.from_numpy(values), torch.from_numpy(weight), 30)
-    for i in range(6):
-        order = np.argsort(values[:, i])
-        reached = np.cumsum(weight[order, i]) >= weight[:, i].sum() / 2
-        assert float(found[i]) == pytest.approx(values[order, i][reached][0], abs=1e-6)
-
-
 #: Cameras of ``scene``: a shift of 9 px at 2 m, of 3 px at 6 m.
 K = torch.tensor([[90.0, 0.0, 47.5], [0.0, 90.0, 35.5], [0.0, 0.0, 1.0]])
 BASELINE_M = 0.2
@@ -153,49 +138,6 @@ def test_a_weak_map_takes_its_edges_from_the_views_and_their_colours():
     nothing = matches(truth, 0.0)
     assert wrong(voted(moved, left, view, nothing, 0.4), truth) < 0.4 * wrong(moved, truth)
     assert wrong(voted(moved, left, view, matches(truth), 0.4), truth) < 0.12 * wrong(moved, truth)
-
-
-def test_a_good_map_keeps_its_edges_where_matches_are_fattened():
-    truth, _, view = scene()
-    fattened = -F.max_pool2d(-truth, 7, 1, 3)
-    kept = voted(truth, torch.full((1, 3, 72, 96), 0.5), view, matches(fattened), 0.01)
-    assert (kept / truth - 1.0).abs().max() < 0.01
-
-
-def test_speckles_holes_and_far_outliers_have_no_vote():
-    (truth, left, view), generator = scene(), torch.Generator().manual_seed(2)
-    bad = torch.rand(truth.shape, generator=generator) < 0.04
-    outlier = torch.where(torch.rand(truth.shape, generator=generator) < 0.5, 0.3, 1e6)
-    confidence = torch.where(bad, 0.9, 0.95)
-    confidence[..., 20:24, 30:34] = 0.0
-    after = voted(truth * 1.005, left, view, matches(torch.where(bad, outlier, truth), confidence), 0.3)
-    assert ((after / truth - 1.0).abs()[..., 12:-12] < 0.05).float().mean() > 0.99
-
-
-def test_nothing_leaves_the_maps_range_and_nothing_moves_without_a_rectified_view():
-    generator = torch.Generator().manual_seed(3)
-    truth, left, view = scene()
-    map_m = 1.0 + torch.rand(truth.shape, generator=generator)
-    after = voted(map_m, left, view, matches(20.0 * truth), 0.5)
-    assert after.amin() >= map_m.amin() and after.amax() <= map_m.amax()
-    turned = view._replace(T_right_from_left=view.T_right_from_left.roll(1, 0))
-    for other in (turned, view._replace(image_01=view.image_01[..., 1:])):
-        assert voted(map_m, left, other, matches(truth), 0.5) is map_m
-    assert vote_depth(map_m, left, K, [], matches(truth), error_of(0.5)) is map_m
-
-
-def test_a_plane_stays_one_and_scale_does_not_matter():
-    u = torch.arange(96.0).expand(1, 1, 72, -1)
-    plane, (_, _, view) = 400.0 / (40.0 + u), scene()
-    left = torch.full((1, 3, 72, 96), 0.5)  # in which rows match nothing
-    view = view._replace(image_01=left[0])
-    after = voted(plane, left, view, matches(plane), 0.3)
-    assert (after / plane - 1.0)[..., 12:-12].abs().max() < 5e-3
-    T = view.T_right_from_left.clone()
-    T[:3, 3] *= 100.0
-    far = Matches(1e-2 / plane, torch.full_like(plane, 0.95), torch.full((1,), 2e-5))
-    again = voted(100.0 * plane, left, view._replace(T_right_from_left=T), far, 0.3)
-    assert torch.allclose(again, 100.0 * after, rtol=1e-4)
 
 
 def test_strips_change_nothing_and_a_large_picture_takes_its_edges_from_its_colours(monkeypatch):

@@ -86,31 +86,6 @@ def test_projection_and_warp_are_the_definition(seed, pose, size_right):
         )
 
 
-@pytest.mark.parametrize("size_to", [(48, 64), (12, 20), (7, 5)])
-def test_a_resized_image_shows_a_point_where_its_camera_says(size_to):
-    depth = 1.0 + np.random.default_rng(0).random(SIZE)
-    resized = g.resize_intrinsics(tensor(K), SIZE, size_to)
-    scale = np.array([size_to[1] / SIZE[1], size_to[0] / SIZE[0]])[:, None, None]
-    expected = (pixels(SIZE)[:2] + 0.5) * scale - 0.5
-    np.testing.assert_allclose(uv_of(points_of(depth, K), resized[0].numpy()), expected, atol=1e-9)
-    torch.testing.assert_close(g.resize_intrinsics(resized, size_to, SIZE), tensor(K))
-    image = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
-    small, K_small = g.resize_image(image, tensor(K)[0], size_to)
-    assert small.shape == (3, *size_to) and torch.equal(K_small, resized[0])
-    same, K_same = g.resize_image(image, tensor(K)[0], SIZE)
-    assert same is image and torch.equal(K_same, tensor(K)[0])
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.3, np.pi])
-def test_nearest_rotation_is_that_of_scipy(angle):
-    exact = Rotation.from_rotvec(angle * np.array([1, 2, 3]) / 14**0.5).as_matrix()
-    noisy = exact + 1e-3 * np.random.default_rng(1).normal(size=(3, 3))
-    nearest = g.nearest_rotation(tensor(noisy))[0].numpy()
-    np.testing.assert_allclose(nearest, Rotation.from_matrix(noisy).as_matrix(), atol=2e-3)
-    np.testing.assert_allclose(nearest @ nearest.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(g.nearest_rotation(tensor(exact))[0], exact, atol=1e-12)
-
-
 def test_zero_baseline_is_the_identity():
     image = torch.rand(2, 3, *SIZE, generator=torch.Generator().manual_seed(0))
     depth = 1.0 + 3.0 * torch.rand(2, 1, *SIZE, generator=torch.Generator().manual_seed(1))
@@ -152,40 +127,3 @@ def test_a_near_square_hides_the_strip_beside_it(size_right):
     assert (hidden != expected).sum() <= 2 * (20 + 6) * coarse
     assert hidden[12:28, 20:24].all()
     assert not hidden[12:28, 25 + coarse :].any() and not hidden[:, : 19 - coarse].any()
-
-
-def test_a_skew_moves_what_is_hidden_and_a_slanted_floor_hides_nothing():
-    step = tensor(np.where(pixels(SIZE)[0] > 15, 1.0, 3.0))[None]
-    cameras = tensor(K_RIGHT), tensor(T_of(at=(0.12, -0.01, -0.02)))
-    skewed, straight = (
-        g.hidden_in_right(step, tensor(K * own), *cameras, SIZE) for own in (1, np.where(K == 7.0, 0, 1))
-    )
-    assert skewed.any() and not torch.equal(skewed, straight)
-    floor = (60.0 / (torch.arange(40.0) + 5.0)).view(1, 1, 40, 1).expand(1, 1, 40, 60)
-    camera_up, T = (
-        tensor(camera(40.0, 29.5, -5.0)).float(),
-        tensor(T_of((0.2, 0.1, 0.3), (1, 0, 0), 0.05)).float(),
-    )
-    assert not g.hidden_in_right(floor, camera_up, camera_up, T, (40, 60)).any()
-
-
-@pytest.mark.parametrize(
-    ("pose", "intrinsics", "expected"),
-    [
-        ({}, {}, True),
-        ({"at": (0.5, 0.004, 0.004)}, {}, True),
-        ({"at": (0.5, 0.006, 0)}, {}, False),
-        ({"at": (0.5, 0, 0.006)}, {}, False),
-        ({"at": (0, 0, 0)}, {}, False),
-        ({"angle": 5e-4}, {}, True),
-        ({"angle": 2e-3}, {}, False),
-        ({"angle": 2e-3, "axis": (0, 0, 1)}, {}, False),
-        ({}, {"cx": 25.0}, True),  # Middlebury's doffs
-        ({}, {"cy": 11.6}, False),
-        ({}, {"f": 30.1}, False),
-    ],
-)
-def test_rectified_means_that_rows_are_epipolar_lines(pose, intrinsics, expected):
-    T = tensor(T_of(**{"at": (0.5, 0, 0)} | pose))
-    assert g.is_rectified(tensor(camera()), tensor(camera(**intrinsics)), T).tolist() == [expected]
-    assert not g.is_rectified(tensor(K), tensor(camera()), T).any()  # another skew

@@ -9,19 +9,10 @@ from PIL import Image
 
 from geodiff_plugin.formats import depth as strips
 from geodiff_plugin.formats import flying_points, make_cloud, write_depth_mm, write_ply
-from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.formats.points import read_ply_points
-from geodiff_plugin.plotting import colour_depth, depth_range, overview, share_figure
+from geodiff_plugin.plotting import colour_depth, share_figure
 from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
 from geodiff_plugin.types import CameraView
-
-
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (7, 5), (30, 1000), (3, 2000)])
-def test_strips_cover_every_row_once(monkeypatch, height, width):
-    monkeypatch.setattr(strips, "STRIP_PIXELS", 1500)
-    found = list(row_strips(height, width))
-    assert [row for s in found for row in range(s.start, s.stop)] == list(range(height))
-    assert all((s.stop - s.start) * width <= max(1500, width) for s in found)
 
 
 @pytest.fixture
@@ -78,16 +69,3 @@ def test_rerendering_and_confidence_in_strips(textured_plane, monkeypatch):
     torch.testing.assert_close(error, whole[1], atol=1e-4, rtol=0)
     torch.testing.assert_close(confidence, whole[2], atol=1e-3, rtol=0)
     assert float(error[visible].mean()) < 0.02  # at the true depth the views agree
-
-
-def test_a_large_map_has_the_colours_and_the_overview_of_a_small_one():
-    rng = np.random.default_rng(0)
-    small = np.exp(rng.normal(size=(30, 40))).astype(np.float32) + 1
-    large = np.kron(small, np.ones((100, 100), np.float32))
-    assert depth_range(large) == pytest.approx(depth_range(small), rel=0.02)
-    image = np.zeros((*large.shape, 3), np.float32)
-    one, other = (
-        np.asarray(overview(image[k], large[k], large[k] / 9, None).resize((960, 660)), dtype=float)
-        for k in (np.s_[:, :], np.s_[::5, ::5])
-    )
-    assert np.abs(one - other).mean() < 6.0  # of 255; the legends are a pixel apart

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
-import numpy as np
 import pytest
 import torch
 
@@ -13,7 +9,7 @@ from geodiff_plugin import matching as m
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.points import fit_to_points, refine_to_matches, reliable_matches
 from geodiff_plugin.scale.space import MetricMap
-from geodiff_plugin.scale.volume_search import argmin_over, search_scale
+from geodiff_plugin.scale.volume_search import search_scale
 from tests.benchmarks.matching import textured_pair
 
 SPACES = {
@@ -25,7 +21,6 @@ SPACES = {
 }
 NEAR_IS_ONE = ("disparity", "sqrt_disparity")
 SIZE = (96, 144)
-REAL = Path(os.environ.get("GEODIFF_TEST_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
 
 def relative(depth: torch.Tensor, space: str, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
@@ -66,29 +61,6 @@ def test_true_relative_map_gives_the_true_metres(scene, space):
     assert float(found.near_m) == pytest.approx(float(depth.min()), rel=0.05)
     assert found.near_m.shape == found.far_m.shape == found.cost.shape == found.on_edge.shape == (1,)
     assert 0 <= found.cost < 0.15
-
-
-def test_each_sample_of_a_batch_has_its_own_answer(scene):
-    volume, depth = scene
-    x = relative(depth, "depth")
-    squeezed = 0.05 + 0.9 * x  # the same scene, so another (near, far)
-    both = search_scale(volume, torch.cat([x, squeezed]), "depth")
-    alone = search_scale(volume, squeezed, "depth")
-    torch.testing.assert_close(both.near_m[1], alone.near_m[0])
-    torch.testing.assert_close(both.far_m[1], alone.far_m[0])
-    estimate = metres(squeezed[0], float(alone.near_m), float(alone.far_m), "depth")
-    assert ((estimate - depth).abs() / depth).mean() < 0.05
-    assert both.near_m[1] < both.near_m[0] and both.far_m[1] > both.far_m[0]
-
-
-def test_range_that_excludes_the_answer_is_reported(scene):
-    volume, depth = scene
-    x = relative(depth, "depth")
-    inside = search_scale(volume, x, "depth", depth_range=(1.0, 40.0))
-    outside = search_scale(volume, x, "depth", depth_range=(3.2, 40.0))
-    assert not inside.on_edge and outside.on_edge
-    assert outside.near_m >= 3.2 * 0.999 and outside.far_m <= 40.0 * 1.001
-    assert outside.cost > inside.cost + 0.02
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity"])
@@ -140,66 +112,6 @@ def test_noise_of_far_matches_does_not_pull_the_far_end_nearer(scene, seed):
     assert float(far) == pytest.approx(float(true[1]), rel=0.1)
 
 
-def test_refinement_without_matches_changes_nothing(scene):
-    volume, depth = scene
-    x = relative(depth, "depth")
-    nothing = m.Matches(1 / depth, torch.zeros_like(depth), volume.plane_step)
-    start = (torch.tensor([2.0]), torch.tensor([9.0]))
-    near, far = refine_to_matches(x, nothing, *start, "depth")
-    torch.testing.assert_close((near, far), start)
-
-
-@pytest.mark.parametrize("space", ["depth", "disparity", "log"])
-def test_points_of_one_depth_give_a_finite_range(scene, space):
-    volume, depth = scene
-    same = m.Matches(torch.full_like(depth, 0.4), torch.ones_like(depth), torch.tensor(0.004))
-    near, far = refine_to_matches(
-        relative(depth, space), same, torch.tensor([2.0]), torch.tensor([9.0]), space
-    )
-    assert torch.isfinite(near).all() and torch.isfinite(far).all() and float(near) < float(far)
-
-
-def test_argmin_over_is_per_sample_and_tells_edges():
-    candidates = torch.linspace(1, 9, 9)
-    targets = torch.tensor([3.2, 0.0, 12.0])
-    best, on_edge = argmin_over(candidates, lambda g_s: (g_s - targets) ** 2)
-    assert best.tolist() == [3.0, 1.0, 9.0] and on_edge.tolist() == [False, True, True]
-
-
-def fill(depth: np.ndarray, valid: np.ndarray) -> torch.Tensor:
-    from scipy.ndimage import distance_transform_edt
-
-    rows, columns = distance_transform_edt(~valid, return_distances=False, return_indices=True)
-    return torch.from_numpy(depth[rows, columns]).float()[None]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not REAL.is_dir(), reason="the real pairs are not on this machine")
-def test_search_alone_is_within_5_percent_on_every_real_pair():
-    """The truth, normalised by its 2 and 98 % quantiles, as relative depth: the search gives the metres."""
-    from geodiff_plugin.evaluation.datasets import load_pairs
-
-    errors = {}
-    for pair in load_pairs(REAL):
-        left, right = (
-            torch.from_numpy(i.copy()).permute(2, 0, 1).float() / 255 for i in (pair.left, pair.right)
-        )
-        K_left, K_right, E = (torch.from_numpy(a).float() for a in (pair.K_left, pair.K_right, pair.E))
-        volume = m.build_cost_volume(left, [(right, K_right, torch.linalg.inv(E))], K_left)
-        depth = fill(pair.depth_m, pair.valid)
-        known = torch.from_numpy(pair.depth_m[pair.valid])
-        low, high = (float(np.quantile(known.numpy(), q)) for q in (0.02, 0.98))
-        x = ((depth - low) / (high - low)).clamp(0, 1)[None]
-        found = search_scale(volume, x, "depth")
-        estimate = metres(x[0, 0], float(found.near_m), float(found.far_m), "depth")
-        errors[pair.label] = float(
-            ((estimate - depth[0]).abs() / depth[0])[torch.from_numpy(pair.valid)].mean()
-        )
-        print(f"{pair.label}: {errors[pair.label]:.4f}")
-    assert len(errors) >= 13
-    assert all(error < 0.05 for error in errors.values()), errors
-
-
 STREET = (40, 60)
 
 
@@ -226,7 +138,3 @@ def test_a_wrong_basin_is_left_and_a_right_one_kept(street):
     assert near.item() == pytest.approx(6.0, rel=0.3) and far.item() > 40.0
     kept = fit_to_points(x, reliable, metric, (torch.tensor([6.0]), torch.tensor([80.0])))
     assert [v.item() for v in kept] == pytest.approx([6.0, 80.0])
-
-
-def test_too_few_reliable_matches_say_nothing(street):
-    assert reliable_matches(matches_of(street[0], confidence=0.4)) is None

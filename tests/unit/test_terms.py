@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import kornia.metrics
 import numpy as np
 import pytest
 import torch
@@ -13,10 +12,6 @@ from geodiff_plugin.algorithm.terms import (
     TERM_CAUCHY,
     TERMS,
     Compared,
-    masked_mean,
-    match_exposure,
-    photometric_map,
-    ssim,
 )
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching import Matches
@@ -110,57 +105,3 @@ def test_photometric_takes_the_view_that_explains_a_pixel_best():
     hidden[:, 1] = False
     assert (alone > 0.2).all()
     torch.testing.assert_close(photometric(estimate(warped_01=both.warped_01, visible=hidden)), alone)
-
-
-def test_photometric_gradient():
-    left, warped = draw(1, 3, 26, 25), draw(1, 2, 3, 26, 25, seed=1).requires_grad_()
-    seen = draw(1, 2, 1, 26, 25, seed=2) < 0.8
-    base = estimate(left_01=left, visible=seen, config=DEFAULT.changed(pyramid_levels=2))
-
-    def loss(w):
-        return photometric(base._replace(warped_01=w)).sum()
-
-    (grad,) = torch.autograd.grad(loss(warped), warped)
-    direction, h = draw(*warped.shape, seed=3) - 0.5, 1e-6
-    with torch.no_grad():
-        numeric = (loss(warped + h * direction) - loss(warped - h * direction)) / (2 * h)
-    torch.testing.assert_close((grad * direction).sum(), numeric, rtol=1e-5, atol=1e-9)
-
-
-def test_means_and_kornias_ssim():
-    weight = torch.tensor([[1, 0, 1], [0, 0, 0]], dtype=torch.bool).view(1, 1, 2, 3)
-    value = torch.arange(6.0).view(1, 1, 2, 3)
-    assert masked_mean(value, weight).item() == 1.0
-    assert masked_mean(value, torch.zeros_like(weight)).item() == 0.0
-    a, b = draw(2, 2, 3, 25, 31).float()
-    b = 0.7 * a + 0.3 * b
-    torch.testing.assert_close(ssim(a, b), kornia.metrics.ssim(a, b, 3), atol=2e-5, rtol=0)
-    torch.testing.assert_close(photometric_map(a, b, eta=0.0), (a - b).abs())
-
-
-LEFT, SEEN = 0.3 + 0.2 * draw(1, 3, 48, 60).float(), torch.ones(1, 1, 48, 60, dtype=torch.bool)
-
-
-@pytest.mark.parametrize("gain", [0.5, 1.0, 2.0])
-def test_gain_bias_and_most_of_the_vignetting_are_undone(gain):
-    right = gain * LEFT * torch.tensor([0.9, 1.0, 1.1]).view(1, 3, 1, 1) + 0.02
-    assert (match_exposure(right, LEFT, SEEN) - LEFT).abs().max() < 0.01
-    rows, columns = torch.meshgrid(torch.linspace(-1, 1, 48), torch.linspace(-1, 1, 60), indexing="ij")
-    right = gain * LEFT * (1.0 - 0.15 * (rows**2 + columns**2))
-    before, after = (
-        (right / gain - LEFT).abs().mean(),
-        (match_exposure(right, LEFT, SEEN) - LEFT).abs().mean(),
-    )
-    assert after < 0.35 * before
-
-
-def test_exposure_of_what_is_hidden_blank_or_another_scene():
-    half, right = SEEN.clone(), 0.7 * LEFT
-    half[..., 30:], right[..., 30:] = False, 1.0
-    assert (match_exposure(right, LEFT, half) - LEFT)[..., :25].abs().max() < 0.02
-    other = 0.3 + 0.2 * draw(1, 3, 48, 60, seed=1).float()
-    assert (match_exposure(other, LEFT, SEEN) - LEFT).abs().mean() > 0.04
-    blank = torch.full_like(LEFT, 0.5).requires_grad_()
-    matched = match_exposure(blank, blank.detach(), SEEN)
-    (gradient,) = torch.autograd.grad(matched.square().sum(), blank)
-    assert torch.isfinite(matched).all() and torch.isfinite(gradient).all()
