@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-__all__ = ["DepthFrame", "agreed", "seen_in"]
-
 #: Two depths of one point agree within this share.
 SAME_SHARE = 0.06
 #: A frame's depth counts so many times that of another frame, whose pixels are resampled.
@@ -54,9 +52,8 @@ class DepthFrame:
 def seen_in(frame: DepthFrame, other: DepthFrame) -> Maps:
     """Where another frame's camera sees the points of a frame.
 
-    Returns:
-        ``(H, W)`` each: rows and columns of the nearest pixels of the other frame (0 where it does not see
-        the point), depth of the point in its camera, whether it is inside of the picture.
+    ``(H, W)`` each: rows and columns of its nearest pixels (0 where it does not see the point), depth of the
+    point in its camera, whether it is inside of the picture.
     """
     T = np.linalg.inv(other.E)
     points = (frame.world() @ T[:3, :3].T + T[:3, 3]) @ other.K.T
@@ -70,18 +67,11 @@ def seen_in(frame: DepthFrame, other: DepthFrame) -> Maps:
 
 
 def agreed(frame: DepthFrame, others: Sequence[DepthFrame]) -> DepthFrame:
-    """A frame's depth averaged with that of other frames where they agree.
+    """A frame's depth, as it came from its own run, averaged with that of others where they agree.
 
     A depth that no other frame confirms gives way to one on which several others agree and which together
-    count more.
-
-    Args:
-        frame: as it came from its own run.
-        others: frames that see the same, likewise.
-
-    Returns:
-        The frame with ``confirmed`` and ``asked``. Depth is a mean over inverse depths weighted by
-        confidence, and never leaves what frames agree on.
+    count more. Depth is a mean over inverse depths weighted by confidence. Returns the frame with
+    ``confirmed`` and ``asked``.
 
     Source: Merrell et al. 2007, S4: depth maps rendered into one view, supported by those that agree.
     """
@@ -120,9 +110,8 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame]) -> DepthFrame:
 def _depth_by(other: DepthFrame, frame: DepthFrame) -> Maps:
     """What another frame says of the depth of every pixel of a frame, at the point where that puts it.
 
-    Returns:
-        ``(H, W)`` each: its depth, brought into the frame's view, its confidence, whether it sees the point,
-        and whether both mean the same point.
+    ``(H, W)`` each: its depth, brought into the frame's view, its confidence, whether it sees the point, and
+    whether both mean the same point.
     """
     row, column, z, seen = seen_in(frame, other)
     there = other.depth[row, column].astype(np.float64)
@@ -151,23 +140,18 @@ def _rendered(other: DepthFrame, frame: DepthFrame) -> tuple[np.ndarray, np.ndar
 def _vote(rendered: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -> Maps:
     """The depth that most of the other frames agree on, at the ``n`` pixels of a mask.
 
-    Returns:
-        ``(n,)`` each: how many agree, their weight, their mean inverse depth and joint confidence.
+    ``(n,)`` each: how many agree, their weight, their mean inverse depth and joint confidence.
     """
     depths, sures = (np.stack([maps[k][mask] for maps in rendered]) for k in (0, 1))
     weights = np.where(depths > 0, LEAST_WEIGHT + sures, 0.0)
     inverse = 1.0 / np.where(depths > 0, depths, 1.0)
     best = [np.zeros(depths.shape[1]) for _ in range(4)]
     for candidate in range(len(depths)):
-        same = (
-            (np.abs(inverse / inverse[candidate] - 1) < SAME_SHARE) & (depths > 0) & (depths[candidate] > 0)
-        )
+        same = np.abs(inverse / inverse[candidate] - 1) < SAME_SHARE
+        same &= (depths > 0) & (depths[candidate] > 0)
         weight = (weights * same).sum(0)
-        better = weight > best[1]
         mean = (weights * same * inverse).sum(0) / np.maximum(weight, 1e-9)
         sure = 1.0 - np.where(same, 1.0 - RISES * sures, 1.0).prod(0)
-        best = [
-            np.where(better, new, old)
-            for new, old in zip((same.sum(0), weight, mean, sure), best, strict=True)
-        ]
+        better, by_these = weight > best[1], (same.sum(0), weight, mean, sure)
+        best = [np.where(better, new, old) for new, old in zip(by_these, best, strict=True)]
     return best[0].astype(np.uint8), best[1], best[2], best[3]

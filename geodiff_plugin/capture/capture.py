@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -13,7 +13,6 @@ import torch
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin._threads import available_cores
-from geodiff_plugin.capture.neighbours import choose_neighbours
 from geodiff_plugin.capture.options import NEIGHBOURS
 from geodiff_plugin.formats.captures import CaptureFiles, CaptureFrame, read_capture
 from geodiff_plugin.formats.depth import read_depth_png
@@ -24,12 +23,18 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
-__all__ = ["Capture"]
-
 #: Points of a model that fewer images see, or that lie further off, are no known depths.
 FEWEST_VIEWS, MOST_ERROR_PX = 3, 1.5
 #: What 7-Scenes writes where depth is unknown.
 NO_DEPTH = 65535
+#: Angle of two rays that a match is worth most at, degrees, and how fast it is worth less below and above it.
+BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG = 6.0, 2.5, 10.0
+#: A point that a chosen neighbour sees already counts so much for the next one.
+SEEN_AGAIN = 0.5
+#: A neighbour must be worth this share of the best one.
+LEAST_SHARE = 0.15
+#: Shared points below which two frames are no neighbours.
+FEWEST_SHARED = 12
 
 
 class Capture:
@@ -38,10 +43,8 @@ class Capture:
     >>> capture = Capture.open("scan")
     >>> out = capture.depth(pipe, "frame_0010")
 
-    Attributes:
-        files: what was read.
-        names: of the frames, in order.
-        unit: ``"m"``, or ``None`` where no length is known.
+    ``files`` is what was read, ``names`` those of the frames in order, ``unit`` ``"m"``, or ``None`` where no
+    length is known.
     """
 
     def __init__(self, files: CaptureFiles) -> None:
@@ -99,17 +102,16 @@ class Capture:
         """
         if wanted is None:
             return list(self.names)
-        if ":" in wanted:
-            try:
-                numbers = [int(part) if part else None for part in wanted.split(":")]
-                first, last, step = (*numbers, None, None)[:3]
-            except ValueError:
-                bad_value("--frames", "NAME,NAME or FIRST:LAST:STEP with numbers from 0", repr(wanted))
-            chosen = self.names[first : None if last is None else last + 1 : step]
-            if not chosen:
-                bad_value("--frames", f"numbers from 0 to {len(self) - 1}", repr(wanted))
-            return chosen
-        return [self.frame(name.strip()).name for name in wanted.split(",") if name.strip()]
+        if ":" not in wanted:
+            return [self.frame(name.strip()).name for name in wanted.split(",") if name.strip()]
+        try:
+            first, last, step = (*(int(part) if part else None for part in wanted.split(":")), None)[:3]
+        except ValueError:
+            bad_value("--frames", "NAME,NAME or FIRST:LAST:STEP with numbers from 0", repr(wanted))
+        chosen = self.names[first : None if last is None else last + 1 : step]
+        if not chosen:
+            bad_value("--frames", f"numbers from 0 to {len(self) - 1}", repr(wanted))
+        return chosen
 
     @property
     def poses(self) -> np.ndarray | None:
@@ -118,11 +120,9 @@ class Capture:
         return None if any(E is None for E in Es) else np.stack([E for E in Es if E is not None])
 
     def solve(self, poses: str = "refined", *, threads: int | None = None) -> SolvedCapture:
-        """Poses of all frames (extra ``capture``); made once and kept.
+        """Poses of all frames (extra ``capture``), ``"refined"`` or ``"given"``; made once and kept.
 
-        Args:
-            poses: ``"refined"``, or ``"given"`` to keep the given ones.
-            threads: for features, matching and adjustment; all cores by default.
+        ``threads`` are for features, matching and adjustment; all cores by default.
 
         Raises:
             InputError: pycolmap is missing; frames without poses that cannot be connected.
@@ -146,11 +146,7 @@ class Capture:
         self._solved = solved
 
     def rescale(self, factor: float) -> None:
-        """Multiply all lengths, which then are metres.
-
-        Raises:
-            InputError: a factor that is not above 0.
-        """
+        """Multiply all lengths, which then are metres, by a factor above 0."""
         check_number(factor, "metres per unit", 1e-12, 1e12)
         frames = tuple(replace(f, E=None if f.E is None else _longer(f.E, factor)) for f in self.files.frames)
         model = self.files.points
@@ -163,11 +159,7 @@ class Capture:
             self._solved = replace(s, E=_longer(s.E, factor), E_given=given, points=s.points * factor)
 
     def image(self, name: str) -> np.ndarray:
-        """``(H, W, 3)`` float32 in [0, 1], upright, free of lens distortion.
-
-        Raises:
-            OSError, InputError: an image that cannot be read.
-        """
+        """``(H, W, 3)`` float32 in [0, 1], upright, free of lens distortion."""
         frame = self.frame(name)
         if frame.index is not None:
             if self._video is None:
@@ -183,12 +175,7 @@ class Capture:
             yield np.rint(grey * 255).astype(np.uint8)
 
     def neighbours(self, name: str, count: int = NEIGHBOURS) -> list[str]:
-        """Frames that are right views of a frame, the best first.
-
-        Args:
-            name: of the frame.
-            count: how many at most, >= 1.
-        """
+        """Frames that are right views of a frame, at most ``count``, the best first."""
         check_number(count, "neighbours", 1, 32, integer=True)
         solved, number = self.solve(), self._number[self.frame(name).name]
         return [self.names[i] for i in choose_neighbours(solved, number, count)]
@@ -196,12 +183,9 @@ class Capture:
     def guidance(
         self, name: str, neighbours: Sequence[str] | int = NEIGHBOURS, **knobs: Any
     ) -> GeometryGuidance:
-        """The guidance of a frame: its neighbours as right views, with the solved poses.
+        """The guidance of a frame: its neighbours, by name or how many, as right views with the solved poses.
 
-        Args:
-            name: of the frame.
-            neighbours: names, or how many are chosen.
-            **knobs: further arguments of ``GeometryGuidance``.
+        Further arguments are those of ``GeometryGuidance``.
 
         Raises:
             InputError: no frame that sees the same; a frame without pose.
@@ -211,15 +195,11 @@ class Capture:
         if not names:
             bad_value(f"frame {name}", "connected to others by shared points", "none shares any")
         i, rights = self._number[name], [self._number[other] for other in names]
-        views = [
-            (self.image(other), solved.K[j], solved.pose(i, j))
-            for other, j in zip(names, rights, strict=True)
-        ]
-        first = (None, solved.K[i], np.eye(4))
+        views: list[tuple[Any, ...]] = [(None, solved.K[i], np.eye(4))]
+        views += [(self.image(self.names[j]), solved.K[j], solved.pose(i, j)) for j in rights]
         settings = {"pose": "given"} if solved.status in ("solved", "estimated") else {}
-        return GeometryGuidance.from_views(
-            [first, *views], left_size=self.frame(name).size, unit=self.unit, **settings | knobs
-        )
+        size = self.frame(name).size
+        return GeometryGuidance.from_views(views, left_size=size, unit=self.unit, **settings | knobs)
 
     def known_depths(self, name: str, points: str) -> np.ndarray | None:
         """Known depths of a frame, as ``GeometryGuidance(points=...)`` takes them; ``None`` for none.
@@ -247,11 +227,7 @@ class Capture:
         return (model.xyz[rows] @ T[:3, :3].T + T[:3, 3]).astype(np.float32) if len(rows) else None
 
     def measured_depth(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """The depth map that the capture names for a frame: ``(h, w)`` metres, and where it is known.
-
-        Raises:
-            InputError: it names none.
-        """
+        """The depth map that the capture names for a frame: ``(h, w)`` metres, and where it is known."""
         frame = self.frame(name)
         if frame.depth is None:
             bad_value("points", "depth maps that the capture names", f"none for {name}")
@@ -292,3 +268,60 @@ def _longer(E: np.ndarray, factor: float) -> np.ndarray:
     E = E.copy()
     E[..., :3, 3] *= factor
     return E
+
+
+def choose_neighbours(
+    solved: SolvedCapture, frame: int, most: int, among: Collection[int] | None = None
+) -> list[int]:
+    """Numbers of at most ``most`` neighbours of a frame, the best first, ``among`` those given if any are.
+
+    Every shared point counts by the angle of its two rays, as in COLMAP's and MVSNet's view selection, and
+    less where earlier neighbours see it: so the neighbours together see all of the frame. Those nearest by
+    position where the frame shares no points.
+
+    Source: Yao et al. 2018 (MVSNet), S5.1: the piecewise Gaussian of the angle.
+    """
+    values = _values(solved, frame)
+    chosen: list[int] = []
+    first, left = 0.0, np.ones(values.shape[1])
+    out = (values > 0).sum(1) < FEWEST_SHARED
+    out |= [among is not None and i not in among for i in range(len(out))]
+    while len(chosen) < most:
+        gains = np.where(out, -1.0, values @ left)
+        best = int(np.argmax(gains))
+        if gains[best] <= LEAST_SHARE * first:
+            break
+        first = first or float(gains[best])
+        chosen.append(best)
+        out[best] = True
+        left = left * np.where(values[best] > 0, SEEN_AGAIN, 1.0)
+    return chosen if chosen or among is not None else _nearest(solved, frame, most)
+
+
+def _values(solved: SolvedCapture, frame: int) -> np.ndarray:
+    """``(N, P)`` worth of the frame's points to every other frame, 0 where it does not see them."""
+    own, values = solved.seen[frame].point, np.zeros((len(solved.E), len(solved.seen[frame].point)))
+    rays = solved.points[own] - solved.E[frame, :3, 3]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    for other, (E, seen) in enumerate(zip(solved.E, solved.seen, strict=True)):
+        if other == frame or not np.isfinite(E).all():
+            continue
+        back = solved.points[own] - E[:3, 3]
+        back /= np.linalg.norm(back, axis=1, keepdims=True)
+        angle = np.degrees(np.arccos(np.clip((rays * back).sum(1), -1, 1)))
+        width = np.where(angle < BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG)
+        worth = np.exp(-0.5 * ((angle - BEST_ANGLE_DEG) / width) ** 2)
+        values[other] = worth * np.isin(own, seen.point)
+    return values
+
+
+def _nearest(solved: SolvedCapture, frame: int, most: int) -> list[int]:
+    """Frames near a frame that look the same way, for one that shares no points."""
+    E = solved.E if solved.E_given is None else solved.E_given
+    if not np.isfinite(E[frame]).all():
+        return []
+    apart = np.linalg.norm(E[:, :3, 3] - E[frame, :3, 3], axis=1)
+    turned = np.degrees(np.arccos(np.clip(E[:, :3, 2] @ E[frame, :3, 2], -1, 1)))
+    fits = np.isfinite(apart) & (apart > 0) & (turned < 30)
+    order = [int(i) for i in np.argsort(np.abs(np.arange(len(E)) - frame)) if fits[i]]
+    return order[:most]

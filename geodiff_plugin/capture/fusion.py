@@ -15,8 +15,6 @@ from geodiff_plugin.formats.colmap import write_colmap
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.pose.capture import Observations
 
-__all__ = ["fuse", "normals_of", "write_colmap_maps", "write_mesh", "write_normal_ply"]
-
 #: Points closer than this share of the median depth are one; points of lower confidence are left out.
 CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
 #: Points of one frame at most; more would not show in a cloud of many frames.
@@ -52,14 +50,9 @@ def kept(frame: DepthFrame) -> np.ndarray:
 
 
 def fuse(frames: Sequence[DepthFrame], image: Callable[[str], np.ndarray]) -> tuple[Cloud, np.ndarray]:
-    """The cloud of all frames in the world's frame, one point a cell.
+    """The cloud of all agreed frames in the world's frame, one point a cell, and its ``(N, 3)`` normals.
 
-    Args:
-        frames: agreed.
-        image: a frame's name -> ``(H, W, 3)`` in [0, 1].
-
-    Returns:
-        The cloud, and ``(N, 3)`` normals.
+    ``image`` gives ``(H, W, 3)`` in [0, 1] by a frame's name.
     """
     cell = CELL_SHARE * float(np.median([np.median(frame.depth) for frame in frames]))
     every_point = np.zeros((0, 9))
@@ -95,32 +88,24 @@ def _thinned(rows: np.ndarray, cell: float) -> np.ndarray:
 
 def write_normal_ply(path: Path, cloud: Cloud, normals: np.ndarray, unit: str | None) -> None:
     """Write a cloud with normals as binary PLY."""
-    vertices = np.empty(len(cloud.points_m), VERTEX)
-    for names, values in (
-        (("x", "y", "z"), cloud.points_m),
-        (("nx", "ny", "nz"), normals),
-        (("red", "green", "blue"), cloud.colours),
-    ):
-        for column, name in enumerate(names):
-            vertices[name] = values[:, column]
+    vertices, columns = np.empty(len(cloud.points_m), VERTEX), (cloud.points_m, normals, cloud.colours)
+    for name, values in zip(VERTEX.names or (), np.concatenate(columns, axis=1).T, strict=True):
+        vertices[name] = values
     kinds = {"<f4": "float", "|u1": "uchar"}
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         f"comment world frame, {'metres' if unit else 'no unit'}",
+        f"element vertex {len(vertices)}",
+        *(f"property {kinds[VERTEX[name].str]} {name}" for name in VERTEX.names or ()),
+        "end_header\n",
     ]
-    lines += [f"element vertex {len(vertices)}"]
-    lines += [f"property {kinds[VERTEX[name].str]} {name}" for name in VERTEX.names or ()]
     with atomic_path(path) as temporary:
-        temporary.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + vertices.tobytes())
+        temporary.write_bytes("\n".join(lines).encode() + vertices.tobytes())
 
 
 def write_mesh(path: Path, frames: Sequence[DepthFrame], image: Callable[[str], np.ndarray]) -> None:
-    """Write a mesh of all frames by TSDF (extra ``mesh``).
-
-    Raises:
-        InputError: Open3D is not installed.
-    """
+    """Write a mesh of all frames by TSDF (extra ``mesh``); ``InputError`` where Open3D is not installed."""
     try:
         import open3d
     except ImportError:
@@ -150,14 +135,10 @@ def write_colmap_maps(
     points: np.ndarray,
     seen: Sequence[Observations],
 ) -> None:
-    """Write a dense workspace of COLMAP: images, sparse model, depth and normal maps.
+    """Write a dense workspace of COLMAP: images, sparse model, depth (where frames are kept) and normal maps.
 
-    Args:
-        folder: to appear.
-        frames: agreed; maps have depth only where frames are kept.
-        image: a frame's name -> ``(H, W, 3)`` in [0, 1].
-        points: ``(M, 3)`` of the poses' solve, the model's; by what frames share COLMAP chooses pairs.
-        seen: where each of the frames sees them.
+    ``points (M, 3)`` are those of the poses' solve, ``seen`` where each of the agreed frames sees them: by
+    what frames share COLMAP chooses pairs.
 
     Convention:
         ``colmap stereo_fusion --workspace_path FOLDER --input_type geometric --output_path fused.ply``

@@ -12,8 +12,6 @@ from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.options import CAMERAS, OUTPUT, SPACES, check_options, declare
 
-__all__ = ["NEIGHBOURS", "CaptureOptions"]
-
 #: Right views of a frame, at most.
 NEIGHBOURS = 5
 

@@ -1,4 +1,4 @@
-"""What a run leaves behind its frames: depth agreed between them, one cloud, a contact sheet, a video."""
+"""What a run leaves behind its frames: depth agreed between them, one cloud, a contact sheet."""
 
 from __future__ import annotations
 
@@ -11,21 +11,18 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin.capture.agreement import DepthFrame, agreed
-from geodiff_plugin.capture.capture import Capture
+from geodiff_plugin.capture.capture import Capture, choose_neighbours
 from geodiff_plugin.capture.fusion import fuse, write_colmap_maps, write_mesh, write_normal_ply
-from geodiff_plugin.capture.neighbours import choose_neighbours
 from geodiff_plugin.formats.clouds import write_glb
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
 from geodiff_plugin.formats.out import atomic_path
-from geodiff_plugin.plotting import depth_figure, depth_frames, grid, write_depth_video
-
-__all__ = ["ALONE", "write_agreement", "write_results"]
+from geodiff_plugin.plotting import depth_figure, depth_frames, grid
 
 #: Depth and confidence of a frame by its own run, which agreement starts from whenever it is made anew.
 ALONE = ("depth_alone", "confidence_alone")
 AGREED = ("depth", "confidence", "confirmed", "asked")
-#: Frames that a frame is checked against, frames on the contact sheet and in the video, points of the GLB.
-OTHERS, ON_SHEET, IN_VIDEO, GLB_POINTS = 6, 24, 200, 400_000
+#: Frames that a frame is checked against, frames on the contact sheet, points of the GLB.
+OTHERS, ON_SHEET, GLB_POINTS = 6, 24, 400_000
 
 
 class _Frames(Sequence[DepthFrame]):
@@ -48,16 +45,10 @@ class _Frames(Sequence[DepthFrame]):
 
 
 def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Check every frame against those that see the same, and write what they agree on into its folder.
+    """Check finished frames against those that see the same, and write what they agree on into their folders.
 
-    Args:
-        capture: with its poses.
-        out: of the run.
-        names: of the finished frames.
-
-    Returns:
-        By frame: how many others it was checked against, the share of its pixels that another frame sees and
-        confirms, and that another one sees and none confirms.
+    By frame: how many others it was checked against, the share of its pixels that another frame sees and
+    confirms, and that another one sees and none confirms.
     """
     solved, number = capture.solve(), {name: i for i, name in enumerate(capture.names)}
     there, shares = {number[name] for name in names}, {}
@@ -81,16 +72,9 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
 
 
 def write_results(capture: Capture, out: Path, names: Sequence[str], export: Sequence[str]) -> dict[str, Any]:
-    """Write ``cloud.ply``, ``cloud.glb``, ``sheet.jpg``, ``depth.webp``, and what ``export`` asks for.
+    """Write ``cloud.ply``, ``cloud.glb``, ``sheet.jpg`` and what ``export`` asks for.
 
-    Args:
-        capture: with its poses.
-        out: of the run, where ``write_agreement`` has been.
-        names: of the finished frames.
-        export: ``"colmap"`` (a dense workspace), ``"mesh"`` (TSDF, extra ``mesh``).
-
-    Returns:
-        Counts for the report.
+    Frames are finished, and ``write_agreement`` has been there. Returns counts for the report.
     """
     frames = _Frames(capture, out, names, AGREED)
     cloud, normals = fuse(frames, capture.image)
@@ -104,37 +88,18 @@ def write_results(capture: Capture, out: Path, names: Sequence[str], export: Seq
         seen = [solved.seen[capture.names.index(name)] for name in names]
         write_colmap_maps(out / "colmap", frames, capture.image, solved.points, seen)
     _sheet(capture, out, names)
-    _video(capture, out, names)
     return {"cloud_points": len(cloud.points_m)}
 
 
-def _some(capture: Capture, out: Path, names: Sequence[str], most: int) -> tuple[list[str], list[np.ndarray]]:
-    """Names of evenly chosen frames, and their depth."""
-    chosen = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, most).astype(int))]
-    return chosen, [np.load(out / name / "depth.npy") for name in chosen]
-
-
-def _picture(capture: Capture, name: str) -> Image.Image:
-    return Image.fromarray(np.rint(capture.image(name) * 255).astype(np.uint8))
-
-
 def _sheet(capture: Capture, out: Path, names: Sequence[str]) -> None:
-    shown, depths = _some(capture, out, names, ON_SHEET)
-    alike, unit = len({depth.shape for depth in depths}) == 1, capture.unit
+    """A picture of evenly chosen frames and their depth, in the colours of one range where they are alike."""
+    shown = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, ON_SHEET).astype(int))]
+    depths, unit = [np.load(out / name / "depth.npy") for name in shown], capture.unit
+    alike = len({depth.shape for depth in depths}) == 1
     figures = depth_frames(depths, unit=unit) if alike else (depth_figure(d, unit=unit) for d in depths)
-    cells = [
-        cell
-        for name, figure in zip(shown, figures, strict=True)
-        for cell in (_picture(capture, name), figure)
-    ]
+    cells: list[Image.Image] = []
+    for name, figure in zip(shown, figures, strict=True):
+        cells += [Image.fromarray(np.rint(capture.image(name) * 255).astype(np.uint8)), figure]
     titles = [title for name in shown for title in (name, "depth")]
     with atomic_path(out / "sheet.jpg") as temporary:
         grid(cells, titles, columns=min(4, len(cells)), cell_width=360).save(temporary, quality=88)
-
-
-def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
-    shown, depths = _some(capture, out, names, IN_VIDEO)
-    if len(shown) < 3 or len({depth.shape for depth in depths}) > 1:
-        return
-    pictures = depth_frames(depths, (_picture(capture, name) for name in shown), unit=capture.unit)
-    write_depth_video(out / "depth.webp", pictures, 5.0)

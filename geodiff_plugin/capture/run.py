@@ -8,8 +8,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +22,15 @@ from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.capture.results import ALONE, write_agreement, write_results
-from geodiff_plugin.capture.store import load_solved, save_solved
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import read_matrix
-from geodiff_plugin.formats.out import OutFolder, atomic_path
+from geodiff_plugin.formats.out import OutFolder, atomic_path, write_text
+from geodiff_plugin.pose.capture import Observations, SolvedCapture
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, this_process
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import MetricDepthOutput
-
-__all__ = ["Writer", "open_capture", "run_capture", "run_frames", "solved_poses"]
 
 #: Writes the files of one frame: folder, output, image ``(H, W, 3)`` -> counts for the report.
 Writer = Callable[[Path, MetricDepthOutput, np.ndarray], dict[str, Any]]
@@ -45,8 +42,6 @@ OF_SCALE = ("metres_per_unit", "known_length", "distance")
 OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "prior_map", "space", "steps", "seed")
 #: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
 PROCESS_BYTES = 1.5e9
-#: Captures with more frames are told how long they will take: seconds of a core and bytes a frame.
-MANY, POSE_S, DEPTH_S, POSE_BYTES = 300, 1.0, 12.0, 4e5
 #: Depth maps of other models, in the order in which they are looked for.
 MAPS = (".npy", ".npz", ".pfm", ".png")
 
@@ -75,6 +70,34 @@ def solved_poses(capture: Capture, options: CaptureOptions) -> None:
     factor = _factor(capture, options, key)
     if factor is not None:
         capture.rescale(factor)
+
+
+def save_solved(path: Path, solved: SolvedCapture, key: str) -> None:
+    """Write everything as ``.npz``, under the key of the frames and settings that it is of."""
+    arrays = {f.name: getattr(solved, f.name) for f in fields(solved) if f.name not in ("seen", "notes")}
+    arrays["E_given"] = np.zeros(0) if solved.E_given is None else solved.E_given
+    arrays["px"] = np.concatenate([seen.px for seen in solved.seen])
+    arrays["point"] = np.concatenate([seen.point for seen in solved.seen])
+    arrays["counts"] = np.array([len(seen.point) for seen in solved.seen])
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, key=np.array(key), notes=np.array(solved.notes, np.str_), **arrays)
+
+
+def load_solved(path: Path, key: str) -> SolvedCapture | None:
+    """What ``save_solved`` wrote; ``None`` where there is none of that key."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        if str(arrays.pop("key")) != key:
+            return None
+        cuts = np.cumsum(arrays.pop("counts"))[:-1]
+        px, point = np.split(arrays.pop("px"), cuts), np.split(arrays.pop("point"), cuts)
+        values: dict[str, Any] = {n: a.item() if a.ndim == 0 else a for n, a in arrays.items()}
+        values["E_given"] = values["E_given"] if values["E_given"].size else None
+        values["notes"] = tuple(str(note) for note in values["notes"])
+        return SolvedCapture(seen=tuple(map(Observations, px, point)), **values)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _numbers(words: Sequence[str], option: str, typed: str) -> list[float]:
@@ -132,18 +155,16 @@ def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None
     rays = np.linalg.solve(capture.solve().K[capture.names.index(name)], np.c_[ends, np.ones(2)].T).T
     points = rays * depth[tuple(np.rint(ends).astype(int).T[::-1])][:, None]
     factor = metres / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
-    _write_json(path, {"metres_per_unit": factor, "of": asked})
+    write_text(path, json.dumps({"metres_per_unit": factor, "of": asked}) + "\n")
     return factor
 
 
 def _pipe(options: CaptureOptions) -> Any:
+    prior = "map" if options.prior_map is not None else options.prior
     with no_bars():
-        prior = "map" if options.prior_map is not None else options.prior
-        pipe = enable_geometry_guidance(
-            load_prior(prior, space=options.space).to(pick_device(options.device))
-        )
+        pipe = load_prior(prior, space=options.space).to(pick_device(options.device))
     pipe.set_progress_bar_config(disable=True)
-    return pipe
+    return enable_geometry_guidance(pipe)
 
 
 def _depth(
@@ -182,7 +203,7 @@ class _Work:
             for file, values in zip(ALONE, (depth, confidence), strict=True):
                 np.save(folder / f"{file}.npy", values.astype(np.float32))
             report["seconds"] = round(time.perf_counter() - started, 2)
-            _write_json(folder / REPORT, report)
+            write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
 
         with OutFolder(self.options.out / name, overwrite=True) as out:
             out.write(fill)
@@ -213,29 +234,19 @@ def _rounded(value: float) -> float | None:
     return round(value, 4) if math.isfinite(value) else None
 
 
-def _write_json(path: Path, data: Any) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-
-
 def run_frames(
     capture: Capture, options: CaptureOptions, names: Sequence[str], write: Writer
 ) -> list[dict[str, Any]]:
     """Depth of every chosen frame that is not done yet, by one process a core.
 
-    Args:
-        capture: with its poses solved and saved by ``solved_poses``.
-        options: of the run.
-        names: of the frames.
-        write: writes the files of a frame; a function of a module, as other processes import it.
-
-    Returns:
-        The reports in the order of the names; ``{"key", "status": "broken", "error"}`` of one that failed.
+    ``capture`` has its poses solved and saved by ``solved_poses``; ``write`` is a function of a module, as
+    other processes import it. Returns the reports in the order of the names; ``{"key", "status": "broken",
+    "error"}`` of a frame that failed.
 
     Raises:
         InputError: every frame failed for one reason.
     """
-    journal, items = _job(capture, options, names)
+    journal, items = Journal(options.out / JOURNAL), _items(capture, options, names)
     if options.overwrite:
         for item in items:
             journal.forget(item)
@@ -253,7 +264,7 @@ def run_frames(
         helper.start()
     threads = torch.get_num_threads()
     try:
-        return _work(capture, options, write, journal, items)
+        return _work(capture, options, write, items)
     finally:
         torch.set_num_threads(threads)
         for helper in helpers:
@@ -261,29 +272,29 @@ def run_frames(
             helper.join()
 
 
-def _job(capture: Capture, options: CaptureOptions, names: Sequence[str]) -> tuple[Journal, list[Item]]:
+def _items(capture: Capture, options: CaptureOptions, names: Sequence[str]) -> list[Item]:
     key = options.key(capture.names, *OF_POSES, *OF_FRAME)
-    return Journal(options.out / JOURNAL), [Item(name, inputs=key) for name in names]
+    return [Item(name, inputs=key) for name in names]
 
 
 def _work(
-    capture: Capture, options: CaptureOptions, write: Writer, journal: Journal, items: list[Item]
+    capture: Capture, options: CaptureOptions, write: Writer, items: list[Item]
 ) -> list[dict[str, Any]]:
     """This process's part of the frames."""
+
+    def whole(item: Item, record: dict[str, Any]) -> bool:
+        return all((options.out / item.key / f"{file}.npy").is_file() for file in ALONE)
+
     torch.set_num_threads(1 if (options.processes or 1) > 1 else max(1, available_cores()))
     runner = Runner(
         items,
-        journal,
+        Journal(options.out / JOURNAL),
         noun="frame",
         survives=(InputError, OSError, ValueError, RuntimeError),
         progress=not options.quiet,
-        whole=partial(_whole, options.out),
+        whole=whole,
     )
     return runner.run(_Work(capture, options, write))
-
-
-def _whole(out: Path, item: Item, record: dict[str, Any]) -> bool:
-    return all((out / item.key / f"{file}.npy").is_file() for file in ALONE)
 
 
 def _help(options: CaptureOptions, names: Sequence[str], write: Writer, index: int, count: int) -> None:
@@ -292,7 +303,7 @@ def _help(options: CaptureOptions, names: Sequence[str], write: Writer, index: i
     options = replace(options, overwrite=False, quiet=True)
     capture = open_capture(options)
     solved_poses(capture, options)
-    _work(capture, options, write, *_job(capture, options, names))
+    _work(capture, options, write, _items(capture, options, names))
 
 
 def _memory_processes() -> int:
@@ -305,15 +316,9 @@ def _memory_processes() -> int:
 
 
 def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], None]) -> dict[str, Any]:
-    """Everything of ``geodiff capture``: poses, frames, report.
+    """Everything of ``geodiff capture``: poses, frames, and the report, as in ``capture.json``.
 
-    Args:
-        options: as typed.
-        write: writes the files of a frame; a function of a module.
-        say: tells the user a sentence.
-
-    Returns:
-        The report, as in ``capture.json``.
+    ``write``, a function of a module, writes the files of a frame; ``say`` tells the user a sentence.
 
     Raises:
         OSError, InputError: bad input, before any depth is computed where it can be seen that early.
@@ -323,14 +328,13 @@ def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], Non
     names = capture.choose(options.frames)
     for note in capture.files.notes:
         say(note)
-    if len(capture) > MANY and not options.quiet:
-        say(_forecast(capture, len(names)))
     options.out.mkdir(parents=True, exist_ok=True)
     solved_poses(capture, options)
     seconds = {"poses": round(time.perf_counter() - started, 1)}
+    solved = capture.solve()
     if not options.quiet:
-        say(pose_line(capture))
-    for note in capture.solve().notes:
+        say(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
+    for note in solved.notes:
         say(f"warning: {note}")
     frames = run_frames(capture, options, names, write)
     seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
@@ -343,45 +347,17 @@ def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], Non
         "path": str(options.path),
         "kind": capture.files.kind,
         "unit": capture.unit,
-        "poses": pose_report(capture),
+        "poses": _pose_report(capture),
         "seconds": seconds,
         "files": files,
         "agreement": agreement,
         "frames": frames,
     }
-    _write_json(options.out / "capture.json", report)
+    write_text(options.out / "capture.json", json.dumps(report, indent=2) + "\n")
     return report
 
 
-def _forecast(capture: Capture, chosen: int) -> str:
-    """How long a large capture will take, before it begins."""
-    width, height = capture.files.frames[0].size
-    of_size = max(1.0, width * height / 3e5) ** 0.5
-    hours = (len(capture) * POSE_S + chosen * DEPTH_S * of_size) / available_cores() / 3600
-    return (
-        f"{len(capture)} frames, depth of {chosen}: about {hours:.1f} h on {available_cores()} cores with "
-        f"the bundled prior, {len(capture) * POSE_BYTES / 1e9:.1f} GB for features. --frames FIRST:LAST:STEP "
-        "chooses fewer."
-    )
-
-
-def pose_line(capture: Capture) -> str:
-    """One line on what the solve did."""
-    solved, unit = capture.solve(), capture.unit or "units"
-    if solved.status in ("given", "kept"):
-        return f"poses as given: matches {solved.residual_px_given:.2f} px off their epipolar lines"
-    if solved.status == "estimated":
-        count = int(solved.connected.sum())
-        return f"poses estimated: {count} of {len(capture)} frames, {solved.residual_px:.2f} px"
-    moved, turned = map(np.median, solved.moved())
-    return (
-        f"poses solved: residual {solved.residual_px_given:.2f} -> {solved.residual_px:.2f} px, cameras "
-        f"moved {moved:.3f} {unit} and turned {turned:.1f} degrees in the median, scale known to "
-        f"{100 * solved.scale_spread:.0f} %"
-    )
-
-
-def pose_report(capture: Capture) -> dict[str, Any]:
+def _pose_report(capture: Capture) -> dict[str, Any]:
     """What the solve did, for ``capture.json``."""
     solved = capture.solve()
     numbers = {
@@ -391,11 +367,11 @@ def pose_report(capture: Capture) -> dict[str, Any]:
         "scale_by_depth": solved.scale_depth,
         "scale_spread": solved.scale_spread,
     }
+    rounded = {name: _rounded(value) for name, value in numbers.items()}
     each = zip(capture.names, solved.connected, *solved.moved(), strict=True)
     frames = {
         name: {"connected": bool(c), "moved": round(float(m), 5), "turned_deg": round(float(t), 3)}
         for name, c, m, t in each
         if math.isfinite(m)
     }
-    shown = {name: _rounded(value) for name, value in numbers.items()}
-    return {"status": solved.status, **shown, "notes": list(solved.notes), "frames": frames}
+    return {"status": solved.status, **rounded, "notes": list(solved.notes), "frames": frames}
