@@ -5,11 +5,13 @@ Torch and diffusers are imported inside the commands, so that ``--help`` and ``-
 
 from __future__ import annotations
 
+import importlib
 import io
 import os
 import sys
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,11 +22,13 @@ from geodiff_plugin.cli.commands import Command, new_group
 from geodiff_plugin.cli.options import DepthOptions, start_pair
 from geodiff_plugin.cli.terminal import StopWatch
 from geodiff_plugin.formats.out import free_folder
-from geodiff_plugin.options import OUTPUT, check_options, declare, help_of
+from geodiff_plugin.options import OUTPUT, SPACES, declare, help_of
+
+_out = partial(declare, panel=OUTPUT)
 
 
-def prepare_torch(quiet: bool) -> None:
-    """What is to be settled before torch is imported, and said while that takes its seconds.
+def _imported(where: str, quiet: bool = False) -> Callable[..., None]:
+    """A function of a module of ``cli``, after what is to be settled before torch is imported.
 
     OpenMP's threads spin while they wait, which on a busy machine takes the core from the thread that they
     wait for; asleep they cost one call in ten on an idle machine and save half of it on a busy one.
@@ -33,6 +37,14 @@ def prepare_torch(quiet: bool) -> None:
     if not quiet and "torch" not in sys.modules and sys.stderr.isatty():
         sys.stderr.write("loading torch and diffusers ...\r")
         sys.stderr.flush()
+    module, _, name = where.rpartition(".")
+    function: Callable[..., None] = getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
+    return function
+
+
+def _later(where: str) -> Callable[[Any], None]:
+    """Calls a function, which is imported then, with the values of the options by their names."""
+    return lambda options: _imported(where)(**vars(options))
 
 
 def _with_folder(options: DepthOptions, default: str) -> DepthOptions:
@@ -47,86 +59,49 @@ def _depth(options: DepthOptions) -> None:
     from geodiff_plugin.formats.bags import is_bag
 
     if is_bag(options.left):
-        prepare_torch(options.quiet)
-        from geodiff_plugin.cli.bag import run_bag
-
-        run_bag(options)
+        _imported("cli.many.run_bag", options.quiet)(options)
         return
     names = ("topic_left", "topic_right")
     options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
     if is_many(options.left):
         options = replace(options, out=options.out or Path("geodiff-out"))
         refs = start_many(options)
-        prepare_torch(options.quiet)
-        from geodiff_plugin.cli.many import run_many
-
-        run_many(options, refs)
+        _imported("cli.many.run_many", options.quiet)(options, refs)
         return
     options, watch = _with_folder(options, "geodiff-out"), StopWatch()
     with start_pair(options) as folder:
         with watch.stage("start"):
-            prepare_torch(options.quiet)
-            from geodiff_plugin.cli.depth import run_depth
-
-        run_depth(options, folder, watch)
-
-
-def _capture(options: CaptureOptions) -> None:
-    prepare_torch(options.quiet)
-    from geodiff_plugin.cli.capture import run_and_report
-
-    run_and_report(options)
+            run = _imported("cli.depth.run_depth", options.quiet)
+        run(options, folder, watch)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Demo:
-    out: Path | None = declare(
-        None, "Folder; geodiff-demo, or -2 and so on where that is taken.", "--out", "-o", panel=OUTPUT
-    )
-    overwrite: bool = declare(False, "Write into a folder that holds files.", panel=OUTPUT)
-    quiet: bool = declare(False, "No progress bar.", "--quiet", "-q", panel=OUTPUT)
+    out: Path | None = _out(None, "Folder; geodiff-demo, or -2 and so on where that is taken.", "--out", "-o")
+    overwrite: bool = _out(False, "Write into a folder that holds files.")
+    quiet: bool = _out(False, "No progress bar.", "--quiet", "-q")
 
     def run(self) -> None:
         pair = Path(__file__).resolve().parents[1] / "bundled" / "pair"
-        files: dict[str, Any] = {
-            "left": pair / "left.png",
-            "right": pair / "right.png",
-            "calib": (pair / "calib.txt",),
-        }
-        options = _with_folder(DepthOptions(**files, device="cpu", **vars(self)), "geodiff-demo")
+        views: dict[str, Path] = {"left": pair / "left.png", "right": pair / "right.png"}
+        options = DepthOptions(**views, calib=(pair / "calib.txt",), device="cpu", **vars(self))
+        options = _with_folder(options, "geodiff-demo")
         with start_pair(options) as folder:
-            prepare_torch(options.quiet)
-            from geodiff_plugin.cli.demo import run_demo
-
-            run_demo(options, folder)
+            _imported("cli.demo.run_demo", options.quiet)(options, folder)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Info:
     prior: str | None = declare(None, "Describe this prior as well.")
-    space: str | None = declare(None, "Space in which its map is affine, if its folder does not say.")
+    space: str | None = declare(
+        None, "Space in which its map is affine, if its folder does not say.", choices=SPACES
+    )
     knobs: bool = declare(False, "List the knobs of the guidance instead: default, range, what each does.")
-
-    def run(self) -> None:
-        if self.knobs:
-            from geodiff_plugin.config import knob_lines
-
-            typer.echo("\n".join(knob_lines()))
-            return
-        from geodiff_plugin.cli.info import run_info
-
-        run_info(self.prior, self.space)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Bench:
     device: str = declare("auto", help_of("device"))
-
-    def run(self) -> None:
-        prepare_torch(True)
-        from geodiff_plugin.cli.bench import run_bench
-
-        run_bench(self.device)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,31 +109,19 @@ class _Video:
     frames: tuple[Path, ...] = declare(
         MISSING, "Folders of geodiff depth, or .npy maps, in order.", "", metavar="FRAME..."
     )
-    out: Path = declare(
-        Path("depth.webp"), "The video: .mp4 (OpenCV), .webp or .gif.", "--out", "-o", panel=OUTPUT
-    )
+    out: Path = _out(Path("depth.webp"), "The video: .mp4 (OpenCV), .webp or .gif.", "--out", "-o")
     fps: float = declare(10.0, "Frames a second.")
     near: float | None = declare(None, "Depth of the last colour, metres.")
     far: float | None = declare(None, "Depth of the first colour, metres.")
     photographs: bool = declare(False, "Show the left images beside the depth.")
 
-    def run(self) -> None:
-        from geodiff_plugin.cli.video import run_video
-
-        run_video(**vars(self))
-
 
 @dataclass(frozen=True, kw_only=True)
 class _Submit:
     results: tuple[Path, ...] = declare(MISSING, "Folders of geodiff depth.", "", metavar="RESULT...")
-    to: str = declare(MISSING, "The benchmark: middlebury or eth3d.")
-    out: Path = declare(MISSING, "Folder for its files.", "--out", "-o", panel=OUTPUT)
+    to: str = declare(MISSING, "The benchmark: middlebury or eth3d.", choices=("middlebury", "eth3d"))
+    out: Path = _out(MISSING, "Folder for its files.", "--out", "-o")
     method: str = declare("GeoDiff", "Name of the method in Middlebury's files.")
-
-    def run(self) -> None:
-        from geodiff_plugin.cli.submit import run_submit
-
-        run_submit(self.results, self.to, self.out, self.method)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,11 +133,8 @@ class _Page:
     browser: bool = declare(False, "Open the page in a browser.")
 
     def run(self) -> None:
-        check_options(self)
-        prepare_torch(False)
-        from geodiff_plugin.app.launch import run_app
-
-        run_app(self.prior or ("bundled",), self.device, self.host, self.port, self.browser)
+        run = _imported("app.launch.run_app")
+        run(self.prior or ("bundled",), self.device, self.host, self.port, self.browser)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,12 +149,13 @@ class _Convert:
     part: str | None = declare(
         None, "What is not in SRC (docs/reference/priors.md): a file, a folder or a hub id.", "--with"
     )
-    space: str | None = declare(None, "marigold-v2: space of its map, if CHECKPOINT's folder does not say.")
+    space: str | None = declare(
+        None, "marigold-v2: space of its map, if CHECKPOINT's folder does not say.", choices=SPACES
+    )
 
-    def run(self) -> None:
-        from geodiff_plugin.cli.convert import run_convert
 
-        run_convert(self.paths, self.part, self.space)
+def _capture(options: CaptureOptions) -> None:
+    _imported("cli.capture.run_and_report", options.quiet)(options)
 
 
 def _eval(_: None) -> typer.Typer:
@@ -215,18 +176,26 @@ COMMANDS: dict[str, tuple[type | None, Callable[[Any], Any], str]] = {
         _Demo.run,
         "Run on a rendered pair of the package's own, and print how good it is.",
     ),
-    "info": (_Info, _Info.run, "Print versions, devices, priors and what is cached."),
-    "bench": (_Bench, _Bench.run, "What guidance costs in seconds and memory, and a command's seconds."),
-    "video": (_Video, _Video.run, "Join the depth maps of a sequence into a video, in one range of colours."),
+    "info": (_Info, _later("cli.info.run_info"), "Print versions, devices, priors and what is cached."),
+    "bench": (
+        _Bench,
+        _later("cli.bench.run_bench"),
+        "What guidance costs in seconds and memory, and a command's seconds.",
+    ),
+    "video": (
+        _Video,
+        _later("cli.results.run_video"),
+        "Join the depth maps of a sequence into a video, in one range of colours.",
+    ),
     "submit": (
         _Submit,
-        _Submit.run,
+        _later("cli.results.run_submit"),
         "Write disparities and times as Middlebury and ETH3D take them.",
     ),
     "app": (_Page, _Page.run, "Serve a web page: drop two photographs, and measure (needs the extra app)."),
     "convert": (
         _Convert,
-        _Convert.run,
+        _later("cli.convert.run_convert"),
         "Convert pickled or split weights to a folder for --prior.",
     ),
     "eval": (None, _eval, "Measure this package and its peers on data sets in their official layouts."),
@@ -257,11 +226,7 @@ def _root(
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command line and leave by ``SystemExit``.
-
-    Args:
-        argv: arguments without the program's name; ``None`` for those of the process.
-    """
+    """Run the command line on ``argv``, by default that of the process, and leave by ``SystemExit``."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a name that the terminal's encoding lacks is no error
             stream.reconfigure(errors="backslashreplace")

@@ -7,9 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
 from multiprocessing import get_context
 from typing import Any
 
@@ -27,50 +25,19 @@ from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 VARIANTS = {"plain": None, "guided, denoised gradient": "denoised", "guided, full gradient": "full"}
 
 
-@dataclass(frozen=True)
-class Workload:
-    """What is measured; it travels to another process.
+def measure(gradient: str | None, device_name: str, repeats: int = 2, **knobs: Any) -> tuple[float, int]:
+    """Seconds of one call of the bundled prior on the demo pair, and the most bytes that it took.
 
-    Attributes:
-        title: heading of the table.
-        load: function of a module, from a device to a pipeline.
-        knobs: of the guidance.
-        options: of the call.
-        repeats: calls after the first one, of which the fastest tells the seconds; 0: the first one does.
+    Plain and guided calls run the same number of steps. The first call of a process tells its memory, since
+    what is freed later stays with the allocator; the fastest of ``repeats`` more, if any, tells the seconds.
     """
-
-    title: str
-    load: Callable[[torch.device], Any]
-    knobs: dict[str, Any] = field(default_factory=dict)
-    options: dict[str, Any] = field(default_factory=dict)
-    repeats: int = 2
-
-
-def _load_bundled(device: torch.device) -> Any:
-    return load_prior("bundled", device=device)
-
-
-BUNDLED = Workload("bundled prior, default guidance", _load_bundled)
-
-
-def measure(gradient: str | None, workload: Workload, device_name: str) -> tuple[float, int]:
-    """Seconds of one call on the demo pair, and the most bytes that it took; in a process of its own.
-
-    The first call of a process tells its memory, since what is freed later stays with the allocator.
-
-    Args:
-        gradient: of the guidance; ``None`` for the plain pipeline.
-        workload: prior and settings; plain and guided calls run the same number of steps.
-        device_name: torch device.
-    """
-    device = torch.device(device_name)
-    pair = read_demo_pair()
-    pipe = workload.load(device)
+    device, pair = torch.device(device_name), read_demo_pair()
+    pipe = load_prior("bundled", device=device)
     pipe.set_progress_bar_config(disable=True)
     enable_geometry_guidance(pipe)
     cameras = (pair.rig.K_left, pair.rig.K_right), pair.rig.E
-    guidance = GeometryGuidance(pair.right, *cameras, gradient=gradient or "denoised", **workload.knobs)
-    options = workload.options | {"num_inference_steps": guidance.denoising_steps(None, 1)}
+    guidance = GeometryGuidance(pair.right, *cameras, gradient=gradient or "denoised", **knobs)
+    options: dict[str, Any] = {"num_inference_steps": guidance.denoising_steps(None, 1)}
     if gradient is not None:
         options["guidance"] = guidance
 
@@ -79,7 +46,7 @@ def measure(gradient: str | None, workload: Workload, device_name: str) -> tuple
 
     with PeakMemory(device) as memory:
         first = timed(call, device)
-    return min([timed(call, device) for _ in range(workload.repeats)], default=first), memory.peak_bytes
+    return min([timed(call, device) for _ in range(repeats)], default=first), memory.peak_bytes
 
 
 def command_seconds(device_name: str) -> dict[str, float]:
@@ -98,29 +65,19 @@ def command_seconds(device_name: str) -> dict[str, float]:
     return stages | {"python": whole - sum(stages.values())}
 
 
-def run_bench(device_name: str, workload: Workload = BUNDLED) -> None:
-    """Print the table.
-
-    Args:
-        device_name: as ``--device``.
-        workload: what is measured.
-
-    Raises:
-        ValueError: no such device.
-    """
-    device, console = pick_device(device_name), new_console()
-    where = f"{device}, {torch.get_num_threads()} threads, torch {torch.__version__}"
-    console.print(f"{workload.title}; {where}; demo pair")
+def run_bench(device: str) -> None:
+    """Print the table; every row is measured in a process of its own."""
+    place, console, plain = pick_device(device), new_console(), None
+    where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
+    console.print(f"bundled prior, default guidance; {where}; demo pair")
     table = new_table(("", "seconds", "peak MB", "time x", "memory x"))
-    plain = None
     with Live(table, console=console):
         for name, gradient in VARIANTS.items():
             with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
-                cost = fresh_process.submit(measure, gradient, workload, str(device)).result()
+                cost = fresh_process.submit(measure, gradient, str(place)).result()
             plain = plain or cost
-            ratios = cost[0] / plain[0], cost[1] / max(plain[1], 1)
-            numbers = (f"{ratio:.2f}" for ratio in ratios)
-            table.add_row(name, f"{cost[0]:.2f}", f"{cost[1] / 1e6:.0f}", *numbers)
-    stages = command_seconds(device_name)
+            ratios = (f"{cost[0] / plain[0]:.2f}", f"{cost[1] / max(plain[1], 1):.2f}")
+            table.add_row(name, f"{cost[0]:.2f}", f"{cost[1] / 1e6:.0f}", *ratios)
+    stages = command_seconds(device)
     told = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
     console.print(f"geodiff depth on the demo pair: {sum(stages.values()):.1f} s ({told})")

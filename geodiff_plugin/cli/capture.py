@@ -10,19 +10,12 @@ from typing import Any
 from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.capture.run import run_capture
 from geodiff_plugin.cli.exports import write_maps
-from geodiff_plugin.cli.terminal import collected_warnings, say
+from geodiff_plugin.cli.terminal import Warner, collected_warnings, say
 
 
 def run_and_report(options: CaptureOptions) -> None:
     """Depth of every frame, the answer on stdout, and exit code 1 where a frame failed."""
-    told: set[str] = set()
-
-    def tell(sentence: str) -> None:
-        if sentence not in told:
-            told.add(sentence)
-            say(f"warning: {sentence}")
-
-    with collected_warnings(tell):
+    with collected_warnings(Warner()):
         report = run_capture(options, write_maps, say)
     print(json.dumps(report, indent=2) if options.json else _summary(report, options.out))
     if any("error" in frame for frame in report["frames"]):
@@ -30,10 +23,9 @@ def run_and_report(options: CaptureOptions) -> None:
 
 
 def _summary(report: dict[str, Any], out: Path) -> str:
-    done = [frame for frame in report["frames"] if "error" not in frame]
-    unit = "m" if report["unit"] else "units of the poses"
-    line = f"{len(done)} of {len(report['frames'])} frames"
-    if done:
-        depths = sorted(frame["depth"]["median"] for frame in done)
+    depths = sorted(frame["depth"]["median"] for frame in report["frames"] if "error" not in frame)
+    line = f"{len(depths)} of {len(report['frames'])} frames"
+    if depths:
+        unit = "m" if report["unit"] else "units of the poses"
         line += f", median depth {depths[len(depths) // 2]:.2f} {unit}"
     return f"{line} -> {out}/"

@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, say
-from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, flag_of
+from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, check_options, flag_of
 
 APPEARANCE: dict[str, Any] = {
     "add_completion": False,
@@ -70,15 +70,14 @@ def new_group(help_text: str, commands: Mapping[str, Command], outermost: bool =
 def _built(name: str, command: Command) -> Any:
     if command.options is None:
         return typer.main.get_command(command.run(None))
-    kinds = get_type_hints(command.options)
-    panels = [CAMERAS, RUN, OUTPUT]
-    known = [field for field in dataclasses.fields(command.options) if field.metadata]
+    options, kinds, panels = command.options, get_type_hints(command.options), [CAMERAS, RUN, OUTPUT]
+    known = [field for field in dataclasses.fields(options) if field.metadata]
     known.sort(key=lambda f: (flag_of(f)[0] == "-", panels.index(f.metadata["panel"])))
 
     def call(**typed: Any) -> None:
-        values = {f.name: _value(f, typed[f.name], kinds[f.name]) for f in known}
-        assert command.options is not None
-        command.run(command.options(**values))
+        made = options(**{f.name: _value(f, typed[f.name], kinds[f.name]) for f in known})
+        check_options(made)
+        command.run(made)
 
     vars(call)["__signature__"] = Signature([_parameter(field, kinds[field.name]) for field in known])
     single = typer.Typer(**APPEARANCE)
@@ -88,33 +87,26 @@ def _built(name: str, command: Command) -> Any:
 
 def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
     """An option or argument of typer for a field of a dataclass of options."""
-    rules = field.metadata
-    default: Any = field.default
-    flags = rules["flags"] or (flag_of(field),)
-    if get_origin(kind) is tuple:
-        if rules["split"]:
-            kind, default = str | None, ",".join(map(str, default)) or None
-        elif default is dataclasses.MISSING:
-            kind = list[get_args(kind)[0]]  # type: ignore[misc]
-        else:
-            kind, default = list[get_args(kind)[0]] | None, list(default) or None  # type: ignore[misc]
+    rules, default, required = field.metadata, field.default, field.default is dataclasses.MISSING
+    if rules["split"]:
+        kind, default = str | None, ",".join(map(str, field.default)) or None
+    elif get_origin(kind) is tuple:
+        kind = list[get_args(kind)[0]]  # type: ignore[misc]
+        kind, default = (kind, default) if required else (kind | None, list(field.default) or None)
+    flags, about = rules["flags"] or (flag_of(field),), {"metavar": rules["metavar"], "help": rules["help"]}
     if flags == ("",):
-        typed: Any = typer.Argument(metavar=rules["metavar"], help=rules["help"])
+        typed: Any = typer.Argument(**about)
     else:
-        typed = typer.Option(
-            *flags, metavar=rules["metavar"], help=rules["help"], rich_help_panel=rules["panel"] or None
-        )
-    default = Parameter.empty if default is dataclasses.MISSING else default
+        typed = typer.Option(*flags, **about, rich_help_panel=rules["panel"] or None)
+    default = Parameter.empty if required else default
     return Parameter(field.name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind, typed], default=default)
 
 
 def _value(field: dataclasses.Field[Any], value: Any, kind: Any) -> Any:
     """What was typed, as the field has it."""
-    if get_origin(kind) is not tuple:
-        return value
     if field.metadata["split"]:
         parts = [part.strip() for part in (value or "").split(",") if part.strip()]
         if get_args(kind)[0] is int and not all(part.isdecimal() for part in parts):
             bad_value(flag_of(field), "whole numbers, comma-separated", repr(value))
         return tuple(get_args(kind)[0](part) for part in parts)
-    return tuple(value or ())
+    return tuple(value or ()) if get_origin(kind) is tuple else value

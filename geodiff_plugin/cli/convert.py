@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.converters import depthfm, ppd
+from geodiff_plugin.cli.converters import depthfm, ppd, read_checkpoint, save_weights
 from geodiff_plugin.cli.converters.marigold_v2 import MARIGOLD_V2, convert_marigold_v2
-from geodiff_plugin.cli.converters.reading import read_checkpoint, save_weights
 
 #: Kind -> module with ``recognises(checkpoint)`` and ``write(checkpoint, folder, part)``.
 CONVERTERS = {"depthfm": depthfm, "ppd": ppd}
@@ -22,18 +21,14 @@ NAMED_KEYS = 8
 COPIED = (".json", ".txt", ".md", ".model", ".safetensors")
 
 
-def run_convert(paths: Sequence[Path], part: str | None, space: str | None = None) -> None:
-    """Convert and say where it is.
+def run_convert(paths: Sequence[Path], part: str | None = None, space: str | None = None) -> None:
+    """Convert and say where it is; nothing is left behind where that fails.
 
     Args:
         paths: checkpoint file (or a folder in diffusers' layout with .bin weights) and the folder to appear;
             or ``marigold-v2``, base, checkpoint and the folder to appear.
         part: file, folder or hub id of what the checkpoint lacks (DepthFM's VAE), ``None`` for the usual one.
         space: of Marigold V2, where the checkpoint's folder does not tell.
-
-    Raises:
-        ValueError: another number of paths; a target that exists or has no parent; a source that is no
-            checkpoint, of no known kind, or whose weights do not fit. Nothing is left behind.
     """
     layered = len(paths) == 4 and str(paths[0]) == MARIGOLD_V2
     if not layered and len(paths) != 2:
@@ -44,12 +39,11 @@ def run_convert(paths: Sequence[Path], part: str | None, space: str | None = Non
     source, target = paths[-2:]
     if os.path.lexists(target):
         bad_value("DST", "a folder that does not exist yet", target, "Name another, or remove it first.")
-    if not os.path.isdir(target.parent):
-        bad_value("DST", "in an existing folder", target, f"Make the folder {target.parent} first.")
     try:
         unfinished = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     except OSError as error:
-        bad_value("DST", "a folder that can be made", f"{target} ({error.strerror})", "Name another.")
+        cure = f"Name another, or make the folder {target.parent} first."
+        bad_value("DST", "a folder that can be made", f"{target} ({error.strerror})", cure)
     kind = MARIGOLD_V2 if layered else "folder"
     try:
         if layered:
@@ -72,9 +66,7 @@ def _convert_file(source: Path, folder: Path, part: str | None) -> str:
         if converter.recognises(checkpoint):
             converter.write(checkpoint, folder, part)
             return kind
-    keys = list(map(str, checkpoint))
-    more = f" and {len(keys) - NAMED_KEYS} more" if len(keys) > NAMED_KEYS else ""
-    got = f"{source} with the keys {', '.join(keys[:NAMED_KEYS]) or 'of an empty mapping'}{more}"
+    got = f"{source} with the keys {', '.join(map(str, list(checkpoint)[:NAMED_KEYS])) or 'of nothing'}"
     cure = "docs/reference/priors.md tells which prior comes from where."
     bad_value("SRC", f"a checkpoint of a known kind ({', '.join(CONVERTERS)})", got, cure)
 
@@ -86,11 +78,7 @@ def _safe_name(name: str) -> str:
 
 
 def _convert_folder(source: Path, folder: Path) -> None:
-    """Write the same folder, of one component or several, with safetensors in place of ``.bin`` files.
-
-    Raises:
-        ValueError: no .bin file in it, or one that cannot be read.
-    """
+    """Write the same folder, of one component or several, with safetensors in place of ``.bin`` files."""
     if not any(source.rglob("*.bin")):
         expected, cure = "a checkpoint file, or a folder with .bin weights", "Give it to --prior as it is."
         bad_value("SRC", expected, f"the folder {source} without: it needs no conversion", cure)

@@ -30,17 +30,12 @@ def _write_comparison(path: Path, pair: DemoPair, aligned_m: np.ndarray, guided_
 
 
 def run_demo(options: DepthOptions, out: OutFolder) -> None:
-    """Write what ``geodiff depth`` writes and ``comparison.png``, and print how far it is from the truth.
-
-    Args:
-        options: of ``demo_options``, which ``start_pair`` has seen.
-        out: the folder that it gave, held.
-    """
-    pipe, _, output, report = estimate_and_write(options, out, StopWatch())
+    """Write what ``geodiff depth`` writes and ``comparison.png``, and print how far it is from the truth."""
+    pipe, job, report = estimate_and_write(options, out, StopWatch())
     pair = read_demo_pair()
     plain = pipe(pair.left, generator=torch.Generator("cpu").manual_seed(options.seed))
     aligned_m = align(single_map(plain.prediction), pair.depth_m, pair.valid, pipe.config.prediction_type)
-    guided_m = single_map(output.prediction)
+    guided_m = single_map(job.output.prediction)
     table = new_table(("", "AbsRel", "delta1", "RMSE, m"))
     for name, depth_m in (
         ("prior, aligned by an oracle", aligned_m),

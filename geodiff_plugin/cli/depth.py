@@ -5,27 +5,22 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.bundled import no_bars
-from geodiff_plugin.cli.exports import (
-    check_image_names,
-    make_scene,
-    pick_viewer,
-    show_scene,
-    write_exports,
-    write_maps,
-    write_undistorted,
-)
+from geodiff_plugin.cli.exports import check_image_names, write_exports, write_maps, write_undistorted
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
 from geodiff_plugin.cli.options import DepthOptions
-from geodiff_plugin.cli.report import build_report, summary_line
-from geodiff_plugin.cli.terminal import StopWatch, collected_warnings, say
+from geodiff_plugin.cli.report import REPORT, build_report, summary_line
+from geodiff_plugin.cli.terminal import StopWatch, Warner, collected_warnings, say
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
@@ -38,9 +33,6 @@ def load_guided_prior(options: DepthOptions, device: torch.device) -> Any:
     """The prior of ``--prior``, with guidance enabled and no progress bars but that of a download.
 
     Which it is and its licence are said on stderr, unless ``--quiet``.
-
-    Raises:
-        InputError: no such prior, not cached, of no known kind; an option that it does not take.
     """
     name = options.prior
     on_disk = name == "bundled" or os.path.isdir(name) or os.path.isdir(name.partition(":")[2])
@@ -59,115 +51,89 @@ def load_guided_prior(options: DepthOptions, device: torch.device) -> Any:
     return pipe
 
 
-def guided_call(pipe: Any, inputs: Inputs, options: DepthOptions, **further: Any) -> MetricDepthOutput:
-    """Call the pipeline as the options say; unless ``--quiet``, with the loss in a progress bar on stderr.
+@dataclass(eq=False)
+class Job:
+    """A pair on its way from its files to its folder, and what the stages have made of it so far."""
 
-    Args:
-        pipe: of ``load_guided_prior``.
-        inputs: views and cameras.
-        options: of this pair.
-        **further: what else the call takes.
+    options: DepthOptions
+    folder: OutFolder
+    watch: StopWatch = field(default_factory=StopWatch)
+    warnings: list[str] = field(default_factory=list)
+    inputs: Inputs = field(init=False)
+    output: MetricDepthOutput = field(init=False)
 
-    Raises:
-        InputError: what only both views together show, such as no overlap; with ``--strict`` a depth that is
-            not to be trusted.
-    """
-    call = options.call() | {"generator": torch.Generator("cpu").manual_seed(options.seed)} | further
-    if inputs.prior_map is not None:
-        call["depth_map"] = inputs.prior_map
-    pipe.set_progress_bar_config(disable=options.quiet, file=sys.stderr, leave=False)
-    try:
-        return pipe(inputs.left, guidance=inputs.guidance, strict=options.strict, **call)
-    finally:
-        pipe.set_progress_bar_config(disable=True)
+    def read(self, frames: Sequence[np.ndarray] | None = None) -> None:
+        """Read the views, from their files or as ``frames``, and the cameras, and see that they fit."""
+        with self.watch.stage("calibration"):
+            self.inputs = read_inputs(self.options, self.options.config(), frames)
+            check_image_names(self.options, self.inputs)
 
+    def guide(self, pipe: Any, progress: bool, **further: Any) -> None:
+        """Call the pipeline as the options say, if wanted with the loss in a progress bar on stderr."""
+        options, inputs = self.options, self.inputs
+        call = options.call() | {"generator": torch.Generator("cpu").manual_seed(options.seed)} | further
+        if inputs.prior_map is not None:
+            call["depth_map"] = inputs.prior_map
+        pipe.set_progress_bar_config(disable=not progress, file=sys.stderr, leave=False)
+        try:
+            with self.watch.stage("guided call"):
+                self.output = pipe(inputs.left, guidance=inputs.guidance, strict=options.strict, **call)
+        finally:
+            pipe.set_progress_bar_config(disable=True)
 
-def estimate_and_write(
-    options: DepthOptions, out: OutFolder, watch: StopWatch
-) -> tuple[Any, Inputs, MetricDepthOutput, dict[str, Any]]:
-    """Everything of ``geodiff depth`` but its answer on stdout.
+    def write(self, pipe: Any, **entries: Any) -> dict[str, Any]:
+        """Fill the folder: every map, what ``--export`` asks for, and last the report, which is returned."""
+        options, inputs, output = self.options, self.inputs, self.output
+        report = build_report(inputs, output, pipe, options, self.warnings) | entries
 
-    Args:
-        options: that ``start_pair`` has seen.
-        out: the folder that it gave, held.
-        watch: of the stages so far.
+        def fill(folder: Path) -> None:
+            with self.watch.stage("write"):
+                report["files"] = write_maps(folder, output, inputs.left, options.min_confidence)
+                if inputs.undistorted:
+                    write_undistorted(folder, inputs.left)
+                if options.export:
+                    write_exports(folder, output, inputs, options)
+            report["files"]["names"] = [*sorted(path.name for path in folder.iterdir()), REPORT]
+            report["seconds"] = {stage: round(seconds, 3) for stage, seconds in self.watch.seconds.items()}
+            (folder / REPORT).write_text(_text(report) + "\n", encoding="utf-8")
 
-    Returns:
-        The pipeline, the inputs, the output and the report.
-
-    Raises:
-        InputError: bad input; before any weights load where it can be seen that early.
-    """
-    warnings: list[str] = []
-
-    def tell(sentence: str) -> None:
-        if sentence not in warnings:
-            warnings.append(sentence)
-            say(f"warning: {sentence}")
-
-    with collected_warnings(tell):
-        device, config = pick_device(options.device), options.config()
-        pick_viewer(options.show)
-        with watch.stage("calibration"):
-            inputs = read_inputs(options, config)
-            check_image_names(options, inputs)
-        for sentence in () if options.quiet else inputs.guidance.assumed:
-            say(f"assumed: {sentence}")
-        with watch.stage("load"):
-            pipe = load_guided_prior(options, device)
-        with watch.stage("guided call"):
-            output = guided_call(pipe, inputs, options)
-        for sentence in output.warnings:
-            tell(sentence)
-        report = build_report(inputs, output, pipe, options, warnings)
-        write_result(options, out, inputs, output, report, watch)
-    return pipe, inputs, output, report
-
-
-def write_result(
-    options: DepthOptions,
-    out: OutFolder,
-    inputs: Inputs,
-    output: MetricDepthOutput,
-    report: dict[str, Any],
-    watch: StopWatch,
-) -> None:
-    """Fill the folder of a pair: every map, what ``--export`` asks for, and last the report.
-
-    Files and seconds are added to ``report``.
-    """
-
-    def fill(folder: Path) -> None:
-        with watch.stage("write"):
-            report["files"] = write_maps(folder, output, inputs.left, options.min_confidence)
-            if inputs.undistorted:
-                write_undistorted(folder, inputs.left)
-            if options.export:
-                write_exports(folder, options.export, make_scene(output, inputs, options))
-        report["files"]["names"] = [*sorted(path.name for path in folder.iterdir()), "report.json"]
-        report["seconds"] = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
-        (folder / "report.json").write_text(_text(report) + "\n", encoding="utf-8")
-
-    out.write(fill)
+        self.folder.write(fill)
+        return report
 
 
 def _text(report: dict[str, Any]) -> str:
     return json.dumps(report, indent=2, allow_nan=False)
 
 
-def run_depth(options: DepthOptions, out: OutFolder, watch: StopWatch) -> None:
-    """Run the command and answer on stdout: the summary, or the report with ``--json``.
+def estimate_and_write(
+    options: DepthOptions, folder: OutFolder, watch: StopWatch
+) -> tuple[Any, Job, dict[str, Any]]:
+    """Everything of ``geodiff depth`` but its answer on stdout: the pipeline, the job, the report.
 
     Args:
         options: that ``start_pair`` has seen.
-        out: the folder that it gave, held.
+        folder: that it gave, held.
         watch: of the stages so far.
     """
-    _, inputs, output, report = estimate_and_write(options, out, watch)
+    job, warn = Job(options, folder, watch), Warner()
+    warn.note_in(job.warnings)
+    with collected_warnings(warn):
+        device = pick_device(options.device)
+        job.read()
+        for sentence in () if options.quiet else job.inputs.guidance.assumed:
+            say(f"assumed: {sentence}")
+        with watch.stage("load"):
+            pipe = load_guided_prior(options, device)
+        job.guide(pipe, progress=not options.quiet)
+        for sentence in job.output.warnings:
+            warn(sentence)
+        return pipe, job, job.write(pipe)
+
+
+def run_depth(options: DepthOptions, folder: OutFolder, watch: StopWatch) -> None:
+    """Run the command and answer on stdout: the summary, or the report with ``--json``."""
+    _, _, report = estimate_and_write(options, folder, watch)
     if options.json:
         print(_text(report))
     elif not options.quiet:
-        print(summary_line(report, f"{out.path}/"))
-    viewer = pick_viewer(options.show)
-    if viewer is not None:
-        show_scene(viewer, make_scene(output, inputs, options))
+        print(summary_line(report, f"{folder.path}/"))

@@ -1,25 +1,19 @@
-"""Files of ``geodiff depth``: maps, cloud, GLB and COLMAP; and viewers (rerun, viser)."""
+"""Files of ``geodiff depth``: maps, cloud, GLB and COLMAP."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.options import DepthOptions, undistorted_name
 from geodiff_plugin.cli.report import single_map, used_poses
-from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.formats import (
-    Cloud,
     flying_points,
     make_cloud,
     write_colmap,
@@ -94,46 +88,6 @@ def cameras_of(output: MetricDepthOutput, guidance: GeometryGuidance) -> Cameras
     return ((K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What can be exported and shown.
-
-    Attributes:
-        cloud: points of at least the least confidence, without those that hang between two surfaces.
-        cameras: of ``cameras_of``.
-        names: of their images, which a pinhole camera took: the photographs, or without lens distortion
-            those of ``write_undistorted``.
-        left: ``(H, W, 3)`` in [0, 1].
-        further: likewise, the other views without lens distortion; empty where the names are photographs.
-    """
-
-    cloud: Cloud
-    cameras: Cameras
-    names: tuple[str, ...]
-    left: np.ndarray
-    further: tuple[np.ndarray, ...] = ()
-
-
-def make_scene(output: MetricDepthOutput, inputs: Inputs, options: DepthOptions) -> Scene:
-    """The cloud of a guided call with the cameras of all its views.
-
-    Args:
-        output: at the left image's resolution.
-        inputs: the views and cameras.
-        options: names of the images, and the least confidence of a point.
-    """
-    depth_m, cameras = single_map(output.prediction), cameras_of(output, inputs.guidance)
-    keep = ~flying_points(depth_m)
-    if output.confidence is not None:
-        keep &= single_map(output.confidence) >= options.min_confidence
-    cloud = make_cloud(depth_m, inputs.left, cameras[0][0], keep)
-    if not inputs.undistorted:
-        return Scene(cloud, cameras, _image_names(options.photographs().values()), inputs.left)
-    further = tuple(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)
-    written = tuple(undistorted_name(number) for number in range(1, 2 + len(further)))
-    return Scene(cloud, cameras, written, inputs.left, further)
-
-
 def _image_names(paths: Collection[Path]) -> tuple[str, ...]:
     """Names of the images, with their folders below a common one where two of them are alike."""
     names = tuple(path.name for path in paths)
@@ -145,79 +99,28 @@ def _image_names(paths: Collection[Path]) -> tuple[str, ...]:
 
 
 def check_image_names(options: DepthOptions, inputs: Inputs) -> None:
-    """Refuse photographs whose names an export cannot hold, before the work that would be lost.
-
-    Raises:
-        InputError: naming the photograph.
-    """
+    """Refuse photographs whose names an export cannot hold, before the work that would be lost."""
     if "colmap" in options.export and not inputs.undistorted:
         check_colmap_names(_image_names(options.photographs().values()))
 
 
-def write_exports(folder: Path, kinds: Collection[str], scene: Scene) -> None:
-    """Write what ``--export`` asks for, into a folder with the maps."""
-    if "glb" in kinds:
-        write_glb(folder / "cloud.glb", scene.cloud, scene.cameras)
-    if "colmap" in kinds:
-        for number, image_01 in enumerate(scene.further, 2):  # the left one is there without any export
-            write_undistorted(folder, image_01, number)
-        views = [(name, *camera) for name, camera in zip(scene.names, scene.cameras, strict=True)]
-        write_colmap(folder, views, scene.cloud)
+def write_exports(folder: Path, output: MetricDepthOutput, inputs: Inputs, options: DepthOptions) -> None:
+    """Write what ``--export`` asks for, into a folder with the maps.
 
-
-def _in_rerun(scene: Scene) -> None:
-    import rerun
-
-    rerun.init("geodiff", spawn=True)
-    rerun.log("world", rerun.ViewCoordinates.RDF, static=True)
-    rerun.log("world/cloud", rerun.Points3D(scene.cloud.points_m, colors=scene.cloud.colours))
-    for number, (K, E, (width, height)) in enumerate(scene.cameras):
-        entity = f"world/camera {number}"
-        rerun.log(entity, rerun.Transform3D(translation=E[:3, 3], mat3x3=E[:3, :3]))
-        rerun.log(entity, rerun.Pinhole(image_from_camera=K, width=width, height=height))
-    rerun.log("world/camera 0", rerun.Image(np.rint(scene.left * 255).astype(np.uint8)))
-
-
-def _in_viser(scene: Scene) -> None:
-    import viser
-
-    server = viser.ViserServer()
-    server.scene.set_up_direction("-y")
-    points_m, left = scene.cloud.points_m.astype(np.float32), np.rint(scene.left * 255).astype(np.uint8)
-    size = float(np.median(points_m[:, 2])) / 400 if len(points_m) else 0.01
-    server.scene.add_point_cloud("/cloud", points_m, scene.cloud.colours, point_size=size)
-    for number, (K, E, (width, height)) in enumerate(scene.cameras):
-        x, y, z, w = Rotation.from_matrix(E[:3, :3]).as_quat()
-        view = {"fov": 2 * float(np.arctan(height / (2 * K[1, 1]))), "aspect": width / height}
-        pose = {"wxyz": (w, x, y, z), "position": E[:3, 3], "image": left if number == 0 else None}
-        server.scene.add_camera_frustum(f"/camera {number}", scale=20 * size, **view, **pose)
-    say(f"viser serves the cloud at http://localhost:{server.get_port()}; Ctrl-C ends it.")
-    server.sleep_forever()
-
-
-#: What ``--show`` opens, by the name of the module: its package, and how. "auto" is the first that is there.
-VIEWERS: dict[str, tuple[str, Callable[[Scene], None]]] = {
-    "rerun": ("rerun-sdk", _in_rerun),
-    "viser": ("viser", _in_viser),
-}
-
-
-def pick_viewer(wanted: str | None) -> str | None:
-    """The viewer to open, ``"auto"`` resolved, or ``None``; asked before anything is computed.
-
-    Raises:
-        InputError: naming what to install.
+    The cloud has points of at least the least confidence, without those that hang between two surfaces. The
+    images of a COLMAP model are the photographs, or where lens distortion was taken out written here.
     """
-    if wanted is None:
-        return None
-    names = tuple(VIEWERS) if wanted == "auto" else (wanted,)
-    for name in names:
-        if importlib.util.find_spec(name) is not None:
-            return name
-    packages = " or ".join(VIEWERS[name][0] for name in names)
-    bad_value("--show", "a viewer that is installed", repr(wanted), f"pip install {packages}")
-
-
-def show_scene(viewer: str, scene: Scene) -> None:
-    """Open a viewer of ``VIEWERS``; viser serves until Ctrl-C."""
-    VIEWERS[viewer][1](scene)
+    depth_m, cameras = single_map(output.prediction), cameras_of(output, inputs.guidance)
+    keep = ~flying_points(depth_m)
+    if output.confidence is not None:
+        keep &= single_map(output.confidence) >= options.min_confidence
+    cloud = make_cloud(depth_m, inputs.left, cameras[0][0], keep)
+    if "glb" in options.export:
+        write_glb(folder / "cloud.glb", cloud, cameras)
+    if "colmap" in options.export:
+        names = _image_names(options.photographs().values())
+        if inputs.undistorted:
+            names = tuple(undistorted_name(number) for number in range(1, 1 + len(cameras)))
+            for number, image in enumerate(inputs.guidance.rights, 2):  # the left one is always written
+                write_undistorted(folder, image.permute(1, 2, 0).numpy(), number)
+        write_colmap(folder, [(name, *view) for name, view in zip(names, cameras, strict=True)], cloud)

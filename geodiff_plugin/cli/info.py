@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 from huggingface_hub import CacheNotFound, scan_cache_dir
 
-from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.cli.terminal import print_lines
-from geodiff_plugin.options import SPACES
-from geodiff_plugin.priors import BUNDLED_FOLDER, PRIORS, FoundPrior, find_adapter, find_prior
+from geodiff_plugin.config import knob_lines
+from geodiff_plugin.priors import PRIORS, FoundPrior, find_adapter, find_prior
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import versions
 
@@ -26,12 +26,6 @@ def _devices() -> list[str]:
         properties = torch.cuda.get_device_properties(index)
         lines.append(f"cuda:{index} ({properties.name}, {properties.total_memory / 2**30:.0f} GiB)")
     return lines + (["mps"] if torch.backends.mps.is_available() else [])
-
-
-def _bundled() -> str:
-    if not (BUNDLED_FOLDER / "model_index.json").is_file():
-        return "missing from this installation"
-    return _megabytes(sum(path.stat().st_size for path in BUNDLED_FOLDER.rglob("*") if path.is_file()))
 
 
 def _cached() -> list[str]:
@@ -50,7 +44,6 @@ def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
     parts = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
     parameters = sum(weight.numel() for part in parts for weight in part.parameters())
     most = "" if adapter.max_steps is None else f", at most {adapter.max_steps}"
-    gradients = "denoised, full" if adapter.network_input is not None else "denoised"
     options = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
     side = pipe.image_processor.config.vae_scale_factor
     return [
@@ -63,36 +56,24 @@ def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
         ("space", adapter.space),
         ("steps", f"{pipe.default_denoising_steps} by default{most}"),
         ("same every time", "yes, ensembles run one member" if adapter.deterministic else "no"),
-        ("guided", "latent of a VAE" if "vae" in pipe.components else "pixels"),
-        ("gradients", gradients),
+        ("gradients", "denoised" if adapter.network_input is None else "denoised, full"),
         ("longer side", f"{pipe.default_processing_resolution} pixels by default"),
-        ("grid", "sides of any length" if side == 1 else f"sides are multiples of {side} pixels"),
+        ("grid", f"sides are multiples of {side} pixels"),
         ("options", ", ".join(options) or "none"),
     ]
 
 
-def run_info(prior: str | None, space: str | None = None) -> None:
-    """Print it.
-
-    Args:
-        prior: also load this one and tell what it is.
-        space: what it is affine in, where its folder does not tell.
-
-    Raises:
-        ValueError: that prior does not exist, is not cached, is refused or of no known kind; no such space,
-            or a space without a prior.
-    """
-    if space is not None:
-        check_choice(space, "--space", SPACES)
-        if prior is None:
-            bad_value("--space", "given with --prior, the prior that it describes", repr(space))
+def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
+    """Print it, with what a prior is, or the knobs instead."""
+    if knobs:
+        print("\n".join(knob_lines()))
+        return
+    if space is not None and prior is None:
+        bad_value("--space", "given with --prior, the prior that it describes", repr(space))
     described = []
     if prior is not None:
         with no_bars():
             described = _describe(find_prior(prior), space)
-    rows = [*versions().items()]
-    rows += [("device", line) for line in _devices()]
-    rows += [("adapters", ", ".join(PRIORS)), ("bundled prior", _bundled())]
+    rows = [*versions().items(), *(("device", line) for line in _devices()), ("adapters", ", ".join(PRIORS))]
     rows += [("cached", line) for line in _cached()]
-    rows += [("package", str(Path(__file__).resolve().parents[1])), *described]
-    print_lines(rows)
+    print_lines([*rows, ("package", str(Path(__file__).resolve().parents[1])), *described])

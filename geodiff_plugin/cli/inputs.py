@@ -83,9 +83,10 @@ def read_inputs(
         if frames is None:
             for K, (name, path) in zip((rig.K_left, rig.K_right), list(views.items())[:2], strict=False):
                 warn_of_other_lens(path, K, name)
-        further = [_further_camera(options, i, rig.K_left) for i in range(len(options.view))]
-        Ks = [rig.K_left, rig.K_right, *(K for K, _ in further)][: len(images)]
-        poses = [np.eye(4), rig.E, *(E for _, E in further)]
+        further = [_matrix(path, "--view-K") for path in options.view_k] or [rig.K_left] * len(options.view)
+        Ks = [rig.K_left, rig.K_right, *further][: len(images)]
+        poses = [np.eye(4), rig.E]
+        poses += [check_pose(read_matrix(path, "--view-E"), f"--view-E {path}") for path in options.view_e]
     lenses = lenses_of(options, rig)
     images = [pinhole(*each, config) for each in zip(images, Ks, lenses, strict=False)]
     known: dict[str, Any] = {
@@ -130,17 +131,8 @@ def _read_view(path: Path, name: str) -> np.ndarray:
 
 
 def read_rig(options: DepthOptions, left_size: Size, right_size: Size | None = None) -> Rig:
-    """The cameras, from whichever of the three ways was taken, for images of these sizes.
-
-    Args:
-        options: of one pair.
-        left_size: ``(width, height)`` of the left image.
-        right_size: likewise; ``None`` without a right one.
-
-    Raises:
-        InputError: no calibration or more than one, a file that is none, K for images of another size.
-    """
-    way, alone = options.cameras_way(), right_size is None and options.disparity is None
+    """The cameras, whichever way they are given, for images of these ``(width, height)``."""
+    way = options.cameras_way()
     if way == "file":
         rig = read_calibration(
             options.calib,
@@ -151,8 +143,17 @@ def read_rig(options: DepthOptions, left_size: Size, right_size: Size | None = N
             baseline_m=options.baseline,
             distorted=True,
         )
+    elif way == "parameters":
+        camera = [getattr(options, name) for name in PARAMETERS[:-1]]
+        baseline_m = 1.0 if options.baseline is None else options.baseline
+        rig = rig_from_parameters(*camera, baseline_m, cx_right=options.cx_right)
+        rig = replace(rig, E=np.eye(4)) if options.baseline is None else rig
     else:
-        rig = (_rig_from_parameters if way == "parameters" else _rig_from_matrices)(options, left_size, alone)
+        assert options.k is not None
+        K = _matrix(options.k, "--K")
+        K_right = K if options.k_right is None else _matrix(options.k_right, "--K-right")
+        E = np.eye(4) if options.e is None else check_pose(read_matrix(options.e, "--E"), "--E")
+        rig = Rig(K, K_right, E, source=str(options.k), measured=options.e is None)
     for side, calibrated, size, path in (
         ("left", rig.size_left, left_size, options.left),
         ("right", rig.size_right, right_size, options.right),
@@ -163,59 +164,20 @@ def read_rig(options: DepthOptions, left_size: Size, right_size: Size | None = N
     return replace(rig, size_left=left_size, size_right=right_size)
 
 
-def _rig_from_parameters(options: DepthOptions, size: Size, alone: bool) -> Rig:
-    names = PARAMETERS[:-1] if alone else PARAMETERS
-    missing = [name for name in names if getattr(options, name) is None]
-    if missing:
-        bad_value(
-            " ".join(f"--{name}" for name in missing),
-            "given as well, with " + " ".join(f"--{name}" for name in names if name not in missing),
-            "nothing",
-            f"--fy is --fx where pixels are square; --cx, --cy are near the centre, here "
-            f"{(size[0] - 1) / 2:g} and {(size[1] - 1) / 2:g}; --baseline is the distance of the cameras in "
-            "metres.",
-        )
-    values = [getattr(options, name) for name in PARAMETERS]
-    if alone:
-        K = rig_from_parameters(*values[:-1], 1.0).K_left
-        return Rig(K, K, np.eye(4))
-    return rig_from_parameters(*values, cx_right=options.cx_right)
-
-
 def _matrix(path: Path, option: str) -> np.ndarray:
     """K out of a file, which is named where an option is given several times."""
     named = f"{option} {path}" if option.startswith("--view") else option
     return check_intrinsics(read_matrix(path, option), named)
 
 
-def _rig_from_matrices(options: DepthOptions, _size: Size, alone: bool) -> Rig:
-    for option, path in (("--K", options.k), ("--E", options.e)):
-        if path is None and not (alone and option == "--E"):
-            bad_value(option, "given as well", "nothing", "--K and --E go together; --K-right is optional.")
-    assert options.k is not None
-    K, source = _matrix(options.k, "--K"), str(options.k)
-    if options.e is None:
-        return Rig(K, K, np.eye(4), source=source)
-    K_right = K if options.k_right is None else _matrix(options.k_right, "--K-right")
-    E = check_pose(read_matrix(options.e, "--E"), "--E")
-    return Rig(K, K_right, E, source=source, measured=False)
-
-
-def _further_camera(options: DepthOptions, i: int, K_left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """K and pose of a ``--view``."""
-    K = _matrix(options.view_k[i], "--view-K") if options.view_k else K_left
-    pose = options.view_e[i]
-    return K, check_pose(read_matrix(pose, "--view-E"), f"--view-E {pose}")
-
-
 def _intrinsics(options: DepthOptions, way: str, path: Path, i: int, size: Size) -> np.ndarray:
     """K of photograph ``i`` without a pose, 0 being the left one, from the options, else from its EXIF."""
     if i > 1 and options.view_k:
         return _matrix(options.view_k[i - 2], "--view-K")
-    if way == "matrices":
-        assert options.k is not None
-        right = i > 0 and options.k_right is not None
-        return _matrix(options.k_right, "--K-right") if right else _matrix(options.k, "--K")  # type: ignore[arg-type]
+    if i > 0 and options.k_right is not None:
+        return _matrix(options.k_right, "--K-right")
+    if options.k is not None:
+        return _matrix(options.k, "--K")
     if way == "parameters":
         return intrinsics(*(getattr(options, name) for name in PARAMETERS[:-1]))
     if options.fov is not None:
@@ -229,27 +191,21 @@ def _intrinsics(options: DepthOptions, way: str, path: Path, i: int, size: Size)
 def _known_length(
     text: str | None, K: np.ndarray, lens: Distortion | None
 ) -> tuple[float, float, float, float, float] | None:
-    """``X1,Y1,X2,Y2,METRES`` as typed, its ends where the image without lens distortion has them.
-
-    Raises:
-        InputError: not five numbers; an end that the lens model sends no ray to.
-    """
+    """``X1,Y1,X2,Y2,METRES`` as typed, its ends where the image without lens distortion has them."""
     if text is None:
         return None
     try:
-        *ends, metres = (float(part) for part in text.split(","))
-        x1, y1, x2, y2 = ends
+        x1, y1, x2, y2, metres = (float(part) for part in text.split(","))
     except ValueError:  # not numbers, or not five of them
         cure = "Two pixels of LEFT and the distance of the two places, such as 100,200,400,210,1.5."
         bad_value("--known-length", "X1,Y1,X2,Y2,METRES", repr(text), cure)
-    if lens is None:
-        return x1, y1, x2, y2, metres
-    straight = undistorted_pixels(np.reshape(ends, (2, 2)), K, lens)
-    if not np.isfinite(straight).all():
-        got = f"{ends}, of which the lens model has no ray"
-        cure = "Choose ends nearer to the middle of LEFT, or check --distortion."
-        bad_value("--known-length", "between two pixels that the lens shows", got, cure)
-    (x1, y1), (x2, y2) = straight.tolist()
+    if lens is not None:
+        straight = undistorted_pixels(np.array([[x1, y1], [x2, y2]]), K, lens)
+        if not np.isfinite(straight).all():
+            got = f"{text}, of which the lens model has no ray"
+            cure = "Choose ends nearer to the middle of LEFT, or check --distortion."
+            bad_value("--known-length", "between two pixels that the lens shows", got, cure)
+        (x1, y1), (x2, y2) = straight.tolist()
     return x1, y1, x2, y2, metres
 
 
@@ -294,17 +250,10 @@ def _read_confidence(options: DepthOptions, lens: Distortion | None) -> np.ndarr
 def pinhole(
     image_01: np.ndarray, K: np.ndarray, lens: Distortion | None, config: GuidanceConfig
 ) -> np.ndarray:
-    """The image as a pinhole camera would have taken it.
+    """The image ``(H, W, 3)`` as a pinhole camera would have taken it; as it is behind a lens that is one.
 
-    Args:
-        image_01: ``(H, W, 3)`` float32 in [0, 1].
-        K: ``(3, 3)`` pixels.
-        lens: what it was taken through; ``None`` for a lens without distortion.
-        config: says whether photographs are cleaned. That comes first: once an image is resampled, the
-            blocks of its compression are no longer found.
-
-    Returns:
-        The same shape; the array that was given where the lens has no distortion.
+    Photographs are cleaned first, as ``config`` says: once an image is resampled, the blocks of its
+    compression are no longer found.
     """
     if lens is None:
         return image_01
@@ -317,14 +266,6 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> Lenses:
 
     Options take precedence over the calibration. A further view without ``--view-distortion`` has the left
     one's lens, as it has its K.
-
-    Args:
-        options: of one pair.
-        rig: the calibration, with the lenses that it knows; ``None`` where there is none.
-
-    Raises:
-        InputError: more than two lenses, malformed coefficients, lenses for rectified images, or a further
-            view with a K of its own and a lens that is not given.
     """
     typed = [distortion_from_text(text) for text in options.distortion]
     if len(typed) > 2:
@@ -337,14 +278,12 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> Lenses:
             "Drop it and give the rectified images. If its numbers are of the raw cameras, give them as "
             "--fx --fy --cx --cy --baseline (parallel cameras with one K), or as --K, --K-right and --E.",
         )
-    pair = (None, None) if rig is None else rig.distortion
-    pair = (typed[0], typed[-1]) if typed else pair
+    pair = (typed[0], typed[-1]) if typed else (None, None) if rig is None else rig.distortion
     further: list[Distortion | None] = [
         distortion_from_text(text, "--view-distortion") for text in options.view_distortion
     ]
-    if not further:
-        if options.view_k and any(is_distorted(lens) for lens in pair):
-            cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
-            bad_value("--view-distortion", "given for each --view", "none", cure)
-        further = [pair[0]] * len(options.view)
+    if options.view_k and not further and any(is_distorted(lens) for lens in pair):
+        cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
+        bad_value("--view-distortion", "given for each --view", "none", cure)
+    further = further or [pair[0]] * len(options.view)
     return tuple(lens if is_distorted(lens) else None for lens in (*pair, *further))

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import csv
-import errno
 import json
 import sys
-import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +17,22 @@ from rich.text import Text
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin._threads import WithinCores
-from geodiff_plugin.cli.depth import guided_call, load_guided_prior, write_result
-from geodiff_plugin.cli.exports import check_image_names
-from geodiff_plugin.cli.inputs import Inputs, read_inputs
-from geodiff_plugin.cli.options import DepthOptions, check_files, out_folder_of
-from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, assumption, options_of
-from geodiff_plugin.cli.report import build_report
-from geodiff_plugin.cli.terminal import (
-    EXIT_SOME_FAILED,
-    StopWatch,
-    collected_warnings,
-    new_table,
-    say,
-    show,
+from geodiff_plugin.cli.depth import Job, load_guided_prior
+from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, check_files, out_folder_of
+from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, assumption, check_pair, options_of, start_many
+from geodiff_plugin.cli.report import read_report
+from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, Warner, collected_warnings, new_table, say, show
+from geodiff_plugin.formats.bags import (
+    BAG_SUFFIXES,
+    BagReader,
+    Stamp,
+    is_bag,
+    list_pairs,
+    stereo_calibration,
+    write_depth_bag,
 )
-from geodiff_plugin.formats.bags import BagReader, is_bag
 from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.formats.out import OutFolder, atomic_path, reason_of
+from geodiff_plugin.formats.out import atomic_path, reason_of, write_text
 from geodiff_plugin.formats.reading import has_pose_per_image
 from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.guidance.evidence import EvidenceStore
@@ -43,99 +40,55 @@ from geodiff_plugin.options import flag_of
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.pipeline import native_images
-from geodiff_plugin.types import MetricDepthOutput
 
 #: What became of every pair, as it is known to all processes of a run.
 JOURNAL = ".pairs.jsonl"
 #: A table of more pairs than this has only those that want to be looked at.
 MOST_ROWS = 20
 #: Options that a result does not depend on.
-NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "show", "strict", "device", "encoding"}
-#: The next pair cannot be written either.
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-RESUMES = "Finished pairs stay; the same command goes on with the rest."
-
+NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "strict", "device", "encoding"}
 Row = dict[str, Any]
+Work = tuple[Job, Row]
 
 
 class _EndsRun(BaseException):
-    """What no pair can be spared: the prior does not load, the disk is full; its cause says which."""
-
-
-@dataclass(eq=False)
-class _Job:
-    """A pair on its way through the stages, and what they have made of it so far."""
-
-    ref: PairRef
-    options: DepthOptions
-    warnings: list[str] = field(default_factory=list)
-    watch: StopWatch = field(default_factory=StopWatch)
-    held: ExitStack = field(default_factory=ExitStack)
-    inputs: Inputs | None = None
-    output: MetricDepthOutput | None = None
-    out: OutFolder | None = None
-    digests: dict[str, str] = field(default_factory=dict)
-    began_from: str | None = None
+    """The prior does not load, which no pair can be spared; its cause says why."""
 
 
 class Stages:
     """The stages of a pair, each called in a thread of its own.
 
+    What goes from stage to stage is the job of the pair, and what its report says of it as one of many.
+
     Args:
         options: of the run.
-        refs: its pairs, in order.
         device: where the prior runs.
         pipe: the prior where it is loaded; otherwise it is loaded when the first pair has been read.
         among: stages that compute at the same time and share the cores.
     """
 
-    def __init__(
-        self,
-        options: DepthOptions,
-        refs: Sequence[PairRef],
-        device: torch.device,
-        pipe: Any = None,
-        among: int = 2,
-    ) -> None:
+    def __init__(self, options: DepthOptions, device: torch.device, pipe: Any = None, among: int = 2) -> None:
         self._options, self._device, self._pipe, self._among = options, device, pipe, among
-        self._number = {ref.name: number for number, ref in enumerate(refs)}
-        self._jobs: dict[str, _Job] = {}
-        self._videos, self._held = dict[Path, VideoReader | BagReader](), ExitStack()
-        self._before: tuple[PairRef, tuple[int, ...], MetricDepthOutput] | None = None
-        self._thread, self._told = threading.local(), set[str]()
+        self._videos, self._open = dict[Path, VideoReader | BagReader](), ExitStack()
+        self._folders: dict[str, ExitStack] = {}
+        self.warn = Warner()
 
     def close(self) -> None:
         """Close the videos, when the threads are done."""
-        self._held.close()
+        self._open.close()
 
-    def tell(self, sentence: str) -> None:
-        """Note a warning with the pair that this thread is at, and say it the first time."""
-        noted = getattr(self._thread, "warnings", [])
-        if sentence not in noted:
-            noted.append(sentence)
-        if sentence not in self._told:
-            self._told.add(sentence)
-            say(f"warning: {sentence}")
-
-    def read(self, item: Item) -> _Job:
+    def read(self, item: Item) -> Work:
         """Look at the files, take the folder, decode the views."""
         ref: PairRef = item.payload
-        job = self._jobs[item.key] = _Job(ref, options_of(ref, self._options))
-        self._thread.warnings = job.warnings
-        with job.watch.stage("calibration"):
-            views_of_one = ref.frame is not None and ref.right is None
-            (replace(job.options, right=ref.left) if views_of_one else job.options).check_all()
-            check_files(job.options, photographs=ref.frame is None)
-            try:
-                job.out = job.held.enter_context(out_folder_of(job.options))
-            except InputError as error:
-                _end_if_full(error)
-                raise
-            job.digests = _digests(job.options)  # before: what changes later is another version
-            frames = None if ref.frame is None else self._frames(ref, ref.frame)
-            job.inputs = read_inputs(job.options, job.options.config(), frames)
-            check_image_names(job.options, job.inputs)
-        return job
+        options, warnings = options_of(ref, self._options), list[str]()
+        self.warn.note_in(warnings)
+        check_pair(ref, options)
+        check_files(options, photographs=ref.frame is None)
+        held = self._folders[item.key] = ExitStack()
+        job = Job(options, held.enter_context(out_folder_of(options)), warnings=warnings)
+        digests = _digests(options)  # before: what changes later is another version
+        job.read(None if ref.frame is None else self._frames(ref, ref.frame))
+        return job, {"name": ref.name, "frame": ref.frame, "sha256": digests}
 
     def _frames(self, ref: PairRef, frame: int) -> Sequence[np.ndarray]:
         for path in {ref.left, ref.right or ref.left} - set(self._videos):
@@ -143,81 +96,49 @@ class Stages:
                 reader: Any = BagReader(path, self._options.bag_topics(), self._options.tolerance)
             else:
                 reader = VideoReader(path)
-            self._videos[path] = self._held.enter_context(reader)
+            self._videos[path] = self._open.enter_context(reader)
         left = self._videos[ref.left].read(frame)
         return both_halves(left, "LEFT") if ref.right is None else (left, self._videos[ref.right].read(frame))
 
-    def evidence(self, job: _Job) -> _Job:
+    def evidence(self, work: Work) -> Work:
         """What the views say by themselves, into a store of the pair's own, where the call finds it."""
-        self._thread.warnings = job.warnings
-        assert job.inputs is not None
+        job, _ = work
+        self.warn.note_in(job.warnings)
         if self._pipe is None:
             try:
                 self._pipe = load_guided_prior(self._options, self._device)
             except Exception as error:
                 raise _EndsRun from error
-        device = self._pipe._execution_device
+        device, guidance = self._pipe._execution_device, job.inputs.guidance
         with (
             job.watch.stage("evidence"),
             WithinCores(self._among),
             torch.no_grad(),
             torch.autocast(device.type, enabled=False),
         ):
-            job.inputs.guidance.evidence_store = EvidenceStore(1, copies=False)
-            job.inputs.guidance.prepare(native_images(job.inputs.left, device))
-        return job
+            guidance.evidence_store = EvidenceStore(1, copies=False)
+            guidance.prepare(native_images(job.inputs.left, device))
+        return work
 
-    def guide(self, job: _Job) -> _Job:
-        """The guided call, from the pair before where that is wanted."""
-        self._thread.warnings = job.warnings
-        assert job.inputs is not None
-        guidance, size, before = job.inputs.guidance, job.inputs.left.shape, self._before
-        self._before = None  # whatever happens now: a sequence with a hole begins anew
-        # A pair between that failed before this stage, or that was there already, has left no trace here.
-        follows = before is not None and self._number[before[0].name] == self._number[job.ref.name] - 1
-        if before is not None and before[1] == size and follows:
-            job.began_from, guidance.previous = before[0].name, before[2]
-        warm = self._options.warm_start
-        with job.watch.stage("guided call"), WithinCores(self._among):
-            quiet = replace(job.options, quiet=True)
-            job.output = guided_call(self._pipe, job.inputs, quiet, output_latent=warm)
-        guidance.evidence_store = guidance.previous = None
-        if warm:  # without its maps
-            needed = ("latent", "space", "scale", "shift", "global_scale", "rescaled")
-            kept = {name: getattr(job.output, name) for name in needed}
-            small = MetricDepthOutput(prediction=job.output.prediction[:0], **kept)
-            self._before = job.ref, size, small
-        return job
+    def guide(self, work: Work) -> Work:
+        """The guided call."""
+        job, _ = work
+        self.warn.note_in(job.warnings)
+        with WithinCores(self._among):
+            job.guide(self._pipe, progress=False)
+        job.inputs.guidance.evidence_store = None
+        return work
 
-    def write(self, job: _Job) -> Row:
+    def write(self, work: Work) -> Row:
         """The files, the report last, and the row of the table."""
-        self._thread.warnings = job.warnings
-        assert job.inputs is not None and job.output is not None and job.out is not None
-        job.warnings += [w for w in job.output.warnings if w not in job.warnings]
-        report = build_report(job.inputs, job.output, self._pipe, job.options, job.warnings)
-        pair = {"name": job.ref.name, "frame": job.ref.frame, "began_from": job.began_from}
-        report["pair"] = pair | {"sha256": job.digests}
-        try:
-            write_result(job.options, job.out, job.inputs, job.output, report, job.watch)
-        except OSError as error:
-            _end_if_full(error)
-            raise
-        return _row(report)
+        job, entry = work
+        self.warn.note_in(job.warnings)
+        job.warnings += [sentence for sentence in job.output.warnings if sentence not in job.warnings]
+        return _row(job.write(self._pipe, pair=entry))
 
     def release(self, item: Item) -> None:
-        """Give back the folder and the memory of a pair."""
-        job = self._jobs.pop(item.key, None)
-        if job is not None:
-            job.held.close()
-
-
-def _end_if_full(error: Exception) -> None:
-    """End the run where a full disk is behind an error."""
-    cause: BaseException | None = error
-    while cause is not None and getattr(cause, "errno", None) not in DISK_FULL:
-        cause = cause.__cause__ or cause.__context__
-    if isinstance(cause, OSError):
-        raise _EndsRun from InputError(f"The disk of --out is full ({reason_of(cause)}). {RESUMES}")
+        """Give back the folder of a pair."""
+        self._folders.pop(item.key, ExitStack()).close()
 
 
 def _digests(options: DepthOptions) -> dict[str, str]:
@@ -232,20 +153,15 @@ def _digests(options: DepthOptions) -> dict[str, str]:
 def finished_row(options: DepthOptions) -> Row | None:
     """The row of a pair that an earlier run has finished; ``None`` where it is still to be done.
 
-    The report is written last and names every file, so a folder that holds all of them is whole.
-
-    Args:
-        options: of this pair alone.
-
-    Raises:
-        InputError: it was made with other options, or from files whose content has changed since.
+    The report is written last and names every file, so a folder that holds all of them is whole. One that
+    was made with other options, or from files whose content has changed since, is an error.
     """
     assert options.out is not None
+    report = read_report(options.out)
     try:
-        report = json.loads((options.out / "report.json").read_text(encoding="utf-8"))
-        names, made, _ = report["files"]["names"], report["arguments"], report["verdict"]
-        whole = all((options.out / name).stat().st_size > 0 for name in names)
-    except (OSError, ValueError, KeyError, TypeError):
+        made, row = report["arguments"], _row(report)
+        whole = all((options.out / name).stat().st_size > 0 for name in report["files"]["names"])
+    except (OSError, KeyError, TypeError):
         return None
     if not whole:
         return None
@@ -262,7 +178,7 @@ def finished_row(options: DepthOptions) -> Row | None:
         got = f"{options.out}, made before {' and '.join(changed)} changed"
         cure = "Name another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
         bad_value("--out", "a folder of results of the same files", got, cure)
-    return _row(report)
+    return row
 
 
 def _row(report: dict[str, Any]) -> Row:
@@ -281,15 +197,10 @@ def _row(report: dict[str, Any]) -> Row:
 
 
 def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
-    """Refuse one distance for all pairs of a model, whose cameras are differently far from each other.
-
-    Raises:
-        InputError: ``--baseline`` with a calibration that has a pose for each image.
-    """
-    if options.baseline is None or len(refs) < 2:
-        return
-    for calib in dict.fromkeys(options_of(ref, options).calib for ref in refs):
-        if calib and has_pose_per_image(calib if len(calib) > 1 else calib[0]):
+    """Refuse one distance for all pairs of a model, whose cameras are differently far from each other."""
+    given = [] if options.baseline is None or len(refs) < 2 else [options_of(ref, options) for ref in refs]
+    for calib in dict.fromkeys(each.calib for each in given if each.calib):
+        if has_pose_per_image(calib if len(calib) > 1 else calib[0]):
             cure = (
                 "Every pair of such a model has another distance. Give the model's scale: geodiff capture "
                 "MODEL with --distance, --known-length or --metres-per-unit."
@@ -297,43 +208,34 @@ def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
             bad_value("--baseline", "left out with many pairs of one model", str(calib[0]), cure)
 
 
-def _items(refs: Sequence[PairRef], out: Path, journal: Journal, there: Mapping[str, Row]) -> list[Item]:
-    """An item a pair; what is there already, in folders of its own, has its record."""
-    items = [Item(r.name, r, words=(str(r.left), str(r.right), str(out / r.name))) for r in refs]
-    for item in items:
-        if item.key in there and journal.get(item) is None:
-            journal.put(item, there[item.key])
-    return items
-
-
 def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
-    """Run the command on all pairs, answer on stdout, and leave with a code if one of them failed.
+    """Run the command on all pairs, answer on stdout, and leave with a code if one of them failed."""
+    if _any_fails(options, refs):
+        sys.exit(EXIT_SOME_FAILED)
 
-    Args:
-        options: that ``start_many`` has seen.
-        refs: the pairs, in order.
 
-    Raises:
-        InputError: ``--out`` has results of other options, or of files that have changed since: then nothing
-            is computed, and nothing written; all pairs fail for one reason; the disk is full.
-    """
+def _any_fails(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
     assert options.out is not None
     _refuse_one_length(options, refs)
     device, _ = pick_device(options.device), options.config()
-    rows = {} if options.overwrite else {ref.name: finished_row(options_of(ref, options)) for ref in refs}
+
+    def finished(ref: PairRef) -> Row | None:
+        return None if options.overwrite else finished_row(options_of(ref, options))
+
+    rows = {ref.name: finished(ref) for ref in refs}
     there = {name: row for name, row in rows.items() if row is not None}
-
-    def is_whole(item: Item, _: Row) -> bool:  # looked at again: another process may have finished it
-        return not options.overwrite and finished_row(options_of(item.payload, options)) is not None
-
     journal = Journal(options.out / JOURNAL)
-    items = _items(refs, options.out, journal, there)
+    items = [Item(r.name, r, words=(str(r.left), str(r.right), str(options.out / r.name))) for r in refs]
+    for item in items:
+        if item.key in there and journal.get(item) is None:
+            journal.put(item, there[item.key])
     runner = Runner(
         items,
         journal,
         noun="pair",
         survives=(Exception,),
-        whole=is_whole,
+        # Looked at again: another process may have finished it.
+        whole=lambda item, _: finished(item.payload) is not None,
         progress=not options.quiet,
     )
     process = runner.process
@@ -342,9 +244,9 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     assumed = assumption(refs, options)
     if assumed and process.index == 0 and not options.quiet:
         say(assumed)
-    stages = Stages(options if process.index == 0 else replace(options, quiet=True), refs, device)
+    stages = Stages(options if process.index == 0 else replace(options, quiet=True), device)
     try:
-        with collected_warnings(stages.tell):
+        with collected_warnings(stages.warn):
             records = runner.run(
                 stages.read, stages.evidence, stages.guide, stages.write, release=stages.release
             )
@@ -361,8 +263,7 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     answers = [_final(record, there.get(record["key"]), options) for record in records]
     if process.index == 0:
         _answer(answers, options)
-    if any(row["result"] == "failed" for row in answers):
-        sys.exit(EXIT_SOME_FAILED)
+    return any(row["result"] == "failed" for row in answers)
 
 
 def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:
@@ -418,3 +319,45 @@ def _print(rows: Sequence[Row], out: Path) -> None:
     for row in shown:
         if row["result"] == "failed":
             show(Text(f"{row['pair']}: {row['message']}"))
+
+
+def run_bag(options: DepthOptions) -> None:
+    """Depth of every pair of a bag as a bag.
+
+    The results lie in a folder beside ``--out``, named ``NAME-frames``, from which the same command goes on
+    after it was interrupted; the bag is written when all pairs are done, without those that failed.
+    """
+    out, topics = options.out or Path("depth.mcap"), options.bag_topics()
+    if out.suffix not in BAG_SUFFIXES or out.is_dir():
+        bad_value("--out", f"a file that ends in {' or '.join(BAG_SUFFIXES)}, as LEFT is a bag", out)
+    if out.exists() and not options.overwrite:
+        bad_value("--out", "a new file", f"{out}, which exists", "Name another, or add --overwrite.")
+    pairs = list_pairs(options.left, topics, options.tolerance)
+    frames = out.with_name(f"{out.stem}-frames")
+    options, frame_id = _with_its_cameras(replace(options, out=frames), frames)
+    refs = start_many(options)
+    failed = _any_fails(options, refs)
+
+    def results() -> Iterator[tuple[Stamp, np.ndarray, np.ndarray]]:
+        for ref, (stamp, _) in zip(refs, pairs, strict=True):
+            if report := read_report(frames / ref.name):
+                depth_m = np.load(frames / ref.name / "depth.npy", allow_pickle=False)
+                yield stamp, depth_m, np.reshape(report["K"], (3, 3))
+
+    count = write_depth_bag(out, results(), frame_id, options.encoding)
+    if not options.quiet:
+        say(f"{out}: {count} depth images ({options.encoding}) of {len(pairs)} pairs")
+    if failed:
+        sys.exit(EXIT_SOME_FAILED)
+
+
+def _with_its_cameras(options: DepthOptions, folder: Path) -> tuple[DepthOptions, str]:
+    """The calibration of a bag in files of a folder unless cameras are given, and its frame's name."""
+    if options.calib or any(getattr(options, name) is not None for name in (*PARAMETERS, "k", "e")):
+        return options, "left"
+    texts, frame_id = stereo_calibration(options.left, options.bag_topics())
+    files = tuple(folder / f"camera_info_{number}.yaml" for number in range(len(texts)))
+    for file, text in zip(files, texts, strict=True):
+        if not file.is_file() or file.read_text(encoding="utf-8") != text:  # else results were made by it
+            write_text(file, text)
+    return replace(options, calib=files), frame_id

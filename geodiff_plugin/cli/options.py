@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,19 @@ from geodiff_plugin.options import CAMERAS, OUTPUT, RunOptions, declare, flag_of
 MODEL_FILES = ("cameras.txt", "images.txt")
 _camera, _output = partial(declare, panel=CAMERAS), partial(declare, panel=OUTPUT)
 PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
+#: The ways to give cameras, by the options that belong to each alone.
+WAYS = {
+    "file": ("calib",),
+    "matrices": ("k", "e", "k_right"),
+    "parameters": (*PARAMETERS[:-1], "cx_right"),
+    "--fov": ("fov",),
+}
+#: What helps where a way is taken in parts.
+CURES = {
+    "matrices": "--K and --E go together, but for one photograph; --K-right is optional.",
+    "parameters": "--fy is --fx where pixels are square; --cx, --cy are near the middle of the image; "
+    "--baseline is the distance of the cameras in metres.",
+}
 #: Fields that hold paths, but not of files that are read beside the photographs.
 PHOTOGRAPHS_AND_OUT = ("left", "right", "view", "out")
 
@@ -116,9 +130,6 @@ class DepthOptions(RunOptions):
     encoding: str = _output(
         "16UC1", "A bag: depth in whole millimetres, or metres.", choices=("16UC1", "32FC1")
     )
-    warm_start: bool = declare(
-        False, "Many pairs: start each from the result of the previous frame, in fewer steps."
-    )
     min_confidence: float = _output(0.0, "Least confidence of a point in the cloud, 0 to 1.", low=0, high=1)
     out: Path | None = _output(
         None, "Folder for the results; geodiff-out, or -2 and so on where it is taken.", *("--out", "-o")
@@ -127,11 +138,6 @@ class DepthOptions(RunOptions):
     strict: bool = _output(False, "End with an error if the result is not to be trusted.")
     export: tuple[str, ...] = _output(
         (), "Also write the cloud and cameras as glb or colmap; repeatable.", choices=("glb", "colmap")
-    )
-    show: str | None = _output(
-        None,
-        "Open the cloud and cameras in rerun, viser, or auto (whichever is installed).",
-        choices=("auto", "rerun", "viser"),
     )
     quiet: bool = _output(False, "No progress bar, no summary.", "--quiet", "-q")
     json: bool = _output(False, "Print the report instead of the summary.")
@@ -147,12 +153,13 @@ class DepthOptions(RunOptions):
 
     def other_files(self) -> list[tuple[str, Path]]:
         """Name and path of every input that is no photograph."""
-        read = [f for f in fields(self) if "Path" in str(f.type) and f.name not in PHOTOGRAPHS_AND_OUT]
-        return [
-            ("calibration" if field.name == "calib" else flag_of(field), path)
-            for field in read
-            for path in _listed(getattr(self, field.name))
-        ]
+        named: list[tuple[str, Path]] = []
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value and "Path" in str(field.type) and field.name not in PHOTOGRAPHS_AND_OUT:
+                name = "calibration" if field.name == "calib" else flag_of(field)
+                named += [(name, path) for path in (value if isinstance(value, tuple) else (value,))]
+        return named
 
     def read_files(self) -> list[Path]:
         """Every file that a run reads; of a COLMAP model its texts."""
@@ -160,21 +167,13 @@ class DepthOptions(RunOptions):
         return [f for p in paths for f in ([p / name for name in MODEL_FILES] if p.is_dir() else [p])]
 
     def refuse(self, names: Iterable[str], expected: str, got: str, cure: str = "") -> None:
-        """Refuse every option of these that was given.
-
-        Raises:
-            InputError: naming the first.
-        """
+        """Refuse the first option of these that was given."""
         for field in fields(self):
             if field.name in names and getattr(self, field.name) not in (None, (), False):
                 bad_value(flag_of(field), expected, got, cure)
 
     def bag_topics(self) -> tuple[str, str]:
-        """The topics of ``--left`` and ``--right``.
-
-        Raises:
-            InputError: one of them is not given, or RIGHT is.
-        """
+        """The topics of ``--left`` and ``--right``."""
         self.refuse(["right"], "left out where LEFT is a bag", "given", "Name the topics: --left, --right.")
         for flag, topic in (("--left", self.topic_left), ("--right", self.topic_right)):
             if topic is None:
@@ -182,148 +181,104 @@ class DepthOptions(RunOptions):
         return str(self.topic_left), str(self.topic_right)
 
     def camera_pair(self) -> tuple[int, int] | None:
-        """The two numbers of ``--cameras``.
-
-        Raises:
-            InputError: not two different numbers with a comma.
-        """
+        """The two numbers of ``--cameras``."""
         if self.cameras is None:
             return None
-        parts = self.cameras.split(",")
-        if len(parts) != 2 or not all(part.strip().isdecimal() and len(part) < 10 for part in parts):
-            expected = "two camera numbers with a comma, left first, such as 2,3"
+        match = re.fullmatch(r"\s*(\d{1,9})\s*,\s*(\d{1,9})\s*", self.cameras)
+        if match is None or int(match[1]) == int(match[2]):
+            expected = "two different camera numbers with a comma, left first, such as 2,3"
             bad_value("--cameras", expected, repr(self.cameras))
-        left, right = (int(part) for part in parts)
-        if left == right:
-            bad_value("--cameras", "two different cameras", repr(self.cameras))
-        return left, right
+        return int(match[1]), int(match[2])
 
     def check_all(self) -> None:
-        """``check``, and what options exclude or need each other; knobs are checked when torch is there.
-
-        Raises:
-            InputError: naming the option.
-        """
+        """``check``, and what options exclude or need each other; knobs are checked when torch is there."""
         self.check()
         self.camera_pair()
-        if self.preset == "paper":
-            given, got = "given with the default preset", "--preset paper"
-            self.refuse(["points", "disparity"], given, got, "Algorithm 1 has no points.")
-            self.refuse(["view"], given, got, "Algorithm 1 has two views.")
-            cure = "Its scale is settled once, by a search over one number."
-            self.refuse(["warm_start"], given, got, cure)
-        if not self.estimate_pose:
-            names = ("fov", "known_length", "matcher")
-            self.refuse(names, "given together with --estimate-pose", "no --estimate-pose")
+        for holds, names, expected, got, cure in self._excluded():
+            if holds:
+                self.refuse(names, expected, got, cure)
         if (self.prior == "map") != (self.prior_map is not None):
             beside = "no --prior-map" if self.prior_map is None else "--prior-map"
             bad_value("--prior-map", "given in place of a --prior", f"--prior {self.prior} and {beside}")
-        if self.points is None:
-            self.refuse(["points_scale", "points_calib"], "given with --points", "no --points")
-        else:
-            self.refuse(["disparity"], "given in place of --points", "both")
-        if self.points is None and self.disparity is None:
-            self.refuse(["points_confidence"], "given with --points or --disparity", "neither")
-        if self.right is None:
-            self._check_alone()
-        poses = 0 if self.estimate_pose else len(self.view)
-        for option, count, counts in (
-            ("--view-E", len(self.view_e), {poses}),
-            ("--view-K", len(self.view_k), {0, len(self.view)}),
-            ("--view-distortion", len(self.view_distortion), {0, len(self.view)}),
-        ):
-            if count not in counts:
-                bad_value(option, f"given once for each of {len(self.view)} --view", f"{count} times")
-
-    def _check_alone(self) -> None:
-        """LEFT without RIGHT: known points, and nothing that is of a second camera."""
-        if self.points is None and self.disparity is None:
+        if self.right is None and self.points is None and self.disparity is None:
             cure = (
                 "One photograph alone does not tell metres: give a second one, or known depths with --points."
             )
             bad_value("RIGHT", "given, or --points instead of it", "neither", cure)
-        expected, got, cure = "given with RIGHT", "no RIGHT", "It belongs to a second view."
-        if self.disparity is None:  # which is of a rig
-            self.refuse(("baseline", "cx_right"), expected, got, cure)
-        self.refuse(("e", "k_right", "view", "estimate_pose"), expected, got, cure)
-        if self.preset == "paper":
-            bad_value("--preset paper", expected, got, cure)
+        views = len(self.view)
+        for option, given, counts in (
+            ("--view-E", self.view_e, {0 if self.estimate_pose else views}),
+            ("--view-K", self.view_k, {0, views}),
+            ("--view-distortion", self.view_distortion, {0, views}),
+        ):
+            if len(given) not in counts:
+                bad_value(option, f"given once for each of {views} --view", f"{len(given)} times")
+
+    def _excluded(self) -> Iterator[tuple[bool, tuple[str, ...], str, str, str]]:
+        """When, which options, and what a message says that they must be, what came instead, and the cure."""
+        alone, without_points = self.right is None, self.points is None
+        default = "given with the default preset", "--preset paper"
+        paper, second = (
+            self.preset == "paper",
+            ("given with RIGHT", "no RIGHT", "It belongs to a second view."),
+        )
+        yield paper, ("points", "disparity"), *default, "Algorithm 1 has no points."
+        yield paper, ("view",), *default, "Algorithm 1 has two views."
+        together = "given together with --estimate-pose", "no --estimate-pose"
+        yield not self.estimate_pose, ("fov", "known_length", "matcher"), *together, ""
+        names = ("calib", "cameras", "e", "view_e", "cx_right")
+        cure = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
+        yield self.estimate_pose, names, "left out with --estimate-pose", "both", cure
+        cure = "It chooses among the cameras of a file."
+        yield not self.calib, ("cameras",), "given with --calib only", "no --calib", cure
+        yield without_points, ("points_scale", "points_calib"), "given with --points", "no --points", ""
+        yield not without_points, ("disparity",), "given in place of --points", "both", ""
+        neither, known = without_points and self.disparity is None, "given with --points or --disparity"
+        yield neither, ("points_confidence",), known, "neither", ""
+        yield alone and self.disparity is None, ("baseline", "cx_right"), *second
+        yield alone, ("e", "k_right", "view", "estimate_pose"), *second
 
     def cameras_way(self) -> str:
-        """How the cameras are given: ``"file"``, ``"parameters"`` or ``"matrices"``.
-
-        With ``--estimate-pose`` how K is given: ``"parameters"``, ``"matrices"``, ``"--fov"`` or ``"EXIF"``.
+        """How the cameras are given, or with ``--estimate-pose`` how K is: a key of ``WAYS``, or ``"EXIF"``.
 
         Raises:
-            InputError: in no way, in more than one, in parts, or beside options that belong to another.
+            InputError: in no way, in more than one, or in parts.
         """
-        return self._intrinsics_way() if self.estimate_pose else self._calibration_way()
-
-    def _given(self, names: Iterable[str]) -> list[bool]:
-        return [getattr(self, name) is not None for name in names]
-
-    def _calibration_way(self) -> str:
+        alone = self.right is None and self.disparity is None
         # --baseline beside --calib gives a file its unit, as COLMAP's models need it.
-        parameters = PARAMETERS[:-1] if self.calib else PARAMETERS
-        ways = {
-            "file": bool(self.calib),
-            "parameters": any(self._given((*parameters, "cx_right"))),
-            "matrices": any(self._given(("k", "e", "k_right"))),
-        }
-        numbers, matrices = "--fx --fy --cx --cy", "--K FILE"
-        if self.right is not None or self.disparity is not None:
-            numbers, matrices = f"{numbers} --baseline", f"{matrices} --E FILE"
+        needed: dict[str, tuple[str, ...]] = {}
+        needed["parameters"] = PARAMETERS[: 4 if self.calib or self.estimate_pose or alone else 5]
+        needed["matrices"] = ("k",) if self.estimate_pose or alone else ("k", "e")
+        given = {name for name in itertools.chain(PARAMETERS, *WAYS.values()) if getattr(self, name) not in (None, ())}
+        taken = [way for way, names in WAYS.items() if given & {*names, *needed.get(way, ())}]
+        numbers, matrices = (" ".join(map(_flag, needed[way])) for way in ("parameters", "matrices"))
         known = f"--calib FILE, or {numbers}, or {matrices}"
-        cure = "Without cameras two images do not tell metres."
-        way = _only("calibration", ways, known) or bad_value("calibration", f"given: {known}", "none", cure)
-        if way != "file":
-            cure = "It chooses among the cameras of a file."
-            self.refuse(["cameras"], "given with --calib only", "no --calib", cure)
-        return way
-
-    def _intrinsics_way(self) -> str:
-        cure = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
-        others = ("calib", "cameras", "e", "view_e", "cx_right")
-        self.refuse(others, "left out with --estimate-pose", "both", cure)
-        parameters = self._given(PARAMETERS[:-1])
-        ways = {
-            "matrices": any(self._given(("k", "k_right"))),
-            "parameters": any(parameters),
-            "--fov": self.fov is not None,
-        }
-        way = _only("K", ways, "--K FILE, or --fx --fy --cx --cy, or --fov, or EXIF") or "EXIF"
-        if self.k_right is not None and self.k is None:
-            bad_value("--K", "given with --K-right", "--K-right alone", "It is K of LEFT.")
-        if way == "parameters" and not all(parameters):
-            bad_value("--fx --fy --cx --cy", "given all together", "some of them")
-        if self.cropped and way in ("--fov", "EXIF") and not self.view_k:
+        if self.estimate_pose:
+            known = f"{matrices}, or {numbers}, or --fov, or EXIF"
+        if len(taken) > 1:
+            what = "K" if self.estimate_pose else "calibration"
+            bad_value(what, f"given in one way: {known}", " and ".join(taken), "Drop the others.")
+        if not taken and not self.estimate_pose:
+            cure = "Without cameras two images do not tell metres."
+            bad_value("calibration", f"given: {known}", "none", cure)
+        way = taken[0] if taken else "EXIF"
+        missing = [_flag(name) for name in needed.get(way, ()) if getattr(self, name) is None]
+        if missing:
+            names = dict.fromkeys((*needed[way], *WAYS[way]))
+            there = " ".join(_flag(name) for name in names if name in given)
+            bad_value(" ".join(missing), f"given as well, with {there}", "nothing", CURES[way])
+        if self.estimate_pose and self.cropped and way in ("--fov", "EXIF") and not self.view_k:
             cure = "A field of view, or EXIF, does not tell where the principal point of a crop is."
             bad_value("--cropped", "given with --K, or --fx --fy --cx --cy", f"K by {way}", cure)
         return way
 
 
-def _listed(value: Path | tuple[Path, ...] | None) -> tuple[Path, ...]:
-    return value if isinstance(value, tuple) else () if value is None else (value,)
-
-
-def _only(name: str, ways: dict[str, bool], known: str) -> str | None:
-    """The only way that was taken, or ``None``; more than one are refused."""
-    taken = [way for way, is_taken in ways.items() if is_taken]
-    if len(taken) > 1:
-        bad_value(name, f"given in one way: {known}", " and ".join(taken), "Drop the others.")
-    return taken[0] if taken else None
+def _flag(name: str) -> str:
+    return flag_of(DepthOptions.__dataclass_fields__[name])
 
 
 def check_files(options: DepthOptions, photographs: bool = True) -> None:
-    """Look at every file that was named.
-
-    Args:
-        options: that ``check_all`` has seen.
-        photographs: the views too; those of a video are looked at when they are counted.
-
-    Raises:
-        InputError: naming the option or the file.
-    """
+    """Look at every file that was named; at frames of a video when they are counted, not here."""
     if photographs:
         views = options.photographs()
         for name, path in views.items():
@@ -345,15 +300,7 @@ def out_folder_of(options: DepthOptions) -> OutFolder:
 
 
 def start_pair(options: DepthOptions) -> OutFolder:
-    """Check the options and files of a run over one pair.
-
-    Returns:
-        Its output folder, to be held during the work.
-
-    Raises:
-        InputError: naming the option or the file.
-    """
-    options.refuse(["warm_start"], "given with many pairs", "one pair", "It goes on from the pair before.")
+    """Check the options and files of one pair; its output folder, to be held during the work."""
     options.check_all()
     options.cameras_way()
     check_files(options)

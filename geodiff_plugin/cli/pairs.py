@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from PIL import Image
 
@@ -29,10 +28,8 @@ COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "verdict", "confiden
 LISTS = (".csv", ".tsv", ".txt")
 #: Files of maps, the first of a name is taken.
 MAPS = (".npy", ".npz", ".pfm", ".png")
-#: A list's heading, which is no pair, begins with this.
+#: A list's heading, which names no file, begins with this.
 HEADING = "left"
-#: A comment in a line of a list, unless its mark is within quotes, which stay.
-COMMENT = re.compile(r'("[^"]*")|(?:^|\s)#.*')
 
 
 @dataclass(frozen=True)
@@ -59,62 +56,48 @@ def is_many(left: Path) -> bool:
     return os.path.isdir(left) or left.suffix.lower() in LISTS or is_video(left)
 
 
+def check_pair(ref: PairRef, options: DepthOptions) -> None:
+    """Check the options of one of many pairs; both views may lie in one video."""
+    both_in_one = ref.frame is not None and ref.right is None
+    (replace(options, right=ref.left) if both_in_one else options).check_all()
+
+
 def start_many(options: DepthOptions) -> list[PairRef]:
-    """Find the pairs of a run over many, and make all checks that need neither images nor torch.
-
-    Args:
-        options: with ``out``.
-
-    Raises:
-        InputError: naming the option or the file.
-    """
-    names = ("show", "points", "disparity", "view", "known_length")
+    """Find the pairs of a run over many, and make all checks that need neither images nor torch."""
+    names = ("points", "disparity", "view", "known_length")
     options.refuse(names, "left out with many pairs", "given", "It is of one pair.")
     refs = find_pairs(options)
-    for ref in refs if options.prior_map is not None else ():
-        options_of(ref, options)  # every pair has its map
+    each = [options_of(ref, options) for ref in refs]  # every pair has its map
     if refs[0].frame is not None:
         cure = "Extract some frames, and try it there."
         options.refuse(["estimate_pose"], "left out with a video", "given", cure)
         if "colmap" in options.export:
             cure = "A model names image files: extract the frames, and give their folders."
             bad_value("--export colmap", "left out with a video", "given", cure)
-    first = options_of(refs[0], options)
-    first = first if first.right is not None else replace(first, right=first.left)
-    first.check_all()
+    check_pair(refs[0], each[0])
     if options.estimate_pose or all(ref.calib is None for ref in refs):
-        first.cameras_way()
-    check_files(replace(options, prior_map=first.prior_map), photographs=False)
+        replace(each[0], right=refs[0].right or refs[0].left).cameras_way()
+    check_files(replace(options, prior_map=each[0].prior_map), photographs=False)
     _check_summary(options)
     return refs
 
 
 def _check_summary(options: DepthOptions) -> None:
-    """See that the table of the run takes the place of no other file, and is no result of one pair.
-
-    Raises:
-        InputError: ``--out`` holds the result of one pair, or a ``pairs.csv`` that is a folder, or a file of
-            the user's, such as the list of pairs.
-    """
+    """See that the table of the run replaces no file of the user's, and is no result of one pair."""
     assert options.out is not None
     folder, path = check_out(options.out), options.out / SUMMARY
     if (folder / "report.json").exists():
         got = f"{options.out}, which holds the result of one pair"
         bad_value("--out", "a folder for the folders of many pairs", got, "Name another.")
-    if path.is_file() and path.read_bytes().startswith(",".join(COLUMNS).encode()):
-        return
-    if os.path.lexists(path):
-        got = f"{path}, which is {'a folder' if path.is_dir() else 'not the table of an earlier run'}"
+    ours = path.is_file() and path.read_bytes().startswith(",".join(COLUMNS).encode())
+    if os.path.lexists(path) and not ours:
         cure = f"Name another --out, or move that {SUMMARY}: a table of the results takes its place."
+        got = f"{path}, which is not the table of an earlier run"
         bad_value("--out", f"a folder whose {SUMMARY} may be replaced", got, cure)
 
 
 def find_pairs(options: DepthOptions) -> list[PairRef]:
-    """The pairs of a run, in order.
-
-    Raises:
-        OSError, ValueError: a folder or list without pairs, views that have no partner, a line that is none.
-    """
+    """The pairs of a run, in order."""
     left, right = options.left, options.right
     if is_bag(left):
         return _frames(len(list_pairs(left, options.bag_topics(), options.tolerance)), left, None)
@@ -126,9 +109,7 @@ def find_pairs(options: DepthOptions) -> list[PairRef]:
 def assumption(refs: Sequence[PairRef], options: DepthOptions) -> str | None:
     """What was assumed about which views belong together, for the user to check; ``None`` for nothing."""
     first, last = refs[0], refs[-1]
-    if is_bag(first.left):
-        return None
-    if first.frame is not None and first.right is None:
+    if is_video(first.left) and first.right is None:
         return f"{first.left} is read as both views side by side; with a video for each view, name both."
     if first.right is None or last.right is None or not os.path.isdir(options.left):
         return None
@@ -136,29 +117,23 @@ def assumption(refs: Sequence[PairRef], options: DepthOptions) -> str | None:
         return None
     return (
         f"The two folders share no name, so their images are paired in order: {first.left.name} with "
-        f"{first.right.name}, and so on to {last.left.name} with {last.right.name}. Should one be missing, "
-        "write a list of pairs."
+        f"{first.right.name}, and so on to {last.left.name} with {last.right.name}."
     )
 
 
 def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
-    """What ``geodiff depth`` would have been asked for this pair alone.
-
-    Raises:
-        InputError: no map for it in the folder of ``--prior-map``.
-    """
-    calib = options.calib if ref.calib is None else (ref.calib,)
-    folder, prior_map = options.prior_map, None
-    if folder is not None:
+    """What ``geodiff depth`` would have been asked for this pair alone."""
+    prior_map = options.prior_map
+    if prior_map is not None:
         stem = ref.left.stem if ref.frame is None else ref.name
-        paths = [folder / f"{stem}{suffix}" for suffix in MAPS]
+        paths = [prior_map / f"{stem}{suffix}" for suffix in MAPS]
+        got = f"{prior_map} without {stem}{{{','.join(MAPS)}}}"
         prior_map = next((path for path in paths if path.is_file()), None)
         if prior_map is None:
-            got = f"{folder} without {stem}{{{','.join(MAPS)}}}"
             bad_value("--prior-map", "a folder with a map for each left image, of its name", got)
     assert options.out is not None  # a run over pairs has a folder
-    of_pair: dict[str, Any] = {"calib": calib, "out": options.out / ref.name, "prior_map": prior_map}
-    return replace(options, left=ref.left, right=ref.right, **of_pair)
+    calib, out = options.calib if ref.calib is None else (ref.calib,), options.out / ref.name
+    return replace(options, left=ref.left, right=ref.right, calib=calib, out=out, prior_map=prior_map)
 
 
 def _photographs(folder: Path) -> list[Path]:
@@ -224,7 +199,8 @@ def _of_list(path: Path, right: Path | None) -> list[PairRef]:
     rows: list[list[Path]] = []
     for number, line in enumerate(lines, 1):
         cells = _cells(line)
-        if not cells or (not rows and _is_heading(cells[0], file.parent)):
+        heading = not rows and cells and cells[0].lower().startswith(HEADING) and not Path(cells[0]).suffix
+        if not cells or heading:
             continue
         if len(cells) not in (2, 3):
             cure = "Separate them by commas, tabs, or blanks where no name has one."
@@ -232,24 +208,15 @@ def _of_list(path: Path, right: Path | None) -> list[PairRef]:
         rows.append([file.parent / cell for cell in cells])
     if not rows:
         bad_value("LEFT", "a list with a pair a line: LEFT,RIGHT[,CALIB]", f"{path}, which names none")
-    names = _names([row[0] for row in rows])
-    return [
-        PairRef(name, row[0], row[1], row[2] if len(row) > 2 else None)
-        for name, row in zip(names, rows, strict=True)
-    ]
-
-
-def _is_heading(cell: str, folder: Path) -> bool:
-    """Whether the first cell of a list is a word such as left_image, and no file or name of one."""
-    name = Path(cell)
-    plain = name.name == cell and not name.suffix
-    return cell.lower().startswith(HEADING) and plain and not os.path.isfile(folder / name)
+    return [PairRef(name, *row) for name, row in zip(_names([row[0] for row in rows]), rows, strict=True)]
 
 
 def _cells(line: str) -> list[str]:
     """What stands in a line, by tabs, else commas, else blanks; nothing of an empty one or a comment."""
-    line = COMMENT.sub(lambda found: found.group(1) or "", line).strip()
-    separator = next((mark for mark in ("\t", ",") if mark in line), None)
+    line = line.strip()
+    if line.startswith("#"):
+        return []
+    separator = next((mark for mark in "\t," if mark in line), None)
     if separator is None:
         return line.split()
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator)) if cell.strip()]
@@ -262,10 +229,8 @@ def _names(lefts: Sequence[Path]) -> list[str]:
         absolute = [path.absolute() for path in lefts]
         common = Path(os.path.commonpath([path.parent for path in absolute]))
         names = ["_".join(path.relative_to(common).with_suffix("").parts) for path in absolute]
-    taken: set[str] = set()
-    for i, name in enumerate(names):  # one left view with several right ones
-        number = 2
-        while names[i] in taken:
-            names[i], number = f"{name}-{number}", number + 1
-        taken.add(names[i])
-    return names
+    counts, taken = Counter[str](), list[str]()
+    for name in names:  # one left view with several right ones
+        counts[name] += 1
+        taken.append(name if counts[name] == 1 else f"{name}-{counts[name]}")
+    return taken

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,17 @@ from geodiff_plugin.runtime.confidence import expected_error
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.types import MetricDepthOutput
 
+REPORT = "report.json"
+
+
+def read_report(folder: Path) -> dict[str, Any]:
+    """The report of a result; empty where there is none, or none that can be read."""
+    try:
+        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return report if isinstance(report, dict) else {}
+
 
 def single_map(value: Any) -> np.ndarray:
     """The ``(H, W)`` map of the one image of a call."""
@@ -23,11 +36,9 @@ def single_map(value: Any) -> np.ndarray:
 
 
 def depth_summary(depth_m: np.ndarray, visible: np.ndarray | None) -> dict[str, Any]:
-    """Near, far, median in metres over valid pixels; shares and counts over all.
+    """Near, far, median of ``(H, W)`` metres over valid pixels; shares and counts over all.
 
-    Args:
-        depth_m: ``(H, W)`` metres.
-        visible: ``(H, W)`` bool; ``None`` without a right view.
+    ``visible`` is ``None`` without a right view.
     """
     valid = np.isfinite(depth_m) & (depth_m > 0)
     kept = depth_m[valid] if valid.any() else np.array([math.nan])
@@ -76,28 +87,18 @@ def _estimated(guidance: GeometryGuidance, output: MetricDepthOutput) -> dict[st
     rig = guidance.estimated
     if rig is None:
         return None
-    numbers = {
-        name: getattr(rig, name) for name in ("inliers", "parallax_deg", "residual_px", "depth_spread")
-    }
-    return numbers | {
-        "scale_from": output.scale_from,
-        "scale_spread": output.scale_spread,
-        "assumed": rig.notes,
-    }
+    names = ("inliers", "parallax_deg", "residual_px", "depth_spread")
+    scale = {"scale_from": output.scale_from, "scale_spread": output.scale_spread}
+    return {name: getattr(rig, name) for name in names} | scale | {"assumed": rig.notes}
 
 
 def result_entries(output: MetricDepthOutput, guidance: GeometryGuidance) -> dict[str, Any]:
-    """What a report says of a result, whoever asked for it.
-
-    Args:
-        output: of the guided call on one image.
-        guidance: that it was called with.
-    """
+    """What a report says of the result of a guided call on one image, whoever asked for it."""
     depth_m, visible, error = single_map(output.prediction), None, math.nan
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
         error = float(single_map(output.photometric_error)[visible].mean()) if visible.any() else math.nan
-    verdict = asdict(output.verdict)
+    verdict, spread = asdict(output.verdict), output.uncertainty
     names = ("K", "scale", "shift", "global_scale", "own_scale", "prior_error", "unit", "assumed")
     return {
         "depth": depth_summary(depth_m, visible),
@@ -106,9 +107,7 @@ def result_entries(output: MetricDepthOutput, guidance: GeometryGuidance) -> dic
         "expected_error_median_m": np.median(
             expected_error(depth_m, guidance.inputs[0].K_left, used_poses(output, guidance))
         ),
-        "uncertainty_median_m": None
-        if output.uncertainty is None
-        else np.median(single_map(output.uncertainty)),
+        "uncertainty_median_m": None if spread is None else np.median(single_map(spread)),
         **{name: getattr(output, name) for name in names},
         "history": [vars(step) for step in output.history],
         "estimated_pose": _estimated(guidance, output),
@@ -121,15 +120,7 @@ def result_entries(output: MetricDepthOutput, guidance: GeometryGuidance) -> dic
 def build_report(
     inputs: Inputs, output: MetricDepthOutput, pipe: Any, options: DepthOptions, warnings: list[str]
 ) -> dict[str, Any]:
-    """The report without seconds and files, which are known when everything else is written.
-
-    Args:
-        inputs: the views and cameras.
-        output: of the guided call.
-        pipe: the pipeline that made it.
-        options: as typed.
-        warnings: sentences, those of the output included.
-    """
+    """The report without seconds and files, which are known when everything else is written."""
     rig, rigs = inputs.rig, inputs.guidance.rigs
     report = result_entries(output, inputs.guidance) | {
         "warnings": warnings,
@@ -176,13 +167,11 @@ def summary_line(report: dict[str, Any], where: str) -> str:
     if verdict["status"] != "trusted":
         reason = verdict["reasons"][0] if verdict["reasons"] else "neither matches nor known depths test it."
         return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {end})"
-    signs = verdict["signs"]
-    said = [metres, "trusted"]
-    said[1] += "" if signs["confidence"] is None else f", confidence {signs['confidence']:.2f}"
-    error = report.get("expected_error_median_m")
-    said[1] += "" if error is None else f", expected error {_length(error, report['unit'])}"
-    said[1] += "" if signs["matched"] is None else f", {100 * signs['matched']:.0f} % matched"
-    said[1] += f", {signs['points']} known depths" if signs["points"] else ""
-    if report["own_scale"] is not None:
-        said.append(f"prior's own metres x {report['own_scale'][0][0]:.2f}")
-    return "; ".join([*said, end])
+    signs, error, own = verdict["signs"], report.get("expected_error_median_m"), report["own_scale"]
+    trusted = ["trusted"]
+    trusted += [] if signs["confidence"] is None else [f"confidence {signs['confidence']:.2f}"]
+    trusted += [] if error is None else [f"expected error {_length(error, report['unit'])}"]
+    trusted += [] if signs["matched"] is None else [f"{100 * signs['matched']:.0f} % matched"]
+    trusted += [f"{signs['points']} known depths"] if signs["points"] else []
+    scale = [] if own is None else [f"prior's own metres x {own[0][0]:.2f}"]
+    return "; ".join([metres, ", ".join(trusted), *scale, end])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -42,6 +43,26 @@ class StopWatch:
         started = time.perf_counter()
         yield
         self.seconds[name] = time.perf_counter() - started
+
+
+class Warner:
+    """Says each warning once, and notes it with the work that its thread is at."""
+
+    def __init__(self) -> None:
+        self._thread, self._said = threading.local(), set[str]()
+
+    def note_in(self, sentences: list[str]) -> None:
+        """From here on what this thread warns of goes into ``sentences``, once each."""
+        self._thread.sentences = sentences
+
+    def __call__(self, sentence: str) -> None:
+        """Warn."""
+        noted = getattr(self._thread, "sentences", [])
+        if sentence not in noted:
+            noted.append(sentence)
+        if sentence not in self._said:
+            self._said.add(sentence)
+            say(f"warning: {sentence}")
 
 
 @contextmanager

@@ -132,7 +132,7 @@ def measure_depth(folder: Path) -> dict[str, dict[str, float]]:
     out, samples = folder / "out", [(time.perf_counter(), psutil.Process().memory_info().rss)]
     options = DepthOptions(**names, calib=(folder / "calib.txt",), out=out, device="cpu", quiet=True)
     with _sampled(samples), start_pair(options) as held:
-        stages = estimate_and_write(options, held, StopWatch())[3]["seconds"]
+        stages = estimate_and_write(options, held, StopWatch())[2]["seconds"]
     # The stages follow each other and the last one ends where sampling ends.
     found, end = {}, samples[-1][0]
     for name, seconds in reversed(stages.items()):

@@ -1,4 +1,4 @@
-"""Kinds of bad input to ``geodiff depth`` and its siblings: what is typed, and what lies in the files."""
+"""Kinds of bad input to the commands: what is typed, and what lies in the files."""
 
 from __future__ import annotations
 
@@ -123,38 +123,47 @@ def _changed(matrix: object, index: tuple[int, int], value: float) -> np.ndarray
     return matrix
 
 
+def _command(words: str, **files: object) -> Callable[[Path], Words]:
+    """Another command, or many pairs; ``name_npy`` is an array, ``name_csv`` a text, ``name`` a folder."""
+
+    def write(folder: Path) -> Words:
+        for name, content in files.items():
+            stem, _, suffix = name.rpartition("_")
+            if suffix == "npy":
+                np.save(folder / f"{stem}.npy", content)
+            elif isinstance(content, dict):
+                (folder / name).mkdir()
+                for inner, text in content.items():
+                    (folder / name / inner).write_text(text)
+            else:
+                (folder / f"{stem}.{suffix}").write_text(str(content))
+        return words.split()
+
+    return write
+
+
+LIST = "left.png,right.png\n"
+MANY = "pairs.csv --calib calib.txt --out"
+MAP = np.ones((48, 64), np.float32)
 MOVED = np.eye(4) + 0.12 * np.eye(4, k=3)
 GOOD_K = [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]
 
-#: Kind -> what is done in a folder with a good pair and calibration, and the words behind ``geodiff depth``.
+#: Kind -> what is done in a folder with a good pair and calibration, and the words behind ``geodiff depth``;
+#: or behind ``geodiff`` where the first one is another command.
 KINDS: dict[str, Callable[[Path], Words]] = {
     # options
     "steps-zero": _with("--steps", 0),
-    "steps-negative": _with("--steps", -3),
-    "steps-many": _with("--steps", 100_000),
     "ensemble-zero": _with("--ensemble", 0),
     "resolution-odd": _with("--resolution", 100),
-    "resolution-small": _with("--resolution", 8),
     "resolution-huge": _with("--resolution", 80_000),
-    "seed-negative": _with("--seed", -1),
-    "seed-beyond": _with("--seed", 2**63),
     "seed-endless": _with("--seed", 10**60),
     "near-alone": _with("--near", 1),
     "far-alone": _with("--far", 9),
     "near-beyond-far": _with("--near", 5, "--far", 2),
-    "near-nan": _with("--near", "nan", "--far", 2),
-    "far-infinite": _with("--near", 1, "--far", "inf"),
     "near-zero": _with("--near", 0, "--far", 2),
-    "near-is-far": _with("--near", 2, "--far", 2),
     "device-unknown": _with("--device", "tpu"),
-    "device-meta": _with("--device", "meta"),
     "device-not-here": _with("--device", "cuda"),
-    "device-number": _with("--device", "cuda:99"),
     "dtype-unknown": _with("--dtype", "float64"),
-    "preset-unknown": _with("--preset", "best"),
-    "space-unknown": _with("--space", "banana"),
-    "cameras-one": _with("--cameras", "2"),
-    "cameras-same": _with("--cameras", "2,2"),
     "cameras-words": _with("--cameras", "left,right"),
     "cameras-of-two": _with("--cameras", "0,1"),
     "cameras-without-file": _bare(*CAMERA, "--cameras", "2,3"),
@@ -163,9 +172,7 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "knob-form": _with("--knob", "inner_steps"),
     "knob-unknown": _with("--knob", "speed=9"),
     "knob-range": _with("--knob", "inner_steps=-1"),
-    "knob-weight": _with("--knob", "weights.smooth=1"),
     "knob-type": _with("--knob", "crisp=maybe"),
-    "knob-nested": _with("--knob", "smoothness=" + "[" * 100_000),
     "knob-depth-range": _with("--knob", "depth_range=[1,2]"),
     "paper-with-points": _with("--preset", "paper", "--points", "calib.txt"),
     "paper-with-view": _with("--preset", "paper", "--view", "left.png"),
@@ -173,10 +180,6 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "known-length-alone": _with("--known-length", "1,2,3,4,5"),
     "matcher-alone": _with("--matcher", "sift"),
     "known-length-short": _bare("--estimate-pose", *CAMERA[:-2], "--known-length", "1,2,3"),
-    "known-length-words": _bare("--estimate-pose", *CAMERA[:-2], "--known-length", "a,b,c,d,e"),
-    "warm-start-of-one": _with("--warm-start"),
-    "export-unknown": _with("--export", "fbx"),
-    "show-unknown": _with("--show", "blender"),
     "points-scale-alone": _with("--points-scale", 256),
     "points-calib-alone": _with("--points-calib", "calib.txt"),
     # calibration, chosen
@@ -185,29 +188,20 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "calibration-parts": _bare("--fx", 60, "--baseline", 0.12),
     "calibration-pair": _with("--calib", "left.png"),
     "fx-zero": _camera(fx=0),
-    "fy-negative": _camera(fy=-60),
-    "fx-nan": _camera(fx="nan"),
     "cx-outside": _camera(cx=131.5),
-    "cx-infinite": _camera(cx="inf"),
     "baseline-zero": _camera(baseline=0),
-    "baseline-nan": _camera(baseline="nan"),
     "K-alone": lambda f: _matrices()(f)[:4],
     "E-alone": lambda f: [*_matrices()(f)[:2], "--E", "E.txt"],
     "K-shape": _matrices(K=np.eye(4)),
-    "K-focal": _matrices(K=_changed(GOOD_K, (0, 0), 0)),
     "K-nan": _matrices(K=_changed(GOOD_K, (1, 1), np.nan)),
     "K-decimal-commas": _matrices(K_right="60,5 0 31,5\n0 60,5 23,5\n0 0 1\n"),
-    "K-without-numbers": _matrices(K_right="# fx 0 cx\n"),
     "K-last-row": _matrices(K=_changed(GOOD_K, (2, 0), 1)),
     "K-of-another-size": _matrices(K=4 * np.diag([60, 60, 0.25]) + 128 * np.eye(3, k=2)),
     "K-right-outside": _matrices(K_right="60 0 500\n0 60 23.5\n0 0 1\n"),
-    "E-last-row": _matrices(E=_changed(MOVED, (3, 0), 0.5)),
     "E-image": lambda f: [*_matrices()(f)[:4], "--E", "left.png"],
     "K-right-words": _matrices(K_right="fx fy cx cy"),
     "E-shape": _matrices(E=np.eye(3)),
     "E-ragged": lambda f: [*_matrices()(f)[:4], "--E", (f / "r.txt").write_text("1 0 0\n1 0\n") and "r.txt"],
-    "E-infinite": _matrices(E=_changed(MOVED, (0, 3), np.inf)),
-    "E-scaled": _matrices(E=np.diag([1.0, 1, 1.1, 1])),
     "E-mirrored": _matrices(E=np.diag([1.0, 1, -1, 1])),
     "E-transposed": _matrices(E=MOVED.T),
     "E-still": _matrices(E=np.eye(4)),
@@ -220,12 +214,8 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     # calibration files
     "calib-missing": _bare("--calib", "nothing.txt"),
     "calib-folder": _bare("--calib", "."),
-    "calib-name-too-long": _bare("--calib", "x" * 300),
     "calib-pipe": lambda f: os.mkfifo(f / "pipe") or _bare("--calib", "pipe")(f),
-    "calib-device": _bare("--calib", os.devnull),
     "calib-empty": _calib(b""),
-    "calib-blank": _calib(" \n\n"),
-    "calib-binary": _calib(b"\x00\x01\x02"),
     "calib-words": _calib("my camera is a good one\n"),
     "calib-middlebury-cut": _calib("cam0=[700 0 320; 0 700\n"),
     "calib-middlebury-no-baseline": _calib(
@@ -254,10 +244,7 @@ KINDS: dict[str, Callable[[Path], Words]] = {
         *_calib(f"distortion_model: plumb_bob\nP: [{P.format(-84).replace(' ', ', ')}]\n", "r.yaml")(f)[2:],
     ],
     "distortion-of-rectified": _with("--distortion", "-0.1,0,0,0"),
-    "distortion-short": _bare(*CAMERA, "--distortion", "0.1"),
     "distortion-fisheye-short": _bare(*CAMERA, "--distortion", "fisheye:1,2,3"),
-    "distortion-words": _bare(*CAMERA, "--distortion", "a,b,c,d"),
-    "distortion-unknown": _bare(*CAMERA, "--distortion", "lens:1,2,3,4"),
     "calib-middlebury-still": _calib(
         "cam0=[60 0 32; 0 60 24; 0 0 1]\ncam1=[60 0 32; 0 60 24; 0 0 1]\ndoffs=0\nbaseline=0\nwidth=64\n"
         "height=48\n"
@@ -270,14 +257,8 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "calib-nerf-scaled": _calib(NERF.replace("[1, 0, 0, 0.12]", "[1.5, 0, 0, 0.12]")),
     "calib-nerf-of-another-size": _calib(NERF.replace("64", "128").replace("48", "96")),
     "calib-mvsnet-one": _calib("extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
-    "calib-of-another-size": _calib(
-        "cam0=[60 0 32; 0 60 24; 0 0 1]\ncam1=[60 0 32; 0 60 24; 0 0 1]\ndoffs=0\nbaseline=120\nwidth=128\n"
-        "height=96\n"
-    ),
     # images
-    "left-name-too-long": _all("x" * 300 + ".png", "right.png", "--calib", "calib.txt"),
     "left-missing": _all("nothing.png", "right.png", "--calib", "calib.txt"),
-    "right-missing": _all("left.png", "nothing.png", "--calib", "calib.txt"),
     "left-folder": _all(".", "right.png", "--calib", "calib.txt"),
     "left-text": _all("calib.txt", "right.png", "--calib", "calib.txt"),
     "left-cut": _image(_cut),
@@ -294,20 +275,14 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "view-K-of-another-size": _view(K=4.0 * np.diag([60.0, 60.0, 0.25]) + 128.0 * np.eye(3, k=2)),
     "view-is-right": _view(which="right.png"),
     "view-missing": _view(which="none.png"),
-    "paper-with-posed-view": _view("--preset", "paper"),
     "view-without-pose": _with("--view", "calib.txt"),
     "pose-without-view": _with("--view-E", "calib.txt"),
     # points
-    "points-name-too-long": _with("--points", "x" * 300),
     "points-decimal-commas": _points("1,5;2,5;3,0\n"),
-    "points-decimal-commas-and-blanks": _points("1,5 2,5 3,0\n"),
     "points-of-pixels": _points("u,v,depth\n10,20,3\n"),
     "points-with-words": _points("1 2 3\n1 2 car\n"),
     "points-with-too-few-cells": _points("id,x,y,z\n0,1,2,3\n1,2\n"),
-    "points-missing": _with("--points", "nothing.npy"),
-    "points-empty": _points(b""),
     "points-words": _points("lidar\n"),
-    "points-ragged": _points("1 2 3\n1 2\n"),
     "points-two-columns": _points("1 2\n3 4\n"),
     "points-pickled": _points(b"\x80\x04K\x01.", "points.npy"),
     "points-cut": _points(b"\x93NUMPY\x01\x00", "points.npy"),
@@ -319,11 +294,48 @@ KINDS: dict[str, Callable[[Path], Words]] = {
     "points-scale-zero": _points("0 0 2\n", "points.txt", "--points-scale", 0),
     # output
     "out-file": _with("--out", "left.png"),
-    "out-below-file": _with("--out", "left.png/out"),
     "out-full": _with("--out", "."),
     "out-long": _with("--out", "x" * 300),
     "out-of-its-input": lambda f: [
         *_out(lambda f: (f / "res").mkdir() or np.save(f / "res" / "depth.npy", np.ones((48, 64))), "res")(f),
         *("--points", "res/depth.npy", "--overwrite"),
     ],
+    # many pairs
+    "many-list-empty": _command(f"{MANY} out", pairs_csv="\n"),
+    "many-list-short": _command(f"{MANY} out", pairs_csv="a.png\n"),
+    "many-list-long": _command(f"{MANY} out", pairs_csv=f"{LIST}a.png,b.png,c,d\n"),
+    "many-no-partner": _command("l r --out out", l={"a.png": "", "b.png": ""}, r={"b.png": ""}),
+    "many-no-images": _command("l r --out out", l={"a.txt": ""}, r={"b.png": ""}),
+    "many-one-folder": _command("l --out out", l={"a.png": ""}),
+    "many-view": _command(f"{MANY} out --view x.png", pairs_csv=LIST),
+    "many-calib-gone": _command("pairs.csv --calib gone.txt --out out", pairs_csv=LIST),
+    "many-calibration-none": _command("pairs.csv --out out", pairs_csv=LIST),
+    "many-steps": _command(f"{MANY} out --steps 0", pairs_csv=LIST),
+    "many-out-of-one-pair": _command(f"{MANY} one", pairs_csv=LIST, one={"report.json": "{}"}),
+    "many-own-table": _command(f"{MANY} mine --overwrite", pairs_csv=LIST, mine={"pairs.csv": LIST}),
+    "many-out-file": _command(f"{MANY} calib.txt", pairs_csv=LIST),
+    "many-prior-map": _command(f"{MANY} out --prior-map maps", pairs_csv=LIST, maps={"right.npy": ""}),
+    # other commands
+    "video-suffix": _command("video 0.npy --out depth.avi", **{"0_npy": MAP}),
+    "video-no-folder": _command("video 0.npy --out no/depth.gif", **{"0_npy": MAP}),
+    "video-missing": _command("video 0.npy nothing.npy", **{"0_npy": MAP}),
+    "video-of-two-sizes": _command("video 0.npy 1.npy", **{"0_npy": MAP, "1_npy": MAP[:4, :4]}),
+    "video-near-beyond-far": _command("video 0.npy --near 3 --far 2", **{"0_npy": MAP}),
+    "video-fps": _command("video 0.npy --fps 0", **{"0_npy": MAP}),
+    "video-integers": _command("video 0.npy", **{"0_npy": MAP.astype(int)}),
+    "video-picture": _command("video left.png"),
+    "info-space-alone": _command("info --space depth"),
+    "info-space-unknown": _command("info --prior bundled --space banana"),
+    "info-prior-missing": _command("info --prior ./nothing"),
+    "submit-unknown": _command("submit . --to kitti --out sent"),
+    "submit-nothing": _command("submit . --to eth3d --out sent"),
+    "convert-one-path": _command("convert one"),
+    "convert-other-words": _command("convert marigold a b c"),
+    "convert-space": _command("convert calib.txt out --space log"),
+    "convert-no-parent": _command("convert calib.txt a/b"),
+    "convert-name-too-long": _command(f"convert calib.txt {'x' * 300}"),
+    "convert-there": _command("convert calib.txt left.png"),
+    "convert-missing": _command("convert no.ckpt out"),
+    "convert-text": _command("convert calib.txt out"),
+    "convert-folder-without-bin": _command("convert theirs out", theirs={"model.safetensors": ""}),
 }

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,12 +13,20 @@ from PIL import Image
 
 from geodiff_plugin.cli.app import main
 
+#: One update of one step: for tests of everything but the depth.
+QUICK = ["--steps", "1", "--preset", "paper", "--device", "cpu"]
 
-@dataclass(frozen=True)
-class Answer:
-    code: int
-    out: str
-    err: str
+
+def never(*_, **__):
+    raise AssertionError("the work was begun")
+
+
+def stop(*_, **__):
+    raise KeyboardInterrupt
+
+
+def report_of(folder: str | Path = "geodiff-out") -> dict:
+    return json.loads(Path(folder, "report.json").read_text())
 
 
 @dataclass(frozen=True)
@@ -36,20 +46,18 @@ class PairFiles:
     def command(self) -> list[str]:
         return [*self.images, "--calib", str(self.calib)]
 
-    def write_calibration(self, K: np.ndarray, baseline_m: float, size: tuple[int, int]) -> None:
-        """In Middlebury's format; ``size`` is (width, height)."""
-        camera = f"[{K[0, 0]} 0 {K[0, 2]}; 0 {K[1, 1]} {K[1, 2]}; 0 0 1]"
-        self.calib.write_text(
-            f"cam0={camera}\ncam1={camera}\ndoffs=0\nbaseline={1000 * baseline_m}\n"
-            f"width={size[0]}\nheight={size[1]}\nndisp=64\n"
-        )
-
 
 def write_pair(folder: Path, pair) -> PairFiles:
+    """Images, and a calibration in Middlebury's format."""
     files = PairFiles(folder, folder / "left.png", folder / "right.png", folder / "calib.txt")
     Image.fromarray(pair.left).save(files.left)
     Image.fromarray(pair.right).save(files.right)
-    files.write_calibration(pair.K, pair.E[0, 3], (pair.left.shape[1], pair.left.shape[0]))
+    K, (height, width) = pair.K, pair.left.shape[:2]
+    camera = f"[{K[0, 0]} 0 {K[0, 2]}; 0 {K[1, 1]} {K[1, 2]}; 0 0 1]"
+    files.calib.write_text(
+        f"cam0={camera}\ncam1={camera}\ndoffs=0\nbaseline={1000 * pair.E[0, 3]}\n"
+        f"width={width}\nheight={height}\nndisp=64\n"
+    )
     return files
 
 
@@ -68,6 +76,11 @@ def pair_files(tmp_path, textured_plane, monkeypatch) -> PairFiles:
     return write_pair(tmp_path, textured_plane)
 
 
+@pytest.fixture
+def command(pair_files, prior) -> list[str]:
+    return [*pair_files.command, "--prior", prior, "--device", "cpu"]
+
+
 def call(words) -> int:
     """Run the command in this process; its exit code."""
     with pytest.raises(SystemExit) as leaving:
@@ -79,11 +92,11 @@ def call(words) -> int:
 def geodiff(capsys):
     """Call it with arguments; returns exit code, stdout and stderr."""
 
-    def run(*arguments: object) -> Answer:
+    def run(*arguments: object) -> SimpleNamespace:
         capsys.readouterr()
         code = call(arguments)
         captured = capsys.readouterr()
-        return Answer(code, captured.out, captured.err)
+        return SimpleNamespace(code=code, out=captured.out, err=captured.err)
 
     return run
 
@@ -94,17 +107,12 @@ def result(prior, textured_plane, tmp_path_factory):
     folder = tmp_path_factory.mktemp("result")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        write_pair(folder, textured_plane)
-        words = [
-            "depth",
-            "left.png",
-            "right.png",
-            "--calib",
-            "calib.txt",
-            "--prior",
-            prior,
-            "--device",
-            "cpu",
-        ]
-        assert call([*words, "--export", "glb", "--export", "colmap", "-q"]) == 0
+        words = write_pair(Path(), textured_plane).command
+        words += ["--prior", prior, "--device", "cpu", "--export", "glb", "--export", "colmap", "-q"]
+        assert call(words) == 0
     return folder
+
+
+def save_maps(folder: Path, **maps: np.ndarray) -> None:
+    for name, values in maps.items():
+        np.save(folder / f"{name}.npy", values)

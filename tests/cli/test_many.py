@@ -22,11 +22,10 @@ from geodiff_plugin.cli import many
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.pairs import assumption, find_pairs
 from geodiff_plugin.formats.video import VideoReader, both_halves, count_frames
-from tests.cli.conftest import call, write_pair
+from tests.cli.conftest import QUICK, call, never, report_of, write_pair
 
-#: One update of one step: for tests of everything but the depth.
-QUICK = ["--steps", "1", "--preset", "paper", "--device", "cpu"]
 COMMAND = ["depth", "left", "right", "--calib", "calib.txt", "--prior", "prior", "--out", "out", *QUICK]
+DEPTHS = [Path("out", name, "depth.npy") for name in "abc"]
 
 
 def write_folders(root: Path, pair, names) -> None:
@@ -39,9 +38,8 @@ def write_folders(root: Path, pair, names) -> None:
 
 @pytest.fixture(scope="module")
 def made(textured_plane, prior, tmp_path_factory):
-    """A folder of three pairs, and of a run over them in ``out`` and ``answer.txt``; to be copied."""
-    root = tmp_path_factory.mktemp("many")
-    threads = torch.get_num_threads()
+    """A folder of three pairs, and of a run over them in ``out``; to be copied."""
+    root, threads = tmp_path_factory.mktemp("many"), torch.get_num_threads()
     torch.set_num_threads(1)  # half of several cores add up to other last digits than all of them
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
@@ -69,28 +67,13 @@ def fresh(finished):
     return finished
 
 
-def rows_of(out: Path):
-    with open(out / "pairs.csv", newline="") as file:
+def rows_of(out: str = "out"):
+    with open(Path(out, "pairs.csv"), newline="") as file:
         return list(csv.DictReader(file))
 
 
 def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def report_of(name: str) -> dict:
-    return json.loads(Path("out", name, "report.json").read_text())
-
-
-def cut(path: Path) -> bytes:
-    """Damage an image; what it held."""
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    return whole
-
-
-def never(*_, **__):
-    raise AssertionError("weights were loaded before the input was checked")
 
 
 # Which pairs
@@ -110,67 +93,22 @@ def test_folders_go_by_name_else_by_order_in_which_numbers_count(tmp_path, textu
         path.rename(path.with_stem(f"{path.stem}_R"))
     refs = find_pairs(options)
     assert [ref.right.name for ref in refs] == ["f1_R.png", "f2_R.png", "f10_R.png"]
-    said = assumption(refs, options)
-    assert "f1.png with f1_R.png, and so on to f10.png with f10_R.png" in said
-    (right / "f2_R.png").rename(right / "f2.png")
-    (left / "f1.png").unlink()
-    with pytest.raises(InputError, match="f10 has no partner"):
-        names_of(left, right)
+    assert "f1.png with f1_R.png, and so on to f10.png with f10_R.png" in assumption(refs, options)
 
 
 def test_lists_by_comma_tab_or_blank(tmp_path):
     listed = tmp_path / "pairs.txt"
     listed.write_text(
-        "left,right,calib\n# a comment\n\none/im 0.png,one/im1.png,one/calib.txt\n"
+        "left_image,right_image,calib\n# a comment\n\none/im 0.png,one/im1.png,one/calib.txt\n"
         "two/im 0.png\ttwo/im1.png\nthree/x.png three/y.png\nthree/x.png three/z.png\n"
+        '"left #1, a.png",right#1.png\n'
     )
     refs = find_pairs(DepthOptions(left=listed))
-    assert [ref.name for ref in refs] == ["one_im 0", "two_im 0", "three_x", "three_x-2"]
+    assert [ref.name for ref in refs] == ["one_im 0", "two_im 0", "three_x", "three_x-2", "left #1, a"]
     assert refs[0].calib == tmp_path / "one" / "calib.txt" and refs[1].calib is None
-    assert refs[2].right == tmp_path / "three" / "y.png"
-
-
-@pytest.mark.parametrize(
-    ("heading", "names"),
-    [
-        ("left_image,right_image,calib", ["a"]),
-        ("Left\tRight", ["a"]),
-        ("left.png,right.png", ["left", "a"]),  # a pair, also where its files are missing
-        ("left/0.png,right/0.png", ["0", "a"]),
-        ("leftmost,right", ["leftmost", "a"]),  # a file of that name is there
-        ("image,right", ["image", "a"]),
-    ],
-)
-def test_a_heading_begins_with_left_and_names_no_file(tmp_path, heading, names):
-    (tmp_path / "leftmost").touch()
-    (tmp_path / "pairs.csv").write_text(f"{heading}\na.png,b.png\n")
-    assert names_of(tmp_path / "pairs.csv") == names
-
-
-@pytest.mark.parametrize(
-    ("line", "cells"),
-    [
-        ("le, ft.png\tri, ght.png", ["le, ft.png", "ri, ght.png"]),  # tabs come first
-        ("a.png b.png\t#second, third", ["a.png", "b.png"]),
-        ("left#1.png,right#1.png", ["left#1.png", "right#1.png"]),
-        ('"left #1.png","right #1.png" # quoted', ["left #1.png", "right #1.png"]),
-    ],
-)
-def test_commas_in_names_and_comments_behind_a_line(tmp_path, line, cells):
-    listed = tmp_path / "pairs.tsv"
-    listed.write_text(f"{line}\n")
-    (ref,) = find_pairs(DepthOptions(left=listed))
-    assert [ref.left, ref.right, ref.calib] == [*(tmp_path / cell for cell in cells), None]
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [("\n", "with a pair a line"), ("a.png\n", "line 1 of"), ("a.png,b.png\na.png,b.png,c,d\n", "line 2 of")],
-)
-def test_lists_that_are_none(tmp_path, text, told):
-    (tmp_path / "pairs.csv").write_text(text)
-    with pytest.raises(InputError, match=told):
-        names_of(tmp_path / "pairs.csv")
+    assert refs[2].right == tmp_path / "three" / "y.png" and refs[4].left.name == "left #1, a.png"
+    listed.write_text("left.png,right.png\n")  # a pair, also where its files are missing
+    assert names_of(listed) == ["left"]
 
 
 # Runs
@@ -179,14 +117,11 @@ def test_lists_that_are_none(tmp_path, text, told):
 def test_two_folders_give_what_single_runs_give(geodiff, finished):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    assert (
-        geodiff("depth", "left/b.png", "right/b.png", *COMMAND[3:7], *QUICK, "-q", "-o", "single").code == 0
-    )
+    assert geodiff("depth", "left/b.png", "right/b.png", *COMMAND[3:7], *QUICK, "-q", "-o", "one").code == 0
     torch.set_num_threads(threads)
-    both = [np.load(f"{name}/depth.npy") for name in ("out/b", "single")]
-    np.testing.assert_array_equal(*both)
-    assert [row["pair"] for row in rows_of(Path("out"))] == ["a", "b", "c"]
-    assert sorted(os.listdir("out/b")) == sorted(os.listdir("single"))
+    np.testing.assert_array_equal(*(np.load(f"{name}/depth.npy") for name in ("out/b", "one")))
+    assert [row["pair"] for row in rows_of()] == ["a", "b", "c"]
+    assert sorted(os.listdir("out/b")) == sorted(os.listdir("one"))
 
 
 def test_warnings_are_those_of_every_pair_and_said_once(geodiff, fresh):
@@ -196,42 +131,38 @@ def test_warnings_are_those_of_every_pair_and_said_once(geodiff, fresh):
     answer = geodiff(*COMMAND)
     assert answer.code == 0 and answer.err.count("for the right image") == 1, answer.err
     assert "3 pairs: 3 done, 0 there already, 0 failed" in answer.out and "3/3" in answer.err
-    assert all("for the right image" in report_of(name)["warnings"][0] for name in "abc")
+    assert all("for the right image" in report_of(f"out/{name}")["warnings"][0] for name in "abc")
 
 
 def test_finished_pairs_are_skipped_and_overwrite_does_them_anew(geodiff, finished):
-    made = {name: (finished / "out" / name / "depth.npy").stat().st_mtime_ns for name in "abc"}
+    made = [path.stat().st_mtime_ns for path in DEPTHS]
     for path in (finished / "out" / "b").iterdir():
         path.unlink()
     answer = geodiff(*COMMAND)
     assert answer.code == 0 and "1 done, 2 there already" in answer.out
-    now = {name: (finished / "out" / name / "depth.npy").stat().st_mtime_ns for name in "abc"}
-    assert {name for name in "abc" if now[name] != made[name]} == {"b"}
+    now = [path.stat().st_mtime_ns for path in DEPTHS]
+    assert [a == b for a, b in zip(made, now, strict=True)] == [True, False, True]
     assert "3 done, 0 there already" in geodiff(*COMMAND, "--overwrite").out
 
 
-def test_results_of_other_options_or_files_are_not_taken_for_these(geodiff, finished, textured_plane):
+def test_results_of_other_options_or_files_are_not_taken_for_these(geodiff, finished):
     (finished / "out" / "b" / "report.json").unlink()  # so that there is something to do
     before = contents(finished / "out")
     answer = geodiff(*COMMAND, "--seed", 1)
     assert answer.code == 2 and "a, made with --seed 0 instead of 1. Name another" in answer.err
-    assert before == contents(finished / "out") and answer.err.count("\n") == 1
-    calib = finished / "calib.txt"
     for changed in (Path("right", "a.png"), Path("calib.txt")):
         whole = changed.read_bytes()
         changed.write_bytes(whole + b"\n")
         answer = geodiff(*COMMAND)
         assert answer.code == 2 and answer.err.count("\n") == 1
         assert f"same files; got {Path('out', 'a')}, made before {changed} changed. Name" in answer.err
-        assert before == contents(finished / "out")
         changed.write_bytes(whole)
-    calib.write_text(calib.read_text().replace("baseline=1", "baseline=2"))
-    assert "3 done, 0 there already" in geodiff(*COMMAND, "--overwrite").out
+    assert before == contents(finished / "out")
 
 
 def test_a_finished_pair_is_judged_with_strict(geodiff, finished):
     for name, status in (("a", "trusted"), ("b", "not trusted"), ("c", "trusted")):
-        report = report_of(name)
+        report = report_of(f"out/{name}")
         report["verdict"] |= {"status": status, "reasons": ["E is wrong."]}
         Path("out", name, "report.json").write_text(json.dumps(report))
     answer = geodiff(*COMMAND)
@@ -239,94 +170,67 @@ def test_a_finished_pair_is_judged_with_strict(geodiff, finished):
     answer = geodiff(*COMMAND, "--strict")
     assert answer.code == 4 and "2 there already, 1 failed" in answer.out
     assert f"geodiff: b: The depth in {Path('out', 'b')} is not trusted: E is wrong." in answer.err
-    assert [row["result"] for row in rows_of(Path("out"))] == ["there", "failed", "there"]
+    assert [row["result"] for row in rows_of()] == ["there", "failed", "there"]
 
 
 def test_a_broken_pair_and_a_defect_are_reported_and_the_rest_go_on(geodiff, fresh, monkeypatch):
-    write = many.write_result
+    write = many.Job.write
 
-    def broken(options, *rest):
-        if options.out.name == "a":
+    def broken(job, *rest, **entries):
+        if job.folder.path.name == "a":
             raise KeyError("nobody thought of this")
-        return write(options, *rest)
+        return write(job, *rest, **entries)
 
-    monkeypatch.setattr(many, "write_result", broken)
-    cut(fresh / "right" / "b.png")
+    monkeypatch.setattr(many.Job, "write", broken)
+    image = fresh / "right" / "b.png"
+    image.write_bytes(image.read_bytes()[:1000])
     answer = geodiff(*COMMAND)
     assert answer.code == 4 and "geodiff: b: RIGHT must be a whole image file" in answer.err
     assert answer.err.count("Traceback") == 1 and "nobody thought of this" in answer.err
     assert "1 done, 0 there already, 2 failed" in answer.out
-    assert [row["result"] for row in rows_of(Path("out"))] == ["failed", "failed", "done"]
+    assert [row["result"] for row in rows_of()] == ["failed", "failed", "done"]
     assert not (fresh / "out" / "b").exists()
 
 
-@pytest.mark.parametrize("fault", ["calibration", "size", "cut off"])
+@pytest.mark.parametrize("fault", ["calibration", "images"])
 def test_what_fails_all_pairs_is_said_once_before_the_prior_is_loaded(geodiff, fresh, monkeypatch, fault):
     monkeypatch.setattr(many, "load_guided_prior", never)
-    calib = fresh / "calib.txt"
-    if fault == "calibration":
-        calib.write_text("no calibration")
-    elif fault == "size":
-        calib.write_text(calib.read_text().replace("width=", "width=9"))
-    else:
-        for path in (fresh / "right").iterdir():
-            cut(path)
+    for path in [fresh / "calib.txt"] if fault == "calibration" else (fresh / "right").iterdir():
+        path.write_bytes(path.read_bytes()[:60])
     answer = geodiff(*COMMAND)
     assert answer.code == 2 and answer.err.count("geodiff: ") == 1, answer.err
     assert "The same holds for all 3 pairs; nothing was computed." in answer.err
     assert not (fresh / "out").exists() and not list(fresh.glob(".out*"))
 
 
-def test_pairs_that_fail_for_several_reasons_are_reported_each(geodiff, fresh):
-    for path in ("left/a.png", "right/b.png", "right/c.png"):
-        Path(path).write_bytes(b"no image")
-    answer = geodiff(*COMMAND)
-    assert answer.code == 4 and answer.err.count("geodiff: ") == 3, answer.err
-    assert [row["result"] for row in rows_of(Path("out"))] == ["failed"] * 3
-
-
-def test_a_list_with_a_calibration_each(geodiff, fresh):
+def test_a_list_with_a_calibration_each_and_maps_of_another_model(geodiff, fresh):
     Path("pairs.csv").write_text("left/a.png,right/a.png,calib.txt\nleft/b.png,right/b.png,calib.txt\n")
-    answer = geodiff("depth", "pairs.csv", *COMMAND[5:], "--json")
+    Path("maps").mkdir()
+    for name in "ab":
+        np.save(f"maps/{name}.npy", np.add.outer(np.arange(24.0), np.ones(32)))
+    words = [
+        "depth",
+        "pairs.csv",
+        *COMMAND[7:9],
+        "--prior-map",
+        "maps",
+        *QUICK[4:],
+        "--knob",
+        "inner_steps=0",
+    ]
+    answer = geodiff(*words, "--json")
     assert answer.code == 0, answer.err
     assert [row["pair"] for row in json.loads(answer.out)] == ["a", "b"]
-    assert report_of("a")["arguments"]["calib"] == ["calib.txt"]
+    assert report_of("out/a")["arguments"]["calib"] == ["calib.txt"]
+    np.save("maps/b.npy", np.add.outer(np.ones(24), np.arange(32.0)))
+    answer = geodiff(*words)  # a map that changed is another input
+    assert answer.code == 2 and "b.npy changed" in answer.err
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["--show", "auto"], "--show must be left out with many pairs"),
-        (["--view", "x.png"], "--view must be left out"),
-        (["--steps", 0], "--steps"),
-        (["--warm-start"], "--warm-start must be given with the default preset"),
-        (["--calib", "gone.txt"], "gone.txt"),
-        (["--out", "one"], "holds the result of one pair"),
-        (["--out", "mine", "--overwrite"], "pairs.csv, which is not the table of an earlier run"),
-        (["--out", "odd", "--overwrite"], "pairs.csv, which is a folder"),
-        (["--out", "calib.txt"], "--out must be a folder"),
-    ],
-)
-def test_what_is_refused_at_once(geodiff, fresh, monkeypatch, words, told):
-    monkeypatch.setattr(many, "load_guided_prior", never)
-    for path, text in (
-        ("one/report.json", "{}"),
-        ("mine/pairs.csv", "left,right\n"),
-        ("odd/pairs.csv/x", ""),
-    ):
-        Path(path).parent.mkdir(parents=True)
-        Path(path).write_text(text)
-    before = contents(fresh)
-    answer = geodiff(*COMMAND, *words)
-    assert answer.code == 2 and told in answer.err and contents(fresh) == before
-
-
-def test_the_list_itself_is_not_replaced_by_the_table(geodiff, fresh):
-    Path("out").mkdir()
-    Path("out/pairs.csv").write_text("../left/a.png,../right/a.png\n")
-    Path("list.csv").symlink_to("out/pairs.csv")
-    answer = geodiff("depth", "list.csv", *COMMAND[3:])
-    assert answer.code == 2 and "not the table of an earlier run" in answer.err
+def test_a_prior_that_does_not_load_ends_the_run(geodiff, fresh):
+    (fresh / "prior" / "model_index.json").write_text("{}")
+    answer = geodiff(*COMMAND)
+    assert answer.code == 2 and answer.err.count("geodiff: ") == 1, answer.err
 
 
 def test_a_folder_that_takes_no_file_is_refused_before_the_work(geodiff, fresh, monkeypatch):
@@ -351,64 +255,12 @@ def test_a_table_that_cannot_be_written_in_the_end_is_shown(geodiff, finished, m
     assert answer.err.splitlines()[-1] == told
 
 
-@pytest.mark.parametrize("when", ["writing", "taking the folder"])
-def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(geodiff, fresh, monkeypatch, when):
-    write, take = many.write_result, many.out_folder_of
-
-    def full(function):
-        def fails(options, *rest):
-            if options.out.name == "b":
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return function(options, *rest)
-
-        return fails
-
-    before = set(fresh.iterdir())
-    if when == "writing":
-        monkeypatch.setattr(many, "write_result", full(write))
-    else:
-        usage = shutil.disk_usage
-        monkeypatch.setattr(many, "out_folder_of", take)
-        monkeypatch.setattr(
-            "geodiff_plugin.formats.out.shutil.disk_usage",
-            lambda path: usage(path)._replace(free=10**9 if not Path("out/a").exists() else 1000),
-        )
-    answer = geodiff(*COMMAND)
-    if when == "writing":
-        assert answer.code == 2 and "is full (No space left on device). Finished pairs stay" in answer.err
-        assert (fresh / "out" / "a" / "report.json").exists() and not (fresh / "out" / "b").exists()
-    assert answer.err.count("No space left") <= 1, answer.err
-    assert set(fresh.iterdir()) - before == {fresh / "out"}
-    monkeypatch.undo()
-    monkeypatch.chdir(fresh)
-    assert geodiff(*COMMAND).code == 0
-
-
-def test_warm_start_goes_from_frame_to_frame(geodiff, fresh):
-    """And begins anew behind a pair that has no result of this run."""
-    words = [*COMMAND[:9], "--steps", 4, "--device", "cpu", "--warm-start", "--knob", "corrections=4", "-q"]
-    assert geodiff(*words).code == 0
-    reports = [report_of(name) for name in "abc"]
-    assert [report["pair"]["began_from"] for report in reports] == [None, "a", "b"]
-    assert [len(report["history"]) for report in reports] == [4, 3, 3]
-    for name in "ac":
-        shutil.rmtree(fresh / "out" / name)
-    assert geodiff(*words).code == 0 and report_of("c")["pair"]["began_from"] is None, "b was there already"
-    whole = cut(fresh / "right" / "b.png")  # fails before the guided call
-    assert geodiff(*words, "--overwrite").code == 4 and report_of("c")["pair"]["began_from"] is None
-    (fresh / "right" / "b.png").write_bytes(whole)
-    answer = geodiff("depth", "left/a.png", "right/a.png", *COMMAND[3:], "--warm-start")
-    assert answer.code == 2 and "--warm-start must be given with many pairs" in answer.err
-    answer = geodiff("depth", "left", "right", "--out", "new")
-    assert answer.code == 2 and "calibration must be given" in answer.err and not (fresh / "new").exists()
-
-
 # Videos
 
 
-def write_video(path: Path, frames) -> None:
+def write_video(path: str, frames) -> None:
     height, width = frames[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (width, height))
+    writer = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"MJPG"), 10, (width, height))
     assert writer.isOpened()
     for frame in frames:
         writer.write(np.ascontiguousarray(frame[..., ::-1]))
@@ -421,9 +273,10 @@ def views(textured_plane):
 
 
 def test_frames_are_read_in_any_order(tmp_path, views):
-    write_video(tmp_path / "left.avi", views[0] * 2)
-    assert count_frames(tmp_path / "left.avi") == 4
-    with VideoReader(tmp_path / "left.avi") as video:
+    path = tmp_path / "left.avi"
+    write_video(str(path), views[0] * 2)
+    assert count_frames(path) == 4
+    with VideoReader(path) as video:
         for frame in (0, 3, 2):
             read = video.read(frame)
             assert read.shape == views[0][0].shape and read.dtype == np.float32
@@ -437,21 +290,20 @@ def test_frames_are_read_in_any_order(tmp_path, views):
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_the_video_of_a_rig(geodiff, fresh, textured_plane, views, beside):
-    words, K = COMMAND[3:], textured_plane.K
+def test_the_video_of_a_rig(geodiff, fresh, views, beside):
+    words = COMMAND[3:]
     if beside:
-        write_video(fresh / "rig.avi", [np.concatenate(both, 1) for both in zip(*views, strict=True)])
+        write_video("rig.avi", [np.concatenate(both, 1) for both in zip(*views, strict=True)])
         videos = ["rig.avi"]
-        numbers = {"--fx": K[0, 0], "--fy": K[1, 1], "--cx": K[0, 2], "--cy": K[1, 2], "--baseline": 0.1}
-        words = [*words[2:], *(word for name, value in numbers.items() for word in (name, float(value)))]
+        words = [*"--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.1".split(), *words[2:]]
     else:
         videos = ["l.avi", "r.avi"]
         for name, frames in zip(videos, views, strict=True):
-            write_video(fresh / name, frames)
+            write_video(name, frames)
     answer = geodiff("depth", *videos, *words)
     assert answer.code == 0, answer.err
     assert sorted(os.listdir("out")) == [many.JOURNAL, "000000", "000001", "pairs.csv"]
-    report = report_of("000001")
+    report = report_of("out/000001")
     assert report["pair"]["frame"] == 1 and report["inputs"]["right_size"] == [64, 48]
     answer = geodiff("video", "out/000000", "out/000001", "--photographs", "--out", "depth.gif")
     assert answer.code == 0, answer.err
@@ -478,4 +330,4 @@ def test_two_processes_share_the_pairs(fresh, launcher):
         out, err = process.communicate(timeout=300)
         assert process.returncode == 0, err
         assert "3 pairs: " in out and ", 0 failed" in out and out.count("pairs:") == 1
-    assert {row["result"] for row in rows_of(Path("out"))} <= {"done", "there"}
+    assert {row["result"] for row in rows_of()} <= {"done", "there"}

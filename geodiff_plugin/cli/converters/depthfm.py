@@ -12,8 +12,7 @@ from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.converters.reading import write_card
-from geodiff_plugin.priors.components import FixedPrompt
+from geodiff_plugin.cli.converters import fixed_prompt, write_card
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.loading import check_weights, reading
 
@@ -28,37 +27,25 @@ def unet_config(hparams: Mapping[str, Any]) -> dict[str, Any]:
     """Config of ``UNet2DConditionModel`` for the options of a CompVis ``UNetModel``.
 
     Options that change the weights' names or shapes in another way are noticed when these are loaded.
-
-    Args:
-        hparams: the constructor's arguments, as the checkpoint holds them.
-
-    Raises:
-        ValueError: an option that is missing; naming it.
     """
     try:
-        mults = tuple(hparams.get("channel_mult", (1, 2, 4, 8)))
-        channels = tuple(hparams["model_channels"] * mult for mult in mults)
+        width, mults = hparams["model_channels"], hparams["channel_mult"]
         attends = [2**level in set(hparams["attention_resolutions"]) for level in range(len(mults))]
-        config = {
+        kinds = ["CrossAttn" if attending else "" for attending in attends]
+        return {
             "in_channels": hparams["in_channels"],
             "out_channels": hparams["out_channels"],
             "layers_per_block": hparams["num_res_blocks"],
             "cross_attention_dim": hparams["context_dim"],
+            "block_out_channels": tuple(width * mult for mult in mults),
+            "use_linear_projection": hparams.get("use_linear_in_transformer", False),
+            # diffusers' name for the number of heads, for reasons of its history.
+            "attention_head_dim": hparams["num_heads"],
+            "down_block_types": tuple(f"{kind}DownBlock2D" for kind in kinds),
+            "up_block_types": tuple(f"{kind}UpBlock2D" for kind in reversed(kinds)),
         }
     except KeyError as error:
         bad_value("ldm_hparams", f"a mapping with {error}", f"only {', '.join(sorted(hparams))}")
-    heads, head_width = hparams.get("num_heads", -1), hparams.get("num_head_channels", -1)
-    if heads == head_width == -1:
-        bad_value("ldm_hparams", "with num_heads or num_head_channels", "neither")
-    kinds = ["CrossAttn" if attending else "" for attending in attends]
-    return config | {
-        "block_out_channels": channels,
-        "use_linear_projection": hparams.get("use_linear_in_transformer", False),
-        # diffusers' name for the number of heads, for reasons of its history.
-        "attention_head_dim": heads if head_width == -1 else tuple(c // head_width for c in channels),
-        "down_block_types": tuple(f"{kind}DownBlock2D" for kind in kinds),
-        "up_block_types": tuple(f"{kind}UpBlock2D" for kind in reversed(kinds)),
-    }
 
 
 def _load_unet(state: Mapping[str, Tensor], hparams: Mapping[str, Any]) -> UNet2DConditionModel:
@@ -79,8 +66,6 @@ def _load_unet(state: Mapping[str, Tensor], hparams: Mapping[str, Any]) -> UNet2
 def _load_vae(part: str | None) -> AutoencoderKL:
     source = part or VAE_ID
     expected = "a folder or hub id of Stable Diffusion 1.5, or of its VAE (the checkpoint has none)"
-    if not Path(source).is_dir() and (source.count("/") != 1 or source.startswith((".", "/", "~"))):
-        bad_value("--with", expected, repr(source), "Check the path.")
     subfolder = "" if (Path(source) / "config.json").is_file() else "vae"
     with reading("--with", expected, repr(source), f"Fetch it once: hf download {VAE_ID}."):
         return AutoencoderKL.from_pretrained(source, subfolder=subfolder, use_safetensors=True)
@@ -94,10 +79,8 @@ def recognises(checkpoint: Mapping[str, Any]) -> bool:
 def write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
     """Fill an empty folder; ``part`` is what ``--with`` names."""
     unet = _load_unet(checkpoint["state_dict"], checkpoint["ldm_hparams"])
-    embedding = torch.as_tensor(checkpoint["empty_text_embedding"]).float()
-    embedding = embedding.reshape(1, *embedding.shape[-2:])
-    prompt = FixedPrompt(*embedding.shape[1:])
-    prompt.load_state_dict({"embedding": embedding})
+    embedding = torch.as_tensor(checkpoint["empty_text_embedding"])
+    prompt = fixed_prompt(embedding.reshape(1, *embedding.shape[-2:]))
     noising_step, scheduler = int(checkpoint["noising_step"]), FlowMatchEulerDiscreteScheduler()
     pipe = DepthFMPipeline(unet, _load_vae(part), scheduler, prompt, noising_step=noising_step)
     pipe.save_pretrained(folder)

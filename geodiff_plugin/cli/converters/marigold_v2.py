@@ -16,17 +16,28 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.cli.converters.reading import read_checkpoint, renamed, save_weights, write_card
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.cli.converters import fixed_prompt, read_checkpoint, renamed, save_weights, write_card
 from geodiff_plugin.priors.components import FixedPrompt
 from geodiff_plugin.priors.loading import check_weights
 from geodiff_plugin.priors.marigold_v2 import SPACE_OF_CHECKPOINT, MarigoldV2Pipeline
-from geodiff_plugin.scale.space import SPACES
 
 MARIGOLD_V2 = "marigold-v2"
 TRAINABLES = "trainables.safetensors"
 PROMPT_FOLDER, PROMPT = "qwen_text_embeddings", "qwen_edit_2509_qwen_depth_realimg512"
 INDEX = "diffusion_pytorch_model.safetensors.index.json"
+#: What loads the parts that are written, but for the space; they are never in memory together.
+INDEX_OF_PRIOR: dict[str, Any] = {
+    "_class_name": MarigoldV2Pipeline.__name__,
+    "_diffusers_version": diffusers_version,
+    "transformer": ["diffusers", "QwenImageTransformer2DModel"],
+    "vae": ["diffusers", "AutoencoderKLQwenImage"],
+    "scheduler": ["diffusers", "FlowMatchEulerDiscreteScheduler"],
+    "prompt": [FixedPrompt.__module__, FixedPrompt.__name__],
+    "sample_latent": False,
+    "default_denoising_steps": 1,
+    "default_processing_resolution": 768,
+}
 #: Component in the checkpoint -> folder in the base.
 FOLDERS = {"Diffuser": "transformer", "VAE": "vae"}
 #: Names in the checkpoint -> those in the base, of a LoRA's factors with ``" A"`` or ``" B"`` behind.
@@ -45,27 +56,18 @@ def merged(name: str, weight: Tensor, trained: Mapping[str, Tensor]) -> Tensor:
 
 
 def _check_trained(trained: Mapping[str, Tensor], base: Mapping[str, tuple[int, ...]], where: str) -> None:
-    """Refuse a checkpoint of another base, before anything is written.
-
-    Args:
-        trained: by names of the base, see ``NAMES``.
-        base: shapes by name.
-        where: the checkpoint's file.
-
-    Raises:
-        ValueError: weights without a place, half a pair of factors, or of other shapes.
-    """
-    factored = {name[:-2] for name in trained if name.endswith((" A", " B"))}
+    """Refuse a checkpoint of another base, by names and shapes, before anything is written."""
+    factored = {name[:-2] for name in trained if " " in name}
     lacking = [f"{name} of factor {f}" for name in factored for f in "AB" if f"{name} {f}" not in trained]
-    whole = {name: tuple(value.shape) for name, value in trained.items() if " " not in name}
-    check_weights(lacking, (factored | set(whole)) - set(base), where)
+    check_weights(lacking, {name.partition(" ")[0] for name in trained} - set(base), where)
+    shapes = {name: tuple(value.shape) for name, value in trained.items()}
     for name in sorted(factored):
-        a, b = (tuple(trained[f"{name} {f}"].shape) for f in "AB")
+        a, b = shapes[f"{name} A"], shapes[f"{name} B"]
         if len(a) != 2 or len(b) != 2 or (b[0], a[1]) != base[name] or a[0] != b[1]:
             bad_value(f"{name} in {where}", f"factors of a matrix {base[name]}", f"{b} times {a}")
-    for name, shape in whole.items():
-        if shape != base[name]:
-            bad_value(f"{name} in {where}", f"of shape {base[name]}", shape)
+    for name in set(shapes) & set(base):
+        if shapes[name] != base[name]:
+            bad_value(f"{name} in {where}", f"of shape {base[name]}", shapes[name])
 
 
 def _base_files(base: Path, name: str) -> tuple[list[Path], dict[str, tuple[int, ...]]]:
@@ -89,11 +91,7 @@ def _base_files(base: Path, name: str) -> tuple[list[Path], dict[str, tuple[int,
 
 
 def read_prompt(folder: Path) -> Tensor:
-    """The first prompt of the two ``.pt`` files, without its padding: ``(1, n, C)``.
-
-    Raises:
-        ValueError: no such files, or not an embedding and its mask.
-    """
+    """The first prompt of the two ``.pt`` files, without its padding: ``(1, n, C)``."""
     files = (folder / f"{PROMPT}_prompt_{part}.pt" for part in ("embeds", "mask"))
     embedding, mask = (read_checkpoint(file, Tensor) for file in files)
     if embedding.ndim != 3 or mask.shape != embedding.shape[:2]:
@@ -108,10 +106,8 @@ def read_prompt(folder: Path) -> Tensor:
 
 def _space(file: Path, requested: str | None) -> str:
     """As requested, or as the checkpoint's folder is called."""
-    if requested is not None:
-        return check_choice(requested, "--space", SPACES)
     name = file.resolve().parent.name
-    space = SPACE_OF_CHECKPOINT.get(name.split("-")[0].lower())
+    space = requested or SPACE_OF_CHECKPOINT.get(name.split("-")[0].lower())
     if space is None:
         cure = "Keep the authors' folder name, or say with --space what its map is affine in."
         bad_value("CHECKPOINT", "in a folder called Log-*, Uniform-* or Disparity-*", repr(name), cure)
@@ -140,9 +136,6 @@ def convert_marigold_v2(
         folder: an empty one to fill.
         prompts: folder of the prompt's files; ``None`` looks for it above the checkpoint.
         space: what the map is affine in; ``None`` as the checkpoint's folder says.
-
-    Raises:
-        ValueError: files that are missing or do not fit each other; a space that cannot be determined.
     """
     file = checkpoint / TRAINABLES if os.path.isdir(checkpoint) else checkpoint
     if not os.path.isfile(file) or file.suffix != ".safetensors":
@@ -165,28 +158,11 @@ def convert_marigold_v2(
         for source in files[name]:
             whole = {key: merged(key, v, trained[part]) for key, v in load_file(source).items()}
             save_weights(whole, folder / name / source.name)
-    _write_rest(folder, prompt, space)
-
-
-def _write_rest(folder: Path, prompt: Tensor, space: str) -> None:
-    """Prompt, scheduler, index and card."""
-    component = FixedPrompt(*prompt.shape[1:])
-    component.load_state_dict({"embedding": prompt.float()})
+    component = fixed_prompt(prompt)
     component.to(prompt.dtype if prompt.is_floating_point() else torch.float32)
     component.save_pretrained(folder / "prompt")
     FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
-    index: dict[str, Any] = {
-        "_class_name": MarigoldV2Pipeline.__name__,
-        "_diffusers_version": diffusers_version,
-        "transformer": ["diffusers", "QwenImageTransformer2DModel"],
-        "vae": ["diffusers", "AutoencoderKLQwenImage"],
-        "scheduler": ["diffusers", "FlowMatchEulerDiscreteScheduler"],
-        "prompt": [FixedPrompt.__module__, FixedPrompt.__name__],
-        "prediction_type": space,
-        "sample_latent": False,
-        "default_denoising_steps": 1,
-        "default_processing_resolution": 768,
-    }
+    index = INDEX_OF_PRIOR | {"prediction_type": space}
     (folder / "model_index.json").write_text(json.dumps(index, indent=2), encoding="utf-8")
     write_card(
         folder,

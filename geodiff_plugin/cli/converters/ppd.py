@@ -16,7 +16,7 @@ from torch import Tensor
 from transformers import Dinov2Config, Dinov2Model
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.converters.reading import read_checkpoint, renamed, save_weights, write_card
+from geodiff_plugin.cli.converters import read_checkpoint, renamed, save_weights, write_card
 from geodiff_plugin.priors.loading import Layout, check_weights, load_component
 from geodiff_plugin.priors.pixel_dit import PixelDiT
 from geodiff_plugin.priors.ppd import PPDPipeline
@@ -53,21 +53,16 @@ def _encoder_in_transformers_names(state: Mapping[str, Any], prefix: str) -> dic
 
 def _encoder_state(checkpoint: Mapping[str, Any], part: str | None) -> dict[str, Tensor]:
     """The encoder in transformers' names: out of the checkpoint itself, or what ``--with`` names."""
-    source = Path(part or "")
+    source, state = Path(part or ""), {}
     if part is None:
         state = _encoder_in_transformers_names(checkpoint, IN_CHECKPOINT)
     elif source.is_file():
         state = _encoder_in_transformers_names(read_checkpoint(source), IN_FILE)
     elif (source / "model.safetensors").is_file():
         state = renamed(load_file(source / "model.safetensors"), (), IN_FOLDER)
-    else:
-        state = {}
     if not state:
         expected = f"{ENCODER_FILE} or a folder of {ENCODER_ID}: the encoder whose tokens ppd.pth needs"
-        cure = (
-            f"Fetch it once: hf download {ENCODER_ID} --local-dir da2. A checkpoint that was trained with "
-            "MoGe-2's tokens (ppd_moge.pth) cannot be used."
-        )
+        cure = f"Fetch it once: hf download {ENCODER_ID} --local-dir da2. ppd_moge.pth needs another."
         bad_value("--with", expected, part or "nothing", cure)
     return state
 

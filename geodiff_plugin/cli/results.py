@@ -1,0 +1,129 @@
+"""What is made of results of ``geodiff depth``: a video of a sequence, the submission to a benchmark."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.cli.report import REPORT, read_report
+from geodiff_plugin.cli.terminal import say
+from geodiff_plugin.formats import check_file, read_image, write_pfm
+from geodiff_plugin.formats.depth import disparity_of_depth
+from geodiff_plugin.formats.files import read_npy
+from geodiff_plugin.formats.out import write_text
+from geodiff_plugin.formats.video import VideoReader, both_halves
+from geodiff_plugin.plotting import check_video, depth_frames, write_depth_video
+
+#: Benchmarks by name, and where their files lie below the folder of a submission.
+BENCHMARKS = {
+    "middlebury": "SET/SCENE/disp0METHOD.pfm (disp0METHOD_s.pfm with holes), timeMETHOD.txt",
+    "eth3d": "low_res_two_view/SCENE.pfm, SCENE.txt",
+}
+
+
+class _Maps(Sequence[np.ndarray]):
+    """The maps of all frames, read whenever they are asked for: those of a long video exceed the memory."""
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        self._files = files
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __getitem__(self, number: Any) -> Any:
+        file = check_file(self._files[number], "FRAME", "a folder of geodiff depth or a .npy")
+        expected = "a depth map (H, W) of floats in metres"
+        depth_m = read_npy(file, "FRAME", expected)
+        if depth_m.ndim != 2 or depth_m.dtype.kind != "f" or not depth_m.size:
+            bad_value("FRAME", expected, f"{file}")
+        return depth_m
+
+
+def _unit(frames: Sequence[Path], folders: Sequence[Path]) -> str | None:
+    """``"m"``, or ``None`` where no map has a unit; one range of colours cannot show both kinds."""
+    in_metres = [read_report(folder).get("unit", "m") is not None for folder in folders]
+    if any(in_metres) and not all(in_metres):
+        with_unit, without = frames[in_metres.index(True)], frames[in_metres.index(False)]
+        expected = "all in metres, or all without a unit"
+        bad_value("FRAME", expected, f"{with_unit} with and {without} without", "Make a video of each kind.")
+    return "m" if all(in_metres) else None
+
+
+def _photograph(folder: Path) -> Image.Image:
+    """The left image that the depth of a result belongs to, where it lay when the result was made."""
+    expected = "the report of a folder of geodiff depth"
+    path, report = check_file(folder / REPORT, "--photographs", expected), read_report(folder)
+    try:
+        left, right = Path(report["arguments"]["left"]), report["arguments"]["right"]
+        frame, undistorted = report.get("pair", {}).get("frame"), report["undistorted"]
+    except (KeyError, TypeError, AttributeError):
+        bad_value("--photographs", expected, f"{path}, which is damaged")
+    if frame is None or undistorted:
+        file = folder / "undistorted.png" if undistorted else left
+        image, _ = read_image(file, f"the left image of {folder}")
+    else:
+        with VideoReader(left, f"the left video of {folder}") as video:
+            image = video.read(frame)
+        image = both_halves(image)[0] if right is None else image
+    return Image.fromarray(np.rint(image * 255).astype(np.uint8))
+
+
+def run_video(
+    frames: Sequence[Path], out: Path, fps: float, near: float | None, far: float | None, photographs: bool
+) -> None:
+    """Write the video and say what is in it."""
+    check_video(out, fps)
+    files = [path / "depth.npy" if os.path.isdir(path) else path for path in frames]
+    depths_m = _Maps(files)
+    shapes = [depth_m.shape for depth_m in depths_m]
+    for path, shape in zip(frames, shapes, strict=True):
+        if shape != shapes[0]:
+            (height, width), (first_height, first_width) = shape, shapes[0]
+            expected = f"all of one shape, {first_width}x{first_height} pixels as {frames[0]}"
+            bad_value("FRAME", expected, f"{path} of {width}x{height}", "Make a video of each size.")
+    unit = _unit(frames, [file.parent for file in files])
+    lefts = map(_photograph, frames) if photographs else None
+    write_depth_video(out, depth_frames(depths_m, lefts, near, far, unit), fps)
+    print(f"{len(frames)} frames, {len(frames) / fps:.1f} s -> {out}")
+
+
+def run_submit(results: Sequence[Path], to: str, out: Path, method: str) -> None:
+    """Write one disparity map, infinity where unknown, and one time for every result below the folders.
+
+    The folder of a pair's left image names the scene.
+
+    Source: upload-format.html of Middlebury's evaluation, version 3; ETH3D's documentation, "Result
+        submission".
+    """
+    if to == "middlebury" and not method.isalnum():
+        bad_value("--method", "letters and digits", repr(method))
+    folders = [path.parent for folder in results for path in sorted(folder.glob(f"**/{REPORT}"))]
+    if not folders:
+        bad_value("RESULT", "a folder of geodiff depth", ", ".join(map(str, results)))
+    scenes: set[Path] = set()
+    for folder in folders:
+        report = read_report(folder)
+        K_left, K_right, E = (np.array(report["inputs"][n], np.float64) for n in ("K_left", "K_right", "E"))
+        depth_m = read_npy(folder / "depth.npy", "RESULT", "a depth map")
+        disparity = disparity_of_depth(depth_m, K_left, K_right, E)
+        scene = Path(report["arguments"]["left"]).absolute().parent
+        if scene in scenes:
+            expected = "one pair of every scene, whose folder its left image lies in"
+            bad_value("RESULT", expected, f"two of {scene}")
+        scenes.add(scene)
+        time = f"{report['seconds']['guided call']:.2f}\n"
+        if to == "middlebury":
+            place, holes = out / scene.parent.name / scene.name, "_s" if np.isinf(disparity).any() else ""
+            name, times = f"disp0{method}{holes}.pfm", f"time{method}.txt"
+        else:
+            place, time = out / "low_res_two_view", f"runtime {time}"
+            name, times = f"{scene.name}.pfm", f"{scene.name}.txt"
+        write_text(place / times, time)
+        write_pfm(place / name, disparity)
+    say(f"{out}: {len(folders)} pairs for {to} ({BENCHMARKS[to]})")

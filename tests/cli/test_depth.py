@@ -1,0 +1,295 @@
+"""``geodiff depth`` end to end on tiny random priors: files, report, silence, Ctrl-C; info and demo."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.cli.conftest import QUICK, report_of
+from tests.contracts.tiny_priors import TINY
+
+FILES = {"depth.npy", "depth_mm.png", "depth.png", "overview.png", "visible.png", "photometric_error.npy"}
+FILES |= {"cloud.ply", "report.json"}
+CONFIDENCE = {"confidence.npy", "confidence.png"}
+#: So small a pair has too few matches to check its pose by, which a run says.
+GIVEN = ("--knob", "pose=given", "--knob", "inner_steps=0")
+
+
+def names_in(folder: str) -> set[str]:
+    return {path.name for path in Path(folder).iterdir()}
+
+
+@pytest.fixture
+def lidar(pair_files):
+    """Writes a map of known depths: a function of where it is known and what it holds there."""
+
+    def write(depth_m, where=np.s_[::4, ::4]) -> np.ndarray:
+        known = np.zeros((48, 64), np.float32)
+        known[where] = depth_m
+        np.save("lidar.npy", known)
+        return known
+
+    return write
+
+
+def test_known_points_move_the_depth(geodiff, command, lidar):
+    known = lidar(2.5)
+    assert geodiff(*command, "--steps", 1, "--points", "lidar.npy", "-q").code == 0
+    depth_m = np.load("geodiff-out/depth.npy")
+    assert np.median(np.abs(depth_m[known > 0] / 2.5 - 1)) < 0.1
+
+
+def test_points_without_a_right_image_and_a_cloud_of_what_is_believed(geodiff, command, lidar):
+    lidar(np.linspace(1.5, 3.0, 16)[None])
+    camera = "--fx 60 --fy 60 --cx 31.5 --cy 23.5 --points lidar.npy --steps 1".split()
+    alone = [*command[:2], *camera, *command[5:]]
+    answer = geodiff(*alone, "--json", "-q", "--min-confidence", 0.6)
+    assert answer.code == 0, answer.err
+    report = json.loads(answer.out)
+    assert names_in("geodiff-out") == FILES - {"visible.png", "photometric_error.npy"} | CONFIDENCE
+    assert report["verdict"]["signs"]["points"] == 192 and report["depth"]["visible_fraction"] == 0
+    doubtful, counts = np.load("geodiff-out/confidence.npy") < 0.6, report["files"]
+    assert counts["doubtful_points"] == doubtful.sum()
+    assert counts["cloud_points"] <= doubtful.size - doubtful.sum()
+    lidar(2.0, np.s_[20, 30])
+    answer = geodiff(*alone, "--strict", "--out", "strict")
+    assert answer.code == 2 and "Too few known depths to fix both scale and shift, 1;" in answer.err
+    assert not Path("strict").exists()
+
+
+def test_a_further_view_takes_part_with_a_lens_of_its_own(geodiff, command, textured_plane):
+    """The pair's right image once more, straight and as if its lens had bent it; knobs reach the guidance."""
+    Image.fromarray(textured_plane.right).save("third.png")
+    np.savetxt("pose.txt", textured_plane.E)
+    knobs = ["--knob", "inner_steps=0", "--knob", "weights.photometric=0.5", "--steps", 1, "-q"]
+    for name, lens in (("straight", "0,0,0,0"), ("bent", "0.3,0,0,0")):
+        view = ["--view", "third.png", "--view-E", "pose.txt", "--view-distortion", lens]
+        assert geodiff(*command, *knobs, *view, "--out", name).code == 0
+    straight, bent = report_of("straight"), report_of("bent")
+    assert [straight["undistorted"], bent["undistorted"]] == [False, True]
+    assert straight["depth"]["median_m"] != bent["depth"]["median_m"]
+    (further,) = straight["inputs"]["further_views"]
+    assert further["E"] == straight["inputs"]["E"] and straight["arguments"]["view"] == ["third.png"]
+    guidance = straight["guidance"]
+    assert guidance["inner_steps"] == 0 and guidance["weights"]["photometric"] == 0.5
+
+
+def test_writes_everything(geodiff, command):
+    answer = geodiff(*command)
+    assert answer.code == 0, answer.err
+    out = Path("geodiff-out")
+    assert names_in(out) == FILES | CONFIDENCE
+    assert answer.out.count("\n") == 1 and " m to " in answer.out and "geodiff-out/" in answer.out
+    assert "loss=" in answer.err
+    depth_m, report = np.load(out / "depth.npy"), report_of()
+    assert depth_m.dtype == np.float32 and depth_m.shape == (48, 64) and (depth_m > 0).all()
+    millimetres = np.asarray(Image.open(out / "depth_mm.png"))
+    near = depth_m < 65.5
+    np.testing.assert_allclose(millimetres[near] / 1000, depth_m[near], atol=5.1e-4)
+    assert (millimetres[depth_m > 65.536] == 0).all()
+    visible = np.asarray(Image.open(out / "visible.png"))
+    assert visible.shape == (48, 64) and set(np.unique(visible)) <= {0, 255}
+    assert np.load(out / "photometric_error.npy").shape == (48, 64)
+    confidence = np.load(out / "confidence.npy")
+    assert confidence.shape == (48, 64) and 0.0 <= confidence.min() <= confidence.max() <= 1.0
+    assert set(report["files"]["names"]) == FILES | CONFIDENCE and report["files"]["doubtful_points"] == 0
+    assert report["depth"]["median_m"] == pytest.approx(float(np.median(depth_m)))
+    assert report["depth"]["visible_fraction"] == pytest.approx((visible > 0).mean())
+    assert report["files"]["depth_mm_zero_pixels"] == (millimetres == 0).sum()
+    assert set(report["seconds"]) == {"start", "calibration", "load", "guided call", "write"}
+    assert len(report["history"]) == 2 and report["inputs"]["baseline_m"] == pytest.approx(0.12)
+    assert report["arguments"]["seed"] == 0 and report["versions"]["torch"]
+    assert f"element vertex {report['files']['cloud_points']}\n".encode() in (out / "cloud.ply").read_bytes()
+
+
+def test_json_and_quiet(geodiff, command):
+    answer = geodiff(*command, *"--json -q --ensemble 2 --steps 1 --resolution 32".split(), *GIVEN)
+    assert (answer.code, answer.err) == (0, "")
+    report = json.loads(answer.out)
+    assert report == report_of()
+    assert report["uncertainty_median_m"] >= 0 and len(report["scale"][0]) == 2
+    assert np.load("geodiff-out/uncertainty.npy").shape == (48, 64)
+    again = geodiff(*command, "-q", "--overwrite", *QUICK, *GIVEN)
+    assert (again.code, again.out, again.err) == (0, "", "")
+    assert names_in("geodiff-out") == FILES
+
+
+def test_seeds_presets_and_range(geodiff, command):
+    words = [*command, "-q", "--near", 1, "--far", 5]
+    for out, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert geodiff(*words, *QUICK, "--seed", seed, "--out", out).code == 0
+    a, b, c = (np.load(f"{out}/depth.npy") for out in "abc")
+    np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(a, c)
+    paper = report_of("a")["guidance"]
+    assert paper["gradient"] == "full" and paper["g_s_range"] == [1.0, 5.0]
+    guidance = json.loads(geodiff(*words, "--json", "--steps", 1).out)["guidance"]
+    assert guidance["gradient"] == "denoised" and guidance["depth_range"] == [1.0, 5.0]
+
+
+def test_images_of_different_kind_and_size(geodiff, command, pair_files, textured_plane):
+    """A grey 16-bit left image and a right one of twice the size with a K of its own."""
+    grey = textured_plane.left.mean(-1) / 255 * 65535
+    Image.fromarray(grey.astype(np.uint16)).save(pair_files.left)
+    Image.open(pair_files.right).resize((128, 96)).save(pair_files.right)
+    K_right = textured_plane.K.copy()
+    K_right[:2, :2] *= 2
+    K_right[:2, 2] = K_right[:2, 2] * 2 + 0.5
+    for name, matrix in (("K", textured_plane.K), ("Kr", K_right), ("E", textured_plane.E)):
+        np.savetxt(f"{name}.txt", matrix)
+    cameras = "--K K.txt --K-right Kr.txt --E E.txt".split()
+    answer = geodiff(*pair_files.images, *cameras, *command[5:], *QUICK, "-q", "--json")
+    assert answer.code == 0 and json.loads(answer.out)["inputs"]["right_size"] == [128, 96], answer.err
+
+
+def test_the_right_cameras_centre(geodiff, command, pair_files):
+    """Assumed where it is not given, and said; with it depth is of another disparity."""
+    numbers = "--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.12".split()
+    camera = [*pair_files.images, *numbers, *command[5:], *QUICK]
+    answer = geodiff(*camera, "--out", "same")
+    assert answer.code == 0 and "assumed: The right camera's cx" in answer.err and "--cx-right" in answer.err
+    answer = geodiff(*camera, "--cx-right", 33.5, "--out", "other")
+    assert answer.code == 0 and "assumed" not in answer.err
+    assert report_of("other")["inputs"]["K_right"][0][2] == 33.5
+    assert report_of("same")["assumed"] and not report_of("other")["assumed"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, OSError])
+def test_failing_call_writes_nothing(geodiff, command, pair_files, monkeypatch, error):
+    def broken(*_):
+        raise error("in the middle")
+
+    monkeypatch.setattr("geodiff_plugin.cli.depth.write_maps", broken)
+    before = names_in(pair_files.folder)
+    if error is OSError:  # a full disk, say
+        assert "geodiff-out could not be written (in the middle)" in geodiff(*command, "-q", *QUICK).err
+    else:
+        with pytest.raises(error, match="in the middle"):
+            geodiff(*command, "-q", *QUICK)
+    assert names_in(pair_files.folder) == before
+
+
+def test_interrupt_of_a_running_process(command, pair_files):
+    """Ctrl-C while it denoises: exit code 130, no traceback, nothing written."""
+    before = names_in(pair_files.folder)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "geodiff_plugin", *map(str, command), "--steps", "1000"],
+        stderr=subprocess.PIPE,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        # A job in the background of a script ignores Ctrl-C, and hands that down.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    heard, deadline = b"", time.monotonic() + 120
+    while b"guided steps" not in heard and time.monotonic() < deadline:
+        heard += os.read(process.stderr.fileno(), 4096)
+    process.send_signal(signal.SIGINT)
+    rest = process.communicate(timeout=60)[1]
+    assert process.returncode == 130, heard + rest
+    said = b"geodiff: interrupted; the same command resumes"
+    assert b"Traceback" not in rest and rest.rstrip().endswith(said)
+    assert names_in(pair_files.folder) == before
+
+
+def test_demo(geodiff, prior, pair_files, monkeypatch):
+    """Over the folder of an earlier run; the tiny prior stands in for the bundled one."""
+    monkeypatch.setattr("geodiff_plugin.priors.loading.BUNDLED_FOLDER", prior)
+    out = pair_files.folder / "geodiff-demo"
+    out.mkdir()
+    for name in ("depth.npy", "uncertainty.npy", "notes.txt"):
+        (out / name).write_text("of an earlier run, but for the notes")
+    (out / "report.json").write_text('{"files": {"names": ["depth.npy", "uncertainty.npy"]}}')
+    answer = geodiff("demo", "--quiet", "--overwrite")
+    assert answer.code == 0, answer.err
+    assert "AbsRel" in answer.out and "delta1" in answer.out and "guided" in answer.out
+    assert f"Open {Path('geodiff-demo', 'comparison.png')} first" in answer.out
+    assert names_in(out) == FILES | CONFIDENCE | {"comparison.png", "notes.txt"}
+    assert np.load(out / "depth.npy").shape == (336, 448)
+
+
+# Priors
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """Factory: the folder of a tiny prior."""
+
+    def save(key: str) -> Path:
+        TINY[key]().save_pretrained(tmp_path / key)
+        return tmp_path / key
+
+    return save
+
+
+@pytest.mark.parametrize(("key", "space"), [("lotus", "disparity"), ("depthmaster", "sqrt_disparity")])
+def test_info_tells_what_the_adapter_found(geodiff, saved, key, space):
+    folder = saved(key)
+    (folder / "README.md").write_text("---\nlicense: cc-by-4.0\n---\n")
+    answer = geodiff("info", "--prior", folder)
+    assert answer.code == 0 and "torch" in answer.out, answer.err
+    told = dict(line.split("  ", 1) for line in answer.out.splitlines() if "  " in line)
+    told = {name.strip(): value.strip() for name, value in told.items()}
+    assert (told["adapter"], told["space"], told["licence"]) == (key, space, "cc-by-4.0")
+    assert told["steps"] == "1 by default, at most 1"
+    assert told["gradients"] == ("denoised" if key == "depthmaster" else "denoised, full")
+    assert told["same every time"].startswith("yes" if key == "depthmaster" else "no")
+
+
+def test_info_lists_the_knobs(geodiff):
+    answer = geodiff("info", "--knobs")
+    assert (
+        answer.code == 0 and "  smoothness = 40" in answer.out and "  weights = photometric 1" in answer.out
+    )
+
+
+def test_geowizard_with_its_option(geodiff, saved, command):
+    prior = ["--prior", saved("geowizard"), "--steps", "1", "--resolution", "32"]
+    answer = geodiff(*command[:5], *prior, "--option", "domain=outdoor", "--out", "out")
+    assert answer.code == 0 and "(geowizard; licence unknown)" in answer.err, answer.err
+    normals = np.load("out/normals.npy")
+    assert normals.shape == (*np.load("out/depth.npy").shape, 3)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-3)
+    assert "normals.npy" in report_of("out")["files"]["names"]
+
+
+def test_a_deterministic_prior_says_so(geodiff, saved, command):
+    prior = ["--prior", saved("e2e-ft"), "--ensemble", "3", "--resolution", "32", "--space", "disparity"]
+    answer = geodiff(*command[:5], *prior, "--out", "out")
+    assert answer.code == 0 and "warning: This prior gives the same map every time" in answer.err
+    assert not Path("out/uncertainty.npy").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--option", "domain=outdoor"], "--option must be one that marigold takes (none); got 'domain'"),
+        (["--prior", "developy/ApDepth"], "It is refused because"),
+        (["--prior", "no/such-prior"], "bundled"),
+        (["--prior", "map"], "--prior map and no --prior-map"),
+        (["--prior-map", "none.npy"], "in place of a --prior"),
+        (["--prior-map", "none.npy", "--prior", "bundled"], "none.npy"),
+    ],
+)
+def test_priors_that_cannot_be(geodiff, command, options, said, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    answer = geodiff(*command, *options, "-q")
+    assert answer.code == 2 and said in answer.err and len(answer.err.splitlines()) == 1
+    assert not Path("geodiff-out").exists()
+
+
+def test_a_map_of_another_model_as_the_prior(geodiff, pair_files, textured_plane):
+    truth = np.asarray(textured_plane.depth_m)
+    np.save("map.npy", 1 / truth + np.linspace(0, 1e-3, 64))
+    options = ["--space", "disparity", *GIVEN, "--device", "cpu", "--out", "out"]
+    answer = geodiff(*pair_files.command, "--prior-map", "map.npy", *options)
+    assert answer.code == 0, answer.err
+    assert "prior: map (map; that of the model which made the map)" in answer.err
+    assert np.median(np.abs(np.load("out/depth.npy") / truth - 1)) < 0.05

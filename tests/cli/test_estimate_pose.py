@@ -1,0 +1,252 @@
+"""``geodiff depth --estimate-pose`` on a pair as from a phone; what goes through a lens on its way there."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.cli.inputs import _read_known, lenses_of, read_inputs
+from geodiff_plugin.cli.options import DepthOptions
+from geodiff_plugin.formats.distortion import distortion_from_text
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.types import Rig
+from tests.cli.conftest import QUICK, report_of
+from tests.scenes import render_pair
+
+pytest.importorskip("poselib")
+
+SIZE = (240, 320)
+VIEWS = {"left": Path("left.png"), "right": Path("right.png")}
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return render_pair(3, size=SIZE, posed=True)
+
+
+@pytest.fixture(scope="module")
+def photographs(pair, tmp_path_factory):
+    """Two JPEG files whose EXIF has the focal length in 35 mm equivalent and the size they were taken at."""
+    folder = tmp_path_factory.mktemp("phone")
+    focal_35 = float(pair.K_left[0, 0]) * math.hypot(36, 24) / math.hypot(*SIZE)
+    paths = []
+    for name, view in (("left", pair.left), ("right", pair.right)):
+        image = Image.fromarray(np.rint(view.image_01.permute(1, 2, 0).numpy() * 255).astype(np.uint8))
+        exif = image.getexif()
+        entries = exif.get_ifd(0x8769)
+        entries[0xA405], entries[0xA002], entries[0xA003] = round(focal_35), SIZE[1], SIZE[0]
+        paths.append(folder / f"{name}.jpg")
+        image.save(paths[-1], exif=exif, quality=95)
+    return paths
+
+
+@pytest.fixture
+def estimate(geodiff, photographs, prior, tmp_path, monkeypatch):
+    """Run with as little of the guided call as there is; the answer, and the report where there is one."""
+    monkeypatch.chdir(tmp_path)
+    quick = "--steps 1 --knob inner_steps=0 --knob loss_resolution=64 --device cpu".split()
+
+    def run(*words, ends=0):
+        answer = geodiff("depth", *photographs, "--estimate-pose", "--prior", prior, *quick, *words)
+        assert answer.code == ends, answer.err
+        return answer, None if ends else report_of()
+
+    return run
+
+
+def test_a_pair_from_a_phone(estimate, pair):
+    baseline = float(np.linalg.norm(pair.E.numpy()[:3, 3]))
+    answer, report = estimate("--baseline", baseline, "-q")
+    assert "35 mm equivalent by its EXIF" in answer.err
+    found = report["estimated_pose"]
+    assert found["inliers"][0] > 50 and found["parallax_deg"][0] > 1 and found["residual_px"][0] < 1
+    assert 0 < found["depth_spread"] < 0.06
+    assert found["scale_from"] == "baseline" and report["unit"] == "m"
+    assert report["inputs"]["baseline_m"] == pytest.approx(baseline)
+    # EXIF has whole millimetres, so the focal length and with it the pose are known to a few per cent.
+    assert report["inputs"]["K_left"][0][0] == pytest.approx(float(pair.K_left[0, 0]), rel=0.03)
+    E, true = np.array(report["inputs"]["E"]), pair.E.numpy()
+    turn = math.degrees(math.acos(min(1.0, (np.trace(E[:3, :3].T @ true[:3, :3]) - 1) / 2)))
+    assert turn < 1.5 and E[:3, 3] @ true[:3, 3] > 0.98 * baseline**2
+
+
+def test_without_a_length_there_is_no_unit(estimate):
+    answer, report = estimate()
+    assert report["unit"] is None and report["estimated_pose"]["scale_from"] == "none"
+    assert report["inputs"]["baseline_m"] == pytest.approx(1.0)
+    assert any("no unit" in sentence for sentence in report["warnings"])
+    assert "baselines (no unit)" in answer.out and " m to " not in answer.out
+    assert b"no unit" in Path("geodiff-out/cloud.ply").read_bytes()[:600]
+
+
+def test_a_known_length_gives_the_unit(estimate, pair):
+    """Two pixels near the middle, and how far apart the rendered depth says that their places are."""
+    depth_m, K = pair.left.depth_m[0].double().numpy(), pair.K_left.numpy()
+    ends = np.array([[110.0, 120.0], [210.0, 120.0]])
+    rays = np.c_[ends, np.ones(2)] @ np.linalg.inv(K).T
+    at = [rays[i] * depth_m[int(v), int(u)] for i, (u, v) in enumerate(ends)]
+    text = ",".join(str(n) for n in (*ends.reshape(-1), float(np.linalg.norm(at[0] - at[1]))))
+    _, report = estimate("--known-length", text)
+    assert report["estimated_pose"]["scale_from"] == "known length" and report["unit"] == "m"
+    assert 0 <= report["estimated_pose"]["scale_spread"] < 0.5
+    true = float(np.linalg.norm(pair.E.numpy()[:3, 3]))
+    assert report["inputs"]["baseline_m"] == pytest.approx(true, rel=0.25)
+
+
+def test_a_matcher_that_is_not_here(estimate, tmp_path, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
+    answer, _ = estimate("--matcher", "lightglue", ends=2)
+    assert "matcher must be 'sift'" in answer.err and "hf download" in answer.err
+
+
+def test_a_lens_is_taken_out_before_the_pose_is_sought(estimate):
+    _, report = estimate("--distortion", "0.001,0,0,0", "--baseline", 0.3)
+    assert report["undistorted"] and Path("geodiff-out/undistorted.png").is_file()
+
+
+def test_poses_of_structure_from_motion_have_no_unit_either(geodiff, command, pair_files, textured_plane):
+    K, axes = textured_plane.K, np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": path.name, "transform_matrix": (pose @ axes).tolist()}
+        for path, pose in ((pair_files.left, np.eye(4)), (pair_files.right, textured_plane.E))
+    ]
+    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5, "w": 64, "h": 48}
+    Path("transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    views = [*command[:3], "--calib", "transforms.json", *command[5:], *QUICK]
+    for more, unit, said in (
+        ([], None, "the calibration's lengths (no unit)"),
+        (["--baseline", "0.12"], "m", " m to "),
+    ):
+        answer = geodiff(*views, *more, "--overwrite")
+        assert answer.code == 0 and said in answer.out, answer
+        assert report_of()["unit"] == unit
+        assert (b"no unit" in Path("geodiff-out/cloud.ply").read_bytes()[:600]) == (unit is None)
+
+
+def test_every_photograph_has_its_lens():
+    """First coefficients, from the options, else from the calibration; a further view has the left one's."""
+
+    def told(own=(None, None), **given) -> list[float | None]:
+        rig = Rig(np.eye(3), np.eye(3), np.eye(4), source="calib.txt", distortion=own)
+        lenses = lenses_of(DepthOptions(**VIEWS, **given), rig)
+        return [None if lens is None else float(lens.coefficients[0]) for lens in lenses]
+
+    view, two = (Path("v.png"),), (Path("v.png"), Path("w.png"))
+    one, other, straight = "0.1,0,0,0", "0.2,0,0,0", "0,0,0,0"
+    own = (distortion_from_text(one), distortion_from_text(straight))
+    for expected, given in (
+        ([None, None], {}),
+        ([0.1, 0.1, 0.1], {"distortion": (one,), "view": view}),
+        ([0.1, 0.2, 0.1, 0.1], {"distortion": (one, other), "view": two}),
+        ([None, None, None, 0.2], {"view": two, "view_distortion": (straight, other)}),
+        ([0.1, 0.1, None], {"distortion": (one,), "view": view, "view_distortion": (straight,)}),
+        ([0.1, None, 0.1], {"own": own, "view": view}),
+        ([0.1, None, 0.2], {"own": own, "view": view, "view_k": view, "view_distortion": (other,)}),
+        ([None, None, None], {"view": view, "view_k": view}),
+    ):
+        assert told(**given) == expected, given
+    with pytest.raises(InputError, match="--view-distortion must be given for each"):
+        told(own=own, view=view, view_k=view)
+
+
+def test_rectified_images_have_no_lens():
+    rig = Rig(np.eye(3), np.eye(3), np.eye(4), source="calib.txt", rectified=True)
+    assert lenses_of(DepthOptions(**VIEWS, distortion=("0,0,0,0",)), rig) == (None, None), "as the file says"
+
+
+FOUR = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
+
+
+@pytest.mark.parametrize(
+    ("given", "way"),
+    [
+        ({}, "EXIF"),
+        ({"fov": 60.0, "baseline": 0.1}, "--fov"),
+        ({"fov": 60.0, "view_k": (Path("K.txt"),), "cropped": True}, "--fov"),
+        ({**FOUR, "cropped": True}, "parameters"),
+        ({"k": Path("K.txt"), "k_right": Path("K.txt"), "cropped": True}, "matrices"),
+    ],
+)
+def test_ways_to_give_intrinsics(given, way):
+    assert DepthOptions(**VIEWS, estimate_pose=True, **given).cameras_way() == way
+
+
+LENS = "0.2,0,0,0"
+
+
+def straight(x: float, y: float) -> tuple[float, float]:
+    """Where a pixel behind that lens lies without it: r (1 + 0.2 r^2) = R, solved by bisection."""
+    ray = np.array([x - 31.5, y - 23.5]) / 60
+    far, low, high = float(np.linalg.norm(ray)), 0.0, 2.0
+    for _ in range(60):
+        r = (low + high) / 2
+        low, high = (r, high) if r * (1 + 0.2 * r * r) < far else (low, r)
+    u, v = ray / far * r * 60 + (31.5, 23.5)
+    return float(u), float(v)
+
+
+@pytest.fixture
+def millimetres(pair_files) -> Path:
+    """A map of two depths, 2 m at (10, 12) and 3 m at (50, 40)."""
+    depth = np.zeros((48, 64))
+    depth[12, 10], depth[40, 50] = 2000.0, 3000.0
+    np.save("mm.npy", depth)
+    return Path("mm.npy")
+
+
+def expected_points() -> np.ndarray:
+    at = np.array([straight(10, 12), straight(50, 40)])
+    return np.c_[(at - (31.5, 23.5)) / 60, np.ones(2)] * [[2.0], [3.0]]
+
+
+@pytest.fixture
+def told_to_estimate(pair_files, monkeypatch):
+    """What the estimation of poses is called with."""
+
+    def tell(**given) -> dict:
+        told = {}
+
+        def stop(_images, **options):
+            told.update(options)
+            raise InterruptedError
+
+        monkeypatch.setattr(GeometryGuidance, "from_photographs", stop)
+        options = DepthOptions(**VIEWS, device="cpu", estimate_pose=True, **FOUR | given)
+        with pytest.raises(InterruptedError):
+            read_inputs(options, options.config())
+        return told
+
+    return tell
+
+
+def test_the_estimation_of_poses_is_told_what_it_needs(told_to_estimate, millimetres):
+    """Points in metres and a known length, both where an image without lens distortion has them."""
+    known = {"points": millimetres, "points_scale": 1000.0, "known_length": "10,12,50,40,1.5"}
+    told = told_to_estimate(**known, cropped=True)
+    assert told["points"].shape == (48, 64) and told["points"][12, 10] == 2.0
+    assert told["known_length"] == (10, 12, 50, 40, 1.5) and told["cropped"] is True
+    told = told_to_estimate(**known, distortion=(LENS,))
+    np.testing.assert_allclose(told["points"], expected_points(), atol=1e-4)
+    ends = (*straight(10, 12), *straight(50, 40), 1.5)
+    assert told["known_length"] == pytest.approx(ends, abs=0.01)
+    with pytest.raises(InputError, match="--known-length must be between two pixels that the lens shows"):
+        told_to_estimate(known_length="0,0,60,40,1", distortion=("-1,0,0,0",))
+
+
+def test_a_map_of_known_depths_goes_through_the_lens(millimetres):
+    known = {"points": millimetres, "points_scale": 1000.0, "device": "cpu"}
+    options = DepthOptions(**VIEWS, **known, **FOUR, baseline=0.12, distortion=(LENS,))
+    inputs = read_inputs(options, options.config())
+    np.testing.assert_allclose(inputs.guidance.inputs[0].points.numpy(), expected_points(), atol=1e-4)
+    lens, K = distortion_from_text(LENS), inputs.rig.K_left
+    with pytest.raises(InputError, match="--points must be a map of .* 32x24 pixels; got 64x48"):
+        _read_known(options, K, lens, (32, 24))
+    Path("points.txt").write_text("0.1 0.2 2\n")
+    listed = DepthOptions(left=Path("left.png"), points=Path("points.txt"))
+    np.testing.assert_allclose(_read_known(listed, K, lens, (64, 48)), [[0.1, 0.2, 2.0]], atol=1e-6)

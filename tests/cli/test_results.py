@@ -1,0 +1,199 @@
+"""``--export`` and ``geodiff video``."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import weakref
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
+from geodiff_plugin.formats import read_calibration
+from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
+from geodiff_plugin.formats.files import read_npy
+from geodiff_plugin.plotting import write_depth_video
+from tests.cli.conftest import QUICK, never, report_of
+
+LENS = "-0.2,0.05,0,0"
+
+
+def first_frame(name: str) -> np.ndarray:
+    with Image.open(name) as video:
+        return np.asarray(video.convert("RGB")).astype(int)
+
+
+def test_exports_stand_beside_the_ply(geodiff, result, textured_plane, command):
+    out, again = result / "geodiff-out", Path("geodiff-out")
+    assert (out / "cloud.glb").read_bytes()[:4] == b"glTF"
+    rig = read_calibration(out, image_names=("left.png", "right.png"), baseline_m=0.12)
+    np.testing.assert_allclose(rig.E, textured_plane.E, atol=1e-6)
+    # A later run without them leaves none of them behind.
+    shutil.copytree(out, again)
+    assert geodiff(*command, *QUICK, "-q", "--overwrite").code == 0
+    assert not (again / "cloud.glb").exists() and not (again / "cameras.txt").exists()
+
+
+def test_images_of_one_name_are_named_with_their_folders(geodiff, command, pair_files):
+    images = []
+    for side, path in (("image_2", pair_files.left), ("image_3", pair_files.right)):
+        Path(side).mkdir()
+        images.append(shutil.copy(path, Path(side, "000000.png")))
+    answer = geodiff("depth", *images, *command[3:], *QUICK, "--export", "colmap", "-q")
+    assert answer.code == 0, answer.err
+    lines = Path("geodiff-out", "images.txt").read_text().splitlines()
+    assert [line.split()[-1] for line in lines[3::2]] == ["image_2/000000.png", "image_3/000000.png"]
+
+
+def test_a_colmap_model_names_what_its_cameras_took(geodiff, command, pair_files):
+    """Of a pair as if its lenses had distortion, and a third view without."""
+    Image.fromarray(255 - np.asarray(Image.open(pair_files.right))).save("third.png")
+    np.savetxt("pose.txt", np.eye(4) + 0.12 * np.eye(4, k=3))
+    camera = f"--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.12 --distortion {LENS}".split()
+    camera += "--steps 1 --knob inner_steps=0 -q --export colmap".split()
+    view = ["--view", "third.png", "--view-E", "pose.txt", "--view-distortion", "0,0,0,0"]
+    answer = geodiff(*command[:3], *command[5:], *camera, *view)
+    assert answer.code == 0, answer.err
+    out, written = Path("geodiff-out"), ["undistorted.png", "undistorted-2.png", "undistorted-3.png"]
+    lines = (out / "images.txt").read_text().splitlines()
+    assert [line.split()[9] for line in lines if line and line[0] != "#"] == written
+    rig = read_calibration(out, image_names=tuple(written[:2]), baseline_m=0.12)
+    assert rig.size_right == (64, 48) and rig.K_left[0, 0] == 60
+    for name, path, lens in ((written[1], "right.png", LENS), (written[2], "third.png", "0,0,0,0")):
+        image_01 = np.asarray(Image.open(path), np.float32) / 255
+        expected = undistorted(image_01, rig.K_left, distortion_from_text(lens))
+        image = np.asarray(Image.open(out / name), np.float32) / 255
+        assert np.abs(image - expected).mean() < 0.01, "but for cleaning"
+    assert set(report_of()["files"]["names"]) == {path.name for path in out.iterdir()}
+    # Its video shows the photograph without distortion.
+    Image.new("RGB", (64, 48), "red").save(out / "undistorted.png")
+    assert geodiff("video", "geodiff-out", "--photographs", "--out", "both.webp").code == 0
+    red, green, blue = first_frame("both.webp").transpose(2, 0, 1)
+    assert ((red > 200) & (green < 60) & (blue < 60)).mean() > 0.3
+
+
+def test_exported_cameras_are_those_that_the_cloud_fits(geodiff, prior, tmp_path, monkeypatch):
+    """Of refined poses: the given ones leave the cloud beside what the right photograph shows."""
+    monkeypatch.chdir(tmp_path)
+    pair, turn = read_demo_pair(), np.radians(1.0)
+    moved = pair.rig.E.copy()
+    moved[1:3, 1:3] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    np.savetxt("K.txt", pair.rig.K_left)
+    np.savetxt("E.txt", moved)
+    views = [DEMO_PAIR_FOLDER / "left.png", DEMO_PAIR_FOLDER / "right.png", "--K", "K.txt", "--E", "E.txt"]
+    run = ["--prior", prior, "--device", "cpu", "--steps", 1, "--resolution", 64, "--export", "colmap"]
+    answer = geodiff("depth", *views, *run)
+    assert answer.code == 0, answer.err
+    pose = report_of()["pose"]
+    assert pose["status"] == "refined"
+    rig = read_calibration("geodiff-out", image_names=("left.png", "right.png"), baseline_m=0.12)
+    np.testing.assert_allclose(rig.E[:3, :3], np.array(pose["E"][0])[:3, :3], atol=1e-5)
+    assert not np.allclose(rig.E[:3, :3], moved[:3, :3], atol=3e-3)
+
+
+def test_a_name_that_colmap_cannot_hold_is_refused_before_the_work(geodiff, pair_files, monkeypatch):
+    monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", never)
+    pair_files.left.rename("left one.png")
+    answer = geodiff("depth", "left one.png", *pair_files.command[2:], "--export", "colmap")
+    assert answer.code == 2 and "without blanks; got 'left one.png'" in answer.err
+
+
+# Videos
+
+
+@pytest.fixture
+def maps(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for number in range(3):
+        values = np.linspace(1 + number, 4 + number, 48 * 64, dtype=np.float32)
+        np.save(f"{number}.npy", values.reshape(48, 64))
+    return ["0.npy", "1.npy", "2.npy"]
+
+
+@pytest.mark.parametrize("name", ["depth.webp", "depth.gif", "depth.mp4"])
+def test_video(geodiff, maps, name):
+    answer = geodiff("video", *maps, "--out", name, "--fps", 4)
+    assert answer.code == 0 and "3 frames, 0.8 s" in answer.out, answer.err
+    if name.endswith("mp4"):
+        video = cv2.VideoCapture(name)
+        assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3 and video.get(cv2.CAP_PROP_FPS) == 4
+        return
+    with Image.open(name) as video:
+        video.load()
+        assert video.n_frames == 3 and video.info["duration"] == 250
+        frames = []
+        for index in (0, 2):
+            video.seek(index)
+            frames.append(np.asarray(video.convert("RGB")).astype(int))
+    assert np.abs(frames[0] - frames[1]).mean() > 10  # one range: later frames are farther
+
+
+def test_video_of_results_without_a_unit(geodiff, maps):
+    """The legend says what the reports say; a video of both kinds would show one of them wrongly."""
+    for number, unit in enumerate(("m", None)):
+        folder = Path(f"result-{number}")
+        folder.mkdir()
+        shutil.copy(maps[0], folder / "depth.npy")
+        (folder / "report.json").write_text(json.dumps({"unit": unit}))
+    for name in ("result-0", "result-1", "result-1/depth.npy"):
+        assert geodiff("video", name, "--out", f"{name.replace('/', '-')}.gif").code == 0
+    metres, without = first_frame("result-0.gif"), first_frame("result-1.gif")
+    changed = (np.abs(metres - without).sum(axis=2) > 300).any(axis=1)  # beyond what the palettes change
+    assert changed.any() and not changed[len(changed) // 8 :].any()  # the heading of the legend alone
+    assert np.array_equal(first_frame("result-1-depth.npy.gif"), without)
+    answer = geodiff("video", "result-0", "result-1")
+    assert answer.code == 2 and "all in metres, or all without a unit; got result-0 with" in answer.err
+    Path("result-0/report.json").write_text('{"a"')
+    answer = geodiff("video", "result-0", "--photographs")
+    assert answer.code == 2 and "report.json, which is damaged" in answer.err
+
+
+def test_a_long_video_is_never_in_memory_as_a_whole(geodiff, maps, monkeypatch):
+    most, alive = [], []
+
+    def counted(path, *rest):
+        depth_m = read_npy(path, *rest)
+        alive.append(weakref.ref(depth_m))
+        most.append(sum(ref() is not None for ref in alive))
+        return depth_m
+
+    monkeypatch.setattr("geodiff_plugin.cli.results.read_npy", counted)
+    assert geodiff("video", *maps * 4, "--out", "depth.mp4").code == 0
+    assert len(most) >= 12 and max(most) <= 3
+
+
+class Interrupted:
+    """A frame at which the user presses Ctrl-C."""
+
+    def __getattr__(self, name: str):
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("name", ["depth.webp", "depth.gif", "depth.mp4"])
+def test_video_is_whole_or_as_it_was(tmp_path, name):
+    (tmp_path / name).write_bytes(b"older")
+    frames = [Image.new("RGB", (64, 48), shade) for shade in ("red", "green")]
+    with pytest.raises(KeyboardInterrupt):
+        write_depth_video(tmp_path / name, [*frames, Interrupted()])
+    assert (tmp_path / name).read_bytes() == b"older" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_video_shows_photographs_as_they_were_read(geodiff, command, pair_files):
+    """16 bits are no white picture, and a photograph that was damaged since is a sentence."""
+    for path in (pair_files.left, pair_files.right):
+        grey = np.asarray(Image.open(path).convert("L"))
+        Image.fromarray(grey.astype(np.uint16) * 257).save(path)
+    assert geodiff(*command, *QUICK, "-q").code == 0
+    video = ["video", "geodiff-out", "--photographs", "--out", "both.webp"]
+    assert geodiff(*video).code == 0
+    both = first_frame("both.webp")
+    shown = both[:, : len(both)].mean()
+    assert abs(shown - np.asarray(Image.open(pair_files.left)).mean() / 257) < 20
+    assert both.shape[1] > 1.5 * both.shape[0]
+    pair_files.left.write_bytes(b"damaged")
+    answer = geodiff(*video)
+    assert answer.code == 2 and "the left image of geodiff-out must be an image file" in answer.err
