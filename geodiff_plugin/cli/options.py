@@ -249,7 +249,11 @@ class DepthOptions(RunOptions):
         needed: dict[str, tuple[str, ...]] = {}
         needed["parameters"] = PARAMETERS[: 4 if self.calib or self.estimate_pose or alone else 5]
         needed["matrices"] = ("k",) if self.estimate_pose or alone else ("k", "e")
-        given = {name for name in itertools.chain(PARAMETERS, *WAYS.values()) if getattr(self, name) not in (None, ())}
+        given = {
+            name
+            for name in itertools.chain(PARAMETERS, *WAYS.values())
+            if getattr(self, name) not in (None, ())
+        }
         taken = [way for way, names in WAYS.items() if given & {*names, *needed.get(way, ())}]
         numbers, matrices = (" ".join(map(_flag, needed[way])) for way in ("parameters", "matrices"))
         known = f"--calib FILE, or {numbers}, or {matrices}"

@@ -50,7 +50,7 @@ def photographs(pair, tmp_path_factory):
 def estimate(geodiff, photographs, prior, tmp_path, monkeypatch):
     """Run with as little of the guided call as there is; the answer, and the report where there is one."""
     monkeypatch.chdir(tmp_path)
-    quick = "--steps 1 --knob inner_steps=0 --knob loss_resolution=64 --device cpu".split()
+    quick = "--steps 1 --knob inner_steps=0 --device cpu".split()
 
     def run(*words, ends=0):
         answer = geodiff("depth", *photographs, "--estimate-pose", "--prior", prior, *quick, *words)
@@ -80,7 +80,6 @@ def test_without_a_length_there_is_no_unit(estimate):
     answer, report = estimate()
     assert report["unit"] is None and report["estimated_pose"]["scale_from"] == "none"
     assert report["inputs"]["baseline_m"] == pytest.approx(1.0)
-    assert any("no unit" in sentence for sentence in report["warnings"])
     assert "baselines (no unit)" in answer.out and " m to " not in answer.out
     assert b"no unit" in Path("geodiff-out/cloud.ply").read_bytes()[:600]
 
@@ -97,12 +96,6 @@ def test_a_known_length_gives_the_unit(estimate, pair):
     assert 0 <= report["estimated_pose"]["scale_spread"] < 0.5
     true = float(np.linalg.norm(pair.E.numpy()[:3, 3]))
     assert report["inputs"]["baseline_m"] == pytest.approx(true, rel=0.25)
-
-
-def test_a_matcher_that_is_not_here(estimate, tmp_path, monkeypatch):
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
-    answer, _ = estimate("--matcher", "lightglue", ends=2)
-    assert "matcher must be 'sift'" in answer.err and "hf download" in answer.err
 
 
 def test_a_lens_is_taken_out_before_the_pose_is_sought(estimate):
