@@ -19,12 +19,7 @@ from PIL import Image
 
 from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_number
 from geodiff_plugin.formats.depth import row_strips
-from geodiff_plugin.formats.out import atomic_path
-
-__all__ = [
-    *("VIDEO_SUFFIXES", "check_video", "colour_depth", "colour_share", "depth_figure", "depth_frames"),
-    *("depth_range", "grid", "overview", "share_figure", "ticks", "write_depth_video"),
-]
+from geodiff_plugin.formats.out import atomic_path, reason_of
 
 #: Lightness grows evenly in both, so equal steps look equal; neither has a colour near the grey of "unknown".
 DEPTH_COLOURS, SHARE_COLOURS = "plasma", "YlGnBu_r"
@@ -45,9 +40,6 @@ MOST_VIDEO_WIDTH = 960
 #: A power of two: figures in inches are whole pixels again.
 DPI = 128
 POINTS_PER_PIXEL = 72 / DPI
-
-#: Shares of a colour bar with the text beside them.
-Marks = tuple[tuple[float, str], ...]
 
 
 def _as_map(values: Any, name: str = "depth_m") -> np.ndarray:
@@ -73,10 +65,10 @@ def _usable(depth_m: np.ndarray, valid: Any) -> np.ndarray:
 def depth_range(
     depth_m: Any, valid: Any = None, near: float | None = None, far: float | None = None
 ) -> tuple[float, float]:
-    """The depths at the two ends of the colours, ``0 < near < far`` in metres.
+    """The depths at the two ends of the colours, ``0 < near < far`` in metres; by default 2 % lie beyond.
 
     ``depth_m`` is ``(H, W)`` metres, numpy or torch; pixels that are not finite, not above 0 or not ``valid``
-    never count. Without ``near`` and ``far`` the ends are the 2nd and the 98th percentile.
+    never count.
 
     Raises:
         ValueError: ``near`` or ``far`` not above 0 and finite, or ``near >= far`` when both are given.
@@ -166,43 +158,33 @@ def _drawn(picture: np.ndarray, draw: Callable[[Any], None]) -> Image.Image:
 
 
 def _figure(
-    picture: np.ndarray, colours: str, label: str, marks: Marks, unknown: bool, title: str | None = None
+    picture: np.ndarray, colours: str, label: str, marks: Sequence[tuple[float, str]], unknown: bool
 ) -> Image.Image:
-    """A picture beside its colour bar with marks, and where pixels are unknown a grey key."""
+    """A picture beside its colour bar with texts at shares of it; a grey key where pixels are unknown."""
     factor = math.ceil(FIGURE_MIN_HEIGHT / len(picture))  # a whole one, so that pixels stay squares
     picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
-    size = max(12, len(picture) // 26)
-    gap, bar, head = size // 2, max(14, len(picture) // 24), 0 if title is None else 2 * size
-    sheet = np.pad(picture, ((head, 0), (0, gap + bar + 5 * size), (0, 0)), constant_values=255)
-    high, wide = sheet.shape[:2]
-    x, thick, letters = (picture.shape[1] + gap) / wide, bar / wide, {"fontsize": size * POINTS_PER_PIXEL}
+    high, size = len(picture), max(12, len(picture) // 26)
+    gap, bar = size // 2, max(14, high // 24)
+    sheet = np.pad(picture, ((0, 0), (0, gap + bar + 5 * size), (0, 0)), constant_values=255)
+    wide, letters = sheet.shape[1], {"fontsize": size * POINTS_PER_PIXEL}
+    x, thick = (picture.shape[1] + gap) / wide, bar / wide
 
     def draw(figure: Any) -> None:
         low = size * (3 if unknown else 1)
-        axes = figure.add_axes((x, low / high, thick, (len(picture) - 2 * size - low) / high))
+        axes = figure.add_axes((x, low / high, thick, (high - 2 * size - low) / high))
         ramp = np.linspace(0, 1, 512)[:, None]
         axes.imshow(ramp, cmap=colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1))
         axes.set_xticks([])
         axes.yaxis.tick_right()
         axes.set_yticks([share for share, _ in marks], [text for _, text in marks], **letters)
         axes.tick_params(length=size * POINTS_PER_PIXEL / 3, pad=size * POINTS_PER_PIXEL / 4)
-        figure.text(x, (len(picture) - 0.9 * size) / high, label, va="center", **letters)
+        figure.text(x, 1 - 0.9 * size / high, label, va="center", **letters)
         if unknown:
             key = figure.add_axes((x, size / high, thick, size / high), facecolor=str(GREY / 255))
             key.set(xticks=[], yticks=[])
             figure.text(x + thick + size / 2 / wide, 1.5 * size / high, "none", va="center", **letters)
-        if title is not None:
-            _write(figure, title, (wide / 2, head / 2), size, wide)
 
     return _drawn(sheet, draw)
-
-
-def _write(figure: Any, text: str, at: tuple[float, float], size: float, width: float) -> None:
-    """A line of text centred at a pixel, counted from the top left, smaller where it is too long."""
-    wide, high = (side * DPI for side in figure.get_size_inches())
-    size = min(size, 1.7 * width / max(1, len(text))) * POINTS_PER_PIXEL
-    place = {"ha": "center", "va": "center"}
-    figure.text(at[0] / wide, 1 - at[1] / high, text, fontsize=size, parse_math=False, **place)
 
 
 def depth_figure(
@@ -210,25 +192,24 @@ def depth_figure(
     valid: Any = None,
     near: float | None = None,
     far: float | None = None,
-    title: str | None = None,
     unit: str | None = "m",
 ) -> Image.Image:
     """A coloured depth map beside a colour bar, far on top; small maps are enlarged by a whole factor.
 
-    The map and the ends of the colours, and errors, are as for ``depth_range``. ``title`` is a line above it;
-    ``unit`` is ``"m"``, or ``None`` for a depth without one, as the legend then says.
+    The map and the ends of the colours, and errors, are as for ``depth_range``; ``unit`` is ``"m"``, or
+    ``None`` for a depth without one, as the legend then says.
     """
     near, far = depth_range(depth_m, valid, near, far)
-    marks = tuple((math.log(z / near) / math.log(far / near), f"{z:g}") for z in ticks(near, far))
+    marks = [(math.log(z / near) / math.log(far / near), f"{z:g}") for z in ticks(near, far)]
     unknown = not _usable(_as_map(depth_m), valid).all()
     label = "no unit" if unit is None else f"depth, {unit}"
     picture = colour_depth(depth_m, valid, near, far)
-    return _figure(picture, f"{DEPTH_COLOURS}_r", label, marks, unknown, title)
+    return _figure(picture, f"{DEPTH_COLOURS}_r", label, marks, unknown)
 
 
 def share_figure(values: np.ndarray, label: str, top: float) -> Image.Image:
     """A map ``(H, W)`` of something from 0 to ``top`` (> 0), beside a colour bar under its ``label``."""
-    marks = tuple((share, f"{share * top:.2g}") for share in (0.0, 0.25, 0.5, 0.75, 1.0))
+    marks = [(share, f"{share * top:.2g}") for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
     unknown = not np.isfinite(values).all()
     return _figure(colour_share(values, top), SHARE_COLOURS, label, marks, unknown)
 
@@ -246,45 +227,40 @@ def _as_picture(image: Any) -> Image.Image:
 
 
 def grid(
-    images: Sequence[Any],
-    titles: Sequence[str] | None = None,
-    *,
-    columns: int | None = None,
-    cell_width: int = 320,
+    images: Sequence[Any], titles: Sequence[str], *, columns: int | None = None, cell_width: int = 320
 ) -> Image.Image:
-    """A contact sheet: pictures side by side, each under its title.
+    """A contact sheet: pictures side by side, each under its title, scaled to ``cell_width`` pixels.
 
-    Pictures are PIL images, or ``(H, W)`` or ``(H, W, 3)`` arrays of uint8, bool or floats in [0, 1]. Each is
-    scaled to ``cell_width`` pixels; a row, of ``columns`` (all, up to 4), is as high as its highest.
+    Pictures are PIL images, or ``(H, W)`` or ``(H, W, 3)`` arrays of uint8, bool or floats in [0, 1]. A row,
+    of ``columns`` (all, up to 4), is as high as its highest.
 
     Raises:
-        ValueError: no pictures, another number of titles, an array that is no picture, no columns.
+        ValueError: no pictures, another number of titles, an array that is no picture.
     """
     pictures = [_as_picture(image) for image in images]
-    if not pictures:
-        bad_value("images", "at least one picture", "none")
-    if titles is not None and len(titles) != len(pictures):
-        bad_value("titles", f"one for each of {len(pictures)} pictures", f"{len(titles)}")
-    if columns is not None and columns < 1:
-        bad_value("columns", "at least 1", columns)
-    columns, gap, head = columns or min(len(pictures), 4), 6, 0 if titles is None else 24
+    if not pictures or len(titles) != len(pictures):
+        bad_value(
+            "images", "at least one picture, each with a title", f"{len(pictures)}, {len(titles)} titles"
+        )
+    columns, gap, head = columns or min(len(pictures), 4), 6, 24
     cells = [p.resize((cell_width, max(1, round(p.height * cell_width / p.width)))) for p in pictures]
-    rows = [cells[start : start + columns] for start in range(0, len(cells), columns)]
-    heights = [head + gap + max(cell.height for cell in row) for row in rows]
-    sheet = Image.new("RGB", (gap + columns * (cell_width + gap), gap + sum(heights)), "white")
-    places = [
-        (gap + column * (cell_width + gap), gap + sum(heights[:row]))
-        for row, cells_of_row in enumerate(rows)
-        for column in range(len(cells_of_row))
+    heights = [
+        head + gap + max(cell.height for cell in cells[start : start + columns])
+        for start in range(0, len(cells), columns)
     ]
-    for cell, (left, top) in zip(cells, places, strict=True):
-        sheet.paste(cell, (left, top + head))
+    wide, high = gap + columns * (cell_width + gap), gap + sum(heights)
+    sheet, places = Image.new("RGB", (wide, high), "white"), []
+    for k, cell in enumerate(cells):
+        places.append((gap + k % columns * (cell_width + gap), gap + sum(heights[: k // columns])))
+        sheet.paste(cell, (places[-1][0], places[-1][1] + head))
 
     def draw(figure: Any) -> None:
-        for title, (left, top) in zip(titles or (), places, strict=True):
-            _write(figure, title, (left + cell_width / 2, top + head / 2), 15, cell_width)
+        for title, (left, top) in zip(titles, places, strict=True):
+            size = min(15, 1.7 * cell_width / max(1, len(title))) * POINTS_PER_PIXEL  # smaller if too long
+            x, y = (left + cell_width / 2) / wide, 1 - (top + head / 2) / high
+            figure.text(x, y, title, fontsize=size, parse_math=False, ha="center", va="center")
 
-    return sheet if titles is None else _drawn(np.asarray(sheet), draw)
+    return _drawn(np.asarray(sheet), draw)
 
 
 def overview(
@@ -294,10 +270,9 @@ def overview(
     error: np.ndarray | None,
     unit: str | None = "m",
 ) -> Image.Image:
-    """Left image, depth with legend, and where there are any confidence and photometric error, two a row.
+    """Left image in [0, 1], depth with legend, and any confidence and photometric error, two in a row.
 
-    ``left_01`` is ``(H, W, 3)`` in [0, 1], ``depth_m`` ``(H, W)`` in ``unit``; ``confidence`` and ``error``
-    are ``(H, W)`` in [0, 1], the latter not finite where no right view sees the pixel.
+    Both are ``(H, W)`` in [0, 1], the latter not finite where no right view sees the pixel.
     """
     every = max(1, depth_m.shape[1] // (2 * CELL_WIDTH))
     depth = depth_figure(depth_m[::every, ::every], unit=unit)
@@ -358,19 +333,9 @@ def _beside(photograph: Image.Image, figure: Image.Image, shape: float) -> Image
 
 
 def check_video(path: str | os.PathLike[str], fps: float) -> None:
-    """Refuse a video that could not be written, before its frames are drawn.
-
-    Raises:
-        ValueError: another ending than ``VIDEO_SUFFIXES``, a folder, no folder to write into, or ``fps``
-            outside [0.1, 120].
-    """
-    path = Path(path)
-    if path.suffix.lower() not in VIDEO_SUFFIXES:
-        bad_value("the video", f"a file that ends in {', '.join(VIDEO_SUFFIXES)}", path.name)
-    if os.path.isdir(path):
-        bad_value("the video", "a file", f"the folder {path}", "Name a file inside of it.")
-    if not path.parent.is_dir():
-        bad_value("the video", "in an existing folder", path, f"Make the folder {path.parent} first.")
+    """``ValueError`` for a video of another ending than ``VIDEO_SUFFIXES``, or ``fps`` outside [0.1, 120]."""
+    if Path(path).suffix.lower() not in VIDEO_SUFFIXES:
+        bad_value("the video", f"a file that ends in {', '.join(VIDEO_SUFFIXES)}", Path(path).name)
     check_number(fps, "fps", 0.1, 120)
 
 
@@ -379,10 +344,8 @@ def _write_mp4(path: Path, frames: Iterable[Image.Image], fps: float) -> None:
     writer = None
     try:
         for frame in frames:
-            width, height = (side // 2 * 2 for side in frame.size)
-            writer = writer or cv2.VideoWriter(
-                str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height)
-            )
+            width, height = size = tuple(side // 2 * 2 for side in frame.size)
+            writer = writer or cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
             if not writer.isOpened():
                 raise InputFileError("the video must be one that OpenCV can write; got .mp4.")
             writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))
@@ -397,16 +360,14 @@ def write_depth_video(path: str | os.PathLike[str], frames: Iterable[Image.Image
     An MP4 is written frame by frame; all frames of the others are in memory, as Pillow wants them.
 
     Raises:
-        ValueError: as ``check_video``; no frames.
+        ValueError: another ending, no frames, or ``fps`` (frames a second) outside [0.1, 120].
         OSError: the file cannot be written.
     """
-    path = Path(path)
     check_video(path, fps)
-    rest = iter(frames)
+    rest, kind = iter(frames), Path(path).suffix.lower()
     first = next(rest, None)
     if first is None:
         bad_value("frames", "at least one picture", "none")
-    kind = path.suffix.lower()
     more: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0}
     more |= {"quality": 85} if kind == ".webp" else {}
     try:
@@ -419,6 +380,5 @@ def write_depth_video(path: str | os.PathLike[str], frames: Iterable[Image.Image
     except InputError:  # of a photograph, or of the file, which it names
         raise
     except OSError as error:
-        reason = error.strerror or error
-        said = f"the video must be a file that can be written; got {path} ({reason})."
+        said = f"the video must be a file that can be written; got {path} ({reason_of(error)})."
         raise InputFileError(said) from error

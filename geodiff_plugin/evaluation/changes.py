@@ -49,8 +49,8 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
     "parts": (
         ("as it is", "guided"),
         ("search only", "search-only"),
-        ("photometric only", "photometric-only"),
-        ("matches only", "matches-only"),
+        ("photometric only", "guided:weights.matches=0"),
+        ("matches only", "guided:weights.photometric=0"),
         ("no diffusion", "no-diffusion"),
         ("without correction in the loop", "guided:correct=false"),
         ("with a correction in every step", "guided:corrections=1000"),

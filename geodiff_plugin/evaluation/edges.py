@@ -1,19 +1,12 @@
-"""Metrics of depth edges and of the surfaces between them."""
+"""Metrics of depth edges and of the surfaces between them.
+
+Maps are ``(H, W)`` as in ``metrics``: depth in metres, disparity in pixels, ``valid`` bool.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
-
-__all__ = [
-    "boundary_errors",
-    "boundary_f1",
-    "depth_edges",
-    "edge_error",
-    "hidden_by_truth",
-    "near_disparity_steps",
-    "surface_error",
-]
 
 #: A step of the true disparity between neighbours that makes an edge, and how near it "edge" reaches, pixels.
 STEP_PX, REACH_PX = 3.0, 4
@@ -27,14 +20,9 @@ LOG_STEP, NEAR_EDGE, OFF_EDGE = 0.08, 3, 5
 
 
 def near_disparity_steps(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Pixels within ``REACH_PX`` of a step of the true disparity of more than ``STEP_PX``.
+    """``(H, W)`` bool: pixels within ``REACH_PX`` of a step of the true disparity of more than ``STEP_PX``.
 
-    Args:
-        disparity_px: ``(H, W)`` float, pixels.
-        valid: ``(H, W)`` bool, where it is known.
-
-    Returns:
-        ``(H, W)`` bool, within ``valid``; a step lies between two known neighbours of a row or a column.
+    A step lies between two known neighbours of a row or a column.
     """
     step = np.zeros(valid.shape, bool)
     for axis in (0, 1):
@@ -46,15 +34,10 @@ def near_disparity_steps(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndar
 
 
 def hidden_by_truth(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Pixels of dense truth that something nearer hides in the right view of a rectified pair.
+    """``(H, W)`` bool: pixels of dense truth hidden in the right view of a rectified pair.
 
-    Args:
-        disparity_px: ``(H, W)`` float, pixels.
-        valid: ``(H, W)`` bool, where it is known.
-
-    Returns:
-        ``(H, W)`` bool: another pixel of the row, nearer by more than 1 px of disparity, falls onto the same
-        column of the right image; pixels that fall beside the image are none.
+    Another pixel of the row, nearer by more than 1 px of disparity, falls onto the same column of the right
+    image; pixels that fall beside the image are none.
     """
     height, width = valid.shape
     rows, columns = np.nonzero(valid)
@@ -70,11 +53,7 @@ def hidden_by_truth(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def _front_of(depth_m: np.ndarray, known: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Depth of the other pixel over that of this one, for neighbours right, left, below, above.
-
-    Returns:
-        ``(ratio, both known)`` each; above 1 where this pixel lies in front.
-    """
+    """Depth of the neighbour right, left, below, above over that of a pixel, and where both are known."""
     pairs = []
     for axis in (1, 0):
         near, far = (np.take(depth_m, range(i, depth_m.shape[axis] - 1 + i), axis) for i in (0, 1))
@@ -85,12 +64,7 @@ def _front_of(depth_m: np.ndarray, known: np.ndarray) -> list[tuple[np.ndarray, 
 
 
 def boundary_f1(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> float:
-    """How well the boundaries of a map lie where those of the truth lie, whatever its scale.
-
-    Args:
-        pred_m: ``(H, W)`` float, metres up to a factor; not finite or not positive is unknown.
-        truth_m: ``(H, W)`` float, metres.
-        valid: ``(H, W)`` bool; pairs of neighbours count where both have truth and prediction.
+    """How well the boundaries of a map, of any scale, lie where those of the truth lie.
 
     Returns:
         In [0, 1], 1 for truth with boundaries of all four directions itself; NaN where it has none.
@@ -137,12 +111,7 @@ def _canny(depth_m: np.ndarray) -> np.ndarray:
 
 
 def boundary_errors(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> dict[str, float]:
-    """Distances between the boundaries of a map and those of the truth.
-
-    Args:
-        pred_m: ``(H, W)`` float, metres; unknown pixels take the nearest known depth.
-        truth_m: ``(H, W)`` float, metres; likewise.
-        valid: ``(H, W)`` bool, where the truth is known; boundaries elsewhere do not count.
+    """Distances between the boundaries of a map, whose holes take the nearest depth, and those of the truth.
 
     Returns:
         ``dbe_acc``: mean distance, pixels, of the map's boundaries from the truth's, of those nearer than 10;
@@ -153,12 +122,10 @@ def boundary_errors(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) 
         Deviation: their true boundaries are drawn by hand, ours are found by the same filter.
     """
     known = np.isfinite(pred_m) & (pred_m > 0)
-    if not known.any():
-        return {"dbe_acc": float("nan"), "dbe_comp": float("nan")}
     true = _canny(_filled(truth_m, valid)) & valid
-    drawn = _canny(_filled(pred_m, known)) & valid
-    if not true.any():
+    if not known.any() or not true.any():
         return {"dbe_acc": float("nan"), "dbe_comp": float("nan")}
+    drawn = _canny(_filled(pred_m, known)) & valid
     to_true = ndimage.distance_transform_edt(~true)
     near = drawn & (to_true < FARTHEST_PX)
     if not near.any():

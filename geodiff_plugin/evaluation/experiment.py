@@ -25,7 +25,7 @@ import torch
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import Method, NotApplicable, PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.baselines.outside import map_name
+from geodiff_plugin.evaluation.baselines.unguided import map_name
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, load
 from geodiff_plugin.evaluation.metrics import crop_mask
 from geodiff_plugin.evaluation.options import command_line

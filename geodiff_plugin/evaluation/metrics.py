@@ -1,4 +1,8 @@
-"""Errors of depth, disparity and uncertainty against the truth, and alignment with it (paper S5.1)."""
+"""Errors of depth, disparity and uncertainty against the truth, and alignment with it (paper S5.1).
+
+Maps are ``(H, W)``: ``pred_m`` and ``truth_m`` float, metres; ``valid`` bool, where the truth counts. A
+prediction is not finite, or not positive, where a method leaves a hole; holes count in no mean.
+"""
 
 from __future__ import annotations
 
@@ -45,12 +49,7 @@ def _check_maps(**maps: np.ndarray) -> None:
 
 
 def counted(truth_m: np.ndarray, valid: np.ndarray, cap_m: float | None = None) -> np.ndarray:
-    """``(H, W)`` bool: pixels whose truth counts, known and strictly between ``FLOOR_M`` and the cap.
-
-    Args:
-        truth_m: ``(H, W)`` float, metres.
-        valid: ``(H, W)`` bool, where the truth is known.
-        cap_m: farthest truth that counts, metres; ``None`` for no limit.
+    """``(H, W)`` bool: pixels whose truth is known and strictly between ``FLOOR_M`` and the cap, if any.
 
     Raises:
         ValueError: shapes differ, or no pixel is left.
@@ -65,13 +64,7 @@ def counted(truth_m: np.ndarray, valid: np.ndarray, cap_m: float | None = None) 
 def evaluate_depth(
     pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, cap_m: float | None = None
 ) -> dict[str, float]:
-    """Errors of one depth map.
-
-    Args:
-        pred_m: ``(H, W)`` float, metres; NaN, infinite or not positive where a method leaves a hole.
-        truth_m: ``(H, W)`` float, metres.
-        valid: ``(H, W)`` bool, where the truth is known.
-        cap_m: truth from here on is dropped and predictions are clipped to it, metres; ``None`` for no limit.
+    """Errors of one depth map; truth from ``cap_m`` on is dropped, and predictions are clipped to it.
 
     Returns:
         ``DEPTH_METRICS`` over the pixels with both truth and prediction, NaN where there is none;
@@ -96,17 +89,10 @@ def evaluate_depth(
 def evaluate_disparity(
     pred_px: np.ndarray, truth_px: np.ndarray, valid: np.ndarray, step_px: float = 0.0
 ) -> dict[str, float | None]:
-    """Errors of one disparity map.
+    """``DISPARITY_METRICS`` of a disparity map, pixels; NaN without a pixel with truth and prediction.
 
-    Args:
-        pred_px: ``(H, W)`` float, pixels; not finite where a method leaves a hole.
-        truth_px: ``(H, W)`` float, pixels.
-        valid: ``(H, W)`` bool, where the truth counts.
-        step_px: distance between two neighbouring values that the truth can take, pixels.
-
-    Returns:
-        ``DISPARITY_METRICS`` over the pixels with both truth and prediction, NaN where there is none;
-        ``None`` where the truth's step is coarser than the threshold.
+    ``step_px`` is the distance between two neighbouring values that the truth can take: a metric whose
+    threshold is finer is ``None``.
 
     Raises:
         ValueError: shapes differ, or no pixel has truth.
@@ -123,11 +109,6 @@ def evaluate_disparity(
         name: None if step_px > limit else float(metric(error, truth)) if error.size else float("nan")
         for name, (limit, metric) in DISPARITY_METRICS.items()
     }
-
-
-def _relative_errors(pred_m: np.ndarray, truth_m: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    truth = np.asarray(truth_m, np.float64)[kept]
-    return np.abs(np.asarray(pred_m, np.float64)[kept] - truth) / truth
 
 
 def _remaining(error: np.ndarray, order: np.ndarray, steps: int) -> np.ndarray:
@@ -147,13 +128,7 @@ def ause(
 
     The share ``k / steps`` of the least certain pixels is left out, the mean relative error of the rest is
     compared with the same where the worst pixels are left out, and the difference is averaged over k.
-
-    Args:
-        pred_m: ``(H, W)`` float, metres.
-        truth_m: ``(H, W)`` float, metres.
-        valid: ``(H, W)`` bool, where the truth counts.
-        uncertainty: ``(H, W)`` float, any unit; larger is less certain. ``None``: the mean over random ones.
-        steps: number of points on the curve, at least 1.
+    ``uncertainty`` is ``(H, W)``, any unit, larger is less certain; ``None``: the mean over random ones.
 
     Returns:
         In AbsRel's unit, at least 0; 0 where the order of the pixels is the order of their errors.
@@ -169,7 +144,8 @@ def ause(
     kept = valid & np.isfinite(pred_m) & (pred_m > 0) & np.isfinite(known)
     if not kept.any():
         bad_value("uncertainty", "finite for at least one pixel with truth and prediction", "none")
-    error = _relative_errors(pred_m, truth_m, kept)
+    truth = np.asarray(truth_m, np.float64)[kept]
+    error = np.abs(np.asarray(pred_m, np.float64)[kept] - truth) / truth
     # Stable sorts: pixels of equal uncertainty keep the image's order on every machine.
     best = _remaining(error, np.argsort(-error, kind="stable"), steps)
     if uncertainty is None:
@@ -181,14 +157,7 @@ def ause(
 def confidence_deciles(
     pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, confidence: np.ndarray, within: float
 ) -> list[dict[str, float | None]]:
-    """What a confidence promises and what it keeps, in ten classes of equal width.
-
-    Args:
-        pred_m: ``(H, W)`` metres.
-        truth_m: ``(H, W)`` metres.
-        valid: ``(H, W)`` bool, where the truth counts.
-        confidence: ``(H, W)`` in [0, 1], a probability that the relative error is below ``within``.
-        within: relative error, > 0.
+    """What a confidence in [0, 1], that the relative error is below ``within``, promises and what it keeps.
 
     Returns:
         Ten entries, from [0, 0.1) to [0.9, 1]: ``share`` of the pixels, mean ``promised``, ``kept`` (share of
@@ -200,9 +169,9 @@ def confidence_deciles(
     values = {"promised": promised, "kept": error < within, "abs_rel": error}
     decile, classes = np.minimum((promised * 10).astype(int), 9), list[dict[str, float | None]]()
     for k in range(10):
-        own = decile == k
-        means = {name: float(np.mean(v[own])) if own.any() else None for name, v in values.items()}
-        classes.append({"share": float(own.mean()) if own.size else 0.0, **means})
+        inside = decile == k
+        means = {name: float(np.mean(v[inside])) if inside.any() else None for name, v in values.items()}
+        classes.append({"share": float(inside.mean()) if inside.size else 0.0, **means})
     return classes
 
 
@@ -211,25 +180,10 @@ def to_space(depth_m: np.ndarray, space: str) -> np.ndarray:
     return SPACES[space].inverse(torch.from_numpy(np.asarray(depth_m, np.float64))).numpy()
 
 
-def _from_space(values: np.ndarray, space: str) -> np.ndarray:
-    """Metres of values in a space; where values fall with depth, none is less than that of a kilometre."""
-    kind, metre = SPACES[space], torch.ones((), dtype=torch.float64)
-    x = torch.from_numpy(np.asarray(values, np.float64))
-    if not kind.grows_with_depth:
-        x = x.clamp_min(float(kind.inverse(metre / MIN_DISPARITY)))
-    return kind.forward(x, metre).numpy()
-
-
 def least_squares(values: np.ndarray, target: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
     """Scale and shift that bring ``values`` closest to ``target`` over the mask, in the sum of squares.
 
-    Args:
-        values: ``(H, W)`` float.
-        target: ``(H, W)`` float.
-        mask: ``(H, W)`` bool, not empty.
-
-    Returns:
-        ``(scale, shift)``; the scale is negative where the two run against each other.
+    The scale is negative where the two run against each other.
 
     Source: Marigold, ``align_depth_least_square`` (without its optional downscaling), in float64.
     """
@@ -239,23 +193,17 @@ def least_squares(values: np.ndarray, target: np.ndarray, mask: np.ndarray) -> t
 
 
 def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str = "depth") -> np.ndarray:
-    """Depth in metres of a prediction that is right up to scale and shift in its space.
-
-    Args:
-        values: ``(H, W)`` float, affine in what ``space`` says; not finite where a method leaves a hole.
-        truth_m: ``(H, W)`` float, metres.
-        valid: ``(H, W)`` bool, where the truth counts.
-        space: key of ``SPACES``.
+    """Depth in metres of ``values`` that are right up to scale and shift in a key of ``SPACES``.
 
     Returns:
         ``(H, W)`` float64, metres, at least ``FLOOR_M``, where Marigold's evaluation clips what least
-        squares sends behind the camera; not finite where ``values`` is not, and nowhere finite where no pixel
-        has both truth and prediction.
+        squares sends behind the camera, and at most a kilometre where values fall with depth; not finite
+        where ``values`` is not, and nowhere finite where no pixel has both truth and prediction.
 
     Source: Marigold's evaluation: ``least_square`` and ``least_square_disparity``, the latter over positive
         predictions only and clipped at 1e-3; the other spaces are the same idea.
     """
-    check_choice(space, "space", SPACES)
+    kind, metre = SPACES[check_choice(space, "space", SPACES)], torch.ones((), dtype=torch.float64)
     known = valid & np.isfinite(values) & (truth_m > 0)
     if space == "disparity":
         known &= np.nan_to_num(values) > 0
@@ -264,11 +212,15 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
     target = np.zeros(np.shape(truth_m))
     target[known] = to_space(np.asarray(truth_m, np.float64)[known], space)
     scale, shift = least_squares(values, target, known)
-    return np.maximum(_from_space(np.asarray(values, np.float64) * scale + shift, space), FLOOR_M)
+    x = torch.from_numpy(np.asarray(values, np.float64) * scale + shift)
+    if not kind.grows_with_depth:
+        x = x.clamp_min(float(kind.inverse(metre / MIN_DISPARITY)))
+    return np.maximum(kind.forward(x, metre).numpy(), FLOOR_M)
 
 
 #: Shares of the image: first and last row, first and last column.
 _SHARES = {
+    "none": (0.0, 1.0, 0.0, 1.0),
     "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),
     "eigen": (0.3324324, 0.91351351, 0.0359477, 0.96405229),
 }
@@ -277,14 +229,10 @@ _BENCHMARK = (352, 1216)
 
 
 def crop_mask(name: str, size: tuple[int, int]) -> np.ndarray:
-    """``(H, W)`` bool: pixels inside of a crop; methods still see whole images.
+    """``(H, W)`` bool: pixels of an image inside of a crop, one of ``CROPS``; methods still see whole images.
 
     Of 375 x 1242 pixels, Garg's crop keeps rows 153 to 370 and columns 44 to 1196, Eigen's rows 124 to 341
     and the same columns, the benchmark's rows 23 to 374 and columns 13 to 1228 (bottom, middle).
-
-    Args:
-        name: one of ``CROPS``.
-        size: ``(H, W)`` of the image.
 
     Raises:
         ValueError: an unknown name, or an image smaller than the benchmark's.
@@ -294,7 +242,6 @@ def crop_mask(name: str, size: tuple[int, int]) -> np.ndarray:
     """
     check_choice(name, "crop", CROPS)
     height, width = size
-    top, bottom, left, right = 0, height, 0, width
     if name == "benchmark":
         rows, columns = _BENCHMARK
         if height < rows or width < columns:
@@ -302,7 +249,7 @@ def crop_mask(name: str, size: tuple[int, int]) -> np.ndarray:
             bad_value("crop", expected, f"{width} x {height}", "It is for KITTI; leave --crop out.")
         top, left = height - rows, (width - columns) // 2
         bottom, right = top + rows, left + columns
-    elif name != "none":
+    else:
         sides = zip(_SHARES[name], (height, height, width, width), strict=True)
         top, bottom, left, right = (int(share * side) for share, side in sides)
     mask = np.zeros(size, bool)

@@ -28,7 +28,7 @@ CAPTURE_ROWS = ("given", "pairs", "capture")
 """Poses of a capture: as given, refined pair by pair, solved together."""
 STRENGTHS = ("exact", "2%", "5%", "10%", "20%", "blur", "gamma")
 DTYPES = ("float32", "float16", "bfloat16")
-FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative", "epipolar", "terms")
+FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative")
 WAYS = ("alone", "alone-half", "scale", "warm", "warm-50", "warm-75")
 #: Fields that are those of ``Settings``.
 SETTINGS = ("ensemble", "seed", "steps", "resolution", "dtype", "space", "views")

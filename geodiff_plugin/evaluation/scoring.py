@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation import edges
 from geodiff_plugin.evaluation.baselines.base import Prediction
-from geodiff_plugin.evaluation.baselines.stereo import sweep
+from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
 from geodiff_plugin.evaluation.metrics import (
     align,

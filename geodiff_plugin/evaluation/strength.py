@@ -29,7 +29,7 @@ from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Setti
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load
 from geodiff_plugin.evaluation.edges import edge_error, surface_error
 from geodiff_plugin.evaluation.experiment import Experiment, Page, cell_key, last_of
-from geodiff_plugin.evaluation.figures.curves import draw_strength, shaded
+from geodiff_plugin.evaluation.figures import draw_strength, shaded
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth, to_space
 from geodiff_plugin.evaluation.options import StrengthOptions, data_of
 from geodiff_plugin.evaluation.scoring import DENSE

@@ -22,7 +22,7 @@ from tqdm import tqdm
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, posed_views
-from geodiff_plugin.evaluation.baselines.stereo import sweep
+from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.scoring import DENSE

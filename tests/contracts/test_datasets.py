@@ -5,7 +5,6 @@ real sample was at hand, so that page is all that there is to check them by. The
 """
 
 import os
-import re
 import shutil
 from pathlib import Path
 
@@ -17,11 +16,12 @@ from PIL import Image
 from geodiff_plugin.evaluation.baselines import Prediction
 from geodiff_plugin.evaluation.datasets import DATASETS, StereoSample, find_pairs, load, load_pairs
 from geodiff_plugin.evaluation.datasets.changed import changed_ref
-from geodiff_plugin.evaluation.datasets.posed import KEY_VIEWS, find_mvsnet, find_robustmvd
+from geodiff_plugin.evaluation.datasets.layouts import KEY_VIEWS, find_mvsnet, find_robustmvd
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.experiment import cell_key
 from geodiff_plugin.evaluation.scoring import score
-from geodiff_plugin.formats import write_depth_mm, write_pfm
+from geodiff_plugin.formats import as_image_01, write_depth_mm, write_pfm
+from geodiff_plugin.geometry import warp_right_to_left
 from tests.contracts import factory_calibrations as factory
 
 HEIGHT, WIDTH, F, CX, CY, BASELINE = 40, 64, 50.0, 31.0, 19.5, 0.2
@@ -52,17 +52,16 @@ def with_hole(values, unknown):
 
 
 def write_kitti(folder, left, right, truth, calibration, prefix, numbers):
-    save(folder / left / "000007_10.png", picture(channels=1 if left == "image_0" else 3))
-    save(folder / right / "000007_10.png", picture(channels=1 if left == "image_0" else 3))
+    for name in (left, right):
+        save(folder / name / "000007_10.png", picture(channels=1 if left == "image_0" else 3))
     save(folder / truth / "000007_10.png", np.rint(with_hole(disparity(), 0) * 256).astype(np.uint16))
-    lines = []
+    text = ""
     for number, shift in zip(numbers, (0.0, -F * BASELINE), strict=True):
         if prefix == "P_rect_0":
-            lines.append(f"S_rect_0{number}: {WIDTH} {HEIGHT}\nR_rect_0{number}: 1 0 0 0 1 0 0 0 1")
-        lines.append(f"{prefix}{number}: {F} 0 {CX} {shift} 0 {F} {CY} 0 0 0 1 0")
-    path = folder / calibration / "000007.txt"
-    path.parent.mkdir(parents=True)
-    path.write_text("\n".join(lines) + "\n")
+            text += f"S_rect_0{number}: {WIDTH} {HEIGHT}\nR_rect_0{number}: 1 0 0 0 1 0 0 0 1\n"
+        text += f"{prefix}{number}: {F} 0 {CX} {shift} 0 {F} {CY} 0 0 0 1 0\n"
+    (folder / calibration).mkdir(parents=True)
+    (folder / calibration / "000007.txt").write_text(text)
 
 
 def kitti2015(root):
@@ -74,7 +73,7 @@ def kitti2012(root):
     write_kitti(folder, "image_0", "image_1", "disp_noc", "calib", "P", (0, 1))
 
 
-def write_middlebury(folder, truth, doffs):
+def write_middlebury(folder, truth, doffs, mask=False):
     for name in ("im0.png", "im1.png"):
         save(folder / name, picture())
     truth.parent.mkdir(parents=True, exist_ok=True)
@@ -83,6 +82,11 @@ def write_middlebury(folder, truth, doffs):
         f"cam0=[{F} 0 {CX}; 0 {F} {CY}; 0 0 1]\ncam1=[{F} 0 {CX + doffs}; 0 {F} {CY}; 0 0 1]\n"
         f"doffs={doffs}\nbaseline={BASELINE * 1000}\nwidth={WIDTH}\nheight={HEIGHT}\nndisp=16\n"
     )
+    if mask:
+        save(
+            truth.parent / "mask0nocc.png",
+            np.where(np.arange(WIDTH) < 4, 128, 255)[None].repeat(HEIGHT, 0).astype(np.uint8),
+        )
 
 
 def middlebury2014(root):
@@ -91,18 +95,12 @@ def middlebury2014(root):
 
 def middeval3(root):
     scene = root / "MiddEval3" / "trainingQ" / "Scene"
-    write_middlebury(scene, scene / "disp0GT.pfm", 1.5)
-    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    mask[:, :4] = 128
-    save(scene / "mask0nocc.png", mask)
+    write_middlebury(scene, scene / "disp0GT.pfm", 1.5, mask=True)
 
 
 def eth3d(root):
     truth = root / "two_view_training_gt" / "scene_1s" / "disp0GT.pfm"
-    write_middlebury(root / "two_view_training" / "scene_1s", truth, 0)
-    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    mask[:, :4] = 128
-    save(truth.parent / "mask0nocc.png", mask)
+    write_middlebury(root / "two_view_training" / "scene_1s", truth, 0, mask=True)
 
 
 def booster(root):
@@ -128,37 +126,31 @@ def booster(root):
     )
 
 
-def mvsnet(root):
-    group = root / "scan1"
-    for view in range(3):
+def write_posed(group, views, pixel_centre, ranges):
+    """Cameras that look along z; each of the views stands a baseline to the right of the one before."""
+    K = f"{F} 0 {CX + pixel_centre}\n0 {F} {CY + pixel_centre}\n0 0 1"
+    (group / "cams").mkdir(parents=True)
+    for place, view in enumerate(views):
         save(group / "images" / f"{view:08d}.jpg", picture())
-        # World-to-camera: all look along z, the camera of view n stands n baselines to the right.
-        world_to_camera = f"1 0 0 {-BASELINE * view}\n0 1 0 0\n0 0 1 0\n0 0 0 1"
-        path = group / "cams" / f"{view:08d}_cam.txt"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(
-            f"extrinsic\n{world_to_camera}\n\nintrinsic\n{F} 0 {CX}\n0 {F} {CY}\n0 0 1\n\n9e9 9e9 192 9e9\n"
-        )
-    (group / "depths").mkdir()
-    write_pfm(group / "depths" / "00000000.pfm", with_hole(F * BASELINE / disparity(), 0))
-    (group / "pair.txt").write_text("3\n0\n2 1 10.0 2 5.0\n1\n1 0 10.0\n2\n1 0 5.0\n")
+        world_to_camera = f"1 0 0 {-BASELINE * place}\n0 1 0 0\n0 0 1 0\n0 0 0 1"
+        text = f"extrinsic\n{world_to_camera}\n\nintrinsic\n{K}\n{ranges}"
+        (group / "cams" / f"{view:08d}_cam.txt").write_text(text)
+
+
+def mvsnet(root):
+    write_posed(root / "scan1", range(3), 0.0, "\n9e9 9e9 192 9e9\n")
+    (root / "scan1" / "depths").mkdir()
+    write_pfm(root / "scan1" / "depths" / "00000000.pfm", with_hole(F * BASELINE / disparity(), 0))
+    (root / "scan1" / "pair.txt").write_text("3\n0\n2 1 10.0 2 5.0\n1\n1 0 10.0\n2\n1 0 5.0\n")
 
 
 def robustmvd(root):
     """The scene Barn with key view 60, its best source 62 to the right of it, and 61 further to the right."""
-    scene = root / "Barn"
-    for place, view in enumerate((60, 62, 61)):
-        save(scene / "images" / f"{view:08d}.jpg", picture())
-        world_to_camera = f"1 0 0 {-BASELINE * place}\n0 1 0 0\n0 0 1 0\n0 0 0 1"
-        path = scene / "cams" / f"{view:08d}_cam.txt"
-        path.parent.mkdir(exist_ok=True)
-        # COLMAP's convention: the first pixel's centre is at 0.5.
-        K = f"{F} 0 {CX + 0.5}\n0 {F} {CY + 0.5}\n0 0 1"
-        path.write_text(f"extrinsic\n{world_to_camera}\n\nintrinsic\n{K}\n")
-    (scene / "depth").mkdir()
+    write_posed(root / "Barn", (60, 62, 61), 0.5, "")  # COLMAP's: the first pixel's centre is at 0.5
+    (root / "Barn" / "depth").mkdir()
     depth_m = with_hole(F * BASELINE / disparity(), np.inf).astype(np.float32)
-    np.savez_compressed(scene / "depth" / "000061.npz", depth_m)  # scans are counted from 1
-    (scene / "pair.txt").write_text("1\n60\n2 62 10.0 61 5.0\n")
+    np.savez_compressed(root / "Barn" / "depth" / "000061.npz", depth_m)  # scans are counted from 1
+    (root / "Barn" / "pair.txt").write_text("1\n60\n2 62 10.0 61 5.0\n")
 
 
 def folder(root):
@@ -177,36 +169,17 @@ LAYOUTS = {
     "middeval3": (middeval3, "*/*/Scene/im1.png", "*/*/Scene/disp0GT.pfm", "*/*/Scene/calib.txt"),
     "eth3d": (eth3d, "two_view_training/*/im1.png", "two_view_training_gt/*/disp0GT.pfm", "*/*/calib.txt"),
     "booster": (booster, "*/*/*/camera_02/im0.png", "*/*/*/disp_00.npy", "*/*/*/calib_00-02.xml"),
-    "mvsnet": (
-        mvsnet,
-        "scan1/images/00000001.jpg",
-        "scan1/depths/00000000.pfm",
-        "scan1/cams/00000001_cam.txt",
-    ),
-    "robustmvd": (
-        robustmvd,
-        "Barn/images/00000062.jpg",
-        "Barn/depth/000061.npz",
-        "Barn/cams/00000062_cam.txt",
-    ),
+    "mvsnet": (mvsnet, "*/images/00000001.jpg", "*/depths/00000000.pfm", "*/cams/00000001_cam.txt"),
+    "robustmvd": (robustmvd, "*/images/00000062.jpg", "*/depth/000061.npz", "*/cams/00000062_cam.txt"),
     "folder": (folder, "mine/right.png", "mine/depth.npy", "mine/calib.txt"),
 }
 
-each_dataset = pytest.mark.parametrize("name", LAYOUTS)
+each_dataset = pytest.mark.parametrize("name", [name for name in DATASETS if name != "synthetic"])
 
 
 def one(root, name) -> StereoSample:
     (ref,) = find_pairs(root, [name])
     return load(ref)
-
-
-def only_file(root: Path, pattern: str) -> Path:
-    (path,) = root.glob(pattern)
-    return path
-
-
-def test_every_data_set_has_a_fixture():
-    assert set(DATASETS) - {"synthetic"} == set(LAYOUTS)
 
 
 @each_dataset
@@ -225,7 +198,9 @@ def test_sample_is_in_our_conventions_and_metric(tmp_path, name):
     np.testing.assert_array_equal(sample.valid, known)
     np.testing.assert_allclose(sample.depth_m[known], (F * BASELINE / disparity())[known], rtol=1e-5)
     assert (sample.depth_m[~known] == 0).all()
-    # Disparity moves left pixels to the left.
+    if name in ("middeval3", "eth3d", "booster"):
+        np.testing.assert_array_equal(sample.occluded, known & (np.arange(WIDTH) < 4))
+    assert name != "booster" or (sample.material == 3).all()
     cameras = sample.K_left, sample.K_right, sample.E
     raw = depth_to_disparity(np.where(known, sample.depth_m, 1), *cameras)
     doffs = sample.K_right[0, 2] - sample.K_left[0, 2]
@@ -233,30 +208,9 @@ def test_sample_is_in_our_conventions_and_metric(tmp_path, name):
     np.testing.assert_allclose(disparity_to_depth(raw, *cameras)[known], sample.depth_m[known], rtol=1e-5)
 
 
-@each_dataset
-@pytest.mark.parametrize("which", [1, 2, 3], ids=["image", "truth", "calibration"])
-def test_missing_file_is_named_or_leaves_nothing_valid(tmp_path, name, which):
-    LAYOUTS[name][0](tmp_path)
-    gone = only_file(tmp_path, LAYOUTS[name][which])
-    gone.unlink()
-    refs = find_pairs(tmp_path, [name])
-    if which == 2 and name in ("mvsnet", "folder"):
-        assert not load(refs[0]).valid.any()
-        return
-    for ref in refs:  # none where what makes the folder a sample is gone with it
-        with pytest.raises(FileNotFoundError, match=gone.stem.replace("disp0GT", "disp0")):
-            load(ref)
-
-
 def of_another_size(path):
-    size = (HEIGHT, WIDTH - 2)
-    if path.suffix == ".png":
-        save(path, np.ones(size, np.uint16))
-    elif path.suffix == ".pfm":
-        write_pfm(path, np.ones(size))
-    else:
-        write = np.save if path.suffix == ".npy" else np.savez
-        write(path, np.ones(size, np.float32))
+    write = {".png": save, ".pfm": write_pfm, ".npy": np.save, ".npz": np.savez}[path.suffix]
+    write(path, np.ones((HEIGHT, WIDTH - 2), np.uint16 if path.suffix == ".png" else np.float32))
 
 
 def cut_off(path):
@@ -264,19 +218,29 @@ def cut_off(path):
 
 
 @each_dataset
-@pytest.mark.parametrize(("which", "damage"), [(1, cut_off), (2, cut_off), (2, of_another_size)])
-def test_damaged_file_is_named(tmp_path, name, which, damage):
+@pytest.mark.parametrize(
+    ("which", "damage", "error"),
+    [
+        *((which, Path.unlink, FileNotFoundError) for which in (1, 2, 3)),
+        *((1, cut_off, ValueError), (2, cut_off, ValueError), (2, of_another_size, ValueError)),
+    ],
+)
+def test_a_file_that_is_missing_or_damaged_is_named(tmp_path, name, which, damage, error):
     LAYOUTS[name][0](tmp_path)
-    path = only_file(tmp_path, LAYOUTS[name][which])
+    (path,) = tmp_path.glob(LAYOUTS[name][which])
     damage(path)
-    with pytest.raises(ValueError, match=path.name.replace(".", r"\.")):
-        one(tmp_path, name)
+    for ref in find_pairs(tmp_path, [name]):  # none where what makes the folder a sample is gone
+        if (which, damage) == (2, Path.unlink) and name in ("mvsnet", "folder"):
+            assert not load(ref).valid.any()
+            continue
+        with pytest.raises(error, match=path.stem.replace("disp0GT", "disp0")):
+            load(ref)
 
 
 @pytest.mark.parametrize("name", ["kitti2015", "middlebury2014", "eth3d"])
 def test_calibration_for_another_size_is_named(tmp_path, name):
     LAYOUTS[name][0](tmp_path)
-    path = only_file(tmp_path, LAYOUTS[name][3])
+    (path,) = tmp_path.glob(LAYOUTS[name][3])
     text = path.read_text().replace(f"width={WIDTH}", "width=99").replace(f": {WIDTH} {HEIGHT}", ": 99 40")
     path.write_text(text)
     with pytest.raises(ValueError, match=path.name):
@@ -310,16 +274,6 @@ def test_kitti2012_prefers_colour_and_all_pixels_and_says_so(tmp_path):
     np.testing.assert_array_equal(sample.occluded, seen_by_both == 0)
 
 
-@pytest.mark.parametrize("name", ["middeval3", "eth3d", "booster"])
-def test_occlusion_masks_are_read(tmp_path, name):
-    LAYOUTS[name][0](tmp_path)
-    sample = one(tmp_path, name)
-    expected = np.zeros((HEIGHT, WIDTH), bool)
-    expected[:, :4] = True
-    np.testing.assert_array_equal(sample.occluded, expected & sample.valid)
-    assert name != "booster" or (sample.material == 3).all()
-
-
 def test_test_scenes_without_truth_belong_to_no_set(tmp_path):
     """The archive of the images has them beside the training scenes."""
     middeval3(tmp_path)
@@ -332,29 +286,21 @@ def test_test_scenes_without_truth_belong_to_no_set(tmp_path):
         load(find_pairs(tmp_path)[0])
 
 
-@pytest.mark.parametrize("changed", ["depths/00000000.pfm", "cams/00000001_cam.txt", "images/00000002.jpg"])
-def test_a_posed_pair_is_another_one_when_a_file_of_its_group_changes(tmp_path, changed):
-    mvsnet(tmp_path)
-
-    def key():
-        return cell_key(find_mvsnet(tmp_path)[0], "guided", {})
-
-    before = key()
-    assert key() == before
-    with open(tmp_path / "scan1" / changed, "ab") as file:
-        file.write(b" ")
-    assert key() != before
-
-
-def test_a_pair_without_truth_cannot_be_perturbed(tmp_path):
-    mvsnet(tmp_path)
-    for path in (tmp_path / "scan1" / "depths").iterdir():
-        path.unlink()
-    with pytest.raises(ValueError, match="the truth of mvsnet/scan1-turn1-shift0.1 must be known"):
-        load(changed_ref(find_mvsnet(tmp_path)[0], "perturbed", (1.0, 0.1)))
-    with pytest.raises(ValueError, match=r"got none \(no .*00000000\.pfm\)"):
-        blind = load(find_mvsnet(tmp_path)[0])
-        score(blind, Prediction(np.ones(blind.depth_m.shape)), None)
+@pytest.mark.parametrize(
+    ("name", "truth", "sought"),
+    [
+        ("mvsnet", "scan1/depths/00000000.pfm", r"no .*00000000\.pfm"),
+        ("folder", "mine/depth.npy", r"no depth\.npy, depth\.pfm, depth\.png or depth_mm\.png in .*mine"),
+    ],
+)
+def test_a_pair_without_truth_is_neither_scored_nor_perturbed(tmp_path, name, truth, sought):
+    LAYOUTS[name][0](tmp_path)
+    (tmp_path / truth).unlink()
+    (ref,) = find_pairs(tmp_path, [name])
+    with pytest.raises(ValueError, match=rf"the truth of {name}/.*-turn1-shift0.1 must be known"):
+        load(changed_ref(ref, "perturbed", (1.0, 0.1)))
+    with pytest.raises(ValueError, match=rf"got none \({sought}\)"):
+        score(load(ref), Prediction(np.ones((HEIGHT, WIDTH))), None)
 
 
 def test_coarse_middlebury_truth_says_how_coarse(tmp_path):
@@ -365,28 +311,24 @@ def test_coarse_middlebury_truth_says_how_coarse(tmp_path):
 
 
 def test_mvsnet_pairs_extra_views_and_pixel_centre(tmp_path):
+    robustmvd(tmp_path / "benchmark")
     mvsnet(tmp_path)
     every = find_mvsnet(tmp_path, pairs="all")
-    assert [(ref.files["left"], ref.files["right"]) for ref in every] == [(0, 1), (0, 2), (1, 0), (2, 0)]
+    assert [ref.files["views"][:2] for ref in every] == [(0, 1), (0, 2), (1, 0), (2, 0)]
+    further = tmp_path / "scan1" / "images" / "00000002.jpg"
+    before, _ = cell_key(every[0], "guided", {}), further.write_bytes(further.read_bytes() + b" ")
+    assert cell_key(every[0], "guided", {}) != before  # another result
     backwards = load(every[2])
     np.testing.assert_allclose(backwards.E[:3, 3], [-BASELINE, 0, 0], atol=1e-9)
     ((image, K, E),) = one(tmp_path, "mvsnet").extra_views
     assert image.shape == (HEIGHT, WIDTH, 3)
     np.testing.assert_allclose(E[:3, 3], [2 * BASELINE, 0, 0], atol=1e-9)
+    refs = find_pairs(tmp_path, pixel_centre=None, pairs="default")
+    centres = [(ref.dataset, ref.files["pixel_centre"]) for ref in refs]
+    assert centres == [("mvsnet", 0.0), ("robustmvd", 0.5)]  # what is left open is the set's own
     colmap = load(find_mvsnet(tmp_path, pixel_centre=0.5)[0])
     assert colmap.K_left[0, 2] == CX - 0.5 and colmap.K_right[1, 2] == CY - 0.5
     assert colmap.K_left[0, 0] == F and K[0, 2] == CX
-
-
-@pytest.mark.parametrize("depths", ["1 2", "0.5 0.01 192 2.5"])
-def test_mvsnet_depth_numbers_change_nothing(tmp_path, depths):
-    mvsnet(tmp_path)
-    before = one(tmp_path, "mvsnet")
-    for path in (tmp_path / "scan1" / "cams").iterdir():
-        path.write_text(path.read_text().replace("9e9 9e9 192 9e9", depths))
-    after = one(tmp_path, "mvsnet")
-    for name in ("K_left", "E", "depth_m"):
-        np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
 
 
 def test_robustmvd_takes_key_views_and_belongs_to_no_other_set(tmp_path):
@@ -403,14 +345,6 @@ def test_robustmvd_takes_key_views_and_belongs_to_no_other_set(tmp_path):
     assert find_pairs(tmp_path) == []
 
 
-def test_options_left_open_are_the_sets_own(tmp_path):
-    robustmvd(tmp_path / "benchmark")
-    mvsnet(tmp_path)
-    refs = find_pairs(tmp_path, pixel_centre=None, pairs="default")
-    own = [(ref.dataset, ref.files["pixel_centre"]) for ref in refs]
-    assert own == [("mvsnet", 0.0), ("robustmvd", 0.5)]
-
-
 def test_folder_takes_depth_in_three_formats(tmp_path):
     folder(tmp_path)
     expected, mine = one(tmp_path, "folder").depth_m, tmp_path / "mine"
@@ -420,11 +354,6 @@ def test_folder_takes_depth_in_three_formats(tmp_path):
     (mine / "depth.pfm").unlink()
     write_depth_mm(mine / "depth.png", expected)
     np.testing.assert_allclose(one(tmp_path, "folder").depth_m, expected, atol=5.1e-4)
-    (mine / "depth.png").unlink()
-    names = "depth.npy, depth.pfm, depth.png or depth_mm.png"
-    said = f"at least one pixel; got none (no {names} in {mine})"
-    with pytest.raises(ValueError, match=re.escape(said)):
-        score(one(tmp_path, "folder"), Prediction(np.ones((HEIGHT, WIDTH))), None)
 
 
 @pytest.mark.parametrize("suffixes", [(".JPG", ".jpeg"), (".tif", ".bmp"), (".webp", ".PNG")])
@@ -432,10 +361,8 @@ def test_folder_takes_every_image_that_pillow_reads_and_a_png_before_its_copies(
     folder(tmp_path)
     mine = tmp_path / "mine"
     for side, suffix in zip(("left", "right"), suffixes, strict=True):
-        with Image.open(mine / f"{side}.png") as image:
-            image.save(mine / f"own{suffix}")
         (mine / f"{side}.png").unlink()
-        (mine / f"own{suffix}").rename(mine / f"{side}{suffix}")
+        save(mine / f"{side}{suffix}", picture())
     (mine / "left.txt").write_text("notes")
     assert one(tmp_path, "folder").left.shape == (HEIGHT, WIDTH, 3)
     save(mine / "left.png", picture(HEIGHT, WIDTH - 2))
@@ -468,7 +395,6 @@ TWO_SIZES = factory.REALSENSE_PRINTED.replace(
 @pytest.mark.parametrize(
     ("calibrations", "size", "focal_px", "baseline_m"),
     [
-        ({"calib.txt": TWO_SIZES}, (640, 480), 700.0, 0.12),
         ({"calib.txt": TWO_SIZES}, (320, 240), 350.0, 0.12),
         ({"calib.json": factory.OAK}, (640, 400), 350.0, 0.12),
         ({"calib.json": factory.NERF}, (640, 480), 700.0, 0.5),
@@ -479,20 +405,18 @@ TWO_SIZES = factory.REALSENSE_PRINTED.replace(
             0.5,
         ),
     ],
-    ids=["RealSense", "RealSense-small", "OAK-D", "transforms.json", "COLMAP"],
+    ids=["RealSense", "OAK-D", "transforms.json", "COLMAP"],
 )
 @pytest.mark.filterwarnings("ignore:.*has no unit")
 def test_folder_takes_calibrations_that_go_by_size_or_name(
     tmp_path, calibrations, size, focal_px, baseline_m
 ):
-    (tmp_path / "mine").mkdir()
     for side in ("left", "right"):
-        Image.new("RGB", size).save(tmp_path / "mine" / f"{side}.jpg")
+        save(tmp_path / "mine" / f"{side}.jpg", np.zeros((*size[::-1], 3), np.uint8))
     for name, text in calibrations.items():
         (tmp_path / "mine" / name).write_text(text)
     sample = one(tmp_path, "folder")
-    assert sample.K_left[0, 0] == pytest.approx(focal_px)
-    assert sample.E[0, 3] == pytest.approx(baseline_m)
+    assert (sample.K_left[0, 0], sample.E[0, 3]) == pytest.approx((focal_px, baseline_m))
 
 
 def test_root_must_be_a_folder(tmp_path):
@@ -503,24 +427,15 @@ def test_root_must_be_a_folder(tmp_path):
 
 
 REAL = Path(os.environ.get("GEODIFF_TEST_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
-
-
-def real_refs():
-    return find_pairs(REAL) if REAL.is_dir() else []
+REAL_REFS = find_pairs(REAL) if REAL.is_dir() else []
 
 
 def photometric_error(sample, factor):
     """Mean absolute difference to the left image of the right one, warped by ``factor`` times the truth."""
-    from geodiff_plugin.geometry import warp_right_to_left
-
-    left, right = (
-        torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1)[None]
-        for image in (sample.left, sample.right)
-    )
+    left, right = (as_image_01(image, "image")[None] for image in (sample.left, sample.right))
     depth_m = torch.from_numpy(np.where(sample.valid, sample.depth_m, 1) * np.float32(factor))[None, None]
     matrices = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
-    cameras = (torch.from_numpy(matrix).float()[None] for matrix in matrices)
-    warped = warp_right_to_left(right, depth_m, *cameras)
+    warped = warp_right_to_left(right, depth_m, *(torch.from_numpy(m).float()[None] for m in matrices))
     seen = warped.visible & torch.from_numpy(sample.valid)
     return ((warped.image - left).abs().mean(1, keepdim=True) * seen).sum() / seen.sum()
 
@@ -528,14 +443,12 @@ def photometric_error(sample, factor):
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="no real samples")
 def test_the_thirteen_real_pairs_are_found():
-    refs = real_refs()
-    assert [ref.dataset for ref in refs] == (
-        ["kitti2015"] + ["kitti2012"] * 5 + ["middlebury2014", "eth3d"] + ["mvsnet"] * 5
-    )
+    expected = ["kitti2015"] + ["kitti2012"] * 5 + ["middlebury2014", "eth3d"] + ["mvsnet"] * 5
+    assert [ref.dataset for ref in REAL_REFS] == expected
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ref", real_refs(), ids=lambda ref: ref.label)
+@pytest.mark.parametrize("ref", REAL_REFS, ids=lambda ref: ref.label)
 def test_real_truth_warps_right_to_left(ref):
     sample = load(ref)
     assert sample.rectified == (sample.dataset != "mvsnet")

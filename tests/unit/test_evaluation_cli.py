@@ -99,12 +99,12 @@ def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
 
 def test_pairs_goes_on_after_a_broken_sample_on_request(data, tmp_path):
     (data / "one" / "im1.png").unlink()
-    words = ("pairs", data, "--methods", "sgbm,plane-sweep", "-o", tmp_path / "out")
+    words = ("pairs", data, "--methods", "sgbm,sweep-sgm", "-o", tmp_path / "out")
     with pytest.raises(FileNotFoundError, match=r"im1\.png"):
         invoke(*words)
     said = invoke(*words, "--skip-broken").stdout
     assert "1 broken sample was skipped" in said and said.count("im1.png") == 1
-    assert "(sgbm, plane-sweep)" in said
+    assert "(sgbm, sweep-sgm)" in said
 
 
 def test_two_samples_of_one_name_are_refused(data, tmp_path):

@@ -11,7 +11,6 @@ from geodiff_plugin.evaluation.edges import (
     near_disparity_steps,
     surface_error,
 )
-from geodiff_plugin.evaluation.metrics import ause, evaluate_disparity
 
 
 def maps(seed, size=(17, 23)):
@@ -21,7 +20,7 @@ def maps(seed, size=(17, 23)):
     return truth, truth + rng.normal(0, 2, size), rng.random(size) > 0.15
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_near_a_step_is_within_four_pixels_of_known_neighbours_apart(seed):
     truth, _, valid = maps(seed)
     steps = []
@@ -36,7 +35,7 @@ def test_near_a_step_is_within_four_pixels_of_known_neighbours_apart(seed):
     assert not near_disparity_steps(np.full((5, 6), 9.0), np.ones((5, 6), bool)).any()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_hidden_is_what_something_nearer_covers(seed):
     truth, _, valid = maps(seed)
     expected = np.zeros(truth.shape, bool)
@@ -47,20 +46,7 @@ def test_hidden_is_what_something_nearer_covers(seed):
     np.testing.assert_array_equal(hidden_by_truth(truth, valid), expected)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_disparity_errors_by_pixel(seed):
-    truth, pred, valid = maps(seed)
-    pred[::5, ::7] = np.nan
-    errors = [(abs(pred[i] - truth[i]), truth[i]) for i in zip(*np.nonzero(valid), strict=True)]
-    errors = [(e, t) for e, t in errors if np.isfinite(e)]
-    scores = evaluate_disparity(pred, truth, valid)
-    assert scores["epe"] == pytest.approx(np.mean([e for e, _ in errors]))
-    for k in (1, 2, 3):
-        assert scores[f"bad{k}"] == pytest.approx(np.mean([e > k for e, _ in errors]))
-    assert scores["d1"] == pytest.approx(np.mean([e > 3 and e / t > 0.05 for e, t in errors]))
-
-
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_boundary_f1_by_direction_and_threshold(seed):
     truth, pred, valid = maps(seed)
     truth, pred = 100.0 / truth, 100.0 / np.abs(pred)
@@ -99,16 +85,6 @@ def test_boundary_errors_without_boundaries():
     assert boundary_errors(far, truth, valid)["dbe_acc"] == 10.0
     assert np.isnan(boundary_errors(truth, flat, valid)["dbe_comp"])
     assert np.isnan(boundary_errors(np.full(truth.shape, np.nan), truth, valid)["dbe_acc"])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_random_confidence_has_the_ause_of_no_confidence(seed):
-    rng = np.random.default_rng(seed)
-    truth = rng.uniform(1, 50, (40, 30))
-    pred, valid = truth * rng.lognormal(0, 0.3, truth.shape), rng.random(truth.shape) > 0.2
-    draws = [ause(pred, truth, valid, rng.random(truth.shape)) for _ in range(200)]
-    assert ause(pred, truth, valid, None) == pytest.approx(np.mean(draws), rel=0.02)
-    assert ause(pred, truth, valid, np.abs(pred / truth - 1)) == pytest.approx(0, abs=1e-12)
 
 
 def test_errors_at_edges_and_of_surfaces():

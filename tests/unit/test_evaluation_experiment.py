@@ -244,9 +244,3 @@ def test_intervals_cover_the_mean_and_need_five():
     assert wide.high - wide.low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)  # normal theory
     difference = paired_difference({"a": 1.0, "b": 3.0}, {"b": 1.0, "c": 9.0})
     assert (difference.value, difference.count) == (2, 1)
-
-
-@pytest.mark.parametrize("wrong", [{"ensemble": 0}, {"dtype": "int8"}, {"steps": 0}, {"views": 1}])
-def test_settings_are_checked(wrong):
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be"):
-        Settings(**wrong)

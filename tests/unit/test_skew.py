@@ -17,7 +17,7 @@ from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit
 from geodiff_plugin.algorithm.evidence import prepare_evidence
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
-from geodiff_plugin.evaluation.figures.maps import render_cloud
+from geodiff_plugin.evaluation.figures import render_cloud
 from geodiff_plugin.formats.clouds import write_ply
 from geodiff_plugin.matching import build_cost_volume, match_volume, points_to_matches
 from geodiff_plugin.matching.alignment import align_view
@@ -44,7 +44,7 @@ HAND_ON = {
     *("algorithm.evidence.prepare_evidence", "algorithm.finish.vote_depth", "matching.rows.match_rows"),
     "capture.fusion.normals_of",
     *("cli.inputs.pinhole", "cli.inputs._read_known", "app.measure.read_pixel"),
-    *("evaluation.datasets.pairs._quarter_intrinsics", "pose.tracks.project_tracks"),
+    *("evaluation.datasets.layouts._quartered", "pose.tracks.project_tracks"),
     *("formats.captures.read_capture", "formats.clouds.make_cloud", "formats.rigs.make_rig"),
     *("formats.distortion.undistorted", "formats.distortion.undistorted_pixels"),  # to OpenCV
     *("formats.distortion.undistorted_points", "pose.capture.solve_capture"),  # the latter to pycolmap

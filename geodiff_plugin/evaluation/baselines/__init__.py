@@ -8,51 +8,43 @@ from functools import partial
 from typing import Any
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.config import DEFAULT, PAPER
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
-from geodiff_plugin.evaluation.baselines.guided import (
-    CONSTANT_METHODS,
-    GUIDED_METHODS,
-    default_variant,
-    paper_variant,
-)
-from geodiff_plugin.evaluation.baselines.outside import files_method, hf_method
-from geodiff_plugin.evaluation.baselines.stereo import STEREO_METHODS
+from geodiff_plugin.evaluation.baselines.guided import GUIDED_METHODS, variant
+from geodiff_plugin.evaluation.baselines.unguided import STEREO_METHODS, files_method, hf_method
 
 __all__ = ["FAMILIES", "METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
 __all__ += ["find_method", "with_poses", "with_priors", "with_seeds"]
 
-METHODS: dict[str, Method] = {m.name: m for m in (*GUIDED_METHODS, *CONSTANT_METHODS, *STEREO_METHODS)}
+METHODS: dict[str, Method] = {method.name: method for method in (*GUIDED_METHODS, *STEREO_METHODS)}
 """Every method by name, in the order of the tables' columns."""
 
 FAMILIES: dict[str, Callable[[str], Method]] = {
-    "guided": default_variant,
-    "paper": paper_variant,
+    "guided": partial(variant, "guided", DEFAULT),
+    "paper": partial(variant, "paper", PAPER),
     "hf": hf_method,
     "files": files_method,
     "prior-map": partial(files_method, guided=True),
 }
 """Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter."""
 
-PRIORLESS = ("hf", "files", "prior-map")
-"""Families that use no prior, so that an @ in their parameter is part of it."""
-
 
 def find_method(name: str) -> Method:
     """The method of a name.
 
     Args:
-        name: a key of ``METHODS``, or ``family:parameter`` with a key of ``FAMILIES``; a method that uses a
-            prior may be bound to one other than the settings', to another seed, or to both, the seed last:
-            ``guided@prs-eth/marigold-depth-v1-1#3``. Digits after the last # are always a seed.
+        name: a key of ``METHODS``, or ``family:parameter`` with a key of ``FAMILIES``; one that uses a prior
+            may be bound to another, to another seed, or to both: ``guided@prs-eth/marigold-depth-v1-1#3``.
+            Digits after the last # are always a seed.
 
     Raises:
         ValueError: neither; a prior or a seed for a method without a prior; one bound twice; or the family's
-            own error about its parameter.
+            error about its parameter.
     """
     if name in METHODS:
         return METHODS[name]
     family, colon, parameter = name.partition(":")
-    if colon and family in PRIORLESS:
+    if colon and family in ("hf", "files", "prior-map"):  # an @ or # is part of their parameter
         return FAMILIES[family](parameter)
     bare, _, seed = name.rpartition("#")
     if bare and seed.isdecimal():
@@ -69,7 +61,6 @@ def find_method(name: str) -> Method:
 
 
 def _bound(method: Method, suffix: str, form: str, title: str, **to: Any) -> Method:
-    """A method bound to a prior or a seed."""
     if not (len(suffix) > 1 and method.uses_prior and method.seed is None):
         bad_value("methods", f"{form} with a method that uses a prior", method.name + suffix)
     return replace(method, name=method.name + suffix, title=title, **to)
@@ -83,18 +74,12 @@ def with_priors(methods: Sequence[str], priors: Sequence[str]) -> tuple[str, ...
 
 def with_poses(methods: Sequence[str], poses: Sequence[str]) -> tuple[str, ...]:
     """The methods, with ``guided`` once for each of the named poses; none leaves them as they are."""
-    own = tuple(f"guided:pose={pose}" for pose in poses) or ("guided",)
-    return tuple(name for given in methods for name in (own if given == "guided" else (given,)))
+    posed = tuple(f"guided:pose={pose}" for pose in poses) or ("guided",)
+    return tuple(name for given in methods for name in (posed if given == "guided" else (given,)))
 
 
 def with_seeds(methods: Sequence[str], first: int, count: int) -> tuple[str, ...]:
-    """The methods, then those of them that use a prior, and are bound to no seed, for every further seed.
-
-    Args:
-        methods: names.
-        first: the settings' own seed.
-        count: how many seeds, ``first`` counted, at least 1.
-    """
+    """The methods, then those with a prior and no seed for ``count - 1`` seeds after ``first``."""
     if count < 1:
         bad_value("seeds", "at least 1", count)
     noisy = [name for name in methods if find_method(name).uses_prior and find_method(name).seed is None]

@@ -13,15 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.priors import load_prior
-from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
-
-_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
 
 def folder_fingerprint(folder: Path) -> str:
@@ -58,31 +54,13 @@ class Settings:
     space: str | None = None
     views: int = 2
 
-    def __post_init__(self) -> None:
-        check_choice(self.dtype, "dtype", _DTYPES)
-        for name, least in (("ensemble", 1), ("steps", 1), ("views", 2)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                bad_value(name, f"at least {least}", value)
-
-    @property
-    def weights_dtype(self) -> torch.dtype:
-        """``dtype`` as torch names it."""
-        return _DTYPES[self.dtype]
-
-    @property
-    def which_prior(self) -> tuple[str | None, ...]:
-        """What decides which pipeline is loaded, and how."""
-        return self.prior, self.device, self.dtype, self.space
-
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """One method's answer for one sample, at the left image's resolution.
 
     Attributes:
-        depth_m: ``(H, W)`` float, metres, not finite where the method leaves a hole; ``None`` where it knows
-            relative depth only.
+        depth_m: ``(H, W)`` metres, not finite in holes; ``None`` where only relative depth is known.
         relative: ``(H, W)`` float, affine in ``space``; ``None`` where only metres are known.
         space: space for the oracle's alignment, see ``metrics.align``.
         uncertainty: ``(H, W)`` float, larger is less certain; ``None`` where the method has none.
@@ -99,23 +77,22 @@ class Prediction:
 
 
 class PriorCache:
-    """Loads a prior once per run, ready to be guided, and a depth model without diffusion likewise.
-
-    Attributes:
-        evidence: of the last pairs, for the methods that guide the prior by them.
-    """
+    """Loads a prior once per run, ready to be guided; ``evidence`` is that of the last pairs."""
 
     def __init__(self) -> None:
         self.evidence = EvidenceStore()
         self._pipes: dict[tuple[str | None, ...], Any] = {}
-        self._models: dict[tuple[str, ...], TransformersDepthPipeline] = {}
         self._fingerprints: dict[tuple[str | None, ...], str] = {}
+
+    @staticmethod
+    def _key(settings: Settings) -> tuple[str | None, ...]:
+        return settings.prior, settings.device, settings.dtype, settings.space
 
     def get(self, settings: Settings) -> Any:
         """The pipeline of ``settings.prior`` with geometry guidance enabled; errors as ``load_prior``."""
-        key = settings.which_prior
+        key = self._key(settings)
         if key not in self._pipes:
-            options: dict[str, Any] = {"device": settings.device, "dtype": settings.weights_dtype}
+            options: dict[str, Any] = {"device": settings.device, "dtype": getattr(torch, settings.dtype)}
             options |= {} if settings.space is None else {"space": settings.space}
             with no_bars():
                 pipe = load_prior(settings.prior, **options)
@@ -123,21 +100,12 @@ class PriorCache:
             self._pipes[key] = enable_geometry_guidance(pipe)
         return self._pipes[key]
 
-    def depth_model(self, name: str, settings: Settings) -> TransformersDepthPipeline:
-        """A depth model of ``transformers``; errors as ``load_prior``."""
-        key = (name, settings.device, settings.dtype)
-        if key not in self._models:
-            pipe = load_prior(f"transformers:{name}", device=settings.device, dtype=settings.weights_dtype)
-            self._models[key] = pipe
-        return self._models[key]
-
     def fingerprint(self, settings: Settings) -> str:
         """Short hash of the prior's configuration and of samples of its weights.
 
-        A prior that was trained further under the same name has another fingerprint, so that its old results
-        are not taken for its own.
+        A prior that was trained further under the same name has another one: its old results do not count.
         """
-        key = settings.which_prior
+        key = self._key(settings)
         if key not in self._fingerprints:
             pipe, digest = self.get(settings), hashlib.sha256()
             # The pipeline's own options are the space of its map, its size, how images are prepared.

@@ -8,13 +8,12 @@ from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.datasets.changed import CHANGES
-from geodiff_plugin.evaluation.datasets.pairs import PAIRS
-from geodiff_plugin.evaluation.datasets.posed import POSED
+from geodiff_plugin.evaluation.datasets.layouts import LAYOUTS
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
 
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load", "load_pairs"]
 
-DATASETS: dict[str, Dataset] = {dataset.name: dataset for dataset in (*PAIRS[:-1], *POSED, PAIRS[-1])}
+DATASETS: dict[str, Dataset] = {dataset.name: dataset for dataset in LAYOUTS}
 """Every data set by name, in the order in which results are listed."""
 
 

@@ -22,18 +22,12 @@ Numbers = tuple[float, float]
 
 
 def changed_ref(ref: SampleRef, kind: str, change: Numbers) -> SampleRef:
-    """The reference to a changed sample, which is named by what was changed.
-
-    Args:
-        ref: as it was taken.
-        kind: key of ``CHANGES``.
-        change: its two numbers.
-    """
+    """The reference to a sample with a change, a key of ``CHANGES``, by whose two numbers it is named."""
     name = f"{ref.name}-{CHANGES[kind][0].format(*change)}"
     return replace(ref, name=name, files={**ref.files, kind: change})
 
 
-def two_numbers(text: str, option: str, names: str, most: Numbers, cure: str) -> Numbers:
+def _two_numbers(text: str, option: str, names: str, most: Numbers, cure: str) -> Numbers:
     """Two numbers with a comma as typed, each from 0 to its ``most``; else ``ValueError`` with the cure."""
     parts = re.fullmatch(r"\s*(\d*\.?\d+)\s*,\s*(\d*\.?\d+)\s*", text)
     one, other = map(float, parts.groups()) if parts else (-1.0, -1.0)
@@ -45,13 +39,13 @@ def two_numbers(text: str, option: str, names: str, most: Numbers, cure: str) ->
 def perturbation(text: str) -> Numbers:
     """``DEGREES,SHARE`` as typed: at most 30 degrees, and 0.9 of the baseline."""
     cure = "1.5,0.1 turns by up to 1.5 degrees and shifts by up to a tenth of the baseline."
-    return two_numbers(text, "--perturb", "DEGREES,SHARE", (30, 0.9), cure)
+    return _two_numbers(text, "--perturb", "DEGREES,SHARE", (30, 0.9), cure)
 
 
 def drift_of(text: str) -> Numbers:
     """``DEGREES,PIXELS`` as typed: at most 5 degrees, and 20 pixels."""
     cure = "0.3,1.5 turns the right camera by 0.3 degrees and moves its image by 1.5 pixels."
-    return two_numbers(text, "--drift", "DEGREES,PIXELS", (5, 20), cure)
+    return _two_numbers(text, "--drift", "DEGREES,PIXELS", (5, 20), cure)
 
 
 def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
@@ -64,12 +58,8 @@ def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> S
 def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
     """What a rig gives whose right camera has turned since it was calibrated, and whose image has moved.
 
-    Both are a homography of the right image, whatever the depth: calibration and truth stay.
-
-    Args:
-        sample: as it was taken.
-        change: degrees, about an axis that is drawn, and pixels up or down.
-        name: of the result; the axis and the way are drawn from it.
+    Both are a homography of the right image, whatever the depth: calibration and truth stay. ``change`` is
+    degrees, about an axis that is drawn from the name, and pixels up or down, likewise.
     """
     degrees, px = change
     rng = np.random.default_rng(zlib.crc32(name.encode()))
@@ -88,13 +78,9 @@ def perturbed_pose(
 ) -> np.ndarray:
     """A pose with an error, whose baseline is as long as before: the length is what no photograph tells.
 
-    Args:
-        E: ``(4, 4)``, metres; pose of the right camera in the left camera's frame.
-        degrees: the largest turn.
-        share: the largest shift, of the baseline.
-        depth_m: of the scene.
-        rng: draws the error. Every second one is of a tracker's kind, whose shift makes up for its turn at
-            the scene's depth as far as it may; the others' shift goes anywhere.
+    The turn is at most ``degrees``, the shift that ``share`` of the baseline. Every second error is of a
+    tracker's kind, whose shift makes up for its turn at the scene's depth as far as it may; the others' shift
+    goes anywhere.
     """
     axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     turn = axis * np.radians(degrees) * rng.uniform(LEAST, 1.0)
@@ -113,10 +99,8 @@ def perturbed_pose(
 def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
     """Give the poses of a sample's right views wrongly; images, intrinsics and truth stay.
 
-    Args:
-        sample: with truth, which says how far away its scene is.
-        change: degrees and share, as for ``perturbed_pose``.
-        name: of the result; the error is drawn from it.
+    The truth says how far away the scene is; the error, ``change`` degrees and share of the baseline at most,
+    is drawn from the name.
     """
     sample.check_truth()
     rng = np.random.default_rng(zlib.crc32(name.encode()))

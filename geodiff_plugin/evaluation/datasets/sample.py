@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from geodiff_plugin._checks import bad_value, check_metres
-from geodiff_plugin.formats import check_file, files, read_depth_png, read_image, read_pfm
+from geodiff_plugin.formats import read_depth_png, read_image
+from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.types import Rig
 
@@ -25,23 +26,19 @@ class StereoSample:
     """Two posed views with the truth of the left one.
 
     Attributes:
-        dataset: its name in ``DATASETS``.
-        name: of the sample within it.
-        left: ``(H, W, 3)`` uint8, the reference view.
-        right: ``(H', W', 3)`` uint8.
-        K_left: ``(3, 3)`` float64, pixels of ``left``.
-        K_right: ``(3, 3)`` float64, pixels of ``right``.
+        dataset, name: its name in ``DATASETS``, and of the sample within it.
+        left, right: ``(H, W, 3)`` and ``(H', W', 3)`` uint8; the left one is the reference view.
+        K_left, K_right: ``(3, 3)`` float64, pixels.
         E: ``(4, 4)`` float64, metres; pose of the right camera in the left camera's frame.
         depth_m: ``(H, W)`` float32, metres; 0 where the truth is unknown.
         valid: ``(H, W)`` bool, where the truth is known.
-        occluded: ``(H, W)`` bool, hidden in the right view or outside it; ``None`` where the set does not
-            say.
+        occluded: ``(H, W)`` bool, hidden in the right view or outside it; ``None`` if the set is silent.
         material: ``(H, W)`` uint8 material class; ``None`` where the set has none.
         rectified: whether rows are epipolar lines with equal focal lengths (``geometry.is_rectified``).
         notes: what a reader of the numbers should know, e.g. ``truth``, ``disparity_step_px``.
         extra_views: ``(image, K, E)`` of further views, ``E`` the pose in the left camera's frame.
         E_true: ``(4, 4)`` the pose that the right image was taken from, where ``E`` is given wrongly on
-            purpose; ``None`` where ``E`` is it.
+            purpose, but for the length of the baseline; ``None`` where ``E`` is it.
     """
 
     dataset: str
@@ -64,11 +61,6 @@ class StereoSample:
     def label(self) -> str:
         """``dataset/name``."""
         return f"{self.dataset}/{self.name}"
-
-    @property
-    def measured_baseline(self) -> bool:
-        """Whether the baseline's length is known to be true: a pose given wrongly on purpose keeps it."""
-        return self.E_true is not None
 
     @property
     def E_scored(self) -> np.ndarray:
@@ -128,24 +120,16 @@ class Dataset:
 def disparity_to_depth(
     disparity_px: np.ndarray, K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray
 ) -> np.ndarray:
-    """Depth of a rectified pair's disparity: ``f b / (d + cx_right - cx_left)``.
+    """``(H, W)`` float32 metres of a rectified pair's disparity: ``f b / (d + cx_right - cx_left)``.
 
-    Args:
-        disparity_px: ``(H, W)`` float, ``x_left - x_right`` in pixels.
-        K_left: ``(3, 3)``, pixels.
-        K_right: ``(3, 3)``, pixels; its cx minus the left one is Middlebury's ``doffs``.
-        E: ``(4, 4)``, metres; pose of the right camera in the left camera's frame.
-
-    Returns:
-        ``(H, W)`` float32, metres; 0 where the shifted disparity is not positive or not finite.
+    The disparity is ``x_left - x_right`` in pixels, the difference of the centres Middlebury's ``doffs``; the
+    result is 0 where their sum is not positive or not finite.
     """
-    shifted = np.asarray(disparity_px, np.float64) + (K_right[0, 2] - K_left[0, 2])
-    known = np.isfinite(shifted) & (shifted > 0)
-    depth_m = np.zeros(shifted.shape)
-    depth_m[known] = K_left[0, 0] * E[0, 3] / shifted[known]
     if E[0, 3] <= 0:
         bad_value("E[0, 3]", "positive, the right camera to the right", E[0, 3], "Swap the two views.")
-    return depth_m.astype(np.float32)
+    shifted = np.asarray(disparity_px, np.float64) + (K_right[0, 2] - K_left[0, 2])
+    known = np.isfinite(shifted) & (shifted > 0)
+    return np.where(known, K_left[0, 0] * E[0, 3] / np.where(known, shifted, 1.0), 0).astype(np.float32)
 
 
 def depth_to_disparity(
@@ -161,39 +145,26 @@ def read_rgb(path: Path, name: str) -> np.ndarray:
     return np.rint(image_01 * 255.0).astype(np.uint8)
 
 
-def read_npy(path: Path, name: str) -> np.ndarray:
-    """``(H, W)`` array of an npy file; ``ValueError`` naming it where it is damaged or of another rank."""
-    values = files.read_npy(check_file(path, name, "an npy file"), name, "a map of shape (H, W)")
-    if values.ndim != 2:
-        bad_value(name, "a map of shape (H, W)", f"{path} of shape {values.shape}")
-    return values
-
-
 def read_depth_m(path: Path, name: str) -> np.ndarray:
     """``(H, W)`` metres of an npy or PFM file, or of a 16-bit PNG of millimetres; 0 or not finite is unknown.
 
-    Raises:
-        OSError: no readable file.
-        ValueError: it is damaged, or an npy file of integers.
+    Errors are those of ``formats.depth.read_map``; ``ValueError`` for an npy file of integers, too.
     """
     if path.suffix == ".png":
         return read_depth_png(path, name=name)[0]
-    if path.suffix == ".pfm":
-        return read_pfm(path, name)
-    values = read_npy(path, name)
-    check_metres(values, name, f"{path}, {values.dtype}")
+    values = read_map(path, name)
+    if path.suffix == ".npy":
+        stored = np.load(path, mmap_mode="r")
+        check_metres(stored, name, f"{path}, {stored.dtype}")
     return values
 
 
 def check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...], side: str = "left") -> None:
     """Raise ``ValueError`` naming ``path`` where its ``(H, W)`` is not that of the image of a ``side``."""
     if tuple(got[:2]) != tuple(expected[:2]):
-        bad_value(
-            str(path),
-            f"for {expected[1]} x {expected[0]} pixels as the {side} image",
-            f"{got[1]} x {got[0]}",
-            "Image, calibration and truth must be of one resolution.",
-        )
+        size = f"for {expected[1]} x {expected[0]} pixels as the {side} image"
+        cure = "Image, calibration and truth must be of one resolution."
+        bad_value(str(path), size, f"{got[1]} x {got[0]}", cure)
 
 
 def folders(root: Path, depth: int) -> list[Path]:

@@ -1,0 +1,454 @@
+"""Readers of data sets in their official layouts, and of the user's own folders (S5.1, Tables 1 to 3).
+
+Depth of a rectified pair is ``f b / (d + doffs)`` in metres, with doffs in pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+
+from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.evaluation.datasets.sample import (
+    Dataset,
+    Images,
+    SampleRef,
+    StereoSample,
+    check_size,
+    disparity_to_depth,
+    folders,
+    make_sample,
+    read_depth_m,
+    read_rgb,
+)
+from geodiff_plugin.formats import check_file, read_calibration, read_depth_png, read_text
+from geodiff_plugin.formats.depth import read_map
+from geodiff_plugin.geometry import resize_intrinsics
+from geodiff_plugin.types import Rig
+
+
+def _read_pair(ref: SampleRef) -> tuple[Images, Rig]:
+    """Images and rig of the files ``left``, ``right``, ``calibration`` and, if any, ``calibration_right``.
+
+    Raises:
+        OSError: a file is missing.
+        ValueError: a file is damaged, or the calibration is for another size.
+    """
+    files = ref.files
+    images = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
+    first, second = files["calibration"], files.get("calibration_right")
+    rig = read_calibration(
+        first if second is None else (first, second),
+        files.get("cameras"),
+        str(files["left"]),
+        image_names=(files["left"].name, files["right"].name),
+        image_size=images[0].shape[1::-1],
+    )
+    sizes = (first, rig.size_left, "left"), (second or first, rig.size_right, "right")
+    for image, (path, size, side) in zip(images, sizes, strict=True):
+        if size is not None:
+            check_size(path, size[::-1], image.shape, side)
+    return images, rig
+
+
+def _read_mask(path: Path, name: str, image: np.ndarray) -> np.ndarray:
+    mask = read_rgb(path, name)[..., 0]
+    check_size(path, mask.shape, image.shape)
+    return mask
+
+
+#: Truth beyond 80 m does not count, the range that monocular depth papers use on KITTI.
+KITTI_CAP_M = 80.0
+#: Folders of left and right images with the numbers of their cameras, of calibrations, of both truths.
+_KITTI = {
+    "kitti2015": ([("image_2", "image_3", (2, 3))], "calib_cam_to_cam", "disp_occ_0", "disp_noc_0"),
+    "kitti2012": (
+        [("colored_0", "colored_1", (2, 3)), ("image_0", "image_1", (0, 1))],
+        *("calib", "disp_occ", "disp_noc"),
+    ),
+}
+
+
+def _find_kitti(root: Path, name: str) -> list[SampleRef]:
+    """Pairs below the folder ``training``, its parent or that one's; colour where there is some, else grey.
+
+    The truth of a pair is that of all pixels where it exists, else that of the pixels seen twice.
+    """
+    refs, (pairs, calibrations, *truths) = [], _KITTI[name]
+    for folder in folders(root, 3):
+        there = [pair for pair in pairs if (folder / pair[0]).is_dir()]
+        if not there or not any((folder / truth).is_dir() for truth in truths):
+            continue
+        left_name, right_name, cameras = there[0]
+        for left in sorted((folder / left_name).glob("*_10.png")):
+            occ, noc = (folder / truth / left.name for truth in truths)
+            files = {
+                "left": left,
+                "right": folder / right_name / left.name,
+                "disparity": occ if occ.is_file() or not noc.is_file() else noc,
+                "noc": noc if occ.is_file() and noc.is_file() else None,
+                "calibration": folder / calibrations / f"{left.stem[:-3]}.txt",
+                "cameras": cameras,
+            }
+            refs.append(SampleRef(name, left.stem[:-3], files))
+    return refs
+
+
+def _load_kitti(ref: SampleRef) -> StereoSample:
+    """Read one KITTI pair; ``occluded`` where both kinds of truth exist."""
+    (images, rig), truth, noc = _read_pair(ref), ref.files["disparity"], ref.files["noc"]
+    disparity, valid = read_depth_png(truth, 256.0, "true disparity")
+    check_size(truth, disparity.shape, images[0].shape)
+    occluded = None
+    if noc is not None:
+        _, seen_twice = read_depth_png(noc, 256.0, "disparity of the pixels seen twice")
+        check_size(noc, seen_twice.shape, images[0].shape)
+        occluded = valid & ~seen_twice
+    depth_m = np.where(valid, disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E), 0)
+    notes = {"truth": truth.parent.name, "disparity_step_px": 1 / 256}
+    return make_sample(ref, images, rig, depth_m, notes, occluded=occluded)
+
+
+#: Folders of scenes whose truth is not published; the archives of the images have them as well.
+_TESTS = ("testF", "testH", "testQ", "two_view_test")
+
+
+def _find_scenes(root: Path, name: str) -> list[SampleRef]:
+    """Scenes of one of the three sets in Middlebury's format: folders with ``im0.png`` and ``calib.txt``.
+
+    The truth is ``disp0.pfm`` (2014), ``disp0GT.pfm`` beside the images (MiddEval3), or ``disp0GT.pfm`` in
+    ``two_view_training_gt/<scene>`` (ETH3D). The set follows from the folder's name (``eth3d``,
+    ``two_view``), else from the truth's. Test scenes without truth are none.
+    """
+    refs = []
+    for folder in folders(root, 3):
+        if not ((folder / "im0.png").is_file() and (folder / "calib.txt").is_file()):
+            continue
+        beside = folder.parent.parent / "two_view_training_gt" / folder.name / "disp0GT.pfm"
+        candidates = (folder / "disp0.pfm", folder / "disp0GT.pfm", beside)
+        truth = next((path for path in candidates if path.is_file()), None)
+        if truth is None and folder.parent.name in _TESTS:
+            continue
+        truth = truth or folder / "disp0.pfm"
+        dataset = "middeval3" if truth.name == "disp0GT.pfm" else "middlebury2014"
+        parts = (root.resolve().name, *folder.relative_to(root).parts)
+        if any("eth3d" in part.lower() or "two_view" in part for part in parts):
+            dataset = "eth3d"
+        if dataset != name:
+            continue
+        mask = truth.parent / "mask0nocc.png"
+        files = {
+            "left": folder / "im0.png",
+            "right": folder / "im1.png",
+            "calibration": folder / "calib.txt",
+            "disparity": truth,
+            "mask": mask if mask.is_file() else None,
+        }
+        refs.append(SampleRef(name, folder.name, files))
+    return refs
+
+
+def _step_px(disparity: np.ndarray) -> float:
+    """Coarseness of the truth: gap between neighbouring values, 0 where as good as continuous."""
+    gaps = np.diff(np.unique(disparity))
+    # Float truth has gaps far below a sixteenth of a pixel; truth that was made from 8-bit maps has none.
+    return float(gaps.min()) if gaps.size and gaps.min() > 1 / 16 else 0.0
+
+
+def _load_scene(ref: SampleRef) -> StereoSample:
+    """Read one pair in Middlebury's format; its mask has 255 seen twice, 128 hidden on the right, 0 unknown.
+
+    ``notes["disparity_step_px"]`` says how coarse the truth is (Adirondack's quarter size: 1 px).
+    """
+    (images, rig), truth, mask = _read_pair(ref), ref.files["disparity"], ref.files["mask"]
+    disparity = read_map(truth, "true disparity")
+    check_size(truth, disparity.shape, images[0].shape)
+    valid, occluded = np.isfinite(disparity), None
+    if mask is not None:
+        occluded = valid & (_read_mask(mask, "mask of pixels seen twice", images[0]) == 128)
+    depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
+    notes = {"truth": truth.name, "disparity_step_px": _step_px(disparity[valid])}
+    return make_sample(ref, images, rig, depth_m, notes, occluded=occluded)
+
+
+SHRINK = 4
+"""Booster's images of 12 megapixels are scored at a quarter of their size, as the set's authors do."""
+
+
+def _find_booster(root: Path) -> list[SampleRef]:
+    """Every image pair of every scene of the balanced split, which has one truth and several lightings."""
+    refs = []
+    for scene in folders(root, 3):
+        if not ((scene / "camera_00").is_dir() and (scene / "camera_02").is_dir()):
+            continue
+        for left in sorted((scene / "camera_00").glob("im*.png")):
+            files = {
+                "left": left,
+                "right": scene / "camera_02" / left.name,
+                "disparity": scene / "disp_00.npy",
+                "occluded": scene / "mask_00.png",
+                "material": scene / "mask_cat.png",
+                "calibration": scene / "calib_00-02.xml",
+            }
+            refs.append(SampleRef("booster", f"{scene.name}-{left.stem}", files))
+    return refs
+
+
+def _quartered(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(H / 4, W / 4, 3)`` uint8, mean over squares of four by four pixels, and its intrinsics."""
+    planes = torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None]
+    shrunk = np.rint(F.avg_pool2d(planes, SHRINK)[0].permute(1, 2, 0).numpy()).astype(np.uint8)
+    sizes = image.shape[:2], shrunk.shape[:2]
+    return shrunk, resize_intrinsics(torch.from_numpy(K)[None], *sizes)[0].numpy()
+
+
+def _sampled(values: np.ndarray) -> np.ndarray:
+    """Every fourth value: truth and classes must not be mixed across edges."""
+    return values[SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK]
+
+
+def _load_booster(ref: SampleRef) -> StereoSample:
+    """Read one pair at a quarter of its size; the disparity is in pixels of the full size, 0 = unknown.
+
+    Masks, where the scene has them: ``occluded`` (0 = hidden in the right view), and ``material`` (class 0
+    the least, 3 the most specular or transparent; 2 and 3 are the authors' ToM, transparent or mirror).
+    """
+    files = ref.files
+    (left, right), rig = _read_pair(ref)
+    if any(side % SHRINK for side in (*left.shape[:2], *right.shape[:2])):
+        bad_value(str(files["left"]), f"of sides that are multiples of {SHRINK}", left.shape[:2])
+    disparity = read_map(files["disparity"], "true disparity")
+    check_size(files["disparity"], disparity.shape, left.shape)
+    depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
+    depth_m = _sampled(np.where(disparity > 0, depth_m, 0))
+    masks = {
+        name: _sampled(_read_mask(files[name], f"{name} mask", left))
+        for name in ("occluded", "material")
+        if files[name].is_file()
+    }
+    if "occluded" in masks:
+        masks["occluded"] = (masks["occluded"] == 0) & (depth_m > 0)
+    (left, K_left), (right, K_right) = _quartered(left, rig.K_left), _quartered(right, rig.K_right)
+    quarter, notes = replace(rig, K_left=K_left, K_right=K_right), {"truth": "disp_00.npy"}
+    return make_sample(ref, (left, right), quarter, depth_m, notes | {"disparity_step_px": 0.0}, **masks)
+
+
+#: Further views of the reference that a posed sample brings along, the best ones first.
+MOST_OTHERS = 4
+KEY_VIEWS: dict[str, tuple[int, ...]] = {
+    "Barn": tuple(range(60, 401, 20)),
+    "Church": tuple(range(10, 491, 20)),
+    "Courthouse": (243, 263, 283, 343, 523, 743, 763, 783, 923, 943, 963, 983, 1103),
+    "Ignatius": tuple(range(17, 258, 20)),
+}
+"""The views with filtered truth that the Robust Multi-View Depth Benchmark scores: 18, 25, 13 and 13."""
+
+
+def _groups(root: Path, pairs: str, benchmark: bool) -> list[tuple[Path, dict[int, list[int]]]]:
+    """Folders with ``images``, ``cams`` and ``pair.txt``, down to two levels; the sources of their views."""
+    check_choice(pairs, "pairs", ("default", "all"))
+    return [
+        (group, _sources_of(group / "pair.txt"))
+        for group in folders(root, 2)
+        if (group / "pair.txt").is_file() and (group / "cams").is_dir() and (group / "images").is_dir()
+        if benchmark == (group.name in KEY_VIEWS and (group / "depth").is_dir())
+    ]
+
+
+def _sources_of(path: Path) -> dict[int, list[int]]:
+    """For every reference view of a ``pair.txt`` its source views, best first, in the file's order."""
+    lines = [line.split() for line in read_text(path, "list of view pairs").splitlines() if line.strip()]
+    try:
+        sources = {}
+        for i in range(int(lines[0][0])):
+            reference, row = int(lines[1 + 2 * i][0]), lines[2 + 2 * i]
+            sources[reference] = [int(source) for source in row[1 : 1 + 2 * int(row[0]) : 2]]
+    except (IndexError, ValueError):
+        layout = "a pair.txt (count, then 'id' and 'n id score ...' lines per view)"
+        bad_value(str(path), layout, "another format")
+    return sources
+
+
+def _posed_files(group: Path, views: list[int], pixel_centre: float, truth: Path) -> dict[str, Any]:
+    """``files`` of a posed reference: of the left view, the right one, and the first four of the others."""
+    others = dict.fromkeys(view for view in views[2:] if view not in views[:2])
+    taken = [*views[:2], *list(others)[:MOST_OTHERS]]
+    files: dict[str, Any] = {"views": tuple(taken), "pixel_centre": pixel_centre, "truth": truth}
+    names = [("left", "calibration"), ("right", "calibration_right")]
+    names += [(f"image {view}", f"camera {view}") for view in taken[2:]]
+    for view, (image, camera) in zip(taken, names, strict=True):
+        images = [group / "images" / f"{view:08d}{suffix}" for suffix in (".png", ".jpg", ".jpeg")]
+        files[image] = next((path for path in images if path.is_file()), images[0])
+        files[camera] = group / "cams" / f"{view:08d}_cam.txt"
+    return files
+
+
+def _load_posed(ref: SampleRef) -> StereoSample:
+    """Read one posed pair; the camera files' depth numbers are never used.
+
+    Without a truth ``valid`` is False everywhere, but for the benchmark, whose truth must be there.
+    """
+    (images, rig), files = _read_pair(ref), ref.files
+    truth, half, extra = files["truth"], np.zeros((3, 3)), []
+    half[:2, 2] = files["pixel_centre"]
+    for view in files["views"][2:]:
+        image, camera = read_rgb(files[f"image {view}"], "further image"), files[f"camera {view}"]
+        pose = read_calibration((files["calibration"], camera))
+        extra.append((image, pose.K_right - half, pose.E))
+    if ref.dataset == "robustmvd":
+        check_file(truth, "true depth", "an npz file")
+    depth_m, named = np.zeros(images[0].shape[:2], np.float32), f"no {truth}"
+    if truth.is_file():
+        depth_m, named = read_map(truth, "true depth"), f"{truth.parent.name}/{truth.name}"
+        check_size(truth, depth_m.shape, images[0].shape)
+    notes = {"truth": named, "views": files["views"][:2]}
+    shifted = replace(rig, K_left=rig.K_left - half, K_right=rig.K_right - half)
+    return make_sample(ref, images, shifted, depth_m, notes, extra_views=tuple(extra))
+
+
+def find_robustmvd(root: Path, pairs: str = "default", pixel_centre: float = 0.5) -> list[SampleRef]:
+    """Every key view with its best source view or, for ``pairs="all"``, with each of its sources.
+
+    The benchmark's cameras are COLMAP's, whose first pixel has its centre at 0.5.
+    """
+    refs = []
+    for scene, sources in _groups(root, pairs, benchmark=True):
+        for view in KEY_VIEWS[scene.name]:
+            listed = sources.get(view, [])
+            truth = scene / "depth" / f"{view + 1:06d}.npz"  # counted from 1, as the scans are
+            for source in listed if pairs == "all" else listed[:1]:
+                files = _posed_files(scene, [view, source, *listed], pixel_centre, truth)
+                refs.append(SampleRef("robustmvd", f"{scene.name}-{view}-{source}", files))
+    return refs
+
+
+def find_mvsnet(root: Path, pairs: str = "default", pixel_centre: float = 0.0) -> list[SampleRef]:
+    """The first two views of each group or, for ``pairs="all"``, every ordered pair of ``pair.txt``.
+
+    The truth, our addition to the layout, is ``depths/<view>.pfm`` in metres. ``pixel_centre`` is the
+    coordinate of the top-left pixel's centre in the cameras' convention.
+    """
+    refs = []
+    for group, sources in _groups(root, pairs, benchmark=False):
+        if pairs == "all":
+            chosen = [[i, j, *sources[i]] for i in sources for j in sources[i]]
+        else:
+            chosen = [sorted({*sources, *(view for listed in sources.values() for view in listed)})]
+        for views in (views for views in chosen if len(views) > 1):
+            name = group.name if pairs == "default" else f"{group.name}-{views[0]}-{views[1]}"
+            truth = group / "depths" / f"{views[0]:08d}.pfm"
+            refs.append(SampleRef("mvsnet", name, _posed_files(group, views, pixel_centre, truth)))
+    return refs
+
+
+_DEPTHS = ("depth.npy", "depth.pfm", "depth.png", "depth_mm.png")
+
+
+def _image(folder: Path, stem: str) -> Path | None:
+    """The image file of this name that Pillow knows, a PNG before others."""
+    Image.init()
+    listed = [p for p in folder.glob(f"{stem}.*") if p.is_file() and p.suffix.lower() in Image.EXTENSION]
+    return min(listed, key=lambda path: (path.suffix.lower() != ".png", path.name), default=None)
+
+
+def _find_folders(root: Path) -> list[SampleRef]:
+    """``root`` and the folders right below it with ``left.*``, ``right.*``, ``calib.*`` and perhaps depth.
+
+    A folder that lacks one of the three counts as a pair: reading it names the file that is missing. The
+    calibration is one file of any known format, or ``calib_left.*`` and ``calib_right.*``; one with a pose
+    per image knows these as ``left.*`` and ``right.*``, in whatever folder.
+    """
+    refs = []
+    for folder in folders(root, 1):
+        left, right = _image(folder, "left"), _image(folder, "right")
+        single = sorted(folder.glob("calib.*"))
+        pair = [*sorted(folder.glob("calib_left.*"))[:1], *sorted(folder.glob("calib_right.*"))[:1]]
+        calibrated = bool(single) or len(pair) == 2
+        if (left is None and right is None) or (left is not None) + (right is not None) + calibrated < 2:
+            continue
+        # What is missing has a path as well, so that reading the pair says so.
+        files = {
+            "left": left or folder / "left.png",
+            "right": right or folder / "right.png",
+            "calibration": single[0] if single else pair[0] if calibrated else folder / "calib.txt",
+            "calibration_right": pair[1] if calibrated and not single else None,
+            "depth": next((folder / name for name in _DEPTHS if (folder / name).is_file()), None),
+        }
+        refs.append(SampleRef("folder", folder.resolve().name, files))
+    return refs
+
+
+def _load_folder(ref: SampleRef) -> StereoSample:
+    """Read one pair; without depth ``valid`` is False everywhere, and the notes say what was sought."""
+    (images, rig), path = _read_pair(ref), ref.files["depth"]
+    depth_m = np.zeros(images[0].shape[:2], np.float32)
+    truth = f"no {', '.join(_DEPTHS[:-1])} or {_DEPTHS[-1]} in {ref.files['left'].parent}"
+    if path is not None:
+        depth_m, truth = read_depth_m(path, "depth"), path.name
+        check_size(path, depth_m.shape, images[0].shape)
+    return make_sample(ref, images, rig, depth_m, {"truth": truth})
+
+
+LAYOUTS = (
+    Dataset(
+        *("kitti2015", partial(_find_kitti, name="kitti2015"), _load_kitti, KITTI_CAP_M),
+        "data_scene_flow.zip and data_scene_flow_calib.zip from "
+        "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (CC BY-NC-SA 3.0), unpacked into one "
+        "folder.",
+        full_count=200,
+    ),
+    Dataset(
+        *("kitti2012", partial(_find_kitti, name="kitti2012"), _load_kitti, KITTI_CAP_M),
+        "data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php "
+        "(CC BY-NC-SA 3.0), unpacked into one folder.",
+        full_count=194,
+    ),
+    Dataset(
+        *("middlebury2014", partial(_find_scenes, name="middlebury2014"), _load_scene, None),
+        "scene folders from https://vision.middlebury.edu/stereo/data/scenes2014/ (free with citation).",
+    ),
+    Dataset(
+        *("middeval3", partial(_find_scenes, name="middeval3"), _load_scene, None),
+        "MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from "
+        "https://vision.middlebury.edu/stereo/submit3/, unpacked into one folder.",
+        full_count=15,
+    ),
+    Dataset(
+        *("eth3d", partial(_find_scenes, name="eth3d"), _load_scene, None),
+        "two_view_training.7z and two_view_training_gt.7z from https://www.eth3d.net/datasets "
+        "(CC BY-NC-SA 4.0), unpacked into two_view_training and two_view_training_gt.",
+        full_count=27,
+    ),
+    Dataset(
+        *("booster", _find_booster, _load_booster, 10.0),
+        "booster_gt.zip from https://cvlab-unibo.github.io/booster-web/ (non-commercial research), "
+        "unpacked: train/balanced/<scene>.",
+        full_count=228,
+    ),
+    Dataset(
+        *("mvsnet", find_mvsnet, _load_posed, None),
+        "folders of images/, cams/ and pair.txt as MVSNet code circulates Tanks and Temples; "
+        "for the numbers here also depths/*.pfm in metres.",
+        ("pairs", "pixel_centre"),
+    ),
+    Dataset(
+        *("robustmvd", find_robustmvd, _load_posed, None),
+        "tanks_and_temples_images.zip and tanks_and_temples_depth.zip, fetched by "
+        "download_tanks_and_temples.sh of https://github.com/lmb-freiburg/robustmvd; then cams/ and pair.txt "
+        "from its sample list as docs/how-to/evaluation.md shows.",
+        ("pairs", "pixel_centre"),
+        full_count=sum(map(len, KEY_VIEWS.values())),
+    ),
+    Dataset(
+        *("folder", _find_folders, _load_folder, None),
+        "your own: <pair>/left.png, right.png, calib.* (any known format) and depth.npy, .pfm (metres) "
+        "or .png (mm).",
+    ),
+)
