@@ -1,12 +1,8 @@
 """Threads of torch on the CPU: never more than cores that this process may use.
 
-Beyond the cores every parallel operation waits for threads that are not running: with twice as many threads
-as cores a guided call takes twice as long. torch counts the cores of the affinity mask, but not the CPU quota
-of a container, and takes any number from ``OMP_NUM_THREADS`` and ``torch.set_num_threads``.
-
-The number belongs to the thread that calls: others that run already keep theirs. A thread that is started
-inside the block begins with the number inside. OpenCV is left alone: its number belongs to the whole process,
-is by default that of the cores by the same count, and more are not slower there.
+With twice as many threads as cores a guided call takes twice as long. torch does not count the CPU quota of a
+container, and takes any number from ``OMP_NUM_THREADS`` and ``torch.set_num_threads``. The number belongs to
+the thread that calls. OpenCV's own, of the whole process, is left alone: more are not slower there.
 """
 
 from __future__ import annotations
@@ -28,10 +24,8 @@ def available_cores() -> int:
 class WithinCores:
     """Context manager: torch has at most ``available_cores()`` threads inside, afterwards what it had.
 
-    A lower number holds as it is, and so does one that is set inside. Once left, it may be entered again.
-
-    Args:
-        among: parts of a program that work at the same time and share the cores, >= 1.
+    ``among`` parts of a program that work at the same time share the cores. A lower number holds as it is,
+    and so does one that is set inside. Once left, it may be entered again.
     """
 
     _before: int | None = None

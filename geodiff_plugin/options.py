@@ -6,10 +6,10 @@ Nothing here imports torch: ``geodiff --help`` and what is wrong with an option 
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections.abc import Callable
 from dataclasses import Field, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number, check_positive, refuse
@@ -38,19 +38,12 @@ def declare(
     split: bool = False,
     metavar: str | None = None,
 ) -> Any:
-    """A field of a dataclass of options.
+    """A field of a dataclass of options: its default, ``MISSING`` where it must be given, and its help.
 
-    Args:
-        default: its value where nothing is given; ``dataclasses.MISSING`` where something must be.
-        help_text: a sentence, with the unit.
-        *flags: as typed, where that is not ``--name-with-dashes``; ``""`` for an argument without a name.
-        panel: heading in the help.
-        low: least number, with ``high``.
-        high: largest number.
-        above_0: unit of a number that is finite and above 0.
-        choices: every value that it may have, besides ``None``.
-        split: a tuple that is typed with commas; otherwise a tuple's option is repeated.
-        metavar: what the help calls its value.
+    ``flags`` are as typed, where that is not ``--name-with-dashes``, ``""`` for an argument without a name;
+    ``panel`` is the heading in the help, ``metavar`` what it calls the value. A number lies between ``low``
+    and ``high``, or is finite and above 0, in the unit ``above_0``; ``choices`` are all values besides
+    ``None``. A tuple is typed with commas where ``split``, otherwise its option is repeated.
     """
     metadata = {"help": help_text, "flags": flags, "panel": panel, "split": split, "metavar": metavar}
     metadata |= {"low": low, "high": high, "above_0": above_0, "choices": choices}
@@ -63,34 +56,28 @@ def flag_of(field: Field[Any]) -> str:
     return flags[0] or field.name.upper()
 
 
-def help_of(name: str, options: type | None = None) -> str:
-    """The sentence that says what an option of ``RunOptions``, or of another dataclass, is."""
-    text: str = (options or RunOptions).__dataclass_fields__[name].metadata["help"]  # type: ignore[attr-defined]
+def help_of(name: str) -> str:
+    """The sentence that says what an option of ``RunOptions`` is."""
+    text: str = RunOptions.__dataclass_fields__[name].metadata["help"]
     return text
 
 
 def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) -> None:
     """Hold every value of a dataclass of options against what its field declares.
 
-    Args:
-        options: of fields made by ``declare``; others are left alone.
-        name_of: what a message calls a field.
-
-    Raises:
-        InputError: naming the option.
+    ``name_of`` is what a message calls a field. Fields that were not made by ``declare`` are left alone.
     """
     for field in dataclasses.fields(options):
-        rules, value = field.metadata, getattr(options, field.name)
+        rules, value, name = field.metadata, getattr(options, field.name), name_of(field)
         for entry in value if isinstance(value, tuple) else (value,):
             if entry is None or not rules:
                 continue
             if rules["choices"]:
-                check_choice(entry, name_of(field), rules["choices"])
+                check_choice(entry, name, rules["choices"])
             if rules["low"] is not None:
-                whole = "int" in str(field.type)
-                check_number(entry, name_of(field), rules["low"], rules["high"], integer=whole)
+                check_number(entry, name, rules["low"], rules["high"], integer="int" in str(field.type))
             if rules["above_0"]:
-                check_positive(entry, name_of(field), rules["above_0"])
+                check_positive(entry, name, rules["above_0"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,19 +113,15 @@ class RunOptions:
     )
 
     def check(self, name_of: Callable[[Field[Any]], str] = flag_of) -> None:
-        """Everything that can be said before a file is opened or torch is imported.
-
-        Raises:
-            InputError: naming the option.
-        """
+        """Everything that can be said before a file is opened or torch is imported."""
         check_options(self, name_of)
         names = {field.name: name_of(field) for field in dataclasses.fields(self)}
         if (self.near is None) != (self.far is None):
             missing, given = ("near", "far") if self.near is None else ("far", "near")
             bad_value(names[missing], f"given together with {names[given]}", "none", "Both in metres.")
         if self.near is not None and self.far is not None and self.near >= self.far:
-            cure = "Both are metres from the camera."
-            bad_value(names["near"], f"less than {names['far']}", f"{self.near:g} and {self.far:g}", cure)
+            got, cure = f"{self.near:g} and {self.far:g}", "Both are metres from the camera."
+            bad_value(names["near"], f"less than {names['far']}", got, cure)
         if self.resolution is not None and (self.resolution % 8 or 0 < self.resolution < 32):
             cure = f"Try {max(32, round(self.resolution / 8) * 8)}."
             bad_value(names["resolution"], "a multiple of 8 from 32 on, or 0", self.resolution, cure)
@@ -149,11 +132,7 @@ class RunOptions:
                 bad_value(names["option"], "NAME=VALUE, such as domain=outdoor", repr(entry))
 
     def config(self) -> GuidanceConfig:
-        """The preset with the range of depths and the knobs that were given; imports torch.
-
-        Raises:
-            InputError: a knob that does not exist, or the range given as one.
-        """
+        """The preset with the range of depths and the knobs that were given; imports torch."""
         from geodiff_plugin.config import PRESETS as CONFIGS
         from geodiff_plugin.config import config_from_text
 
@@ -163,11 +142,10 @@ class RunOptions:
             refuse("Give depth_range as --near and --far, in metres, not as --knob.")
         if self.near is None or self.far is None:
             return config
-        if self.preset != "paper":
-            return config.changed(depth_range=(self.near, self.far))
         # The paper's search is over one number, between the same two depths.
-        given = config.g_s_range != base.g_s_range
-        return config if given else config.changed(g_s_range=(self.near, self.far))
+        name = "depth_range" if self.preset != "paper" else "g_s_range"
+        given = name == "g_s_range" and config.g_s_range != base.g_s_range
+        return config if given else config.changed(**{name: (self.near, self.far)})
 
     def call(self) -> dict[str, Any]:
         """Keywords of the pipeline's call, without its generator."""
@@ -181,10 +159,5 @@ class RunOptions:
 
     def as_json(self) -> dict[str, Any]:
         """The options as JSON can hold them."""
-        return {name: _plain(value) for name, value in dataclasses.asdict(self).items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_plain(entry) for entry in value]
-    return str(value) if isinstance(value, Path) else value
+        plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self), default=str))
+        return plain

@@ -7,8 +7,6 @@ item without a result through the stages of the work and appends one record each
     runner = Runner(items, Journal(out / "samples.jsonl"), noun="sample")
     records = runner.run(lambda item: {"abs_rel": measure(item.payload)})
 
-- **Resuming.** An item whose key, and ``inputs``, are those of a record is done. One of them is the
-  fingerprint of what it is made from.
 - **Several processes**, started by ``torchrun``, ``accelerate launch`` or in two terminals, share a job by
   sharing its journal. Each claims an item before the work, with a lock that the kernel gives back when the
   process ends, however it ends. The first process waits for what others have claimed, takes it over should
@@ -104,12 +102,12 @@ def this_process() -> Process:
 
 @dataclass(frozen=True, eq=False)
 class Item:
-    """One piece of work.
+    """One piece of work; a record of the same ``key`` and ``inputs`` says that it is done.
 
     Attributes:
         key: no two items of a job share one.
         payload: what the first stage works on.
-        inputs: fingerprint of its inputs, unless ``key`` is it; a record of other inputs does not count.
+        inputs: fingerprint of its inputs, unless ``key`` is it.
         name: in messages; ``key`` by default.
         head: what its record begins with, also where it fails.
         words: texts of this item alone, such as its paths, which are no part of the cause of a failure; its
@@ -190,7 +188,6 @@ class Journal:
         self._records[item.key, item.inputs] = record
 
     def _lock(self, byte: int, wait: bool = False) -> bool:
-        """Lock a byte of the file, there or not; ``False`` where another process has it."""
         if CAN_LOCK:
             try:
                 fcntl.lockf(self._file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, byte)
@@ -212,7 +209,7 @@ class Journal:
 
 
 def _byte(item: Item) -> int:
-    """The byte of a journal that stands for an item; the first one is for appending."""
+    """The byte of a journal that stands for an item, there or not; the first one is for appending."""
     return 1 + int(fingerprint(item.key, item.inputs)[:15], 16)
 
 
@@ -225,7 +222,6 @@ class Runner:
         noun: what an item is, for the bar and messages.
         survives: exceptions of a stage that fail its item only; every other one ends the run.
         progress: show a bar with the time left, in the first process.
-        show: what the bar says of the records so far, such as running means.
         whole: whether what a record stands for is still there, such as files beside it; else it is made anew.
     """
 
@@ -237,24 +233,24 @@ class Runner:
         noun: str = "item",
         survives: tuple[type[Exception], ...] = (),
         progress: bool = True,
-        show: Callable[[Sequence[Record]], dict[str, str]] | None = None,
         whole: Callable[[Item, Record], bool] | None = None,
     ) -> None:
         self.items, self.journal, self.process = list(items), journal, this_process()
         if len({(item.key, item.inputs) for item in self.items}) < len(self.items):
             bad_value("items", "of different keys", f"{len(self.items)} {noun}s, some of one key")
-        if self.process.count > 1 and not CAN_LOCK:
-            bad_value("the number of processes", "1 on a system without fcntl", self.process.count)
         for item in self.items:
             record = journal.get(item)
             if record is not None and whole is not None and not whole(item, record):
                 journal.forget(item)
-        self._noun, self._survives, self._show = noun, survives, show
+        self._noun, self._survives = noun, survives
         self._progress = progress and self.process.index == 0
-        self._failures, self._begun = _Failures(noun, len(self.items)), set[Item]()
+        self._begun = set[Item]()
         low, high = (len(items) * (self.process.index + i) // self.process.count for i in (0, 1))
         # Of another's share from the end on: an item may start from the result of the one before.
         self._left = deque(self.items[low:high] + self.items[:low][::-1] + self.items[high:][::-1])
+        self._struck: dict[str, list[str]] = {}  # labels of the items that failed, by the cause
+        self._unsaid: list[str] = []  # the first failure, as long as every item fails as the first one did
+        self._any_passed = False
 
     def run(
         self, *stages: Stage, release: Callable[[Item], None] | None = None, most: int = 4
@@ -293,10 +289,7 @@ class Runner:
                 elif on_the_way:
                     self._record(*on_the_way[0])
                     leave(on_the_way.popleft()[0])
-                    records = self._records()
-                    if self._show is not None:
-                        bar.set_postfix(self._show(records), refresh=False)
-                    bar.update(len(records) - bar.n)
+                    bar.update(len(self._records()) - bar.n)
                 elif not self._look_again():
                     break
         finally:
@@ -304,7 +297,7 @@ class Runner:
             pipeline.end()
             for item, _ in on_the_way:
                 leave(item)
-        self._failures.report()
+        self._report()
         return self._records()
 
     def _records(self) -> list[Record]:
@@ -315,9 +308,11 @@ class Runner:
         try:
             record = result()
         except self._survives as error:
-            record = {"status": BROKEN, "error": self._failures.add(item, error)}
+            record = {"status": BROKEN, "error": self._fail(item, error)}
         else:
-            self._failures.passed()
+            self._any_passed = True
+        if self._any_passed or len(self._struck) > 1:
+            self._say_unsaid()
         self.journal.put(item, record)
 
     def _next(self) -> Item | None:
@@ -342,6 +337,38 @@ class Runner:
         time.sleep(POLL_S)
         self._left.extend(left)
         return True
+
+    def _fail(self, item: Item, error: Exception) -> str:
+        """Note a failure to be said, unless its cause has been; returns the message."""
+        is_plain = isinstance(error, (InputError, OSError, ValueError))
+        message = str(error) if is_plain else f"{type(error).__name__}: {error}"
+        cause = message
+        for word in sorted(item.words or (item.label,), key=len, reverse=True):
+            cause = cause.replace(word, "")
+        if cause not in self._struck:
+            self._unsaid.append(f"{item.label}: {message}")
+            if not is_plain:  # a defect of ours
+                _say("".join(traceback.format_exception(error)).rstrip())
+        self._struck.setdefault(cause, []).append(item.label)
+        return message
+
+    def _say_unsaid(self) -> None:
+        for message in self._unsaid:
+            _say(f"geodiff: {message}")
+        self._unsaid.clear()
+
+    def _report(self) -> None:
+        """Say which items each cause struck, where several; raise if it was one, and all items."""
+        if self._unsaid and sum(map(len, self._struck.values())) == len(self.items) > 1:
+            everywhere = f"The same holds for all {len(self.items)} {self._noun}s; nothing was computed."
+            raise InputError(f"{self._unsaid[0]} {everywhere}")
+        self._say_unsaid()
+        for labels in self._struck.values():
+            if len(labels) > 1:
+                more = [f"and {len(labels) - MOST_NAMES} more"] if len(labels) > MOST_NAMES else []
+                names = " ".join([", ".join(labels[:MOST_NAMES]), *more])
+                count = f"{len(labels)} of {len(self.items)} {self._noun}s"
+                _say(f"geodiff: {count} failed for one reason: {names}.")
 
 
 class _Pipeline:
@@ -376,55 +403,3 @@ class _Pipeline:
 def _say(sentence: str) -> None:
     tqdm.write(sentence, file=sys.stderr)  # above the bar
     sys.stderr.flush()
-
-
-class _Failures:
-    """Says why items failed: each cause once, and at the end how many items it struck."""
-
-    def __init__(self, noun: str, total: int) -> None:
-        self._noun, self._total, self._any_passed = noun, total, False
-        self._labels: dict[str, list[str]] = {}
-        self._unsaid: list[str] = []  # the first message, as long as every item fails as the first one did
-
-    def add(self, item: Item, error: Exception) -> str:
-        """Note a failure, say it unless its cause has been said, and return the message."""
-        is_plain = isinstance(error, (InputError, OSError, ValueError))
-        message = str(error) if is_plain else f"{type(error).__name__}: {error}"
-        cause = message
-        for word in sorted(item.words or (item.label,), key=len, reverse=True):
-            cause = cause.replace(word, "")
-        if cause not in self._labels:
-            self._unsaid.append(f"{item.label}: {message}")
-            if not is_plain:  # a defect of ours
-                _say("".join(traceback.format_exception(error)).rstrip())
-        self._labels.setdefault(cause, []).append(item.label)
-        if self._any_passed or len(self._labels) > 1:
-            self._flush()
-        return message
-
-    def passed(self) -> None:
-        """Note that an item has not failed."""
-        self._any_passed = True
-        self._flush()
-
-    def _flush(self) -> None:
-        for message in self._unsaid:
-            _say(f"geodiff: {message}")
-        self._unsaid.clear()
-
-    def report(self) -> None:
-        """Say how many items each cause struck, where several.
-
-        Raises:
-            ValueError: all items of the run failed, for one cause.
-        """
-        if self._unsaid and sum(map(len, self._labels.values())) == self._total > 1:
-            everywhere = f"The same holds for all {self._total} {self._noun}s; nothing was computed."
-            raise InputError(f"{self._unsaid[0]} {everywhere}")
-        self._flush()
-        for labels in self._labels.values():
-            if len(labels) > 1:
-                names = ", ".join(labels[:MOST_NAMES])
-                names += f" and {len(labels) - MOST_NAMES} more" if len(labels) > MOST_NAMES else ""
-                count = f"{len(labels)} of {self._total} {self._noun}s"
-                _say(f"geodiff: {count} failed for one reason: {names}.")

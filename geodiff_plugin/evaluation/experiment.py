@@ -19,7 +19,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from geodiff_plugin import __version__
@@ -30,7 +29,7 @@ from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample
 from geodiff_plugin.evaluation.metrics import crop_mask
 from geodiff_plugin.evaluation.options import command_line
 from geodiff_plugin.evaluation.scoring import score
-from geodiff_plugin.evaluation.tables import Table, headline
+from geodiff_plugin.evaluation.tables import Table
 from geodiff_plugin.formats import write_depth_npy
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import write_text
@@ -159,23 +158,12 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
         noun="cell",
         survives=(OSError, ValueError) if getattr(options, "skip_broken", False) else (),
         progress=not options.quiet,
-        show=_running_means,
         whole=_has_map,
     )
     records = {record["key"]: record for record in runner.run(lambda cell: cell.payload())}
     if runner.process.index > 0:
         return None
     return [records[cell.key] | dict(cell.head) for cell in cells if cell.key in records]
-
-
-def _running_means(records: Sequence[Record]) -> dict[str, str]:
-    """AbsRel so far of every method."""
-    values: dict[str, list[float]] = {}
-    for record in records:
-        value = headline(record) if "all_pixels" in record else record.get("abs_rel")
-        if value is not None:
-            values.setdefault(record.get("method", "AbsRel"), []).append(value)
-    return {name: f"{np.mean(each):.3f}" for name, each in values.items()}
 
 
 def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: str = "") -> str:

@@ -77,11 +77,7 @@ def _header_stamp(raw: bytes | memoryview, is_ros2: bool) -> int:
 
 @lru_cache(maxsize=4)
 def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple[tuple[Stamp, Stamp], ...]:
-    """The stamps of the images that belong together, each right one to one left one, in order.
-
-    Raises:
-        OSError, ValueError: no bag, no such topics, or no images within the tolerance of each other.
-    """
+    """The stamps of the images that belong together, each right one to one left one, in order."""
     stamps: list[list[Stamp]] = []
     try:
         with _open(path) as reader:
@@ -122,11 +118,7 @@ class BagReader:
         self._reader.close()
 
     def read(self, frame: int) -> np.ndarray:
-        """A pair, ``(H, 2 W, 3)`` float32 in [0, 1], RGB, left one first.
-
-        Raises:
-            OSError: it does not decode, or its images are of two sizes.
-        """
+        """A pair, ``(H, 2 W, 3)`` float32 in [0, 1], RGB, left one first."""
         images = [self._image(*each) for each in zip(self._connections, self._pairs[frame], strict=True)]
         if images[0].shape != images[1].shape:
             sizes = " and ".join("{1}x{0}".format(*image.shape) for image in images)
@@ -163,9 +155,6 @@ def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], 
     """The ``camera_info`` beside two topics as files of ``robots.read_ros``, and the left one's ``frame_id``.
 
     Topics with "rect" in their name are of rectified images, others of the images as taken.
-
-    Raises:
-        OSError, ValueError: no bag, or no ``camera_info``.
     """
     texts, frames = [], []
     with _open(path) as reader:
@@ -207,10 +196,11 @@ def write_depth_bag(
     from rosbags.typesys import Stores, get_typestore
 
     is_ros2, count = path.suffix != ".bag", 0
-    store = get_typestore(Stores.ROS2_HUMBLE if is_ros2 else Stores.ROS1_NOETIC)
-    serialize = store.serialize_cdr if is_ros2 else store.serialize_ros1
+    store: Any = get_typestore(Stores.ROS2_HUMBLE if is_ros2 else Stores.ROS1_NOETIC)
     plugin: dict[str, Any] = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}
     kinds = {"/depth/image": "sensor_msgs/msg/Image", "/depth/camera_info": "sensor_msgs/msg/CameraInfo"}
+    image_of, camera_of = (store.types[kind] for kind in kinds.values())
+    roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
         made = Path(folder) / "depth"
         writer: Any = rosbag2.Writer(made, **plugin) if is_ros2 else rosbag1.Writer(made)
@@ -221,24 +211,15 @@ def write_depth_bag(
                 time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp.header, 1_000_000_000))
                 order = {} if is_ros2 else {"seq": 0}
                 header = store.types["std_msgs/msg/Header"](**order, stamp=time, frame_id=frame_id)
-                messages = _image(store, header, depth_m, encoding), _info(store, header, depth_m.shape, K)
-                for topic, kind, message in zip(topics, kinds.values(), messages, strict=True):
+                values = np.where(depth_m > 0, depth_m, np.nan).astype("<f4")
+                values = depth_mm(values) if encoding == "16UC1" else values
+                size, data = values.shape, np.ascontiguousarray(values).view(np.uint8).ravel()
+                image = image_of(header, *size, encoding, 0, values.strides[0], data)
+                P = np.column_stack([K, np.zeros(3)])
+                matrices = [m.astype(np.float64).ravel() for m in (np.zeros(5), K, np.eye(3), P)]
+                camera = camera_of(header, *size, "plumb_bob", *matrices, 0, 0, roi)
+                for topic, kind, message in zip(topics, kinds.values(), (image, camera), strict=True):
+                    serialize = store.serialize_cdr if is_ros2 else store.serialize_ros1
                     writer.write(topic, stamp.recorded, serialize(message, kind))
         os.replace(made / "depth.mcap" if is_ros2 else made, path)
     return count
-
-
-def _image(store: Any, header: Any, depth_m: np.ndarray, encoding: str) -> Any:
-    values = np.where(depth_m > 0, depth_m, np.nan).astype("<f4")
-    values = depth_mm(values) if encoding == "16UC1" else values
-    (height, width), data = values.shape, np.ascontiguousarray(values).view(np.uint8).ravel()
-    kind = store.types["sensor_msgs/msg/Image"]
-    return kind(header, height, width, encoding, 0, width * values.itemsize, data)
-
-
-def _info(store: Any, header: Any, size: tuple[int, ...], K: np.ndarray) -> Any:
-    """The camera of a pinhole's image ``(H, W)``."""
-    P = np.column_stack([K, np.zeros(3)])
-    matrices = [m.astype(np.float64).ravel() for m in (np.zeros(5), K, np.eye(3), P)]
-    roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    return store.types["sensor_msgs/msg/CameraInfo"](header, *size, "plumb_bob", *matrices, 0, 0, roi)

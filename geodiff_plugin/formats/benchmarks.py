@@ -97,11 +97,7 @@ def read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
 
 
 def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[int, int]:
-    """Left and right camera.
-
-    In this order: ``cameras`` as given; the pair that the image folder's name says, if the file has it; the
-    colour pair; the only pair in the file.
-    """
+    """The pair that was given, else of the image folder's name, else the colour pair, else the only one."""
     if choice.cameras is not None:
         return two_cameras(choice, available)
     pairs = [pair for pair in PAIRS if set(pair) <= set(available)]
@@ -117,10 +113,7 @@ def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[in
 
 
 def read_kitti(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
-    """``P_rect_02`` with ``S_rect_02`` of ``calib_cam_to_cam``, or ``P0`` to ``P3``; DrivingStereo's too.
-
-    A note says that the colour pair was taken where nothing chooses between two pairs.
-    """
+    """``P_rect_02`` with ``S_rect_02`` of ``calib_cam_to_cam``, or ``P0`` to ``P3``; DrivingStereo's too."""
     rows = dict(KITTI_ROW.findall(texts[0]))
     named = {int(match[2]): match for match in map(PROJECTION.fullmatch, rows) if match}
     cameras = _kitti_cameras(named, choice)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import zipfile
 import zlib
@@ -40,14 +41,9 @@ def row_strips(height: int, width: int) -> Iterator[slice]:
 
 
 def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
-    """Read a portable float map.
+    """The ``(H, W)`` or ``(H, W, 3)`` float32 of a portable float map, top row first, unlike the file.
 
-    Returns:
-        ``(H, W)`` or ``(H, W, 3)`` float32, top row first (the file has the bottom row first); infinity and
-        0, which data sets use for "unknown", stay as they are.
-
-    Raises:
-        OSError, ValueError: no readable file, not a PFM, or cut off; ``name`` is the argument in the message.
+    Infinity and 0, which data sets use for "unknown", stay as they are.
     """
     file = check_file(path, name, "a PFM file")
     with open(file, "rb") as stream:
@@ -62,28 +58,22 @@ def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
         expected = "a PFM file (Pf or PF, size, scale)"
         bad_value(name, expected, f"{file}, whose head is another", "Is it a PNG or npy?")
     shape = (height, width) if kind == b"Pf" else (height, width, 3)
-    count = int(np.prod(shape))
-    if len(data) < 4 * count:
-        expected = f"a whole PFM file of {4 * count} bytes of data"
-        bad_value(name, expected, f"{file} with {len(data)}", "Is it cut off?")
-    values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4", count=count)
+    size = 4 * math.prod(shape)
+    if len(data) < size:
+        got = f"{file} with {len(data)}"
+        bad_value(name, f"a whole PFM file of {size} bytes of data", got, "Is it cut off?")
+    values = np.frombuffer(data[:size], dtype="<f4" if scale < 0 else ">f4")
     return np.flipud(values.reshape(shape)).astype(np.float32)
 
 
 def write_pfm(path: PathLike, values: np.ndarray) -> None:
-    """Write ``(H, W)`` or ``(H, W, 3)`` floats as a little-endian portable float map, whole or not at all.
-
-    Raises:
-        ValueError: another shape.
-        OSError: the folder does not exist or is not writable.
-    """
+    """Write ``(H, W)`` or ``(H, W, 3)`` floats as a little-endian portable float map, whole or not at all."""
     values = np.asarray(values, dtype="<f4")
-    if values.ndim != 2 and not (values.ndim == 3 and values.shape[-1] == 3):
+    if values.ndim != 2 and values.shape[2:] != (3,):
         bad_value("values", "of shape (H, W) or (H, W, 3)", f"shape {values.shape}")
-    kind = b"Pf" if values.ndim == 2 else b"PF"
     with atomic_path(path) as temporary:
-        head = b"%s\n%d %d\n-1.0\n" % (kind, values.shape[1], values.shape[0])
-        temporary.write_bytes(head + np.flipud(values).tobytes())
+        head = f"{'Pf' if values.ndim == 2 else 'PF'}\n{values.shape[1]} {values.shape[0]}\n-1.0\n"
+        temporary.write_bytes(head.encode() + np.flipud(values).tobytes())
 
 
 def _check_map(depth_m: np.ndarray) -> np.ndarray:
@@ -94,12 +84,7 @@ def _check_map(depth_m: np.ndarray) -> np.ndarray:
 
 
 def write_depth_npy(path: PathLike, depth_m: np.ndarray) -> None:
-    """Write ``(H, W)`` metres as float32 ``.npy``, whole or not at all.
-
-    Raises:
-        ValueError: another shape.
-        OSError: the folder does not exist or is not writable.
-    """
+    """Write a depth map ``(H, W)`` in metres as float32 ``.npy``, whole or not at all."""
     depth_m = _check_map(depth_m)
     # An open file, since numpy appends .npy to a name that lacks it.
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -107,13 +92,9 @@ def write_depth_npy(path: PathLike, depth_m: np.ndarray) -> None:
 
 
 def depth_mm(depth_m: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
-    """Depth as whole millimetres of 16 bits, as ROS' ``16UC1`` images and RGB-D data sets have it.
+    """Metres ``(H, W)`` as whole millimetres of 16 bits, as ROS' ``16UC1`` and RGB-D data sets have it.
 
-    ``depth_m`` is ``(H, W)`` metres, ``valid`` boolean of that shape; the result is ``(H, W)`` uint16, 0
-    where not valid, not finite, under half a millimetre or beyond 65.535 m.
-
-    Raises:
-        ValueError: another shape.
+    0 where not ``valid``, not finite, under half a millimetre or beyond 65.535 m.
     """
     depth_m = _check_map(depth_m)
     keep = np.isfinite(depth_m) if valid is None else np.isfinite(depth_m) & np.asarray(valid, dtype=bool)
@@ -126,12 +107,7 @@ def depth_mm(depth_m: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray
 
 
 def write_depth_mm(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None = None) -> int:
-    """Write ``depth_mm`` as a 16-bit PNG, whole or not at all; returns how many of its pixels are 0.
-
-    Raises:
-        ValueError: another shape.
-        OSError: the folder does not exist or is not writable.
-    """
+    """Write ``depth_mm`` as a 16-bit PNG, whole or not at all; returns how many of its pixels are 0."""
     whole = depth_mm(depth_m, valid)
     with atomic_path(path) as temporary:
         Image.fromarray(whole).save(temporary, format="PNG")
@@ -141,13 +117,9 @@ def write_depth_mm(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None
 def read_depth_png(
     path: PathLike, units_per_m: float = 1000.0, name: str = "depth"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Read a 16-bit PNG of depth or disparity with so many units in a metre or pixel (KITTI has 256).
+    """Depth or disparity of a 16-bit PNG with so many units in a metre or pixel (KITTI has 256).
 
-    Returns:
-        ``(H, W)`` float32 metres (or pixels), and the ``(H, W)`` boolean mask of where it is known (not 0).
-
-    Raises:
-        OSError, ValueError: no readable file, not a 16-bit PNG, or cut off.
+    ``(H, W)`` float32 metres or pixels, and the ``(H, W)`` boolean mask of where it is known, which is not 0.
     """
     with open_image(path, name, "a 16-bit PNG file") as image:
         mode, values = image.mode, np.asarray(image)
@@ -158,18 +130,10 @@ def read_depth_png(
 
 
 def read_map(path: PathLike, name: str = "map") -> np.ndarray:
-    """Read the map of a depth model, in whatever unit and space it is.
+    """The ``(H, W)`` map of a depth model, in whatever unit and space it is.
 
-    Args:
-        path: ``.npy``; ``.npz`` with ``depth``, or a single array; ``.pfm``; or a 16-bit ``.png``. Axes of
-            length 1 are dropped.
-        name: the argument that it came in, for messages.
-
-    Returns:
-        ``(H, W)`` as in the file; NaN where it is not finite, and where a PNG has 0.
-
-    Raises:
-        OSError, ValueError: no readable file, another kind of it, or more than one map.
+    A file ``.npy``; ``.npz`` with ``depth``, or a single array; ``.pfm``; or a 16-bit ``.png``. Axes of
+    length 1 are dropped. NaN where it is not finite, and where a PNG has 0.
     """
     file = check_file(path, name, MAP_FILES)
     kind = file.suffix.lower()
@@ -206,9 +170,6 @@ def disparity_of_depth(
     """Disparity in pixels of a rectified rig, ``fx baseline / Z - doffs``; infinity where depth is unknown.
 
     ``depth_m`` is ``(H, W)`` in the unit of ``E``; the intrinsics are in its pixels.
-
-    Raises:
-        ValueError: a rig that is not rectified.
     """
     shift = K_left[0, 0] * _baseline(E, "a submission", "a pair with another pose")
     known = np.isfinite(depth_m) & (depth_m > 0)
@@ -219,21 +180,12 @@ def disparity_of_depth(
 def depth_of_disparity(
     path: PathLike, rig: Rig, size: tuple[int, int], name: str = "disparity"
 ) -> np.ndarray:
-    """Depths by a disparity map of the left image, from a stereo network or a sensor.
+    """Depths ``(H, W)``, metres, by a disparity map of the left image, from a stereo network or a sensor.
 
-    Args:
-        path: of ``read_map``; a PNG holds 256 units a pixel, as KITTI's.
-        rig: rectified, in metres; its K are for images of ``size``.
-        size: ``(width, height)`` of the left image. A map of another size is one of the image scaled to it:
-            its disparities grow with its width, and every pixel takes the nearest.
-        name: the argument that it came in, for messages.
-
-    Returns:
-        ``(H, W)`` float32 metres, ``fx baseline / (d + doffs)``; 0 where the disparity is not finite or 0, or
-        nothing is in front of the cameras.
-
-    Raises:
-        OSError, ValueError: no map; a rig that is not rectified, or a map of another shape.
+    The map, of ``read_map``, may be one of the image scaled: its disparities grow with its width, and every
+    pixel takes the nearest. A PNG holds 256 units a pixel, as KITTI's. ``rig`` is rectified, in metres, its K
+    for images of ``size``, ``(width, height)``. The depth is ``fx baseline / (d + doffs)``; 0 where the
+    disparity is not finite or 0, or nothing is in front of the cameras.
     """
     baseline_m = _baseline(rig.E, name, f"the rig of {rig.source}")
     if rig.unit is None:

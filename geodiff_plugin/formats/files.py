@@ -45,12 +45,8 @@ MATRIX = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
 def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") -> Path:
     """The path of an existing, readable, non-empty file.
 
-    ``name`` is the argument that it came in and ``what`` what is expected there, for the message.
-
-    Raises:
-        TypeError: not a path.
-        FileNotFoundError, IsADirectoryError, PermissionError: nothing there, a folder, not readable.
-        ValueError: empty, or a pipe or a device.
+    ``name`` is the argument that it came in and ``what`` what is expected there, for the message: TypeError,
+    FileNotFoundError, IsADirectoryError, PermissionError, or ValueError where empty, or a pipe or a device.
     """
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
@@ -74,9 +70,7 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
 def open_image(path: str | os.PathLike[str], name: str, what: str = "an image file") -> Iterator[Image.Image]:
     """Open an image file with Pillow, HEIC by pillow-heif where that is installed; no pixel is read yet.
 
-    Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: not an image, one of more pixels than Pillow takes, or damage that shows in the block.
+    What is no image, too large, or damaged, which may show in the block only, is refused.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -108,11 +102,7 @@ def open_image(path: str | os.PathLike[str], name: str, what: str = "an image fi
 
 
 def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file") -> str:
-    """The text of a file, with Unix line ends and no byte-order mark.
-
-    Raises:
-        OSError, ValueError: as ``check_file``; not text.
-    """
+    """The text of a file, with Unix line ends and no byte-order mark."""
     file = check_file(path, name, what)
     cure = "Is this an image or an archive?"
     size = file.stat().st_size
@@ -132,11 +122,8 @@ def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file"
 def read_rows(path: str | os.PathLike[str], name: str, what: str) -> list[list[str]]:
     """The words of every line of a text that has any, without remarks behind ``#`` and ``//``.
 
-    Blanks, commas, semicolons and quotes stand between words.
-
-    Raises:
-        OSError, ValueError: as ``read_text``; a line of several numbers, one of them with a decimal comma:
-            ``1,5 2,5 3,0`` would be read as six. ``1,2`` alone in a line may be two columns.
+    Blanks, commas, semicolons and quotes stand between words. Decimal commas are refused, as ``1,5 2,5 3,0``
+    would be read as six numbers; ``1,2`` alone in a line may be two columns.
     """
     rows = []
     for line in read_text(path, name, what).replace('"', "").splitlines():
@@ -151,11 +138,7 @@ def read_rows(path: str | os.PathLike[str], name: str, what: str) -> list[list[s
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of what a file holds, read once as long as its size and time stay the same.
-
-    Raises:
-        OSError: it cannot be read, or is a folder.
-    """
+    """SHA-256 of what a file holds, read once as long as its size and time stay the same."""
     state = path.stat()
     return _digest(path.absolute(), state.st_size, state.st_mtime_ns)
 
@@ -167,11 +150,7 @@ def _digest(path: Path, size: int, changed_ns: int) -> str:
 
 
 def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
-    """The array of real numbers of an existing file, in the file's own type; nothing is unpickled.
-
-    Raises:
-        ValueError: numpy cannot load it, or it holds something else than ``expected``.
-    """
+    """The array of real numbers of an existing file, in the file's own type; nothing is unpickled."""
     import numpy as np
 
     try:
@@ -192,10 +171,6 @@ def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarra
 
     The file is ``.npy`` or text: rows of numbers, or all 9, 12 or 16 in one row, in brackets or not. A 3x4
     pose gets the row 0 0 0 1. Whether the matrix is a K or an E is checked where it is used.
-
-    Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: no matrix of such a shape, not finite, or with decimal commas.
     """
     import numpy as np
 

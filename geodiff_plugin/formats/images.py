@@ -90,14 +90,9 @@ def _checked_floats(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.ndarray, list[str]]:
-    """Read an image file, upright.
+    """Read an image file, upright: ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it.
 
-    Grey, palette, 16-bit and CMYK images work; alpha is dropped; of several frames the first is taken.
-
-    Returns:
-        ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it: alpha dropped, or turned
-        as the EXIF orientation says (K must belong to the turned image), 16 bits of which few are used, or
-        only the first of several frames taken. They call the image ``name``.
+    Alpha is dropped, the image turned as its EXIF orientation says, and of several frames the first is taken.
 
     Raises:
         OSError, ValueError: no readable file; not an image, cut off, or a side under 32 pixels.
@@ -143,11 +138,7 @@ def _hwc(value: Any, name: str) -> np.ndarray:
 
 
 def picture_size(value: Any, name: str) -> tuple[int, int]:
-    """``(width, height)`` of what ``as_image_01`` takes, without a look at its pixels, nor its warnings.
-
-    Raises:
-        TypeError, ValueError: no image by its type or shape, or a side under 32 pixels.
-    """
+    """``(width, height)`` of what ``as_image_01`` takes, without a look at its pixels, nor its warnings."""
     if isinstance(value, Image.Image):
         _check_sides(*value.size, name)
         return value.size
@@ -156,19 +147,15 @@ def picture_size(value: Any, name: str) -> tuple[int, int]:
 
 
 def as_image_01(value: Any, name: str) -> torch.Tensor:
-    """An image from memory as a tensor.
+    """An image from memory as a tensor ``(3, H, W)`` float32 in [0, 1] on the CPU; not differentiable.
 
-    A PIL image is taken as it lies in memory, as diffusers does; one that still carries an EXIF turn gets a
-    warning. A fourth channel is alpha and is dropped with a warning; one channel is repeated. 16 bits of
-    which few are used get a warning.
+    A PIL image is taken as it lies in memory, as diffusers does; a pending EXIF turn, a fourth channel, which
+    is dropped, and 16 bits of which few are used get a warning. One channel is repeated.
 
     Args:
         value: PIL image; numpy ``(H, W, C)`` or ``(H, W)``, or torch ``(C, H, W)``, of uint8, uint16 or
             float in [0, 1].
         name: the argument that it came in, for messages.
-
-    Returns:
-        ``(3, H, W)`` float32 in [0, 1] on the CPU; not differentiable.
 
     Raises:
         TypeError: none of these types.

@@ -26,6 +26,7 @@ KINDS = (
 MILLIMETRES = 1000.0
 #: Columns of points: x y z, with an intensity, or with a colour.
 COLUMNS = (3, 4, 6)
+NUMBER = re.compile(r"[-+]?(\d.*|\..*|nan|inf)", re.IGNORECASE)
 MOST_POINTS = 50_000_000
 NEAREST, FARTHEST_SCALE = 1e-9, 1e9
 PLY_TYPES = {
@@ -58,7 +59,7 @@ def read_points(
             or two-dimensional ``.npy`` of metres. Or points, metres, in the left camera's frame (x right, y
             down, z forward): ``N x 3``, ``N x 4`` or ``N x 6`` as ``.npy`` or text (blanks or commas), of
             which those columns count that a heading names x, y and z, else the first three; ``.ply``; KITTI's
-            velodyne ``.bin`` with its calibration.
+            velodyne ``.bin``.
         name: the argument that it came in, for messages.
         scale: units of the file in a metre, > 0, for any kind: 1000 for millimetres, 256 for KITTI's PNG.
         calibration: of a ``.bin``: KITTI's object ``calib/N.txt``, or ``calib_velo_to_cam.txt`` with
@@ -68,8 +69,7 @@ def read_points(
         ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)`` float32 metres.
 
     Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: a file of another kind, or that does not decode.
+        OSError, ValueError: no readable file, one of another kind, or one that does not decode.
     """
     file = check_file(path, name, "a file of known depths")
     if scale is not None:
@@ -97,11 +97,7 @@ def read_points(
 
 
 def read_confidence(path: PathLike, name: str = "points_confidence") -> np.ndarray:
-    """How far to rely on points: ``(N,)`` or ``(H, W)`` in [0, 1], from ``.npy``, ``.pfm``, or an image.
-
-    Raises:
-        OSError, ValueError: no such file.
-    """
+    """How far to rely on points: ``(N,)`` or ``(H, W)`` in [0, 1], from ``.npy``, ``.pfm``, or an image."""
     file = check_file(path, name, "a file of confidences")
     kind = file.suffix.lower()
     if kind == ".png":
@@ -117,7 +113,7 @@ def read_confidence(path: PathLike, name: str = "points_confidence") -> np.ndarr
 def _table(path: Path, name: str) -> np.ndarray:
     """Numbers of a text, one row a line, below one heading at most."""
     rows = read_rows(path, name, KINDS)
-    heading = rows.pop(0) if rows and not _is_number(rows[0][0]) else []
+    heading = rows.pop(0) if rows and not NUMBER.fullmatch(rows[0][0]) else []
     lengths = sorted({len(row) for row in rows})
     got = f"rows of {lengths or 'no'} numbers"
     if len(lengths) == 1:
@@ -126,14 +122,6 @@ def _table(path: Path, name: str) -> np.ndarray:
             return np.array([[row[column] for column in columns] for row in rows], dtype=np.float64)
         got = "words among them"
     bad_value(name, "points in metres, one a line, below one heading at most", f"{path} with {got}")
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _columns(heading: list[str], path: Path, name: str) -> Sequence[int]:
@@ -147,11 +135,7 @@ def _columns(heading: list[str], path: Path, name: str) -> Sequence[int]:
 
 
 def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
-    """The points ``(N, 3)`` float64 of a PLY file, ASCII or binary, in the file's unit and frame.
-
-    Raises:
-        ValueError: not PLY, no x, y, z, or cut off.
-    """
+    """The points ``(N, 3)`` float64 of a PLY file, ASCII or binary, in the file's unit and frame."""
     data = path.read_bytes()
     begin = data.find(b"\n", data.find(b"end_header", 0, LONGEST_HEAD)) + 1
     head = re.sub(r"(?m)^(comment|obj_info)\b.*\n", "", data[:begin].decode("latin-1"))
@@ -211,11 +195,11 @@ def _velodyne(path: Path, calibration: Sequence[PathLike], name: str) -> np.ndar
     if not calibration:
         cure = "The scanner has a frame of its own: x forward, y left, z up."
         bad_value(f"{name}-calib", f"given with a .bin ({VELODYNE})", "nothing", cure)
-    data = path.read_bytes()
-    if len(data) % 16:
+    size = path.stat().st_size
+    if size % 16:
         expected = "a velodyne .bin of whole points (4 float32 each)"
-        bad_value(name, expected, f"{path} of {len(data)} bytes", "Is it cut off?")
-    scan = np.frombuffer(data, dtype="<f4").reshape(-1, 4)[:, :3].astype(np.float64)
+        bad_value(name, expected, f"{path} of {size} bytes", "Is it cut off?")
+    scan = np.fromfile(path, dtype="<f4").reshape(-1, 4)[:, :3].astype(np.float64)
     T = _camera_from_velodyne(calibration, f"{name}-calib")
     points = scan @ T[:3, :3].T + T[:3, 3]
     points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)]

@@ -24,21 +24,15 @@ def is_video(path: Path) -> bool:
 def _open(path: Path, name: str) -> Any:
     import cv2
 
-    found = check_file(path, name, "a video file")
-    capture = cv2.VideoCapture(str(found))
+    capture = cv2.VideoCapture(str(check_file(path, name, "a video file")))
     if not capture.isOpened():
         cure = "Convert it, or extract its frames into a folder."
-        bad_value(name, "a video that OpenCV reads", f"{found}", cure)
+        bad_value(name, "a video that OpenCV reads", path, cure)
     return capture
 
 
 def count_frames(path: Path, name: str = "video") -> int:
-    """How many frames a video has, by going through it: heads of videos are not to be relied on.
-
-    Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
-        ValueError: no video, or one without frames.
-    """
+    """How many frames a video has, by going through it: heads of videos are not to be relied on."""
     capture, count = _open(path, name), 0
     while capture.grab():
         count += 1
@@ -62,11 +56,7 @@ class VideoReader:
         self._capture.release()
 
     def read(self, frame: int) -> np.ndarray:
-        """One frame, ``(H, W, 3)`` float32 in [0, 1], RGB, by its number from 0, passing over what is before.
-
-        Raises:
-            OSError: there is no such frame, or it does not decode.
-        """
+        """One frame, ``(H, W, 3)`` float32 in [0, 1], RGB, by its number from 0."""
         import cv2
 
         if frame < self._next:
@@ -82,11 +72,7 @@ class VideoReader:
 
 
 def both_halves(image_01: np.ndarray, name: str = "video") -> tuple[np.ndarray, np.ndarray]:
-    """Left and right view of a frame ``(H, 2 W, 3)`` that has them side by side, left one first.
-
-    Raises:
-        ValueError: an odd width.
-    """
+    """Left and right view of a frame ``(H, 2 W, 3)`` that has them side by side, left one first."""
     width = image_01.shape[1]
     if width % 2:
         cure = "Or give the right view's video as RIGHT."
