@@ -36,7 +36,6 @@ CELL_WIDTH = 480
 LEAST_ERROR = 0.05
 VIDEO_SUFFIXES = (".mp4", ".webp", ".gif")
 #: Of a frame with its photograph, pixels.
-MOST_VIDEO_WIDTH = 960
 #: A power of two: figures in inches are whole pixels again.
 DPI = 128
 POINTS_PER_PIXEL = 72 / DPI
@@ -294,18 +293,17 @@ def overview(
 
 def depth_frames(
     depths_m: Sequence[np.ndarray],
-    photographs: Iterable[Image.Image] | None = None,
     near: float | None = None,
     far: float | None = None,
     unit: str | None = "m",
 ) -> Iterator[Image.Image]:
     """One picture a depth map, all of one size and in the same colours; each is drawn when it is asked for.
 
-    The maps are ``(H, W)`` metres (or of no ``unit``); a photograph for each, taken when it is drawn, stands
-    on its left. ``near`` and ``far`` are as in ``depth_range``, over all maps.
+    The maps are ``(H, W)`` metres (or of no ``unit``). ``near`` and ``far`` are as in ``depth_range``, over
+    all maps.
 
     Raises:
-        ValueError: no maps, or maps of several shapes; at the last picture: another number of photographs.
+        ValueError: no maps, or maps of several shapes.
     """
     shapes, samples = set(), []
     for depth_m in depths_m:  # one pass: a map may be read from its file whenever it is asked for
@@ -315,21 +313,7 @@ def depth_frames(
     if len(shapes) != 1:
         bad_value("depths_m", "at least one map, all of one shape", sorted(shapes) or "none")
     near, far = depth_range(np.concatenate(samples)[None], near=near, far=far)
-    figures = (depth_figure(depth_m, near=near, far=far, unit=unit) for depth_m in depths_m)
-    if photographs is None:
-        return figures
-    ((height, width),) = shapes
-    pairs = zip(photographs, figures, strict=True)
-    return (_beside(photograph, figure, width / height) for photograph, figure in pairs)
-
-
-def _beside(photograph: Image.Image, figure: Image.Image, shape: float) -> Image.Image:
-    """A photograph as large as the map in a figure, on its left."""
-    left = photograph.convert("RGB").resize((round(shape * figure.height), figure.height))
-    joined = Image.fromarray(np.hstack([np.asarray(left), np.asarray(figure)]))
-    factor = min(1.0, MOST_VIDEO_WIDTH / joined.width)
-    size = round(joined.width * factor), round(joined.height * factor)
-    return joined.resize(size, Image.Resampling.LANCZOS)
+    return (depth_figure(depth_m, near=near, far=far, unit=unit) for depth_m in depths_m)
 
 
 def check_video(path: str | os.PathLike[str], fps: float) -> None:

@@ -27,23 +27,20 @@ from geodiff_plugin.options import OUTPUT, SPACES, declare, help_of
 _out = partial(declare, panel=OUTPUT)
 
 
-def _imported(where: str, quiet: bool = False) -> Callable[..., None]:
-    """A function of a module of ``cli``, after what is to be settled before torch is imported.
+def _imported(where: str) -> Callable[..., None]:
+    """A function of the package, imported when it is needed.
 
     OpenMP's threads spin while they wait, which on a busy machine takes the core from the thread that they
     wait for; asleep they cost one call in ten on an idle machine and save half of it on a busy one.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    if not quiet and "torch" not in sys.modules and sys.stderr.isatty():
-        sys.stderr.write("loading torch and diffusers ...\r")
-        sys.stderr.flush()
     module, _, name = where.rpartition(".")
     function: Callable[..., None] = getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
     return function
 
 
 def _later(where: str) -> Callable[[Any], None]:
-    """Calls a function, which is imported then, with the values of the options by their names."""
+    """Calls such a function with the values of the options by their names."""
     return lambda options: _imported(where)(**vars(options))
 
 
@@ -59,19 +56,19 @@ def _depth(options: DepthOptions) -> None:
     from geodiff_plugin.formats.bags import is_bag
 
     if is_bag(options.left):
-        _imported("cli.many.run_bag", options.quiet)(options)
+        _imported("cli.many.run_bag")(options)
         return
     names = ("topic_left", "topic_right")
     options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
     if is_many(options.left):
         options = replace(options, out=options.out or Path("geodiff-out"))
         refs = start_many(options)
-        _imported("cli.many.run_many", options.quiet)(options, refs)
+        _imported("cli.many.run_many")(options, refs)
         return
     options, watch = _with_folder(options, "geodiff-out"), StopWatch()
     with start_pair(options) as folder:
         with watch.stage("start"):
-            run = _imported("cli.depth.run_depth", options.quiet)
+            run = _imported("cli.depth.run_depth")
         run(options, folder, watch)
 
 
@@ -87,7 +84,7 @@ class _Demo:
         options = DepthOptions(**views, calib=(pair / "calib.txt",), device="cpu", **vars(self))
         options = _with_folder(options, "geodiff-demo")
         with start_pair(options) as folder:
-            _imported("cli.demo.run_demo", options.quiet)(options, folder)
+            _imported("cli.demo.run_demo")(options, folder)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +110,6 @@ class _Video:
     fps: float = declare(10.0, "Frames a second.")
     near: float | None = declare(None, "Depth of the last colour, metres.")
     far: float | None = declare(None, "Depth of the first colour, metres.")
-    photographs: bool = declare(False, "Show the left images beside the depth.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +151,7 @@ class _Convert:
 
 
 def _capture(options: CaptureOptions) -> None:
-    _imported("cli.capture.run_and_report", options.quiet)(options)
+    _imported("cli.capture.run_and_report")(options)
 
 
 def _eval(_: None) -> typer.Typer:
@@ -164,45 +160,21 @@ def _eval(_: None) -> typer.Typer:
     return eval_app
 
 
-COMMANDS: dict[str, tuple[type | None, Callable[[Any], Any], str]] = {
-    "depth": (DepthOptions, _depth, "Metric depth of LEFT with RIGHT as its guide; of one pair, or of many."),
-    "capture": (
-        CaptureOptions,
-        _capture,
-        "Depth of every frame of a capture, with poses solved together, and one cloud of all.",
-    ),
-    "demo": (
-        _Demo,
-        _Demo.run,
-        "Run on a rendered pair of the package's own, and print how good it is.",
-    ),
-    "info": (_Info, _later("cli.info.run_info"), "Print versions, devices, priors and what is cached."),
-    "bench": (
-        _Bench,
-        _later("cli.bench.run_bench"),
-        "What guidance costs in seconds and memory, and a command's seconds.",
-    ),
-    "video": (
-        _Video,
-        _later("cli.results.run_video"),
-        "Join the depth maps of a sequence into a video, in one range of colours.",
-    ),
-    "submit": (
-        _Submit,
-        _later("cli.results.run_submit"),
-        "Write disparities and times as Middlebury and ETH3D take them.",
-    ),
-    "app": (_Page, _Page.run, "Serve a web page: drop two photographs, and measure (needs the extra app)."),
-    "convert": (
-        _Convert,
-        _later("cli.convert.run_convert"),
-        "Convert pickled or split weights to a folder for --prior.",
-    ),
-    "eval": (None, _eval, "Measure this package and its peers on data sets in their official layouts."),
+COMMANDS = {
+    "depth": Command(DepthOptions, _depth, "Metric depth of LEFT guided by RIGHT; of one pair, or of many."),
+    "capture": Command(CaptureOptions, _capture, "Depth of a capture's frames, and one cloud of all."),
+    "demo": Command(_Demo, _Demo.run, "Run on a rendered pair of the package, and print how good it is."),
+    "info": Command(_Info, _later("cli.info.run_info"), "Versions, devices, priors and what is cached."),
+    "bench": Command(_Bench, _later("cli.bench.run_bench"), "What guidance costs in seconds and memory."),
+    "video": Command(_Video, _later("cli.results.run_video"), "Join depth maps of a sequence into a video."),
+    "submit": Command(_Submit, _later("cli.results.run_submit"), "Write what Middlebury and ETH3D take."),
+    "app": Command(_Page, _Page.run, "Serve a web page on which to measure (needs the extra app)."),
+    "convert": Command(_Convert, _later("cli.convert.run_convert"), "Make a folder for --prior of weights."),
+    "eval": Command(None, _eval, "Measure this package and its peers on data sets."),
 }
 app = new_group(
     "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior.",
-    {name: Command(*command) for name, command in COMMANDS.items()},
+    COMMANDS,
     outermost=True,
 )
 

@@ -1,12 +1,7 @@
-"""``geodiff bench``: time and memory of a guided call against a plain one, and the seconds of a command."""
+"""``geodiff bench``: time and memory of a guided call against a plain one."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-import tempfile
-import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any
@@ -14,7 +9,7 @@ from typing import Any
 import torch
 from rich.live import Live
 
-from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
+from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.cli.terminal import new_console, new_table
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior
@@ -49,22 +44,6 @@ def measure(gradient: str | None, device_name: str, repeats: int = 2, **knobs: A
     return min([timed(call, device) for _ in range(repeats)], default=first), memory.peak_bytes
 
 
-def command_seconds(device_name: str) -> dict[str, float]:
-    """Wall-clock seconds of ``geodiff depth`` on the demo pair by stage, in a process of its own.
-
-    "start" imports torch and diffusers, "python" is what comes before and behind the stages.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        left, right, calib = (str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png", "calib.txt"))
-        words = ["depth", left, right, "--calib", calib, "--device", device_name, "--json", "--quiet"]
-        words = [sys.executable, "-m", "geodiff_plugin", *words, "--out", f"{folder}/out"]
-        started = time.perf_counter()
-        answer = subprocess.run(words, check=True, capture_output=True, text=True)
-        whole = time.perf_counter() - started
-    stages: dict[str, float] = json.loads(answer.stdout)["seconds"]
-    return stages | {"python": whole - sum(stages.values())}
-
-
 def run_bench(device: str) -> None:
     """Print the table; every row is measured in a process of its own."""
     place, console, plain = pick_device(device), new_console(), None
@@ -78,6 +57,3 @@ def run_bench(device: str) -> None:
             plain = plain or cost
             ratios = (f"{cost[0] / plain[0]:.2f}", f"{cost[1] / max(plain[1], 1):.2f}")
             table.add_row(name, f"{cost[0]:.2f}", f"{cost[1] / 1e6:.0f}", *ratios)
-    stages = command_seconds(device)
-    told = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
-    console.print(f"geodiff depth on the demo pair: {sum(stages.values()):.1f} s ({told})")

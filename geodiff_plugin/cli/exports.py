@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin.cli.inputs import Inputs
-from geodiff_plugin.cli.options import DepthOptions, undistorted_name
+from geodiff_plugin.cli.options import DepthOptions, told_apart, undistorted_name
 from geodiff_plugin.cli.report import single_map, used_poses
 from geodiff_plugin.formats import (
     flying_points,
@@ -31,16 +29,13 @@ from geodiff_plugin.types import MetricDepthOutput
 def write_maps(
     folder: Path, output: MetricDepthOutput, left: np.ndarray, min_confidence: float = 0.0
 ) -> dict[str, Any]:
-    """Write every file but exports and the report.
+    """Write every file but exports and the report; counts for that.
 
     Args:
         folder: an existing one.
         output: of the guided call, at the left image's resolution.
         left: ``(H, W, 3)`` image in [0, 1], colours of the cloud.
         min_confidence: pixels below it are no points of the cloud, [0, 1].
-
-    Returns:
-        Counts for the report.
     """
     depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
     write_depth_npy(folder / "depth.npy", depth_m)
@@ -88,20 +83,10 @@ def cameras_of(output: MetricDepthOutput, guidance: GeometryGuidance) -> Cameras
     return ((K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
 
 
-def _image_names(paths: Collection[Path]) -> tuple[str, ...]:
-    """Names of the images, with their folders below a common one where two of them are alike."""
-    names = tuple(path.name for path in paths)
-    if len(set(names)) == len(names):
-        return names
-    absolute = [path.absolute() for path in paths]
-    root = os.path.commonpath([path.parent for path in absolute])
-    return tuple(path.relative_to(root).as_posix() for path in absolute)
-
-
 def check_image_names(options: DepthOptions, inputs: Inputs) -> None:
     """Refuse photographs whose names an export cannot hold, before the work that would be lost."""
     if "colmap" in options.export and not inputs.undistorted:
-        check_colmap_names(_image_names(options.photographs().values()))
+        check_colmap_names(told_apart(options.photographs().values()))
 
 
 def write_exports(folder: Path, output: MetricDepthOutput, inputs: Inputs, options: DepthOptions) -> None:
@@ -118,9 +103,9 @@ def write_exports(folder: Path, output: MetricDepthOutput, inputs: Inputs, optio
     if "glb" in options.export:
         write_glb(folder / "cloud.glb", cloud, cameras)
     if "colmap" in options.export:
-        names = _image_names(options.photographs().values())
+        names = told_apart(options.photographs().values())
         if inputs.undistorted:
-            names = tuple(undistorted_name(number) for number in range(1, 1 + len(cameras)))
+            names = [undistorted_name(number) for number in range(1, 1 + len(cameras))]
             for number, image in enumerate(inputs.guidance.rights, 2):  # the left one is always written
                 write_undistorted(folder, image.permute(1, 2, 0).numpy(), number)
         write_colmap(folder, [(name, *view) for name, view in zip(names, cameras, strict=True)], cloud)

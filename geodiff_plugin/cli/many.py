@@ -262,7 +262,7 @@ def _any_fails(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
         stages.close()
     answers = [_final(record, there.get(record["key"]), options) for record in records]
     if process.index == 0:
-        _answer(answers, options)
+        _answer(answers, options, options.out)
     return any(row["result"] == "failed" for row in answers)
 
 
@@ -272,39 +272,40 @@ def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:
     With ``--strict`` what is not trusted has failed.
     """
     record = record | (there or {})
-    row = dict.fromkeys(COLUMNS) | {name: record[name] for name in COLUMNS if name in record}
-    row |= {"pair": record["key"], "result": "there" if there else "done"}
+    row = {name: record.get(name) for name in COLUMNS} | {"pair": record["key"]}
     if record.get("status") == BROKEN:
-        row |= {"result": "failed", "message": record["error"]}
-    elif options.strict and record["verdict"] != "trusted":
-        assert options.out is not None
-        reason = f"The depth in {options.out / record['key']} is {record['verdict']}: {record['reasons']}"
-        say(f"geodiff: {row['pair']}: {reason}")
-        row = dict.fromkeys(COLUMNS) | {"pair": row["pair"], "result": "failed", "message": reason}
-    return row
-
-
-def _answer(rows: Sequence[Row], options: DepthOptions) -> None:
-    """Print the table, or the rows as JSON, and write ``pairs.csv``."""
+        return row | {"result": "failed", "message": record["error"]}
+    if not options.strict or record["verdict"] == "trusted":
+        return row | {"result": "there" if there else "done"}
     assert options.out is not None
+    reason = f"The depth in {options.out / record['key']} is {record['verdict']}: {record['reasons']}"
+    say(f"geodiff: {record['key']}: {reason}")
+    return dict.fromkeys(COLUMNS) | {"pair": record["key"], "result": "failed", "message": reason}
+
+
+def _answer(rows: Sequence[Row], options: DepthOptions, out: Path) -> None:
+    """Print the table, or the rows as JSON, and write ``pairs.csv``."""
     if options.json:
         print(json.dumps(rows, indent=2))
     elif not options.quiet:
-        _print(rows, options.out)
-    path = options.out / SUMMARY
+        _print(rows, out)
     try:
-        with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        with (
+            atomic_path(out / SUMMARY) as temporary,
+            open(temporary, "w", newline="", encoding="utf-8") as file,
+        ):
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()
             writer.writerows(rows)
     except OSError as error:  # what became of the pairs is on the screen, and each result in its folder
-        say(f"geodiff: {path} could not be written ({reason_of(error)}).")
+        say(f"geodiff: {out / SUMMARY} could not be written ({reason_of(error)}).")
 
 
 def _print(rows: Sequence[Row], out: Path) -> None:
     """The table and what it comes to."""
     doubtful = [row for row in rows if row["verdict"] not in (None, "trusted")]
-    shown = [r for r in rows if len(rows) <= MOST_ROWS or r["result"] == "failed" or r in doubtful]
+    failed = [row for row in rows if row["result"] == "failed"]
+    shown = [row for row in rows if len(rows) <= MOST_ROWS or row in failed or row in doubtful]
     if shown:
         table = new_table(("pair", "result", "near m", "median m", "far m", "confidence", "s"))
         for row in shown:
@@ -312,13 +313,10 @@ def _print(rows: Sequence[Row], out: Path) -> None:
             result = row["verdict"] if row in doubtful else row["result"]
             table.add_row(row["pair"], result, *("-" if v is None else f"{v:.2f}" for v in numbers))
         show(table)
-    done, there, failed = (sum(row["result"] == kind for row in rows) for kind in ("done", "there", "failed"))
+    done, there = (sum(row["result"] == kind for row in rows) for kind in ("done", "there"))
     number = "1 pair" if len(rows) == 1 else f"{len(rows)} pairs"
-    totals = f"{number}: {done} done, {there} there already, {failed} failed, {len(doubtful)} not trusted"
-    show(Text(f"{totals} -> {out}/"))
-    for row in shown:
-        if row["result"] == "failed":
-            show(Text(f"{row['pair']}: {row['message']}"))
+    totals = f"{done} done, {there} there already, {len(failed)} failed, {len(doubtful)} not trusted"
+    show(Text(f"{number}: {totals} -> {out}/"), *(Text(f"{r['pair']}: {r['message']}") for r in failed))
 
 
 def run_bag(options: DepthOptions) -> None:

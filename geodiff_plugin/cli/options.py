@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import MISSING, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -41,104 +41,75 @@ def undistorted_name(number: int) -> str:
     return "undistorted.png" if number == 1 else f"undistorted-{number}.png"
 
 
+def told_apart(paths: Collection[Path]) -> list[str]:
+    """Names of files, with their folders below a common one where two are alike."""
+    if len({path.stem for path in paths}) == len(paths):
+        return [path.name for path in paths]
+    absolute = [path.absolute() for path in paths]
+    common = os.path.commonpath([path.parent for path in absolute])
+    return [path.relative_to(common).as_posix() for path in absolute]
+
+
 @dataclass(frozen=True, kw_only=True)
 class DepthOptions(RunOptions):
     """The options of ``geodiff depth`` as they were typed."""
 
     left: Path = declare(
         MISSING,
-        "Left image, whose depth is estimated; its EXIF rotation is applied. Or a folder of images, "
-        "a video, or a list with LEFT,RIGHT[,CALIB] per line.",
+        "Left image, whose depth is estimated. Or a folder, a video, or a list: LEFT,RIGHT[,CALIB] a line.",
         "",
         metavar="LEFT",
     )
     right: Path | None = declare(
         None,
-        "Right image, of any size; not needed with --points. Or a folder, or a video; without it, a "
-        "video LEFT has both views side by side.",
+        "Right image, not needed with --points. Or a folder, or a video; else video LEFT has both views.",
         "",
         metavar="RIGHT",
     )
-    calib: tuple[Path, ...] = _camera(
-        (), "Calibration file in any known format, or COLMAP folder; twice if each view has its own."
-    )
+    calib: tuple[Path, ...] = _camera((), "Calibration file, or COLMAP folder; twice for one a view.")
     cameras: str | None = _camera(None, "Which two cameras of a file that has more, as 2,3.")
     fx: float | None = _camera(None, "Focal length, pixels.")
     fy: float | None = _camera(None, "Focal length, pixels.")
     cx: float | None = _camera(None, "Principal point, pixels.")
     cy: float | None = _camera(None, "Principal point, pixels.")
-    baseline: float | None = _camera(
-        None, "Distance of the cameras, metres, right one to the right; replaces that of --calib."
-    )
-    cx_right: float | None = _camera(
-        None, "Principal point of the right camera of a rectified pair (cx + doffs); --cx if not given."
-    )
+    baseline: float | None = _camera(None, "Distance of the cameras, metres; replaces that of --calib.")
+    cx_right: float | None = _camera(None, "That of the right camera of a rectified pair; --cx if none.")
     k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
     e: Path | None = _camera(None, "4x4 pose of the right camera in the left one's frame, metres.", "--E")
     k_right: Path | None = _camera(None, "3x3 intrinsics of the right image, if they differ.", "--K-right")
     distortion: tuple[str, ...] = _camera(
-        (), "Lens: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; twice for two lenses."
+        (), "Lens: k1,k2,p1,p2[,k3...] or fisheye:k1,...,k4; for one or both."
     )
-    estimate_pose: bool = _camera(
-        False, "Find the cameras' poses from the photographs (needs the extra pose)."
-    )
+    estimate_pose: bool = _camera(False, "Find the poses from the photographs (needs the extra pose).")
     fov: float | None = _camera(None, "Horizontal field of view, degrees, if EXIF has no focal length.")
-    known_length: str | None = _camera(
-        None, "Distance between two points of LEFT, X1,Y1,X2,Y2,METRES; instead of --baseline."
-    )
-    matcher: str | None = _camera(
-        None, "Finds points in the photographs: sift, lightglue, superglue, a folder."
-    )
+    known_length: str | None = _camera(None, "A distance in LEFT, X1,Y1,X2,Y2,METRES; instead of --baseline.")
+    matcher: str | None = _camera(None, "Finds points to match: sift, lightglue, superglue, a folder.")
     view: tuple[Path, ...] = _camera((), "A further view, with --view-E; repeat both for each.")
     view_k: tuple[Path, ...] = _camera((), "3x3 intrinsics of each --view; LEFT's if none.", "--view-K")
-    view_e: tuple[Path, ...] = _camera(
-        (), "4x4 pose of each --view in the left camera's frame, metres.", "--view-E"
-    )
-    view_distortion: tuple[str, ...] = _camera(
-        (), "Lens of each --view, 0,0,0,0 for none; LEFT's if not given."
-    )
+    view_e: tuple[Path, ...] = _camera((), "4x4 pose of each --view in the left camera's frame.", "--view-E")
+    view_distortion: tuple[str, ...] = _camera((), "Lens of each --view, 0,0,0,0 for none; default LEFT's.")
     cropped: bool = _camera(False, "The principal point may lie outside: the images are crops.")
     prior_map: Path | None = declare(
-        None,
-        "Depth map of LEFT by another model in place of --prior, of any size, unit and --space: .npy, .npz, "
-        ".pfm, 16-bit .png. Or a folder of maps with the images' names.",
+        None, "Depth map of LEFT by another model in place of --prior; of many pairs a folder of maps."
     )
-    points: Path | None = declare(
-        None, "Known depths: a map of LEFT (PNG, PFM, .npy) or points (.npy, text, .ply, .bin)."
-    )
+    points: Path | None = declare(None, "Known depths: a map of LEFT, or points (.npy, text, .ply, .bin).")
     points_scale: float | None = declare(
-        None,
-        "How many units of that file are a metre: 1000 for mm, 256 for KITTI's PNG.",
-        above_0="units per metre",
+        None, "How many units of that file are a metre: 1000 for mm.", above_0="units per metre"
     )
-    points_calib: tuple[Path, ...] = declare(
-        (), "KITTI's lidar calibration, for a .bin; twice if it is in two files."
-    )
-    disparity: Path | None = declare(
-        None,
-        "Known disparities of LEFT against the right camera of a rectified rig, in pixels, by a network or a "
-        "sensor: .npy, .npz, .pfm, or KITTI's .png; instead of --points.",
-    )
-    points_confidence: Path | None = declare(
-        None, "How far to rely on --points or --disparity, in [0, 1], of the same shape: .npy, .pfm or .png."
-    )
+    points_calib: tuple[Path, ...] = declare((), "KITTI's lidar calibration for a .bin; twice for two files.")
+    disparity: Path | None = declare(None, "Disparities of LEFT in a rectified rig, instead of --points.")
+    points_confidence: Path | None = declare(None, "How far to rely on them, in [0, 1], of the same shape.")
     topic_left: str | None = declare(None, "Topic of the left images, where LEFT is a bag.", "--left")
     topic_right: str | None = declare(None, "Topic of the right images, where LEFT is a bag.", "--right")
-    tolerance: float = declare(
-        0.005, "A bag: most seconds between the time stamps of a pair.", low=0.0, high=10.0
-    )
-    encoding: str = _output(
-        "16UC1", "A bag: depth in whole millimetres, or metres.", choices=("16UC1", "32FC1")
-    )
+    tolerance: float = declare(0.005, "A bag: most seconds between the stamps of a pair.", low=0.0, high=10.0)
+    encoding: str = _output("16UC1", "A bag: depth in whole mm, or metres.", choices=("16UC1", "32FC1"))
     min_confidence: float = _output(0.0, "Least confidence of a point in the cloud, 0 to 1.", low=0, high=1)
     out: Path | None = _output(
         None, "Folder for the results; geodiff-out, or -2 and so on where it is taken.", *("--out", "-o")
     )
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")
     strict: bool = _output(False, "End with an error if the result is not to be trusted.")
-    export: tuple[str, ...] = _output(
-        (), "Also write the cloud and cameras as glb or colmap; repeatable.", choices=("glb", "colmap")
-    )
+    export: tuple[str, ...] = _output((), "Also write glb or colmap; repeatable.", choices=("glb", "colmap"))
     quiet: bool = _output(False, "No progress bar, no summary.", "--quiet", "-q")
     json: bool = _output(False, "Print the report instead of the summary.")
 
@@ -201,9 +172,7 @@ class DepthOptions(RunOptions):
             beside = "no --prior-map" if self.prior_map is None else "--prior-map"
             bad_value("--prior-map", "given in place of a --prior", f"--prior {self.prior} and {beside}")
         if self.right is None and self.points is None and self.disparity is None:
-            cure = (
-                "One photograph alone does not tell metres: give a second one, or known depths with --points."
-            )
+            cure = "One photograph alone does not tell metres."
             bad_value("RIGHT", "given, or --points instead of it", "neither", cure)
         views = len(self.view)
         for option, given, counts in (

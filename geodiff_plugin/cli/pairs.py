@@ -16,7 +16,7 @@ from pathlib import Path
 from PIL import Image
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.options import DepthOptions, check_files
+from geodiff_plugin.cli.options import DepthOptions, check_files, told_apart
 from geodiff_plugin.formats.bags import is_bag, list_pairs
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.out import check_out
@@ -109,11 +109,10 @@ def find_pairs(options: DepthOptions) -> list[PairRef]:
 def assumption(refs: Sequence[PairRef], options: DepthOptions) -> str | None:
     """What was assumed about which views belong together, for the user to check; ``None`` for nothing."""
     first, last = refs[0], refs[-1]
-    if is_video(first.left) and first.right is None:
-        return f"{first.left} is read as both views side by side; with a video for each view, name both."
-    if first.right is None or last.right is None or not os.path.isdir(options.left):
-        return None
-    if first.left.stem == first.right.stem:
+    if first.right is None or last.right is None:
+        beside = "is read as both views side by side; with a video for each view, name both."
+        return f"{first.left} {beside}" if is_video(first.left) else None
+    if not os.path.isdir(options.left) or first.left.stem == first.right.stem:
         return None
     return (
         f"The two folders share no name, so their images are paired in order: {first.left.name} with "
@@ -224,13 +223,9 @@ def _cells(line: str) -> list[str]:
 
 def _names(lefts: Sequence[Path]) -> list[str]:
     """A folder name a pair: the left image's, with what tells it apart from others of that name."""
-    names = [path.stem for path in lefts]
-    if len(set(names)) < len(names):
-        absolute = [path.absolute() for path in lefts]
-        common = Path(os.path.commonpath([path.parent for path in absolute]))
-        names = ["_".join(path.relative_to(common).with_suffix("").parts) for path in absolute]
-    counts, taken = Counter[str](), list[str]()
-    for name in names:  # one left view with several right ones
-        counts[name] += 1
-        taken.append(name if counts[name] == 1 else f"{name}-{counts[name]}")
-    return taken
+    counts, names = Counter[str](), list[str]()
+    for name in told_apart(lefts):
+        stem = Path(name).with_suffix("").as_posix().replace("/", "_")
+        counts[stem] += 1  # one left view with several right ones
+        names.append(stem if counts[stem] == 1 else f"{stem}-{counts[stem]}")
+    return names

@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.report import REPORT, read_report
 from geodiff_plugin.cli.terminal import say
-from geodiff_plugin.formats import check_file, read_image, write_pfm
+from geodiff_plugin.formats import check_file, write_pfm
 from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.files import read_npy
 from geodiff_plugin.formats.out import write_text
-from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.plotting import check_video, depth_frames, write_depth_video
 
 #: Benchmarks by name, and where their files lie below the folder of a submission.
@@ -55,28 +53,7 @@ def _unit(frames: Sequence[Path], folders: Sequence[Path]) -> str | None:
     return "m" if all(in_metres) else None
 
 
-def _photograph(folder: Path) -> Image.Image:
-    """The left image that the depth of a result belongs to, where it lay when the result was made."""
-    expected = "the report of a folder of geodiff depth"
-    path, report = check_file(folder / REPORT, "--photographs", expected), read_report(folder)
-    try:
-        left, right = Path(report["arguments"]["left"]), report["arguments"]["right"]
-        frame, undistorted = report.get("pair", {}).get("frame"), report["undistorted"]
-    except (KeyError, TypeError, AttributeError):
-        bad_value("--photographs", expected, f"{path}, which is damaged")
-    if frame is None or undistorted:
-        file = folder / "undistorted.png" if undistorted else left
-        image, _ = read_image(file, f"the left image of {folder}")
-    else:
-        with VideoReader(left, f"the left video of {folder}") as video:
-            image = video.read(frame)
-        image = both_halves(image)[0] if right is None else image
-    return Image.fromarray(np.rint(image * 255).astype(np.uint8))
-
-
-def run_video(
-    frames: Sequence[Path], out: Path, fps: float, near: float | None, far: float | None, photographs: bool
-) -> None:
+def run_video(frames: Sequence[Path], out: Path, fps: float, near: float | None, far: float | None) -> None:
     """Write the video and say what is in it."""
     check_video(out, fps)
     files = [path / "depth.npy" if os.path.isdir(path) else path for path in frames]
@@ -88,8 +65,7 @@ def run_video(
             expected = f"all of one shape, {first_width}x{first_height} pixels as {frames[0]}"
             bad_value("FRAME", expected, f"{path} of {width}x{height}", "Make a video of each size.")
     unit = _unit(frames, [file.parent for file in files])
-    lefts = map(_photograph, frames) if photographs else None
-    write_depth_video(out, depth_frames(depths_m, lefts, near, far, unit), fps)
+    write_depth_video(out, depth_frames(depths_m, near=near, far=far, unit=unit), fps)
     print(f"{len(frames)} frames, {len(frames) / fps:.1f} s -> {out}")
 
 

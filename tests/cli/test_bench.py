@@ -67,7 +67,6 @@ def test_table(monkeypatch, capsys):
             return SimpleNamespace(result=lambda: costs[gradient])
 
     monkeypatch.setattr("geodiff_plugin.cli.bench.ProcessPoolExecutor", Inline)
-    monkeypatch.setattr("geodiff_plugin.cli.bench.command_seconds", lambda _: {"start": 1.5, "load": 0.5})
     run_bench("cpu")
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     rows = [words[-4:] for words in lines if words and re.fullmatch(r"\d\.\d\d", words[-1])]

@@ -305,8 +305,6 @@ def test_the_video_of_a_rig(geodiff, fresh, views, beside):
     assert sorted(os.listdir("out")) == [many.JOURNAL, "000000", "000001", "pairs.csv"]
     report = report_of("out/000001")
     assert report["pair"]["frame"] == 1 and report["inputs"]["right_size"] == [64, 48]
-    answer = geodiff("video", "out/000000", "out/000001", "--photographs", "--out", "depth.gif")
-    assert answer.code == 0, answer.err
     answer = geodiff("depth", *videos, *words, "--export", "colmap", "--overwrite")
     assert answer.code == 2 and "--export colmap must be left out with a video" in answer.err
 
