@@ -61,9 +61,8 @@ def render(E: np.ndarray, size: tuple[int, int] = SIZE, K: np.ndarray = K) -> tu
 def perturbed(E: np.ndarray, shift: float = 0.02, turn_deg: float = 2.0, seed: int = 0) -> np.ndarray:
     """Poses of a tracker that drifts: errors that change slowly along the walk."""
     rng = np.random.default_rng(seed)
-    smooth = np.array(
-        [np.convolve(rng.normal(size=len(E) + 6), np.ones(7) / 7**0.5, "valid") for _ in range(6)]
-    ).T
+    drawn = [np.convolve(rng.normal(size=len(E) + 6), np.ones(7) / 7**0.5, "valid") for _ in range(6)]
+    smooth = np.stack(drawn, axis=1)
     out = E.copy()
     out[:, :3, 3] += shift * smooth[:, :3]
     out[:, :3, :3] = (Rotation.from_rotvec(np.radians(turn_deg) * smooth[:, 3:])).as_matrix() @ E[:, :3, :3]
@@ -81,13 +80,7 @@ def write_transforms(folder: Path, E: np.ndarray, given: np.ndarray, **more: obj
         Image.fromarray(np.rint(depth * 1000).astype(np.uint16)).save(folder / f"depth/f{i:02d}.png")
         file = {"file_path": f"images/f{i:02d}.png", "depth_file_path": f"depth/f{i:02d}.png"}
         frames.append(file | {"transform_matrix": (said @ FLIP).tolist()})
-    camera = {
-        "fl_x": K[0, 0],
-        "fl_y": K[1, 1],
-        "cx": K[0, 2] + 0.5,
-        "cy": K[1, 2] + 0.5,
-        "w": SIZE[0],
-        "h": SIZE[1],
-    }
+    camera = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
+    camera |= {"w": SIZE[0], "h": SIZE[1]}
     (folder / "transforms.json").write_text(json.dumps(camera | {"frames": frames} | more))
     return folder

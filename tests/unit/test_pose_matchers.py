@@ -97,14 +97,11 @@ def test_folders_and_names_that_hold_no_matcher(tmp_path, monkeypatch) -> None:
             (tmp_path / "config.json").write_text(config)
         with pytest.raises(InputError, match=said):
             find_matcher(str(tmp_path))
-    (tmp_path / "model.safetensors").write_bytes(b"cut off")
-    with pytest.raises(InputError, match="readable"):
-        find_matcher(str(tmp_path))
-
-
-def test_weights_of_another_architecture(tmp_path) -> None:
-    saved("superglue", tmp_path)
-    config = json.loads((saved("lightglue", tmp_path / "other") / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(InputError, match="missing"):
-        find_matcher(str(tmp_path))
+    for kind, said in (("superglue", "weights of the matcher"), (None, "readable")):
+        if kind is None:
+            (tmp_path / "model.safetensors").write_bytes(b"cut off")
+        else:  # under the config of another architecture
+            tiny(kind).save_pretrained(tmp_path / kind)
+            (tmp_path / kind / "config.json").write_text('{"model_type": "lightglue"}')
+        with pytest.raises(InputError, match=said):
+            find_matcher(str(tmp_path / (kind or "")))
