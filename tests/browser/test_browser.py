@@ -31,6 +31,10 @@ def tab(page, name: str) -> None:
         page.locator(".overflow-dropdown button", has_text=name).click()
 
 
+def field(page, name: str):
+    return page.locator(f"#{name} textarea, #{name} input")
+
+
 def upload(page, paths) -> None:
     """Give the files and wait until the page shows each: a picture, or a file's row."""
     for name, path in zip(("left", "right", "calibration"), paths, strict=False):
@@ -105,12 +109,12 @@ def test_a_result_is_judged_stale_after_a_change_and_gone_under_an_error(visitor
     tab(page, "Measure")
     page.wait_for_selector("#measure-picture img")
     assert page.locator(".verdict:visible").count() == 2, "again where it matters"
-    page.locator("#pixel textarea, #pixel input").fill("32, 48")  # by keyboard
+    field(page, "pixel").fill("32, 48")  # by keyboard
     page.keyboard.press("Enter")
     page.wait_for_selector("#readings >> text=Choose a second point")
     tab(page, "Downloads")
     assert page.locator(".verdict:visible").count() == 2
-    page.locator("#baseline_m textarea, #baseline_m input").fill("0.3")
+    field(page, "baseline_m").fill("0.3")
     page.keyboard.press("Tab")
     page.wait_for_function("document.getElementById('results').classList.contains('stale')")
     page.get_by_text("Focal length and baseline").click()
@@ -126,14 +130,12 @@ def test_bad_input_shows_its_sentence(visitor, plane_files, tmp_path):
     bad.write_text("the rig on the roof\n")
     page = visitor()
     page.click("#run")
-    sentence = page.wait_for_selector("#status [role=alert]").inner_text()
-    assert "the left photograph must be given" in sentence
+    page.wait_for_selector("#status [role=alert] >> text=the left photograph must be given")
     upload(page, [*plane_files()[:2], bad])
     page.click("#run")
     page.wait_for_selector("#status >> text=calibration must be in a known format", timeout=RUN_MS)
-    assert "notes.txt" in page.locator("#status").inner_text()
     page.get_by_text("Focal length and baseline").click()
-    page.locator("#fx textarea, #fx input").fill("about 700")
+    field(page, "fx").fill("about 700")
     page.click("#run")
     page.wait_for_selector("#status >> text=fx, px must be a number")
 
@@ -141,10 +143,10 @@ def test_bad_input_shows_its_sentence(visitor, plane_files, tmp_path):
 def test_an_example_sets_every_field_and_runs(visitor):
     page = visitor()
     page.get_by_text("Focal length and baseline").click()
-    page.locator("#baseline_m textarea, #baseline_m input").fill("0.5")
+    field(page, "baseline_m").fill("0.5")
     page.locator("#examples button").nth(1).click()
     page.wait_for_selector("#status .figures", timeout=RUN_MS)
-    assert page.locator("#baseline_m textarea, #baseline_m input").input_value() == ""
+    assert field(page, "baseline_m").input_value() == ""
     assert page.locator("#way input:checked").get_attribute("value") == "file"
     assert "0.06 m away, right" in page.locator("#status .cameras").inner_text()
     page.wait_for_timeout(500)
@@ -177,7 +179,6 @@ def test_stop(visitor, plane_files):
     page.wait_for_timeout(300)
     page.click("#stop")
     page.wait_for_selector("#status >> text=Stopped.", timeout=RUN_MS)
-    page.wait_for_function("!document.querySelector('#run').disabled")
     assert page.locator("#status .figures").count() == 0
 
 

@@ -35,13 +35,8 @@ def host(monkeypatch, tmp_path):
     def save_path(prefix, output):
         folder = Path(output) / Path(prefix).parent
         folder.mkdir(parents=True, exist_ok=True)
-        return (
-            str(folder),
-            Path(prefix).name,
-            1 + len(list(folder.iterdir())),
-            str(Path(prefix).parent),
-            prefix,
-        )
+        number = 1 + len(list(folder.iterdir()))
+        return str(folder), Path(prefix).name, number, str(Path(prefix).parent), prefix
 
     folders.get_save_image_path = save_path
 
@@ -57,9 +52,8 @@ def host(monkeypatch, tmp_path):
         if state.interrupt:
             raise Interrupted
 
-    comfy, utils, management = (
-        types.ModuleType(n) for n in ("comfy", "comfy.utils", "comfy.model_management")
-    )
+    names = ("comfy", "comfy.utils", "comfy.model_management")
+    comfy, utils, management = map(types.ModuleType, names)
     utils.ProgressBar, management.get_torch_device = ProgressBar, lambda: torch.device("cpu")
     management.throw_exception_if_processing_interrupted = throw
     management.free_memory = lambda size, device: state.freed.append(size)
@@ -99,39 +93,30 @@ def prior(make_pipeline, tmp_path):
     return str(tmp_path / "prior")
 
 
-def widgets(node: type) -> dict:
-    """Inputs of a node that are typed in, in the order of the workflow's values."""
-    types_ = node.INPUT_TYPES()
-    every = types_["required"] | types_.get("optional", {})
-    return {
-        name: kind
-        for name, kind in every.items()
-        if isinstance(kind[0], list) or kind[0] in ("STRING", "INT", "FLOAT")
-    }
+def inputs_of(node: type) -> dict:
+    known = node.INPUT_TYPES()
+    return known["required"] | known.get("optional", {})
 
 
-def test_every_node_says_what_the_host_asks(pack):
+def test_the_nodes_say_what_the_host_asks_and_the_workflow_fits_them(pack):
     assert set(pack.NODE_CLASS_MAPPINGS) == set(pack.NODE_DISPLAY_NAME_MAPPINGS)
     for node in pack.NODE_CLASS_MAPPINGS.values():
         assert callable(getattr(node, node.FUNCTION)) and node.CATEGORY
         assert len(node.RETURN_TYPES) == len(node.RETURN_NAMES)
-        assert "required" in node.INPUT_TYPES()
-
-
-def test_the_workflow_fits_the_nodes(pack):
     nodes = {node["id"]: node for node in WORKFLOW["nodes"]}
     for _, source, slot, target, into, kind in WORKFLOW["links"]:
         assert nodes[source]["outputs"][slot]["type"] == nodes[target]["inputs"][into]["type"] == kind
     for node in nodes.values():
+        outputs = tuple(output["type"] for output in node["outputs"])
         if node["type"] in HOST_OUTPUTS:
-            assert tuple(output["type"] for output in node["outputs"]) == HOST_OUTPUTS[node["type"]]
+            assert outputs == HOST_OUTPUTS[node["type"]]
             continue
         made = pack.NODE_CLASS_MAPPINGS[node["type"]]
-        assert tuple(output["type"] for output in node["outputs"]) == made.RETURN_TYPES
-        known = made.INPUT_TYPES()
-        every = known["required"] | known.get("optional", {})
-        assert all(every[given["name"]][0] == given["type"] for given in node["inputs"])
-        fields = list(widgets(made))
+        asked = inputs_of(made)
+        assert outputs == made.RETURN_TYPES
+        assert all(asked[given["name"]][0] == given["type"] for given in node["inputs"])
+        typed = ("STRING", "INT", "FLOAT")
+        fields = [name for name, kind in asked.items() if isinstance(kind[0], list) or kind[0] in typed]
         # The host adds a field behind every seed: what becomes of it after a run.
         assert len(node["widgets_values"]) == len(fields) + ("seed" in fields)
 
@@ -164,7 +149,7 @@ def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plan
 
 def test_numbers_make_a_rig(pack):
     node, image = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"], torch.zeros(1, 48, 64, 3)
-    numbers = node.INPUT_TYPES()["required"]["file"][0][0]
+    numbers = inputs_of(node)["file"][0][0]
     (rig,) = node().read(numbers, 700.0, baseline_m=0.12, image=image, cx_right=33.0)
     assert rig.E[0, 3] == pytest.approx(0.12) and rig.K_left[0, 0] == 700
     assert rig.K_left[:2, 2].tolist() == [31.5, 23.5] and rig.K_right[0, 2] == 33
@@ -175,7 +160,7 @@ def test_numbers_make_a_rig(pack):
 @pytest.mark.usefixtures("pair")
 def test_files_are_those_of_the_input_folder(pack, host):
     node = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"]
-    assert node.INPUT_TYPES()["required"]["file"][0][1:] == ["K.txt"]
+    assert inputs_of(node)["file"][0][1:] == ["K.txt"]
     before = node.IS_CHANGED("K.txt")
     (host.folder / "K.txt").write_text("1 0 0 0 1 0 0 0 1\n0.3\n")
     assert node.IS_CHANGED("K.txt") != before

@@ -491,9 +491,6 @@ def test_every_pair_of_a_folder_has_its_own_cameras(tmp_path, kind):
 def test_the_page_knows_photographs_by_their_names_alone(tmp_path):
     (tmp_path / "transforms.json").write_text(factory.NERF)
     image = np.random.default_rng(0).random((480, 640, 3)).astype(np.float32)
-    paths, calibration = (
-        ("/tmp/page/0f/left.jpg", "/tmp/page/3a/right.jpg"),
-        str(tmp_path / "transforms.json"),
-    )
-    request = Request(*paths, calibration=(calibration,), baseline_m=0.12)
+    photographs = ("/tmp/page/0f/left.jpg", "/tmp/page/3a/right.jpg")
+    request = Request(*photographs, calibration=(str(tmp_path / "transforms.json"),), baseline_m=0.12)
     assert float(CAMERA_WAYS["file"][1](request, image, image).rigs[0].E[0, 3]) == pytest.approx(0.12)
