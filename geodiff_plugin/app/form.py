@@ -39,12 +39,8 @@ EXAMPLES = {
 class Form:
     """The components, and how their values become a request.
 
-    Attributes:
-        fields: by the name of what they fill in, of ``Request`` or ``RunOptions``.
-        untouched: the values that they begin with.
-        examples: the gallery of ``EXAMPLES``.
-        run: starts a job.
-        stop: ends it.
+    ``fields`` are by the name of what they fill in, of ``Request`` or ``RunOptions``; ``untouched`` are the
+    values that they begin with.
     """
 
     fields: dict[str, Any]

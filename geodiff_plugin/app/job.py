@@ -41,12 +41,7 @@ class Stopped(Exception):
 
 
 class Priors:
-    """The priors that a page offers, each loaded once for all visitors, when it is first used.
-
-    Args:
-        names: as ``load_prior`` takes them; a visitor can choose among these alone.
-        device: where they run.
-    """
+    """The priors that a page offers by name, each loaded once for all visitors when it is first used."""
 
     def __init__(self, names: tuple[str, ...], device: torch.device) -> None:
         self.names, self.device = names, device
@@ -66,16 +61,9 @@ class Priors:
 class Request:
     """What a visitor filled in; ``None`` is an empty field.
 
-    Attributes:
-        left: path of the left photograph.
-        right: path of the right one.
-        way: key of ``CAMERA_WAYS``.
-        calibration: paths of the calibration file, or of one file a camera.
-        fx: focal length, pixels; fy is the same where it is empty.
-        cx: principal point, pixels, with cy; the middle of the image where it is empty.
-        cx_right: the right image's cx; empty means that it is the left one's.
-        baseline_m: distance of the cameras, metres.
-        run: prior and settings.
+    ``left``, ``right`` and ``calibration``, one file or one a camera, are paths; ``way`` is a key of
+    ``CAMERA_WAYS``; ``fx`` to ``cx_right`` are pixels: fy is fx, cx and cy the middle of the image, and the
+    right camera's cx that of the left one where they are empty.
     """
 
     left: str | None
@@ -96,11 +84,7 @@ class Request:
 
     @property
     def photographs(self) -> tuple[str, str]:
-        """Paths of the left and the right one.
-
-        Raises:
-            InputError: one is missing.
-        """
+        """Paths of the left and the right one; ``InputError`` where one is missing."""
         for path, name in ((self.left, "the left photograph"), (self.right, "the right photograph")):
             if path is None:
                 bad_value(name, "given", "nothing", "Drop a picture into its field.")
@@ -120,14 +104,8 @@ class Request:
 class Result:
     """What is shown and measured.
 
-    Attributes:
-        left: ``(H, W, 3)`` float32 in [0, 1], the left photograph.
-        guidance: with the cameras as understood.
-        output: of the guided call, at the left photograph's size.
-        warnings: sentences, what was assumed among them.
-        seconds: by stage.
-        request: what was asked.
-        folder: of its files.
+    ``left`` is the photograph, ``(H, W, 3)`` float32 in [0, 1]; ``guidance`` has the cameras as understood;
+    ``warnings`` are sentences, what was assumed among them; ``seconds`` are by stage, files in ``folder``.
     """
 
     left: np.ndarray
@@ -231,11 +209,8 @@ def _read(path: str, name: str) -> tuple[np.ndarray, list[str]]:
 def run_job(request: Request, priors: Priors, stop: threading.Event, report: Report) -> Result:
     """Read, estimate, and say how far it is; only one job runs at a time.
 
-    Args:
-        request: what was filled in.
-        priors: what may be chosen.
-        stop: looked at before every stage and after every denoising step.
-        report: called with the share that is done, [0, 1], and the name of the stage.
+    ``stop`` is looked at before every stage and after every denoising step; ``report`` is called with the
+    share that is done, [0, 1], and the name of the stage.
 
     Raises:
         Stopped: ``stop`` was set.

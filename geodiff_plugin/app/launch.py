@@ -59,15 +59,9 @@ def _own_folder() -> None:
 
 
 def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **options: Any) -> Any:
-    """Build the page and launch it.
+    """Build the page and launch it; further ``options`` are those of ``gradio.Blocks.launch``.
 
-    Args:
-        priors: what a visitor may choose, as ``load_prior`` takes them; the first is the default.
-        device: auto, cpu, cuda, cuda:N or mps.
-        **options: of ``gradio.Blocks.launch``.
-
-    Returns:
-        What ``launch`` returns.
+    A visitor may choose among ``priors``, named as ``load_prior`` takes them; the first is the default.
 
     Raises:
         OSError, ValueError: gradio is missing, no such device, or the first prior cannot be loaded.

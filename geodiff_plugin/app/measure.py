@@ -22,13 +22,10 @@ SD_OF_MAD = 1.4826
 
 @dataclass(frozen=True)
 class Reading:
-    """What the depth map says at one pixel.
+    """What the depth map says at one pixel ``(x, y)``.
 
-    Attributes:
-        pixel: ``(x, y)``, whole numbers.
-        point_m: ``(3,)`` metres in the left camera's frame.
-        spread: standard deviation of the depth as a share of it; ``None`` where nothing tells.
-        confidence: [0, 1], or ``None``.
+    ``point_m (3,)`` is metres in the left camera's frame; ``spread`` the standard deviation of the depth as a
+    share of it, ``None`` where nothing tells; ``confidence`` in [0, 1], or ``None``.
     """
 
     pixel: tuple[int, int]

@@ -24,14 +24,9 @@ Maps = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 class DepthFrame:
     """Depth of one frame of a capture, as it goes from the runs to agreement and fusion.
 
-    Attributes:
-        name: of the frame.
-        depth: ``(H, W)`` z of the frame's camera.
-        confidence: ``(H, W)`` in [0, 1].
-        K: ``(3, 3)`` pixels.
-        E: ``(4, 4)`` camera-to-world.
-        confirmed: ``(H, W)`` how many other frames have the same depth there.
-        asked: ``(H, W)`` how many other frames see the point by this depth, or a surface before it.
+    ``depth`` is ``(H, W)`` z, ``confidence`` ``(H, W)`` in [0, 1], ``K (3, 3)`` pixels, ``E (4, 4)``
+    camera-to-world; ``confirmed`` and ``asked`` are ``(H, W)``: how many other frames have the same depth
+    there, and how many see the point by this depth, or a surface before it.
     """
 
     name: str

@@ -82,11 +82,7 @@ class Capture:
         return len(self.names)
 
     def frame(self, name: str) -> CaptureFrame:
-        """The frame of a name.
-
-        Raises:
-            InputError: no such frame.
-        """
+        """The frame of a name; ``InputError`` where there is none."""
         if name not in self._number:
             some = ", ".join(self.names[:3])
             bad_value(
@@ -95,11 +91,7 @@ class Capture:
         return self.files.frames[self._number[name]]
 
     def choose(self, wanted: str | None) -> list[str]:
-        """Names of ``NAME,NAME`` or ``FIRST:LAST:STEP``; all for ``None``.
-
-        Raises:
-            InputError: names that do not exist, or other text.
-        """
+        """Names of ``NAME,NAME`` or ``FIRST:LAST:STEP``; all for ``None``."""
         if wanted is None:
             return list(self.names)
         if ":" not in wanted:
@@ -205,7 +197,7 @@ class Capture:
         """Known depths of a frame, as ``GeometryGuidance(points=...)`` takes them; ``None`` for none.
 
         Raises:
-            InputError: another word; a capture without such points, or without a unit.
+            InputError: a capture without such points, or without a unit.
         """
         check_choice(points, "points", ("none", "model", "depth"))
         frame = self.frame(name)

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.pose.reconstruction import FEWEST_FOR_FOCAL, Match, Reconstruction, pycolmap
 
 #: Frames that a frame is matched with: so many after it, and so many others that look at the same place.
@@ -40,7 +41,6 @@ DISAGREES = 0.1
 CONVENTION_GAIN = 0.5
 #: Names that a sentence gives.
 MOST_NAMES = 5
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,9 +201,9 @@ def _in_convention(base: Reconstruction, E: np.ndarray) -> tuple[np.ndarray, lis
     matches = base.matches[:: max(1, len(base.matches) // 200)]
     forms = {
         "as given": E,
-        "with OpenGL's axes (y up, z backward)": E @ FLIP,
+        "with OpenGL's axes (y up, z backward)": E @ OPENGL_FROM_OPENCV,
         "world-to-camera": np.linalg.inv(E),
-        "world-to-camera with OpenGL's axes": np.linalg.inv(FLIP @ E),
+        "world-to-camera with OpenGL's axes": np.linalg.inv(OPENGL_FROM_OPENCV @ E),
     }
     if not matches:
         return E, ["No two frames match: are they of one scene, and sharp? The poses were not checked."]
@@ -228,7 +228,7 @@ def _misfit(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> float:
         aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
         at, bt = a @ T[:3, 3], b @ T[:3, 3]
         below = aa * bb - ab**2
-        ahead += int(((ab * bt - bb * at > 0) & (aa * bt - ab * at > 0) & (below > 0)).sum())
+        ahead += int(((ab * bt > bb * at) & (aa * bt > ab * at) & (below > 0)).sum())
         count += len(a)
     return _median_px(_residuals_px(E, K, matches)) / max(ahead / max(count, 1), 0.05)
 
