@@ -135,7 +135,7 @@ MUTANTS = [
         ("g = a * 0.9", "g = a * 0.8"),
         ("g / v**2", "g / v**1.9"),
         ("floored - FLOOR_EPS**2 / floored", "floored"),
-        ("self.t_hat**2 * self.unit_shift", "self.t_hat * self.unit_shift"),
+        ("self.t_hat**2 * self.units[1]", "self.t_hat * self.units[1]"),
     ),
     *of(
         "scale/points.py",

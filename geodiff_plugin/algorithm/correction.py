@@ -136,7 +136,7 @@ def correction_target(
     Args:
         matches: of some samples, ``(B, 1, h, w)``; or ``None``.
         points: on the same grid, or ``None``.
-        kept: ``(B, 1, h', w')`` in [0, 1], the share of each match's confidence that remains once reflections
+        kept: ``(B, 1, h, w)`` in [0, 1], the share of each match's confidence that remains once reflections
             are rejected; without it no match is used.
         error: of the prior, as ``refine_depth`` takes it, or ``None`` before it is measured.
         depth_m: ``(B, 1, H, W)`` metres, the estimate.

@@ -106,29 +106,15 @@ def prepare_evidence(
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
     reliable = None if matches is None else reliable_matches(matches)
-    _read_back_once(volume, (matches, targets, reliable))
-    return Evidence(
-        left,
-        left_01,
-        K,
-        further,
-        volume,
-        matches,
-        targets,
-        reliable,
-        tuple(views),
-        pose,
-        tuple(dict.fromkeys(warnings)),  # the same mistake may show in two ways
-    )
-
-
-def _read_back_once(volume: CostVolume | None, targets: Sequence[Matches | None]) -> None:
-    """Compute now what has to be read back from the device, so that no step waits for it."""
+    # Read back from the device now, so that no step waits for it.
     if volume is not None:
         _ = volume.reach_m, volume.rectified
-    for target in targets:
+    for target in (matches, targets, reliable):
         if target is not None:
             _ = target.above(0.0), target.above(RELIABLE)
+    told = tuple(dict.fromkeys(warnings))  # the same mistake may show in two ways
+    known = volume, matches, targets, reliable
+    return Evidence(left, left_01, K, further, *known, tuple(views), pose, told)
 
 
 @dataclass(frozen=True)

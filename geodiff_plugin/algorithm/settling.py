@@ -1,4 +1,12 @@
-"""The scale of a relative map (S7.3): by cost volume, matches and points, or the paper's single number."""
+"""The scale of a relative map (S7.3), in this order (``_ends_of_image``).
+
+1. ``search_scale``: near and far by lookup in the cost volume, at the first step, or at every one where too
+   few matches are reliable; without a right view ``fit_to_points`` instead.
+2. ``refine_to_matches``, then ``fit_to_points`` on reliable matches: which minimum of the search is right.
+3. ``refine_to_matches``: the fit within it, to the matches and then to the points, which have the last word.
+4. ``ordered``: near stays below far, and both within a given range.
+3. ``refine_to_matches``: the fit within it, to the matches, then to the points, which have the last word.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +22,8 @@ from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refi
 from geodiff_plugin.scale.space import AffineState, MetricMap, smooth_floor
 from geodiff_plugin.scale.volume_search import argmin_over, search_scale
 
+#: Metres ``(B,)`` of the nearest and of the farthest end of a map.
 _Ends = tuple[Tensor, Tensor]
-"""Metres ``(B,)`` of the nearest and of the farthest end of a map."""
 
 
 def span_of_points(evidence: Sequence[Evidence]) -> _Ends:
@@ -26,10 +34,7 @@ def span_of_points(evidence: Sequence[Evidence]) -> _Ends:
 
 
 def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Tensor]:
-    """The paper's start, s_hat = t_hat = 0 and the g_s of least photometric loss; and whether it is on edge.
-
-    ``x (B, 1, h, w)`` are float32 relative maps; the objective's configuration has the candidates.
-    """
+    """The paper's s_hat = t_hat = 0 and the g_s of least photometric loss; whether that is on the edge."""
     config, zero = objective.config, x.new_zeros(x.shape[0])
     low, high = config.g_s_range
     candidates = torch.linspace(low, high, config.g_s_candidates, dtype=torch.float32, device=x.device)
@@ -55,32 +60,26 @@ def settle_ends(
     on_edge: Tensor | None,
     valid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Nearest and farthest depth of a map, by lookup, or by a fit to points where there is no right view.
+    """Both ends of relative maps ``x (B, 1, h, w)``, and whether they lie on the edge of the range, ``(B,)``.
 
     Args:
-        x: ``(B, 1, h, w)`` float32 relative maps.
+        x: float32, about [0, 1].
         owners: the image of every sample; those of an image side by side.
         evidence: of every sample.
         metric: the prior's metric parametrisation.
         config: hyperparameters.
         current: both ends in use, which stay unless a better basin shows up.
-        on_edge: ``(B,)`` bool of the search before, ``None`` at the first.
+        on_edge: of the search before, ``None`` at the first.
         valid: ``(B, 1, H, W)`` bool, where the maps say something; ``None`` for everywhere.
-
-    Returns:
-        Metres ``(B,)`` of the nearest and the farthest end, and ``(B,)`` bool, whether they lie on the edge
-        of the search's range.
-
-    Source: S7.3; deviations in ``scale.volume_search``.
     """
     results = []
     for image in sorted(set(owners)):
         first = owners.index(image)
-        members = slice(first, first + owners.count(image))
-        before = None if current is None else (current[0][members], current[1][members])
-        edge = None if on_edge is None else on_edge[members]
+        of = slice(first, first + owners.count(image))
+        before = None if current is None else (current[0][of], current[1][of])
+        edge = None if on_edge is None else on_edge[of]
         where = None if valid is None else valid[first : first + 1]
-        results.append(_ends_of_image(x[members], evidence[first], metric, config, before, edge, where))
+        results.append(_ends_of_image(x[of], evidence[first], metric, config, before, edge, where))
     near, far, edges = (torch.cat(parts) for parts in zip(*results, strict=True))
     return near, far, edges
 
@@ -94,7 +93,7 @@ def _ends_of_image(
     on_edge: Tensor | None,
     valid: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``settle_ends`` of one image. Points have the last word: they are measured, matches inferred."""
+    """``settle_ends`` of one image."""
     space, floored, reliable = metric.space, smooth_floor(x), evidence.reliable
     if evidence.volume is None:
         assert evidence.points is not None  # without views there are points

@@ -55,6 +55,12 @@ class Trajectory:
     """
 
     affine: AffineState
+    kept: Tensor | None = None
+    error: Tensor | None = None
+    hidden: Tensor | None = None
+    order: Tensor | None = None
+    prior_depth: Tensor | None = None
+    on_edge: Tensor | None = None
 
     def __init__(
         self,
@@ -83,12 +89,6 @@ class Trajectory:
         self._prior_range = None if prior_range is None else tuple(torch.stack(prior_range).sort(0).values)
         self._start_range = self._prior_range if start_range is None else start_range
         self._affine_start: AffineState | None = None  # what the search gave, which the loss pulls towards
-        self.kept: Tensor | None = None
-        self.error: Tensor | None = None
-        self.hidden: Tensor | None = None
-        self.order: Tensor | None = None
-        self.prior_depth: Tensor | None = None
-        self.on_edge: Tensor | None = None
         if start_range is not None:  # the frame before has searched
             self.on_edge = torch.zeros_like(start_range[0], dtype=torch.bool)
         self.history: list[StepReport] = []
@@ -143,12 +143,12 @@ class Trajectory:
         config, depth_m = self.config, self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         if self.matches is not None and self.kept is None:
             self.kept = torch.ones_like(depth_m)
-            if config.reject_reflections and self.valid is None:
-                self.kept = reject_reflections(self.matches, depth_m)
-            elif config.reject_reflections and self.valid is not None:  # nothing is behind what is not there
-                kept = reject_reflections(self.matches.within(self.valid), depth_m)
-                inside = F.interpolate(self.valid.float(), kept.shape[-2:], mode="nearest-exact")
-                self.kept = torch.where(inside > 0, kept, self.kept)
+            if config.reject_reflections:
+                judged = self.matches if self.valid is None else self.matches.within(self.valid)
+                self.kept = reject_reflections(judged, depth_m)
+                if self.valid is not None:  # nothing is behind what is not there
+                    inside = F.interpolate(self.valid.float(), depth_m.shape[-2:], mode="nearest-exact")
+                    self.kept = torch.where(inside > 0, self.kept, 1.0)
         if config.correct or config.crisp:
             target = self._target(depth_m)
             assert target is not None  # there are matches or points
@@ -193,14 +193,5 @@ class Trajectory:
     def report(self, loss: Loss) -> None:
         """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
         terms = {name: value.detach() for name, value in loss.terms.items()}
-        affine = self.affine
-        report = StepReport(
-            *self.step,
-            loss.total.detach(),
-            terms,
-            affine.s_hat,
-            affine.t_hat,
-            affine.g_s,
-            loss.visible_fraction,
-        )
-        self.history.append(report)
+        state = self.affine.s_hat, self.affine.t_hat, self.affine.g_s
+        self.history.append(StepReport(*self.step, loss.total.detach(), terms, *state, loss.visible_fraction))

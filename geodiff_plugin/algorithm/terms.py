@@ -200,11 +200,6 @@ def _relative_error(depth_m: Tensor, target: Matches) -> Tensor:
     return (1.0 / depth_m - target.inverse_depth) / target.plane_step.view(-1, 1, 1, 1)
 
 
-def photometric_term(compared: Compared) -> Tensor:
-    """``photometric`` of the right images seen from the left."""
-    return photometric(compared.left_01, compared.warped_01, compared.visible, compared.config)
-
-
 def matches_term(compared: Compared) -> Tensor:
     """Robust distance from the matches in inverse depth, in planes of the sweep: far and near weigh alike."""
     target = compared.matches
@@ -257,7 +252,7 @@ def anchor_term(compared: Compared) -> Tensor:
 
 
 TERMS: dict[str, Term] = {
-    "photometric": Term(photometric_term, "views"),
+    "photometric": Term(lambda c: photometric(c.left_01, c.warped_01, c.visible, c.config), "views"),
     "matches": Term(matches_term, "matches"),
     "points": Term(points_term, "points"),
     "prior_pull": Term(prior_pull_term),
@@ -313,19 +308,8 @@ class Objective:
         with torch.set_grad_enabled(torch.is_grad_enabled() and warps):
             warped_01, in_view = self._warp(depth_m)
         visible = in_view if hidden is None else in_view & ~hidden
-        compared = Compared(
-            depth_m=depth_m,
-            left_01=self.views.left_01,
-            warped_01=warped_01,
-            visible=visible,
-            affine=affine,
-            affine_start=affine_start,
-            z0=z0,
-            anchor=anchor,
-            matches=matches,
-            points=points,
-            config=self.config,
-        )
+        seen = depth_m, self.views.left_01, warped_01, visible
+        compared = Compared(*seen, affine, affine_start, z0, anchor, matches, points, self.config)
         visible_fraction = in_view.any(1).float().flatten(1).mean(1)
         total, values = torch.zeros_like(visible_fraction), {}
         for name, weight in active.items():

@@ -76,10 +76,7 @@ class AlignedView:
 
 
 def align_view(
-    right: tuple[Tensor, Tensor, Tensor],
-    K_left: Tensor,
-    size: tuple[int, int],
-    inverse_depth: Tensor,
+    right: tuple[Tensor, Tensor, Tensor], K_left: Tensor, size: tuple[int, int], inverse_depth: Tensor
 ) -> AlignedView:
     """Turn a right view parallel to the left one; a rectified right image is its own canvas.
 
@@ -128,11 +125,7 @@ def _translation(to_right: Tensor, size: tuple[int, int]) -> Tensor | None:
 
 
 def _extent(
-    to_right: Tensor,
-    size: tuple[int, int],
-    size_right: tuple[int, int],
-    scale: Tensor,
-    shift: Tensor,
+    to_right: Tensor, size: tuple[int, int], size_right: tuple[int, int], scale: Tensor, shift: Tensor
 ) -> tuple[Tensor, Tensor]:
     """First and last column and row ``(2,)`` of the canvas, in pixels of the left grid at infinity."""
     far = torch.tensor([size[1] - 1.0, size[0] - 1.0], **_CPU_FLOAT64)

@@ -21,12 +21,12 @@ from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.correction import prior_error, refine_depth
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.geometry import image_size
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime.noise_levels import noise_level, trailing_timesteps
 from geodiff_plugin.scale.space import SPACES
-from geodiff_plugin.types import MetricDepthOutput
 
 #: Longer side of the depth prompt, pixels.
 PROMPT_LONG_EDGE = 256
@@ -72,7 +72,9 @@ def plan_warm_start(
     device, steps = pipe._execution_device, call["num_inference_steps"]
     # Its lengths may have become a metric prior's metres, where those of this call are in baselines.
     metres = 1.0 if guidance.unit else previous.rescaled
-    near, far = (end.to(device) / metres for end in _ends(previous, prior.space))
+    affine = (cast(Tensor, v) for v in (previous.scale, previous.shift, previous.global_scale))
+    ends = SPACES[prior.space].range_of(*(v.flatten().float() for v in affine))
+    near, far = (end.to(device) / metres for end in ends)
     skipped = min(steps - 1, round(steps * guidance.config.warm_start))
     if skipped < 1 or not isinstance(pipe.scheduler, DDIMScheduler):
         return WarmStart(near, far)
@@ -111,36 +113,24 @@ def _counted(images: int, members: int) -> str:
     return f"{images} image{'s' * (images != 1)} of {members} member{'s' * (members != 1)}"
 
 
-def _ends(previous: MetricDepthOutput, space: str) -> tuple[Tensor, Tensor]:
-    """Nearest and farthest depth of every sample's map, ``(N * E,)`` metres."""
-    scale, shift, g_s = (
-        cast(Tensor, v).flatten().float() for v in (previous.scale, previous.shift, previous.global_scale)
-    )
-    formulas = SPACES[space]
-    return formulas.ends(formulas.forward(shift, g_s), formulas.forward(scale + shift, g_s))
-
-
 def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
     """Confident matches and points, spread along surfaces, for priors that take a depth prompt.
 
-    ``(N, 1, h, w)`` metres; ``None`` if some image has neither.
+    ``(N, 1, h, w)`` metres: flat maps corrected by both, as a prior's would be; ``None`` if an image has
+    neither.
     """
-    maps = [depth_m for image in evidence if (depth_m := _spread(image, config)) is not None]
-    return torch.cat(maps) if len(maps) == len(evidence) else None
-
-
-def _spread(evidence: Evidence, config: GuidanceConfig) -> Tensor | None:
-    """``(1, 1, h, w)`` metres: a flat map corrected by matches and points, as a prior's would be."""
-    confident, points = Matches.stack([evidence.reliable]), Matches.stack([evidence.points])
-    target = confident if points is None else with_points(confident, points)
-    if target is None:
-        return None
-    height, width = evidence.left_01.shape[-2:]
-    factor = min(1.0, PROMPT_LONG_EDGE / max(height, width))
-    size = max(1, round(height * factor)), max(1, round(width * factor))
-    median = 1.0 / target.inverse_depth[target.confidence > 0].median()
-    flat = median.expand(1, 1, height, width)
-    left = evidence.left_01[None]
-    error = prior_error(flat, target, left, config=config)
-    depth_m, _, _ = refine_depth(flat, target, left, error, config=config)
-    return F.interpolate(depth_m, size, mode="bilinear", antialias=True)
+    maps = []
+    for image in evidence:
+        confident, points = Matches.stack([image.reliable]), Matches.stack([image.points])
+        target = confident if points is None else with_points(confident, points)
+        if target is None:
+            return None
+        height, width = image_size(image.left_01)
+        factor = min(1.0, PROMPT_LONG_EDGE / max(height, width))
+        size = max(1, round(height * factor)), max(1, round(width * factor))
+        median = 1.0 / target.inverse_depth[target.confidence > 0].median()
+        flat, left = median.expand(1, 1, height, width), image.left_01[None]
+        error = prior_error(flat, target, left, config=config)
+        depth_m, _, _ = refine_depth(flat, target, left, error, config=config)
+        maps.append(F.interpolate(depth_m, size, mode="bilinear", antialias=True))
+    return torch.cat(maps)

@@ -40,46 +40,24 @@ def inverse_softplus(y: Tensor) -> Tensor:
 class AffineState:
     """The three numbers per sample that make a relative map metric, all ``(B,)`` float32.
 
-    Attributes:
-        s_hat: raw scale, before softplus.
-        t_hat: raw shift, before softplus.
-        g_s: global scale; metres, in every space.
+    ``s_hat`` and ``t_hat`` are raw scale and shift, ``g_s`` is the global scale, metres. Scale and shift are
+    their softplus, or, as in Marigold-DC, their squares times ``units``, what raw values of 1 stand for.
     """
 
     s_hat: Tensor
     t_hat: Tensor
     g_s: Tensor
+    units: tuple[Tensor, Tensor] | None = None
 
     @property
     def scale(self) -> Tensor:
-        """``softplus(s_hat)``, dimensionless."""
-        return F.softplus(self.s_hat)
+        """``softplus(s_hat)``, or ``s_hat^2`` times its unit; dimensionless."""
+        return F.softplus(self.s_hat) if self.units is None else self.s_hat**2 * self.units[0]
 
     @property
     def shift(self) -> Tensor:
-        """``softplus(t_hat)``, dimensionless."""
-        return F.softplus(self.t_hat)
-
-
-@dataclass(frozen=True)
-class SquareAffine(AffineState):
-    """Scale and shift as squares that start at 1, as Marigold-DC has them.
-
-    ``unit_scale (B,)`` is what a raw scale of 1 stands for, ``unit_shift (B,)`` the same for the shift.
-    """
-
-    unit_scale: Tensor
-    unit_shift: Tensor
-
-    @property
-    def scale(self) -> Tensor:
-        """``s_hat^2 unit_scale``, dimensionless."""
-        return self.s_hat**2 * self.unit_scale
-
-    @property
-    def shift(self) -> Tensor:
-        """``t_hat^2 unit_shift``, dimensionless."""
-        return self.t_hat**2 * self.unit_shift
+        """``softplus(t_hat)``, or ``t_hat^2`` times its unit; dimensionless."""
+        return F.softplus(self.t_hat) if self.units is None else self.t_hat**2 * self.units[1]
 
 
 @dataclass(frozen=True)
@@ -101,6 +79,10 @@ class Space:
     def ends(self, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         """The nearest and the farthest depth as those at ``x = 0`` and ``x = 1``, or the other way around."""
         return (near, far) if self.grows_with_depth else (far, near)
+
+    def range_of(self, scale: Tensor, shift: Tensor, g_s: Tensor) -> tuple[Tensor, Tensor]:
+        """Metres of the nearest and of the farthest end of a map under a scale and a shift."""
+        return self.ends(self.forward(shift, g_s), self.forward(scale + shift, g_s))
 
     def depth_at(self, x: Tensor, near: Tensor, far: Tensor) -> Tensor:
         """Metres at relative values ``x (..., P)`` of ranges ``(..., 1)``; monotone between near and far."""
@@ -192,10 +174,9 @@ class MetricMap:
         tiny = 1e-4  # a flat map is legal; softplus cannot reach 0
         s, t = s.clamp_min(tiny), t.clamp_min(tiny)
         if self.positive == SQUARE:
-            return SquareAffine(torch.ones_like(s), torch.ones_like(t), g, s, t)
+            return AffineState(torch.ones_like(s), torch.ones_like(t), g, (s, t))
         return AffineState(inverse_softplus(s), inverse_softplus(t), g)
 
     def range_of(self, affine: AffineState) -> tuple[Tensor, Tensor]:
         """Nearest and farthest depth in metres, ``(B,)`` each; inverse of ``from_range``."""
-        space, s, t, g = SPACES[self.space], affine.scale, affine.shift, affine.g_s
-        return space.ends(space.forward(t, g), space.forward(s + t, g))
+        return SPACES[self.space].range_of(affine.scale, affine.shift, affine.g_s)

@@ -3,10 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from geodiff_plugin.scale.space import (
-    SPACES,
-    MetricMap,
-)
+from geodiff_plugin.scale.space import SPACES, MetricMap
 
 NEAR, FAR = torch.tensor([0.5, 4.0, 0.8]), torch.tensor([0.9, 80.0, 60.0])
 

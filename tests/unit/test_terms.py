@@ -7,12 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from geodiff_plugin.algorithm.terms import (
-    ANCHOR_FLOOR,
-    TERM_CAUCHY,
-    TERMS,
-    Compared,
-)
+from geodiff_plugin.algorithm.terms import ANCHOR_FLOOR, TERM_CAUCHY, TERMS, Compared
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState
