@@ -23,7 +23,6 @@ from geodiff_plugin.formats import CALIBRATION_FORMATS, read_calibration
 from geodiff_plugin.matching import points_to_matches
 from geodiff_plugin.priors import PRIORS
 from geodiff_plugin.priors.components import DirectScheduler
-from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.scale.points import fit_to_points
 from geodiff_plugin.scale.space import SPACES, MetricMap
 from tests.conftest import make_vae
@@ -81,8 +80,8 @@ def test_what_the_page_adds_works(page, textured_plane, tmp_path):
     )
     tiny = page["InkPipeline"](unet, make_vae(), DirectScheduler(), default_processing_resolution=64)
     tiny.save_pretrained(tmp_path)
-    own = page["OwnNetworkPrior"].load(Layout(tmp_path, "own"), torch.float32, None)
-    assert isinstance(own, page["InkPipeline"]) and isinstance(own.unet, UNet2DModel)
+    index = tmp_path / "model_index.json"
+    index.write_text(index.read_text().replace('"diffusers",\n    "UNet2DModel"', '"mine",\n    "MyUNet"'))
     pipe = enable_geometry_guidance(load_prior(tmp_path))
     pipe.set_progress_bar_config(disable=True)
     assert isinstance(pipe, page["InkPipeline"])

@@ -18,7 +18,7 @@ from geodiff_plugin.priors.depthfm import DepthFMPrior
 from geodiff_plugin.priors.depthmaster import DepthMasterPrior
 from geodiff_plugin.priors.e2e_ft import E2EFTPrior
 from geodiff_plugin.priors.geowizard import GeoWizardPrior
-from geodiff_plugin.priors.loading import BUNDLED_FOLDER, REFUSED, Layout, check_device, fetch, refuse
+from geodiff_plugin.priors.loading import BUNDLED_FOLDER, REFUSED, Layout, fetch, reading, refuse
 from geodiff_plugin.priors.lotus import LotusPrior
 from geodiff_plugin.priors.map import MAP_LAYOUT, DepthMapPrior
 from geodiff_plugin.priors.marigold import MarigoldPrior
@@ -54,13 +54,10 @@ PRIORS: dict[str, type[DepthPrior]] = {
 
 
 def find_adapter(pipe: Any) -> type[DepthPrior]:
-    """The class in ``PRIORS`` that understands a live pipeline; otherwise a ``TypeError``.
-
-    A ``DepthDiffusionPipeline`` that is not in the table says of itself what guidance must know.
-    """
+    """The class in ``PRIORS`` that understands a live pipeline, or ``DepthPrior``; else a ``TypeError``."""
     adapters: list[type[DepthPrior]] = [*PRIORS.values(), DepthPrior]
     for adapter in adapters:
-        if adapter.matches(pipe):
+        if isinstance(pipe, adapter.pipeline_class):
             return adapter
     expected = f"a pipeline with an adapter ({', '.join(PRIORS)})"
     bad_type("pipe", expected, pipe, "docs/how-to/extending.md shows how to write one.")
@@ -68,12 +65,7 @@ def find_adapter(pipe: Any) -> type[DepthPrior]:
 
 @dataclass(frozen=True)
 class FoundPrior:
-    """A prior whose folder is known and recognised, before its weights are read.
-
-    Attributes:
-        key: of ``PRIORS``.
-        layout: its folder.
-    """
+    """A prior whose folder is recognised as of a ``key`` of ``PRIORS``; its weights are not read yet."""
 
     key: str
     layout: Layout
@@ -94,7 +86,10 @@ class FoundPrior:
             check_choice(space, "space", SPACES)
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             bad_value("dtype", "torch.float32, torch.float16 or torch.bfloat16", repr(dtype))
-        device = None if device is None else check_device(device)
+        if device is not None:
+            expected = "one that PyTorch has on this machine"
+            with reading("device", expected, repr(str(device)), "Try 'cpu'."):
+                torch.empty(1, device=device)
         pipe = PRIORS[self.key].load(self.layout, dtype, space)
         pipe.register_to_config(_name_or_path=self.layout.name)
         return pipe.to(device) if device is not None else pipe
@@ -103,20 +98,14 @@ class FoundPrior:
 def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> FoundPrior:
     """Find a prior and tell which it is, by the configs of its components.
 
-    Args:
-        name: ``"bundled"``, ``"map"``, a folder, or a hub id; with a key of ``PRIORS`` and a colon before it
-            (``"e2e-ft:folder"``) it is taken for that.
-        variant: of the weight files, such as ``"fp16"``.
-        **hub: for the download (``revision``, ``token``, ``cache_dir``, ``local_files_only``).
-
-    Raises:
-        ValueError: it does not exist, is neither cached nor reachable, is refused, or is of no known kind.
+    With a key of ``PRIORS`` and a colon before its name (``"e2e-ft:folder"``) it is taken for that. Arguments
+    and errors as ``load_prior``.
     """
     key, typed = None, str(name)
     if typed == MAP_LAYOUT.name:
         return FoundPrior("map", MAP_LAYOUT)
-    prefix, colon, rest = typed.partition(":")
-    if colon and prefix in PRIORS:
+    prefix, _, rest = typed.partition(":")
+    if rest and prefix in PRIORS:
         key, typed = prefix, rest
     else:
         refuse(typed)
@@ -148,15 +137,17 @@ def load_prior(
     """Load a pipeline that can be guided.
 
     Args:
-        name: ``"bundled"``, a folder, or a hub id (``prs-eth/marigold-depth-v1-1``), see ``find_prior``; or
-            ``"map"``, whose call takes the ``depth_map`` of another model.
+        name: ``"bundled"``, a folder, or a hub id (``prs-eth/marigold-depth-v1-1``); or ``"map"``, whose call
+            takes the ``depth_map`` of another model.
         device: where to, CPU for ``None``.
         dtype: of the networks.
         space: what the prior's map is affine in, key of ``SPACES``; ``None`` for what the folder says, and of
             ``"map"`` for depth.
-        **kwargs: for ``find_prior`` (``variant``, ``revision``, ``token``, ``local_files_only``, ...).
+        **kwargs: ``variant`` of the weight files (``"fp16"``), and for the download ``revision``, ``token``,
+            ``cache_dir``, ``local_files_only``.
 
     Raises:
-        ValueError: it does not exist, is refused or unknown; its weights do not fit; its space is unknown.
+        ValueError: it does not exist, is neither cached nor reachable, is refused or of no known kind; its
+            weights do not fit; its space is unknown.
     """
     return find_prior(name, **kwargs).load(device, dtype, space)

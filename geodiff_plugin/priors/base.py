@@ -14,44 +14,36 @@ from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 class DepthPrior:
     """Adapter of one kind of pipeline; as it stands, of any ``DepthDiffusionPipeline``.
 
-    A subclass names its ``pipeline_class`` and writes ``recognises``; the rest where its pipeline is another
-    or its prior more than relative. The grid needs no word of its own: the pipeline's ``image_processor``
-    resizes and pads, what it returns tells scale per axis and padding, and ``decode`` answers on that grid.
+    A subclass names its ``pipeline_class`` and writes ``recognises``; the rest where its pipeline is another.
+    The pipeline's ``image_processor`` resizes and pads, and ``decode`` answers on that grid.
 
     Args:
         pipe: the live pipeline.
 
     Attributes:
         pipeline_class: of the pipelines that it understands.
-        component_classes: components by name whose class is this, whatever the folder's index says.
         licence: of the weights by hub id, for those that are known.
         space: what the decoded map is affine in, key of ``SPACES``.
         max_steps: most denoising steps that make sense, ``None`` for any number. A guided call of a prior
             with one step makes as many updates in it as it would have made in ``min_steps`` steps.
         deterministic: the same image gives the same map, so that an ensemble has one member.
+        takes_prompt: the call takes ``prompt_depth``, depths that the network starts from.
         latents: channels of the scheduler's latents that are depth; no gradient step touches the others.
         network_input: channels of the network's first argument that are the depth latent z_t; ``None``
             if z_t is no input of the network, so that only its output can be guided.
-        takes_prompt: whether the call takes ``prompt_depth``, depths that the network starts from.
     """
 
     pipeline_class: type[Any] = DepthDiffusionPipeline
-    component_classes: ClassVar[dict[str, type[Any]]] = {}
     licence: ClassVar[dict[str, str]] = {}
-    takes_prompt: bool = False
 
     def __init__(self, pipe: Any) -> None:
         self._pipe = pipe
         self.space: str = pipe.config.get("prediction_type")
         self.max_steps: int | None = getattr(pipe, "max_steps", None)
         self.deterministic: bool = getattr(pipe, "deterministic", False)
+        self.takes_prompt: bool = getattr(pipe, "takes_prompt", False)
         self.latents: slice = getattr(pipe, "depth_channels", slice(None))
         self.network_input: slice | None = self.latents if getattr(pipe, "sees_latents", True) else None
-
-    @classmethod
-    def matches(cls, pipe: Any) -> bool:
-        """Whether this adapter understands the live pipeline."""
-        return isinstance(pipe, cls.pipeline_class)
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
@@ -60,17 +52,12 @@ class DepthPrior:
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
-        """The pipeline of a folder that it recognises, each component from its own subfolder.
-
-        Args:
-            layout: the folder.
-            dtype: of the networks.
-            space: what the user said, or ``None``.
+        """The pipeline of a folder that it recognises; ``space`` is what the user said, or ``None``.
 
         Raises:
             ValueError: weights missing or left over; an unknown space.
         """
-        return build_pipeline(cls.pipeline_class, layout, dtype, cls.component_classes, prediction_type=space)
+        return build_pipeline(cls.pipeline_class, layout, dtype, prediction_type=space)
 
     def network(self) -> tuple[Any, str]:
         """Where the loop calls the network once a step: an object and the name of the method on it."""
@@ -88,20 +75,17 @@ class DepthPrior:
         return self._pipe.encode_relative(x)
 
     def metric_range(self, samples: slice) -> tuple[Tensor, Tensor] | None:
-        """What the prior itself says in metres, from which the search for the scale then starts.
+        """Metres ``(B,)`` of ``x = 0`` and of ``x = 1`` by the prior itself; ``None`` for a relative one.
 
-        Args:
-            samples: which members of the running call, once its condition is prepared.
-
-        Returns:
-            Depths of ``x = 0`` and of ``x = 1``, ``(B,)`` metres each; ``None`` for a relative prior.
+        The search for the scale starts from them. ``samples`` are members of the running call.
         """
-        return None
+        own = getattr(self._pipe, "own_range", None)
+        return None if own is None else own[samples].unbind(1)
 
     def known(self, samples: slice) -> Tensor | None:
-        """Where the prior says anything; what it gives elsewhere is no evidence of its scale or quality.
+        """``(B, 1, H, W)`` bool on the processing grid, where the prior says anything; ``None``: everywhere.
 
-        Returns:
-            ``(B, 1, H, W)`` bool on the processing grid, of the members ``samples``; ``None`` for everywhere.
+        What it gives elsewhere is no evidence of its scale or quality.
         """
-        return None
+        known = getattr(self._pipe, "known", None)
+        return None if known is None else known[samples]

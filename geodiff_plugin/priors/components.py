@@ -1,4 +1,4 @@
-"""Small components that the pipelines of this package share: a one-step schedule, prompts, image sizes."""
+"""Small components that the pipelines of this package share: a one-step schedule, a prompt, image sizes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from diffusers.configuration_utils import ConfigMixin, register_to_config
 from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from diffusers.schedulers.scheduling_utils import SchedulerMixin, SchedulerOutput
 from torch import Tensor
-from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin._checks import bad_value
 
@@ -28,8 +27,6 @@ class DirectScheduler(SchedulerMixin, ConfigMixin):
 
     @register_to_config
     def __init__(self, timestep: int = 999, prediction_type: str = "sample") -> None:
-        if prediction_type != "sample":
-            bad_value("prediction_type of a DirectScheduler", "'sample'", repr(prediction_type))
         self.set_timesteps()
 
     def set_timesteps(self, num_inference_steps: int = 1, device: str | torch.device | None = None) -> None:
@@ -39,10 +36,6 @@ class DirectScheduler(SchedulerMixin, ConfigMixin):
             bad_value("num_inference_steps", "1", num_inference_steps, cure)
         self.num_inference_steps = num_inference_steps
         self.timesteps = torch.tensor([self.config.timestep], device=device)
-
-    def scale_model_input(self, sample: Tensor, timestep: Any = None) -> Tensor:
-        """The sample, as it is."""
-        return sample
 
     def step(
         self,
@@ -81,12 +74,7 @@ class SidesOf(MarigoldImageProcessor):
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> tuple[Tensor, tuple[int, int], tuple[int, int]]:
-        """As the stock method, but for the size.
-
-        Returns:
-            ``(N, 3, H, W)`` in [-1, 1] with sides of a multiple of ``side``, no padding ``(0, 0)``, and the
-            size ``(H, W)`` that the image came with.
-        """
+        """As the stock method, but for the size of the processed image ``(N, 3, H, W)``."""
         # In float32 until the end: not every device resizes in half precision.
         image, padding, size = super().preprocess(image, 0, resample_method_input, device, torch.float32)
         factor = processing_resolution / max(size) if processing_resolution else 1.0
@@ -100,37 +88,8 @@ class SidesOf(MarigoldImageProcessor):
         return max(1, parts) * self.side
 
 
-def text_embedding(
-    tokenizer: CLIPTokenizer, text_encoder: CLIPTextModel, device: torch.device, prompt: str = ""
-) -> Tensor:
-    """Embedding ``(1, n, C)`` of a prompt, not padded, as Marigold and its descendants were trained with.
-
-    Args:
-        tokenizer: of the text encoder.
-        text_encoder: its weights may be offloaded.
-        device: where it computes.
-        prompt: its words; empty for most depth priors, which leaves the start and the end token.
-    """
-    tokens = tokenizer(
-        prompt,
-        padding="do_not_pad",
-        max_length=tokenizer.model_max_length,
-        truncation=True,
-        return_tensors="pt",
-    )
-    return text_encoder(tokens.input_ids.to(device))[0]
-
-
 class FixedPrompt(ModelMixin, ConfigMixin):
-    """A text embedding that was saved instead of the text encoder that made it.
-
-    Args:
-        length: tokens n.
-        width: channels C.
-
-    Attributes:
-        embedding: ``(1, n, C)``.
-    """
+    """A text embedding ``(1, length, width)`` that was saved instead of the text encoder that made it."""
 
     @register_to_config
     def __init__(self, length: int = 77, width: int = 1024) -> None:

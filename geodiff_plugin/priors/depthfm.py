@@ -14,7 +14,7 @@ from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.components import FixedPrompt, SidesOf
 from geodiff_plugin.priors.loading import Layout
-from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, decode_picture
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, stretched
 
 #: Steps of the schedule that ``noising_step`` counts in.
 NOISING_STEPS = 1000
@@ -37,11 +37,8 @@ class DepthFMPipeline(DepthDiffusionPipeline):
         scheduler: rectified flow without a shift.
         prompt: the empty prompt's embedding, which comes with the weights.
         noising_step: how much noise the image latent gets to start from, 0 (none) to 999.
-        default_denoising_steps: 4; the authors run 2 to 4.
-        default_processing_resolution: longer side, pixels; 0, the image's own, is what the authors run.
-
-    Raises:
-        TypeError, ValueError: ``noising_step`` out of its range.
+        default_denoising_steps: the authors run 2 to 4.
+        default_processing_resolution: longer side, pixels; the authors run 0, the image's own.
     """
 
     model_cpu_offload_seq = "unet->vae"
@@ -69,10 +66,7 @@ class DepthFMPipeline(DepthDiffusionPipeline):
     ) -> Condition:
         """Mode of the image latent's posterior, and the prompt that came with the weights."""
         latent = self.image_latents(image, ensemble_size, batch_size)  # (N * E, 4, h, w)
-        return {
-            "image_latent": latent,
-            "prompt": self.prompt().to(latent).expand(len(latent), -1, -1),
-        }
+        return {"image_latent": latent, "prompt": self.prompt().to(latent).expand(len(latent), -1, -1)}
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
         """The image latent with noise, anew for every member."""
@@ -95,17 +89,11 @@ class DepthFMPipeline(DepthDiffusionPipeline):
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
         """The network's velocity with its sign turned; its t is in [0, 1), not in [0, 1000)."""
         time = 1.0 - timestep / self.scheduler.config.num_train_timesteps
-        velocity = self.unet(
-            torch.cat([latents, condition["image_latent"]], dim=1),
-            time,
-            encoder_hidden_states=condition["prompt"],
-            return_dict=False,
-        )[0]
-        return -velocity
+        return -self.run_unet(torch.cat([latents, condition["image_latent"]], dim=1), time, condition)
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """Log depth as decoded, about [-1, 1]: members are averaged before the exponential."""
-        return decode_picture(self.vae, latents).mean(dim=1, keepdim=True)
+        return self.decode_picture(latents).mean(dim=1, keepdim=True)
 
     def put_together(
         self, maps: Tensor, ensemble_size: int, output_uncertainty: bool, ensembling_kwargs: dict[str, Any]
@@ -116,17 +104,16 @@ class DepthFMPipeline(DepthDiffusionPipeline):
             bad_value("ensembling_kwargs", "empty", sorted(ensembling_kwargs), cure)
         members = maps.unflatten(0, (-1, ensemble_size))  # (N, E, 1, H, W)
         depth = members.mean(dim=1).exp()
-        low, high = depth.amin((1, 2, 3), keepdim=True), depth.amax((1, 2, 3), keepdim=True)
-        width = (high - low).clamp_min(torch.finfo(depth.dtype).tiny)
-        spread = members.exp().std(dim=1) / width if output_uncertainty else None
-        return (depth - low) / width, spread
+        if not output_uncertainty:
+            return stretched(depth), None
+        width = depth.amax((1, 2, 3), keepdim=True) - depth.amin((1, 2, 3), keepdim=True)
+        return stretched(depth), members.exp().std(dim=1) / width.clamp_min(torch.finfo(depth.dtype).tiny)
 
 
 class DepthFMPrior(DepthPrior):
     """DepthFM: rectified flow, log depth, a prompt that is part of the weights."""
 
     pipeline_class = DepthFMPipeline
-    component_classes = {"prompt": FixedPrompt}
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

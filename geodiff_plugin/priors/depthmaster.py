@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin.priors.base import DepthPrior
-from geodiff_plugin.priors.components import DirectScheduler, text_embedding
+from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
 
@@ -21,10 +21,6 @@ TIMESTEP = 1
 
 class FourierBlock(nn.Module):
     """Features mended twice, in their Fourier magnitude and angle and in space, and fused.
-
-    Args:
-        channels: C.
-        groups: of the normalisation.
 
     The submodules are named as in the published weights.
     """
@@ -76,11 +72,8 @@ class FourierUNet(UNet2DConditionModel):
 class DepthMasterPipeline(DepthDiffusionPipeline):
     """Deterministic depth in one step; affine in the square root of disparity.
 
-    Args:
-        unet: takes the image latent alone and answers with the clean depth latent.
-        vae: of Stable Diffusion 2.
-        text_encoder: for the empty prompt.
-        tokenizer: likewise.
+    Its U-Net takes the image latent alone and answers with the clean depth latent; the autoencoder is that of
+    Stable Diffusion 2, the prompt is empty.
     """
 
     max_steps = 1
@@ -110,21 +103,17 @@ class DepthMasterPipeline(DepthDiffusionPipeline):
     ) -> Condition:
         """Mode of the image latent's posterior, and the empty prompt."""
         latent = self.image_latents(image, ensemble_size, batch_size)  # (N * E, 4, h, w)
-        prompt = text_embedding(self.tokenizer, self.text_encoder, latent.device).to(latent)
-        return {"image_latent": latent, "prompt": prompt.expand(len(latent), -1, -1)}
+        return {"image_latent": latent, "prompt": self.prompt_embedding(latent)}
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
         """The clean depth latent; ``latents`` are not looked at."""
-        return self.unet(
-            condition["image_latent"], timestep, encoder_hidden_states=condition["prompt"], return_dict=False
-        )[0]
+        return self.run_unet(condition["image_latent"], timestep, condition)
 
 
 class DepthMasterPrior(DepthPrior):
     """DepthMaster: a U-Net on the image latent alone, and no scheduler."""
 
     pipeline_class = DepthMasterPipeline
-    component_classes = {"unet": FourierUNet}
     licence = {"zysong212/DepthMaster": "apache-2.0"}
 
     @staticmethod

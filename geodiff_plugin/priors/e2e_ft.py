@@ -18,7 +18,8 @@ class E2EFTPipeline(MarigoldDepthPipeline):
     """``MarigoldDepthPipeline`` that starts from zeros and takes one step, whose result is the clean latent.
 
     Of its scheduler the betas count: it becomes a DDIM with trailing spacing whose last step ends at no noise
-    at all (the authors read ``pred_original_sample`` instead). Arguments as ``MarigoldDepthPipeline``'s.
+    at all (the authors read ``pred_original_sample`` instead). Arguments as ``MarigoldDepthPipeline``'s;
+    ``initial_latents`` is saved, so that the folder differs from Marigold's.
     """
 
     max_steps = 1
@@ -38,23 +39,12 @@ class E2EFTPipeline(MarigoldDepthPipeline):
         default_processing_resolution: int = 768,
         initial_latents: str = "zeros",
     ) -> None:
-        if initial_latents != "zeros":  # saved, so that the folder differs from Marigold's
-            bad_value("initial_latents", "'zeros'", repr(initial_latents), "A Marigold starts from noise.")
-        to_the_end = DDIMScheduler.from_config(
+        scheduler = DDIMScheduler.from_config(
             scheduler.config, timestep_spacing="trailing", set_alpha_to_one=True
         )
-        super().__init__(
-            unet,
-            vae,
-            to_the_end,
-            text_encoder,
-            tokenizer,
-            prediction_type=prediction_type,
-            scale_invariant=scale_invariant,
-            shift_invariant=shift_invariant,
-            default_denoising_steps=default_denoising_steps,
-            default_processing_resolution=default_processing_resolution,
-        )
+        parts = unet, vae, scheduler, text_encoder, tokenizer
+        defaults = default_denoising_steps, default_processing_resolution
+        super().__init__(*parts, prediction_type, scale_invariant, shift_invariant, *defaults)
         self.register_to_config(initial_latents=initial_latents)
 
     def check_inputs(self, image: Any, num_inference_steps: int, *args: Any, **kwargs: Any) -> int:
@@ -98,10 +88,3 @@ class E2EFTPrior(MarigoldPrior):
                 and layout.index.get("default_denoising_steps", 1) == 1
             )
         )
-
-    @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
-        """As Marigold's; a model of normals is a ``ValueError``."""
-        if "normals" in layout.name.lower():
-            bad_value("prior", "a model of depth", repr(layout.name), "Its sibling *-e2e-ft-depth is one.")
-        return super().load(layout, dtype, space)

@@ -6,18 +6,16 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from diffusers import AutoencoderKL, DDIMScheduler, SchedulerMixin, UNet2DConditionModel
+from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 from diffusers.models.attention_processor import Attention, AttnProcessor2_0
-from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.priors.base import DepthPrior
-from geodiff_plugin.priors.components import text_embedding
-from geodiff_plugin.priors.loading import LIBRARIES, Layout, build_pipeline, load_component
-from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, decode_picture
+from geodiff_plugin.priors.loading import Layout, build_pipeline, load_component
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, stretched
 
 DOMAINS = ("indoor", "outdoor", "object")
 #: Width of the class embedding -> further condition of the U-Net: the image in v1, the domain as text in v2.
@@ -38,19 +36,6 @@ class PairAttention(AttnProcessor2_0):
 class GeoWizardPipeline(DepthDiffusionPipeline):
     """GeoWizard v1 (conditioned on the image through CLIP) and v2 (on the domain as text).
 
-    Args:
-        unet: 8 channels in, 4 out, class embedding of 10 (v1) or 4 (v2) numbers.
-        vae: of Stable Diffusion 2.
-        scheduler: theirs is a DDIM with v-prediction.
-        image_encoder: v1 only.
-        text_encoder: v2 only.
-        tokenizer: v2 only.
-        default_domain: one of ``DOMAINS``, when a call names none.
-        clip_statistics: ``{"mean": [3], "std": [3]}`` of the image encoder's input, CLIP's own for ``None``.
-
-    Raises:
-        ValueError: the U-Net is of neither version, or the parts of its version are not all given.
-
     Convention:
         Normals are unit vectors of the left camera's frame (x right, y down, z forward) on the side of the
         surface that the camera sees: a wall that faces the camera has ``(0, 0, -1)``. GeoWizard's own files
@@ -66,7 +51,7 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         self,
         unet: UNet2DConditionModel,
         vae: AutoencoderKL,
-        scheduler: SchedulerMixin,
+        scheduler: DDIMScheduler,
         image_encoder: CLIPVisionModelWithProjection | None = None,
         text_encoder: CLIPTextModel | None = None,
         tokenizer: CLIPTokenizer | None = None,
@@ -74,28 +59,20 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         default_denoising_steps: int = 10,
         default_processing_resolution: int = 768,
         default_domain: str = "indoor",
-        clip_statistics: dict[str, list[float]] | None = None,
     ) -> None:
         super().__init__()
+        parts = {"image_encoder": image_encoder, "text_encoder": text_encoder, "tokenizer": tokenizer}
+        needed = {IMAGE_EMBEDDING: ["image_encoder"], TEXT_PROMPT: ["text_encoder", "tokenizer"]}
         width = unet.config.projection_class_embeddings_input_dim
-        complete = {
-            IMAGE_EMBEDDING: image_encoder is not None,
-            TEXT_PROMPT: text_encoder is not None and tokenizer is not None,
-        }
-        if width not in complete:
+        if width not in needed:
             bad_value("the U-Net's class embedding", "10 (GeoWizard v1) or 4 (v2) numbers wide", width)
-        if not complete[width]:
-            expected = "image_encoder" if width == IMAGE_EMBEDDING else "text_encoder and tokenizer"
-            bad_value("components", f"with {expected} for this U-Net", "None")
+        if any(parts[name] is None for name in needed[width]):
+            bad_value("components", f"with {' and '.join(needed[width])} for this U-Net", "None")
         couple_pairs(unet)
-        conditions = {"image_encoder": image_encoder, "text_encoder": text_encoder, "tokenizer": tokenizer}
         defaults = prediction_type, default_denoising_steps, default_processing_resolution
-        self.register_prior(
-            {"unet": unet, "vae": vae, "scheduler": scheduler, **conditions},
-            *defaults,
-            default_domain=check_choice(default_domain, "default_domain", DOMAINS),
-            clip_statistics=clip_statistics or {"mean": list(OPENAI_CLIP_MEAN), "std": list(OPENAI_CLIP_STD)},
-        )
+        domain = check_choice(default_domain, "default_domain", DOMAINS)
+        modules = {"unet": unet, "vae": vae, "scheduler": scheduler, **parts}
+        self.register_prior(modules, *defaults, default_domain=domain)
 
     def prepare_condition(
         self,
@@ -108,7 +85,7 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         """Image latent, prompt and class embedding of every member.
 
         Args:
-            image: as in the base class, like the next two.
+            image: as in the base class, like the next three.
             ensemble_size: E.
             batch_size: of the VAE.
             generator: unused.
@@ -117,18 +94,11 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         Returns:
             ``image_latent (N * E, 4, h, w)``, ``prompt (N * E, tokens, width)``,
             ``class_labels (N * E, 2, 10 or 4)`` for depth and normals.
-
-        Raises:
-            ValueError: an unknown domain; a U-Net whose attention between depth and normals was replaced.
         """
         domain = check_choice(domain or self.config.default_domain, "domain", DOMAINS)
-        check_coupled(self.unet)
+        couple_pairs(self.unet)  # again: under other processors depth and normals do not see each other
         of_image = self.unet.config.projection_class_embeddings_input_dim == IMAGE_EMBEDDING
-        if of_image:
-            prompt = self._image_prompt(image)
-        else:
-            words = text_embedding(self.tokenizer, self.text_encoder, image.device, f"{domain} geometry")
-            prompt = words.to(image.dtype).expand(len(image), -1, -1)
+        prompt = self._image_prompt(image) if of_image else self.prompt_embedding(image, f"{domain} geometry")
         labels = class_embedding(domain if of_image else None).to(image)
         return {
             "image_latent": self.image_latents(image, ensemble_size, batch_size),
@@ -138,43 +108,37 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
 
     def _image_prompt(self, image: Tensor) -> Tensor:
         """CLIP's embedding of the whole image squeezed into its square, ``(N, 1, width)``."""
-        side = self.image_encoder.config.image_size
-        statistics = self.config.clip_statistics
-        mean, std = (image.new_tensor(statistics[k], dtype=torch.float32) for k in ("mean", "std"))
-        small = F.interpolate(
-            (image.float() + 1.0) / 2.0, (side, side), mode="bicubic", align_corners=False, antialias=True
-        )
-        small = (small - mean[:, None, None]) / std[:, None, None]
-        return self.image_encoder(small.to(image.dtype)).image_embeds[:, None].to(image.dtype)
+        size = (self.image_encoder.config.image_size,) * 2
+        statistics = OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
+        mean, std = (image.new_tensor(v, dtype=torch.float32)[:, None, None] for v in statistics)
+        image_01 = (image.float() + 1.0) / 2.0
+        small = F.interpolate(image_01, size, mode="bicubic", align_corners=False, antialias=True)
+        embeds = self.image_encoder(((small - mean) / std).to(image.dtype)).image_embeds
+        return embeds[:, None].to(image.dtype)
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
         """One Gaussian for depth and normals, ``(N * E, 8, h, w)``."""
-        like = condition["image_latent"]
-        noise = randn_tensor(like.shape, generator=generator, device=like.device, dtype=like.dtype)
-        return noise.repeat(1, 2, 1, 1)
+        return super().prepare_latents(condition, generator).repeat(1, 2, 1, 1)
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
         """The U-Net's answer for both halves, ``(B, 8, h, w)``."""
         geometry = torch.cat([latents[:, self.depth_channels], latents[:, self.normal_channels]])
-        output = self.unet(
-            torch.cat([condition["image_latent"].repeat(2, 1, 1, 1), geometry], dim=1),
-            timestep,
-            encoder_hidden_states=condition["prompt"].repeat(2, 1, 1),
-            class_labels=torch.cat(condition["class_labels"].unbind(dim=1)),
-            return_dict=False,
-        )[0]  # (2B, 4, h, w)
+        of_pairs = {
+            "prompt": condition["prompt"].repeat(2, 1, 1),
+            "class_labels": torch.cat(condition["class_labels"].unbind(dim=1)),
+        }
+        sample = torch.cat([condition["image_latent"].repeat(2, 1, 1, 1), geometry], dim=1)
+        output = self.run_unet(sample, timestep, of_pairs)  # (2B, 4, h, w)
         return torch.cat(output.chunk(2), dim=1)
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """Their ending: clipped, then stretched so that every map has a 0 and a 1."""
-        maps = super().decode_prediction(latents)
-        low, high = maps.amin((1, 2, 3), keepdim=True), maps.amax((1, 2, 3), keepdim=True)
-        return (maps - low) / (high - low).clamp_min(torch.finfo(maps.dtype).tiny)
+        return stretched(super().decode_prediction(latents))
 
     def decode_extras(self, latents: Tensor, ensemble_size: int) -> dict[str, Tensor]:
         """``{"normals": (N, 3, H, W)}`` of every image: those of the member closest to the mean of all."""
         halves = latents[:, self.normal_channels].split(1)
-        normals = torch.cat([decode_picture(self.vae, half) for half in halves])
+        normals = torch.cat([self.decode_picture(half) for half in halves])
         normals = normals / (normals.norm(dim=1, keepdim=True) + EPS_LENGTH)
         return {"normals": torch.cat([closest_to_mean(m) for m in normals.split(ensemble_size)])}
 
@@ -197,29 +161,10 @@ def closest_to_mean(normals: Tensor) -> Tensor:
 
 def couple_pairs(unet: UNet2DConditionModel) -> None:
     """Let every self-attention of the transformer blocks see the pair; it has no weights of its own."""
-    own = (name for name in unet.attn_processors if name.endswith("attn1.processor"))
-    unet.set_attn_processor(unet.attn_processors | dict.fromkeys(own, PairAttention()))
+    names = (name for name in unet.attn_processors if name.endswith("attn1.processor"))
+    unet.set_attn_processor(unet.attn_processors | dict.fromkeys(names, PairAttention()))
 
 
-def check_coupled(unet: UNet2DConditionModel) -> None:
-    """Refuse a U-Net with replaced processors, in which depth and normals do not see each other."""
-    own = (p for name, p in unet.attn_processors.items() if name.endswith("attn1.processor"))
-    strangers = sorted({type(p).__name__ for p in own if not isinstance(p, PairAttention)})
-    if strangers:
-        expected = "with PairAttention, through which depth and normals see each other"
-        cure = "Do not set attention processors (xformers, slicing, ...) on this pipeline."
-        bad_value("pipe.unet", expected, ", ".join(strangers), cure)
-
-
-#: What the authors' scripts load from a folder whose index names classes of their own, or that has no index.
-CLASSES = {
-    "unet": UNet2DConditionModel,
-    "vae": AutoencoderKL,
-    "scheduler": DDIMScheduler,
-    "image_encoder": CLIPVisionModelWithProjection,
-    "text_encoder": CLIPTextModel,
-    "tokenizer": CLIPTokenizer,
-}
 UNET_V2 = "unet_v2"
 
 
@@ -249,18 +194,10 @@ class GeoWizardPrior(DepthPrior):
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> GeoWizardPipeline:
         """From our folder or the authors', whose v2 holds ``unet_v2`` and parts of Stable Diffusion 2."""
-        classes = {
-            name: found
-            for name, found in CLASSES.items()
-            if layout.has(name) and (layout.index.get(name) or [None])[0] not in LIBRARIES
-        }
-        options: dict[str, Any] = {"prediction_type": space}
+        unet = None
         if _unet_folder(layout) == UNET_V2:
-            options["unet"] = load_component(layout, UNET_V2, UNet2DConditionModel, dtype)
-        statistics = layout.read_json("feature_extractor/preprocessor_config.json")
-        if statistics:
-            options["clip_statistics"] = {k: statistics[f"image_{k}"] for k in ("mean", "std")}
-        return build_pipeline(GeoWizardPipeline, layout, dtype, classes, **options)
+            unet = load_component(layout, UNET_V2, UNet2DConditionModel, dtype)
+        return build_pipeline(cls.pipeline_class, layout, dtype, unet=unet, prediction_type=space)
 
 
 def _unet_folder(layout: Layout) -> str:

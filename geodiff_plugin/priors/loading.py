@@ -6,6 +6,7 @@ import inspect
 import json
 import os
 import re
+import typing
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,12 +17,12 @@ from typing import Any
 import diffusers
 import torch
 import transformers
-from huggingface_hub import snapshot_download
-from huggingface_hub.errors import HfHubHTTPError
-from safetensors import SafetensorError
+from huggingface_hub import metadata_load, snapshot_download
+from yaml import YAMLError
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors import components
+from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 
 BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
 
@@ -34,10 +35,10 @@ REFUSED = {
     "whose authors report it as better",
     r"diffusion-?depth": "its 2023 toolchain (torch 1.10, mmdet3d, compiled extensions) cannot be installed "
     "any more, and its metric depth is of KITTI or NYU alone",
+    r"(lotus|.*e2e-ft)-normals?.*": "it predicts normals; take its sibling for depth",
     r"ddp": "its 2023 toolchain (mmsegmentation, mmcv) cannot be installed any more, and its metric depth is "
     "of KITTI or NYU alone",
 }
-LICENCE_LINE = re.compile(r"^license:\s*(\S.*?)\s*$", re.MULTILINE)
 SMALL_FILES = ["*.json", "*.txt", "*.md"]
 WEIGHTS = ["*/*.safetensors", "model*.safetensors"]
 #: Second copies of the same weights, which only ``variant`` asks for.
@@ -45,46 +46,22 @@ OTHER_VARIANTS = ["*.fp16.*safetensors", "*.bf16.*safetensors", "*.fp16-*.safete
 #: What ``model_index.json`` may name: the two hosts, and the small components of this package.
 LIBRARIES = {"diffusers": diffusers, "transformers": transformers, components.__name__: components}
 
-#: What the libraries are known to raise over a damaged, foreign or absent folder.
-ERRORS = (
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    AttributeError,
-    ImportError,
-    RuntimeError,  # RecursionError and torch's are among them
-    SafetensorError,
-    HfHubHTTPError,
-)
-LONGEST_REASON = 200
-#: Keys listed in an error before it says how many more there are.
-LISTED_KEYS = 12
 CURE = "Is a file of it cut off, or of another version? Save or fetch the folder anew."
 
 
 @contextmanager
 def reading(what: str, expected: str, got: str, cure: str) -> Iterator[None]:
-    """Turn an error of a library into one sentence.
+    """Turn what a library raises over a damaged, foreign or absent file into the sentence of ``bad_value``.
 
-    Args:
-        what: is read, the subject of the sentence.
-        expected: of it.
-        got: came instead; the library's own first line is added.
-        cure: what to do.
-
-    Raises:
-        ValueError: in the place of anything in ``ERRORS``.
+    To ``got`` the library's own first line is added.
     """
     try:
         yield
-    except ERRORS as error:
+    except Exception as error:  # libraries raise nearly everything
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         reason = lines[0] if lines else type(error).__name__
     else:
         return
-    reason = reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]}..."
     bad_value(what, expected, f"{got} ({reason})", cure)
 
 
@@ -103,11 +80,7 @@ class Layout:
     variant: str | None = None
 
     def read_json(self, path: str) -> dict[str, Any]:
-        """A JSON file below the folder; empty if there is none.
-
-        Raises:
-            ValueError: it is there and holds no JSON object.
-        """
+        """A JSON object in a file below the folder, empty if there is none; ``ValueError`` over another."""
         file = self.folder / path
         if not file.is_file():
             return {}
@@ -125,10 +98,7 @@ class Layout:
         return self.read_json("model_index.json")
 
     def config(self, component: str) -> dict[str, Any]:
-        """Config of a component by the name of its subfolder, a scheduler's too; ``""`` is the folder itself.
-
-        Empty where there is none, so that ``config("unet").get("in_channels") == 8`` is a safe question.
-        """
+        """Config of a component by its subfolder, ``""`` for the folder itself; empty where there is none."""
         prefix = f"{component}/" if component else ""
         return self.read_json(f"{prefix}config.json") or self.read_json(f"{prefix}scheduler_config.json")
 
@@ -139,13 +109,11 @@ class Layout:
     @cached_property
     def licence(self) -> str | None:
         """``license:`` of the model card's front matter, if it has one."""
-        card = self.folder / "README.md"
-        if not card.is_file():
+        try:
+            card = metadata_load(self.folder / "README.md") or {}
+        except (OSError, ValueError, YAMLError):
             return None
-        text = card.read_text(encoding="utf-8", errors="replace")
-        front = text.split("---")[1] if text.startswith("---") and text.count("---") > 1 else ""
-        line = LICENCE_LINE.search(front)
-        return line.group(1) if line else None
+        return str(card["license"]) if card.get("license") else None
 
 
 def refuse(name: str) -> None:
@@ -159,11 +127,7 @@ def refuse(name: str) -> None:
 def fetch(name: str, hub: dict[str, Any], weights: bool = False, variant: str | None = None) -> Path:
     """The folder of a prior, from the hub with its configs at least.
 
-    Args:
-        name: ``"bundled"``, a folder, or a hub id.
-        hub: options of ``snapshot_download`` (``revision``, ``token``, ``cache_dir``, ``local_files_only``).
-        weights: with the weights, too.
-        variant: of the weight files, such as ``"fp16"``.
+    ``hub`` are options of ``snapshot_download``. With ``weights`` also those, of a ``variant``.
 
     Raises:
         ValueError: no such folder; a hub id that is neither cached nor can be reached.
@@ -186,58 +150,45 @@ def fetch(name: str, hub: dict[str, Any], weights: bool = False, variant: str | 
     return Path(folder)
 
 
-def check_device(device: str | torch.device) -> torch.device:
-    """A device that this machine has; another is a ``ValueError``."""
-    with reading("device", "one that PyTorch has on this machine", repr(str(device)), "Try 'cpu'."):
-        try:
-            place = torch.device(device)
-            torch.empty(1, device=place)
-        except AssertionError as error:  # torch built without CUDA
-            raise RuntimeError(str(error)) from error
-    return place
-
-
-def check_finite(module: torch.nn.Module, where: str | Path) -> None:
-    """Refuse weights with NaN or infinity in them by a ``ValueError`` that names the first."""
-    for name, weight in module.named_parameters():
-        if weight.numel() and weight.is_floating_point() and weight.device.type != "meta":
-            low, high = weight.detach().aminmax()  # one pass; NaN comes through
-            if not bool(torch.isfinite(low) & torch.isfinite(high)):
-                cure = "The file is damaged, or was trained or converted so: fetch it anew."
-                bad_value(f"weights in {where}", "finite", f"NaN or infinity in {name}", cure)
-
-
 def check_weights(missing: Any, unexpected: Any, where: str) -> None:
-    """Refuse weights that do not fit, listing them.
-
-    Args:
-        missing: names that the module has and the file has not.
-        unexpected: names that the file has and the module has not.
-        where: the folder or file, for the message.
-
-    Raises:
-        ValueError: there is any.
-    """
-    parts = []
-    for label, keys in (("missing", sorted(missing)), ("unexpected", sorted(unexpected))):
-        if keys:
-            more = f" and {len(keys) - LISTED_KEYS} more" if len(keys) > LISTED_KEYS else ""
-            parts.append(f"{label}: {', '.join(map(str, keys[:LISTED_KEYS]))}{more}")
+    """Refuse weights in ``where`` that do not fit their module by a ``ValueError`` that lists their names."""
+    named = {"missing": sorted(map(str, missing)), "unexpected": sorted(map(str, unexpected))}
+    parts = [f"{label}: {', '.join(keys)}" for label, keys in named.items() if keys]
     if parts:
         cure = "These weights are of another architecture, or the file is damaged."
         bad_value(f"weights in {where}", "those of its config, name by name", "; ".join(parts), cure)
 
 
-def _component_class(layout: Layout, name: str) -> type[Any]:
-    """The class of a component as ``model_index.json`` names it, out of diffusers or transformers alone."""
+def _component_class(pipeline_class: type[Any], layout: Layout, name: str) -> type[Any]:
+    """The class of a component, as ``model_index.json`` names it, out of ``LIBRARIES`` alone.
+
+    In a pipeline of ours the annotation of the constructor's parameter stands in for any other class, and for
+    a class that it is derived from.
+    """
     entry = layout.index.get(name)
     library, cls = entry if isinstance(entry, list) and len(entry) == 2 else ("", "")
     named = getattr(LIBRARIES.get(str(library)), str(cls), None)
-    if not isinstance(named, type) or not hasattr(named, "from_pretrained"):
+    expected = _annotated(pipeline_class).get(name)
+    is_known = isinstance(named, type) and hasattr(named, "from_pretrained")
+    if expected is not None and not (is_known and not issubclass(expected, named)):
+        return expected
+    if not is_known:
         what = f"component {name!r} in {layout.folder / 'model_index.json'}"
         cure = "Code that comes with weights is never run."
         bad_value(what, "a class of diffusers or transformers", repr(entry), cure)
     return named
+
+
+def _annotated(pipeline_class: type[Any]) -> dict[str, type[Any]]:
+    """Component classes of a ``DepthDiffusionPipeline`` by the names of its constructor's parameters."""
+    if not issubclass(pipeline_class, DepthDiffusionPipeline):
+        return {}
+    found = {}
+    for name, hint in typing.get_type_hints(pipeline_class.__init__).items():
+        for cls in (hint, *typing.get_args(hint)):  # with None it is optional
+            if hasattr(cls, "from_pretrained"):
+                found[name] = cls
+    return found
 
 
 def load_component(
@@ -250,8 +201,8 @@ def load_component(
         name: of the subfolder; ``""`` for the folder itself.
         cls: with ``from_pretrained``.
         dtype: of a module's weights.
-        unread: for files that transformers' users published: part of the names of weights that may be
-            missing, since no forward reads them; weights left over do not matter either.
+        unread: part of the names of weights that may be missing, since no forward reads them; weights left
+            over do not matter then either, as in files that users of transformers published.
 
     Raises:
         ValueError: weights missing, left over, cut off or not finite; files that cannot be read.
@@ -279,39 +230,30 @@ def load_component(
         check_weights(info["missing_keys"], info["unexpected_keys"], folder)
     else:
         check_weights([key for key in info["missing_keys"] if unread not in key], (), folder)
-    check_finite(module, folder)
     return module.eval()
 
 
-def build_pipeline(
-    cls: type[Any],
-    layout: Layout,
-    dtype: torch.dtype,
-    classes: dict[str, type[Any]] | None = None,
-    **options: Any,
-) -> Any:
+def build_pipeline(cls: type[Any], layout: Layout, dtype: torch.dtype, **options: Any) -> Any:
     """A pipeline from the components that its constructor names and the options that the index holds.
 
     Args:
         cls: pipeline class; its constructor's parameters are components and options.
         layout: of the folder.
         dtype: of the weights.
-        classes: for components whose class is not what the index says.
         **options: constructor arguments, components too, that go before the folder's; ``None`` is left out.
 
     Raises:
         ValueError: a component that the folder lacks, weights that do not fit.
     """
     arguments = {name: value for name, value in options.items() if value is not None}
-    classes = classes or {}
+    annotated = _annotated(cls)
     for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:
         entry = layout.index.get(name)
+        is_component = isinstance(entry, list) and entry[0] is not None
         if name in arguments:
             continue
-        if name in classes and layout.has(name):
-            arguments[name] = load_component(layout, name, classes[name], dtype)
-        elif isinstance(entry, list) and entry[0] is not None:
-            arguments[name] = load_component(layout, name, _component_class(layout, name), dtype)
+        if is_component or (name in annotated and layout.has(name)):
+            arguments[name] = load_component(layout, name, _component_class(cls, layout, name), dtype)
         elif entry is not None and not isinstance(entry, list):
             arguments[name] = entry
         elif parameter.default is parameter.empty:

@@ -7,15 +7,14 @@ from typing import Any
 
 import torch
 from diffusers import AutoencoderKL, UNet2DConditionModel
-from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.base import DepthPrior
-from geodiff_plugin.priors.components import DirectScheduler, text_embedding
+from geodiff_plugin.priors.components import DirectScheduler, SidesOf
 from geodiff_plugin.priors.loading import Layout, build_pipeline
-from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, decode_picture
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, map_of
 
 #: The only timestep that Lotus was trained at.
 TIMESTEP = 999
@@ -23,42 +22,13 @@ TIMESTEP = 999
 DEPTH_TASK = (1.0, 0.0)
 
 
-class LotusImageProcessor(MarigoldImageProcessor):
-    """Preprocessing as the authors' ``resize_max_res``: no padding, and their rounding of the sides."""
-
-    def __init__(self) -> None:
-        super().__init__(vae_scale_factor=1)
-
-    @staticmethod
-    def resize_to_max_edge(image: Tensor, max_edge_sz: int, mode: str) -> Tensor:
-        """Resize ``(N, 3, H, W)`` so that its longer side is ``max_edge_sz``, sometimes a pixel less.
-
-        A float product cut to an integer: at 768 a width of 1242 becomes 768, one of 1226 becomes 767.
-        """
-        height, width = image.shape[-2:]
-        factor = min(max_edge_sz / width, max_edge_sz / height)
-        size = (int(height * factor), int(width * factor))
-        if 0 in size:
-            bad_value("image", "of a moderate aspect ratio", f"{width} x {height}")
-        return MarigoldImageProcessor.resize_antialias(image, size, mode, is_aa=True)
-
-
 class LotusPipeline(DepthDiffusionPipeline):
     """Lotus-G (8 input channels: image and noise) or Lotus-D (4: image alone), as the U-Net says.
 
     Not deterministic even as D: the image latent is drawn from the VAE's posterior.
 
-    Args:
-        unet: ``UNet2DConditionModel`` with 4-d projected class embeddings.
-        vae: SD's ``AutoencoderKL``.
-        text_encoder: for the empty prompt.
-        tokenizer: of it.
-        scheduler: any; replaced by ``DirectScheduler``: a schedule of noise prediction (SD-2's own, which
-            such a folder may carry) is not what the network was trained on.
-        prediction_type: ``"depth"`` or ``"disparity"``; the repository's name is the only place that says.
-
-    Raises:
-        ValueError: an unknown prediction type; a U-Net of other channels or without task embedding.
+    ``prediction_type`` is ``"depth"`` or ``"disparity"``, as only the repository's name says. A scheduler of
+    noise prediction (SD-2's own, which such a folder may carry) is replaced: the network was trained without.
     """
 
     model_cpu_offload_seq = "text_encoder->unet->vae"
@@ -89,7 +59,7 @@ class LotusPipeline(DepthDiffusionPipeline):
             scheduler = DirectScheduler(timestep=TIMESTEP)
         defaults = prediction_type, default_denoising_steps, default_processing_resolution
         modules = {"unet": unet, "vae": vae, "text_encoder": text_encoder, "tokenizer": tokenizer}
-        self.register_prior(modules | {"scheduler": scheduler}, *defaults, LotusImageProcessor())
+        self.register_prior(modules | {"scheduler": scheduler}, *defaults, SidesOf(1))
 
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
@@ -98,11 +68,10 @@ class LotusPipeline(DepthDiffusionPipeline):
         latents = self.image_latents(image, ensemble_size, batch_size, generator, sample=True)
         task = torch.tensor(DEPTH_TASK, dtype=torch.float32, device="cpu")
         task = torch.cat([task.sin(), task.cos()]).to(latents)  # (4,)
-        prompt = text_embedding(self.tokenizer, self.text_encoder, latents.device)
         return {
             "image_latent": latents,  # (N * E, 4, h, w)
-            "task": task.expand(len(latents), -1),
-            "prompt": prompt.to(latents).expand(len(latents), -1, -1),  # (N * E, 2, C)
+            "class_labels": task.expand(len(latents), -1),
+            "prompt": self.prompt_embedding(latents),  # (N * E, 2, C)
         }
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
@@ -110,47 +79,27 @@ class LotusPipeline(DepthDiffusionPipeline):
         sample = condition["image_latent"]
         if self.sees_latents:
             sample = torch.cat([sample, latents], dim=1)
-        return self.unet(
-            sample,
-            timestep,
-            encoder_hidden_states=condition["prompt"],
-            class_labels=condition["task"],
-            return_dict=False,
-        )[0]
-
-    def decode_relative(self, z0: Tensor) -> Tensor:
-        """Channel mean in [0, 1], not clipped, pixel to pixel with the processed image.
-
-        The latent covers whole cells of 8 pixels only; a guided call repeats the last row and column beyond
-        them. (The authors stretch instead, which moves the map by up to 7 pixels.)
-        """
-        return (decode_picture(self.vae, z0) / 2 + 0.5).mean(dim=1, keepdim=True)  # (B, 1, 8 h, 8 w)
+        return self.run_unet(sample, timestep, condition)
 
     def encode_relative(self, x: Tensor) -> Tensor:
-        """As the base class, of whole cells only."""
+        """As the base class, of whole cells of 8 pixels only, as the map that is decoded.
+
+        A guided call repeats the last row and column beyond them. (The authors stretch instead, which moves
+        the map by up to 7 pixels.)
+        """
         cell = 2 ** (len(self.vae.config.block_out_channels) - 1)
         height, width = (side // cell * cell for side in x.shape[-2:])
         return super().encode_relative(x[..., :height, :width])
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
-        """As the authors end: channels clipped to [0, 1], whole cells only, which the resizing stretches."""
-        return (decode_picture(self.vae, latents) / 2 + 0.5).clamp(0.0, 1.0).mean(dim=1, keepdim=True)
+        """As the authors end: every channel is clipped; whole cells only, which the resizing stretches."""
+        return map_of(self.decode_picture(latents).clamp(-1.0, 1.0))
 
 
 def space_of_name(name: str) -> str:
-    """Depth or disparity, as the name of a repository says it; no config of Lotus does.
-
-    Args:
-        name: hub id or path, such as ``"jingheya/lotus-depth-g-v2-1-disparity"``.
-
-    Raises:
-        ValueError: no part of it is named as the authors' repositories are, or it predicts normals.
-    """
+    """Depth or disparity, as the name of a repository or path says it; no config of Lotus does."""
     parts = [part for part in re.split(r"[/\\]", name.lower()) if "lotus" in part]
     named = parts[-1] if parts else ""
-    if "normal" in named:
-        cure = "It predicts normals; take a lotus-depth-* one."
-        bad_value("prior", "a Lotus that predicts depth or disparity", repr(name), cure)
     if "disparity" in named:
         return "disparity"
     if "lotus-depth-" in named:
@@ -178,15 +127,7 @@ class LotusPrior(DepthPrior):
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> LotusPipeline:
-        """The folder's networks; its scheduler, if any, is not used.
-
-        Raises:
-            ValueError: weights that do not fit; a space that neither argument, folder nor name tells.
-        """
-        return build_pipeline(
-            LotusPipeline,
-            layout,
-            dtype,
-            scheduler=DirectScheduler(timestep=TIMESTEP),
-            prediction_type=space or layout.index.get("prediction_type") or space_of_name(layout.name),
-        )
+        """The folder's networks; its scheduler, if any, is not used."""
+        space = space or layout.index.get("prediction_type") or space_of_name(layout.name)
+        scheduler = DirectScheduler(timestep=TIMESTEP)
+        return build_pipeline(cls.pipeline_class, layout, dtype, scheduler=scheduler, prediction_type=space)

@@ -36,13 +36,7 @@ OFFSET = 0.25
 class DepthMapPipeline(DirectMapPipeline):
     """Takes ``depth_map=`` in the call in place of a network; what guidance moves is the map itself.
 
-    Args:
-        scheduler: one step whose result is what it is given.
-        default_processing_resolution: longer side of the map that is guided, 0 for the image's own.
-
-    Attributes:
-        known: ``(N * E, 1, H, W)`` bool, where the maps of the latest call have values; ``None`` for
-            everywhere.
+    ``processing_resolution`` is the longer side of the map that is guided, 0 for the image's own.
     """
 
     def __init__(
@@ -53,22 +47,20 @@ class DepthMapPipeline(DirectMapPipeline):
         default_processing_resolution: int = 0,
     ) -> None:
         super().__init__()
-        self.known: Tensor | None = None
-        self._place = torch.nn.Module()  # of the pipeline, which has no weights that would tell
-        self._place.register_buffer("at", torch.empty(0))
+        self._place = torch.device("cpu")  # there are no weights that would tell
         defaults = prediction_type, default_denoising_steps, default_processing_resolution
         self.register_prior({"scheduler": scheduler}, *defaults, image_processor=1)
 
     @property
     def device(self) -> torch.device:
         """Where calls run."""
-        return next(self._place.buffers()).device
+        return self._place
 
     def to(self, *args: Any, **kwargs: Any) -> DepthMapPipeline:
         """As ``DiffusionPipeline.to``; maps stay in float32."""
-        targets = (*args, *kwargs.values())
-        for device in (t for t in targets if isinstance(t, (str, int, torch.device))):
-            self._place.to(device)
+        for target in (*args, *kwargs.values()):
+            if isinstance(target, (str, int, torch.device)):
+                self._place = torch.device(target)
         return self
 
     def prepare_condition(
@@ -86,8 +78,8 @@ class DepthMapPipeline(DirectMapPipeline):
             ensemble_size: E.
             batch_size: unused.
             generator: unused.
-            depth_map: of every image a map ``(h, w)`` of any size and unit that covers the same view, ``(N,
-                h, w)`` or a list; not finite where nothing is known.
+            depth_map: for every image a map ``(h, w)`` of any size and unit that covers the same view, in an
+                array ``(N, h, w)`` or a list; not finite where nothing is known.
 
         Raises:
             TypeError, ValueError: no map, another number of them, or one without two different values.
@@ -161,12 +153,7 @@ class DepthMapPrior(DepthPrior):
     """Adapter of ``DepthMapPipeline``: scale, shift and a residual per pixel can be guided."""
 
     pipeline_class = DepthMapPipeline
-    component_classes = {"scheduler": DirectScheduler}
     licence = {"map": "that of the model which made the map"}
-
-    def known(self, samples: slice) -> Tensor | None:
-        """Where the maps of the running call have values."""
-        return None if self._pipe.known is None else self._pipe.known[samples]
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

@@ -8,35 +8,26 @@ import torch
 from diffusers import MarigoldDepthPipeline
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import check_choice
 from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.loading import Layout
-from geodiff_plugin.priors.pipeline import decode_map, encode_map
+from geodiff_plugin.priors.pipeline import decode_picture, encode_picture, map_of, picture_of
 from geodiff_plugin.scale.space import SPACES
+
+#: Under ``prs-eth/``.
+PUBLISHED = ("depth-v1-1", "depth-v1-0", "v1-0", "depth-lcm-v1-0", "lcm-v1-0")
 
 
 class MarigoldPrior(DepthPrior):
     """Adapter of ``MarigoldDepthPipeline``; its ``prediction_type`` must be a key of ``SPACES``."""
 
     pipeline_class = MarigoldDepthPipeline
-    licence = dict.fromkeys(
-        (
-            "prs-eth/marigold-depth-v1-1",
-            "prs-eth/marigold-depth-v1-0",
-            "prs-eth/marigold-v1-0",
-            "prs-eth/marigold-depth-lcm-v1-0",
-            "prs-eth/marigold-lcm-v1-0",
-        ),
-        "openrail++ (RAIL++-M)",
-    )
+    licence = dict.fromkeys([f"prs-eth/marigold-{name}" for name in PUBLISHED], "openrail++ (RAIL++-M)")
 
     def __init__(self, pipe: Any) -> None:
         super().__init__(pipe)
-        self.space = pipe.config.get("prediction_type") or "depth"
-        if self.space not in SPACES:
-            bad_value("the pipeline's prediction_type", f"one of {sorted(SPACES)}", repr(self.space))
-        # After the image latent.
-        self.network_input = slice(pipe.vae.config.latent_channels, None)
+        self.space = check_choice(self.space or "depth", "the pipeline's prediction_type", SPACES)
+        self.network_input = slice(pipe.vae.config.latent_channels, None)  # after the image latent
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
@@ -61,8 +52,8 @@ class MarigoldPrior(DepthPrior):
 
     def decode(self, z0: Tensor) -> Tensor:
         """Mean of the channels that the pipeline's VAE decodes, not clipped."""
-        return decode_map(self._pipe.vae, z0)
+        return map_of(decode_picture(self._pipe.vae, z0))
 
     def encode(self, x: Tensor) -> Tensor:
         """By the pipeline's VAE."""
-        return encode_map(self._pipe.vae, x)
+        return encode_picture(self._pipe.vae, picture_of(x))

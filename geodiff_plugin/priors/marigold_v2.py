@@ -15,7 +15,14 @@ from torch import Tensor
 from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.components import FixedPrompt, SidesOf
 from geodiff_plugin.priors.loading import Layout
-from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, map_of, widened
+
+#: First word of a checkpoint's name -> what its map is affine in.
+SPACE_OF_CHECKPOINT = {"log": "log", "uniform": "depth", "disparity": "disparity"}
+#: Timestep input of the network, of 1000. The authors write 499 / 1000 in bfloat16, where 499 is 500.
+TIMESTEP = 500.0
+#: One token is a square of this side, one latent a cell of half of it.
+SIDE, CELL = 16, 8
 
 
 def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -25,30 +32,13 @@ def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tens
     return mean, deviation
 
 
-def latents_of(
-    vae: AutoencoderKLQwenImage,
-    picture: Tensor,
-    generator: Generators = None,
-    sample: bool = False,
-) -> Tensor:
-    """Normalised latents ``(B, C, H / 8, W / 8)`` float32 of pictures ``(B, 3, H, W)`` in [-1, 1].
-
-    The posterior's mode, or a sample of it by ``generator``; sides are multiples of 8.
-    """
-    posterior = vae.encode(picture.to(vae.dtype)[:, :, None]).latent_dist
-    latents = posterior.sample(generator) if sample else posterior.mode()
-    latents = latents[:, :, 0].to(torch.promote_types(latents.dtype, torch.float32))
-    mean, deviation = _statistics(vae, latents)
-    return (latents - mean) / deviation
-
-
 def frame_of(vae: AutoencoderKLQwenImage, latents: Tensor) -> Tensor:
-    """Decode normalised latents without the clamp at the end of ``vae.decode``.
+    """Decode normalised latents ``(B, C, h, w)`` to ``(B, 3, 8 h, 8 w)``, float32 or wider.
 
-    That clamp has no gradient beyond [-1, 1], which is where near and far lie. Slicing and tiling are kept.
-    Latents ``(B, C, h, w)`` give ``(B, 3, 8 h, 8 w)``, float32 or wider, with their graph.
+    Without the clamp at the end of ``vae.decode``, which has no gradient beyond [-1, 1], where near and far
+    lie. Slicing and tiling are kept.
     """
-    wide = latents.to(torch.promote_types(latents.dtype, torch.float32))
+    wide = widened(latents)
     mean, deviation = _statistics(vae, wide)
     z = (wide * deviation + mean).to(vae.dtype)[:, :, None]
     frames = torch.cat([_decode(vae, part) for part in (z.split(1) if vae.use_slicing else (z,))])
@@ -58,18 +48,10 @@ def frame_of(vae: AutoencoderKLQwenImage, latents: Tensor) -> Tensor:
 @apply_forward_hook
 def _decode(vae: AutoencoderKLQwenImage, z: Tensor) -> Tensor:
     """``vae._decode`` of one frame, for which nothing is cached; the hook brings an offloaded one back."""
-    tile = vae.tile_sample_min_height // 8, vae.tile_sample_min_width // 8
+    tile = vae.tile_sample_min_height // CELL, vae.tile_sample_min_width // CELL
     if vae.use_tiling and (z.shape[-2] > tile[0] or z.shape[-1] > tile[1]):
         return vae.tiled_decode(z, return_dict=False)[0]
     return vae.decoder(vae.post_quant_conv(z))
-
-
-#: First word of a checkpoint's name -> what its map is affine in.
-SPACE_OF_CHECKPOINT = {"log": "log", "uniform": "depth", "disparity": "disparity"}
-#: Timestep input of the network, of 1000. The authors write 499 / 1000 in bfloat16, where 499 is 500.
-TIMESTEP = 500.0
-#: One token is a square of this side, one latent a cell of half of it.
-SIDE, CELL = 16, 8
 
 
 class MarigoldV2Pipeline(DepthDiffusionPipeline):
@@ -82,10 +64,9 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         transformer: that of Qwen-Image-Edit, with the checkpoint's LoRA.
         vae: that of Qwen-Image, with the checkpoint's decoder where one was trained.
         scheduler: rectified flow; only its arithmetic is used.
-        prompt: the embedding that came with the checkpoint, which makes a text encoder superfluous.
+        prompt: the embedding that came with the checkpoint.
         prediction_type: ``"log"``, ``"depth"`` (their "Uniform") or ``"disparity"``.
-        sample_latent: draw the image's latent from the posterior, as their ``infer.py``, instead of taking
-            its mode, as their depth completion.
+        sample_latent: draw the image's latent from the posterior, as their ``infer.py``, instead of its mode.
         default_processing_resolution: longer side, pixels; they trained at 768.
     """
 
@@ -114,19 +95,19 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
         """Latent of the image, of every member anew where it is drawn, and the prompt."""
-        members = image.repeat_interleave(ensemble_size, dim=0) if self.config.sample_latent else image
-        parts = []
-        for first in range(0, len(members), batch_size):
-            chunk = slice(first, first + batch_size)
-            own = generator[chunk] if isinstance(generator, list) else generator
-            parts.append(latents_of(self.vae, members[chunk], own, self.config.sample_latent))
-        latent = torch.cat(parts).to(image.dtype)  # (N * E, 16, h, w)
-        if not self.config.sample_latent:
-            latent = latent.repeat_interleave(ensemble_size, dim=0)
-        return {
-            "image_latent": latent,
-            "prompt": self.prompt().to(latent.device).expand(len(latent), -1, -1),
-        }
+        draws = self.config.sample_latent
+        latent = self.image_latents(image, ensemble_size, batch_size, generator, draws).to(image.dtype)
+        prompt = self.prompt().to(latent.device).expand(len(latent), -1, -1)
+        return {"image_latent": latent, "prompt": prompt}  # (N * E, 16, h, w), (N * E, n, C)
+
+    def encode_moments(self, image: Tensor) -> Tensor:
+        """Of the one frame."""
+        return self.vae.encode(image.to(self.vae.dtype)[:, :, None]).latent_dist.parameters[:, :, 0]
+
+    def scale_latents(self, latents: Tensor) -> Tensor:
+        """Normalised channel by channel, float32 or wider."""
+        mean, deviation = _statistics(self.vae, widened(latents))
+        return (widened(latents) - mean) / deviation
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
         """The image's latent, from which the one step starts."""
@@ -150,24 +131,24 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         frames = QwenImageEditPipeline._unpack_latents(velocity, CELL * height, CELL * width, CELL)
         return frames[:, :, 0].to(latents.dtype)
 
-    def decode_relative(self, z0: Tensor) -> Tensor:
-        """Mean of the decoded channels, from [-1, 1] to [0, 1], not clipped."""
-        return (frame_of(self.vae, z0).mean(dim=1, keepdim=True) + 1.0) / 2.0
+    def decode_picture(self, z0: Tensor) -> Tensor:
+        """One frame, not clipped."""
+        return frame_of(self.vae, z0)
 
-    def encode_relative(self, x: Tensor) -> Tensor:
-        """Mode of the code of a grey picture."""
-        return latents_of(self.vae, (2.0 * x - 1.0).expand(-1, 3, -1, -1))
+    def encode_picture(self, picture: Tensor) -> Tensor:
+        """Mode of the code of one frame, float32 or wider."""
+        frame = picture.to(self.vae.dtype)[:, :, None]
+        return self.scale_latents(self.vae.encode(frame).latent_dist.mode()[:, :, 0])
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """As the authors end: every channel is clipped, then their mean taken."""
-        return (frame_of(self.vae, latents).clamp(-1.0, 1.0).mean(dim=1, keepdim=True) + 1.0) / 2.0
+        return map_of(self.decode_picture(latents).clamp(-1.0, 1.0))
 
 
 class MarigoldV2Prior(DepthPrior):
     """Marigold V2: one step of a transformer on the image's latent, in log, linear or inverse depth."""
 
     pipeline_class = MarigoldV2Pipeline
-    component_classes = {"prompt": FixedPrompt}
     licence = {"huawei-bayerlab/marigold-v2-0": "apache-2.0"}
 
     @staticmethod

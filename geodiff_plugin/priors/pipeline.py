@@ -27,26 +27,40 @@ Generators = torch.Generator | list[torch.Generator] | None
 RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
 
 
-def encode_map(vae: Any, x: Tensor) -> Tensor:
-    """Scaled latents ``(B, C, h, w)`` float32 of a map ``(B, 1, H, W)``, 0 to 1 as the encoder's -1 to 1."""
-    picture = (2.0 * x - 1.0).expand(-1, 3, -1, -1).to(vae.dtype)
-    encoded = vae.encode(picture)
+def widened(x: Tensor) -> Tensor:
+    """Float32 of half precision; wider types as they are."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
+def picture_of(x: Tensor) -> Tensor:
+    """A map ``(B, 1, H, W)``, 0 to 1, as a picture ``(B, 3, H, W)``, -1 to 1."""
+    return (2.0 * x - 1.0).expand(-1, 3, -1, -1)
+
+
+def map_of(picture: Tensor) -> Tensor:
+    """Mean of the channels of a picture ``(B, 3, H, W)``, from [-1, 1] to [0, 1]: ``(B, 1, H, W)``."""
+    return (picture.mean(dim=1, keepdim=True) + 1.0) / 2.0
+
+
+def stretched(maps: Tensor) -> Tensor:
+    """Maps ``(B, 1, H, W)`` each of which has a 0 and a 1."""
+    low, high = maps.amin((1, 2, 3), keepdim=True), maps.amax((1, 2, 3), keepdim=True)
+    return (maps - low) / (high - low).clamp_min(torch.finfo(maps.dtype).tiny)
+
+
+def encode_picture(vae: Any, picture: Tensor) -> Tensor:
+    """Scaled latents ``(B, C, h, w)`` of pictures, the posterior's mode, float32 or wider."""
+    encoded = vae.encode(picture.to(vae.dtype))
     latents = encoded.latent_dist.mode() if hasattr(encoded, "latent_dist") else encoded.latents
-    return latents.to(torch.promote_types(latents.dtype, torch.float32)) * vae.config.scaling_factor
+    return widened(latents) * vae.config.scaling_factor
 
 
 def decode_picture(vae: Any, z0: Tensor) -> Tensor:
-    """Scaled latents ``(B, C, h, w)`` as pictures ``(B, 3, H, W)``, about [-1, 1], float32, not clipped."""
-    decoded = vae.decode((z0 / vae.config.scaling_factor).to(vae.dtype), return_dict=False)[0]
-    return decoded.to(torch.promote_types(decoded.dtype, torch.float32))  # half precision ends here
+    """Scaled latents ``(B, C, h, w)`` as pictures ``(B, 3, H, W)``, about [-1, 1], float32 or wider.
 
-
-def decode_map(vae: Any, z0: Tensor) -> Tensor:
-    """Mean of the decoded channels ``(B, 1, H, W)``, from [-1, 1] to [0, 1] and not clipped.
-
-    The pipelines' own endings clip, which silences the gradient exactly at near and far.
+    Not clipped, as the pipelines' own endings are: that silences the gradient exactly at near and far.
     """
-    return (decode_picture(vae, z0).mean(dim=1, keepdim=True) + 1.0) / 2.0
+    return widened(vae.decode((z0 / vae.config.scaling_factor).to(vae.dtype), return_dict=False)[0])
 
 
 @dataclass
@@ -71,16 +85,26 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         deterministic: the same image gives the same map, whatever the generator.
         depth_channels: which channels of the latents are depth; others are never guided.
         sees_latents: whether the network is given the latents (else there is no z_t).
+        takes_prompt: whether the call takes ``prompt_depth``, depths that the network starts from.
         output_resampling: how its authors bring the map to the image's size.
+        own_range: of a prior that is metric by itself, ``(N * E, 2)`` metres at 0 and at 1 of the maps;
+            ``prepare_condition`` sets it.
+        known: ``(N * E, 1, H, W)`` bool, where the prior says anything, ``None`` for everywhere; likewise.
     """
 
-    vae: Any  # registered by the subclasses that have them
+    unet: Any  # registered by the subclasses that have them
+    vae: Any
+    text_encoder: Any
+    tokenizer: Any
     scheduler: Any
     max_steps: int | None = None
     deterministic = False
     depth_channels = slice(None)
     sees_latents = True
+    takes_prompt = False
     output_resampling = "bilinear"
+    own_range: Tensor | None = None
+    known: Tensor | None = None
 
     def register_prior(
         self,
@@ -91,14 +115,14 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         image_processor: MarigoldImageProcessor | int = 8,
         **config: Any,
     ) -> None:
-        """Register modules and options; the last line of a subclass's constructor, whose parameters they are.
+        """The last line of a subclass's constructor, whose parameters these are.
 
         Args:
             modules: by the names of the constructor's parameters.
             prediction_type: what the relative map is affine in, key of ``scale.space.SPACES``.
             default_denoising_steps: when a call names none.
-            default_processing_resolution: longer side, pixels, when a call names none.
-            image_processor: a ``MarigoldImageProcessor``, or the number that padded sides are multiples of.
+            default_processing_resolution: longer side, pixels; likewise.
+            image_processor: resizes and pads; or the number that padded sides are multiples of.
             **config: further options to be saved.
         """
         self.register_modules(**modules)
@@ -132,8 +156,8 @@ class DepthDiffusionPipeline(DiffusionPipeline):
             ensemble_size: members E per image.
             batch_size: images or members that one forward may take.
             generator: for a prior that draws here (a posterior sample).
-            *args: nothing; with ``options`` it lets a subclass name its own keywords.
-            **options: what the subclass adds to the call.
+            *args: nothing.
+            **options: a subclass names here what it adds to the call.
 
         Returns:
             Tensors by name, leading dimension ``N * E``, the members of an image side by side.
@@ -157,49 +181,36 @@ class DepthDiffusionPipeline(DiffusionPipeline):
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
         """The network's output as the scheduler's ``step`` takes it; called once a step.
 
-        Args:
-            latents: ``(B, C, h, w)``.
-            timestep: 0-d, out of ``scheduler.timesteps``.
-            condition: as ``prepare_condition`` made it, of these ``B`` members.
-
-        Returns:
-            ``(B, C, h, w)``, differentiable in ``latents`` if ``sees_latents``.
+        Of latents ``(B, C, h, w)``, differentiable in them if ``sees_latents``; ``timestep`` is 0-d, out of
+        ``scheduler.timesteps``, ``condition`` that of these ``B`` members.
         """
         raise NotImplementedError
 
+    def decode_picture(self, z0: Tensor) -> Tensor:
+        """Unclipped pictures ``(B, 3, H, W)``, about [-1, 1], of clean latents, by ``self.vae``."""
+        return decode_picture(self.vae, z0)
+
+    def encode_picture(self, picture: Tensor) -> Tensor:
+        """About the inverse of ``decode_picture``, float32 or wider."""
+        return encode_picture(self.vae, picture)
+
     def decode_relative(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map of clean latents, by ``self.vae``.
+        """Unclipped relative map ``(B, 1, H, W)``, about [0, 1] on the padded grid, with the graph of ``z0``.
 
-        Args:
-            z0: ``(B, C, h, w)``, the depth channels only.
-
-        Returns:
-            ``(B, 1, H, W)`` about [0, 1] on the padded grid, float32 or wider, with the graph of ``z0``.
+        ``z0 (B, C, h, w)`` has the depth channels only; the map is float32 or wider.
         """
-        return decode_map(self.vae, z0)
+        return map_of(self.decode_picture(z0))
 
     def encode_relative(self, x: Tensor) -> Tensor:
-        """Clean latents of a relative map, about the inverse of ``decode_relative``; by ``self.vae``.
-
-        Args:
-            x: ``(B, 1, H, W)`` on the padded grid; beyond [0, 1] as far as the map goes.
-
-        Returns:
-            ``(B, C, h, w)`` float32, the depth channels only.
-        """
-        return encode_map(self.vae, x)
+        """About the inverse of ``decode_relative``, of a map beyond [0, 1] as far as it goes."""
+        return self.encode_picture(picture_of(x))
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """What the unguided call gives: ``(B, 1, H, W)`` in [0, 1]; override for an author's own ending."""
         return self.decode_relative(latents[:, self.depth_channels]).clamp(0.0, 1.0)
 
     def decode_extras(self, latents: Tensor, ensemble_size: int) -> dict[str, Tensor]:
-        """Further maps by name, ``(N, C, H, W)`` on the padded grid, members put together; none by default.
-
-        Args:
-            latents: ``(N * E, C, h, w)`` final latents.
-            ensemble_size: E.
-        """
+        """Further maps by name, ``(N, C, H, W)`` on the padded grid, of latents ``(N * E, C, h, w)``."""
         return {}
 
     # What a subclass uses ----------------------------------------------------------------------------------
@@ -212,27 +223,40 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         generator: Generators = None,
         sample: bool = False,
     ) -> Tensor:
-        """Scaled latents of the images by ``self.vae``, one per member.
+        """Scaled latents ``(N * E, C, h, w)`` of images ``(N, 3, H, W)`` in [-1, 1], one per member.
 
-        Args:
-            image: ``(N, 3, H, W)`` in [-1, 1].
-            ensemble_size: members E per image.
-            batch_size: images per forward.
-            generator: for the sample.
-            sample: draw from the posterior, anew for every member; otherwise its mode.
-
-        Returns:
-            ``(N * E, C, h, w)``.
+        The posterior's mode, or a ``sample`` by the generator, anew for every member.
         """
-        chunks = image.split(batch_size)
-        moments = torch.cat([self.vae.encode(chunk).latent_dist.parameters for chunk in chunks])
+        moments = torch.cat([self.encode_moments(chunk) for chunk in image.split(batch_size)])
         posterior = DiagonalGaussianDistribution(moments.repeat_interleave(ensemble_size, dim=0))
-        latents = posterior.sample(generator) if sample else posterior.mode()
+        return self.scale_latents(posterior.sample(generator) if sample else posterior.mode())
+
+    def encode_moments(self, image: Tensor) -> Tensor:
+        """Mean and logarithm of the variance of an image's latent, as ``self.vae`` gives them."""
+        return self.vae.encode(image).latent_dist.parameters
+
+    def scale_latents(self, latents: Tensor) -> Tensor:
+        """Latents of the autoencoder as the network takes them."""
         return latents * self.vae.config.scaling_factor
 
-    # The call ------------------------------------------------------------------------------------------
+    def prompt_embedding(self, like: Tensor, words: str = "") -> Tensor:
+        """Embedding of a prompt, ``(len(like), n, C)``, not padded: so was Marigold trained."""
+        most = self.tokenizer.model_max_length
+        tokens = self.tokenizer(words, max_length=most, truncation=True, return_tensors="pt")
+        embedding = self.text_encoder(tokens.input_ids.to(like.device))[0]
+        return embedding.to(like).expand(len(like), -1, -1)
 
-    scale_invariant = shift_invariant = True
+    def run_unet(self, sample: Tensor, timestep: Any, condition: Condition) -> Tensor:
+        """Output of ``self.unet`` with ``condition["prompt"]`` and, if any, ``condition["class_labels"]``."""
+        return self.unet(
+            sample,
+            timestep,
+            encoder_hidden_states=condition["prompt"],
+            class_labels=condition.get("class_labels"),
+            return_dict=False,
+        )[0]
+
+    # The call ------------------------------------------------------------------------------------------
 
     progress_bar = MarigoldDepthPipeline.progress_bar
     ensemble_depth = staticmethod(MarigoldDepthPipeline.ensemble_depth)
@@ -272,17 +296,14 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         resolution = processing_resolution
         if resolution is None:
             resolution = self.default_processing_resolution
-        method_output = resample_method_output or self.output_resampling
-        self._check_numbers(steps, ensemble_size, resolution, batch_size)
+        resampling = resample_method_output or self.output_resampling
+        check_number(steps, "num_inference_steps", 1, self.max_steps or 1000, integer=True)
+        check_number(resolution, "processing_resolution", 0, 1 << 16, integer=True)
+        check_number(ensemble_size, "ensemble_size", 2 if output_uncertainty else 1, 1 << 20, integer=True)
+        check_number(batch_size, "batch_size", 1, 1 << 20, integer=True)
         check_choice(output_type, "output_type", ("np", "pt"))
-        if output_uncertainty and ensemble_size == 1:
-            bad_value("ensemble_size", "2 or more with output_uncertainty=True", ensemble_size)
         check_choice(resample_method_input, "resample_method_input", RESAMPLING)
-        check_choice(method_output, "resample_method_output", RESAMPLING)
-        if latents is not None and not isinstance(latents, Tensor):
-            bad_type("latents", "None or a torch.Tensor", latents)
-        if latents is not None and generator is not None:
-            bad_value("latents and generator", "given one at a time", "both")
+        check_choice(resampling, "resample_method_output", RESAMPLING)
         unknown = set(options) - set(self.call_options())
         if unknown:
             bad_value("arguments of this prior", f"out of {self.call_options()}", sorted(unknown))
@@ -292,14 +313,10 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         )  # (N, 3, H, W)
         padded = padded.contiguous()  # in another layout a network rounds otherwise
         condition = self.prepare_condition(padded, ensemble_size, batch_size, generator, **options)
-        z = self.prepare_latents(condition, None if latents is not None else generator)  # (N * E, C, h, w)
-        if latents is not None:
-            if latents.shape != z.shape:
-                bad_value("latents", f"of shape {tuple(z.shape)}", f"shape {tuple(latents.shape)}")
-            z = latents.to(z)
-        z = self.run_steps(z, condition, steps, batch_size, generator)
+        z = self._start(condition, latents, generator)  # (N * E, C, h, w)
+        z = self._run_steps(z, condition, steps, batch_size, generator)
 
-        def restore(maps: Tensor, method: str = method_output) -> Tensor | np.ndarray:
+        def restore(maps: Tensor, method: str = resampling) -> Tensor | np.ndarray:
             """From the padded processing grid to what the caller gets."""
             if match_input_resolution:
                 maps = processor.resize_antialias(maps, size, method, is_aa=False)
@@ -327,14 +344,20 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         own = inspect.signature(self.prepare_condition).parameters
         return [name for name, p in own.items() if name not in common and p.kind is not p.VAR_KEYWORD]
 
-    def _check_numbers(self, steps: int, members: int, resolution: int, batch_size: int) -> None:
-        most = 1000 if self.max_steps is None else self.max_steps
-        check_number(steps, "num_inference_steps", 1, most, integer=True)
-        check_number(members, "ensemble_size", 1, 1 << 20, integer=True)
-        check_number(resolution, "processing_resolution", 0, 1 << 16, integer=True)
-        check_number(batch_size, "batch_size", 1, 1 << 20, integer=True)
+    def _start(self, condition: Condition, latents: Any, generator: Generators) -> Tensor:
+        """Latents as the caller gave them, or the prior's own."""
+        if latents is None:
+            return self.prepare_latents(condition, generator)
+        if not isinstance(latents, Tensor):
+            bad_type("latents", "None or a torch.Tensor", latents)
+        if generator is not None:
+            bad_value("latents and generator", "given one at a time", "both")
+        z = self.prepare_latents(condition, None)
+        if latents.shape != z.shape:
+            bad_value("latents", f"of shape {tuple(z.shape)}", f"shape {tuple(latents.shape)}")
+        return latents.to(z)
 
-    def run_steps(
+    def _run_steps(
         self, latents: Tensor, condition: Condition, steps: int, batch_size: int, generator: Generators
     ) -> Tensor:
         """Denoise the members ``(N * E, C, h, w)`` in chunks, each of which is a trajectory of its own."""
@@ -356,9 +379,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         if ensemble_size == 1:
             return maps, None
         pairs = [
-            self.ensemble_depth(
-                members, self.scale_invariant, self.shift_invariant, output_uncertainty, **ensembling_kwargs
-            )
+            self.ensemble_depth(members, True, True, output_uncertainty, **ensembling_kwargs)
             for members in maps.split(ensemble_size)
         ]
         depths, spreads = zip(*pairs, strict=True)

@@ -1,22 +1,24 @@
-"""Pixel-Perfect Depth: a flow in pixel space with semantic tokens (arXiv 2510.07316)."""
+"""Pixel-Perfect Depth: a flow in pixel space with semantic tokens half way (arXiv 2510.07316)."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
 from diffusers import FlowMatchEulerDiscreteScheduler
+from diffusers.configuration_utils import ConfigMixin, register_to_config
+from diffusers.models.modeling_utils import ModelMixin
 from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from diffusers.utils.accelerate_utils import apply_forward_hook
-from diffusers.utils.torch_utils import randn_tensor
-from torch import Tensor
+from torch import Tensor, nn
 from transformers import Dinov2Model
 
 from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.loading import Layout
-from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
-from geodiff_plugin.priors.pixel_dit import PixelDiT
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, widened
 
 #: Sides are multiples of this; one semantic token for each such square.
 SIDE = 16
@@ -24,6 +26,8 @@ LAST_TIMESTEP = 1000
 #: Shorter over longer side of the training images: 1024 x 768.
 TRAINING_RATIO = 0.75
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+#: Base of the rotary embedding, and what keeps norms from 0.
+ROPE_BASE, NORM_EPS = 100.0, 1e-6
 #: DINOv2 stretches its position embeddings by (n + 0.1) / old and not by n / old.
 POSITION_OFFSET = 0.1
 
@@ -36,21 +40,6 @@ def sampling_timesteps(steps: int) -> list[float]:
     step = -(LAST_TIMESTEP + 1) / steps
     times = torch.arange(LAST_TIMESTEP, -1, step, dtype=torch.float32, device="cpu")
     return times.round()[:steps].tolist()
-
-
-def _coverage(before: int, after: int) -> Tensor:
-    """``(after, before)``: what part of a new pixel lies on each old one; rows sum to 1."""
-    ends = torch.arange(after + 1, dtype=torch.float64, device="cpu") * (before / after)
-    old = torch.arange(before, dtype=torch.float64, device="cpu")
-    overlap = torch.minimum(ends[1:, None], old + 1) - torch.maximum(ends[:-1, None], old)
-    return (overlap.clamp_min(0) * (after / before)).float()
-
-
-def area_resize(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Mean over the exact area of every new pixel, for ``(B, C, H, W)`` that shrinks to ``size``."""
-    sides = zip(image.shape[-2:], size, strict=True)
-    rows, columns = (_coverage(before, after).to(image.device) for before, after in sides)
-    return (rows @ image.float() @ columns.T).to(image.dtype)
 
 
 class AreaImageProcessor(MarigoldImageProcessor):
@@ -67,7 +56,9 @@ class AreaImageProcessor(MarigoldImageProcessor):
         scale = (max_edge_sz**2 * TRAINING_RATIO / (height * width)) ** 0.5
         size = tuple(max(SIDE, round(side * scale / SIDE) * SIDE) for side in (height, width))
         if scale < 1 and size[0] <= height and size[1] <= width:
-            return area_resize(image, size)
+            views = [view.permute(1, 2, 0).float().cpu().numpy() for view in image]
+            shrunk = [cv2.resize(view, size[::-1], interpolation=cv2.INTER_AREA) for view in views]
+            return torch.from_numpy(np.stack(shrunk)).permute(0, 3, 1, 2).to(image)
         return F.interpolate(image, size, mode="bicubic", align_corners=False).clamp(-1.0, 1.0)
 
 
@@ -77,12 +68,7 @@ def semantic_tokens(encoder: Dinov2Model, image_01: Tensor) -> Tensor:
 
     The parts of ``encoder.forward`` are called one by one; the hook brings an offloaded encoder back.
 
-    Args:
-        encoder: ``Dinov2Model`` with patches of 14.
-        image_01: ``(B, 3, H, W)`` in [0, 1], sides multiples of 16.
-
-    Returns:
-        ``(B, (H / 16) (W / 16), C)``.
+    Of ``image_01 (B, 3, H, W)`` in [0, 1], sides multiples of 16, tokens ``(B, (H / 16) (W / 16), C)``.
     """
     mean, std = (image_01.new_tensor(v).view(1, 3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
     rows, columns = image_01.shape[-2] // SIDE, image_01.shape[-1] // SIDE
@@ -105,6 +91,155 @@ def _position_embeddings(learned: Tensor, rows: int, columns: int) -> Tensor:
     return torch.cat([learned[:, :1], grid.to(learned.dtype)], dim=1)
 
 
+def _rotations(rows: int, columns: int, head_size: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine ``(n, head_size)`` of a grid: half of a head turns with rows, half with columns."""
+    row, column, half = (torch.arange(n, device=like.device) for n in (rows, columns, head_size // 2))
+    positions = torch.cartesian_prod(row, column)  # (n, 2)
+    angles = positions[:, :, None].float() / ROPE_BASE ** (half[::2].float() / len(half))  # (n, 2, half / 2)
+    angles = torch.cat([angles, angles], dim=-1).flatten(1).to(like.dtype)
+    return angles.cos(), angles.sin()
+
+
+def _rotate(tokens: Tensor, rotations: tuple[Tensor, Tensor]) -> Tensor:
+    """Rotary embedding of ``(B, heads, n, head_size)``."""
+    cosine, sine = rotations
+    halves = tokens.unflatten(-1, (2, 2, -1))  # row and column, each in two parts
+    turned = torch.stack([-halves[..., 1, :], halves[..., 0, :]], dim=-2).flatten(-3)
+    return tokens * cosine + turned * sine
+
+
+def _modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    """Normed tokens, scaled and shifted by the time."""
+    normed = F.layer_norm(x, x.shape[-1:], eps=NORM_EPS)
+    return normed * (1 + scale[:, None]) + shift[:, None]
+
+
+class _Attention(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.q_norm, self.k_norm = nn.LayerNorm(width // heads), nn.LayerNorm(width // heads)
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, rotations: tuple[Tensor, Tensor]) -> Tensor:
+        qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        q, k = _rotate(self.q_norm(qkv[0]), rotations), _rotate(self.k_norm(qkv[1]), rotations)
+        return self.proj(F.scaled_dot_product_attention(q, k, qkv[2]).transpose(1, 2).flatten(2))
+
+
+class _Mlp(nn.Module):
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.fc1, self.fc2 = nn.Linear(width, hidden), nn.Linear(hidden, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(F.gelu(self.fc1(x), approximate="tanh"))
+
+
+class _TimeEmbedder(nn.Module):
+    def __init__(self, width: int, frequencies: int = 256) -> None:
+        super().__init__()
+        self.frequencies = frequencies
+        self.mlp = nn.Sequential(nn.Linear(frequencies, width), nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, t: Tensor) -> Tensor:
+        half = self.frequencies // 2
+        rates = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device).float() / half)
+        angles = t[:, None].float() * rates
+        return self.mlp(torch.cat([angles.cos(), angles.sin()], dim=-1).to(next(self.mlp.parameters()).dtype))
+
+
+class _Block(nn.Module):
+    def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
+        super().__init__()
+        self.attn, self.mlp = _Attention(width, heads), _Mlp(width, int(width * mlp_ratio))
+        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 6 * width))
+
+    def forward(self, x: Tensor, time: Tensor, rotations: tuple[Tensor, Tensor]) -> Tensor:
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = self.adaLN_modulation(time).chunk(6, dim=1)
+        x = x + gate_a[:, None] * self.attn(_modulated(x, shift_a, scale_a), rotations)
+        return x + gate_m[:, None] * self.mlp(_modulated(x, shift_m, scale_m))
+
+
+class _FinalLayer(nn.Module):
+    def __init__(self, width: int, outputs: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(width, outputs)
+        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 2 * width))
+
+    def forward(self, x: Tensor, time: Tensor) -> Tensor:
+        shift, scale = self.adaLN_modulation(time).chunk(2, dim=1)
+        return self.linear(_modulated(x, shift, scale))
+
+
+class PixelDiT(ModelMixin, ConfigMixin):
+    """Cascaded diffusion transformer: half of the blocks on patches of twice the size, the rest on patches.
+
+    The width of a token is a multiple of ``4 * num_heads``, the number of blocks even.
+    """
+
+    _supports_gradient_checkpointing = True
+    _no_split_modules = ["_Block"]
+
+    @register_to_config
+    def __init__(
+        self,
+        hidden_size: int = 1024,
+        depth: int = 24,
+        num_heads: int = 16,
+        patch_size: int = 8,
+        semantic_size: int = 1024,
+        mlp_ratio: float = 4.0,
+    ) -> None:
+        super().__init__()
+        self.gradient_checkpointing = False
+        self.x_embedder = nn.ModuleDict({"proj": nn.Conv2d(4, hidden_size, 2 * patch_size, 2 * patch_size)})
+        self.t_embedder = _TimeEmbedder(hidden_size)
+        self.blocks = nn.ModuleList(_Block(hidden_size, num_heads, mlp_ratio) for _ in range(depth))
+        wide = 4 * hidden_size
+        self.proj_fusion = nn.Sequential(
+            nn.Linear(hidden_size + semantic_size, wide),
+            nn.SiLU(),
+            nn.Linear(wide, wide),
+            nn.SiLU(),
+            nn.Linear(wide, wide),
+        )
+        self.final_layer = _FinalLayer(hidden_size, patch_size**2)
+
+    def forward(self, x: Tensor, semantics: Tensor, timestep: Tensor) -> Tensor:
+        """Velocity ``noise - clean``, ``(B, 1, H, W)``.
+
+        Args:
+            x: ``(B, 4, H, W)``, noisy depth and image - 0.5; sides multiples of ``2 * patch_size``.
+            semantics: ``(B, n, C)``, a token of each coarse patch, row by row.
+            timestep: ``(B,)`` or 0-d, in [0, 1000].
+        """
+        patch, head_size = self.config.patch_size, self.config.hidden_size // self.config.num_heads
+        rows, columns = x.shape[-2] // (2 * patch), x.shape[-1] // (2 * patch)
+        time = self.t_embedder(timestep.reshape(-1).expand(len(x)))
+        tokens = self.x_embedder["proj"](x).flatten(2).transpose(1, 2)  # (B, n, D)
+        coarse, fine = (_rotations(rows * k, columns * k, head_size, tokens) for k in (1, 2))
+        middle = len(self.blocks) // 2
+        for block in self.blocks[:middle]:
+            tokens = self._run(block, tokens, time, coarse)
+        tokens = self.proj_fusion(torch.cat([tokens, F.normalize(semantics, dim=-1)], dim=-1))
+        # Every coarse token, 4 D wide now, becomes the four fine ones of its patch, two by two.
+        tokens = tokens.unflatten(2, (2, 2, -1)).unflatten(1, (rows, columns))  # (B, h, w, 2, 2, D)
+        tokens = tokens.permute(0, 1, 3, 2, 4, 5).flatten(1, 4)  # (B, 4 n, D)
+        for block in self.blocks[middle:]:
+            tokens = self._run(block, tokens, time, fine)
+        pixels = self.final_layer(tokens, time)  # (B, 4 n, patch^2)
+        return F.pixel_shuffle(pixels.transpose(1, 2).unflatten(2, (2 * rows, 2 * columns)), patch)
+
+    def _run(
+        self, block: nn.Module, tokens: Tensor, time: Tensor, rotations: tuple[Tensor, Tensor]
+    ) -> Tensor:
+        if torch.is_grad_enabled() and self.gradient_checkpointing:
+            return self._gradient_checkpointing_func(block, tokens, time, rotations)
+        return block(tokens, time, rotations)
+
+
 class PPDPipeline(DepthDiffusionPipeline):
     """Pixel-Perfect Depth.
 
@@ -113,11 +248,9 @@ class PPDPipeline(DepthDiffusionPipeline):
 
     Args:
         dit: the diffusion transformer.
-        semantic_encoder: encoder of Depth Anything V2 Large.
-        scheduler: ``FlowMatchEulerDiscreteScheduler`` without shift.
-        prediction_type: ``"log1p"``.
+        semantic_encoder: of Depth Anything V2 Large.
+        scheduler: without shift.
         default_denoising_steps: 4 in the authors' ``run.py``, 20 where they measure points.
-        default_processing_resolution: see above.
     """
 
     model_cpu_offload_seq = "semantic_encoder->dit"
@@ -137,7 +270,7 @@ class PPDPipeline(DepthDiffusionPipeline):
         self.register_prior(modules, *defaults, AreaImageProcessor(vae_scale_factor=SIDE))
 
     def prepare_condition(
-        self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators, **options: Any
+        self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
         """The image in [-0.5, 0.5] and its semantic tokens, one per member."""
         tokens = [semantic_tokens(self.semantic_encoder, part / 2 + 0.5) for part in image.split(batch_size)]
@@ -146,8 +279,7 @@ class PPDPipeline(DepthDiffusionPipeline):
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
         """Gaussian noise of one channel, ``(N * E, 1, H, W)``."""
-        like = condition["image"][:, :1]
-        return randn_tensor(like.shape, generator=generator, device=like.device, dtype=like.dtype)
+        return super().prepare_latents({"image_latent": condition["image"][:, :1]}, generator)
 
     def set_timesteps(self, num_inference_steps: int, device: torch.device) -> None:
         """The authors' own spacing."""
@@ -162,7 +294,7 @@ class PPDPipeline(DepthDiffusionPipeline):
 
     def decode_relative(self, z0: Tensor) -> Tensor:
         """Clean depth is the map, but for its offset."""
-        return z0.to(torch.promote_types(z0.dtype, torch.float32)) + 0.5
+        return widened(z0) + 0.5
 
     def encode_relative(self, x: Tensor) -> Tensor:
         """The map, but for its offset."""
@@ -173,15 +305,11 @@ class PPDPipeline(DepthDiffusionPipeline):
         return self.decode_relative(latents)
 
 
-LICENCE = "apache-2.0, and cc-by-nc-4.0 for the encoder of Depth Anything V2 Large"
-
-
 class PPDPrior(DepthPrior):
     """Adapter of ``PPDPipeline``: no VAE, so that decoding is an offset and the gradient its own."""
 
     pipeline_class = PPDPipeline
-    component_classes = {"dit": PixelDiT, "semantic_encoder": Dinov2Model}
-    licence = {"gangweix/Pixel-Perfect-Depth": LICENCE}
+    licence = {"gangweix/Pixel-Perfect-Depth": "apache-2.0, and cc-by-nc-4.0 for its encoder"}
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

@@ -10,7 +10,6 @@ import torch
 from diffusers import AutoencoderTiny
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.loading import reading
 
 #: Values of ``decoder`` that are no folder and no hub id.
@@ -31,12 +30,11 @@ def _latent_of(vae: Any) -> tuple[int | None, int | None]:
     return config.get("latent_channels", config.get("z_dim")), 2 ** (len(stages) - 1) if stages else None
 
 
-def tiny_autoencoder(pipe: Any, prior: DepthPrior, decoder: str) -> AutoencoderTiny | None:
+def tiny_autoencoder(pipe: Any, decoder: str) -> AutoencoderTiny | None:
     """The autoencoder for the loop, on the pipeline's device and of its dtype, frozen; ``None`` for its own.
 
     Args:
         pipe: the live pipeline.
-        prior: its adapter, for messages.
         decoder: as in ``GuidanceConfig``.
 
     Raises:
@@ -46,22 +44,18 @@ def tiny_autoencoder(pipe: Any, prior: DepthPrior, decoder: str) -> AutoencoderT
     if decoder == FULL:
         return None
     vae = getattr(pipe, "vae", None)
-    if vae is None:
-        cure = "This prior works on pixels: there is nothing to decode."
-        bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(decoder), cure)
-    own = _latent_of(vae)
-    if own[1] is None:
-        cure = "No tiny autoencoder of images has the latent of one for videos."
+    channels, cell = (None, None) if vae is None else _latent_of(vae)
+    cure = ""
+    if cell is None:
+        cure = "It has no latent of a single image: it works on pixels, or its autoencoder is one of videos."
+    elif decoder == TINY and (channels, cell, vae.config.get("scaling_factor")) not in KNOWN:
+        cure = f"None is published for its latent of {channels} channels; give a folder or a hub id of one."
+    if cure:
         bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(decoder), cure)
     if decoder == TINY:
-        known = KNOWN.get((*own, vae.config.get("scaling_factor")))
-        if known is None:
-            cure = f"None is published for its latent of {own[0]} channels; give a folder or a hub id of one."
-            bad_value("decoder", f"{FULL!r} with {prior.__class__.__name__}", repr(decoder), cure)
-        decoder = known
+        decoder = KNOWN[channels, cell, vae.config.get("scaling_factor")]
     tiny = _loaded(decoder, pipe.dtype, str(pipe._execution_device))
-    if _latent_of(tiny) != own:
-        channels, cell = own
+    if _latent_of(tiny) != (channels, cell):
         got = "{} channels, {} px a cell, in {!r}".format(*_latent_of(tiny), decoder)
         bad_value("decoder", f"of the prior's latent ({channels} channels, {cell} px a cell)", got)
     return tiny

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -22,68 +21,83 @@ MODES = {2: "bilinear", 3: "bicubic"}  # of PIL
 ALIASED, PADDED_LAST = ("ZoeDepth", "DepthPro"), ("DPT", "PromptDepthAnything")
 #: Whose library brings the map to the image's size bilinearly; the others' do so bicubically.
 BILINEAR = ("DepthPro", "Tipsv2Dpt")
-HALF = (0.5, 0.5, 0.5)  # mean and standard deviation where the file names none
-_PLAIN: dict[str, Any] = {"resample": 2, "do_normalize": True, "do_pad": False}
-#: Processor -> what its file leaves out; GLPN and Tipsv2Dpt do not normalise.
+HALF = (0.5, 0.5, 0.5)
+#: What a processor's file leaves out.
+COMMON: dict[str, Any] = {
+    "resample": 2,
+    "do_resize": True,
+    "do_normalize": True,
+    "do_pad": False,
+    "image_mean": HALF,
+    "image_std": HALF,
+    "keep_aspect_ratio": False,
+    "ensure_multiple_of": 1,
+}
+#: Where processors differ from it.
 DEFAULTS: dict[str, dict[str, Any]] = {
-    "DPT": _PLAIN | {"size": 384, "resample": 3},
-    "ZoeDepth": _PLAIN
-    | {
+    "DPT": {"size": 384, "resample": 3},
+    "ZoeDepth": {
         "size": {"height": 384, "width": 512},
         "do_pad": True,
         "keep_aspect_ratio": True,
         "ensure_multiple_of": 1 / 32,
     },
-    "GLPN": _PLAIN | {"size": None, "do_normalize": False, "size_divisor": 32},
-    "DepthPro": _PLAIN | {"size": 1536},
-    "PromptDepthAnything": _PLAIN | {"size": 384, "resample": 3},
-    "Tipsv2Dpt": _PLAIN | {"size": {"height": 448, "width": 448}, "do_normalize": False},
+    "GLPN": {"size": None, "do_normalize": False, "size_divisor": 32},
+    "DepthPro": {"size": 1536},
+    "PromptDepthAnything": {"size": 384, "resample": 3},
+    "Tipsv2Dpt": {"size": {"height": 448, "width": 448}, "do_normalize": False},
 }
 
 
-@dataclass(frozen=True)
 class Preparation:
     """Resizing, padding and normalisation of one checkpoint.
 
+    Args:
+        config: contents of ``preprocessor_config.json``.
+
     Attributes:
         kind: key of ``DEFAULTS``.
-        options: ``preprocessor_config.json`` over the processor's defaults.
+        options: ``config`` over the processor's defaults.
+
+    Raises:
+        ValueError: a processor, a resampling or a size that is not known here.
     """
 
-    kind: str
-    options: dict[str, Any]
-
-    @classmethod
-    def from_config(cls, config: dict[str, Any]) -> Preparation:
-        """Of the contents of ``preprocessor_config.json``.
-
-        Raises:
-            ValueError: a processor, a resampling or a size that is not known here.
-        """
+    def __init__(self, config: dict[str, Any]) -> None:
         file = "of preprocessor_config.json"
         name = str(config.get("image_processor_type") or config.get("feature_extractor_type"))
-        kind = name.removesuffix("Fast").removesuffix("Pil")
-        kind = kind.removesuffix("ImageProcessor").removesuffix("FeatureExtractor")
-        if kind not in DEFAULTS:
+        self.kind = name.removesuffix("Fast").removesuffix("Pil")
+        self.kind = self.kind.removesuffix("ImageProcessor").removesuffix("FeatureExtractor")
+        if self.kind not in DEFAULTS:
             expected = f"one of {', '.join(f'{k}ImageProcessor' for k in DEFAULTS)}"
             bad_value(f"image_processor_type {file}", expected, name)
         given = {k: v for k, v in config.items() if v is not None}
-        options = {"image_mean": HALF, "image_std": HALF, "do_resize": True, **DEFAULTS[kind], **given}
-        if options["resample"] not in MODES:
-            bad_value(f"resample {file}", "2 (bilinear) or 3 (bicubic)", options["resample"])
-        size = options["size"]
+        self.options = COMMON | DEFAULTS[self.kind] | given
+        if self.options["resample"] not in MODES:
+            bad_value(f"resample {file}", "2 (bilinear) or 3 (bicubic)", self.options["resample"])
+        size = self.options["size"]
         if size is not None and not isinstance(size, int) and not {"height", "width"} <= set(size):
             bad_value(f"size {file}", "a number or a height and a width", size)
-        return cls(kind, options)
 
-    def border(self, height: int, width: int) -> tuple[int, int]:
-        """Pixels that ZoeDepth reflects above and below, and left and right, before it resizes."""
-        if self.kind != "ZoeDepth" or not self.options["do_pad"]:
-            return 0, 0
-        return int((height / 2) ** 0.5 * 3), int((width / 2) ** 0.5 * 3)
+    def _grid(self, height: int, width: int) -> tuple[tuple[int, int], tuple[int, int], list[int]]:
+        """How an image is laid out for the network.
 
-    def resized(self, height: int, width: int) -> tuple[int, int]:
-        """Sides ``(h, w)`` of the network's view of an image, without what is padded after resizing."""
+        Returns:
+            Rows above and below, and columns left and right, that ZoeDepth reflects before it resizes; sides
+            ``(h, w)`` after resizing; left, right, top, bottom zeros after normalising, to a multiple of a
+            patch (``PADDED_LAST``).
+        """
+        options, rows, columns = self.options, 0, 0
+        if self.kind == "ZoeDepth" and options["do_pad"]:
+            rows, columns = int((height / 2) ** 0.5 * 3), int((width / 2) ** 0.5 * 3)
+        h, w = self._resized(height + 2 * rows, width + 2 * columns)
+        zeros, divisor = [0, 0, 0, 0], options.get("size_divisor")
+        if self.kind in PADDED_LAST and options["do_pad"] and divisor:
+            missing = -w % divisor, -h % divisor
+            zeros = [part for n in missing for part in (n // 2, n - n // 2)]
+        return (rows, columns), (h, w), zeros
+
+    def _resized(self, height: int, width: int) -> tuple[int, int]:
         if not self.options["do_resize"]:
             return height, width
         if self.kind == "GLPN":
@@ -92,35 +106,19 @@ class Preparation:
         size = self.options["size"]
         target_h, target_w = (size["height"], size["width"]) if isinstance(size, dict) else (size, size)
         scale_h, scale_w = target_h / height, target_w / width
-        if self.options.get("keep_aspect_ratio", False):  # the side that changes least decides
+        if self.options["keep_aspect_ratio"]:  # the side that changes least decides
             scale_h = scale_w = scale_w if abs(1 - scale_w) < abs(1 - scale_h) else scale_h
-        multiple = self.options.get("ensure_multiple_of", 1)
+        multiple = self.options["ensure_multiple_of"]
         h, w = (int(round(side / multiple) * multiple) for side in (scale_h * height, scale_w * width))
         return h, w
 
-    def padding(self, height: int, width: int) -> tuple[int, int, int, int]:
-        """Left, right, top, bottom zeros after normalising, to a multiple of a patch (``PADDED_LAST``)."""
-        divisor = self.options.get("size_divisor")
-        if self.kind not in PADDED_LAST or not self.options["do_pad"] or not divisor:
-            return 0, 0, 0, 0
-        rows, columns = -height % divisor, -width % divisor
-        return columns // 2, columns - columns // 2, rows // 2, rows - rows // 2
-
     def __call__(self, image_01: Tensor) -> Tensor:
-        """What the network is given.
+        """What the network is given, ``(B, 3, h, w)`` float32, of images ``(B, 3, H, W)`` in [0, 1].
 
-        Args:
-            image_01: ``(B, 3, H, W)`` float32 in [0, 1].
-
-        Returns:
-            ``(B, 3, h, w)`` float32, within about a grey level of the library's, which rounds to bytes twice.
-
-        Raises:
-            ValueError: an image smaller than the patch that it is cut into.
+        Within about a grey level of the library's, which rounds to bytes twice.
         """
-        rows, columns = self.border(*image_01.shape[-2:])
+        (rows, columns), size, zeros = self._grid(*image_01.shape[-2:])
         x = F.pad(image_01, (columns, columns, rows, rows), mode="reflect") if rows or columns else image_01
-        size = self.resized(*x.shape[-2:])
         if min(size) < 1:
             bad_value("image", "at least as large as a patch of the network", f"{x.shape[-1]}x{x.shape[-2]}")
         if size != tuple(x.shape[-2:]):
@@ -129,21 +127,15 @@ class Preparation:
             x = F.interpolate(x, size, mode=mode, align_corners=corners, antialias=antialias)
             x = x.clamp(0.0, 1.0) if antialias else x  # the library resizes bytes, which cannot overshoot
         if self.options["do_normalize"]:
-            mean, std = (
-                torch.as_tensor(self.options[k], dtype=x.dtype, device=x.device).view(1, -1, 1, 1)
-                for k in ("image_mean", "image_std")
-            )
+            mean, std = (x.new_tensor(self.options[k]).view(1, -1, 1, 1) for k in ("image_mean", "image_std"))
             x = (x - mean) / std
-        return F.pad(x, self.padding(*size))
+        return F.pad(x, zeros)
 
     def on_the_image(self, values: Tensor, height: int, width: int) -> Tensor:
         """The network's map ``(B, 1, h, w)`` without what was padded around ``(height, width)``."""
-        rows, columns = self.border(height, width)
-        if rows or columns:
-            values = _bicubic(values, (height + 2 * rows, width + 2 * columns))
-            return values[:, :, rows : rows + height, columns : columns + width]
-        h, w = self.resized(height, width)
-        left, right, top, bottom = self.padding(h, w)
+        (rows, columns), (h, w), (left, right, top, bottom) = self._grid(height, width)
+        if rows or columns:  # in pixels of the image
+            h, w, left, right, top, bottom = height, width, columns, columns, rows, rows
         if left + right + top + bottom == 0:
             return values
         return _bicubic(values, (h + top + bottom, w + left + right))[:, :, top : top + h, left : left + w]
@@ -159,7 +151,7 @@ DEPTH_ARCHITECTURES = frozenset(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values(
 }
 #: Those whose map is no depth, and what it is.
 NO_DEPTH = {"CHMv2ForDepthEstimation": "its map is the height of trees above the ground, seen from the air"}
-#: The one that takes depths to start from, and gives metres with them.
+#: The class that takes depths to start from, and gives metres with them.
 PROMPTED = "PromptDepthAnythingForDepthEstimation"
 SPACES = ("depth", "disparity")
 #: Weights that DPT's published files lack and no forward reads: the first fusion has nothing to add to.
@@ -168,21 +160,16 @@ UNREAD = "fusion_stage.layers.0.residual_layer1."
 NEAREST, FARTHEST = 1e4, 1e-4
 #: What is 1; a few stray pixels shall not press the rest together.
 TOP_QUANTILE = 0.98
-#: Metres; a network's least depth may be 0.
-NEAREST_M = 1e-3
+#: Metres; a network's least depth may be 0, and so may the span of a prompt.
+NEAREST_M, LEAST_SPAN_M = 1e-3, 1e-6
 PREPARATION_FILES = ("preprocessor_config.json", "processor_config.json")
 
 
 def output_of(model: PreTrainedModel) -> tuple[str, bool]:
     """What the class of a model predicts: space (``depth`` or ``disparity``) and whether in (inverse) metres.
 
-    Depth Anything as its ``depth_estimation_type`` says; DPT relative disparity, but metres with the
-    projection that only DINOv2's depth heads have; ZoeDepth, GLPN and TIPSv2 metres; DepthPro inverse metres,
-    relative without the head for its field of view; Prompt Depth Anything relative depth, until it is given a
-    prompt.
-
-    Raises:
-        ValueError: a class of which this is not known.
+    DPT predicts metres with the projection that only DINOv2's depth heads have, DepthPro only with the head
+    for its field of view, Prompt Depth Anything only once it is given a prompt.
     """
     name, config = type(model).__name__.removesuffix("ForDepthEstimation"), model.config
     if name in ("DepthAnything", "DPT"):
@@ -220,25 +207,18 @@ def unit_range(values: Tensor) -> Tensor:
 class TransformersDepthPipeline(DirectMapPipeline):
     """Every model that ``AutoModelForDepthEstimation`` loads, but that of canopy height.
 
-    There are no latents to speak of: what guidance moves beside scale and shift is the map itself, pixel by
-    pixel. ``processing_resolution`` is the longer side of that map, 0 for the image's own; which size the
-    network then works at, its ``preprocessor_config.json`` says.
+    What guidance moves beside scale and shift is the map itself, pixel by pixel. ``processing_resolution`` is
+    the longer side of that map, 0 for the image's own; ``preprocessor_config.json`` says at which size the
+    network then works.
 
     Args:
         model: the network.
         scheduler: one step whose result is what it is given.
         preparation: contents of ``preprocessor_config.json``; needed.
         prediction_type: ``"depth"`` or ``"disparity"``; ``None`` for what the model's class is known to give.
-        default_processing_resolution: see above.
 
     Attributes:
-        takes_prompt: whether it can be given depths to start from.
         metric: whether its maps are in metres (inverse metres in disparity space) without a prompt.
-        own_range: ``(N * E, 2)`` metres at 0 and at 1 of the latest call's maps, of a model that is metric by
-            itself or was given a prompt; else ``None``.
-
-    Raises:
-        ValueError: a class whose map is no depth, or of which it is not known.
     """
 
     model_cpu_offload_seq = "model"
@@ -255,8 +235,7 @@ class TransformersDepthPipeline(DirectMapPipeline):
         super().__init__()
         _check_is_depth(type(model).__name__)
         self.takes_prompt = type(model).__name__ == PROMPTED
-        self.own_range: Tensor | None = None
-        self.prepare = Preparation.from_config(preparation or {})
+        self.prepare = Preparation(preparation or {})
         try:
             space, metric = output_of(model)
         except ValueError:
@@ -264,10 +243,8 @@ class TransformersDepthPipeline(DirectMapPipeline):
                 raise
             space, metric = prediction_type, False
         # A space that the model's class is known for says nothing new: what is saved with it stays metric.
-        if prediction_type is not None and prediction_type != space:
-            space, metric = prediction_type, False
-        self.metric = metric
-        check_choice(space, "space", SPACES)
+        self.metric = metric and prediction_type in (None, space)
+        space = check_choice(prediction_type or space, "space", SPACES)
         defaults = space, default_denoising_steps, default_processing_resolution
         modules = {"model": model, "scheduler": scheduler}
         self.register_prior(modules, *defaults, image_processor=1, preparation=preparation)
@@ -297,12 +274,11 @@ class TransformersDepthPipeline(DirectMapPipeline):
             self.predict(part.float() / 2 + 0.5, size, told)
             for part, told in zip(parts, prompts, strict=True)
         ]
-        values = torch.cat(maps)
         self.own_range = None
         if self.metric or prompt_depth is not None:
             ends = torch.cat([torch.stack([self.metres(v) for v in range_of(part)], 1) for part in maps])
             self.own_range = ends.clamp_min(NEAREST_M).repeat_interleave(ensemble_size, dim=0)
-        return {"relative": unit_range(values).repeat_interleave(ensemble_size, dim=0)}
+        return {"relative": unit_range(torch.cat(maps)).repeat_interleave(ensemble_size, dim=0)}
 
     def metres(self, values: Tensor) -> Tensor:
         """Metres, > 0, of values of a metric map's unit, any shape."""
@@ -319,25 +295,24 @@ class TransformersDepthPipeline(DirectMapPipeline):
                 map is in metres then.
 
         Returns:
-            ``(B, 1, h, w)`` float32 over the whole image and nothing but it (what was padded is gone),
-            resampled as the library's ``post_process_depth_estimation`` does.
-
-        Raises:
-            ValueError: an image too small for the network; a prompt for a model that takes none.
+            ``(B, 1, h, w)`` float32 over the image without what was padded, resampled as the library's
+            ``post_process_depth_estimation`` does.
         """
-        told, unit = {}, None
+        told, low, span = {}, 0.0, 1.0
         if prompt_m is not None:
             if not self.takes_prompt:
                 bad_value("prompt_depth", "left out with this model", "given", f"Only {PROMPTED} takes one.")
-            prompt = _with_a_span(prompt_m.to(image_01.device))
-            if self.model.dtype != torch.float32:  # metres would lose the digits that the model divides by
-                low, high = prompt.amin((1, 2, 3), keepdim=True), prompt.amax((1, 2, 3), keepdim=True)
-                unit, prompt = (low, high - low), (prompt - low) / (high - low)
+            # From 0 to 1, as the model itself does it, but before half precision rounds the metres.
+            prompt = prompt_m.to(image_01.device).float()
+            low, high = prompt.amin((1, 2, 3), keepdim=True), prompt.amax((1, 2, 3), keepdim=True)
+            span = (high - low).clamp_min(LEAST_SPAN_M)
+            prompt = (prompt - low) / span
+            prompt[:, :, :1, :1] = torch.where(
+                high > low, prompt[:, :, :1, :1], 1.0
+            )  # it divides by the span
             told["prompt_depth"] = prompt.to(self.model.dtype)
         output = self.model(pixel_values=self.prepare(image_01.float()).to(self.model.dtype), **told)
-        values = output.predicted_depth.float()[:, None]  # (B, 1, h', w')
-        if unit is not None:  # as the model itself does it
-            values = values * unit[1] + unit[0]
+        values = output.predicted_depth.float()[:, None] * span + low  # (B, 1, h', w')
         fov = getattr(output, "field_of_view", None)
         if fov is not None:  # canonical inverse depth -> inverse metres: times width over focal length
             values = values * 2.0 * torch.tan(0.5 * torch.deg2rad(fov.float())).view(-1, 1, 1, 1)
@@ -349,22 +324,10 @@ class TransformersDepthPipeline(DirectMapPipeline):
         return _bicubic(values, size)
 
 
-def _with_a_span(prompt_m: Tensor) -> Tensor:
-    """A prompt that is not one number everywhere, as the library makes it: its span is divided by."""
-    prompt_m = prompt_m.float().clone()
-    corner = prompt_m[:, :, 0, 0]
-    # A millionth of a metre is lost beside tens of them.
-    above = torch.maximum(corner + 1e-6, torch.nextafter(corner, torch.full_like(corner, torch.inf)))
-    is_flat = (prompt_m.amax((1, 2, 3)) == prompt_m.amin((1, 2, 3)))[:, None]
-    prompt_m[:, :, 0, 0] = torch.where(is_flat, above, corner)
-    return prompt_m
-
-
 class TransformersDepthPrior(DepthPrior):
     """Adapter of ``TransformersDepthPipeline``: scale, shift and a residual per pixel can be guided."""
 
     pipeline_class = TransformersDepthPipeline
-    component_classes = {"scheduler": DirectScheduler}
     licence = {
         "depth-anything/Depth-Anything-V2-Small-hf": "apache-2.0",
         "depth-anything/Depth-Anything-V2-Base-hf": "cc-by-nc-4.0",
@@ -375,14 +338,6 @@ class TransformersDepthPrior(DepthPrior):
         "apple/DepthPro-hf": "apple-amlr",
     }
 
-    def __init__(self, pipe: TransformersDepthPipeline) -> None:
-        super().__init__(pipe)
-        self.takes_prompt = pipe.takes_prompt
-
-    def metric_range(self, samples: slice) -> tuple[Tensor, Tensor] | None:
-        """Metres of a metric model's map, or of one that was given a prompt."""
-        return None if self._pipe.own_range is None else self._pipe.own_range[samples].unbind(1)
-
     @staticmethod
     def recognises(layout: Layout) -> bool:
         """An architecture that ``AutoModelForDepthEstimation`` knows, alone or as component ``model``."""
@@ -391,15 +346,9 @@ class TransformersDepthPrior(DepthPrior):
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> TransformersDepthPipeline:
-        """The model and the preparation of its images, from our folder or as the hub has it.
-
-        Raises:
-            ValueError: a folder without safetensors, or without what says how images are prepared.
-        """
+        """The model and the preparation of its images, from our folder or as the hub has it."""
         if layout.index:
-            return build_pipeline(
-                cls.pipeline_class, layout, dtype, cls.component_classes, prediction_type=space
-            )
+            return build_pipeline(cls.pipeline_class, layout, dtype, prediction_type=space)
         for name in layout.config("").get("architectures", ()):
             _check_is_depth(name)
         config = next(filter(None, map(layout.read_json, PREPARATION_FILES)), None)

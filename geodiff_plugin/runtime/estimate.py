@@ -24,12 +24,7 @@ StepInputs = tuple[Tensor, Tensor, Tensor | None]
 
 @dataclass(frozen=True)
 class ProcessingGrid:
-    """The grid that a pipeline denoises on.
-
-    Attributes:
-        content: ``(H, W)`` without padding.
-        padding: rows at the bottom and columns at the right that were added to it.
-    """
+    """The grid that a pipeline denoises on: ``(H, W)`` of the image, and rows and columns that pad it."""
 
     content: tuple[int, int]
     padding: tuple[int, int]
@@ -45,44 +40,32 @@ class ProcessingGrid:
         return x[:, :, :height, :width]
 
     def padded(self, x: Tensor) -> Tensor:
-        """A map on the whole grid: as with the image, its last row and column repeat.
-
-        It may lack the padding, or what lies beyond the last whole cell of the latent.
-        """
+        """A map on the whole grid, also one of whole cells only: its last row and column repeat."""
         bottom, right = (full - side for full, side in zip(self.size, x.shape[-2:], strict=True))
         return F.pad(x, (0, right, 0, bottom), mode="replicate") if bottom or right else x
 
 
 class MapCodec:
-    """Decodes and encodes relative maps during one guided call.
-
-    Args:
-        pipe: the live pipeline.
-        prior: its adapter.
-        grid: the processing grid.
-        tiny: autoencoder that stands in for the pipeline's between the steps, or ``None``.
-    """
+    """Decodes and encodes relative maps of a guided call; ``tiny`` stands in for the pipeline's VAE."""
 
     def __init__(self, pipe: Any, prior: DepthPrior, grid: ProcessingGrid, tiny: Any | None) -> None:
         self._pipe, self.prior, self.grid, self.tiny = pipe, prior, grid, tiny
 
     @contextmanager
     def _autoencoder(self, tiny: Any | None) -> Iterator[None]:
-        if tiny is None:
-            yield
-            return
-        original = self._pipe.vae  # past ``__setattr__``, which would rewrite the pipeline's config
-        object.__setattr__(self._pipe, "vae", tiny)
+        original = getattr(self._pipe, "vae", None)
+        if tiny is not None:  # past ``__setattr__``, which would rewrite the pipeline's config
+            object.__setattr__(self._pipe, "vae", tiny)
         try:
             yield
         finally:
-            object.__setattr__(self._pipe, "vae", original)
+            if tiny is not None:
+                object.__setattr__(self._pipe, "vae", original)
 
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
-        """Unclipped relative map ``(B, 1, H, W)`` float32 of a clean latent ``(B, C, h, w)``, differentiable.
+        """Unclipped relative map ``(B, 1, H, W)`` float32 of a clean latent's depth channels, differentiable.
 
-        ``z0`` has the depth channels alone; a ``final`` map, a result, is decoded by the pipeline's own
-        autoencoder.
+        A ``final`` map, a result, is decoded by the pipeline's autoencoder.
         """
         with self._autoencoder(None if final else self.tiny):
             x = self.prior.decode(z0).float()  # of a prior in float64 as well: the views are in float32
@@ -100,8 +83,8 @@ class StepEstimate:
     Args:
         codec: between latents and maps.
         level: signal and noise of the step.
-        output: ``(B, C, h, w)`` the network's output, all channels, in the pipeline's precision.
-        z_t: the same of the noisy latent.
+        output: ``(B, C, h, w)`` the network's, all channels, in the pipeline's precision.
+        z_t: the noisy latent, likewise.
         tap: of the network for the full gradient; ``None`` where guidance moves the clean latent.
         latent_is_read: another step follows, or the user asked for the latent; else a last map needs no code.
 
@@ -139,12 +122,10 @@ class StepEstimate:
         return self._codec.decode(z0, final and not self.latent_is_read)
 
     def step_inputs(self, move: Tensor, from_moved: bool) -> StepInputs:
-        """What the scheduler's own step is given once the latent has been moved.
+        """What the scheduler's own step is given once guidance adds ``move (B, c, h, w)`` to the latent.
 
-        Args:
-            move: ``(B, c, h, w)`` what guidance adds to ``latent``.
-            from_moved: with the full gradient the step starts from the moved z_t, instead of the move being
-                added to its result.
+        With the full gradient and ``from_moved`` the step starts from the moved z_t; else the move is added
+        to its result.
         """
         moved, prior = (self.latent + move).detach(), self._codec.prior
         if self._tap is None:

@@ -1,7 +1,7 @@
 """All that a guided call changes on a live pipeline, and puts back: scheduler, network, weights.
 
-Each ``attached()`` or context manager undoes itself at exit, and may be entered again: while a callback runs
-the pipeline is as the user left it. The guided ``step`` is the DDIM line of Algorithm 1.
+Each context manager undoes itself at exit, and may be entered again: while a callback runs the pipeline is as
+the user left it. The guided ``step`` is the DDIM line of Algorithm 1.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import functools
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -25,10 +25,7 @@ _LOCKS_GUARD = threading.Lock()
 
 
 def put_channels(whole: Tensor, channels: slice, part: Tensor) -> Tensor:
-    """``whole (B, C, h, w)`` with ``part (B, c, h, w)`` at ``channels``; differentiable in both.
-
-    A slice of all channels gives back ``part`` itself.
-    """
+    """``whole (B, C, h, w)`` with ``part (B, c, h, w)`` at ``channels``, ``part`` itself if these are all."""
     start, stop, _ = channels.indices(whole.shape[1])
     if stop - start == whole.shape[1]:
         return part
@@ -69,8 +66,7 @@ def _modules(pipe: Any) -> list[torch.nn.Module]:
 def images_in_float32(processor: Any) -> AbstractContextManager[None]:
     """An image processor's ``preprocess`` reads and resizes in float32, and casts last.
 
-    PyTorch has no kernels for half precision on a CPU, and float16 cannot represent the white of a 16-bit
-    image.
+    There are no kernels for half precision on a CPU, and float16 has no white of a 16-bit image.
     """
     stock = processor.preprocess
 
@@ -88,18 +84,19 @@ def images_in_float32(processor: Any) -> AbstractContextManager[None]:
 
 
 class Exclusive:
-    """Context manager that holds the locks of some objects; a thread may enter it again inside.
+    """What a call holds: its pipeline; a guided one also the pipeline's networks, and ``WithinCores``.
 
-    Args:
-        owners: objects that can be weakly referenced.
-        inside: further context managers, entered once the locks are held, and again after ``given_back``.
+    So a guided call changes no pipeline whose stock call runs in another thread, and two pipelines that share
+    networks are not guided at once. Stock calls of other pipelines are not held up. A thread may enter again.
     """
 
-    def __init__(self, owners: Iterable[Any], *inside: AbstractContextManager[object]) -> None:
+    def __init__(self, pipe: Any, guided: bool) -> None:
+        owners = [pipe, *_modules(pipe)] if guided else [pipe]
         with _LOCKS_GUARD:
             locks = {id(lock): lock for lock in (_LOCKS.setdefault(o, threading.RLock()) for o in owners)}
-        # All threads take them in one order, so that no two wait for each other.
-        self._contexts = [*(lock for _, lock in sorted(locks.items())), *inside]
+        # All threads take them in the same order, so that no two wait for each other.
+        self._contexts: list[Any] = [lock for _, lock in sorted(locks.items())]
+        self._contexts += [WithinCores()] if guided else []
         self._stack = ExitStack()
 
     def __enter__(self) -> Exclusive:
@@ -122,25 +119,12 @@ class Exclusive:
             self.__enter__()
 
 
-def exclusive_call(pipe: Any, guided: bool) -> Exclusive:
-    """What a call holds: the pipeline, and a guided one also its networks and ``WithinCores``.
-
-    So a guided call changes no pipeline whose stock call runs in another thread, and two pipelines that share
-    networks are not guided at once. Stock calls of other pipelines are not held up.
-    """
-    return Exclusive([pipe, *_modules(pipe)], WithinCores()) if guided else Exclusive([pipe])
-
-
 class DenoiserTap:
     """Runs the network with gradients to its depth latent, and again at another latent.
 
-    The instance gets an attribute that hides its class's method, so that hooks and compiled forwards below
-    are called as before. Source: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
-
-    Args:
-        owner: object whose method the loop calls: the U-Net, or a pipeline of ours.
-        method: name of the method, ``"forward"`` of a module; its first argument holds the latent.
-        channels: which channels of that argument are the depth latent.
+    An attribute of the instance ``owner`` hides its class's ``method``, so that hooks and compiled forwards
+    below are called as before. ``channels`` of the method's first argument are the depth latent.
+    Source: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
     """
 
     def __init__(self, owner: Any, method: str, channels: slice) -> None:
@@ -173,7 +157,7 @@ class DenoiserTap:
         return self._leaf
 
     def release(self) -> None:
-        """Drop the graph and everything that it holds."""
+        """Drop the graph and all that it holds."""
         self._at = self._leaf = self._output = None
 
     def _run(self, forward: Callable[..., Any], model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
@@ -214,13 +198,13 @@ def _first(result: Any) -> Tensor:
 class GuidedScheduler:
     """A copy of the scheduler: ``set_timesteps`` starts a trajectory, ``step`` is guided.
 
-    A pipeline that shares the scheduler never meets a guided ``step``, and the state of the user's scheduler
-    stays what it was. The copy goes onto the pipeline past ``DiffusionPipeline.__setattr__``, which would
-    rewrite the pipeline's config. A scheduler of which the user replaced a method on the instance is used
-    itself, since such a method usually holds on to the instance; all its attributes are put back.
+    So a pipeline that shares the scheduler never meets a guided ``step``, and the user's keeps its state. The
+    copy goes onto the pipeline past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's
+    config. A scheduler of which the user replaced a method on the instance is used itself, since the method
+    usually holds on to it; all its attributes are put back.
 
-    ``step`` gets the timesteps on the CPU, where diffusers keeps the tables that they index: compared and
-    looked up on another device, each would be waited for several times a step.
+    ``step`` gets the timesteps on the CPU, where diffusers keeps the tables that they index: looked up on
+    another device, each would be waited for several times a step.
 
     Args:
         pipe: the live pipeline.
@@ -229,8 +213,7 @@ class GuidedScheduler:
             step shall be given, and what to add to its ``z_{t-1}`` (``None`` for nothing).
         on_done: ``(timestep, z_{t-1}) -> z_{t-1}``, after the step.
         respace: run a leading DDIM as trailing.
-        skipped: steps at the beginning of the schedule that are left out; for a DDIM, whose step asks for the
-            timestep alone.
+        skipped: steps at the beginning of the schedule of a DDIM that are left out.
     """
 
     def __init__(

@@ -29,24 +29,20 @@ def versions() -> dict[str, str]:
 
 
 def pick_device(name: str) -> torch.device:
-    """The device of that name; ``"auto"`` takes CUDA, then MPS, then the CPU.
-
-    Raises ``InputError`` where this machine has no such device.
-    """
-    here = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    """The device of that name, if this machine has it; ``"auto"`` takes CUDA, then MPS, then the CPU."""
+    here = {"cuda": torch.cuda.device_count(), "mps": int(torch.backends.mps.is_available()), "cpu": 1}
     if name == "auto":
-        return torch.device(next(kind for kind, available in here.items() if available))
+        return torch.device(next(kind for kind, count in here.items() if count))
     try:
         device = torch.device(name)
     except RuntimeError:
         device = torch.device("meta")
     if device.type not in here:
         bad_value("--device", "auto, cpu, cuda, cuda:N or mps", repr(name))
-    if not here[device.type]:
-        bad_value("--device", "a device of this machine", repr(name), f"PyTorch finds no {device.type} here.")
-    count = torch.cuda.device_count()
-    if device.type == "cuda" and (device.index or 0) >= count:
-        bad_value("--device", f"one of the {count} CUDA devices of this machine", repr(name))
+    count = here[device.type]
+    if (device.index or 0) >= count:
+        found = f"PyTorch finds {count or 'no'} {device.type} here."
+        bad_value("--device", "a device of this machine", repr(name), found)
     return device
 
 
@@ -68,22 +64,22 @@ class PeakMemory:
 
     def __init__(self, device: torch.device) -> None:
         self.device, self.peak_bytes = device, 0
-        self._start = self._highest = 0
+        self._resident: list[int] = []
         self._process, self._done = psutil.Process(), threading.Event()
-        self._sampler = threading.Thread(target=self._sample, daemon=True)
-
-    def _resident(self) -> int:
-        return int(self._process.memory_info().rss)
+        self._sampler = threading.Thread(target=self._sample_until_done, daemon=True)
 
     def _sample(self) -> None:
+        self._resident.append(self._process.memory_info().rss)
+
+    def _sample_until_done(self) -> None:
         while not self._done.wait(SAMPLING_INTERVAL_S):
-            self._highest = max(self._highest, self._resident())
+            self._sample()
 
     def __enter__(self) -> PeakMemory:
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
         else:
-            self._start = self._highest = self._resident()
+            self._sample()
             self._sampler.start()
         return self
 
@@ -93,4 +89,5 @@ class PeakMemory:
             return
         self._done.set()
         self._sampler.join()
-        self.peak_bytes = max(self._highest, self._resident()) - self._start
+        self._sample()
+        self.peak_bytes = max(self._resident) - self._resident[0]

@@ -23,20 +23,12 @@ from geodiff_plugin.algorithm.denoising import NoiseLevel
 from geodiff_plugin.priors.components import DirectScheduler
 
 
-def _clip(scheduler: Any) -> float | None:
-    if getattr(scheduler.config, "clip_sample", False):
-        return float(getattr(scheduler.config, "clip_sample_range", 1.0))
-    return None
-
-
 def _discrete(scheduler: Any, timestep: Tensor) -> NoiseLevel:
     """Schedulers that index ``alphas_cumprod`` by the timestep."""
-    # Indexed where the table lies, which diffusers leaves on the CPU.
-    table = scheduler.alphas_cumprod
-    alpha_bar = table[timestep.to(table.device)].float()
-    return NoiseLevel(
-        alpha_bar.sqrt(), (1.0 - alpha_bar).sqrt(), scheduler.config.prediction_type, _clip(scheduler)
-    )
+    table, config = scheduler.alphas_cumprod, scheduler.config
+    alpha_bar = table[timestep.to(table.device)].float()  # diffusers leaves the table on the CPU
+    clip = float(config.get("clip_sample_range", 1.0)) if config.get("clip_sample") else None
+    return NoiseLevel(alpha_bar.sqrt(), (1.0 - alpha_bar).sqrt(), config.prediction_type, clip)
 
 
 def _sigma(scheduler: Any, timestep: Tensor) -> Tensor:
@@ -74,13 +66,17 @@ FAMILIES: dict[type, Callable[[Any, Tensor], NoiseLevel]] = {
 
 
 def noise_level(scheduler: Any, timestep: Tensor) -> NoiseLevel:
-    """Signal and noise level that the scheduler's next ``step``, of this timestep, assumes.
+    """Signal and noise level that the scheduler's next ``step`` assumes.
 
     ``timestep`` is a 0-d tensor out of ``scheduler.timesteps``. Raises ``InputTypeError`` if no family fits.
     """
+    return _family(scheduler)(scheduler, timestep)
+
+
+def _family(scheduler: Any) -> Callable[[Any, Tensor], NoiseLevel]:
     for cls, family in FAMILIES.items():
         if isinstance(scheduler, cls):
-            return family(scheduler, timestep)
+            return family
     names = ", ".join(cls.__name__ for cls in FAMILIES)
     cure = "Use pipe.scheduler = DDIMScheduler.from_config(pipe.scheduler.config)."
     bad_type("pipe.scheduler", f"one of {names}", scheduler, cure)
@@ -89,13 +85,10 @@ def noise_level(scheduler: Any, timestep: Tensor) -> NoiseLevel:
 def check_scheduler(scheduler: Any) -> None:
     """Refuse a scheduler that guidance (or the stock pipeline) cannot run, before anything is computed.
 
-    Raises:
-        TypeError: no family.
-        ValueError: noise prediction with zero terminal SNR: its first step is 0 / 0, NaN in diffusers too;
-            dynamic thresholding, which is made for pixels and bends latents.
+    That is one of no family; noise prediction with zero terminal SNR, whose first step is 0 / 0, NaN in
+    diffusers too; dynamic thresholding, which is made for pixels and bends latents.
     """
-    if not isinstance(scheduler, tuple(FAMILIES)):
-        noise_level(scheduler, torch.tensor(0))
+    _family(scheduler)
     name, config = type(scheduler).__name__, scheduler.config
     if getattr(config, "rescale_betas_zero_snr", False) and config.prediction_type == "epsilon":
         expected = "able to tell the clean latent from the network's output at every step"
@@ -111,8 +104,8 @@ def check_scheduler(scheduler: Any) -> None:
 def trailing_timesteps(scheduler: Any, num_inference_steps: int) -> Tensor | None:
     """Timesteps of the same schedule with trailing spacing, for a DDIM that is ``leading``; else ``None``.
 
-    A leading schedule never visits t = 999 and starts from pure noise at a level that is none:
-    with one step it runs at t = 1. Every serious user of Marigold v1-0 switches.
+    A leading schedule never visits t = 999 and starts from pure noise at a level that is none: with one step
+    it runs at t = 1.
     """
     if not isinstance(scheduler, DDIMScheduler) or scheduler.config.timestep_spacing != "leading":
         return None

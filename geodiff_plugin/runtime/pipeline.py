@@ -30,7 +30,7 @@ from geodiff_plugin.runtime.checks import (
     check_named_arguments,
 )
 from geodiff_plugin.runtime.estimate import ProcessingGrid
-from geodiff_plugin.runtime.hooks import Exclusive, exclusive_call
+from geodiff_plugin.runtime.hooks import Exclusive
 from geodiff_plugin.runtime.output import assemble_output, ensemble_metric
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback
 from geodiff_plugin.runtime.start import depth_prompt, plan_warm_start
@@ -82,7 +82,7 @@ class GuidedCall(_Stock):
         """
         if guidance is None and callback_on_step_end is not None:
             bad_value("callback_on_step_end", "given together with guidance", "guidance=None")
-        with exclusive_call(self, guidance is not None) as held:
+        with Exclusive(self, guidance is not None) as held:
             if self._guided_run is not None:
                 raise RuntimeError(
                     "This pipeline is in the middle of a guided call; call it again from "
@@ -90,42 +90,31 @@ class GuidedCall(_Stock):
                 )
             if guidance is None:
                 return super().__call__(image, *args, **kwargs)
-            stock_call = super().__call__
             _check_guided_call(guidance, callback_on_step_end)
             with torch.inference_mode(False), torch.no_grad(), noted() as warned:
-                return self._call_guided(
-                    stock_call,
-                    held,
-                    warned,
-                    guidance,
-                    callback_on_step_end,
-                    strict,
-                    image,
-                    *args,
-                    **kwargs,
-                )
+                call = _bind(super().__call__, image, *args, **kwargs)
+                run, stock = self._call_guided(call, guidance, callback_on_step_end, held)
+                with torch.autocast(self._execution_device.type, enabled=False):
+                    output = assemble_output(stock, run, guidance, call, guidance.warned | warned)
+        if strict and not output.verdict.trusted:
+            refuse(output.verdict.sentence)
+        output.latent = stock.latent if call["output_latent"] else None
+        return output if call["return_dict"] else (output.prediction, output.uncertainty, output.latent)
 
     def _call_guided(
-        self,
-        stock_call: Callable[..., Any],
-        held: Exclusive,
-        warned: dict[str, bool],
-        guidance: GeometryGuidance,
-        callback: StepCallback | None,
-        strict: bool,
-        image: Any,
-        *args: Any,
-        **kwargs: Any,
-    ) -> Any:
-        image, count = check_left_images(image)
-        call, prior = _bind(stock_call, image, *args, **kwargs), find_adapter(self)(self)
+        self, call: dict[str, Any], guidance: GeometryGuidance, callback: StepCallback | None, held: Exclusive
+    ) -> tuple[GuidedRun, Any]:
+        """The stock call with everything in place; ``call`` becomes what it was given in the end."""
+        image, count = check_left_images(call["image"])
+        prior = find_adapter(self)(self)
         check_arguments(call, count)
         asked = call["num_inference_steps"]
         wanted = guidance.denoising_steps(asked, self.default_denoising_steps)
-        call["num_inference_steps"], rounds = count_steps(wanted, asked, prior.max_steps)
-        call["resample_method_output"] = call["resample_method_output"] or "bilinear"
+        steps, rounds = count_steps(wanted, asked, prior.max_steps)
+        resampling = call["resample_method_output"] or "bilinear"
+        call |= {"image": image, "num_inference_steps": steps, "resample_method_output": resampling}
         check_guidable(self, prior, guidance)
-        tiny = tiny_autoencoder(self, prior, guidance.config.decoder)
+        tiny = tiny_autoencoder(self, guidance.config.decoder)
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= _one_member(call)
         device = self._execution_device
@@ -141,30 +130,15 @@ class GuidedCall(_Stock):
         if call["latents"] is not None:
             call["image"] = lefts_01  # beside latents Marigold takes no channels-last image
         run = GuidedRun(
-            self,
-            prior,
-            guidance,
-            evidence,
-            call,
-            grid=grid,
-            rounds=rounds,
-            callback=callback,
-            tiny=tiny,
-            held=held,
-            warm=warm,
+            self, prior, guidance, evidence, call, grid, rounds, callback, tiny=tiny, held=held, warm=warm
         )
         try:
             with run:
-                stock = stock_call(**{**call, "return_dict": True, "output_latent": True})
+                stock = super().__call__(**{**call, "return_dict": True, "output_latent": True})
         finally:
             run.release()
         run.check_finite()
-        with torch.autocast(device.type, enabled=False):
-            output = assemble_output(stock, run, guidance, call, guidance.warned | warned)
-        if strict and not output.verdict.trusted:
-            refuse(output.verdict.sentence)
-        output.latent = stock.latent if call["output_latent"] else None
-        return output if call["return_dict"] else (output.prediction, output.uncertainty, output.latent)
+        return run, stock
 
     def _processing_grid(self, image: Any, call: dict[str, Any], device: torch.device) -> ProcessingGrid:
         """The grid that the stock call will denoise on, found by its own preprocessing."""
@@ -201,11 +175,8 @@ class GuidedCall(_Stock):
         return DepthDiffusionPipeline.put_together(self, maps, *args, **kwargs)
 
     def save_pretrained(self, *args: Any, **kwargs: Any) -> None:
-        """Save the stock pipeline: the folder loads where this package is not installed.
-
-        A call that runs in another thread is waited for; one that begins meanwhile is not disturbed.
-        """
-        with exclusive_call(self, guided=False):
+        """Save the stock pipeline: the folder loads where this package is not installed."""
+        with Exclusive(self, guided=False):
             twin = copy.copy(self)
         twin.__class__ = _stock_class(type(self))
         twin.save_pretrained(*args, **kwargs)
@@ -265,17 +236,7 @@ def _stock_class(guided: type) -> type:
 def _guided_class(stock: type) -> type:
     if stock is MarigoldDepthPipeline:
         return GuidedMarigoldDepthPipeline
-    members = {"__doc__": GuidedMarigoldDepthPipeline.__doc__, "__reduce__": _reduced}
-    return type(f"Guided{stock.__name__}", (GuidedCall, stock), members)
-
-
-def _reduced(pipe: GuidedCall) -> tuple[Any, ...]:
-    """For pickle, which finds no class by name that was made at run time."""
-    return _without_state, (_stock_class(type(pipe)),), vars(pipe)
-
-
-def _without_state(stock: type) -> Any:
-    return object.__new__(_guided_class(stock))
+    return type(f"Guided{stock.__name__}", (GuidedCall, stock), {"__doc__": GuidedCall.__doc__})
 
 
 def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:

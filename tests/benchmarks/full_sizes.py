@@ -40,8 +40,7 @@ from geodiff_plugin.priors.e2e_ft import E2EFTPipeline
 from geodiff_plugin.priors.geowizard import GeoWizardPipeline
 from geodiff_plugin.priors.lotus import LotusPipeline
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
-from geodiff_plugin.priors.pixel_dit import PixelDiT
-from geodiff_plugin.priors.ppd import PPDPipeline
+from geodiff_plugin.priors.ppd import PixelDiT, PPDPipeline
 from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline
 
 __all__ = ["FULL_SIZES", "SCHEDULER", "UNET", "VAE"]

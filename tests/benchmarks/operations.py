@@ -26,7 +26,6 @@ from torch.utils.flop_counter import FlopCounterMode
 from examples.fitted_lora import draw_points
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.priors.tiny import TINY, tiny_autoencoder
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from tests.benchmarks.full_sizes import UNET, VAE
@@ -144,7 +143,7 @@ def count_calls(way: str, size: Size, folder: str) -> Calls:
     pipe = random_marigold(width=COUNTED_WIDTH)
     pipe.set_progress_bar_config(disable=True)
     calls: Counter[str] = Counter()
-    tiny = tiny_autoencoder(pipe, find_adapter(pipe)(pipe), folder)
+    tiny = tiny_autoencoder(pipe, folder)
     networks = [(pipe.unet, "forward", "network")]
     networks += [(pipe.vae, method, method) for method in ("decode", "encode")]
     networks += [(tiny, method, f"tiny {method}") for method in ("decode", "encode")]

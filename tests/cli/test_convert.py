@@ -19,9 +19,9 @@ from geodiff_plugin.cli.converters.marigold_v2 import merged, read_prompt
 from geodiff_plugin.priors import find_prior, load_prior
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
-from geodiff_plugin.priors.pixel_dit import PixelDiT
+from geodiff_plugin.priors.ppd import PixelDiT
 from tests.conftest import make_text_encoder, make_vae
-from tests.contracts.tiny_ppd import make_ppd
+from tests.contracts.tiny_priors import make_ppd
 from tests.parity import marigold_v2_reference as reference
 from tests.parity.depthfm_reference import HPARAMS, VAE
 from tests.parity.depthmaster_reference import UNET

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.contracts.tiny_depthmaster import make_depthmaster
+from tests.contracts.tiny_priors import make_depthmaster
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 

@@ -15,7 +15,7 @@ from diffusers.modular_pipelines.qwenimage.encoders import QwenImageEditResizeSt
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from tests.contracts.tiny_depthmaster import make_depthmaster
+from tests.contracts.tiny_priors import make_depthmaster
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "modular"
 KNOBS = {"inner_steps": 1, "min_steps": 1}

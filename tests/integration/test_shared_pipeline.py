@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,7 +14,7 @@ from diffusers.configuration_utils import FrozenDict
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from tests.conftest import SCHEDULER
-from tests.contracts.tiny_lotus import make_lotus
+from tests.contracts.tiny_priors import AT_64, make_lotus, quiet
 
 BETAS = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012}
 SCHEDULERS = {
@@ -24,58 +23,50 @@ SCHEDULERS = {
 }
 
 
-def guidance_for(pair, **knobs) -> GeometryGuidance:
-    """Without a sweep, for the sake of time."""
-    return GeometryGuidance.paper(pair.right, pair.K, pair.E, **knobs)
-
-
-def seeded() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
-
-
 def sharing(pipe: MarigoldDepthPipeline) -> MarigoldDepthPipeline:
     """A stock pipeline of the same components, as users make one beside a guided one."""
-    twin = MarigoldDepthPipeline(
-        **pipe.components,
-        prediction_type="depth",
-        default_denoising_steps=2,
-        default_processing_resolution=64,
-    )
-    twin.set_progress_bar_config(disable=True)
-    return twin
+    told = {"prediction_type": "depth", "default_denoising_steps": 2, **AT_64}
+    return quiet(MarigoldDepthPipeline(**pipe.components, **told))
 
 
-def calls_of(pipe, pair, **knobs):
-    """A stock call and a guided one of two steps each."""
-    call = {"num_inference_steps": 2}
-    return (
-        lambda: pipe(pair.left, generator=seeded(), **call).prediction,
-        lambda callback=None: (
-            pipe(
-                pair.left,
-                guidance=guidance_for(pair, **knobs),
-                generator=seeded(),
-                callback_on_step_end=callback,
-                **call,
-            ).prediction
-        ),
-    )
+def calls_of(pipe, pair, steps=2, **knobs):
+    """A stock call and a guided one, which takes a callback; without a sweep, for the sake of time."""
+
+    def stock(**more):
+        seeded = torch.Generator().manual_seed(0)
+        return pipe(pair.left, generator=seeded, num_inference_steps=steps, **more).prediction
+
+    def guided(callback=None):
+        guidance = GeometryGuidance.paper(pair.right, pair.K, pair.E, **knobs)
+        return stock(guidance=guidance, callback_on_step_end=callback)
+
+    return stock, guided
 
 
 @pytest.mark.parametrize(
     ("name", "gradient", "other"),
-    [("dpm", "denoised", "itself"), ("ddim", "full", "sharing"), ("ddim", "full", "guided")],
+    [
+        ("dpm", "denoised", "itself"),
+        ("ddim", "full", "sharing"),
+        ("ddim", "full", "guided"),
+        ("lotus", "full", "small"),
+    ],
 )
 def test_any_call_from_a_callback_is_what_it_is_alone(make_pipeline, textured_plane, name, gradient, other):
-    pipe = enable_geometry_guidance(make_pipeline(SCHEDULERS[name]()))
-    stock, guided = calls_of(pipe, textured_plane, gradient=gradient)
-    inner = {"itself": stock, "guided": guided, "sharing": calls_of(sharing(pipe), textured_plane)[0]}[other]
+    pipe = make_lotus("g") if name == "lotus" else make_pipeline(SCHEDULERS[name]())
+    pipe = enable_geometry_guidance(pipe)
+    stock, guided = calls_of(pipe, textured_plane, 1 if name == "lotus" else 2, gradient=gradient)
+    inner = {
+        "itself": stock,
+        "guided": guided,
+        "small": lambda: stock(processing_resolution=40),
+        "sharing": lambda: calls_of(sharing(pipe), textured_plane)[0](),
+    }[other]
     alone_inner, alone_outer, found = inner(), guided(), []
-    outer = guided(lambda *_: found.append(inner()))
-    np.testing.assert_array_equal(outer, alone_outer)
-    assert len(found) == 2
-    for one in found:
-        np.testing.assert_array_equal(one, alone_inner)
+    np.testing.assert_array_equal(guided(lambda *_: found.append(inner())), alone_outer)
+    assert len(found) == (1 if name == "lotus" else 2)
+    for prediction in found:
+        np.testing.assert_array_equal(prediction, alone_inner)
 
 
 def test_the_users_scheduler_is_not_touched(make_pipeline, textured_plane):
@@ -85,7 +76,7 @@ def test_the_users_scheduler_is_not_touched(make_pipeline, textured_plane):
     scheduler, config = pipe.scheduler, dict(pipe.config)
     before, seen = copy.deepcopy(vars(scheduler)), []
     guided(lambda p, *_: seen.append(p.scheduler))
-    assert pipe.scheduler is scheduler and all(one is scheduler for one in seen)
+    assert pipe.scheduler is scheduler and all(found is scheduler for found in seen)
     assert dict(pipe.config) == config and isinstance(pipe.config, FrozenDict)
     torch.testing.assert_close(_tensors(vars(scheduler)), _tensors(before), rtol=0, atol=0)
     assert before.keys() == vars(scheduler).keys() and scheduler.step_index == 2
@@ -100,51 +91,40 @@ def test_methods_that_the_user_replaced_are_used_and_kept(make_pipeline, texture
     stock, guided = calls_of(pipe, textured_plane)
     reference, plain = guided(), stock()
     scheduler, calls = pipe.scheduler, []
-    own_step, own_set_timesteps = scheduler.step, scheduler.set_timesteps
 
-    def step(*args, **kwargs):
-        calls.append("step")
-        return own_step(*args, **kwargs)
+    def counted(method):
+        def call(*args, **kwargs):
+            calls.append(method.__name__)
+            return method(*args, **kwargs)
 
-    def set_timesteps(*args, **kwargs):
-        calls.append("set")
-        return own_set_timesteps(*args, **kwargs)
+        return call
 
-    scheduler.step, scheduler.set_timesteps = step, set_timesteps
+    scheduler.step, scheduler.set_timesteps = step, _ = (
+        counted(scheduler.step),
+        counted(scheduler.set_timesteps),
+    )
     np.testing.assert_array_equal(guided(), reference)
-    assert calls == ["set", "step", "step"]
-    assert scheduler.step is step and scheduler.set_timesteps is set_timesteps
+    assert calls == ["set_timesteps", "step", "step"] and scheduler.step is step
     inside = []
     np.testing.assert_array_equal(guided(lambda *_: inside.append(stock())), reference)
     np.testing.assert_array_equal(inside[0], plain)
-
-
-def test_saved_in_a_callback_it_is_the_stock_pipeline(make_pipeline, textured_plane, tmp_path):
-    pipe = enable_geometry_guidance(make_pipeline())
-    calls_of(pipe, textured_plane)[1](lambda p, *_: p.save_pretrained(tmp_path / "saved"))
-    make_pipeline().save_pretrained(tmp_path / "stock")
-    for name in ("model_index.json", "scheduler/scheduler_config.json", "unet/config.json"):
-        saved, stock = (json.loads((tmp_path / kind / name).read_text()) for kind in ("saved", "stock"))
-        assert saved == stock
 
 
 def test_a_scheduler_assigned_in_a_callback_stays(make_pipeline, textured_plane):
     pipe, other = enable_geometry_guidance(make_pipeline()), SCHEDULERS["dpm"]()
     guided = calls_of(pipe, textured_plane)[1]
     reference = guided()
-
-    def assign(p, *_):
-        p.scheduler = other
-
-    np.testing.assert_array_equal(guided(assign), reference)  # the call goes on with its own
+    found = guided(lambda p, *_: setattr(p, "scheduler", other))
+    np.testing.assert_array_equal(found, reference)  # the call goes on with its own
     assert pipe.scheduler is other and pipe.config["scheduler"][1] == "DPMSolverMultistepScheduler"
 
 
-def test_threads_on_one_pipeline_wait_for_each_other(make_pipeline, textured_plane):
+def test_threads_on_shared_networks_wait_for_each_other(make_pipeline, textured_plane):
     pipe = enable_geometry_guidance(make_pipeline())
     stock, guided = calls_of(pipe, textured_plane, gradient="full")
-    twin_stock, _ = calls_of(sharing(pipe), textured_plane)
-    expected = [stock(), guided(), twin_stock()]
+    twin_guided = calls_of(enable_geometry_guidance(sharing(pipe)), textured_plane, gradient="full")[1]
+    calls = [stock, guided, calls_of(sharing(pipe), textured_plane)[0], twin_guided]
+    expected = [call() for call in calls]
     start = threading.Barrier(4)
 
     def together(call):
@@ -152,20 +132,9 @@ def test_threads_on_one_pipeline_wait_for_each_other(make_pipeline, textured_pla
         return call()
 
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(together, [stock, guided, twin_stock, guided]))
-    for one, reference in zip(found, [*expected, expected[1]], strict=True):
-        np.testing.assert_array_equal(one, reference)
-    assert all(p.requires_grad for p in pipe.unet.parameters())
-
-
-def test_two_pipelines_of_the_same_networks_are_guided_one_after_the_other(make_pipeline, textured_plane):
-    pipe = enable_geometry_guidance(make_pipeline())
-    pipes = [pipe, enable_geometry_guidance(sharing(pipe))]
-    calls = [calls_of(p, textured_plane, gradient="full")[1] for p in pipes]
-    reference = calls[0]()
-    with ThreadPoolExecutor(2) as pool:
-        for found in pool.map(lambda call: call(), calls):
-            np.testing.assert_array_equal(found, reference)
+        found = list(pool.map(together, calls))
+    for prediction, reference in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(prediction, reference)
     assert all(p.requires_grad for p in pipe.unet.parameters()) and "forward" not in vars(pipe.unet)
 
 
@@ -191,22 +160,3 @@ def test_a_call_from_a_hook_of_the_network_is_refused(make_pipeline, textured_pl
         guided()
     hook.remove()
     assert np.isfinite(stock()).all()
-
-
-def test_a_prior_of_our_own_is_itself_in_a_callback(textured_plane):
-    pipe = enable_geometry_guidance(make_lotus("g"))
-    stock, guided = (
-        lambda **k: pipe(textured_plane.left, generator=seeded(), **k).prediction,
-        lambda f=None: (
-            pipe(
-                textured_plane.left,
-                guidance=guidance_for(textured_plane, gradient="full"),
-                generator=seeded(),
-                callback_on_step_end=f,
-            ).prediction
-        ),
-    )
-    small, alone, found = stock(processing_resolution=40), guided(), []
-    outer = guided(lambda *_: found.append(stock(processing_resolution=40)))
-    np.testing.assert_array_equal(found[0], small)
-    np.testing.assert_array_equal(outer, alone)

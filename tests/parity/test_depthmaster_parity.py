@@ -10,7 +10,6 @@ import torch
 from diffusers import AutoencoderKL
 from PIL import Image
 
-from geodiff_plugin.priors import depthmaster
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
 from tests.conftest import make_text_encoder
 from tests.parity.depthmaster_reference import UNET, VAE, image_u8, prompt
@@ -27,7 +26,7 @@ def theirs():
 
 @pytest.fixture
 def pipe(tokenizer, monkeypatch):
-    monkeypatch.setattr(depthmaster, "text_embedding", lambda *_: prompt())
+    monkeypatch.setattr(DepthMasterPipeline, "prompt_embedding", lambda *_: prompt())
     unet, vae = fill(FourierUNet(**UNET), "unet."), fill(AutoencoderKL(**VAE), "vae.")
     pipe = DepthMasterPipeline(unet.eval(), vae.eval(), make_text_encoder(), tokenizer)
     pipe.set_progress_bar_config(disable=True)

@@ -50,7 +50,7 @@ def as_tensor(photograph: np.ndarray) -> torch.Tensor:
 def test_preparation(name, photograph):
     processor = PROCESSORS[name]
     theirs = processor(photograph, return_tensors="pt")["pixel_values"]
-    preparation = Preparation.from_config(processor.to_dict())
+    preparation = Preparation(processor.to_dict())
     ours = preparation(as_tensor(photograph))
     deviation = min(preparation.options["image_std"]) if preparation.options["do_normalize"] else 1.0
     # They round to bytes after either axis; ZoeDepth and what is not resized are never rounded.
@@ -63,7 +63,7 @@ def test_map(kind, photograph):
     torch.manual_seed(0)
     model, config = MODELS[kind]()
     spread(model)
-    preparation = Preparation.from_config(config)
+    preparation = Preparation(config)
     processor = (GLPNImageProcessorPil if kind == "glpn" else DPTImageProcessorPil)()
     with torch.no_grad():
         output = model(pixel_values=preparation(as_tensor(photograph)))
@@ -101,7 +101,7 @@ def test_metres_by_the_librarys_own_ending(kind, library, photograph, monkeypatc
     torch.manual_seed(0)
     model, config = MODELS[kind]()
     spread(model)
-    preparation, told = Preparation.from_config(config), {}
+    preparation, told = Preparation(config), {}
     if kind == "prompt_depth_anything":
         told["prompt_depth"] = torch.rand(1, 1, 12, 16) * 3 + 1
     output = model(pixel_values=preparation(as_tensor(photograph)), **told)

@@ -12,8 +12,13 @@ from PIL import Image
 
 from geodiff_plugin.cli.convert import run_convert
 from geodiff_plugin.priors.loading import Layout
-from geodiff_plugin.priors.pixel_dit import PixelDiT
-from geodiff_plugin.priors.ppd import AreaImageProcessor, PPDPrior, sampling_timesteps, semantic_tokens
+from geodiff_plugin.priors.ppd import (
+    AreaImageProcessor,
+    PixelDiT,
+    PPDPrior,
+    sampling_timesteps,
+    semantic_tokens,
+)
 from tests.parity import ppd_reference as reference
 from tests.parity.named_weights import named_state
 

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.algorithm import settling
 from geodiff_plugin.algorithm.evidence import prepare_evidence
 from geodiff_plugin.cli.report import summary_line
 from geodiff_plugin.config import DEFAULT
@@ -21,43 +22,37 @@ from tests.scenes import render_pair
 FAST = {"inner_steps": 1, "min_steps": 1}
 
 
-def knows(pipe, depth_m, factor=1.0):
-    """Let the model answer with the truth, in its own unit, times a factor."""
-    kind = type(pipe.model).__name__
-    answer = torch.from_numpy(depth_m)[None] * factor
-    told = []
+def knowing(kind, depth_m, factor=1.0):
+    """A model that answers with the truth, in its own unit, times a factor; to a prompt, with the prompt."""
+    pipe, answer = make_transformers(kind), torch.from_numpy(depth_m)[None] * factor
 
     def forward(pixel_values, prompt_depth=None):
-        told.append(prompt_depth)
-        fov = {}
-        if kind.startswith("DepthPro"):
+        values, fov = answer, {}
+        if kind == "depth_pro":
             values, fov = 1 / answer, {"field_of_view": torch.tensor([2 * np.degrees(np.arctan(0.5))])}
-        else:
-            values = answer
+        elif prompt_depth is not None:
+            values = torch.nn.functional.interpolate(prompt_depth, answer.shape[1:], mode="bilinear")[:, 0]
         return type("Output", (), {"predicted_depth": values, **fov})()
 
     pipe.model.forward = forward
-    return told
+    return enable_geometry_guidance(pipe)
 
 
 def guided(pipe, pair, **knobs):
-    enable_geometry_guidance(pipe)
     guidance = GeometryGuidance(pair.right, pair.K, pair.E, **FAST | knobs)
     return pipe(Image.fromarray(pair.left), guidance=guidance, processing_resolution=64)
 
 
 @pytest.mark.parametrize("kind", ["zoedepth", "glpn", "tipsv2", "depth_pro"])
 def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
-    pipe = make_transformers(kind)
-    knows(pipe, textured_plane.depth_m, factor=0.5)
-    out = guided(pipe, textured_plane)
-    assert out.own_scale.shape == (1, 1)
-    assert float(out.own_scale) == pytest.approx(2.0, rel=0.015)
+    out = guided(knowing(kind, textured_plane.depth_m, factor=0.5), textured_plane)
+    assert out.own_scale.shape == (1, 1) and float(out.own_scale) == pytest.approx(2.0, rel=0.015)
     assert any("2 times the prior's own metres" in sentence for sentence in out.warnings)
     assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.01)
 
 
-def test_the_summary_names_the_factor_of_a_metric_prior_alone():
+def test_the_summary_names_the_factor_of_a_metric_prior_alone(textured_plane):
+    assert guided(knowing("depth_anything", textured_plane.depth_m), textured_plane).own_scale is None
     depth = {"min_m": 1.0, "median_m": 2.0, "max_m": 3.0, "visible_fraction": 1.0}
     signs = {"confidence": 0.9, "matched": 0.5, "points": 0}
     report = {"depth": depth, "seconds": {"all": 1.0}, "own_scale": [[1.2]], "unit": "m"}
@@ -66,25 +61,16 @@ def test_the_summary_names_the_factor_of_a_metric_prior_alone():
     assert "own metres" not in summary_line(report | {"own_scale": None}, "out/")
 
 
-def test_a_relative_prior_has_no_metres_to_be_off(textured_plane):
-    assert guided(make_transformers("depth_anything"), textured_plane).own_scale is None
-
-
 @pytest.mark.parametrize("kind", ["tipsv2", "depth_pro"])
 def test_the_search_starts_from_the_priors_own_metres(kind, textured_plane, monkeypatch):
-    from geodiff_plugin.algorithm import settling
-
-    started = []
-    own = settling.search_scale
+    started, stock = [], settling.search_scale
 
     def watched(*arguments, current=None, **options):
         started.append(current)
-        return own(*arguments, current=current, **options)
+        return stock(*arguments, current=current, **options)
 
     monkeypatch.setattr(settling, "search_scale", watched)
-    pipe = make_transformers(kind)
-    knows(pipe, textured_plane.depth_m)
-    out = guided(pipe, textured_plane, crisp=False)
+    out = guided(knowing(kind, textured_plane.depth_m), textured_plane, crisp=False)
     ends = sorted(float(v) for v in started[0])
     # One end is the map's 98 % quantile, which lies up to 6.4 % within the range of this plane.
     assert ends[0] == pytest.approx(textured_plane.depth_m.min(), rel=0.08)
@@ -93,12 +79,9 @@ def test_the_search_starts_from_the_priors_own_metres(kind, textured_plane, monk
 
 
 def test_where_the_views_say_nothing_the_priors_metres_stand(textured_plane):
-    pipe = make_transformers("zoedepth")
-    knows(pipe, textured_plane.depth_m)
-    pipe = enable_geometry_guidance(pipe)
     grey = np.full_like(textured_plane.left, 128)
-    guidance = GeometryGuidance(grey, textured_plane.K, textured_plane.E, **FAST)
-    out = pipe(Image.fromarray(grey), guidance=guidance, processing_resolution=64)
+    blank = replace(textured_plane, left=grey, right=grey)
+    out = guided(knowing("zoedepth", textured_plane.depth_m), blank)
     assert float(out.own_scale) == pytest.approx(1.0, abs=1e-3)
 
 
@@ -106,10 +89,9 @@ def evidence_of(pair, points=None, rights=True):
     def image(x):
         return torch.from_numpy(x).permute(2, 0, 1) / 255.0
 
-    T = torch.tensor(np.linalg.inv(pair.E)).float()
-    right = CameraView(image(pair.right), torch.tensor(pair.K).float(), T)
-    K_left = torch.tensor(pair.K).float()
-    return prepare_evidence(image(pair.left), [right] if rights else [], K_left, points, DEFAULT, rights)
+    T, K = torch.tensor(np.linalg.inv(pair.E)).float(), torch.tensor(pair.K).float()
+    views = [CameraView(image(pair.right), K, T)] if rights else []
+    return prepare_evidence(image(pair.left), views, K, points, DEFAULT, rights)
 
 
 def test_matches_become_a_dense_prompt(textured_plane):
@@ -123,41 +105,31 @@ def test_matches_become_a_dense_prompt(textured_plane):
 def test_points_alone_become_a_prompt_and_nothing_becomes_none(textured_plane):
     points = torch.zeros(textured_plane.depth_m.shape)
     points[::8, ::8] = torch.from_numpy(textured_plane.depth_m)[::8, ::8]
-    prompt = depth_prompt([evidence_of(textured_plane, points, rights=False)], DEFAULT)
+    evidence = evidence_of(textured_plane, points, rights=False)
+    prompt = depth_prompt([evidence], DEFAULT)
     middle = float(np.median(textured_plane.depth_m))
     assert prompt.isfinite().all() and float(prompt.median()) == pytest.approx(middle, rel=0.01)
-    bare = evidence_of(textured_plane, points, rights=False)
-    assert depth_prompt([bare, replace(bare, points=None)], DEFAULT) is None
+    assert depth_prompt([replace(evidence, points=None)], DEFAULT) is None
 
 
-def test_prompt_depth_anything_is_given_what_is_known(textured_plane):
-    pipe = make_transformers("prompt_depth_anything")
-    told = knows(pipe, textured_plane.depth_m)
+def test_prompt_depth_anything_is_given_what_is_known_unless_it_is_given_depths(textured_plane):
+    pipe = knowing("prompt_depth_anything", textured_plane.depth_m)
     out = guided(pipe, textured_plane)
-    assert told[0] is not None and told[0].isfinite().all()
-    middle = float(np.median(textured_plane.depth_m))
-    assert float(told[0].median()) == pytest.approx(middle, rel=0.01)
     assert float(out.own_scale) == pytest.approx(1.0, abs=0.01)  # its map is in metres with a prompt
-    pipe(Image.fromarray(textured_plane.left), processing_resolution=64)
-    assert told[-1] is None  # without guidance it is a relative prior
-
-
-def test_a_depth_prompt_ones_own_goes_before_ours_and_only_where_it_is_taken(textured_plane):
-    pipe = make_transformers("prompt_depth_anything")
-    told = knows(pipe, textured_plane.depth_m)
-    own = torch.full((1, 1, 4, 6), 7.0)
-    pipe(Image.fromarray(textured_plane.left), processing_resolution=64, prompt_depth=own)
-    assert told[-1].mean() == pytest.approx(7.0) and told[-1].std() > 0  # not flat: it divides by its span
+    call = {"image": Image.fromarray(textured_plane.left), "processing_resolution": 64}
+    pipe(**call)
+    assert pipe.own_range is None  # without guidance it is a relative prior
+    own = torch.linspace(7.0, 9.0, 24).view(1, 1, 4, 6)
+    pipe(**call, prompt_depth=own)
+    assert pipe.own_range[0].tolist() == pytest.approx([7.0, 9.0], abs=0.1)
     with pytest.raises(ValueError, match="prompt_depth"):
-        make_transformers("zoedepth")(
-            Image.fromarray(textured_plane.left), processing_resolution=64, prompt_depth=own
-        )
+        make_transformers("zoedepth")(**call, prompt_depth=own)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 @pytest.mark.parametrize("varies_m", [0.0, 0.01])
-def test_a_depth_prompt_a_wall_far_away_has_a_span(textured_plane, dtype, varies_m):
-    """A millionth of a metre is no step beside 40 m, nor is a centimetre one in half precision."""
+def test_the_prompt_of_a_wall_far_away_has_a_span(textured_plane, dtype, varies_m):
+    """Of no span at all nothing can be divided, and a centimetre is no step beside 40 m in half precision."""
     pipe = make_transformers("prompt_depth_anything").to(dtype=dtype)
     wall_m = 40.0 + varies_m * torch.linspace(0, 1, 24).view(1, 1, 4, 6)
     out = pipe(Image.fromarray(textured_plane.left), processing_resolution=64, prompt_depth=wall_m)
@@ -175,10 +147,9 @@ def test_without_a_length_the_metres_are_those_of_a_metric_prior():
     )
     runs = {}
     for kind in ("zoedepth", "depth_anything"):
-        pipe = enable_geometry_guidance(make_transformers(kind))
-        knows(pipe, depth_m)
         guidance = GeometryGuidance.from_photographs(left, right, K=pair.K_left.numpy(), **FAST)
-        runs[kind] = pipe(Image.fromarray(left), guidance=guidance, processing_resolution=64)
+        call = {"guidance": guidance, "processing_resolution": 64}
+        runs[kind] = knowing(kind, depth_m)(Image.fromarray(left), **call)
     metric, relative = runs["zoedepth"], runs["depth_anything"]
     baseline = float(np.linalg.norm(E[:3, 3]))
     assert metric.unit == "m" and metric.scale_from == "prior" and 0 < metric.scale_spread < 0.1
@@ -195,16 +166,13 @@ def test_without_a_length_the_metres_are_those_of_a_metric_prior():
 def test_given_poses_without_a_unit_get_the_metres_of_a_metric_prior(textured_plane):
     scaled = textured_plane.E.copy()
     scaled[:3, 3] *= 0.001 / np.linalg.norm(scaled[:3, 3])  # as a model of COLMAP might have it
-    runs = {}
-    for kind in ("zoedepth", "depth_anything"):
-        pipe = enable_geometry_guidance(make_transformers(kind))
-        knows(pipe, textured_plane.depth_m)
-        guidance = GeometryGuidance(textured_plane.right, textured_plane.K, scaled, unit=None, **FAST)
-        runs[kind] = pipe(Image.fromarray(textured_plane.left), guidance=guidance, processing_resolution=64)
-    metric, relative = runs["zoedepth"], runs["depth_anything"]
+    pair = replace(textured_plane, E=scaled)
+    metric, relative = (
+        guided(knowing(kind, pair.depth_m), pair, unit=None) for kind in ("zoedepth", "depth_anything")
+    )
     assert metric.unit == "m" and metric.scale_from == "prior"
-    assert np.median(metric.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.03)
+    assert np.median(metric.prediction[0, ..., 0] / pair.depth_m) == pytest.approx(1.0, rel=0.03)
     assert sum("metres are the prior's own" in sentence for sentence in metric.warnings) == 1
     assert relative.unit is None and not any(" mm" in sentence for sentence in relative.warnings)
     with pytest.raises(ValueError, match="unit must be 'm' or None; got 'mm'"):
-        GeometryGuidance(textured_plane.right, textured_plane.K, scaled, unit="mm")
+        GeometryGuidance(pair.right, pair.K, scaled, unit="mm")

@@ -19,7 +19,7 @@ from geodiff_plugin.evaluation.sequence import SEQUENCES, flicker, run_sequence
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.start import plan_warm_start
 from geodiff_plugin.types import MetricDepthOutput
-from tests.contracts.tiny_geowizard import make_geowizard
+from tests.contracts.tiny_priors import make_geowizard
 from tests.scenes import render_sequence
 
 FAST = {"inner_steps": 0, "corrections": 4}

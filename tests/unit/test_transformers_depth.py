@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,9 +11,8 @@ from safetensors.torch import load_file, save_file
 from transformers import PretrainedConfig, PreTrainedModel
 from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES
 
-from geodiff_plugin.priors import PRIORS, find_adapter, load_prior
+from geodiff_plugin.priors import find_adapter, find_prior, load_prior
 from geodiff_plugin.priors.components import DirectScheduler
-from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.transformers_depth import (
     NO_DEPTH,
     Preparation,
@@ -42,7 +40,7 @@ def ramps(height: int, width: int) -> torch.Tensor:
     return torch.stack([red, red.flip(0), red.flip(1)])[None]
 
 
-def save_as_transformers(pipe, folder: Path) -> None:
+def save_as_transformers(pipe, folder) -> None:
     """The folder that a user has from the hub."""
     pipe.model.save_pretrained(folder)
     (folder / "preprocessor_config.json").write_text(json.dumps(dict(pipe.config.preparation)))
@@ -62,32 +60,26 @@ class Echo(PreTrainedModel):
         return SimpleNamespace(predicted_depth=pixel_values[:, 0], **self.more)
 
 
-def echo(config, space="depth", model=None):
-    config = {"image_mean": [0, 0, 0], "image_std": [1, 1, 1], **config}
-    return TransformersDepthPipeline(model or Echo(), DirectScheduler(0), config, space)
+def echo(kind, space="depth", model=None, **options):
+    told = {"image_processor_type": f"{kind}ImageProcessor", "image_mean": [0] * 3, "image_std": [1] * 3}
+    return TransformersDepthPipeline(model or Echo(), DirectScheduler(0), told | options, space)
 
 
-GLPN = {"image_processor_type": "GLPNImageProcessor"}
-ECHOES = {
-    "dpt": {"image_processor_type": "DPTImageProcessor", "size": 64},
-    "patches": {"image_processor_type": "DPTImageProcessor", "size": 70, "ensure_multiple_of": 14},
-    "padded": {
-        "image_processor_type": "DPTImageProcessor",
-        "do_resize": False,
-        "do_pad": True,
-        "size_divisor": 14,
-    },
-    "glpn": GLPN,
-    "zoedepth": {"image_processor_type": "ZoeDepthImageProcessor", "ensure_multiple_of": 32},
-    "depth pro": {"image_processor_type": "DepthProImageProcessorFast", "size": {"height": 96, "width": 96}},
-}
-
-
-@pytest.mark.parametrize("name", ECHOES)
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("DPT", {"size": 64}),
+        ("DPT", {"size": 70, "ensure_multiple_of": 14}),
+        ("DPT", {"do_resize": False, "do_pad": True, "size_divisor": 14}),
+        ("GLPN", {}),
+        ("ZoeDepth", {"ensure_multiple_of": 32}),
+        ("DepthPro", {"size": {"height": 96, "width": 96}}),
+    ],
+)
 @pytest.mark.parametrize("size", [(75, 113), (60, 40)])
-def test_the_map_lies_over_the_image_whatever_was_padded(name, size):
+def test_the_map_lies_over_the_image_whatever_was_padded(kind, options, size):
     image = ramps(75, 113)
-    values = echo(ECHOES[name]).predict(image, size)
+    values = echo(kind, **options).predict(image, size)
     wanted = torch.nn.functional.interpolate(image[:, :1], size, mode="bilinear", antialias=True)
     # ZoeDepth's library aligns corners on the way in and not on the way out: up to half a pixel.
     torch.testing.assert_close(values, wanted, rtol=0, atol=0.02)
@@ -96,13 +88,11 @@ def test_the_map_lies_over_the_image_whatever_was_padded(name, size):
 @pytest.mark.parametrize("kind", MODELS)
 @pytest.mark.parametrize("layout_of", ["transformers", "ours"])
 def test_both_layouts_load_and_answer_the_same(kind, layout_of, tmp_path):
-    pipe = make_transformers(kind)
+    pipe, image = make_transformers(kind), ramps(40, 52)
     assert output_of(pipe.model) == OUTPUTS[kind]
-    image = ramps(40, 52)
     before = pipe(image, output_type="pt", processing_resolution=64).prediction
     save_as_transformers(pipe, tmp_path) if layout_of == "transformers" else pipe.save_pretrained(tmp_path)
-    layout = Layout(tmp_path, "tiny")
-    assert [key for key, prior in PRIORS.items() if prior.recognises(layout)] == ["transformers"]
+    assert find_prior(tmp_path).key == "transformers"
     loaded = load_prior(tmp_path)
     loaded.set_progress_bar_config(disable=True)
     resolution = 64 if layout_of == "transformers" else None  # which only ours remembers
@@ -116,13 +106,10 @@ def test_both_layouts_load_and_answer_the_same(kind, layout_of, tmp_path):
 def test_every_class_of_the_library_is_guided_or_refused(tmp_path):
     guided = {type(MODELS[kind]()[0]).__name__ for kind in MODELS}
     assert guided | set(NO_DEPTH) == set(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values())
-    canopy = type("CHMv2ForDepthEstimation", (Echo,), {})
     with pytest.raises(ValueError, match="height of trees"):
-        echo(GLPN, model=canopy())
-    (tmp_path / "config.json").write_text(
-        '{"architectures": ["CHMv2ForDepthEstimation"], "model_type": "dpt"}'
-    )
-    (tmp_path / "preprocessor_config.json").write_text('{"image_processor_type": "CHMv2ImageProcessor"}')
+        echo("GLPN", model=type("CHMv2ForDepthEstimation", (Echo,), {})())
+    config = {"architectures": ["CHMv2ForDepthEstimation"], "model_type": "dpt"}
+    (tmp_path / "config.json").write_text(json.dumps(config))
     with pytest.raises(ValueError, match="height of trees"):
         load_prior(tmp_path)
 
@@ -135,18 +122,17 @@ def test_configs_change_what_a_class_predicts():
 
 
 def test_a_space_that_the_user_says_wins_and_an_unknown_class_needs_one():
-    with pytest.raises(ValueError, match="--space"):
-        echo(GLPN, space=None)
-    assert echo(GLPN).config.prediction_type == "depth"
-    said = echo(GLPN, space="disparity", model=MODELS["glpn"]()[0])
+    assert echo("GLPN").config.prediction_type == "depth"
+    said = echo("GLPN", "disparity", MODELS["glpn"]()[0])
     assert said.config.prediction_type == "disparity" and not said.metric
-    with pytest.raises(ValueError, match="space must be one of"):
-        echo(GLPN, space="log")
+    for space, sentence in ((None, "--space"), ("log", "space must be one of")):
+        with pytest.raises(ValueError, match=sentence):
+            echo("GLPN", space)
 
 
 def test_depth_pro_gives_inverse_metres_by_its_own_field_of_view():
     camera = Echo(field_of_view=torch.tensor([90.0]))  # width over focal length is 2
-    pipe = echo(ECHOES["depth pro"] | {"size": 16}, "disparity", camera)
+    pipe = echo("DepthPro", "disparity", camera, size=16)
     values = pipe.predict(torch.full((1, 3, 16, 16), 0.25), (16, 16))
     torch.testing.assert_close(values, torch.full_like(values, 0.5))
     torch.testing.assert_close(pipe.metres(values), torch.full_like(values, 2.0))
@@ -166,29 +152,27 @@ def test_unit_range_keeps_the_low_end_and_is_not_led_by_a_stray_pixel():
         ({"image_processor_type": "CLIPImageProcessor"}, "image_processor_type"),
         ({"image_processor_type": "GLPNImageProcessor", "resample": 0}, "resample"),
         ({"image_processor_type": "DPTImageProcessor", "size": {"shortest_edge": 9}}, "size"),
-        ({"image_processor_type": "GLPNImageProcessor", "image": (20, 90)}, "patch"),
+        ({"image_processor_type": "GLPNImageProcessor"}, "patch"),
     ],
 )
 def test_processors_and_images_that_do_not_fit_are_refused(config, sentence):
     with pytest.raises(ValueError, match=sentence):
-        Preparation.from_config(config)(torch.zeros(1, 3, *config.get("image", (20, 90))))
+        Preparation(config)(torch.zeros(1, 3, 20, 90))
 
 
 def test_missing_weights_are_listed_but_for_those_that_nothing_reads(tmp_path):
-    pipe = make_transformers("dpt")
+    pipe, file = make_transformers("dpt"), tmp_path / "model.safetensors"
     pipe.model.save_pretrained(tmp_path)
     with pytest.raises(ValueError, match="preprocessor_config"):
         load_prior(tmp_path)
     save_as_transformers(pipe, tmp_path)
-    weights = load_file(tmp_path / "model.safetensors")
-    unread = [name for name in weights if "fusion_stage.layers.0.residual_layer1." in name]
-    kept = {name: v for name, v in weights.items() if name not in unread}
-    save_file(kept, tmp_path / "model.safetensors", metadata={"format": "pt"})
+    kept = {k: v for k, v in load_file(file).items() if "fusion_stage.layers.0.residual_layer1." not in k}
+    save_file(kept, file, metadata={"format": "pt"})
     load_prior(tmp_path)  # as Intel/dpt-large comes
     kept.pop("head.head.0.bias")
-    save_file(kept, tmp_path / "model.safetensors", metadata={"format": "pt"})
+    save_file(kept, file, metadata={"format": "pt"})
     with pytest.raises(ValueError, match=r"missing: head\.head\.0\.bias"):
         load_prior(tmp_path)
-    (tmp_path / "model.safetensors").rename(tmp_path / "pytorch_model.bin")
+    file.rename(tmp_path / "pytorch_model.bin")
     with pytest.raises(ValueError, match="geodiff convert"):
         load_prior(tmp_path)

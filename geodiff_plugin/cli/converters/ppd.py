@@ -18,8 +18,7 @@ from transformers import Dinov2Config, Dinov2Model
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.converters import read_checkpoint, renamed, save_weights, write_card
 from geodiff_plugin.priors.loading import Layout, check_weights, load_component
-from geodiff_plugin.priors.pixel_dit import PixelDiT
-from geodiff_plugin.priors.ppd import PPDPipeline
+from geodiff_plugin.priors.ppd import PixelDiT, PPDPipeline
 
 TRANSFORMER, IN_CHECKPOINT, IN_FILE, IN_FOLDER = "dit.", "sem_encoder.pretrained.", "pretrained.", "backbone."
 #: The same weights as depth_anything_v2_vitl.pth, as transformers has them.
