@@ -41,33 +41,24 @@ DPI = 128
 POINTS_PER_PIXEL = 72 / DPI
 
 
-def _as_map(values: Any, name: str = "depth_m") -> np.ndarray:
+def _as_map(values: Any) -> np.ndarray:
     """``(H, W)`` of a tensor or array whose other axes have length 1."""
     array = np.asarray(values.detach().cpu() if isinstance(values, torch.Tensor) else values)
     while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     if array.ndim != 2:
-        bad_value(name, "one map of shape (H, W)", f"shape {array.shape}")
+        bad_value("depth_m", "one map of shape (H, W)", f"shape {array.shape}")
     return array
 
 
-def _usable(depth_m: np.ndarray, valid: Any) -> np.ndarray:
-    use = np.isfinite(depth_m) & (depth_m > 0)
-    if valid is None:
-        return use
-    mask = _as_map(valid, "valid").astype(bool)
-    if mask.shape != depth_m.shape:
-        bad_value("valid", f"of shape {depth_m.shape} as depth_m", f"shape {mask.shape}")
-    return use & mask
+def _known(depth_m: np.ndarray) -> np.ndarray:
+    return np.isfinite(depth_m) & (depth_m > 0)
 
 
-def depth_range(
-    depth_m: Any, valid: Any = None, near: float | None = None, far: float | None = None
-) -> tuple[float, float]:
+def depth_range(depth_m: Any, near: float | None = None, far: float | None = None) -> tuple[float, float]:
     """The depths at the two ends of the colours, ``0 < near < far`` in metres; by default 2 % lie beyond.
 
-    ``depth_m`` is ``(H, W)`` metres, numpy or torch; pixels that are not finite, not above 0 or not ``valid``
-    never count.
+    ``depth_m`` is ``(H, W)`` metres, numpy or torch; pixels that are not finite or not above 0 never count.
 
     Raises:
         ValueError: ``near`` or ``far`` not above 0 and finite, or ``near >= far`` when both are given.
@@ -78,7 +69,7 @@ def depth_range(
     if near is not None and far is not None and near >= far:
         bad_value("near, far", "near < far, in metres", f"{near}, {far}")
     depth_m = _as_map(depth_m)
-    use = _usable(depth_m, valid)
+    use = _known(depth_m)
     every = math.isqrt(max(1, depth_m.size // MOST_FOR_RANGE))
     if use[::every, ::every].any():
         depth_m, use = depth_m[::every, ::every], use[::every, ::every]
@@ -123,18 +114,16 @@ def _coloured(
     return picture
 
 
-def colour_depth(
-    depth_m: Any, valid: Any = None, near: float | None = None, far: float | None = None
-) -> np.ndarray:
+def colour_depth(depth_m: Any, near: float | None = None, far: float | None = None) -> np.ndarray:
     """``(H, W, 3)`` uint8 RGB of a depth map: near is yellow, far is dark blue, unknown is grey.
 
     The colours go with the logarithm of depth, so that a step of colour is a step of relative depth, as in
     AbsRel. Arguments and errors as for ``depth_range``; axes of length 1 are dropped.
     """
-    near, far = depth_range(depth_m, valid, near, far)
+    near, far = depth_range(depth_m, near, far)
     depth_m = _as_map(depth_m)
     scale = math.log(far / near)
-    return _coloured(depth_m, _usable(depth_m, valid), lambda z: np.log(far / z) / scale, DEPTH_COLOURS)
+    return _coloured(depth_m, _known(depth_m), lambda z: np.log(far / z) / scale, DEPTH_COLOURS)
 
 
 def colour_share(values: np.ndarray, top: float = 1.0) -> np.ndarray:
@@ -187,22 +176,17 @@ def _figure(
 
 
 def depth_figure(
-    depth_m: Any,
-    valid: Any = None,
-    near: float | None = None,
-    far: float | None = None,
-    unit: str | None = "m",
+    depth_m: Any, near: float | None = None, far: float | None = None, unit: str | None = "m"
 ) -> Image.Image:
     """A coloured depth map beside a colour bar, far on top; small maps are enlarged by a whole factor.
 
     The map and the ends of the colours, and errors, are as for ``depth_range``; ``unit`` is ``"m"``, or
     ``None`` for a depth without one, as the legend then says.
     """
-    near, far = depth_range(depth_m, valid, near, far)
+    near, far = depth_range(depth_m, near, far)
     marks = [(math.log(z / near) / math.log(far / near), f"{z:g}") for z in ticks(near, far)]
-    unknown = not _usable(_as_map(depth_m), valid).all()
     label = "no unit" if unit is None else f"depth, {unit}"
-    picture = colour_depth(depth_m, valid, near, far)
+    picture, unknown = colour_depth(depth_m, near, far), not _known(_as_map(depth_m)).all()
     return _figure(picture, f"{DEPTH_COLOURS}_r", label, marks, unknown)
 
 

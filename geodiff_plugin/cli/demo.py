@@ -22,7 +22,7 @@ CELL_WIDTH = 360
 
 def _write_comparison(path: Path, pair: DemoPair, aligned_m: np.ndarray, guided_m: np.ndarray) -> None:
     """Left image, prior, guided, truth side by side, the three maps in the truth's colours."""
-    near, far = depth_range(pair.depth_m, pair.valid)
+    near, far = depth_range(pair.depth_m)
     maps = [colour_depth(depth_m, near=near, far=far) for depth_m in (aligned_m, guided_m, pair.depth_m)]
     titles = ["left image", "prior, aligned by an oracle", "guided", f"truth, {near:.1f} m to {far:.1f} m"]
     with atomic_path(path) as temporary:

@@ -180,18 +180,6 @@ def to_space(depth_m: np.ndarray, space: str) -> np.ndarray:
     return SPACES[space].inverse(torch.from_numpy(np.asarray(depth_m, np.float64))).numpy()
 
 
-def least_squares(values: np.ndarray, target: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
-    """Scale and shift that bring ``values`` closest to ``target`` over the mask, in the sum of squares.
-
-    The scale is negative where the two run against each other.
-
-    Source: Marigold, ``align_depth_least_square`` (without its optional downscaling), in float64.
-    """
-    x, y = np.asarray(values, np.float64)[mask], np.asarray(target, np.float64)[mask]
-    scale, shift = np.linalg.lstsq(np.stack([x, np.ones_like(x)], axis=1), y, rcond=None)[0]
-    return float(scale), float(shift)
-
-
 def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str = "depth") -> np.ndarray:
     """Depth in metres of ``values`` that are right up to scale and shift in a key of ``SPACES``.
 
@@ -201,7 +189,8 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
         where ``values`` is not, and nowhere finite where no pixel has both truth and prediction.
 
     Source: Marigold's evaluation: ``least_square`` and ``least_square_disparity``, the latter over positive
-        predictions only and clipped at 1e-3; the other spaces are the same idea.
+        predictions only and clipped at 1e-3; the other spaces are the same idea. Without its optional
+        downscaling, in float64.
     """
     kind, metre = SPACES[check_choice(space, "space", SPACES)], torch.ones((), dtype=torch.float64)
     known = valid & np.isfinite(values) & (truth_m > 0)
@@ -209,10 +198,11 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
         known &= np.nan_to_num(values) > 0
     if not known.any():  # a method without an answer has no errors, as without alignment
         return np.full(np.shape(truth_m), np.nan)
-    target = np.zeros(np.shape(truth_m))
-    target[known] = to_space(np.asarray(truth_m, np.float64)[known], space)
-    scale, shift = least_squares(values, target, known)
-    x = torch.from_numpy(np.asarray(values, np.float64) * scale + shift)
+    target = to_space(np.asarray(truth_m, np.float64)[known], space)
+    values = np.asarray(values, np.float64)
+    pairs = np.stack([values[known], np.ones(known.sum())], axis=1)
+    scale, shift = np.linalg.lstsq(pairs, target, rcond=None)[0]
+    x = torch.from_numpy(values * scale + shift)
     if not kind.grows_with_depth:
         x = x.clamp_min(float(kind.inverse(metre / MIN_DISPARITY)))
     return np.maximum(kind.forward(x, metre).numpy(), FLOOR_M)

@@ -12,10 +12,8 @@ from geodiff_plugin.plotting import colour_depth, depth_figure, depth_range, gri
 
 
 def test_near_is_yellow_far_is_blue_unknown_is_grey():
-    depth = np.array([[1.0, 2.0, 4.0, np.inf], [np.nan, 0.0, -1.0, 2.0]])
-    valid = np.ones((2, 4), dtype=bool)
-    valid[1, 3] = False
-    picture = colour_depth(depth, valid, near=1, far=4)
+    depth = np.array([[1.0, 2.0, 4.0, np.inf], [np.nan, 0.0, -1.0, -np.inf]])
+    picture = colour_depth(depth, near=1, far=4)
     assert picture.dtype == np.uint8 and picture.shape == (2, 4, 3)
     expected = matplotlib.colormaps["plasma"]([1.0, 0.5, 0.0])[:, :3] * 255
     np.testing.assert_allclose(picture[0, :3], expected, atol=1)
@@ -53,7 +51,7 @@ def test_flat_and_empty_maps_and_ends_beyond_the_data_have_a_range(depth, ends):
 
 def test_tensors_with_axes_of_length_1_are_maps():
     depth = torch.linspace(1, 2, 12).reshape(1, 1, 3, 4)
-    np.testing.assert_array_equal(colour_depth(depth, depth > 0), colour_depth(depth[0, 0].numpy()))
+    np.testing.assert_array_equal(colour_depth(depth), colour_depth(depth[0, 0].numpy()))
 
 
 @pytest.mark.parametrize(
@@ -62,7 +60,6 @@ def test_tensors_with_axes_of_length_1_are_maps():
         (lambda: depth_range(np.ones((3, 4)), near=0), "near"),
         (lambda: depth_range(np.ones((3, 4)), far=float("inf")), "far"),
         (lambda: depth_range(np.ones((3, 4)), near=3, far=2), "near < far"),
-        (lambda: colour_depth(np.ones((3, 4)), np.ones((2, 2), dtype=bool)), "valid"),
         (lambda: colour_depth(np.ones((2, 3, 4))), "depth_m"),
         (lambda: grid([], []), "at least one picture"),
         (lambda: grid([np.zeros((2, 2))], ["a", "b"]), "each with a title; got 1, 2 titles"),
