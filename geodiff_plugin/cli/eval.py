@@ -46,8 +46,8 @@ def _print_page(page: Page) -> None:
     )
     for table in page.tables:
         shown = new_table(table.full_header(), table.title)
-        for index, row in enumerate(table.rows):
-            shown.add_row(*row, end_section=index + 1 in table.rules)
+        for row in table.rows:
+            shown.add_row(*row)
         show("", shown, Text(table.note, style="dim"))
 
 

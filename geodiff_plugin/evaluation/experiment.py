@@ -1,7 +1,7 @@
 """An experiment: cells (samples x methods x settings), each measured once, and tables of their records.
 
-Every command of the evaluation declares one ``Experiment``. Its cells are the items of one ``Runner``, so
-that all of them resume, are shared by several processes and report failures in the same way.
+The cells of every command are the items of one ``Runner``, so that all of them resume, are shared by several
+processes and report failures in the same way.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import platform
 import re
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import date
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,8 @@ from geodiff_plugin.runtime.machine import PeakMemory, versions
 RECORDS_NAME = "samples.jsonl"
 """Journal of methods on samples, which several commands share."""
 
+Tables = Callable[[list[Record]], Sequence[Table]]
+
 
 def run_facts(command: str, options: Any) -> dict[str, Any]:
     """Command line, date, versions and machine of a run."""
@@ -50,24 +52,15 @@ def run_facts(command: str, options: Any) -> dict[str, Any]:
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads"
     if torch.cuda.is_available():
         machine += f", {torch.cuda.get_device_name()}"
-    return {
-        "command": command_line(command, options),
-        "date": date.today().isoformat(),
-        "versions": used,
-        "machine": machine,
-    }
+    line = {"command": command_line(command, options), "date": date.today().isoformat()}
+    return line | {"versions": used, "machine": machine}
 
 
 @dataclass(frozen=True)
 class Page:
-    """What a command of the evaluation measured.
+    """What a command measured: ``run_facts``, sentences above the tables, and the tables in reading order.
 
-    Attributes:
-        title: heading.
-        facts: of ``run_facts``.
-        tables: in reading order.
-        remarks: sentences that belong above the tables, e.g. how many samples were broken.
-        purpose: what the page is for, its first line; "" where the title says it.
+    ``purpose`` is the first line, "" where the title says it.
     """
 
     title: str
@@ -81,68 +74,50 @@ class Page:
         named = ", ".join(f"{name} {value}" for name, value in self.facts["versions"].items())
         return f"{self.facts['date']}; {named}; {self.facts['machine']}."
 
-    def markdown(self) -> str:
-        """What it is for, how it was made, the remarks, then the tables."""
+    def write(self, stem: str, options: Any) -> Page:
+        """Write ``<stem>.md``, ``.tex`` and ``.json`` into ``--out``, and the page to ``--results`` too."""
         head = [f"# {self.title}", *([self.purpose] if self.purpose else [])]
         head += [f"    {self.facts['command']}", self.origin(), *self.remarks]
-        return "".join(f"{line}\n\n" for line in head) + "\n".join(t.markdown() for t in self.tables)
-
-    def write(self, out: Path, stem: str, results: Path | None = None) -> Page:
-        """Write ``<stem>.md``, ``.tex`` and ``.json`` into ``out``, the page to ``results`` too."""
-        for path in (out / f"{stem}.md", *([] if results is None else [results])):
-            write_text(path, self.markdown())
-        write_text(out / f"{stem}.tex", "\n".join(table.latex() for table in self.tables))
-        tables = [table.as_json() for table in self.tables]
+        text = "".join(f"{line}\n\n" for line in head) + "\n".join(t.markdown() for t in self.tables)
+        for path in filter(None, (options.out / f"{stem}.md", options.results)):
+            write_text(path, text)
+        write_text(options.out / f"{stem}.tex", "\n".join(table.latex() for table in self.tables))
+        tables = [asdict(table) for table in self.tables]
         plain = self.facts | {"remarks": list(self.remarks), "tables": tables}
-        write_text(out / f"{stem}.json", json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
+        write_text(options.out / f"{stem}.json", json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
         return self
 
 
-@dataclass(frozen=True)
-class Experiment:
-    """What a command of the evaluation measures and shows.
+def run_experiment(
+    command: str,
+    options: Any,
+    title: str,
+    cells: Sequence[Item],
+    tables: Tables,
+    remarks: Callable[[list[Record]], Sequence[str]] = lambda records: (),
+    purpose: str = "",
+    journal: str = "",
+    stem: str = "",
+) -> Page | None:
+    """Measure the cells that have no record yet, and write the page.
 
-    Attributes:
-        name: stem of the page's files.
-        title: heading of the page.
-        cells: what is measured; the payload of each is a function without arguments that returns the body of
-            its record.
-        tables: of the records of all cells, in their order.
-        remarks: sentences above the tables, likewise.
-        purpose: what the page is for.
-        journal: name of the file of records; ``<name>.jsonl`` by default.
+    The payload of each cell is a ``partial`` that returns the body of its record. Tables, and remarks above
+    them, are of the records of all cells, in their order; tables without rows are left out. ``journal`` is
+    ``<command>.jsonl`` and ``stem``, of the page's files, is ``command`` by default.
+
+    Returns:
+        The page; ``None`` in every process but the first.
+
+    Raises:
+        ValueError: bad options, or a broken sample without ``skip_broken``.
+        OSError: missing or unreadable files, likewise.
     """
-
-    name: str
-    title: str
-    cells: Sequence[Item]
-    tables: Callable[[list[Record]], Sequence[Table]]
-    remarks: Callable[[list[Record]], Sequence[str]] = field(default=lambda records: ())
-    purpose: str = ""
-    journal: str = ""
-
-    def run(self, command: str, options: Any) -> Page | None:
-        """Measure the cells that have no record yet, and write the page.
-
-        Args:
-            command: of ``geodiff eval``.
-            options: its dataclass, with ``out``, ``results`` and ``quiet``, maybe ``skip_broken``.
-
-        Returns:
-            The page; ``None`` in every process but the first.
-
-        Raises:
-            ValueError: bad options, or a broken sample without ``skip_broken``.
-            OSError: missing or unreadable files, likewise.
-        """
-        records = measure_cells(self.cells, options, self.journal or f"{self.name}.jsonl")
-        if records is None:
-            return None
-        tables = tuple(table for table in self.tables(records) if table.rows)
-        page = Page(
-            self.title, run_facts(command, options), tables, tuple(self.remarks(records)), self.purpose
-        )
-        return page.write(options.out, self.name, options.results)
+    records = measure_cells(cells, options, journal or f"{command}.jsonl")
+    if records is None:
+        return None
+    shown = tuple(table for table in tables(records) if table.rows)
+    page = Page(title, run_facts(command, options), shown, tuple(remarks(records)), purpose)
+    return page.write(stem or command, options)
 
 
 def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NAME) -> list[Record] | None:
@@ -151,9 +126,8 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
     A cell that stands several times, or under several names (``guided@bundled`` beside ``guided``), is
     measured once; a record has the ``head`` of its cell, whichever of them it was made for.
     """
-    unique = {cell.key: cell for cell in cells}
     runner = Runner(
-        list(unique.values()),
+        list({cell.key: cell for cell in cells}.values()),
         Journal(options.out / journal),
         noun="cell",
         survives=(OSError, ValueError) if getattr(options, "skip_broken", False) else (),
@@ -169,12 +143,9 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
 def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: str = "") -> str:
     """Name of a result: the same inputs give the same key, anything else another.
 
-    Args:
-        ref: the sample; not where its files lie but what is in them counts, and its other entries (cameras,
-            views). A folder counts by the files of it that the sample names as well.
-        method: its name.
-        configuration: everything that changes the method's result beside the prior, JSON values.
-        prior: name and fingerprint of the prior, empty for a method without one.
+    Of the sample, not where its files lie but what is in them counts, and its other entries (cameras, views);
+    of a folder the files in it that the sample names as well. ``configuration`` is all that changes the
+    method's result beside the prior, ``prior`` that one's name and fingerprint.
     """
     files = {name: value for name, value in ref.files.items() if value is not None}
     return fingerprint(method, configuration, prior, __version__, ref.dataset, ref.name, files)
@@ -202,45 +173,40 @@ def cropped(sample: StereoSample, crop: str) -> StereoSample:
     return sample if crop == "none" else replace(sample, valid=valid)
 
 
-@dataclass(frozen=True, eq=False)
-class _MethodCell:
-    """One method on one sample, scored in a crop; its map goes to ``path`` where one is given."""
-
-    ref: SampleRef
-    read: Callable[[SampleRef], StereoSample]
-    method: Method
-    settings: Settings
-    priors: PriorCache
-    crop: str
-    path: Path | None
-
-    def __call__(self) -> Record:
-        """Run and score; the seconds are those that the method takes alone."""
-        sample, process = self.read(self.ref), {"process": this_process().index}
-        self.priors.evidence.take_spared_seconds()
-        start = time.perf_counter()
-        try:
-            with PeakMemory(torch.device(self.settings.device)) as memory:
-                prediction = self.method.run(sample, self.settings, self.priors)
-        except NotApplicable as reason:
-            why = {"status": "not applicable", "reason": str(reason)}
-            return {"rectified": sample.rectified} | why | process
-        seconds = time.perf_counter() - start + self.priors.evidence.take_spared_seconds()
-        scores = score(cropped(sample, self.crop), prediction, DATASETS[sample.dataset].cap_m)
-        notes = {"sample": dict(sample.notes), "method": dict(prediction.notes)}
-        cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
-        saved = {}
-        if self.path is not None and prediction.depth_m is not None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            write_depth_npy(self.path, prediction.depth_m)
-            saved = {"map": file_digest(self.path)}
-        head = {"rectified": sample.rectified, "status": "ok"}
-        return head | cost | scores | {"notes": notes} | saved | process
+def _measure(
+    ref: SampleRef,
+    read: Callable[[SampleRef], StereoSample],
+    method: Method,
+    settings: Settings,
+    priors: PriorCache,
+    crop: str,
+    path: Path | None,
+) -> Record:
+    """Run one method on one sample and score it; the seconds are those that the method takes alone."""
+    sample, process = read(ref), {"process": this_process().index}
+    priors.evidence.take_spared_seconds()
+    start = time.perf_counter()
+    try:
+        with PeakMemory(torch.device(settings.device)) as memory:
+            prediction = method.run(sample, settings, priors)
+    except NotApplicable as reason:
+        return {"rectified": sample.rectified, "status": "not applicable", "reason": str(reason)} | process
+    seconds = time.perf_counter() - start + priors.evidence.take_spared_seconds()
+    head = {"rectified": sample.rectified, "status": "ok", "seconds": round(seconds, 3)}
+    head["peak_bytes"] = memory.peak_bytes
+    scores = score(cropped(sample, crop), prediction, DATASETS[sample.dataset].cap_m)
+    notes = {"notes": {"sample": dict(sample.notes), "method": dict(prediction.notes)}}
+    saved = {}
+    if path is not None and prediction.depth_m is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_depth_npy(path, prediction.depth_m)
+        saved = {"map": file_digest(path)}
+    return head | scores | notes | saved | process
 
 
 def _has_map(cell: Item, record: Record) -> bool:
     """Whether the map that a cell is to save is there, and not that of other settings in its place."""
-    path = getattr(cell.payload, "path", None)
+    path = cell.payload.keywords.get("path")
     if path is None or record["status"] != "ok" or record["all_pixels"]["raw"] is None:
         return True
     return path.is_file() and record.get("map") == file_digest(path)
@@ -257,18 +223,10 @@ def method_cells(
 ) -> list[Item]:
     """A cell for every method on every sample, all of ``RECORDS_NAME``.
 
-    Args:
-        refs: samples.
-        methods: names that ``find_method`` knows.
-        settings: the user's choices, the same for every method.
-        out: folder of the records.
-        crop: region of the image that is scored, one of ``options.CROPS``.
-        save_depth: write each metric depth map to ``out/depth/<method>/<dataset>_<sample>.npy``, where the
-            method ``files:out/depth/<method>`` finds it; a record without its map is made again.
-
-    Returns:
-        Cells whose records have ``status`` ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"``
-        (``error``); for the numbers see ``scoring.score``.
+    With ``save_depth`` each metric depth map goes to ``out/depth/<method>/<dataset>_<sample>.npy``, where the
+    method ``files:out/depth/<method>`` finds it; a record without its map is made again. Records have
+    ``status`` ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"`` (``error``), and the numbers of
+    ``scoring.score``.
     """
     process, priors, read = this_process(), PriorCache(), last_of(load)
     several = process.count > 1
@@ -284,7 +242,7 @@ def method_cells(
             configuration = method.configuration(replace(chosen, device=device)) | cropping
             folder = out / "depth" / re.sub(r"[^\w.=+-]+", "_", method.name)
             path = folder / f"{map_name(ref.dataset, ref.name)}.npy" if save_depth else None
-            work = _MethodCell(ref, read, method, chosen, priors, crop, path)
+            work = partial(_measure, ref, read, method, chosen, priors, crop, path=path)
             head = {"dataset": ref.dataset, "sample": ref.name, "method": method.name}
             key, name = cell_key(ref, method.base_name, configuration, prior), f"{ref.label}, {method.name}"
             cells.append(Item(key, work, name=name, words=(method.name,), head=head))

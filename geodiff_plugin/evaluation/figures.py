@@ -6,6 +6,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,6 @@ from geodiff_plugin.evaluation.tables import (
     count_of_pairs,
     headline,
     mean_with_interval,
-    seconds_of,
 )
 from geodiff_plugin.formats import as_image_01, atomic_path
 from geodiff_plugin.formats.out import write_text
@@ -129,7 +129,7 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     figure = _new_figure(7.6, 3.1)
     numbers: dict[str, Any] = {"samples": [ref.label for ref in refs], "updates": updates}
     numbers |= {preset: {} for preset in PRESETS}
-    quantities = {"abs_rel": ("AbsRel", headline), "seconds": ("seconds a pair", seconds_of)}
+    quantities = {"abs_rel": ("AbsRel", headline), "seconds": ("seconds a pair", itemgetter("seconds"))}
     panels = figure.subplots(1, 2)
     for axes, (key, (title, value_of)) in zip(panels, quantities.items(), strict=True):
         for index, (preset, names) in enumerate(methods.items()):

@@ -1,46 +1,61 @@
-"""Methods side by side on pairs: ``geodiff eval pairs``, and what other commands share with it."""
+"""Methods side by side on pairs: ``geodiff eval pairs``, ``parts``, ``flatness`` and ``cost``.
+
+Paper: S5.3, which the changes of a preset extend, and S9 for the cost.
+"""
 
 from __future__ import annotations
 
+import statistics
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from operator import itemgetter
 
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.algorithm.gradients import RULES
+from geodiff_plugin.config import DEFAULT, value_of
+from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_priors, with_seeds
 from geodiff_plugin.evaluation.datasets import SampleRef
-from geodiff_plugin.evaluation.experiment import RECORDS_NAME, Experiment, Page, method_cells
+from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
-from geodiff_plugin.evaluation.tables import Table, count_of_pairs, label_of, pairs_tables, without_copies
+from geodiff_plugin.evaluation.tables import Table, cell, count_of_pairs, mean_cell, pairs_of
+from geodiff_plugin.priors import PRIORS, find_prior
 from geodiff_plugin.runner import Item, Record, this_process
 
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:
-    """Cells of methods, with every further prior and seed of the options.
-
-    Poses given wrongly and the choice of poses apply to all of them and to the method ``guided``.
-    """
-    settings, refs = options.settings, options.changed(refs)
-    names = with_priors(with_poses(methods, options.pose), options.prior[1:])
-    names = with_seeds(names, settings.seed, options.seeds)
-    return method_cells(refs, names, settings, options.out, crop=options.crop, save_depth=options.save_depth)
+    """Cells of methods, with every further prior, seed and pose of the options."""
+    names = with_priors(with_poses(tuple(dict.fromkeys(methods)), options.pose), options.prior[1:])
+    names, refs = with_seeds(names, options.seed, options.seeds), options.changed(refs)
+    return experiment.method_cells(
+        refs, names, options.settings, options.out, crop=options.crop, save_depth=options.save_depth
+    )
 
 
-def pairs_experiment(
+def compare(
     name: str,
+    options: PairsOptions,
     title: str,
     refs: Sequence[SampleRef],
     methods: Sequence[str],
-    options: PairsOptions,
-    tables: Callable[[list[Record]], Sequence[Table]],
+    page_tables: experiment.Tables,
     more: Sequence[str] = (),
     purpose: str = "",
-) -> Experiment:
-    """Methods on pairs, with remarks on what was run and ``more``; all such commands share their records."""
+    stem: str = "",
+) -> Page | None:
+    """``run_experiment`` of methods on pairs, with remarks on what was run and ``more``."""
+    cells = pair_cells(refs, methods, options)
 
     def remarks(records: list[Record]) -> list[str]:
         return [*remarks_on(records, options), *more]
 
-    cells = pair_cells(refs, tuple(dict.fromkeys(methods)), options)
-    return Experiment(name, title, cells, tables, remarks, purpose, RECORDS_NAME)
+    journal = experiment.RECORDS_NAME  # all such commands share their records
+    return experiment.run_experiment(
+        name, options, title, cells, page_tables, remarks, purpose, journal, stem
+    )
 
 
 def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
@@ -55,30 +70,226 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
         remarks.append(f"Only what lies in the crop {options.crop!r} is scored.")
     reasons = Counter(
         (find_method(record["method"]).title, record["reason"])
-        for record in without_copies(records)
+        for record in tables.without_copies(records)
         if record["status"] == "not applicable"
     )
     remarks += [f"{title}: '-' for {count_of_pairs(n)}, {reason}." for (title, reason), n in reasons.items()]
-    broken: dict[tuple[str, str], list[str]] = {}
-    for record in records:
-        if record["status"] == "broken":
-            broken.setdefault((label_of(record), record["error"]), []).append(record["method"])
+    broken = [record for record in records if record["status"] == "broken"]
     if broken:
-        count = len({label for label, _ in broken})
+        count = len(set(map(tables.label_of, broken)))
         remarks.append(f"{count} broken {'sample was' if count == 1 else 'samples were'} skipped:")
-        remarks += [f"- {label} ({', '.join(names)}): {error}" for (label, error), names in broken.items()]
+    for (_, _, error), own in tables.grouped(broken, "dataset", "sample", "error").items():
+        names = ", ".join(record["method"] for record in own)
+        remarks.append(f"- {tables.label_of(own[0])} ({names}): {error}")
     return remarks
 
 
 def run_pairs(name: str, options: PairsOptions) -> Page | None:
-    """Measure methods on pairs and write the tables; errors as ``Experiment.run``."""
+    """Measure methods on pairs and write the tables; errors as ``run_experiment``."""
     refs, count, more = select(all_refs(options), options), this_process().count, []
     if options.sample is not None:
         more.append(f"Drawn with seed {options.seed}: {', '.join(ref.label for ref in refs)}.")
     if count > 1:
         more.append(f"Run by {count} processes.")
-    purpose = "Each pair, interval, region and metric behind a comparison of methods."
-    experiment = pairs_experiment(
-        "table", "Results pair by pair", refs, options.methods, options, pairs_tables, more, purpose
+    title, purpose = (
+        "Results pair by pair",
+        "Each pair, interval, region and metric behind a comparison of methods.",
     )
-    return experiment.run(name, options)
+    return compare(name, options, title, refs, options.methods, tables.pairs_tables, more, purpose, "table")
+
+
+CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
+    "guided": (
+        ("as it is", "guided"),
+        ("scale and shift only", "scale-shift-only"),
+        ("reprojection only", "reprojection-only"),
+        ("no diffusion", "no-diffusion"),
+        ("gradient to z_t (full)", "guided:gradient=full"),
+        *((f"rule {name}", f"guided:rule={name}") for name in RULES if name != "adam"),
+        *((f"without {name}", f"guided:weights.{name}=0") for name in DEFAULT.weights if name != "points"),
+    ),
+    "paper": (
+        ("as it is", "paper"),
+        ("scale and shift only", "paper:optimize_latents=false"),
+        ("γ = 0", "paper:weights.prior_pull=0"),
+        # One number that is searched within a thousandth of 1 is 1.
+        ("g_s = 1", "paper:g_s_range=[0.999,1.001]"),
+        ("gradient to the clean latent (denoised)", "paper:gradient=denoised"),
+        *((f"rule {name}", f"paper:rule={name}") for name in RULES if name != "summed"),
+    ),
+    "parts": (
+        ("as it is", "guided"),
+        ("search only", "search-only"),
+        ("photometric only", "guided:weights.matches=0"),
+        ("matches only", "guided:weights.photometric=0"),
+        ("no diffusion", "no-diffusion"),
+        ("without correction in the loop", "guided:correct=false"),
+        ("with a correction in every step", "guided:corrections=1000"),
+        ("with gradient updates", "guided:inner_steps=5"),
+        ("without the last fit and crisp edges", "guided:crisp=false"),
+        ("without rejection of reflections", "guided:reject_reflections=false"),
+        ("without cleaning of photographs", "guided:clean_photographs=false"),
+        ("without exposure", "guided:exposure=false"),
+        ("without z-test", "guided:z_test=false"),
+    ),
+}
+"""What is changed, by table: ``(row, method)``, the unchanged preset first.
+
+``guided`` and ``paper`` stand below the paper's Table 4, every rule and every term with its row (no sample
+has known points, so their term has none); ``parts`` is what the default has beyond the paper.
+"""
+
+_NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
+
+NUMBERS = (
+    *("min_steps", "corrections", "outlier_width", "match_noise", "smoothness"),
+    *("weights.photometric", "weights.matches", "weights.anchor", "sweep_pixels"),
+)
+"""The numbers that decide the default's result, by knob."""
+
+
+def changes_table(records: Sequence[Record], name: str) -> Table:
+    """Every row of ``CHANGES[name]`` that ran, with its paired difference to the unchanged preset."""
+    abs_rel, delta1 = (tables.metric_values(records, "raw", metric) for metric in ("abs_rel", "delta1"))
+    seconds, unchanged, rows = tables.by_method(records, itemgetter("seconds")), CHANGES[name][0][1], []
+    for title, method in CHANGES[name]:
+        values = abs_rel.get(method)
+        if values:
+            difference = tables.paired_difference(values, abs_rel.get(unchanged, {})).cell(sign="+")
+            cells = [tables.mean_with_interval(values.values()).cell(), cell(max(values.values()))]
+            cells.append(tables.mean_with_interval(delta1[method].values()).cell())
+            cells.append("-" if method == unchanged else difference)
+            rows.append((title, str(len(values)), *cells, mean_cell(seconds[method].values(), 1)))
+    header = ("change", "pairs", "AbsRel ↓ [95 %]", "worst", "δ1 ↑ [95 %]", "AbsRel more", "seconds")
+    note = "Metres as they come out; each change alone, and what the knobs leave open follows it."
+    return Table(f"{_NAMES[name]}, one thing changed, {pairs_of(records)}", header, tuple(rows), note)
+
+
+def _at(number: str, factor: float) -> str:
+    """The method with a number of the default at a multiple of itself; integers stay integers."""
+    value = value_of(number, DEFAULT)
+    changed = max(1, round(value * factor)) if isinstance(value, int) else float(f"{value * factor:.6g}")
+    return f"guided:{number}={changed:g}"
+
+
+FLATNESS = ("guided", *(_at(number, factor) for number in NUMBERS for factor in (0.5, 2.0)))
+"""The default, and every one of ``NUMBERS`` at half and at twice its value."""
+
+
+def flatness_table(records: Sequence[Record]) -> Table:
+    """Mean AbsRel with every number at half and at twice its value, and the pair that it changes most."""
+    values = tables.metric_values(records, "raw", "abs_rel")
+    unchanged, rows = values.get("guided", {}), []
+    for number in NUMBERS:
+        cells, most = [], (0.0, "-")
+        for factor in (0.5, 2.0):
+            changed = values.get(_at(number, factor), {})
+            shared = [label for label in changed if label in unchanged]
+            cells.append(mean_cell([changed[label] for label in shared], 4))
+            most = max([most, *((abs(changed[label] - unchanged[label]), label) for label in shared)])
+        moved = f"{cell(most[0])} ({most[1]})" if most[0] else cell(0.0)
+        rows.append((f"`{number}`", f"{value_of(number, DEFAULT):g}", *cells, moved))
+    title = f"Every number of the default at half and at twice its value, {count_of_pairs(len(unchanged))}"
+    header = ("number", "value", "at half", "at twice", "largest change of a pair")
+    note = f"Mean AbsRel; {mean_cell(unchanged.values(), 4)} as they are."
+    return Table(title, header, tuple(rows), note)
+
+
+def run_changes(name: str, options: PairsOptions) -> Page | None:
+    """Change one thing of the default at a time: its ``parts``, or the numbers of ``flatness``.
+
+    ``options.methods`` are run beside the table's own; errors as ``run_experiment``.
+    """
+    flat, refs = name == "flatness", select(all_refs(options), options)
+    methods = FLATNESS if flat else tuple(method for _, method in CHANGES[name])
+
+    def page_tables(records: list[Record]) -> list[Table]:
+        added = [record for record in records if record["method"] not in methods]
+        title = f"Further methods and priors, {pairs_of(added)}"
+        further = tables.summary_table(added, set(map(tables.label_of, added)), title)
+        if flat:
+            return [flatness_table(records), further]
+        return [changes_table(records, name), further, tables.regions_table(records)]
+
+    title = "Flatness" if flat else "Parts of the default"
+    return compare(name, options, title, refs, (*methods, *options.methods), page_tables)
+
+
+PLAIN = "prior-aligned"
+"""The stock pipeline, which everything is compared with; its alignment costs nothing beside it."""
+COST_METHODS = (PLAIN, "search-only", "guided", "guided:gradient=full", "paper")
+#: Denoising steps when none are asked for: what the default guidance takes of a prior that takes any number.
+STEPS = 4
+
+
+def _seconds(own: Sequence[Record]) -> float:
+    return statistics.median(record["seconds"] for record in own)
+
+
+def _peak(own: Sequence[Record]) -> int:
+    return max(record["peak_bytes"] for record in own)
+
+
+def cost_table(records: Sequence[Record]) -> Table:
+    """Seconds and memory of every method, and both as multiples of the plain pipeline's.
+
+    Args:
+        records: of a run in which ``PLAIN`` has worked on some pair; ``ValueError`` without.
+    """
+    done = [record for record in records if record["status"] == "ok"]
+    plain = [record for record in done if record["method"] == PLAIN]
+    if not plain:
+        cure = "See geodiff eval cost without --skip-broken for the reason."
+        bad_value("the pairs", f"some on which {PLAIN} works", "none", cure)
+    plain_seconds, plain_bytes = max(_seconds(plain), 1e-3), max(_peak(plain), 1)
+    columns: dict[str, tables.CellOf] = {
+        "method": lambda own: "plain pipeline" if own[0]["method"] == PLAIN else tables.method_title(own),
+        "pairs": lambda own: str(len(own)),
+        "seconds": lambda own: f"{_seconds(own):.2f}",
+        "time × plain": lambda own: f"{_seconds(own) / plain_seconds:.2f}",
+        "peak MB": lambda own: f"{_peak(own) / 1e6:.0f}",
+        "memory × plain": lambda own: f"{_peak(own) / plain_bytes:.2f}",
+    }
+    note = (
+        "Median seconds and greatest peak over the pairs, each method in a process of its own, all of one "
+        "prior with the same number of denoising steps. On CUDA the peak is what was allocated, weights "
+        "included, reset for each pair; on the CPU it is the increase of resident memory over the start, "
+        "sampled every 50 ms."
+    )
+    return tables.table_of_groups(f"Cost on {pairs_of(records)}", done, ("method",), columns, note)
+
+
+def _steps_of(prior: str) -> int | None:
+    """``STEPS``, or ``None`` for a prior that was trained for fewer: its own number then."""
+    most = getattr(PRIORS[find_prior(prior).key].pipeline_class, "max_steps", None)
+    return STEPS if most is None or most >= STEPS else None
+
+
+def _method_records(refs: Sequence[SampleRef], method: str, options: PairsOptions) -> list[Record]:
+    """Records of one method; called in a process of its own."""
+    return experiment.measure_cells(pair_cells(refs, (method,), options), options) or []
+
+
+def run_cost(name: str, options: PairsOptions) -> Page:
+    """Measure ``COST_METHODS`` and further ones, and write the table.
+
+    Records go to ``out/cost``, apart from those of other commands. Errors as ``run_experiment``, and
+    ``ValueError`` where several processes were started.
+    """
+    if this_process().count > 1:
+        bad_value("the number of processes", "1 for cost", this_process().count)
+    refs = select(all_refs(options), options)
+    records, taken = list[Record](), dict[str, int | None]()
+    alone = replace(options, prior=options.prior[:1], out=options.out / "cost")
+    for method in with_priors(tuple(dict.fromkeys((*COST_METHODS, *options.methods))), options.prior[1:]):
+        prior = find_method(method).prior or options.prior[0]
+        if prior not in taken:
+            taken[prior] = options.steps or _steps_of(prior)
+        # What one method frees stays with the allocator, where the next would find it at no cost.
+        with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
+            job = fresh_process.submit(_method_records, refs, method, replace(alone, steps=taken[prior]))
+            records += job.result()
+    steps = [f"{count or 'its own number'} with {prior}" for prior, count in taken.items()]
+    remarks = (*remarks_on(records, options), f"Denoising steps of each: {', '.join(steps)}.")
+    page = Page("Cost", experiment.run_facts(name, options), (cost_table(records),), remarks)
+    return page.write(name, options)

@@ -12,6 +12,7 @@ import numpy as np
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.capture.agreement import DepthFrame, seen_in
 from geodiff_plugin.evaluation import edges
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.baselines.unguided import sweep
@@ -36,21 +37,14 @@ RELIABLE_MATCH = 0.5
 """Confidence from which on a match of our plane sweep counts as one."""
 
 Scores = dict[str, float | None]
+"""Of JSON values."""
 
 
 def out_of_view(sample: StereoSample) -> np.ndarray:
     """``(H, W)`` bool: pixels with truth that the true depth puts behind or beside the right image."""
-    height, width = sample.depth_m.shape
-    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
-    pixels = np.stack([columns, rows, np.ones_like(rows)], -1).reshape(-1, 3).T
-    points = np.linalg.inv(sample.K_left) @ pixels * sample.depth_m.reshape(1, -1)
-    T = np.linalg.inv(sample.E_scored)
-    in_right = T[:3, :3] @ points + T[:3, 3:]
-    z = np.where(in_right[2] > 1e-6, in_right[2], np.nan)
-    u, v = (sample.K_right @ in_right)[:2] / z
-    right_height, right_width = sample.right.shape[:2]
-    inside = (u >= -0.5) & (u <= right_width - 0.5) & (v >= -0.5) & (v <= right_height - 0.5)
-    return sample.valid & ~inside.reshape(height, width)
+    left = DepthFrame("left", sample.depth_m, sample.valid, sample.K_left, np.eye(4))
+    right = DepthFrame("right", sample.right[..., 0], sample.right[..., 0], sample.K_right, sample.E_scored)
+    return sample.valid & ~seen_in(left, right)[3]
 
 
 @lru_cache(maxsize=1)
@@ -103,39 +97,23 @@ def _positive(depth_m: np.ndarray | None) -> np.ndarray:
     return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
 
 
-def _true_disparity(sample: StereoSample) -> np.ndarray:
-    cameras = (sample.K_left, sample.K_right, sample.E_scored)
-    return depth_to_disparity(np.where(sample.valid, sample.depth_m, 1.0), *cameras)
-
-
-def disparity_masks(sample: StereoSample) -> dict[str, np.ndarray]:
-    """Masks by which the disparity errors of a rectified sample are split, ``(H, W)`` bool.
+def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Scores]:
+    """``DISPARITY_METRICS`` of a rectified sample, of ``all`` pixels with truth and by region.
 
     ``visible``: neither hidden in the right view nor outside of it, by the set's mask or by dense truth, left
     out where nothing says what is hidden; ``edge`` and ``flat``: near a step of the true disparity, and not.
     """
-    true_px = _true_disparity(sample)
-    edge = edges.near_disparity_steps(true_px, sample.valid)
-    masks = {"edge": edge, "flat": sample.valid & ~edge}
-    hidden = sample.occluded
-    if hidden is None and sample.valid.mean() > DENSE:
-        hidden = edges.hidden_by_truth(true_px, sample.valid)
-    if hidden is not None:
-        masks = {"visible": sample.valid & ~hidden & ~out_of_view(sample)} | masks
-    return masks
-
-
-def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Scores]:
-    """``DISPARITY_METRICS`` of a rectified sample, ``all`` pixels with truth and by ``disparity_masks``.
-
-    Args:
-        sample: rectified, with truth.
-        depth_m: ``(H, W)`` metres; holes do not count.
-    """
-    true_px, cameras = _true_disparity(sample), (sample.K_left, sample.K_right, sample.E_scored)
+    cameras, valid = (sample.K_left, sample.K_right, sample.E_scored), sample.valid
+    true_px = depth_to_disparity(np.where(valid, sample.depth_m, 1.0), *cameras)
     pred_px = depth_to_disparity(_positive(depth_m), *cameras)
+    masks, hidden = {"all": valid}, sample.occluded
+    if hidden is None and valid.mean() > DENSE:
+        hidden = edges.hidden_by_truth(true_px, valid)
+    if hidden is not None:
+        masks["visible"] = valid & ~hidden & ~out_of_view(sample)
+    edge = edges.near_disparity_steps(true_px, valid)
+    masks |= {"edge": edge, "flat": valid & ~edge}
     step_px = float(sample.notes.get("disparity_step_px", 0.0))
-    masks = {"all": sample.valid} | disparity_masks(sample)
     return {
         name: _plain(evaluate_disparity(pred_px, true_px, mask, step_px))
         for name, mask in masks.items()
@@ -165,6 +143,14 @@ def _metric_scores(sample: StereoSample, prediction: Prediction, kept: np.ndarra
         f1 = {"f1": edges.boundary_f1(depth_m, truth, valid)}
         record["boundaries"] = _plain(f1 | edges.boundary_errors(depth_m, truth, valid))
     return record
+
+
+def in_metres(prediction: Prediction, truth: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """``(H, W)`` metres as they come out; of relative depth, aligned with the truth."""
+    if prediction.depth_m is not None:
+        return prediction.depth_m
+    assert prediction.relative is not None  # a prediction has one of the two
+    return align(prediction.relative, truth, kept, prediction.space)
 
 
 def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> dict[str, Any]:
@@ -205,8 +191,8 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
     record: dict[str, Any] = {"all_pixels": both(None)}
     record["capped"] = record["all_pixels"] if cap_m is None else both(cap_m)
     kept = counted(truth, valid, cap_m)
-    shown_m = align(values, truth, kept, space) if depth_m is None else depth_m
-    record |= _metric_scores(sample, prediction, kept)
-    masks = {name: mask & kept for name, mask in regions(sample).items() if (mask & kept).any()}
-    errors = {name: evaluate_depth(shown_m, truth, mask, cap_m)["abs_rel"] for name, mask in masks.items()}
-    return record | {"regions": _plain(errors)}
+    shown_m, errors = in_metres(prediction, truth, kept), {}
+    for name, mask in regions(sample).items():
+        if (mask & kept).any():
+            errors[name] = evaluate_depth(shown_m, truth, mask & kept, cap_m)["abs_rel"]
+    return record | _metric_scores(sample, prediction, kept) | {"regions": _plain(errors)}

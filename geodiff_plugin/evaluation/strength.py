@@ -8,11 +8,11 @@ input says, so that an edit of one step is seen by the next one, as a trained ne
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,18 +22,27 @@ from diffusers.configuration_utils import register_to_config
 from scipy import ndimage
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.algorithm.denoising import output_from
 from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load
 from geodiff_plugin.evaluation.edges import edge_error, surface_error
-from geodiff_plugin.evaluation.experiment import Experiment, Page, cell_key, last_of
+from geodiff_plugin.evaluation.experiment import Page, cell_key, last_of, run_experiment
 from geodiff_plugin.evaluation.figures import draw_strength, shaded
-from geodiff_plugin.evaluation.metrics import align, evaluate_depth, to_space
-from geodiff_plugin.evaluation.options import StrengthOptions, data_of
-from geodiff_plugin.evaluation.scoring import DENSE
-from geodiff_plugin.evaluation.tables import Table, count_of_pairs
+from geodiff_plugin.evaluation.metrics import evaluate_depth, to_space
+from geodiff_plugin.evaluation.options import STRENGTHS, Strength, StrengthOptions, data_of
+from geodiff_plugin.evaluation.scoring import DENSE, in_metres
+from geodiff_plugin.evaluation.tables import (
+    CellOf,
+    Table,
+    count_of_pairs,
+    grouped,
+    mean_of,
+    method_title,
+    most_of,
+    table_of_groups,
+)
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runner import Item, Record
 from geodiff_plugin.runtime.noise_levels import noise_level
@@ -48,48 +57,33 @@ PURPOSE = (
     "(*following by 0.3*: 30 %), so it sees corrections as a network does. *Surfaces* is the error of the "
     "slope of log depth away from edges: the lower, the smoother."
 )
+NOTE = (
+    "AbsRel and δ1 in metres, without alignment but for the prior with oracle; AbsRel within 3 px of the "
+    "truth's edges; error of the slope of log depth away from them, per mille a pixel."
+)
 
-SPACES = ("disparity", "depth", "log")
+COLUMNS: dict[str, CellOf] = {
+    "prior's error": lambda own: str(own[0]["strength"]),
+    "method": method_title,
+    "AbsRel": mean_of("abs_rel", 4),
+    "δ1": mean_of("delta1", 4),
+    "at edges": mean_of("edges", 4),
+    "surfaces": mean_of("surfaces", 2),
+    "worst AbsRel": most_of("abs_rel"),
+}
 #: What a prior calls 0 and 1: the quantiles of Marigold's training; the rest of the map lies beyond them.
 ENDS = (0.02, 0.98)
 #: Standard deviation of the smooth half of the error, and spacing of the segments of the other half, as
 #: shares of the longer side; that of the blur.
 SMOOTH, SEGMENTS, BLUR = 0.12, 0.16, 0.012
-
-
-class Strength(NamedTuple):
-    """How a prior errs.
-
-    Attributes:
-        error: mean absolute error of log depth, half of it smooth and half constant over segments.
-        blur: whether the map is blurred.
-        gamma: exponent of the relative map, 1 for none: an error that no scale and shift takes out.
-    """
-
-    error: float = 0.0
-    blur: bool = False
-    gamma: float = 1.0
-
-
-STRENGTHS = {
-    "exact": Strength(),
-    "2%": Strength(0.02),
-    "5%": Strength(0.05),
-    "10%": Strength(0.10),
-    "20%": Strength(0.20),
-    "blur": Strength(0.01, blur=True),
-    "gamma": Strength(gamma=1.6),
-}
+#: The plain call whose scale and shift the truth decides, and the strength whose surfaces the figure shows.
+ORACLE, SHOWN = "prior-aligned", "5%"
 
 
 def relative_map(sample: StereoSample, strength: Strength, space: str, seed: int = 0) -> np.ndarray:
     """The map of a prior that errs in a given way, at the truth's resolution.
 
-    Args:
-        sample: with truth everywhere, or at least densely; holes take the nearest known depth.
-        strength: how it errs.
-        space: what the map is affine in, one of ``SPACES``.
-        seed: of the error; the same one gives the same error whatever the space.
+    Holes of the truth take the nearest known depth; one ``seed`` gives the same error in every space.
 
     Returns:
         ``(H, W)`` float64, 0 and 1 at the 2 % and 98 % quantiles, clipped there as trained maps are.
@@ -157,32 +151,29 @@ class _Denoiser(ModelMixin, ConfigMixin):
         return (output_from(z0, self._noise, level)[0].to(sample.dtype),)
 
 
-class EmulatedPrior:
-    """The bundled pipeline with an emulated network, for one sample after another.
+class EmulatedPrior(PriorCache):
+    """The bundled pipeline with an emulated network, guided, for every method that asks for a prior.
 
     Args:
-        space: what its maps are affine in, one of ``SPACES``.
+        space: what its maps are affine in: disparity, depth or log.
         follow: how far its later answers follow their input, [0, 1].
-
-    Attributes:
-        pipe: the stock pipeline; guidance is enabled as on any other.
     """
 
     def __init__(self, space: str = "disparity", follow: float = 0.3) -> None:
-        check_choice(space, "space", SPACES)
-        self.space, self.pipe = space, load_bundled_prior()
+        super().__init__()
+        self.space, self.pipe = space, enable_geometry_guidance(load_bundled_prior())
         self.pipe.register_to_config(prediction_type=space)
         self.pipe.unet = _Denoiser(follow)
         self.pipe.unet.scheduler = self.pipe.scheduler
         self.pipe.set_progress_bar_config(disable=True)
 
-    @torch.no_grad()
-    def answer(self, sample: StereoSample, strength: Strength, resolution: int, seed: int = 0) -> Tensor:
-        """Let the network answer for a sample, in calls whose ``processing_resolution`` is this one.
+    def get(self, settings: Settings) -> Any:
+        """The emulated pipeline, whatever prior the settings name."""
+        return self.pipe
 
-        Returns:
-            ``(1, 1, H, W)`` the relative map at the image's resolution, before the autoencoder.
-        """
+    @torch.no_grad()
+    def answer(self, sample: StereoSample, strength: Strength, resolution: int, seed: int = 0) -> None:
+        """Let the network answer for a sample, in calls whose ``processing_resolution`` is this one."""
         relative = torch.from_numpy(relative_map(sample, strength, self.space, seed))[None, None].float()
         image = torch.from_numpy(sample.left).permute(2, 0, 1)[None].float() / 255.0
         padded, padding, _ = self.pipe.image_processor.preprocess(image, resolution, "bilinear", "cpu")
@@ -190,28 +181,51 @@ class EmulatedPrior:
         small = F.interpolate(relative, size, mode="bilinear", antialias=True)
         small = F.pad(small, (0, padding[1], 0, padding[0]), mode="replicate")
         self.pipe.unet.code = find_adapter(self.pipe)(self.pipe).encode(small).float()
-        return relative
 
 
-class EmulatedPriors(PriorCache):
-    """Hands an emulated prior, guided, to every method that asks for one."""
+def _depth_m(
+    prior: EmulatedPrior, options: StrengthOptions, sample: StereoSample, strength: str, name: str
+) -> np.ndarray:
+    """``(H, W)`` metres of a method with a prior of some strength, aligned where it is relative."""
+    prior.answer(sample, STRENGTHS[strength], options.resolution, options.seed)
+    method = find_method(name)
+    try:
+        prediction = method.run(sample, method.own_settings(_settings(options)), prior)
+    except NotApplicable as reason:
+        got = f"{name}, not on {sample.label}: {reason}"
+        bad_value("--methods", "methods that work on every pair", got)
+    return in_metres(prediction, sample.depth_m, sample.valid)
 
-    def __init__(self, prior: EmulatedPrior) -> None:
-        super().__init__()
-        self._pipe = enable_geometry_guidance(prior.pipe)
 
-    def get(self, settings: Settings) -> Any:
-        """The emulated pipeline, whatever prior the settings name."""
-        return self._pipe
+def _settings(options: StrengthOptions) -> Settings:
+    return Settings(steps=options.steps, resolution=options.resolution, seed=options.seed)
 
 
-#: The plain call whose scale and shift the truth decides.
-ORACLE = "prior-aligned"
-#: Strength whose surfaces the figure shows.
-SHOWN = "5%"
-#: Field of a record -> heading of its column, and digits.
-_VALUES = {"abs_rel": ("AbsRel", 4), "delta1": ("δ1", 4), "edges": ("at edges", 4)}
-_VALUES |= {"surfaces": ("surfaces", 2)}
+def _measure(
+    prior: EmulatedPrior, options: StrengthOptions, read: Any, ref: SampleRef, strength: str, name: str
+) -> Record:
+    """Errors of one method at one strength, of a pair with dense truth."""
+    sample = read(ref)
+    if sample.valid.mean() < DENSE:
+        return {"status": "sparse"}
+    depth_m = _depth_m(prior, options, sample, strength, name)
+    truth = (sample.depth_m, sample.valid)
+    scores = evaluate_depth(depth_m, *truth)
+    kind = {"rectified": bool(sample.rectified), "rendered": sample.dataset == "synthetic"}
+    errors = {"edges": edge_error(depth_m, *truth), "surfaces": surface_error(depth_m, *truth)}
+    return kind | {"abs_rel": scores["abs_rel"], "delta1": scores["delta1"]} | errors
+
+
+def _pictures(prior: EmulatedPrior, options: StrengthOptions, sample: StereoSample) -> dict[str, np.ndarray]:
+    """The middle of one pair, lit, at the strength of the figure: truth, prior, fitted once, guided."""
+    strength = SHOWN if SHOWN in options.strengths else options.strengths[0]
+    height, width = sample.depth_m.shape
+    window = np.s_[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
+    maps = {"truth": sample.depth_m}
+    for name in (ORACLE, "prior-fit", "guided"):
+        title = f"{find_method(name).title}, {strength}"
+        maps[title] = _depth_m(prior, options, sample, strength, name)
+    return {title: shaded(depth_m[window], float(sample.K_left[0, 0])) for title, depth_m in maps.items()}
 
 
 def strength_tables(records: Sequence[Record]) -> list[Table]:
@@ -222,32 +236,13 @@ def strength_tables(records: Sequence[Record]) -> list[Table]:
         "Rendered, any pose": [r for r in records if r["rendered"] and not r["rectified"]],
         "Real": [r for r in records if not r["rendered"]],
     }
-    return [_table(title, own) for title, own in groups.items() if own]
-
-
-def _table(title: str, records: Sequence[Record]) -> Table:
-    rows, rules = list[tuple[str, ...]](), list[int]()
-    cells = Counter((record["strength"], record["method"]) for record in records)
-    for strength in dict.fromkeys(strength for strength, _ in cells):
-        rules.append(len(rows))
-        for method in dict.fromkeys(method for of, method in cells if of == strength):
-            own = [r for r in records if (r["strength"], r["method"]) == (strength, method)]
-            shown = [f"{_mean([r[name] for r in own]):.{digits}f}" for name, (_, digits) in _VALUES.items()]
-            worst = max(r["abs_rel"] for r in own)
-            rows.append((strength, find_method(method).title, *shown, f"{worst:.3f}"))
-    # Not by label: pairs of one name in two folders are two.
-    note = (
-        f"{count_of_pairs(max(cells.values()))}. AbsRel and δ1 in metres, without alignment but for the "
-        f"prior with oracle; AbsRel within 3 px of the truth's edges; error of the slope of log depth away "
-        f"from them, per mille a pixel."
-    )
-    header = ("prior's error", "method", *(heading for heading, _ in _VALUES.values()), "worst AbsRel")
-    return Table(title, header, tuple(rows), note, rules=tuple(rules[1:]))
-
-
-def _mean(values: Sequence[float]) -> float:
-    known = [value for value in values if value == value]
-    return sum(known) / len(known) if known else float("nan")
+    names, page = ("strength", "method"), []
+    for title, own in groups.items():
+        if own:
+            # Not by label: pairs of one name in two folders are two.
+            pairs = count_of_pairs(max(map(len, grouped(own, *names).values())))
+            page.append(table_of_groups(title, own, names, COLUMNS, f"{pairs}. {NOTE}"))
+    return page
 
 
 def _dense(records: Sequence[Record]) -> list[Record]:
@@ -258,12 +253,7 @@ def _dense(records: Sequence[Record]) -> list[Record]:
 
 
 def run_strength(name: str, options: StrengthOptions) -> Page | None:
-    """Measure every method at every strength, and write the page.
-
-    Raises:
-        InputError: bad options, or no sample with dense truth.
-        OSError: missing or unreadable files.
-    """
+    """Measure every method at every strength, and write the page; errors as ``run_experiment``."""
     for method in map(find_method, options.methods):
         if not method.uses_prior or method.prior is not None:
             bad_value("--methods", "methods that use a prior, none named after an @", repr(method.name))
@@ -271,7 +261,15 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
         got = repr(",".join(options.methods))
         bad_value("--methods", f"with {ORACLE}, the abscissa of the figure", got)
     refs = [ref for root in options.data or (data_of(options),) for ref in find_pairs(root)[: options.limit]]
-    bench = _Bench(options)
+    prior, read, cells = EmulatedPrior(options.space, options.follow), last_of(load), []
+    for ref, strength, method_name in product(refs, options.strengths, options.methods):
+        method = find_method(method_name)
+        configuration = method.configuration(method.own_settings(_settings(options)))
+        emulated = f"emulated {options.space} {options.follow} {strength} {options.seed}"
+        head = {"pair": ref.label, "strength": strength, "method": method_name}
+        work = partial(_measure, prior, options, read, ref, strength, method_name)
+        key = cell_key(ref, method_name, configuration, emulated)
+        cells.append(Item(key, work, name=", ".join(head.values()), head=head))
 
     def remarks(records: list[Record]) -> list[str]:
         sentences = [
@@ -281,81 +279,13 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
         if options.figure is not None:
             labels = {record["pair"] for record in _dense(records)}
             sample = load(next(ref for ref in refs if ref.label in labels))
-            draw_strength(_dense(records), ORACLE, bench.pictures(sample), options.figure)
+            draw_strength(_dense(records), ORACLE, _pictures(prior, options, sample), options.figure)
             if options.results is not None:
                 picture = Path(os.path.relpath(options.figure, options.results.parent)).as_posix()
                 sentences.append(f"![What guidance gains by the prior's error; surfaces, lit]({picture})")
         return sentences
 
-    return Experiment(
-        name,
-        "Priors from exact to weak",
-        [cell for ref in refs for cell in bench.cells(ref)],
-        lambda records: strength_tables(_dense(records)),
-        remarks,
-        PURPOSE,
-    ).run(name, options)
+    def tables(records: list[Record]) -> list[Table]:
+        return strength_tables(_dense(records))
 
-
-class _Bench:
-    """One emulated prior, which answers for one sample and strength after the other."""
-
-    def __init__(self, options: StrengthOptions) -> None:
-        self._options, self._read = options, last_of(load)
-        self._settings = Settings(steps=options.steps, resolution=options.resolution, seed=options.seed)
-        self._prior = EmulatedPrior(options.space, options.follow)
-        self._cache: PriorCache = EmulatedPriors(self._prior)
-
-    def cells(self, ref: SampleRef) -> list[Item]:
-        """A cell for every strength and method."""
-        options, cells = self._options, []
-        for strength in options.strengths:
-            for name in options.methods:
-                method = find_method(name)
-                configuration = method.configuration(method.own_settings(self._settings))
-                prior = f"emulated {options.space} {options.follow} {strength} {options.seed}"
-                head = {"pair": ref.label, "strength": strength, "method": name}
-                work = partial(self._measure, ref, strength, name)
-                key = cell_key(ref, name, configuration, prior)
-                cells.append(Item(key, work, name=f"{ref.label}, {strength}, {name}", head=head))
-        return cells
-
-    def _measure(self, ref: SampleRef, strength: str, name: str) -> Record:
-        sample = self._read(ref)
-        if sample.valid.mean() < DENSE:
-            return {"status": "sparse"}
-        depth_m, truth = self.depth_m(sample, strength, name), (sample.depth_m, sample.valid)
-        scores = evaluate_depth(depth_m, *truth)
-        return {
-            "rectified": bool(sample.rectified),
-            "rendered": sample.dataset == "synthetic",
-            "abs_rel": scores["abs_rel"],
-            "delta1": scores["delta1"],
-            "edges": edge_error(depth_m, *truth),
-            "surfaces": surface_error(depth_m, *truth),
-        }
-
-    def depth_m(self, sample: StereoSample, strength: str, name: str) -> np.ndarray:
-        """``(H, W)`` metres of a method with a prior of some strength, aligned where it is relative."""
-        self._prior.answer(sample, STRENGTHS[strength], self._options.resolution, self._options.seed)
-        method = find_method(name)
-        try:
-            prediction = method.run(sample, method.own_settings(self._settings), self._cache)
-        except NotApplicable as reason:
-            got = f"{name}, not on {sample.label}: {reason}"
-            bad_value("--methods", "methods that work on every pair", got)
-        if prediction.depth_m is not None:
-            return prediction.depth_m
-        assert prediction.relative is not None
-        return align(prediction.relative, sample.depth_m, sample.valid, prediction.space)
-
-    def pictures(self, sample: StereoSample) -> dict[str, np.ndarray]:
-        """The middle of one pair, lit, at the strength of the figure: truth, prior, fitted once, guided."""
-        strengths = self._options.strengths
-        strength = SHOWN if SHOWN in strengths else strengths[0]
-        height, width = sample.depth_m.shape
-        window = np.s_[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
-        maps = {"truth": sample.depth_m}
-        for name in (ORACLE, "prior-fit", "guided"):
-            maps[f"{find_method(name).title}, {strength}"] = self.depth_m(sample, strength, name)
-        return {title: shaded(depth_m[window], float(sample.K_left[0, 0])) for title, depth_m in maps.items()}
+    return run_experiment(name, options, "Priors from exact to weak", cells, tables, remarks, PURPOSE)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
@@ -13,27 +14,22 @@ from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.runner import Record
 from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
+#: Below this number of images no interval is given: resampling four values says nothing.
 FEWEST_FOR_INTERVAL = 5
-"""Below this number of images no interval is given: resampling four values says nothing."""
+#: Column headings of the depth metrics, by their names in a record.
 HEADINGS = {"abs_rel": "AbsRel", "delta1": "δ1", "delta2": "δ2", "delta3": "δ3"}
 HEADINGS |= {"rmse": "RMSE m", "log_rmse": "log RMSE", "silog": "SILog"}
-"""Column headings of the depth metrics, by their names in a record."""
 
 ValueOf = Callable[[Record], float | None]
-Values = Mapping[str, dict[str, float]]
-"""Method -> label of the pair -> a number."""
+#: Records of one row -> what stands in a column.
+CellOf = Callable[[list[Record]], str]
+#: Method -> label of the pair -> a number.
+Values = dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over images.
-
-    Attributes:
-        value: the mean; NaN for no image.
-        low: 2.5 % quantile of the bootstrap, ``None`` for fewer than ``FEWEST_FOR_INTERVAL`` images.
-        high: 97.5 % quantile.
-        count: number of images.
-    """
+    """A mean of ``count`` numbers, NaN of none, with an interval from ``FEWEST_FOR_INTERVAL`` on."""
 
     value: float
     low: float | None
@@ -48,27 +44,35 @@ class Mean:
         return value if self.low is None else f"{value} [{low}, {high}]"
 
 
-def mean_with_interval(values: Sequence[float], seed: int = 0, draws: int = 2000) -> Mean:
-    """Mean over images and its 95 % percentile-bootstrap interval; one seed gives one interval."""
-    data = np.asarray(values, np.float64)
+def mean_with_interval(values: Iterable[float | None]) -> Mean:
+    """Mean of the numbers that there are, with its 95 % percentile-bootstrap interval, which is seeded."""
+    data = np.array([value for value in values if value is not None], np.float64)
+    mean = float(data.mean()) if data.size else float("nan")
     if data.size < FEWEST_FOR_INTERVAL:
-        return Mean(float(data.mean()) if data.size else float("nan"), None, None, data.size)
-    picks = np.random.default_rng(seed).integers(0, data.size, (draws, data.size))
+        return Mean(mean, None, None, data.size)
+    picks = np.random.default_rng(0).integers(0, data.size, (2000, data.size))
     low, high = np.quantile(data[picks].mean(axis=1), [0.025, 0.975])
-    return Mean(float(data.mean()), float(low), float(high), data.size)
+    return Mean(mean, float(low), float(high), data.size)
 
 
-def paired_difference(first: Mapping[str, float], second: Mapping[str, float], seed: int = 0) -> Mean:
+def paired_difference(first: Mapping[str, float], second: Mapping[str, float]) -> Mean:
     """Mean of ``first - second`` over the images that both have; an interval without 0 tells them apart."""
-    return mean_with_interval([first[name] - second[name] for name in first if name in second], seed)
+    return mean_with_interval([first[name] - second[name] for name in first if name in second])
 
 
-_LATEX: dict[str, str | int | None] = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
-_LATEX |= {character: f"\\{character}" for character in "_%&#${}"}
+def cell(value: float | None, digits: int = 3) -> str:
+    """A number, or a dash for ``None``."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def mean_cell(values: Iterable[float | None], digits: int = 3) -> str:
+    """The mean of the numbers that there are, without ``None`` and NaN; a dash where there are none."""
+    known = [value for value in values if value is not None and value == value]
+    return cell(float(np.mean(known)) if known else None, digits)
+
+
+_LATEX: dict[str, str | int | None] = {character: f"\\{character}" for character in "_%&#${}"}
+_LATEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"<": "$<$", ">": "$>$", "|": "$|$", "δ": r"$\delta$", "γ": r"$\gamma$", "±": r"$\pm$"}
 _LATEX |= {"↓": r"$\downarrow$", "↑": r"$\uparrow$", "×": r"$\times$", "†": r"$^\dagger$"}
 _LATEX |= {"✓": r"$\checkmark$", "✗": r"$\times$"}
@@ -83,14 +87,7 @@ def latex_escape(text: str) -> str:
 class Table:
     """Cells as they are printed.
 
-    Attributes:
-        title: heading, one line.
-        header: column headings; the first column names the row.
-        rows: as long as the header each.
-        note: what a reader needs beside it, or empty.
-        groups: ``(heading, number of columns)`` over the whole header, an empty heading for columns on their
-            own; empty for a header of one line.
-        rules: indices of rows that start a new group of rows.
+    The first column names the row; ``groups`` are ``(heading, number of columns)`` over the whole header.
     """
 
     title: str
@@ -98,7 +95,6 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
     groups: tuple[tuple[str, int], ...] = ()
-    rules: tuple[int, ...] = ()
 
     def full_header(self) -> tuple[str, ...]:
         """Column headings in one line each, with the heading of their group before them."""
@@ -116,29 +112,61 @@ class Table:
     def latex(self) -> str:
         """A ``tabular`` with booktabs rules, its title as a comment."""
         lines = [f"% {self.title}", rf"\begin{{tabular}}{{l{'r' * (len(self.header) - 1)}}}", r"\toprule"]
-        cells, rules, first = list[str](), list[str](), 1
+        cells, rules, last = list[str](), list[str](), 0
         for heading, count in self.groups:
-            if heading:
-                cells.append(rf"\multicolumn{{{count}}}{{c}}{{{latex_escape(heading)}}}")
-                rules.append(rf"\cmidrule(lr){{{first}-{first + count - 1}}}")
-            else:
-                cells += [""] * count
-            first += count
+            first, last = last + 1, last + count
+            cells += (
+                [rf"\multicolumn{{{count}}}{{c}}{{{latex_escape(heading)}}}"] if heading else [""] * count
+            )
+            rules += [rf"\cmidrule(lr){{{first}-{last}}}"] if heading else []
         lines += [" & ".join(cells) + r" \\", " ".join(rules)] if self.groups else []
-        lines += [" & ".join(map(latex_escape, self.header)) + r" \\", r"\midrule"]
-        for index, row in enumerate(self.rows):
-            lines += [r"\midrule"] * bool(index and index in self.rules)
-            lines.append(" & ".join(map(latex_escape, row)) + r" \\")
-        return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
-
-    def as_json(self) -> dict[str, Any]:
-        """The same as plain values."""
-        return {name: value for name, value in asdict(self).items() if name != "rules"}
+        header, *rows = (" & ".join(map(latex_escape, row)) + r" \\" for row in (self.header, *self.rows))
+        return "\n".join([*lines, header, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
-def cell(value: float | None, digits: int = 3) -> str:
-    """A number, or a dash for ``None``."""
-    return "-" if value is None else f"{value:.{digits}f}"
+def grouped(records: Iterable[Record], *names: str) -> dict[Any, list[Record]]:
+    """Records by the values of some entries, in the order in which these occur."""
+    groups: dict[Any, list[Record]] = {}
+    for record in records:
+        groups.setdefault(itemgetter(*names)(record), []).append(record)
+    return groups
+
+
+def table_of_groups(
+    title: str, records: Iterable[Record], names: Sequence[str], columns: Mapping[str, CellOf], note: str = ""
+) -> Table:
+    """A row for all values of the entries ``names``, with a cell of its records under each heading."""
+    groups = grouped(records, *names).values()
+    rows = tuple(tuple(cell_of(own) for cell_of in columns.values()) for own in groups)
+    return Table(title, tuple(columns), rows, note)
+
+
+def value_at(record: Record, path: str) -> Any:
+    """``capped.raw.abs_rel`` of a record; ``None`` where any part of it is not there."""
+    value: Any = record
+    for name in path.split("."):
+        value = (value or {}).get(name)
+    return value
+
+
+def mean_of(path: str, digits: int = 3, factor: float = 1.0) -> CellOf:
+    """A column: the mean of an entry of the records that have it."""
+
+    def mean(own: list[Record]) -> str:
+        values = (value_at(record, path) for record in own)
+        return mean_cell([factor * value for value in values if value is not None], digits)
+
+    return mean
+
+
+def most_of(name: str, digits: int = 3) -> CellOf:
+    """A column: the largest value of an entry of the records."""
+    return lambda own: cell(max(record[name] for record in own), digits)
+
+
+def method_title(own: Sequence[Record]) -> str:
+    """A column: the title of the method."""
+    return find_method(own[0]["method"]).title
 
 
 def label_of(record: Record) -> str:
@@ -151,6 +179,11 @@ def count_of_pairs(count: int, kind: str = "") -> str:
     return f"{count} {kind}{'pair' if count == 1 else 'pairs'}"
 
 
+def pairs_of(records: Iterable[Record]) -> str:
+    """How many pairs the records are of, in words."""
+    return count_of_pairs(len({label_of(record) for record in records}))
+
+
 def headline(record: Record) -> float | None:
     """AbsRel over all pixels with truth: not aligned, or aligned for a method without metres."""
     if record["status"] != "ok":
@@ -159,14 +192,9 @@ def headline(record: Record) -> float | None:
     return (both["raw"] or both["aligned"])["abs_rel"]
 
 
-def seconds_of(record: Record) -> float | None:
-    """Of one method on one pair."""
-    return record.get("seconds")
-
-
-def by_method(records: Sequence[Record], value_of: ValueOf) -> dict[str, dict[str, float]]:
+def by_method(records: Sequence[Record], value_of: Callable[[Record], Any]) -> dict[str, dict[str, Any]]:
     """``method -> label -> value`` over the finished records that have one."""
-    values: dict[str, dict[str, float]] = {}
+    values: dict[str, dict[str, Any]] = {}
     for record in records:
         of_label = values.setdefault(record["method"], {})
         value = value_of(record) if record["status"] == "ok" else None
@@ -177,7 +205,7 @@ def by_method(records: Sequence[Record], value_of: ValueOf) -> dict[str, dict[st
 
 def metric_values(records: Sequence[Record], alignment: str, metric: str) -> Values:
     """Method -> label -> one metric under the cap, raw or aligned."""
-    return by_method(records, lambda record: (record["capped"][alignment] or {}).get(metric))
+    return by_method(records, lambda record: value_at(record, f"capped.{alignment}.{metric}"))
 
 
 def groups_of(records: Sequence[Record]) -> dict[str, set[str]]:
@@ -191,219 +219,175 @@ def groups_of(records: Sequence[Record]) -> dict[str, set[str]]:
     return groups
 
 
-def _heading(records: Sequence[Record], method: str) -> str:
-    """A method's title, saying so where it knows relative depth only."""
-    title = find_method(method).title
-    raw = [r["all_pixels"]["raw"] for r in records if r["method"] == method and r["status"] == "ok"]
-    relative = bool(raw) and not any(raw)
-    return f"{title} + oracle" if relative and "oracle" not in title else title
+def whole_mean(values: Mapping[str, float], labels: Iterable[str], digits: int = 3) -> str:
+    """The mean over pairs, a dash unless every one of them has a number."""
+    return mean_cell([values[x] for x in labels] if set(labels) <= values.keys() else [], digits)
 
 
-def per_pair_table(records: Sequence[Record], title: str, value_of: ValueOf, digits: int, note: str) -> Table:
-    """One row per sample, one column per method, then the means of every group.
-
-    A mean stands only where the method has a number for every sample of the group.
-    """
-    values = by_method(records, value_of)
-    labels = list(dict.fromkeys(map(label_of, records)))
-    rows = [(label, *(cell(values[m].get(label), digits) for m in values)) for label in labels]
+def per_pair_table(
+    records: Sequence[Record], title: str, value_of: ValueOf, digits: int = 3, note: str = ""
+) -> Table:
+    """One row per sample, one column per method, then the means of every group."""
+    values, header = by_method(records, value_of).values(), ["pair"]
+    for own in grouped(records, "method").values():
+        raw = [record["all_pixels"]["raw"] for record in own if record["status"] == "ok"]
+        relative = raw and not any(raw) and "oracle" not in method_title(own)
+        header.append(f"{method_title(own)} + oracle" if relative else method_title(own))
+    labels = dict.fromkeys(map(label_of, records))
+    rows = [(label, *(cell(own.get(label), digits) for own in values)) for label in labels]
     for group, members in groups_of(records).items():
-        means = [_whole_mean(values[m], members) for m in values]
-        rows += [(f"mean of {group}", *(cell(mean, digits) for mean in means))] if members else []
-    return Table(title, ("pair", *(_heading(records, m) for m in values)), tuple(rows), note)
+        if members:
+            rows.append((f"mean of {group}", *(whole_mean(own, members, digits) for own in values)))
+    return Table(title, tuple(header), tuple(rows), note)
 
 
-def _whole_mean(values: Mapping[str, float], members: set[str]) -> float | None:
-    return mean_with_interval([values[x] for x in members]).value if members <= values.keys() else None
-
-
-def summary_table(records: Sequence[Record], members: set[str], title: str) -> Table:
+def summary_table(records: Sequence[Record], members: Collection[str], title: str) -> Table:
     """Mean over some samples and its interval of every metric, a row per method as is and one aligned."""
-    rows = []
-    records = [r for r in records if r["status"] == "ok" and label_of(r) in members]
-    for method in dict.fromkeys(record["method"] for record in records):
-        done = [r["capped"] for r in records if r["method"] == method]
-        for column, suffix in (("raw", ""), ("aligned", ", aligned")):
-            scores = [both[column] for both in done if both[column] is not None]
-            if not scores:
-                continue
-            columns = [[v for s in scores if (v := s[name]) is not None] for name in (*HEADINGS, "coverage")]
-            *means, coverage = map(mean_with_interval, columns)
-            cells = [*(mean.cell() for mean in means), cell(coverage.value)]
-            rows.append((find_method(method).title + suffix, str(len(scores)), *cells))
-    header = ("method", "pairs", *HEADINGS.values(), "coverage")
-    return Table(title, header, tuple(rows), "Capped at 80 m for KITTI and 10 m for Booster; mean [95 %].")
+    scores = [
+        {"method": method, "suffix": suffix} | record["capped"][kind]
+        for method, own in grouped(records, "method").items()
+        for kind, suffix in (("raw", ""), ("aligned", ", aligned"))
+        for record in own
+        if record["status"] == "ok" and label_of(record) in members and record["capped"][kind]
+    ]
+
+    def with_interval(name: str) -> CellOf:
+        return lambda own: mean_with_interval([record[name] for record in own]).cell()
+
+    columns: dict[str, CellOf] = {"method": lambda own: method_title(own) + own[0]["suffix"]}
+    columns |= {"pairs": lambda own: str(len(own))}
+    columns |= {heading: with_interval(name) for name, heading in HEADINGS.items()}
+    columns |= {"coverage": mean_of("coverage")}
+    note = "Capped at 80 m for KITTI and 10 m for Booster; mean [95 %]."
+    return table_of_groups(title, scores, ("method", "suffix"), columns, note)
 
 
 def versus_table(records: Sequence[Record], reference: str) -> Table:
     """Paired differences in AbsRel, all pixels, as ``headline``: the reference minus each other method."""
-    values, rows = by_method(records, headline), []
-    own, title = values.get(reference, {}), find_method(reference).title
-    for method, other in values.items():
-        if method != reference and other and own:
-            difference = paired_difference(own, other)
-            wins = f"{sum(own[x] < other[x] for x in own if x in other)} of {difference.count}"
-            rows.append((find_method(method).title, str(difference.count), difference.cell(sign="+"), wins))
+    others, rows = by_method(records, headline), []
+    values, title = others.pop(reference, {}), find_method(reference).title
+    for method, other in others.items():
+        difference = paired_difference(values, other)
+        if difference.count:
+            won = f"{sum(values[x] < other[x] for x in values if x in other)} of {difference.count}"
+            rows.append((find_method(method).title, str(difference.count), difference.cell(sign="+"), won))
     header = ("method", "pairs", "mean difference [95 %]", "pairs won")
     note = "Negative: smaller error than the other method. An interval without 0 tells the two apart."
     return Table(f"{title} against each other method, AbsRel", header, tuple(rows), note)
 
 
 _DISPARITY = {"epe": "EPE px", "bad1": "bad-1", "bad2": "bad-2", "bad3": "bad-3", "d1": "D1"}
-
-
-class _Details(NamedTuple):
-    """A table of means, a column per quantity; ``value_of(column, record)`` may be ``None``."""
-
-    title: str
-    columns: Mapping[str, str]
-    value_of: Callable[[str, Record], float | None]
-    note: str
-
-    def table(self, records: Sequence[Record], columns: Mapping[str, str] | None = None) -> Table:
-        """A row per method with a value: the mean of each quantity over the pairs that have it."""
-        columns = columns or self.columns
-        values = [by_method(records, partial(self.value_of, name)) for name in columns]
-        header, rows = ["method"], []
-        for of_method, heading in zip(values, columns.values(), strict=True):
-            count = len({label for own in of_method.values() for label in own})
-            header.append(f"{heading} ({count_of_pairs(count)})" if count else heading)
-        for method in dict.fromkeys(record["method"] for record in records):
-            own = [list(of_method[method].values()) for of_method in values]
-            if any(own):
-                cells = (cell(mean_with_interval(numbers).value) if numbers else "-" for numbers in own)
-                rows.append((find_method(method).title, *cells))
-        return Table(self.title, tuple(header), tuple(rows), self.note)
-
-
-def _disparity_by_region(column: str, record: Record) -> float | None:
-    region, name = column.split()
-    return ((record["disparity"] or {}).get("regions") or {}).get(region, {}).get(name)
-
-
-def _ause(name: str, record: Record) -> float | None:
-    return record["ause"] if name == "uncertainty" else (record.get("ause_confidence") or {}).get(name)
-
-
-_REGIONS = _Details(
-    "AbsRel by region and material",
-    {
-        "visible": "visible",
-        "occluded": "occluded",
-        "out_of_view": "out of view",
-        "matched": "matched",
-        "unmatched": "unmatched",
-        "tom": "ToM",
-        "not_tom": "other material",
-    },
-    lambda name, record: record["regions"].get(name),
-    "Under the cap; aligned for methods that know relative depth only. Visible and occluded are known where "
-    "the data set has a mask, out of view always; matched is where our sweep of both views has a match of "
-    "confidence 0.5 or more, the same pixels for every method; ToM is transparent or mirror (classes 2, 3).",
-)
-_DETAILS = (
-    _Details(
-        "Disparity, rectified pairs",
+_BY_REGION = {
+    f"{region}.{name}": f"{region}, {heading}"
+    for region in ("visible", "edge", "flat")
+    for name, heading in _DISPARITY.items()
+    if name != "bad3"
+}
+#: Title -> where in a record its numbers are, their headings, note.
+_DETAILS: dict[str, tuple[str, dict[str, str], str]] = {
+    "Disparity, rectified pairs": (
+        "disparity.",
         _DISPARITY,
-        lambda name, record: (record["disparity"] or {}).get(name),
         "Metres turned into disparity at the left image's resolution; shares of pixels for bad-k and D1, "
         "a dash where the truth's step is coarser than the threshold.",
     ),
-    _Details(
-        "Disparity by region, rectified pairs",
-        {
-            f"{region} {name}": f"{region}, {heading}"
-            for region in ("visible", "edge", "flat")
-            for name, heading in _DISPARITY.items()
-            if name != "bad3"
-        },
-        _disparity_by_region,
+    "Disparity by region, rectified pairs": (
+        "disparity.regions.",
+        _BY_REGION,
         "Visible: neither hidden in the right view nor beside it; edge: within 4 px of a step of the true "
         "disparity of more than 3 px; flat: the rest.",
     ),
-    _Details(
-        "Boundaries, dense truth",
+    "Boundaries, dense truth": (
+        "boundaries.",
         {"f1": "boundary F1", "dbe_acc": "ε acc px", "dbe_comp": "ε comp px"},
-        lambda name, record: (record.get("boundaries") or {}).get(name),
         "F1 as Depth Pro defines it, higher is better; distances of depth boundaries as iBims-1 does.",
     ),
-    _Details(
-        "AUSE",
-        {"uncertainty": "uncertainty", "ause": "confidence", "random": "random order"},
-        _ause,
+    "AUSE": (
+        "ause",
+        {"": "uncertainty", "_confidence.ause": "confidence", "_confidence.random": "random order"},
         "Area under the sparsification error of AbsRel; 0 where the least certain pixels are the worst. An "
         "ensemble of at least 2 has an uncertainty.",
     ),
-)
+}
+_REGIONS = {"visible": "visible", "occluded": "occluded", "out_of_view": "out of view", "matched": "matched"}
+_REGIONS |= {"unmatched": "unmatched", "tom": "ToM", "not_tom": "other material"}
+
+
+def _details(records: Sequence[Record], title: str, where: str, headings: dict[str, str], note: str) -> Table:
+    """A row per method with a value: the mean of each quantity over the pairs that have it."""
+    done = [record for record in records if record["status"] == "ok"]
+    columns: dict[str, CellOf] = {"method": method_title}
+    for name, heading in headings.items():
+        count = len({label_of(record) for record in done if value_at(record, where + name) is not None})
+        columns[f"{heading} ({count_of_pairs(count)})" if count else heading] = mean_of(where + name)
+    table = table_of_groups(title, done, ("method",), columns, note)
+    return replace(table, rows=tuple(row for row in table.rows if set(row[1:]) != {"-"}))
 
 
 def regions_table(records: Sequence[Record]) -> Table:
     """AbsRel by what the right camera sees, by matches and material, and for each class that occurs."""
     classes = sorted({name for r in records for name in r.get("regions") or {} if name.startswith("mat")})
-    more = {name: name.replace("material_", "class ") for name in classes}
-    return _REGIONS.table(records, {**_REGIONS.columns, **more})
+    headings = _REGIONS | {name: name.replace("material_", "class ") for name in classes}
+    note = (
+        "Under the cap; aligned for methods that know relative depth only. Visible and occluded are known "
+        "where the data set has a mask, out of view always; matched is where our sweep of both views has a "
+        "match of confidence 0.5 or more, the same pixels for every method; ToM is transparent or mirror "
+        "(classes 2, 3)."
+    )
+    return _details(records, "AbsRel by region and material", "regions.", headings, note)
 
 
 def details_tables(records: Sequence[Record]) -> list[Table]:
     """Regions, disparity, boundaries and AUSE, as far as there are numbers."""
-    return [regions_table(records), *(details.table(records) for details in _DETAILS)]
+    return [regions_table(records), *(_details(records, title, *rest) for title, rest in _DETAILS.items())]
 
 
 def confidence_table(records: Sequence[Record]) -> Table:
     """What the confidence of each method promises by decile, and what it keeps; pairs weigh the same."""
     rows = []
-    deciles_of: Any = by_method(records, lambda record: record.get("confidence"))
-    for method, own in deciles_of.items():
-        for k in range(10):
-            filled = [deciles[k] for deciles in own.values() if deciles[k]["share"]]
-            weight = sum(part["share"] for part in filled)
-            if filled:
-                names = ("promised", "kept", "abs_rel")
-                means = [sum(part[n] * part["share"] for part in filled) / weight for n in names]
-                name, share = f"{k / 10:.1f} to {(k + 1) / 10:.1f}", cell(weight / len(own))
-                rows.append((find_method(method).title, name, share, *map(cell, means)))
+    for method, deciles_of in by_method(records, lambda record: record.get("confidence")).items():
+        for k, parts in enumerate(zip(*deciles_of.values(), strict=True)):
+            shares = np.array([part["share"] for part in parts])
+            if shares.any():
+                values = [[part[name] or 0.0 for part in parts] for name in ("promised", "kept", "abs_rel")]
+                means = (np.array(values) @ shares) / shares.sum()
+                name = f"{k / 10:.1f} to {(k + 1) / 10:.1f}"
+                rows.append((find_method(method).title, name, cell(shares.mean()), *map(cell, means)))
     note = f"Confidence is the probability of a relative error below {RIGHT_WITHIN:g}; pixels of all pairs."
     header = ("method", "confidence", "share of pixels", "promised", "kept", "AbsRel")
     return Table("Confidence by decile", header, tuple(rows), note)
 
 
 def _families(records: Sequence[Record]) -> dict[str, list[str]]:
-    """``METHOD`` -> its name and those of its ``METHOD#SEED``, for every method that was run unbound."""
-    names = list(dict.fromkeys(record["method"] for record in records))
-    families = {name: [name] for name in names if find_method(name).seed is None}
-    for name in names:
-        method = find_method(name)
-        if method.seed is not None and method.seedless_name in families:
-            families[method.seedless_name].append(name)
-    return families
+    """``METHOD`` -> its name and those of its ``METHOD#SEED``, for every method run with several seeds."""
+    names = list(grouped(records, "method"))
+    families = {name: [n for n in names if find_method(n).seedless_name == name] for name in names}
+    return {name: family for name, family in families.items() if len(family) > 1}
 
 
 def without_copies(records: Sequence[Record]) -> list[Record]:
     """The records but for those of ``METHOD#SEED`` where ``METHOD`` itself was run."""
-    copies = {name for family in _families(records).values() for name in family[1:]}
+    families = _families(records)
+    copies = {name for family in families.values() for name in family} - families.keys()
     return [record for record in records if record["method"] not in copies]
 
 
 def spread_table(records: Sequence[Record]) -> Table:
-    """Mean AbsRel of each method over the seeds that it was run with; no rows where that is one.
+    """Mean AbsRel of each method and group over the seeds that it was run with; no rows where that is one.
 
-    A row per method and group. A mean stands only where every seed has a number for every pair of the group;
-    the largest spread is over the pairs that every seed has a number for.
+    A mean stands only where every seed has a number for every pair of the group; the largest spread is over
+    the pairs that every seed has a number for.
     """
-    values, rows, rules = by_method(records, headline), list[tuple[str, ...]](), list[int]()
-    families = {name: family for name, family in _families(records).items() if len(family) > 1}
-    for name, family in families.items():
-        seeds = [values[copy] for copy in family]
-        rules.append(len(rows))
-        for group, members in groups_of(records).items():
-            shared = [x for x in seeds[0] if x in members and all(x in own for own in seeds)]
-            if not shared:
-                continue
+    values, families, rows = by_method(records, headline), _families(records), []
+    for name, (group, members) in product(families, groups_of(records).items()):
+        seeds = [values[copy] for copy in families[name]]
+        shared = [x for x in seeds[0] if x in members and all(x in own for own in seeds)]
+        if shared:
             errors = np.array([[own[label] for label in shared] for own in seeds])  # (seeds, pairs)
             means, spread = errors.mean(axis=1), np.ptp(errors, axis=0)
             over_seeds = (means.mean(), means.std(ddof=1), means.min(), means.max())
-            cells = [cell(float(v) if len(shared) == len(members) else None, 4) for v in over_seeds]
-            pair = cell(float(spread.max()), 4), shared[int(spread.argmax())]
+            cells = [cell(v if len(shared) == len(members) else None, 4) for v in over_seeds]
+            pair = cell(spread.max(), 4), shared[int(spread.argmax())]
             rows.append((find_method(name).title, group, *cells, *pair))
     header = ("method", "AbsRel of", "mean", "deviation", "least", "largest", "spread of a pair", "that pair")
     note = (
@@ -411,27 +395,21 @@ def spread_table(records: Sequence[Record]) -> Table:
         "largest of the mean of these pairs; then the greatest difference between two seeds on one pair."
     )
     count = max(map(len, families.values()), default=1)
-    return Table(f"Spread over {count} seeds", header, tuple(rows), note, rules=tuple(rules))
+    return Table(f"Spread over {count} seeds", header, tuple(rows), note)
 
 
 def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[Table]:
-    """The tables of ``geodiff eval pairs``.
-
-    Args:
-        records: of a run; further seeds of a method in it count in the table of their spread only.
-        reference: the method that the others are compared with.
-    """
+    """The tables of ``geodiff eval pairs``; further seeds count in the table of their spread only."""
     spread, records = spread_table(records), without_copies(records)
-    title = f"AbsRel of {count_of_pairs(len({label_of(record) for record in records}))}"
+    title = f"AbsRel of {pairs_of(records)}"
     note = (
         "All pixels with truth, no cap; metres as they come out, not aligned, except in the columns of "
         "methods that know relative depth only ('oracle'), which get scale and shift from the truth."
     )
-    tables = [per_pair_table(records, title, headline, 3, note)]
-    tables.append(per_pair_table(records, "Seconds", seconds_of, 1, ""))
+    tables = [per_pair_table(records, title, headline, note=note)]
+    tables.append(per_pair_table(records, "Seconds", itemgetter("seconds"), 1))
     if any(record["method"] == reference for record in records):
         tables.append(versus_table(records, reference))
     groups = groups_of(records).items()
     tables += [summary_table(records, members, f"All metrics, {group}") for group, members in groups]
-    tables += [*details_tables(records), confidence_table(records), spread]
-    return [table for table in tables if table.rows]
+    return [*tables, *details_tables(records), confidence_table(records), spread]

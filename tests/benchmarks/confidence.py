@@ -25,8 +25,9 @@ from geodiff_plugin.evaluation.baselines.guided import call_arguments, posed_vie
 from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.evaluation.options import STRENGTHS
 from geodiff_plugin.evaluation.scoring import DENSE
-from geodiff_plugin.evaluation.strength import STRENGTHS, EmulatedPrior, EmulatedPriors
+from geodiff_plugin.evaluation.strength import EmulatedPrior
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import consistency
 from geodiff_plugin.runtime import confidence
@@ -162,10 +163,10 @@ def observe_emulated(sample: StereoSample, strengths: Sequence[str]) -> list[Obs
         return []
     resolution = 384
     prior, settings = EmulatedPrior(), Settings(steps=4, resolution=resolution)
-    priors, found = EmulatedPriors(prior), []
+    found = []
     for name in strengths:
         prior.answer(sample, STRENGTHS[name], resolution, settings.seed)
-        found.append(observe_depth(sample, settings, priors))
+        found.append(observe_depth(sample, settings, prior))
     return found
 
 

@@ -18,7 +18,7 @@ import torch
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.datasets import DATASETS
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample, make_sample
-from geodiff_plugin.evaluation.sequence import SEQUENCES
+from geodiff_plugin.evaluation.frames import SEQUENCES
 from geodiff_plugin.types import Rig
 from tests.scenes import render_pair
 from tests.scenes.cameras import intrinsics

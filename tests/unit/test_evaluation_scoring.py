@@ -11,15 +11,15 @@ from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets import StereoSample
 from geodiff_plugin.evaluation.datasets.changed import with_perturbed_poses
 from geodiff_plugin.evaluation.scoring import matched, out_of_view, regions, score
-from geodiff_plugin.evaluation.tables import details_tables, headline, regions_table
+from geodiff_plugin.evaluation.tables import details_tables, headline
 
 SHAPE = (6, 8)
 
 
 def make_sample(name="a", **changes) -> StereoSample:
-    """A wall 2 m away, 5 m in its first two columns; 0.5 m of baseline; fy is not fx."""
+    """A wall 2 m away, 5 m in its first two columns; 0.52 m of baseline; fy is not fx."""
     K, E = np.array([[10.0, 0, 3.5], [0, 12.0, 2.5], [0, 0, 1]]), np.eye(4)
-    E[0, 3] = 0.5
+    E[0, 3] = 0.52
     image, depth_m = np.zeros((*SHAPE, 3), np.uint8), np.full(SHAPE, 2.0, np.float32)
     depth_m[:, :2] = 5.0
     cameras = {"K_left": K, "K_right": K, "E": E}
@@ -38,20 +38,16 @@ def textured_sample(**changes) -> StereoSample:
     return StereoSample("synthetic", "wall", wide[:, :128], wide[:, 6:], **(given | changes))
 
 
-def record_of(sample, prediction, method="guided"):
-    head = {"dataset": sample.dataset, "sample": sample.name, "method": method, "status": "ok"}
-    return head | score(sample, prediction, None)
-
-
 def test_raw_aligned_and_capped():
     sample = make_sample()
     exact = score(sample, Prediction(sample.depth_m), None)
-    assert exact["all_pixels"]["raw"]["abs_rel"] == 0
-    assert exact["disparity"]["epe"] == pytest.approx(0, abs=1e-6)
-    assert exact["capped"] is exact["all_pixels"]
+    assert exact["all_pixels"]["raw"]["abs_rel"] == 0 and exact["capped"] is exact["all_pixels"]
     double = score(sample, Prediction(2 * sample.depth_m), None)
     assert double["all_pixels"]["raw"]["abs_rel"] == pytest.approx(1)
     assert double["all_pixels"]["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6)
+    # A doubled depth halves the shift of f b / z = 5.2 / z: by 0.52 px in 12 of 48 pixels, by 1.3 px in 36.
+    assert double["disparity"]["epe"] == pytest.approx(0.25 * 0.52 + 0.75 * 1.3, rel=1e-5)
+    assert double["disparity"]["bad1"] == 0.75
     capped = score(sample, Prediction(np.full(SHAPE, 4.0)), cap_m=3.0)
     assert capped["all_pixels"]["raw"]["pixels"] == 48 and capped["capped"]["raw"]["pixels"] == 36
     assert capped["capped"]["raw"]["abs_rel"] == pytest.approx(0.5)  # clipped from 4 to the cap of 3
@@ -69,8 +65,7 @@ def test_relative_depth_has_no_raw_column_and_holes_no_errors():
 
 
 def test_uncertainty_and_confidence_are_scored():
-    sample = make_sample()
-    error = np.arange(48).reshape(SHAPE) / 100
+    sample, error = make_sample(), np.arange(48).reshape(SHAPE) / 100
     pred = sample.depth_m * (1 + error)
     record = score(sample, Prediction(pred, uncertainty=error, confidence=1 - error / error.max()), None)
     assert record["ause"] == pytest.approx(0, abs=1e-6) == record["ause_confidence"]["ause"]
@@ -84,39 +79,42 @@ def test_poses_given_wrongly_change_no_mask_and_no_true_disparity(monkeypatch):
     np.testing.assert_array_equal(out_of_view(wrong), out_of_view(sample))
     double = Prediction(2 * sample.depth_m)
     assert score(wrong, double, None)["disparity"] == score(sample, double, None)["disparity"]
-
-    def seen(sample, device):
-        swept.append(sample.E)
-        raise ValueError("no overlap")
-
-    monkeypatch.setattr(scoring, "sweep", seen)
-    assert matched(with_perturbed_poses(sample, (20.0, 0.5), "b")) is None
+    monkeypatch.setattr(scoring, "sweep", lambda sample, _: swept.append(sample.E) or sweep(sample, "cpu"))
+    assert matched(with_perturbed_poses(sample, (20.0, 0.5), "b")) is None  # too small an image
     np.testing.assert_array_equal(swept[0], sample.E)
 
 
-def test_regions_split_what_the_right_camera_sees():
+def test_regions_split_what_the_right_camera_sees_and_tables_show_them():
     occluded, material = np.zeros(SHAPE, bool), np.zeros(SHAPE, np.uint8)
     occluded[2, 5], material[:, 6:] = True, 3
     sample = make_sample(occluded=occluded, material=material)
-    # Shift f b / z: 1 px at 5 m (columns 0, 1), 2.5 px at 2 m: column 0 leaves, and column 2 falls on -0.5.
-    assert out_of_view(sample)[0].tolist() == [True] + [False] * 7
+    # Shift: 1.04 px at 5 m (columns 0, 1), 2.6 px at 2 m: columns 0 and 2 leave.
+    assert out_of_view(sample)[0].tolist() == [True, False, True] + [False] * 5
     masks = regions(sample)
-    assert masks["occluded"].sum() == 1 and masks["visible"].sum() == 48 - 6 - 1
+    assert masks["occluded"].sum() == 1 and masks["visible"].sum() == 48 - 12 - 1
     assert masks["material_3"].sum() == 12
-    assert set(score(sample, Prediction(sample.depth_m), None)["regions"]) == set(masks)
+    records = []
+    for each, factor in ((sample, 2.0), (make_sample("b"), 3.0)):
+        head = {"dataset": each.dataset, "sample": each.name, "method": "guided", "status": "ok"}
+        prediction = Prediction(factor * each.depth_m, uncertainty=np.ones(SHAPE))
+        records.append(head | score(each, prediction, None))
+    by_region, *_, areas = details_tables(records)
+    one, two = "(1 pair)", "(2 pairs)"
+    header = ["method", f"visible {one}", f"occluded {one}", f"out of view {two}", "matched", "unmatched"]
+    header += [f"{name} {one}" for name in ("ToM", "other material", "class 0", "class 3")]
+    assert list(by_region.header) == header
+    assert by_region.rows == (("guided", "1.000", "1.000", "1.500", "-", "-", *["1.000"] * 4),)
+    assert areas.rows == (("guided", "0.000", "-", "-"),)
+    bare = [records[1] | {"disparity": None, "ause": None, "regions": {}, "boundaries": None}]
+    assert all(table.rows == () for table in details_tables(bare))
 
 
 def test_regions_split_by_whether_the_views_match():
     valid = np.ones((64, 128), bool)
     valid[:8] = False
-    sample = textured_sample(valid=valid)
-    masks = regions(sample)
+    masks = regions(textured_sample(valid=valid))
     np.testing.assert_array_equal(masks["matched"] ^ masks["unmatched"], valid)
     assert masks["matched"][8:, 10:55].mean() > 0.8 and masks["matched"][8:, 90:].mean() < 0.1
-    record = record_of(sample, Prediction(np.where(matched(sample), 2.0, 4.0)))
-    table = regions_table([record])
-    cells = dict(zip(table.header, table.rows[0], strict=True))
-    assert (cells["matched (1 pair)"], cells["unmatched (1 pair)"]) == ("0.000", "1.000")
 
 
 def test_views_are_matched_once_a_sample_and_left_out_where_they_do_not_overlap(monkeypatch):
@@ -128,8 +126,7 @@ def test_views_are_matched_once_a_sample_and_left_out_where_they_do_not_overlap(
     assert len(swept) == 1
     away = np.diag([-1.0, 1, -1, 1])
     away[0, 3] = 0.12
-    behind = textured_sample(E=away)
-    assert matched(behind) is None and set(regions(behind)) == {"out_of_view"}
+    assert set(regions(textured_sample(E=away))) == {"out_of_view"}
 
 
 def test_a_crop_makes_one_object_of_a_sample(monkeypatch):
@@ -140,30 +137,6 @@ def test_a_crop_makes_one_object_of_a_sample(monkeypatch):
     blind = replace(sample, valid=sample.valid & (np.arange(128) < 2))
     with pytest.raises(ValueError, match="the truth of synthetic/wall must be known somewhere in the crop"):
         experiment.cropped(blind, "garg")
-
-
-def test_detail_tables_say_where_and_whether_it_knows():
-    hidden, glass = np.zeros(SHAPE, bool), np.zeros(SHAPE, np.uint8)
-    hidden[:, 4:], glass[:, 6:] = True, 3
-    samples = make_sample("a", occluded=hidden, material=glass), make_sample("b")
-    records = [
-        record_of(sample, Prediction(factor * sample.depth_m, uncertainty=np.ones(SHAPE)))
-        for sample, factor in zip(samples, (2.0, 3.0), strict=True)
-    ]
-    by_region, disparity, _, _, areas = details_tables(records)
-    one, two = "(1 pair)", "(2 pairs)"
-    header = ["method", f"visible {one}", f"occluded {one}", f"out of view {two}", "matched", "unmatched"]
-    header += [f"{name} {one}" for name in ("ToM", "other material", "class 0", "class 3")]
-    assert list(by_region.header) == header
-    # The images are too small to be matched.
-    assert by_region.rows == (("guided", "1.000", "1.000", "1.500", "-", "-", *["1.000"] * 4),)
-    # A doubled depth halves the shift of f b / z = 5 / z: by 0.5 px in 12 of 48 pixels, by 1.25 px in 36; a
-    # tripled one by 0.667 and 1.667 px.
-    epe = (0.25 * 0.5 + 0.75 * 1.25 + 0.25 * 2 / 3 + 0.75 * 5 / 3) / 2
-    assert disparity.rows == (("guided", f"{epe:.3f}", "0.750", "0.000", "0.000", "0.000"),)
-    assert areas.rows == (("guided", "0.000", "-", "-"),)
-    bare = [records[1] | {"disparity": None, "ause": None, "regions": {}, "boundaries": None}]
-    assert all(table.rows == () for table in details_tables(bare))
 
 
 def test_refusals():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,9 +12,9 @@ from diffusers import DDIMScheduler, LCMScheduler
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError, InputTypeError
+from geodiff_plugin.evaluation import frames
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.options import SequenceOptions
-from geodiff_plugin.evaluation.sequence import SEQUENCES, flicker, run_sequence
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.start import plan_warm_start
 from geodiff_plugin.types import MetricDepthOutput
@@ -25,18 +24,14 @@ from tests.scenes import render_sequence
 FAST = {"inner_steps": 0, "corrections": 4}
 
 
-@pytest.fixture(scope="module")
-def sequence():
-    return render_sequence(3, 3, size=(48, 64))
-
-
-def test_flicker_is_what_changes_on_the_same_points(sequence):
+def test_flicker_is_what_changes_on_the_same_points():
+    truth = frames.true_frames(render_sequence(3, 3, size=(48, 64)))
     still = [np.full((48, 64), 0.1)] * 3
-    assert flicker(still, sequence) == (0.0, 0.0)  # wrong, but steadily so
+    assert frames.flicker(still, truth) == (0.0, 0.0)  # wrong, but steadily so
     breathing = [np.full((48, 64), value) for value in (0.0, 0.02, 0.0)]
-    assert flicker(breathing, sequence) == pytest.approx((0.02, 0.02))
+    assert frames.flicker(breathing, truth) == pytest.approx((0.02, 0.02))
     noise = np.random.default_rng(0).normal(size=(3, 48, 64)) * 0.1
-    points, breath = flicker(list(noise), sequence)
+    points, breath = frames.flicker(list(noise), truth)
     # The mean of |a - b| of two normal numbers of deviation s is 2 s / sqrt(pi).
     assert points == pytest.approx(0.2 / np.sqrt(np.pi), rel=0.1) and breath < 0.02
 
@@ -44,28 +39,20 @@ def test_flicker_is_what_changes_on_the_same_points(sequence):
 def test_the_command_measures_and_goes_on(tmp_path, monkeypatch):
     given = {"size": (64, 96), "ways": ("alone", "warm"), "steps": 2, "out": tmp_path, "quiet": True}
     options = SequenceOptions(scenes=1, frames=2, **given)
-    page = run_sequence("sequence", options)
+    page = frames.run_sequence("sequence", options)
     assert [row[0] for row in page.tables[0].rows] == ["each frame alone", "warm start, a quarter left out"]
-    records = [json.loads(line) for line in (tmp_path / "sequence.jsonl").read_text().splitlines()]
-    assert all(0 < record["abs_rel"] < 2 and record["seconds"] > 0 for record in records)
+    assert all(0 < float(row[1]) < 2 and float(row[-1]) > 0 for row in page.tables[0].rows)
     measured = []
 
     def measure(pipe, render, seed, way, *_):
         measured.append(way.title)
         return dict.fromkeys(("abs_rel", "worst", "flicker", "breath", "seconds"), 0.5)
 
-    rendered = SimpleNamespace(seed=0, kind="room")
-    monkeypatch.setitem(SEQUENCES, "synthetic", lambda *_, **__: rendered)
-    monkeypatch.setattr("geodiff_plugin.evaluation.sequence._measure", measure)
-    assert run_sequence("sequence", options).tables == page.tables and not measured  # nothing left to do
-    path = tmp_path / "sequence.jsonl"
-    path.write_bytes(path.read_bytes()[:-20])  # killed while it wrote
-    assert run_sequence("sequence", options).tables != page.tables and measured == [
-        "warm start, a quarter left out"
-    ]
-    assert run_sequence("sequence", options) and len(measured) == 1
+    monkeypatch.setitem(frames.SEQUENCES, "synthetic", lambda *_, **__: SimpleNamespace(kind="room"))
+    monkeypatch.setattr(frames, "_measure_sequence", measure)
+    assert frames.run_sequence("sequence", options).tables == page.tables and not measured
     monkeypatch.setattr(PriorCache, "fingerprint", lambda self, settings: "trained further")
-    assert run_sequence("sequence", options) and len(measured) == 3
+    assert frames.run_sequence("sequence", options) and len(measured) == 2
 
 
 # Calls that go on
@@ -76,8 +63,18 @@ def pipe(make_pipeline):
     return enable_geometry_guidance(make_pipeline())
 
 
+def guided(pair, previous, **more):
+    return GeometryGuidance(pair.right, pair.K, pair.E, previous=previous, **more)
+
+
+def planned(pipe, guidance, size=(48, 64), **told):
+    """What a call of 4 steps would start with."""
+    told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": None} | told
+    return plan_warm_start(pipe, find_adapter(pipe)(pipe), guidance, told, size)
+
+
 def call(pipe, pair, steps=4, previous=None, size=1, latents=None, **knobs):
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, previous=previous, **FAST, **knobs)
+    guidance = guided(pair, previous, **FAST, **knobs)
     return pipe(
         pair.left,
         guidance=guidance,
@@ -102,16 +99,11 @@ def test_a_call_goes_on_in_the_middle_of_the_schedule(pipe, textured_plane):
 def test_its_latents_are_the_frame_before_at_the_level_of_that_step(pipe, textured_plane):
     """Mean over many draws: alpha z0; spread: sigma, by the scheduler's own table."""
     first = call(pipe, textured_plane)
-    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
-    prior, draws = find_adapter(pipe)(pipe), []
-    generator = torch.Generator().manual_seed(1)
-    told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": generator}
-    for _ in range(100):
-        warm = plan_warm_start(pipe, prior, guidance, told, (48, 64))
-        draws.append(warm.latents)
-    assert warm.skipped == 1
+    guidance, generator = guided(textured_plane, first), torch.Generator().manual_seed(1)
+    warm = [planned(pipe, guidance, generator=generator) for _ in range(100)]
+    assert warm[0].skipped == 1
     alpha_bar = pipe.scheduler.alphas_cumprod[749]
-    drawn = torch.stack(draws)
+    drawn = torch.stack([each.latents for each in warm])
     torch.testing.assert_close(drawn.mean(0), alpha_bar.sqrt() * first.latent, atol=0.5, rtol=0)
     assert float(drawn.std(0).mean()) == pytest.approx(float((1 - alpha_bar).sqrt()), rel=0.05)
 
@@ -119,9 +111,7 @@ def test_its_latents_are_the_frame_before_at_the_level_of_that_step(pipe, textur
 def test_its_scale_is_that_of_the_frame_before(pipe, textured_plane):
     """With no search and no fit of its own, a call has the depths of the ends that it was given."""
     first = call(pipe, textured_plane)
-    told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": torch.zeros_like(first.latent)}
-    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
-    warm = plan_warm_start(pipe, find_adapter(pipe)(pipe), guidance, told, (48, 64))
+    warm = planned(pipe, guided(textured_plane, first), latents=torch.zeros_like(first.latent))
     scale, shift, g_s = first.scale[0, 0], first.shift[0, 0], first.global_scale[0, 0]
     assert float(warm.near_m[0]) == pytest.approx(float(g_s * shift), rel=1e-5)
     assert float(warm.far_m[0]) == pytest.approx(float(g_s * (scale + shift)), rel=1e-5)
@@ -133,16 +123,10 @@ def test_its_scale_is_that_of_the_frame_before(pipe, textured_plane):
 def test_metres_of_a_prior_become_baselines_again(pipe, textured_plane):
     """Poses without a unit, a frame before whose lengths were multiplied to a metric prior's."""
     first = call(pipe, textured_plane)
-    told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": None}
-    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
-    prior = find_adapter(pipe)(pipe)
-    plain = plan_warm_start(pipe, prior, guidance, told, (48, 64))
+    plain = planned(pipe, guided(textured_plane, first))
     first.rescaled, first.global_scale = 4.0, 4.0 * first.global_scale
-    in_metres = plan_warm_start(pipe, prior, guidance, told, (48, 64))
-    no_unit = GeometryGuidance(
-        textured_plane.right, textured_plane.K, textured_plane.E, previous=first, unit=None
-    )
-    in_baselines = plan_warm_start(pipe, prior, no_unit, told, (48, 64))
+    in_metres = planned(pipe, guided(textured_plane, first))
+    in_baselines = planned(pipe, guided(textured_plane, first, unit=None))
     torch.testing.assert_close(in_metres.near_m, 4.0 * plain.near_m)
     torch.testing.assert_close(in_baselines.near_m, plain.near_m)
     torch.testing.assert_close(in_baselines.far_m, plain.far_m)
@@ -157,44 +141,43 @@ def test_another_scheduler_takes_over_the_scale_alone(make_pipeline, textured_pl
 
 def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane):
     first = call(pipe, textured_plane)
-    with pytest.raises(InputError, match="previous must be a MetricDepthOutput"):
-        call(pipe, textured_plane, previous=first.prediction)
-    with pytest.raises(InputError, match="output_latent=True"):
-        call(pipe, textured_plane, previous=MetricDepthOutput(first.prediction))
-    with pytest.raises(InputError, match="output of 1 image of 2 members; got one of 1 image of 1 member"):
-        call(pipe, textured_plane, previous=first, size=2)
-    members = copy.copy(first)
-    members.latent = first.latent.repeat(2, 1, 1, 1)
-    members.scale, members.shift, members.global_scale = (
-        value.repeat(1, 2) for value in (first.scale, first.shift, first.global_scale)
-    )
-    two = GeometryGuidance([textured_plane.right] * 2, textured_plane.K, textured_plane.E, previous=members)
-    with pytest.raises(InputError, match="previous must be the output of 2 images of 1 member"):
-        pipe([textured_plane.left] * 2, guidance=two)
-    other = copy.copy(first)
-    other.space = "disparity"
-    with pytest.raises(InputError, match="a prior whose map is affine in depth; got one in disparity"):
-        call(pipe, textured_plane, previous=other)
-    small = copy.copy(first)
-    small.latent = first.latent[..., :-1]
-    with pytest.raises(InputError, match="a sequence of its own"):
-        call(pipe, textured_plane, previous=small)
-    for latents in (first.latent[..., :-1], first.latent[:, :1]):  # the latter would be spread silently
-        with pytest.raises(InputError, match="latents must be of shape"):
-            call(pipe, textured_plane, previous=first, latents=latents)
+
+    def changed(**entries):
+        other = copy.copy(first)
+        for name, value in entries.items():
+            setattr(other, name, value)
+        return other
+
+    two = "output of 1 image of 2 members; got one of 1 image of 1 member"
+    for previous, more, said in (
+        (first.prediction, {}, "previous must be a MetricDepthOutput"),
+        (MetricDepthOutput(first.prediction), {}, "output_latent=True"),
+        (first, {"size": 2}, two),
+        (changed(space="disparity"), {}, "a prior whose map is affine in depth; got one in disparity"),
+        (changed(latent=first.latent[..., :-1]), {}, "a sequence of its own"),
+        (first, {"latents": first.latent[..., :-1]}, "latents must be of shape"),
+        (first, {"latents": first.latent[:, :1]}, "latents must be of shape"),  # would be spread silently
+    ):
+        with pytest.raises(InputError, match=said):
+            call(pipe, textured_plane, previous=previous, **more)
     with pytest.raises(InputTypeError, match="latents must be None or a torch.Tensor; got list"):
         call(pipe, textured_plane, previous=first, latents=[first.latent])
+    twice = {name: getattr(first, name).repeat(1, 2) for name in ("scale", "shift", "global_scale")}
+    members = changed(latent=first.latent.repeat(2, 1, 1, 1), **twice)
+    guidance = GeometryGuidance(
+        [textured_plane.right] * 2, textured_plane.K, textured_plane.E, previous=members
+    )
+    with pytest.raises(InputError, match="previous must be the output of 2 images of 1 member"):
+        pipe([textured_plane.left] * 2, guidance=guidance)
 
 
 def test_depth_and_normals_start_from_one_noise(textured_plane):
     """As in GeoWizard's own call."""
     pipe = enable_geometry_guidance(make_geowizard())
     first = call(pipe, textured_plane)
-    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, previous=first)
-    told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": None}
     factor = pipe.image_processor.config.vae_scale_factor
     size = tuple(side * factor for side in first.latent.shape[-2:])
-    warm = plan_warm_start(pipe, find_adapter(pipe)(pipe), guidance, told, size)
+    warm = planned(pipe, guided(textured_plane, first), size)
     alpha_bar = pipe.scheduler.alphas_cumprod[int(first.history[warm.skipped].timestep)]
     depth, normals = (warm.latents - alpha_bar.sqrt() * first.latent).chunk(2, dim=1)
     torch.testing.assert_close(depth, normals, rtol=0, atol=1e-4)

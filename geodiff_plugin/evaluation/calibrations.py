@@ -1,0 +1,287 @@
+"""Calibrations that are not exact: what they cost (``eval poses``), whether a run tells (``eval trust``)."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin._checks import InputError, bad_value, check_choice
+from geodiff_plugin.evaluation import tables
+from geodiff_plugin.evaluation.baselines import PriorCache, Settings
+from geodiff_plugin.evaluation.baselines.guided import call_arguments, guided_configuration
+from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
+from geodiff_plugin.evaluation.datasets.changed import changed_ref, drift_of, perturbation
+from geodiff_plugin.evaluation.experiment import (
+    RECORDS_NAME,
+    Page,
+    cell_key,
+    last_of,
+    method_cells,
+    run_experiment,
+)
+from geodiff_plugin.evaluation.options import PosesOptions, TrustOptions, real_and_rendered
+from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs, headline, label_of
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.runner import Item, Record
+
+#: An error above this is of the kind that a wrong scale makes, and must be said.
+BY_A_FACTOR = 0.25
+
+
+class Part(NamedTuple):
+    """A table to be of ``refs``; ``columns``: heading -> references and pose."""
+
+    refs: Sequence[SampleRef]
+    kind: str
+    title: str
+    note: str
+    columns: Mapping[str, tuple[Sequence[SampleRef], str]]
+    views: int = 2
+
+
+def poses_table(title: str, columns: Mapping[str, Sequence[Record]], note: str) -> Table:
+    """AbsRel of the same pairs with their poses given in several ways, and what was said.
+
+    A row a pair, then the means of all, of rectified and of posed pairs (of those with a result), then how
+    many have none, and how many are off by more than ``BY_A_FACTOR`` without a warning.
+    """
+    first = next(iter(columns.values()))
+    labels = list(map(label_of, first))
+    values = [dict(zip(labels, map(headline, records), strict=True)) for records in columns.values()]
+    rows = [(label, *(tables.cell(own[label]) for own in values)) for label in labels]
+
+    def mean(own: Sequence[float | None]) -> str:
+        count = len(own) - own.count(None)
+        return tables.mean_cell(own) + (f" of {count}" if 0 < count < len(own) else "")
+
+    for group, members in tables.groups_of(first).items():
+        rows.append((f"mean of {group}", *(mean([own[x] for x in labels if x in members]) for own in values)))
+    rows.append(("without a result", *(str(list(own.values()).count(None)) for own in values)))
+    unwarned = [
+        sum((headline(r) or 0.0) > BY_A_FACTOR and not r["notes"]["method"].get("warnings") for r in records)
+        for records in columns.values()
+    ]
+    rows.append((f"off by more than {BY_A_FACTOR:g}, no warning", *map(str, unwarned)))
+    return Table(title, ("pair", *columns), tuple(rows), note)
+
+
+def _residual_table(records: Sequence[Record]) -> Table:
+    """Residuals of the matches as given and as used, a row a pair."""
+    rows = []
+    for record in records:
+        notes = record.get("notes", {}).get("method", {})
+        residuals = (notes.get(name) or [] for name in ("residual_px_given", "residual_px"))
+        rows.append(
+            (label_of(record), *(" / ".join(f"{px:.2f}" for px in each) or "-" for each in residuals))
+        )
+    note = "Median distance of the matches from their epipolar lines, pixels; one number a right view."
+    return Table("Residuals", ("pair", "refined, as given", "refined, as used"), tuple(rows), note)
+
+
+def _parts(
+    real: Sequence[SampleRef],
+    rendered: Sequence[SampleRef],
+    drift: tuple[float, float],
+    change: tuple[float, float],
+) -> list[Part]:
+    """Two views, three where there are some, a drifted rig where there are rectified pairs, rendered ones."""
+    several, rectified = list[SampleRef](), list[SampleRef]()
+    for ref in real:
+        sample = load(ref)
+        several += [ref] if sample.extra_views else []
+        rectified += [ref] if sample.rectified and any(drift) else []
+    drifted = [changed_ref(ref, "drifted", drift) for ref in rectified]
+    perturbed = [changed_ref(ref, "perturbed", change) for ref in rendered]
+    withheld = "'estimated' has the poses withheld but for the length of the first baseline."
+    turned = f"The right camera has turned by {drift[0]:g} degrees and its image has moved by {drift[1]:g} px"
+    moved = (
+        f"Turned by up to {change[0]:g} degrees and shifted by up to {100 * change[1]:g} % of the baseline."
+    )
+    of_drifted = {"true, given": (rectified, "given"), "drifted, given": (drifted, "given")}
+    of_drifted |= {"drifted, refined": (drifted, "refine")}
+    of_rendered = {"true, given": (rendered, "given"), "perturbed, given": (perturbed, "given")}
+    of_rendered |= {"perturbed, refined": (perturbed, "refine"), "estimated": (rendered, "estimated")}
+
+    def every_pose(refs: Sequence[SampleRef]) -> dict[str, tuple[Sequence[SampleRef], str]]:
+        return {"refined": (refs, "refine"), "given": (refs, "given"), "estimated": (refs, "estimated")}
+
+    parts = (
+        Part(real, "real ", "two views", withheld, every_pose(real)),
+        Part(several, "real ", "three views", "", every_pose(several), views=3),
+        Part(rectified, "rectified ", "the rig drifted", f"{turned} up or down.", of_drifted),
+        Part(rendered, "rendered ", "poses perturbed", moved, of_rendered),
+    )
+    return [part for part in parts if part.refs]
+
+
+def run_poses(name: str, options: PosesOptions) -> Page | None:
+    """Measure, and write the tables; errors as ``run_experiment``."""
+    change, drift = perturbation(options.perturb), drift_of(options.drift)
+    size = options.rendered_size
+    if size is not None and not re.fullmatch(r"\d{2,5}x\d{2,5}", size):
+        cure = "256x192 has a quarter of the usual pixels."
+        bad_value("--rendered-size", "WIDTHxHEIGHT in pixels", repr(size), cure)
+    real, rendered = real_and_rendered(options, "synthetic-posed:{}" + (f"@{size}" if size else ""))
+    parts, columns = _parts(real, rendered, drift, change), list[dict[str, list[Item]]]()
+    for part in parts:
+        chosen = replace(options.settings, views=part.views)
+        columns.append(
+            {
+                heading: method_cells(refs, (f"guided:pose={pose}",), chosen, options.out)
+                for heading, (refs, pose) in part.columns.items()
+            }
+        )
+
+    def page_tables(records: list[Record]) -> list[Table]:
+        by_key, shown = {record["key"]: record for record in records}, []
+        for part, planned in zip(parts, columns, strict=True):
+            filled = {heading: [by_key[cell.key] for cell in cells] for heading, cells in planned.items()}
+            title = f"AbsRel of {count_of_pairs(len(part.refs), part.kind)}, {part.title}"
+            shown.append(poses_table(title, filled, part.note))
+            shown += [_residual_table(filled["refined"])] if part.refs is real and part.views == 2 else []
+        return shown
+
+    said = f"Prior {options.prior[0]}, seed {options.seed}. All pixels with truth, metres as they come out."
+    cells, title = [cell for own in columns for items in own.values() for cell in items], "Results by pose"
+    purpose = "How accurate depth is if poses are exact, perturbed, refined or withheld."
+    return run_experiment(name, options, title, cells, page_tables, lambda _: [said], purpose, RECORDS_NAME)
+
+
+#: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.
+OFF = 0.2
+TRUST_NOTE = (
+    "Median error of the depth as a share of the truth; left and right exchanged, there is no truth. A wrong "
+    "focal length of a rectified pair scales the depth and changes nothing else: two views cannot show it."
+)
+RIGHT = "right"
+
+
+def _moved(sample: StereoSample, centre: np.ndarray) -> StereoSample:
+    E = sample.E.copy()
+    E[:3, 3] = centre
+    return replace(sample, E=E)
+
+
+def _scaled(sample: StereoSample, factor: float) -> StereoSample:
+    """Focal lengths of another size, and the principal point in the middle, where it says nothing."""
+    scale = np.diag((factor, factor, 1.0))
+    return replace(sample, K_left=sample.K_left @ scale, K_right=sample.K_right @ scale)
+
+
+def _tilted(sample: StereoSample) -> StereoSample:
+    """As if not rectified: the right camera nods by two degrees."""
+    nod = np.eye(4)
+    nod[:3, :3] = Rotation.from_euler("x", 2.0, degrees=True).as_matrix()
+    return replace(sample, E=sample.E @ nod)
+
+
+WRONG: dict[str, tuple[str, Callable[[StereoSample], StereoSample]]] = {
+    "swapped": ("left and right images exchanged", lambda s: replace(s, left=s.right, right=s.left)),
+    "inverse": ("E is world-to-camera", lambda s: replace(s, E=np.linalg.inv(s.E))),
+    "axis": ("E along y where it is along x", lambda s: _moved(s, s.E[[1, 0, 2], 3])),
+    "tilted": ("not rectified: 2 degrees of pitch", _tilted),
+    "mirrored": ("right image mirrored", lambda s: replace(s, right=s.right[:, ::-1].copy())),
+    "millimetres": ("baseline in millimetres", lambda s: _moved(s, s.E[:3, 3] * 1000.0)),
+    "thousandth": ("baseline divided by 1000 once too often", lambda s: _moved(s, s.E[:3, 3] * 0.001)),
+    "K-1.5": ("K of an image 1.5 times as large, centred", lambda s: _scaled(s, 1.5)),
+    "K-2": ("K of an image twice as large, centred", lambda s: _scaled(s, 2.0)),
+    "K-0.67": ("K of an image 0.67 times as large, centred", lambda s: _scaled(s, 0.67)),
+}
+"""Kind -> what it is, and how a right sample becomes so."""
+
+
+def _measure(
+    ref: SampleRef, kind: str, read: Callable[[SampleRef], StereoSample], pipe: Any, settings: Settings
+) -> Record:
+    """One guided call, what was said of it, and how far it is off."""
+    original = read(ref).check_truth()
+    sample = original if kind == RIGHT else WRONG[kind][1](original)
+    head = {"rectified": original.rectified}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            guidance = GeometryGuidance(sample.right, (sample.K_left, sample.K_right), sample.E)
+            out = pipe(Image.fromarray(sample.left), guidance=guidance, **call_arguments(settings))
+        except InputError as error:
+            return head | {"status": "refused", "said": [str(error)], "off": None}
+        said = [str(warning.message) for warning in caught if warning.category is UserWarning]
+    verdict, depth_m = out.verdicts[0], out.prediction[0, ..., 0]
+    said += [sentence for sentence in out.warnings if sentence not in {verdict.sentence, *verdict.remarks}]
+    errors = np.abs(depth_m[sample.valid] / sample.depth_m[sample.valid] - 1.0)
+    off = None if kind == "swapped" else float(np.median(errors))  # the truth is the other image's there
+    signs = {name: None if value != value else value for name, value in asdict(verdict.indicators).items()}
+    said += [*verdict.reasons, *verdict.remarks]
+    return head | {"status": verdict.status, "said": said, "off": off, "signs": signs}
+
+
+def _is_told(record: Record) -> bool:
+    return record["status"] != "trusted" or bool(record["said"])
+
+
+def _share(part: int, whole: int) -> str:
+    return "-" if whole == 0 else f"{part} of {whole} ({100 * part // whole} %)"
+
+
+def _told(records: Sequence[Record]) -> str:
+    """Of the depths that are off, how many were told."""
+    off = [record for record in records if record["off"] is None or record["off"] > OFF]
+    return _share(sum(map(_is_told, off)), len(off))
+
+
+def _median(records: Sequence[Record]) -> str:
+    known = [record["off"] for record in records if record["off"] is not None]
+    return f"{np.median(known):.2f}" if known else "-"
+
+
+_COLUMNS: dict[str, CellOf] = {
+    "given as": lambda own: WRONG.get(own[0]["kind"], (RIGHT,))[0],
+    "median error": _median,
+    "not trusted": lambda own: _share(sum(r["status"] != "trusted" for r in own), len(own)),
+    "anything said": lambda own: _share(sum(map(_is_told, own)), len(own)),
+    f"said, of those > {OFF:.0%} off": _told,
+}
+
+
+def _table(group: str, records: Sequence[Record]) -> Table:
+    """A row a kind, then all wrong ones, with and without those that two views cannot show."""
+    pairs = count_of_pairs(len({record["sample"] for record in records}), f"{group} ")
+    title = f"Wrong calibrations detected, right ones not trusted: {pairs}"
+    table = tables.table_of_groups(title, records, ("kind",), _COLUMNS, TRUST_NOTE)
+    wrong = [record for record in records if record["kind"] != RIGHT]
+    # Rectified rows stay rows under any focal length.
+    seen = [record for record in wrong if not (record["rectified"] and record["kind"].startswith("K-"))]
+    sums = {"all wrong ones": wrong, "without focal lengths of rectified pairs": seen}
+    return replace(table, rows=(*table.rows, *((name, "", "", "", _told(own)) for name, own in sums.items())))
+
+
+def run_trust(name: str, options: TrustOptions) -> Page | None:
+    """Measure, write ``trust.jsonl`` and the table; errors as ``run_experiment``."""
+    kinds = options.kinds or tuple(WRONG)
+    for kind in kinds:
+        check_choice(kind, "--kinds", WRONG)
+    pairs = real_and_rendered(options, f"synthetic:{{}}@{options.width}x{options.width * 3 // 4}")
+    settings, priors, read = options.settings, PriorCache(), last_of(load)
+    configuration = guided_configuration(GeometryGuidance, settings)
+    pipe, prior = priors.get(settings), f"{settings.prior} {priors.fingerprint(settings)}"
+    cells = []
+    for group, refs in zip(("real", "rendered"), pairs, strict=True):
+        for ref in refs:
+            for kind in (RIGHT, *kinds):
+                head = {"kind": kind, "group": group, "sample": ref.label}
+                work = partial(_measure, ref, kind, read, pipe, settings)
+                key = cell_key(ref, kind, configuration, prior)
+                cells.append(Item(key, work, name=f"{ref.label}, {kind}", head=head))
+
+    def page_tables(records: list[Record]) -> list[Table]:
+        return [_table(group, own) for group, own in tables.grouped(records, "group").items()]
+
+    purpose = "How many wrong calibrations a run detects, and how many correct ones it does not trust."
+    return run_experiment(name, options, "Trust", cells, page_tables, purpose=purpose)

@@ -1,0 +1,303 @@
+"""Frames of a moving camera: ``geodiff eval sequence`` and ``geodiff eval capture``.
+
+A sequence is of a rig, its frames alone or each from the one before; a capture is of one camera, with the
+poses as given, refined by pairs, and solved together.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from geodiff_plugin import __version__
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.capture.agreement import DepthFrame, agreed, seen_in
+from geodiff_plugin.capture.capture import Capture
+from geodiff_plugin.evaluation.baselines import PriorCache
+from geodiff_plugin.evaluation.experiment import Page, run_experiment
+from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.options import CAPTURE_ROWS, WAYS, CaptureEvalOptions, SequenceOptions, Way
+from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, most_of, table_of_groups
+from geodiff_plugin.guidance.evidence import EvidenceStore
+from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.runner import Item, Record, fingerprint
+from geodiff_plugin.runtime.pipeline import native_images
+
+#: What makes a sequence, by name; a checkout registers its renderer (tests/scenes/dataset.py).
+SEQUENCES: dict[str, Any] = {}
+#: A point is the same in the next frame where the depth there is its own within this share; a point that the
+#: next frame sees so much nearer or further is hidden there.
+SAME_SURFACE, HIDDEN_SHARE = 0.01, 0.3
+#: Distance within which a point of a cloud counts as right, metres, and the clouds' grid.
+RIGHT_M, CELL_M = 0.05, 0.02
+
+
+def flicker(errors: Sequence[np.ndarray], truth: Sequence[DepthFrame]) -> tuple[float, float]:
+    """Change of log depth of the same surface points from frame to frame, beyond that of the truth.
+
+    Args:
+        errors: ``(H, W)`` each, log of depth over truth; NaN where there is no truth.
+        truth: the frames that they belong to.
+
+    Returns:
+        Mean absolute change over points, and over frames the mean absolute change of the median: how far the
+        whole picture breathes.
+    """
+    points, breath = [], []
+    for (frame, following), (before, after) in zip(pairwise(truth), pairwise(errors), strict=True):
+        row, column, z, inside = seen_in(frame, following)
+        same = inside & (np.abs(following.depth[row, column] - z) < SAME_SURFACE * z)
+        change = after[row, column][same] - before[same]
+        change = change[np.isfinite(change)]
+        points.append(np.abs(change).mean())
+        breath.append(abs(np.median(change)))
+    return float(np.mean(points)), float(np.mean(breath))
+
+
+def true_frames(sequence: Any) -> list[DepthFrame]:
+    """The left views of a sequence; NaN where there is no truth."""
+    frames = []
+    for view, pose in zip(sequence.lefts, sequence.T_world_from_left, strict=True):
+        depth = np.where(view.valid[0].numpy(), view.depth_m[0].numpy().astype(np.float64), np.nan)
+        frames.append(DepthFrame("", depth, depth, sequence.K.numpy(), pose.numpy()))
+    return frames
+
+
+def run_sequence(name: str, options: SequenceOptions) -> Page | None:
+    """Measure every way on every sequence, and write the page; errors as ``run_experiment``."""
+    if "synthetic" not in SEQUENCES:
+        cure = "A clone of the repository has them: python -m tests.scenes eval sequence ..."
+        bad_value("the sequences", "registered in evaluation.frames.SEQUENCES as 'synthetic'", "none", cure)
+    settings, priors, store = options.settings, PriorCache(), EvidenceStore(options.frames)
+    pipe, prior = priors.get(settings), priors.fingerprint(settings)
+
+    @lru_cache(maxsize=1)
+    def render(seed: int) -> Any:
+        return SEQUENCES["synthetic"](seed, options.frames, size=options.size)
+
+    cells = []
+    for seed in range(options.scenes):
+        for way in options.ways:
+            how = (options.frames, *options.size, options.steps, options.seed, settings.device)
+            key = "|".join(map(str, (seed, way, *how, settings.prior, prior, __version__)))
+            work = partial(_measure_sequence, pipe, render, seed, WAYS[way], options, store)
+            cells.append(Item(key, work, name=f"sequence {seed}, {way}", head={"seed": seed, "way": way}))
+    remark = (
+        f"{options.scenes} rendered scenes of {options.frames} frames, {options.size[1]}x{options.size[0]} "
+        f"pixels, prior {settings.prior}, {options.steps} steps, seed {options.seed} for every frame."
+    )
+    return run_experiment(name, options, "Sequences", cells, sequence_tables, lambda _: [remark])
+
+
+def _measure_sequence(
+    pipe: Any, render: Any, seed: int, way: Way, options: SequenceOptions, store: EvidenceStore
+) -> Record:
+    """AbsRel, flicker and seconds a frame of one way of going through a sequence."""
+    sequence, steps = render(seed), max(1, round((options.steps or 1) * way.share))
+    device, truth = pipe._execution_device, true_frames(sequence)
+    clock = time.process_time if device.type == "cpu" else time.perf_counter
+    errors, scores, before, seconds = [], [], None, 0.0
+    for left, right, true in zip(sequence.lefts, sequence.rights, truth, strict=True):
+        knobs: dict[str, Any] = {} if way.warm is None else {"previous": before, "warm_start": way.warm}
+        guidance = GeometryGuidance(right.image_01, sequence.K.numpy(), sequence.E.numpy(), **knobs)
+        guidance.evidence_store = store
+        with torch.no_grad():
+            guidance.prepare(native_images(left.image_01, device))  # the same for every way, so not timed
+        generator = torch.Generator("cpu").manual_seed(options.seed)
+        call = {"num_inference_steps": steps, "generator": generator, "output_latent": True}
+        started = clock()
+        before = pipe(left.image_01, guidance=guidance, **call)  # its result is numpy: nothing is pending
+        seconds += clock() - started
+        depth_m = before.prediction[0, ..., 0]
+        scores.append(evaluate_depth(depth_m, true.depth, np.isfinite(true.depth))["abs_rel"])
+        errors.append(np.log(depth_m / true.depth))
+    moved, breath = flicker(errors, truth)
+    numbers = {"abs_rel": float(np.mean(scores)), "worst": float(np.max(scores))}
+    numbers |= {"flicker": moved, "breath": breath, "seconds": seconds / len(truth)}
+    return {"kind": sequence.kind} | numbers
+
+
+_SEQUENCE_COLUMNS: dict[str, CellOf] = {
+    "frames": lambda own: WAYS[own[0]["way"]].title,
+    "AbsRel": mean_of("abs_rel", 4),
+    "worst frame": most_of("worst"),
+    "flicker %": mean_of("flicker", 2, 100.0),
+    "breathing %": mean_of("breath", 2, 100.0),
+    "s a frame": mean_of("seconds", 2),
+}
+
+
+def sequence_tables(records: Sequence[Record]) -> list[Table]:
+    """Ways by means over the sequences."""
+    note = (
+        "AbsRel in metres, without alignment, and that of the worst frame. Flicker: mean absolute change of "
+        "log depth of the same surface point from one frame to the next, beyond that of the truth, in per "
+        "cent; breathing: the same of the frame's median. Seconds of a guided call whose evidence is there "
+        "already; on a CPU those of all its threads."
+    )
+    return [table_of_groups("From frame to frame", records, ("way",), _SEQUENCE_COLUMNS, note)]
+
+
+CAPTURE_PURPOSE = (
+    "Depth of frames of a moving camera, with the bundled prior unless the command says otherwise: poses as "
+    "the tracker gave them, refined by the views of each frame alone, and solved over the whole capture."
+)
+#: Heading of every number of a record, and its digits.
+CAPTURE_COLUMNS = {
+    "abs_rel": ("AbsRel", 4),
+    "worst": ("worst", 4),
+    "scaled": ("scaled", 4),
+    "scale": ("scale", 3),
+    "delta_103": ("within 3 %", 3),
+    "delta_125": ("within 25 %", 3),
+    "agreed": ("agreed", 4),
+    "f": ("F 5 cm", 3),
+    "tae": ("TAE %", 2),
+}
+CAPTURE_NOTE = (
+    "AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its median. "
+    "Scale: median of depth over truth. Agreed: AbsRel after the frames of the table were checked against "
+    "each other. F: of the fused cloud beside that of the true depth under the same poses. TAE: of frames "
+    "one after the other, as chosen."
+)
+
+
+def f_score(points: np.ndarray, truth: np.ndarray, right_m: float = RIGHT_M) -> float:
+    """Harmonic mean of the shares of ``(N, 3)`` points nearer than ``right_m`` to the other cloud's.
+
+    Source: Knapitsch et al. 2017 (Tanks and Temples), S4.
+    """
+    if not len(points) or not len(truth):
+        return 0.0
+    clouds = ((truth, points), (points, truth))
+    distances = (cKDTree(to).query(of, distance_upper_bound=right_m)[0] for to, of in clouds)
+    accuracy, complete = (float((near < np.inf).mean()) for near in distances)
+    return 2 * accuracy * complete / max(accuracy + complete, 1e-12)
+
+
+def temporal_error(frames: Sequence[DepthFrame]) -> float:
+    """TAE of frames in order, per cent: depth moved into the next frame's view beside the depth there.
+
+    Source: Chen et al. 2025 (Video Depth Anything), S4.1; both directions, AbsRel over what both see.
+    """
+    errors = []
+    for pair in pairwise(frames):
+        for frame, other in (pair, pair[::-1]):
+            row, column, z, inside = seen_in(frame, other)
+            off = np.abs(z[inside] / other.depth[row, column][inside] - 1)
+            errors.append(off[off < HIDDEN_SHARE].mean() if (off < HIDDEN_SHARE).sum() >= 100 else np.nan)
+    return 100 * float(np.nanmean(errors)) if errors and not np.isnan(errors).all() else float("nan")
+
+
+def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
+    """Measure every row and number of neighbours, and write the page; errors as ``run_experiment``."""
+    priors, settings, cells, titles = PriorCache(), options.settings, list[Item](), dict[str, str]()
+    for data in options.data:
+        captures = {poses: Capture.open(data) for poses in ("given", "refined")}
+        names = _chosen(captures["given"], options)
+        titles[str(data)] = f"{data.name}, {len(names)} frames"
+        pipe = priors.get(settings)
+        how = (str(data.resolve()), names, options.prior, priors.fingerprint(settings), options.steps)
+        for row in options.rows:
+            title, poses, _ = CAPTURE_ROWS[row]
+            for count in options.neighbours:
+                work = partial(_measure_frames, captures[poses], pipe, row, count, names, options)
+                head = {"data": str(data), "row": title, "views": str(1 + count)}
+                key = fingerprint(row, count, options.seed, __version__, *how)
+                cells.append(Item(key, work, name=f"{data.name}, {row}, {1 + count} views", head=head))
+        head = {"data": str(data), "row": "COLMAP's sparse points", "views": "all"}
+        work = partial(_of_points, captures["refined"], names)
+        key = fingerprint("points", __version__, *how)
+        cells.append(Item(key, work, name=f"{data.name}, sparse points", head=head))
+
+    def tables(records: list[Record]) -> list[Table]:
+        columns: dict[str, CellOf] = {"poses": lambda own: str(own[0]["row"])}
+        columns |= {"views": lambda own: str(own[0]["views"])}
+        columns |= {heading: mean_of(entry, digits) for entry, (heading, digits) in CAPTURE_COLUMNS.items()}
+        return [
+            table_of_groups(titles[data], own, ("key",), columns)
+            for data, own in grouped(records, "data").items()
+        ]
+
+    title, note = "Captures", [CAPTURE_NOTE]
+    return run_experiment(name, options, title, cells, tables, lambda _: note, CAPTURE_PURPOSE)
+
+
+def _chosen(capture: Capture, options: CaptureEvalOptions) -> list[str]:
+    """Names of the frames to measure, all of which have a depth map."""
+    names = capture.choose(options.frames)
+    if options.count is not None:
+        at = ((np.arange(options.count) + 0.5) * len(names) / options.count).astype(int)
+        names = [names[i] for i in np.unique(at)]
+    for name in names:
+        capture.measured_depth(name)
+    return names
+
+
+def _measure_frames(
+    capture: Capture, pipe: Any, row: str, count: int, names: Sequence[str], options: CaptureEvalOptions
+) -> Record:
+    """Depth of every frame by one row and number of neighbours, and its scores."""
+    _, poses, pose = CAPTURE_ROWS[row]
+    solved = capture.solve(poses)
+    call: dict[str, Any] = {} if options.steps is None else {"num_inference_steps": options.steps}
+    frames, true_frames, known = [], [], []
+    for name in names:
+        with torch.no_grad():
+            out = capture.depth(pipe, name, count, seed=options.seed, knobs={"pose": pose}, **call)
+        i, depth = capture.names.index(name), np.asarray(out.prediction)[0, ..., 0]
+        confidence = np.ones_like(depth) if out.confidence is None else np.asarray(out.confidence)[0, ..., 0]
+        truth, valid = capture.measured_depth(name)
+        frames.append(DepthFrame(name, depth, confidence, solved.K[i], solved.E[i]))
+        true_frames.append(DepthFrame(name, truth, np.ones_like(depth), solved.K[i], solved.E[i]))
+        known.append(valid)
+    together = [agreed(frame, [other for other in frames if other is not frame]) for frame in frames]
+    depths = ([frame.depth for frame in which] for which in (frames, together, true_frames))
+    scores, agreed_scores = [], []
+    for depth, checked, truth, mask in zip(*depths, known, strict=True):
+        scores.append(_scores(depth, truth, mask))
+        agreed_scores.append(_scores(checked, truth, mask))
+    f = f_score(_thin(together, known), _thin(true_frames, known))
+    more = {"agreed": _means(agreed_scores)["abs_rel"], "f": f, "tae": temporal_error(together)}
+    return _means(scores) | more
+
+
+def _thin(frames: Sequence[DepthFrame], known: Sequence[np.ndarray]) -> np.ndarray:
+    points = np.concatenate([frame.world(mask) for frame, mask in zip(frames, known, strict=True)])
+    return points[np.unique(np.floor(points / CELL_M).astype(np.int64), axis=0, return_index=True)[1]]
+
+
+def _of_points(capture: Capture, names: Sequence[str]) -> Record:
+    """The solve's own sparse points, at their pixels."""
+    solved, scores = capture.solve(), []
+    for name in names:
+        i = capture.names.index(name)
+        truth, known = capture.measured_depth(name)
+        seen, T = solved.seen[i], np.linalg.inv(solved.E[i])
+        z = solved.points[seen.point] @ T[2, :3] + T[2, 3]
+        u, v = np.rint(seen.px).astype(int).T.clip(0, np.array(truth.shape[::-1])[:, None] - 1)
+        there = known[v, u] & (z > 0)
+        if there.any():
+            scores.append(_scores(z[None], truth[v, u][None], there[None]))
+    return _means(scores) if scores else {}
+
+
+def _scores(depth: np.ndarray, truth: np.ndarray, known: np.ndarray) -> dict[str, float]:
+    scores = evaluate_depth(depth, truth, known)
+    ratio = depth[known] / truth[known]
+    scale = float(np.median(ratio))
+    scaled = {"scaled": float(np.mean(np.abs(ratio / scale - 1))), "scale": scale}
+    within = {"delta_103": float((np.maximum(ratio, 1 / ratio) < 1.03).mean()), "delta_125": scores["delta1"]}
+    return {"abs_rel": scores["abs_rel"]} | scaled | within
+
+
+def _means(scores: Sequence[dict[str, float]]) -> Record:
+    worst = {"worst": max(each["abs_rel"] for each in scores)}
+    return {name: float(np.mean([each[name] for each in scores])) for name in scores[0]} | worst
