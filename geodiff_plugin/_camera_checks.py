@@ -65,12 +65,6 @@ def check_intrinsics_fit(
         bad_value(name, f"for {image} of {width}x{height} pixels", got, cure + "cropped=True (--cropped).")
 
 
-def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -> None:
-    """Refuse a camera matrix that cannot belong to an image ``(H, W)``, and warn of a doubtful one."""
-    check_intrinsics_fit(K, size[1], size[0], name, image)
-    warn_of_other_size(K, size[1], size[0], name, image)
-
-
 def check_calibrated_size(
     size: tuple[int, int], calibrated: tuple[int, int] | None, name: str, source: object, cure: str
 ) -> None:
@@ -80,26 +74,22 @@ def check_calibrated_size(
         bad_value(name, expected, "{}x{}".format(*size), cure)
 
 
-def warn_of_other_size(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
-    """Warn of a principal point that suggests another image size, and of a mistyped focal length."""
-    shares = (K[0, 2] / width, K[1, 2] / height)
-    at = f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f})"
-    cure = f"If it is for another resolution, {SCALED_K}."
-    if min(shares) < NEAR_BORDER or max(shares) > 1.0 - NEAR_BORDER:
+def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -> None:
+    """Refuse a camera matrix that cannot belong to an image ``(H, W)``, and warn of a doubtful one."""
+    height, width = size
+    check_intrinsics_fit(K, width, height, name, image)
+    x, y = K[0, 2] / width, K[1, 2] / height
+    place = ""
+    if min(x, y) < NEAR_BORDER or max(x, y) > 1.0 - NEAR_BORDER:
         place = f"near the border of {image} of {width}x{height} pixels"
-        warn(f"{at} {place}. {cure}", doubt=True, stacklevel=3)
-    elif _off_alike(*shares):
-        place = f"where that of an image {sum(shares):.2g} times the size of {image} would be"
-        warn(f"{at} {place}. {cure}", doubt=True, stacklevel=3)
+    elif min(abs(x - 0.5), abs(y - 0.5)) > OFF_MIDDLE and abs(x - y) < NEARLY_ALIKE:
+        place = f"where that of an image {x + y:.2g} times the size of {image} would be"
+    if place:
+        at = f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) {place}"
+        warn(f"{at}. If it is for another resolution, {SCALED_K}.", doubt=True)
     if max(K[0, 0] / K[1, 1], K[1, 1] / K[0, 0]) > STRETCHED:
         numbers = f"{name} has fx {K[0, 0]:.5g} and fy {K[1, 1]:.5g}"
-        warn(f"{numbers}; pixels are about square, so one of them may be mistyped.", stacklevel=3)
-
-
-def _off_alike(x: float, y: float) -> bool:
-    """Whether a principal point, in shares of the image, lies off its middle along the diagonal."""
-    least = min(abs(x - 0.5), abs(y - 0.5))
-    return least > OFF_MIDDLE and abs(x - y) < NEARLY_ALIKE
+        warn(f"{numbers}; pixels are about square, so one of them may be mistyped.")
 
 
 def check_pose(E: Any, name: str = "E", cure: str = POSE) -> np.ndarray:
@@ -120,26 +110,30 @@ def check_pose(E: Any, name: str = "E", cure: str = POSE) -> np.ndarray:
         got = f"determinant {determinant:.4f}, |R R^T - I| up to {apart:.4f}"
         bad_value(name, expected, got, cure)
     U, _, Vt = np.linalg.svd(R)
-    E = E.copy()
     E[:3, :3] = U @ Vt
     return E
 
 
-def check_baseline(E: np.ndarray, name: str = "E") -> None:
-    """Refuse a relative pose without translation."""
+def check_baseline(E: np.ndarray, name: str, unit: str | None) -> None:
+    """Refuse a relative pose without translation, and warn of one that looks like millimetres."""
     baseline = float(np.linalg.norm(E[:3, 3]))
     if baseline < 1e-6:
         expected = "a pose whose camera centre differs from the left one's (a baseline)"
         cure = "Without a baseline two views do not tell the scale; give the distance between the cameras in "
         bad_value(name, expected, f"a translation of {baseline:.1g} m", cure + "metres.")
-
-
-def warn_of_long_baseline(E: np.ndarray, name: str) -> None:
-    """Warn of a relative pose whose translation looks like millimetres, before anything is computed."""
-    baseline = float(np.linalg.norm(E[:3, 3]))
-    if baseline > LONG_BASELINE_M:
+    if unit == "m" and baseline > LONG_BASELINE_M:
         cure = "If that is millimetres, divide the translation, or baseline_m (--baseline), by 1000."
-        warn(f"{name} has a baseline of {baseline:.4g} m. {cure}", doubt=True, stacklevel=3)
+        warn(f"{name} has a baseline of {baseline:.4g} m. {cure}", doubt=True)
+
+
+def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
+    """Refuse integers, which are a file's own unit, or metres without their fraction."""
+    if array.dtype.kind == "f":
+        return
+    cure = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."
+    if array.shape[1] == 3:
+        cure = "Divide millimetres by 1000; metres lose their fraction as integers: keep them floats."
+    bad_value(name, "metres as floats", got or f"dtype {array.dtype}", cure)
 
 
 def warn_of_far_points(points: np.ndarray, name: str) -> None:
@@ -148,10 +142,9 @@ def warn_of_far_points(points: np.ndarray, name: str) -> None:
     depths = depths[np.isfinite(depths) & (depths > 0)]
     if not len(depths):
         return
-    nearest, median = float(depths.min()), float(np.median(depths))
-    whole = median > FAR_POINTS_M and bool((depths == np.rint(depths)).all())
-    if nearest > FAR_POINTS_M or whole:
+    whole = np.median(depths) > FAR_POINTS_M and (depths == np.rint(depths)).all()
+    if whole or depths.min() > FAR_POINTS_M:
         kind = "only whole numbers" if whole else "none nearer"
         cure = "divide them by 1000, or give --points-scale 1000 (scale=1000) with a file."
-        depths_are = f"{name} has depths of {nearest:.4g} m and more, {kind}"
-        warn(f"{depths_are}. If they are millimetres, {cure}", doubt=True, stacklevel=3)
+        depths_are = f"{name} has depths of {depths.min():.4g} m and more, {kind}"
+        warn(f"{depths_are}. If they are millimetres, {cure}", doubt=True)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any, NoReturn
-
-if TYPE_CHECKING:  # numpy takes longer to import than a wrong option to be said
-    import numpy as np
+from typing import Any, NoReturn
 
 #: The most characters of the given value that a message quotes; it may be a whole file.
 LONGEST_GOT = 400
@@ -68,13 +64,6 @@ def bad_type(name: str, expected: str, got: object, cure: str = "") -> NoReturn:
     raise InputTypeError(_sentence(name, expected, f"{type(got).__name__}", cure))
 
 
-def _short(value: object) -> str:
-    """A number as short text."""
-    if isinstance(value, int) and value.bit_length() > 128:
-        return "a whole number of more than 128 bits"
-    return str(value)
-
-
 def warn(sentence: str, *, doubt: bool = False, stacklevel: int = 2) -> None:
     """Warn, and tell the ``noted`` block that this runs in.
 
@@ -101,16 +90,6 @@ def noted() -> Iterator[dict[str, bool]]:
             outer.update(warned)
 
 
-def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
-    """Refuse integers, which are a file's own unit, or metres without their fraction."""
-    if array.dtype.kind == "f":
-        return
-    cure = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."
-    if array.shape[1] == 3:
-        cure = "Divide millimetres by 1000; metres lose their fraction as integers: keep them floats."
-    bad_value(name, "metres as floats", got or f"dtype {array.dtype}", cure)
-
-
 def check_number(value: Any, name: str, low: float, high: float, *, integer: bool = False) -> Any:
     """A finite number in ``[low, high]``, returned as it came."""
     kind: Any = Integral if integer else Real
@@ -118,24 +97,24 @@ def check_number(value: Any, name: str, low: float, high: float, *, integer: boo
         bad_type(name, "an integer" if integer else "a number", value)
     # Whole numbers may be longer than any float: compared, not converted. NaN is not within anything.
     if not low <= value <= high or value in (float("inf"), float("-inf")):
-        bad_value(name, f"between {low:g} and {high:g}", _short(value))
+        endless = isinstance(value, int) and value.bit_length() > 128
+        got = "a whole number of more than 128 bits" if endless else value
+        bad_value(name, f"between {low:g} and {high:g}", got)
     return value
 
 
 def check_positive(value: Any, name: str, unit: str) -> Any:
     """A finite number above 0, returned as it came."""
-    kind: Any = Real
-    if isinstance(value, bool) or not isinstance(value, kind):
+    if isinstance(value, bool) or not isinstance(value, Real):
         bad_type(name, "a number", value)
     if not 0 < value < float("inf"):
-        bad_value(name, f"a finite number of {unit} above 0", _short(value))
+        bad_value(name, f"a finite number of {unit} above 0", value)
     return value
 
 
 def check_flag(value: Any, name: str) -> bool:
     """``True`` or ``False``; a number or a text is neither."""
-    numpy = sys.modules.get("numpy")
-    if not isinstance(value, bool) and not (numpy and isinstance(value, numpy.bool_)):
+    if type(value).__name__ not in ("bool", "bool_"):  # the latter is numpy's, which is not imported here
         bad_type(name, "True or False", value)
     return bool(value)
 

@@ -23,8 +23,6 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
-#: Points of a model that fewer images see, or that lie further off, are no known depths.
-FEWEST_VIEWS, MOST_ERROR_PX = 3, 1.5
 #: What 7-Scenes writes where depth is unknown.
 NO_DEPTH = 65535
 #: Angle of two rays that a match is worth most at, degrees, and how fast it is worth less below and above it.
@@ -140,10 +138,15 @@ class Capture:
     def rescale(self, factor: float) -> None:
         """Multiply all lengths, which then are metres, by a factor above 0."""
         check_number(factor, "metres per unit", 1e-12, 1e12)
-        frames = tuple(replace(f, E=None if f.E is None else _longer(f.E, factor)) for f in self.files.frames)
-        model = self.files.points
-        model = None if model is None else replace(model, xyz=model.xyz * factor)
-        self.files = replace(self.files, frames=frames, unit="m", points=model)
+        frames = tuple(
+            replace(
+                frame,
+                E=None if frame.E is None else _longer(frame.E, factor),
+                points=None if frame.points is None else frame.points * factor,
+            )
+            for frame in self.files.frames
+        )
+        self.files = replace(self.files, frames=frames, unit="m")
         self.unit = "m"
         if self._solved is not None:
             s = self._solved
@@ -210,13 +213,12 @@ class Capture:
             depth_m, known = self.measured_depth(name)
             depth_m = np.where(known, depth_m, 0.0).astype(np.float32)
             return cv2.resize(depth_m, frame.size, interpolation=cv2.INTER_NEAREST)
-        model = self.files.points
-        if model is None or frame.E is None:
+        if all(each.points is None for each in self.files.frames):
             bad_value("points", "of a COLMAP model", f"a capture of {self.files.kind}, which has none")
-        rows = model.seen.get(name, np.zeros(0, int))
-        rows = rows[(model.tracks[rows] >= FEWEST_VIEWS) & (model.error_px[rows] <= MOST_ERROR_PX)]
+        if frame.points is None or frame.E is None:
+            return None
         T = np.linalg.inv(frame.E)
-        return (model.xyz[rows] @ T[:3, :3].T + T[:3, 3]).astype(np.float32) if len(rows) else None
+        return (frame.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
     def measured_depth(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """The depth map that the capture names for a frame: ``(h, w)`` metres, and where it is known."""

@@ -1,29 +1,28 @@
-"""Calibrations of data sets: Middlebury, Booster, KITTI, MVSNet, FoundationStereo, stereodemo (S5.1)."""
+"""Calibrations of data sets: Middlebury, KITTI, MVSNet, FoundationStereo, stereodemo (S5.1)."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, warn
 from geodiff_plugin.formats.rigs import (
     Camera,
     CameraChoice,
-    RawRig,
     array_of,
     intrinsics,
-    number,
+    make_rig,
     projected,
     rigid,
-    size_of,
     two_cameras,
 )
-from geodiff_plugin.formats.structured import parse_json, parse_storage
+from geodiff_plugin.types import Rig
 
 __all__ = [
-    *("KITTI_ROW", "read_booster", "read_foundation_stereo", "read_kitti", "read_middlebury", "read_mvsnet"),
+    *("KITTI_ROW", "read_foundation_stereo", "read_kitti", "read_middlebury", "read_mvsnet"),
     "read_stereodemo",
 ]
 
@@ -37,7 +36,9 @@ PROJECTION = re.compile(r"(P_rect_|P)(\d+)")
 PAIRS = ((0, 1), (2, 3))
 #: Folder names of the benchmarks: image_2 and image_02, and colored_0 of KITTI 2012.
 FOLDER = re.compile(r"(image|colored)_0?([0-3])(?!\d)")
-WHICH = "it holds the grey pair 0,1 and the colour pair 2,3; taking 2,3. Give cameras (--cameras) to choose."
+WHICH = (
+    "Of the grey pair 0,1 and the colour pair 2,3 of the calibration 2,3 is taken. Give cameras (--cameras)."
+)
 
 
 def _matrix(entries: dict[str, str], key: str) -> np.ndarray:
@@ -47,7 +48,7 @@ def _matrix(entries: dict[str, str], key: str) -> np.ndarray:
     return array_of([row.split() for row in value.strip("[]").split(";")], (3, 3), key)
 
 
-def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """``doffs`` is what the ground truth was made with, so ``cx0 + doffs`` goes before ``cam1``.
 
     Convention:
@@ -55,45 +56,38 @@ def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     """
     entries = dict(ENTRY.findall(texts[0]))
     K_left = _matrix(entries, "cam0")
-    K_right, notes = _matrix(entries, "cam1") if "cam1" in entries else None, []
+    K_right = _matrix(entries, "cam1") if "cam1" in entries else None
     if K_right is None or "doffs" in entries:
-        expected = K_left[0, 2] + number(entries["doffs"], "doffs")
+        expected = K_left[0, 2] + float(entries["doffs"])
         if K_right is None or abs(K_right[0, 2] - expected) > DOFFS_TOLERANCE_PX:
             said = "is missing" if K_right is None else f"says cx = {K_right[0, 2]:g}"
-            notes.append(f"cam1 {said}; using cx0 + doffs = {expected:g} px for the right image.")
+            warn(f"cam1 {said}; using cx0 + doffs = {expected:g} px for the right image.")
             K_right = K_left.copy() if K_right is None else K_right
             K_right[0, 2] = expected
-    size = size_of(entries) if {"width", "height"} <= entries.keys() else None
-    baseline_m = number(entries["baseline"], "baseline") / MM_PER_METRE
-    return RawRig(Camera(K_left, size), Camera(K_right, size), baseline_m, True, tuple(notes))
+    size = entries.get("width"), entries.get("height")
+    baseline_m = float(entries["baseline"]) / MM_PER_METRE
+    return make_rig(Camera(K_left, size), Camera(K_right, size), baseline_m, rectified=True)
 
 
-def read_booster(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
-    """For the images at full resolution, which are rectified; lengths are millimetres."""
-    entries = parse_storage(texts[0])
-    left, right = (Camera(entries[key][:, :3]) for key in ("proj_matl", "proj_matr"))
-    return RawRig(left, right, float(entries["baselinelr"].ravel()[0]) / MM_PER_METRE, rectified=True)
-
-
-def read_foundation_stereo(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_foundation_stereo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """``K.txt``: nine numbers of K of both images, and the baseline in metres."""
-    values = [float(word) for word in texts[0].replace(",", " ").split()]
+    values = texts[0].replace(",", " ").split()
     if len(values) != 10:
         cure = "Add the baseline as a second line; a file that holds only K or E goes to K and E (--K, --E)."
         bad_value("the file", "9 numbers of K and the baseline in metres", f"{len(values)} numbers", cure)
-    camera = Camera(np.reshape(values[:9], (3, 3)))
-    return RawRig(camera, camera, values[9])
+    camera = Camera(array_of(values[:9], (3, 3), "K"))
+    return make_rig(camera, camera, values[9])
 
 
-def read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """Older files have one principal point for both images."""
-    data = parse_json(texts[0])
-    size = size_of(data) if {"width", "height"} <= data.keys() else None
+    data = json.loads(texts[0])
+    size = data.get("width"), data.get("height")
     left, right = (
         Camera(intrinsics(data["fx"], data["fy"], data["cx" if "cx" in data else cx], data["cy"]), size)
         for cx in ("cx0", "cx1")
     )
-    return RawRig(left, right, number(data["baseline_meters"], "baseline_meters"))
+    return make_rig(left, right, data["baseline_meters"])
 
 
 def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[int, int]:
@@ -112,31 +106,28 @@ def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[in
     return pairs[-1] if pairs else (have[0], have[1])
 
 
-def read_kitti(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_kitti(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """``P_rect_02`` with ``S_rect_02`` of ``calib_cam_to_cam``, or ``P0`` to ``P3``; DrivingStereo's too."""
     rows = dict(KITTI_ROW.findall(texts[0]))
     named = {int(match[2]): match for match in map(PROJECTION.fullmatch, rows) if match}
     cameras = _kitti_cameras(named, choice)
     P = [array_of(rows[named[camera][0]].split(), (3, 4), named[camera][0]) for camera in cameras]
     sizes = [rows.get(f"S_rect_{named[camera][2]}") for camera in cameras]
-    raw = projected(*P, *(None if size is None else array_of(size.split(), (2,), "S_rect") for size in sizes))
-    hint = choice.cameras or FOLDER.search(choice.image_folder_hint or "")
-    notes = () if hint or not {0, 1, 2, 3} <= named.keys() else (WHICH,)
-    return RawRig(raw.left, raw.right, raw.pose, raw.rectified, notes)
+    chosen = choice.cameras or FOLDER.search(choice.image_folder_hint or "")
+    if {0, 1, 2, 3} <= named.keys() and not chosen:
+        warn(WHICH)
+    return projected(*P, *(None if size is None else size.split() for size in sizes))
 
 
 def _mvsnet_view(text: str) -> tuple[np.ndarray, Camera]:
     """World-to-camera transform and camera; the line of depth range behind them is never looked at."""
-    extrinsic, mark, intrinsic = text.partition("extrinsic")[2].partition("intrinsic")
-    if not mark:
-        expected = "an MVSNet cam.txt with extrinsic and intrinsic"
-        bad_value("the file", expected, "no intrinsic", "Is it cut off?")
+    extrinsic, _, intrinsic = text.partition("extrinsic")[2].partition("intrinsic")
     # The rotations of hand-held sets are rigid to a few 1e-4 only; inverting them as they are would shear E.
-    T = rigid(array_of(extrinsic.split()[:16], (16,), "extrinsic"), "extrinsic")
+    T = rigid(extrinsic.split()[:16], "extrinsic")
     return T, Camera(array_of(intrinsic.split()[:9], (3, 3), "intrinsic"))
 
 
-def read_mvsnet(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_mvsnet(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """One ``cam.txt`` a view, in the unit of the files: metres in most sets, millimetres in DTU."""
     (T_left_from_world, left), (T_right_from_world, right) = map(_mvsnet_view, texts)
-    return RawRig(left, right, T_left_from_world @ np.linalg.inv(T_right_from_world))
+    return make_rig(left, right, T_left_from_world @ np.linalg.inv(T_right_from_world))

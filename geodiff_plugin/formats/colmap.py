@@ -17,29 +17,14 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.out import atomic_path
-from geodiff_plugin.formats.rigs import (
-    CalibrationFormat,
-    Camera,
-    CameraChoice,
-    RawRig,
-    array_of,
-    intrinsics,
-    names_of_pair,
-)
+from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, intrinsics, make_rig, names_of_pair
+from geodiff_plugin.types import Rig
 
 __all__ = [
-    "COLMAP",
-    "COLMAP_FILES",
-    "check_colmap_names",
-    "model_files",
-    "model_text",
-    "read_colmap_cameras",
-    "read_colmap_images",
-    "read_colmap_points",
-    "write_colmap",
+    *("check_colmap_names", "is_colmap", "model_files", "model_text", "read_colmap"),
+    *("read_colmap_model", "read_colmap_points", "write_colmap"),
 ]
 
-COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 #: Of a model, in the order of its numbers in binary files: how many focal lengths stand before cx cy, what
 #: ``Camera.model`` calls its lens, how many coefficients stand behind. Those that OpenCV has more are 0.
 MODELS = {
@@ -59,9 +44,12 @@ CAMERA = re.compile(r"^(\d+) ([A-Z_]+) (\d+) (\d+) (.+)$", re.MULTILINE)
 IMAGE = re.compile(r"^(\d+)((?: [-+.\deE]+){7}) (\d+) (\S.*)$", re.MULTILINE)
 CAMERAS_MARK, IMAGES_MARK = "# Camera list with", "# Image list with"
 LONGEST_HEAD = 200
+#: Of an image: its number, ``(4, 4)`` T_camera_from_world, its camera's number.
+Posed = tuple[int, np.ndarray, int]
 #: A start for other programs, not a copy of the cloud: text of a million points is 50 MB.
 MOST_POINTS = 100_000
-BINARY = "a binary COLMAP file"
+#: Points that fewer images see, or that lie further off in pixels, are no known depths.
+FEWEST_VIEWS, MOST_ERROR_PX = 3, 1.5
 
 
 def model_files(folder: Path) -> tuple[Path, Path] | None:
@@ -76,14 +64,8 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
 def model_text(path: Path) -> str | None:
     """The text of a model's cameras or images without its points, which may be hundreds of megabytes.
 
-    Binary files are read as the text that they stand for. A file that did not change since it was
-    read last is not read again: every pair of a run asks for it.
-
-    Args:
-        path: an existing file.
-
-    Returns:
-        Comments and a line a camera or image; ``None`` for a text file without the head of ``images.txt``.
+    ``None`` for a text file without the head of ``images.txt``; binary files are read as the text that they
+    stand for. A file that did not change is not read again: every pair of a run asks for it.
     """
     state = path.stat()
     return _model_text(path.absolute(), state.st_size, state.st_mtime_ns)
@@ -112,17 +94,15 @@ class _Bytes:
         try:
             numbers = struct.unpack_from(f"<{layout}", self._data, self._at)
         except struct.error:
-            bad_value(f"{self._path}", BINARY, "less than it says that it holds", "Is it cut off?")
+            bad_value(f"{self._path}", "a binary COLMAP file", "less than it says it holds", "Is it cut off?")
         self._at += struct.calcsize(f"<{layout}")
         return numbers
 
     def name(self) -> str:
         """The text up to the next zero."""
         end = self._data.find(b"\0", self._at)
-        if end < 0:
-            bad_value(f"{self._path}", BINARY, "a name without an end", "Is it cut off?")
-        text, self._at = self._data[self._at : end].decode("utf-8", errors="replace"), end + 1
-        return text
+        (text,) = self(f"{(end if end >= 0 else len(self._data)) - self._at}sx")
+        return str(text.decode("utf-8", errors="replace"))
 
 
 def _binary_cameras(path: Path) -> Iterator[str]:
@@ -161,61 +141,34 @@ def _cameras(text: str) -> dict[int, Camera]:
     return cameras
 
 
-def _images(text: str) -> dict[str, tuple[int, np.ndarray, int]]:
+def _images(text: str) -> dict[str, Posed]:
     images = {}
     for number, words, camera, name in IMAGE.findall(text):
         qw, qx, qy, qz, *translation = array_of(words.split(), (7,), f"image {number}")
-        if not any((qw, qx, qy, qz)):
-            bad_value(f"the rotation of {name}", "a quaternion", "zeros")
         T = np.eye(4)
-        T[:3, :3] = Rotation.from_quat([qx, qy, qz, qw]).as_matrix()
+        T[:3, :3] = Rotation.from_quat([qx, qy, qz, qw]).as_matrix()  # refuses zeros
         T[:3, 3] = translation
         images[name.strip()] = (int(number), T, int(camera))
     return images
 
 
-def _text_of(folder: Path, which: int) -> str:
-    files = model_files(folder)
-    if files is None:
-        bad_value("the model", "a folder with cameras and images as .txt or .bin", f"{folder}")
-    text = model_text(check_file(files[which], "the model"))
-    return files[which].read_text(encoding="utf-8-sig", errors="replace") if text is None else text
+def read_colmap_model(files: tuple[Path, Path]) -> tuple[dict[int, Camera], dict[str, Posed]]:
+    """The cameras of a model by number, and its images by name, of its files of both."""
+    texts = [model_text(path) or path.read_text("utf-8-sig", "replace") for path in files]
+    return _cameras(texts[0]), _images(texts[1])
 
 
-def read_colmap_cameras(folder: Path) -> dict[int, Camera]:
-    """Every camera of a model by its number, with K as this package has it (first pixel's centre at 0).
-
-    Raises:
-        OSError, ValueError: no model, or a damaged one.
-    """
-    return _cameras(_text_of(folder, 0))
-
-
-def read_colmap_images(folder: Path) -> dict[str, tuple[int, np.ndarray, int]]:
-    """Every image of a model by name: its number, ``(4, 4)`` T_camera_from_world, its camera's number.
-
-    Raises:
-        OSError, ValueError: no model, or a damaged one.
-    """
-    return _images(_text_of(folder, 1))
-
-
-def read_colmap_points(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
-    """The points of a model, in its frame and unit.
-
-    Returns:
-        ``(N, 3)`` float64 points, ``(N, 3)`` uint8 colours, ``(N,)`` reprojection errors in pixels, and
-        of every point the numbers of the images that see it.
-
-    Raises:
-        OSError, ValueError: no points3D.txt or .bin, or a damaged one.
-    """
+def read_colmap_points(folder: Path) -> dict[int, np.ndarray]:
+    """The reliable points ``(n, 3)`` that an image of a model sees, by its number, in the model's world."""
     path = folder / "points3D.txt"
-    text = path.exists()
-    rows = list((_text_points if text else _binary_points)(path if text else path.with_suffix(".bin")))
-    columns = array_of([row for row, _ in rows], (-1,), f"{path}").reshape(-1, 7)
-    tracks = [np.asarray(track, np.int64) for _, track in rows]
-    return columns[:, :3], columns[:, 3:6].astype(np.uint8), columns[:, 6], tracks
+    rows = _text_points(path) if path.exists() else _binary_points(path.with_suffix(".bin"))
+    seen: dict[int, list[np.ndarray]] = {}
+    for numbers, images in rows:
+        xyz_error = array_of(numbers, (4,), f"a point of {path}")
+        if len(images) >= FEWEST_VIEWS and xyz_error[3] <= MOST_ERROR_PX:
+            for image in set(images):
+                seen.setdefault(int(image), []).append(xyz_error[:3])
+    return {image: np.array(points) for image, points in seen.items()}
 
 
 def _text_points(path: Path) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:
@@ -223,27 +176,25 @@ def _text_points(path: Path) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:
         for line in file:
             words = line.split()
             if words and not line.startswith("#"):
-                if len(words) < 8:
-                    bad_value(f"{path}", "a COLMAP points3D.txt", repr(line[:80]), "Is it cut off?")
-                yield words[1:8], words[8::2]
+                yield (*words[1:4], *words[7:8]), words[8::2]
 
 
 def _binary_points(path: Path) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:
     take = _Bytes(check_file(path, "the model", "points3D.txt or points3D.bin"))
     for _ in range(*take("Q")):
-        row = take("Q3d3Bd")[1:]
-        (seen,) = take("Q")
-        yield row, take(f"{2 * seen}I")[::2]
+        x, y, z, error_px, seen = take("8x3d3xdQ")
+        yield (x, y, z, error_px), take(f"{2 * seen}I")[::2]
 
 
-def _matches(text: str) -> bool:
+def is_colmap(text: str) -> bool:
+    """Whether a text is of a model's cameras or images."""
     if CAMERAS_MARK in text or IMAGES_MARK in text:
         return True
     camera = CAMERA.search(text)
     return (camera is not None and camera[2] in MODELS) or IMAGE.search(text) is not None
 
 
-def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """The two images of ``choice.image_names``; both files in any order.
 
     Lengths keep the model's unit, which is no metre: one measured distance gives it (``baseline_m``).
@@ -252,31 +203,14 @@ def _read(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     if len(by_kind) != 2:
         bad_value("the files", "cameras.txt and images.txt", "two of one kind")
     cameras, images = _cameras(by_kind[True]), _images(by_kind[False])
-    left, right = (images[name] for name in names_of_pair(images, choice))
-    missing = [camera for _, _, camera in (left, right) if camera not in cameras]
-    if missing:
-        bad_value(
-            "the cameras", f"with camera {missing[0]}", f"only {', '.join(map(str, cameras))}", "Cut off?"
-        )
-    return RawRig(cameras[left[2]], cameras[right[2]], left[1] @ np.linalg.inv(right[1]))
-
-
-COLMAP = CalibrationFormat(
-    "a COLMAP model (cameras.txt and images.txt)",
-    _matches,
-    _read,
-    file_counts=(2,),
-    has_unit=False,
-    by_image=True,
-)
+    (_, T_left, left), (_, T_right, right) = (images[name] for name in names_of_pair(images, choice))
+    if not {left, right} <= cameras.keys():
+        bad_value("the cameras", f"with cameras {left} and {right}", f"only {', '.join(map(str, cameras))}")
+    return make_rig(cameras[left], cameras[right], T_left @ np.linalg.inv(T_right))
 
 
 def check_colmap_names(names: Sequence[str]) -> None:
-    """Refuse names of images that a model cannot hold.
-
-    Raises:
-        ValueError: a name with a blank.
-    """
+    """Refuse names of images that a model cannot hold: those with a blank."""
     for name in names:
         if any(letter.isspace() for letter in name):
             bad_value("the name of an image in a COLMAP model", "without blanks", repr(name), "Rename it.")
@@ -315,6 +249,10 @@ def write_colmap(
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
         "#   POINTS2D[] as (X, Y, POINT3D_ID)",
     ]
+    points = [
+        "# 3D point list with one line of data each:",
+        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+    ]
     tracks = [""] * len(cloud.points_m)
     for number, ((name, K, E, (width, height)), (px, rows)) in enumerate(zip(views, seen, strict=True), 1):
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
@@ -327,16 +265,9 @@ def write_colmap(
         images.append(" ".join(f"{x:.3f} {y:.3f} {row + 1}" for (x, y), row in each))
         for index, row in enumerate(rows):
             tracks[row] += f" {number} {index}"
-    points = [
-        "# 3D point list with one line of data each:",
-        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-    ]
-    points += [
-        f"{number} {x:.5f} {y:.5f} {z:.5f} {r} {g} {b} 0{track}"
-        for number, ((x, y, z), (r, g, b), track) in enumerate(
-            zip(cloud.points_m, cloud.colours, tracks, strict=True), 1
-        )
-    ]
-    for name, lines in zip(COLMAP_FILES, (cameras, images, points), strict=True):
-        with atomic_path(Path(folder) / name) as temporary:
+    rows_of = zip(cloud.points_m, cloud.colours, tracks, strict=True)
+    for number, ((x, y, z), (r, g, b), track) in enumerate(rows_of, 1):
+        points.append(f"{number} {x:.5f} {y:.5f} {z:.5f} {r} {g} {b} 0{track}")
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
+        with atomic_path(Path(folder) / f"{name}.txt") as temporary:
             temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

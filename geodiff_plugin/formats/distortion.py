@@ -20,11 +20,7 @@ STEP_PX = 1e-3
 
 
 def distortion_from_text(text: str, name: str = "--distortion") -> Distortion:
-    """Coefficients as they are typed: ``k1,k2,p1,p2[,k3...]``, or ``fisheye:k1,k2,k3,k4``.
-
-    Raises:
-        ValueError: no numbers, or another count of them.
-    """
+    """Coefficients as they are typed: ``k1,k2,p1,p2[,k3...]``, or ``fisheye:k1,k2,k3,k4``."""
     model, colon, numbers = text.rpartition(":")
     model = model if colon else "opencv"
     try:
@@ -62,26 +58,22 @@ def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion
     result is ``(N, 2)`` float64, also outside of the image; NaN where the model sends no ray to a pixel.
     """
     taken, K = np.asarray(pixels, np.float64).reshape(-1, 1, 2), np.asarray(K, np.float64)
-    straight, found = taken.copy(), np.zeros(len(taken), bool)
-    left = np.arange(len(taken))
+    straight, far = taken.copy(), np.ones(len(taken), bool)
     # Newton's method: OpenCV's own way back stops after five iterations, pixels off behind a strong lens.
     for _ in range(MOST_STEPS):
-        if not left.size:
+        bent = _as_taken(straight, K, distortion)
+        moved = [_as_taken(straight + step, K, distortion) - bent for step in STEP_PX * np.eye(2)]
+        J = np.stack([step[:, 0] / STEP_PX for step in moved], axis=2)
+        # Neither mirrored nor turned over, as behind the edge of a lens.
+        area = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+        ahead = (area > 0) & (J[:, 0, 0] + J[:, 1, 1] > 0)
+        far = ~(np.abs(bent - taken).max(axis=(1, 2)) < TOLERANCE_PX)
+        straight[~ahead] = np.nan
+        move = ahead & far
+        if not move.any():
             break
-        here = straight[left]
-        bent = _as_taken(here, K, distortion)
-        error = (bent - taken[left])[:, 0]
-        moved = [_as_taken(here + step, K, distortion) - bent for step in STEP_PX * np.eye(2)]
-        (a, c), (b, d) = (step[:, 0].T / STEP_PX for step in moved)
-        area = a * d - b * c
-        ahead = (area > 0) & (a + d > 0)  # neither mirrored nor turned over, as behind the edge of a lens
-        near = np.abs(error).max(axis=1) < TOLERANCE_PX
-        found[left[near & ahead]] = True
-        left, error = left[~near & ahead], error[~near & ahead]
-        a, b, c, d, area = (entry[~near & ahead] for entry in (a, b, c, d, area))
-        x, y = error.T
-        straight[left, 0] -= np.stack([(d * x - b * y) / area, (a * y - c * x) / area], axis=1)
-    straight[~found] = np.nan
+        straight[move] -= np.linalg.solve(J[move], (bent - taken)[move, 0, :, None])[..., None, :, 0]
+    straight[far] = np.nan
     return straight[:, 0]
 
 

@@ -43,23 +43,21 @@ def intrinsics_from_exif(
     A focal length in 35 mm equivalent is taken by the diagonal; else a focal length in mm with the resolution
     of the sensor. Both are known to a few per cent.
 
-    Returns:
-        ``(3, 3)`` float64, pixels, and sentences about what was assumed.
-
-    Raises:
-        ValueError: no focal length in it, or an image that was cropped since.
+    Returns K ``(3, 3)`` in pixels, and sentences about what was assumed; refuses an image without a focal
+    length, or one that was cropped since.
     """
     if isinstance(source, Image.Image):
-        return _of(source, name, turned=False)
+        return _of(source, name)
     with open_image(source, name) as image:
-        return _of(image, name, turned=image.getexif().get(_ORIENTATION) in (5, 6, 7, 8))
+        K, notes = _of(image, name)
+        turned = image.getexif().get(_ORIENTATION) in (5, 6, 7, 8)
+    return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if turned else K, notes
 
 
 def warn_of_other_lens(source: str | os.PathLike[str] | Image.Image, K: np.ndarray, name: str) -> None:
     """Warn of a focal length that contradicts the image's own EXIF, which two rectified views cannot tell.
 
     Nothing is said of an image without a focal length, or one that was cropped or zoomed digitally.
-    ``source`` is as for ``intrinsics_from_exif``; ``K`` is in pixels of that image, ``name`` in the message.
     """
     try:
         theirs, notes = intrinsics_from_exif(source, name)
@@ -83,9 +81,8 @@ def _number(entries: Any, tag: int) -> float:
     return value if math.isfinite(value) and value > 0 else 0.0
 
 
-def _of(image: Image.Image, name: str, turned: bool) -> tuple[np.ndarray, list[str]]:
-    exif = image.getexif()
-    entries = exif.get_ifd(_IFD)
+def _of(image: Image.Image, name: str) -> tuple[np.ndarray, list[str]]:
+    entries = image.getexif().get_ifd(_IFD)
     width, height = image.size
     taken = _number(entries, _WIDTH), _number(entries, _HEIGHT)
     if all(taken):
@@ -94,24 +91,20 @@ def _of(image: Image.Image, name: str, turned: bool) -> tuple[np.ndarray, list[s
             got = f"one of {taken[0]:.0f}x{taken[1]:.0f}: it was cropped since it was taken"
             cure = f"Give the image as it was taken. {CURES}"
             bad_value(f"EXIF of {name}", f"of an image of {width}x{height}", got, cure)
-    focal_35, focal_mm = _number(entries, _FOCAL_35), _number(entries, _FOCAL)
-    per_unit = _MM_PER_UNIT.get(int(_number(entries, _UNIT) or 2), 25.4)
-    pitch_x, pitch_y = (
-        per_unit / r if r else 0.0 for r in (_number(entries, t) for t in (_X_RESOLUTION, _Y_RESOLUTION))
-    )
-    zoom = _number(entries, _ZOOM)
+    focal_35, focal_mm, zoom = (_number(entries, tag) for tag in (_FOCAL_35, _FOCAL, _ZOOM))
+    per_unit_x, per_unit_y = (_number(entries, tag) for tag in (_X_RESOLUTION, _Y_RESOLUTION))
     if focal_35:
         fx = fy = focal_35 * math.hypot(width, height) / _DIAGONAL_35_MM
         notes = [f"K of {name}: {focal_35:g} mm in 35 mm equivalent by its EXIF, {fx:.0f} px."]
-    elif focal_mm and pitch_x and taken[0]:
+    elif focal_mm and per_unit_x and taken[0]:
+        mm = _MM_PER_UNIT.get(int(_number(entries, _UNIT) or 2), 25.4)
+        pitch_x, pitch_y = mm / per_unit_x, mm / (per_unit_y or per_unit_x)
         fx = focal_mm / pitch_x * (max(width, height) / max(taken)) * max(zoom, 1.0)
-        fy = fx * pitch_x / (pitch_y or pitch_x)
+        fy = fx * pitch_x / pitch_y
         notes = [f"K of {name}: {focal_mm:g} mm on its sensor by its EXIF, {fx:.0f} px."]
     else:
         bad_value(f"K of {name}", "known", "no focal length in its EXIF", CURES)
     if zoom > 1.01:
         said = "not every camera says whether that is counted in"
         notes.append(f"{name} was zoomed digitally by {zoom:g}; {said}.")
-    if turned:
-        (width, height), (fx, fy) = (height, width), (fy, fx)
     return intrinsics(fx, fy, (width - 1) / 2, (height - 1) / 2), notes

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._camera_checks import check_intrinsics
-from geodiff_plugin._checks import bad_value, check_metres, check_number
+from geodiff_plugin._camera_checks import check_intrinsics, check_metres
+from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.formats.benchmarks import KITTI_ROW
 from geodiff_plugin.formats.depth import read_depth_png, read_pfm
 from geodiff_plugin.formats.files import check_file, open_image, read_npy, read_rows, read_text

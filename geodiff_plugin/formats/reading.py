@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import FolderError, InputError, bad_type, bad_value, check_number, refuse, warn
-from geodiff_plugin.formats import benchmarks, devices, nerf, opencv, robots
-from geodiff_plugin.formats.colmap import COLMAP, model_files, model_text
+from geodiff_plugin._checks import bad_type, bad_value, check_number, warn
+from geodiff_plugin.formats import benchmarks, colmap, devices, nerf, robots
 from geodiff_plugin.formats.files import check_file, read_text
-from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, check_no_distortion, make_rig
+from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.types import Rig
 
 __all__ = ["CALIBRATION_FORMATS", "has_pose_per_image", "read_calibration"]
@@ -30,7 +29,6 @@ def _json(*keys: str) -> Callable[[str], object]:
     return lambda text: text.lstrip().startswith(("{", "[")) and all(f'"{key}"' in text for key in keys)
 
 
-_OPENCV = re.compile('!!opencv-matrix|<opencv_storage|"opencv-matrix"').search
 #: Every format by name. The first that recognises a file reads it: formats that others contain come first.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "middlebury": CalibrationFormat(
@@ -49,7 +47,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         benchmarks.read_foundation_stereo,
     ),
     "booster": CalibrationFormat(
-        "Booster xml (proj_matL)", re.compile("<opencv_st(?s:.*)proj_matL").search, benchmarks.read_booster
+        "Booster xml (proj_matL)", re.compile("<opencv_st(?s:.*)proj_matL").search, robots.read_booster
     ),
     "mvsnet": CalibrationFormat(
         "a pair of MVSNet cam.txt (extrinsic)", _line(r"\s*extrinsic\s*$"), benchmarks.read_mvsnet, (2,)
@@ -69,7 +67,6 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
         _json("frames", "transform_matrix"),
         nerf.read_nerf,
-        has_unit=False,
         by_image=True,
     ),
     "kalibr": CalibrationFormat(
@@ -85,7 +82,10 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         robots.read_orb_slam,
     ),
     "opencv": CalibrationFormat(
-        "OpenCV YAML, XML or JSON (P1, P2, or M1, M2, R, T)", _OPENCV, opencv.read_opencv, (1, 2)
+        "OpenCV YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
+        re.compile('!!opencv-matrix|<opencv_storage|"opencv-matrix"').search,
+        robots.read_opencv,
+        (1, 2),
     ),
     "ros": CalibrationFormat(
         "a pair of ROS camera_info (projection_matrix)",
@@ -94,13 +94,16 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         (2,),
     ),
     "stereodemo": CalibrationFormat("stereodemo JSON (fx)", _json("fx"), benchmarks.read_stereodemo),
-    "colmap": COLMAP,
+    "colmap": CalibrationFormat(
+        "a COLMAP model (cameras.txt and images.txt)",
+        colmap.is_colmap,
+        colmap.read_colmap,
+        (2,),
+        by_image=True,
+    ),
 }
 
 PathLike = str | os.PathLike[str]
-
-#: What a reader that takes a whole file for granted raises on one that is not.
-UNFINISHED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError)
 
 
 def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
@@ -111,76 +114,51 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
     if len(paths) not in (1, 2):
         bad_value("calibration", "one file, or a pair (left, right)", f"{len(paths)} files")
     if len(paths) == 1 and os.path.isdir(paths[0]):
-        files = model_files(Path(paths[0]))
-        if files is None:
-            raise FolderError(
-                "calibration must be a calibration file, or the folder of a COLMAP model with its cameras "
-                f"and images (.txt or .bin); got the folder {paths[0]}. Name the file inside it."
-            )
-        paths = files
-    return {Path(p): _text(Path(p)) for p in paths}
+        paths = colmap.model_files(Path(paths[0])) or paths
+    what = "a calibration file"
+    texts = {}
+    for file in paths:
+        text = colmap.model_text(check_file(file, "calibration", what))
+        texts[Path(file)] = read_text(file, "calibration", what) if text is None else text
+    return texts
 
 
-def _text(path: Path) -> str:
-    text = model_text(check_file(path, "calibration", "a calibration file"))
-    return read_text(path, "calibration", "a calibration file") if text is None else text
-
-
-def _recognise(text: str, path: Path) -> str:
-    name = next((name for name, entry in CALIBRATION_FORMATS.items() if entry.matches(text)), None)
-    if name is None:
-        formats = "; ".join(entry.summary for entry in CALIBRATION_FORMATS.values())
-        cure = "Is this the right file? Otherwise give fx, fy, cx, cy and baseline, or K and E."
-        bad_value("calibration", f"in a known format ({formats})", f"{path}, which is none of them", cure)
-    return name
-
-
-def _one_format(texts: dict[Path, str]) -> str:
-    """The name of the format that all files have, as many as it needs."""
-    names = [_recognise(text, path) for path, text in texts.items()]
+def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
+    """The format that all files have, as many as it needs."""
+    names = []
+    for path, text in texts.items():
+        name = next((name for name, entry in CALIBRATION_FORMATS.items() if entry.matches(text)), None)
+        if name is None:
+            formats = "; ".join(entry.summary for entry in CALIBRATION_FORMATS.values())
+            cure = "Is this the right file? Otherwise give fx, fy, cx, cy and baseline, or K and E."
+            bad_value("calibration", f"in a known format ({formats})", f"{path}, which is none of them", cure)
+        names.append(name)
     if len(set(names)) > 1:
         bad_value("calibration", "two files of one format", " and ".join(names))
-    calibration = CALIBRATION_FORMATS[names[0]]
-    if len(texts) not in calibration.file_counts:
+    entry = CALIBRATION_FORMATS[names[0]]
+    if len(texts) not in entry.file_counts:
         count, cure = "one file", "It describes both cameras; give it once."
         if len(texts) == 1:
             count, cure = "two files", "Give --calib twice, for the left and the right view."
-        got = " and ".join(map(str, texts))
-        bad_value("calibration", f"{count} ({calibration.summary})", got, cure)
-    return names[0]
+        bad_value("calibration", f"{count} ({entry.summary})", " and ".join(map(str, texts)), cure)
+    return entry
 
 
-def _read(texts: dict[Path, str], calibration: CalibrationFormat, choice: CameraChoice) -> Rig:
-    """The rig of files of one format; whatever is wrong in them becomes a sentence with their names."""
-    source = " and ".join(map(str, texts))
-    try:
-        raw = calibration.read(tuple(texts.values()), choice)
-        rig = make_rig(raw, source)
-    except InputError as error:
-        refuse(f"{source}: {error}")
-    except UNFINISHED as error:
-        said = str(error).partition("\n")[0] or "other entries"
-        got = f"no {error}" if isinstance(error, KeyError) else said
-        bad_value(source, f"a whole {calibration.summary}", got, "Is the file cut off?")
-    for note in raw.notes:
-        warn(f"{source}: {note}", stacklevel=3)
-    return rig
-
-
-def _check_cameras(cameras: tuple[int, int] | None, calibration: CalibrationFormat) -> None:
+def _checked(cameras: tuple[int, int] | None, entry: CalibrationFormat) -> tuple[int, int] | None:
     if cameras is None:
-        return
-    if not calibration.uses_cameras:
+        return None
+    if not entry.uses_cameras:
         bad_value("cameras", "left out for a file of two cameras", cameras, "It chooses among more than two.")
     pair = isinstance(cameras, (tuple, list)) and len(cameras) == 2
     if not pair or not all(type(camera) is int for camera in cameras):
         bad_value("cameras", "a pair of camera numbers, as (2, 3)", repr(cameras))
+    return cameras[0], cameras[1]
 
 
-def _in_metres(rig: Rig, baseline_m: float | None, has_unit: bool) -> Rig:
+def _in_metres(rig: Rig, baseline_m: float | None, by_image: bool) -> Rig:
     """The rig with its cameras ``baseline_m`` apart; a warning where nothing says what its unit is."""
     if baseline_m is None:
-        if has_unit:
+        if not by_image:
             return rig
         warn(
             f"{rig.source} has no unit: depth comes out in the model's own. Give the measured "
@@ -191,8 +169,9 @@ def _in_metres(rig: Rig, baseline_m: float | None, has_unit: bool) -> Rig:
     check_number(baseline_m, "baseline_m", float(np.finfo(np.float64).tiny), 1e9)
     length = float(np.linalg.norm(rig.E[:3, 3]))
     if length == 0:
-        cure = "Both its cameras are at one place."
-        bad_value("baseline_m", f"left out for {rig.source}", baseline_m, cure)
+        bad_value(
+            "baseline_m", f"left out for {rig.source}", baseline_m, "Both its cameras are at one place."
+        )
     E = rig.E.copy()
     E[:3, 3] *= baseline_m / length
     return replace(rig, E=E)
@@ -234,28 +213,27 @@ def read_calibration(
         A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
     """
     texts = _texts(path)
-    calibration = CALIBRATION_FORMATS[_one_format(texts)]
-    _check_cameras(cameras, calibration)
+    entry, source = _format_of(texts), " and ".join(map(str, texts))
     choice = CameraChoice(
-        (cameras[0], cameras[1]) if cameras else None,
+        _checked(cameras, entry),
         None if image_folder_hint is None else str(image_folder_hint),
         None if image_names is None else (str(image_names[0]), str(image_names[1])),
         None if image_size is None else (int(image_size[0]), int(image_size[1])),
     )
-    rig = _read(texts, calibration, choice)
-    if not distorted:
-        for side, lens in zip(("left", "right"), rig.distortion, strict=True):
-            check_no_distortion(lens, f"Lens distortion of the {side} camera in {rig.source}")
-    return _in_metres(rig, baseline_m, calibration.has_unit)
+    with reading_whole(source, entry.summary):
+        rig = replace(entry.read(tuple(texts.values()), choice), source=source)
+    for side, lens in zip(("left", "right"), rig.distortion, strict=True):
+        if lens is not None and not distorted:
+            cure = (
+                "Undistort or rectify both images first and give the calibration of the result (P1, P2), "
+                "or use geodiff depth, which undistorts them."
+            )
+            got = f"{lens.model} {np.array2string(lens.coefficients, precision=4, separator=', ')}"
+            name = f"Lens distortion of the {side} camera in {source}"
+            bad_value(name, "zero (images of a pinhole camera)", got, cure)
+    return _in_metres(rig, baseline_m, entry.by_image)
 
 
 def has_pose_per_image(path: PathLike | Sequence[PathLike]) -> bool:
-    """Whether a calibration is another one for every pair of images, found by their names.
-
-    Args:
-        path: as in ``read_calibration``.
-
-    Raises:
-        OSError, TypeError, ValueError: as ``read_calibration``, where no format is recognised.
-    """
-    return CALIBRATION_FORMATS[_one_format(_texts(path))].by_image
+    """Whether a calibration, as ``read_calibration`` takes it, is another one for every pair of images."""
+    return _format_of(_texts(path)).by_image

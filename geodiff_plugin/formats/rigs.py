@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import configparser
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import PurePath
 from typing import Any, TypeVar
+from xml.etree import ElementTree
 
 import numpy as np
-import torch
+import yaml
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_pose
-from geodiff_plugin._checks import bad_value, check_number, check_positive
-from geodiff_plugin.geometry import nearest_rotation
+from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_positive, refuse
 from geodiff_plugin.types import Distortion, Rig
 
 __all__ = [
-    *("COEFFICIENT_COUNTS", "CalibrationFormat", "Camera", "CameraChoice", "RawRig", "array_of"),
-    *("check_no_distortion", "intrinsics", "is_distorted", "make_rig", "names_of_pair", "number", "of_size"),
-    *("projected", "rig_from_parameters", "rigid", "size_of", "two_cameras"),
+    *("COEFFICIENT_COUNTS", "CalibrationFormat", "Camera", "CameraChoice", "array_of"),
+    *("intrinsics", "is_distorted", "lens_of", "make_rig", "names_of_pair", "of_size", "projected"),
+    *("reading_whole", "rig_from_parameters", "rigid", "two_cameras"),
 ]
 
 Size = tuple[int, int]
@@ -29,19 +31,17 @@ Entry = TypeVar("Entry")
 DISTORTION_TOLERANCE = 1e-6
 #: How many coefficients OpenCV's functions take, by the model's name in ``Distortion``.
 COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
+#: What a reader that takes a whole file for granted raises on one that is not.
+UNFINISHED = (
+    *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError),
+    *(yaml.YAMLError, configparser.Error, ElementTree.ParseError),
+)
 CHECK_FILE = "Check the calibration file."
 
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """Which two cameras of a file with more than two, and at which resolution.
-
-    Attributes:
-        cameras: numbers of the left and the right camera, or ``None`` to choose by the folder or the file.
-        image_folder_hint: name or path of the left image's folder (or of the image), or ``None``.
-        image_names: names or paths of the left and the right image, or ``None``.
-        image_size: ``(width, height)`` of the left image, or ``None``; chooses among a file's resolutions.
-    """
+    """Which two cameras of a file with more than two, and at which resolution; as in ``read_calibration``."""
 
     cameras: tuple[int, int] | None = None
     image_folder_hint: str | None = None
@@ -55,7 +55,7 @@ class Camera:
 
     Attributes:
         K: ``(3, 3)`` pixels, the centre of the first pixel at (0, 0).
-        size: ``(width, height)`` that ``K`` is for, or ``None``.
+        size: ``(width, height)`` that ``K`` is for; ``None``, or a pair of ``None``, if unknown.
         coefficients: of the lens, in OpenCV's order; empty for none.
         model: ``"opencv"``, ``"fisheye"``, or the file's name of a model that OpenCV does not have.
     """
@@ -67,73 +67,55 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class RawRig:
-    """Two cameras as a file describes them.
-
-    Attributes:
-        left: the left camera.
-        right: the right camera.
-        pose: ``(4, 4)`` metres, the right camera's pose in the left camera's frame; or the baseline in
-            metres of a right camera that stands to the right.
-        rectified: whether the file says that its images are rectified.
-        notes: sentences about what was assumed, for a warning each.
-    """
-
-    left: Camera
-    right: Camera
-    pose: Any
-    rectified: bool = False
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class CalibrationFormat:
     """One entry of ``CALIBRATION_FORMATS``.
 
     Attributes:
         summary: the format and its mark, for messages.
         matches: whether a text is of this format, given that no format before it in the table matches.
-        read: ``(texts, choice) -> RawRig``. It may raise whatever a missing entry raises, which
+        read: what a file says, by ``make_rig``. It may raise whatever a missing entry raises, which
             ``read_calibration`` turns into a sentence with the file's name.
         file_counts: how many files may describe one pair.
         uses_cameras: whether a file may hold more than two cameras, so that ``cameras`` has a meaning.
-        has_unit: whether its lengths have a known unit (or are taken as metres); a warning says where not.
-        by_image: whether it has a pose for each of many images, which are found by their names.
+        by_image: whether it has a pose, in no known unit, for each of many images, found by their names.
     """
 
     summary: str
     matches: Callable[[str], object]
-    read: Callable[[tuple[str, ...], CameraChoice], RawRig]
+    read: Callable[[tuple[str, ...], CameraChoice], Rig]
     file_counts: tuple[int, ...] = (1,)
     uses_cameras: bool = False
-    has_unit: bool = True
     by_image: bool = False
 
 
 # What readers share. Each raises ValueError with the name of the entry.
 
 
-def number(value: Any, name: str) -> float:
-    """A finite number, as float; text of one is taken, a truth value is not."""
+@contextmanager
+def reading_whole(source: object, summary: str) -> Iterator[None]:
+    """Whatever is wrong in files that are read inside becomes a sentence with their names."""
     try:
-        result = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):  # a whole number of any length is JSON
-        result = math.nan
-    if not math.isfinite(result):
-        bad_value(name, "a finite number", "none" if value is None else repr(value)[:80], CHECK_FILE)
-    return result
+        yield
+    except InputFileError:
+        raise
+    except InputError as error:
+        refuse(f"{source}: {error}")
+    except UNFINISHED as error:
+        said = str(error) or "other entries"
+        got = f"no {error}" if isinstance(error, KeyError) else said
+        bad_value(str(source), f"a whole {summary}", got, "Is the file cut off?")
 
 
 def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Finite numbers as a float64 array; flat lists are brought to ``shape``, ``(-1,)`` takes any count."""
+    """Finite numbers, or text of them, as a float64 array of ``shape``; ``(-1,)`` takes any count."""
     count = math.prod(shape)
-    expected = "numbers" if count < 0 else f"{count} numbers"
+    expected = {1: "a finite number", -1: "finite numbers"}.get(count, f"{count} finite numbers")
     try:
         numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError):  # a whole number of any length is JSON
         numbers = np.array(np.nan)
     if not np.isfinite(numbers).all():
-        bad_value(name, f"{expected}, all finite", repr(value)[:80], CHECK_FILE)
+        bad_value(name, expected, repr(value), CHECK_FILE)
     if count >= 0 and numbers.size != count:
         bad_value(name, expected, f"{numbers.size}", "Is the file cut off?")
     return numbers.reshape(shape)
@@ -141,44 +123,15 @@ def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 def intrinsics(fx: Any, fy: Any, cx: Any, cy: Any) -> np.ndarray:
     """The ``(3, 3)`` float64 camera matrix of four numbers in pixels."""
-    fx, fy, cx, cy = (number(value, name) for value, name in ((fx, "fx"), (fy, "fy"), (cx, "cx"), (cy, "cy")))
+    fx, fy, cx, cy = array_of((fx, fy, cx, cy), (4,), "fx, fy, cx, cy")
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
-
-
-def size_of(entries: Mapping[str, Any], width: str = "width", height: str = "height") -> Any:
-    """The raw ``(width, height)`` of a mapping; ``None`` where it has neither."""
-    pair = entries.get(width), entries.get(height)
-    return None if pair == (None, None) else pair
 
 
 def rigid(matrix: Any, name: str) -> np.ndarray:
     """A ``(4, 4)`` float64 transform of 12 or 16 numbers, its rotation projected to the nearest one."""
     numbers = array_of(matrix, (-1,), name)
-    shape = (3, 4) if numbers.size == 12 else (4, 4)
-    matrix = array_of(numbers, shape, name)
-    cure = "Check that rows and columns are not swapped and that no scale is multiplied in."
-    T = check_pose(matrix, name, cure)
-    T[:3, :3] = nearest_rotation(torch.from_numpy(matrix[:3, :3].copy())).numpy()  # in torch's last bit
-    return T
-
-
-def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> RawRig:
-    """The rig of two rectified ``(3, 4)`` projections ``K [I | t]`` that share one frame.
-
-    A camera with ``K [I | t]`` has its centre at ``-t``, so the pose's translation is ``t_left - t_right``.
-    """
-    P = [array_of(values, (3, 4), f"the {side} projection") for side, values in _sides(P_left, P_right)]
-    t_left, t_right = (
-        np.linalg.solve(check_intrinsics(matrix[:, :3], f"K of the {side} camera"), matrix[:, 3])
-        for side, matrix in _sides(*P)
-    )
-    E = np.eye(4)
-    E[:3, 3] = t_left - t_right
-    return RawRig(Camera(P[0][:, :3], size_left), Camera(P[1][:, :3], size_right), E, rectified=True)
-
-
-def _sides(left: Any, right: Any) -> tuple[tuple[str, Any], tuple[str, Any]]:
-    return ("left", left), ("right", right)
+    matrix = array_of(numbers, (3, 4) if numbers.size == 12 else (4, 4), name)
+    return check_pose(matrix, name, "Are rows and columns swapped, or is a scale multiplied in?")
 
 
 def of_size(by_size: Mapping[Size, Entry], choice: CameraChoice) -> Entry:
@@ -207,9 +160,6 @@ def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, st
 
     Names of the file may hold folders, and may lack the suffix. A path fits a name that it ends with, or that
     ends with it; of several the one with the most folders in common is taken.
-
-    Raises:
-        ValueError: no names, no such image, several that fit as well, or one image for both.
     """
     if choice.image_names is None:
         expected = "given for a calibration of many images, as ('left.jpg', 'right.jpg')"
@@ -220,27 +170,23 @@ def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, st
     return left, right
 
 
-def _parts(name: str) -> tuple[str, ...]:
-    # Files of Windows programs have backslashes; a step upwards says nothing about the name.
-    return tuple(part for part in Path(name.replace("\\", "/")).parts if part != "..")
-
-
-def _agreeing(name: str, wanted: str) -> int:
+def _parts_in_common(name: str, wanted: str) -> int:
     """How many parts both paths have in common, if one of them ends the other; else 0."""
-    ours, theirs = _parts(name), _parts(wanted)
-    if ours and theirs and ours[-1] == Path(theirs[-1]).stem:  # NeRF's names have no suffix
-        theirs = (*theirs[:-1], ours[-1])
+    # Files of Windows programs have backslashes; a step upwards says nothing about the name.
+    paths = (PurePath(text.replace("\\", "/")).parts for text in (name, wanted))
+    ours, theirs = ([part for part in parts if part != ".."] for parts in paths)
+    if ours and theirs and ours[-1] == PurePath(theirs[-1]).stem:  # NeRF's names have no suffix
+        theirs[-1] = ours[-1]
     count = min(len(ours), len(theirs))
-    return count if count and ours[-count:] == theirs[-count:] else 0
+    return count if ours[len(ours) - count :] == theirs[len(theirs) - count :] else 0
 
 
 def _named(names: Collection[str], wanted: str) -> str:
-    agreeing = {name: _agreeing(name, wanted) for name in names}
-    most = max(agreeing.values(), default=0)
-    fitting = sorted(name for name, count in agreeing.items() if count == most)
+    in_common = {name: _parts_in_common(name, wanted) for name in names}
+    most = max(in_common.values(), default=0)
+    fitting = sorted(name for name, count in in_common.items() if count == most)
     if most == 0:
-        some = ", ".join(sorted(names)[:3])
-        expected = f"one of the {len(names)} in the file ({some}, ...)"
+        expected = f"one of the {len(names)} in the file ({', '.join(sorted(names)[:3])}, ...)"
         bad_value("the image", expected, wanted, "Check its name.")
     if len(fitting) > 1:
         got = f"{wanted}, which may be {' and '.join(fitting[:2])}"
@@ -258,74 +204,67 @@ def is_distorted(lens: Distortion | None) -> bool:
     return lens.model == "fisheye" or np.abs(lens.coefficients).max(initial=0.0) > DISTORTION_TOLERANCE
 
 
-def _printed(lens: Distortion) -> str:
-    numbers = np.array2string(lens.coefficients, precision=4, separator=", ")
-    return f"fisheye {numbers}" if lens.model == "fisheye" else numbers
-
-
-def check_no_distortion(lens: Distortion | None, name: str) -> None:
-    """Refuse a lens that moves pixels: every formula here is of a pinhole camera."""
-    if lens is not None and is_distorted(lens):
-        cure = (
-            "Undistort or rectify both images first and give the calibration of the result (P1, P2), "
-            "or use geodiff depth, which undistorts them."
-        )
-        bad_value(name, "zero (images of a pinhole camera)", _printed(lens), cure)
-
-
-def _lens(camera: Camera, side: str) -> Distortion | None:
-    """The lens, or ``None`` where it moves no pixel."""
+def lens_of(camera: Camera, name: str) -> Distortion | None:
+    """The lens of a camera, which messages name; ``None`` where it moves no pixel."""
     counts = COEFFICIENT_COUNTS.get(camera.model)
     if counts is None:
         cure = "OpenCV does not have this model: undistort or rectify both images to a pinhole first."
-        expected = f"one of {', '.join(COEFFICIENT_COUNTS)}"
-        bad_value(f"the lens model of the {side} camera", expected, repr(camera.model), cure)
-    name = f"Lens distortion of the {side} camera"
-    lens = Distortion(camera.model, array_of(camera.coefficients, (-1,), name))
+        bad_value(f"the lens model of {name}", f"one of {', '.join(COEFFICIENT_COUNTS)}", camera.model, cure)
+    lens = Distortion(camera.model, array_of(camera.coefficients, (-1,), f"the lens distortion of {name}"))
     if not is_distorted(lens):
         return None
     if lens.coefficients.size not in counts:
         expected = f"{', '.join(map(str, counts))} coefficients in OpenCV's order ({camera.model})"
-        bad_value(name, expected, f"{lens.coefficients.size}: {_printed(lens)}", CHECK_FILE)
+        bad_value(f"the lens distortion of {name}", expected, lens.coefficients.tolist(), CHECK_FILE)
     return lens
 
 
-def _pixels(size: Any, side: str) -> Size | None:
-    if size is None:
+def _pixels(size: Any, name: str) -> Size | None:
+    if size is None or all(side is None for side in size):
         return None
-    pair = []
-    for name, value in zip(("width", "height"), size, strict=True):
-        pixels = number(value, f"the {name} of the {side} image")
-        if pixels < 1 or pixels % 1:
-            expected = "a whole number of pixels above 0"
-            bad_value(f"the {name} of the {side} image", expected, repr(value), CHECK_FILE)
-        pair.append(int(pixels))
-    return pair[0], pair[1]
+    width, height = array_of(size, (2,), f"the width and height of {name}")
+    if min(width, height) < 1 or width % 1 or height % 1:
+        bad_value(f"the width and height of {name}", "whole numbers of pixels", list(size), CHECK_FILE)
+    return int(width), int(height)
 
 
-def make_rig(raw: RawRig, source: str | Path) -> Rig:
+def make_rig(left: Camera, right: Camera, pose: Any, *, rectified: bool = False) -> Rig:
     """A ``Rig`` of raw numbers: finite, in the right form, with whole pixels and lenses that OpenCV has.
 
-    Args:
-        raw: as a reader returns it.
-        source: the file, for later messages.
+    ``pose`` is the right camera's in the left camera's frame, ``(4, 4)`` metres, or the baseline in metres of
+    a right camera that stands to the right. ``rectified`` images have no lens distortion.
 
     Raises:
         ValueError: what is wrong with which camera, or with the pose.
     """
-    pose = raw.pose
+    E = np.eye(4)
     if np.ndim(pose) == 0:
-        pose, baseline_m = np.eye(4), number(pose, "the baseline")
-        if baseline_m <= 0:
-            bad_value("the baseline", "above 0", baseline_m, CHECK_FILE)
-        pose[0, 3] = baseline_m
-    cameras = _sides(raw.left, raw.right)
-    K_left, K_right = (check_intrinsics(camera.K, f"K of the {side} camera") for side, camera in cameras)
-    size_left, size_right = (_pixels(camera.size, side) for side, camera in cameras)
-    lens_left, lens_right = (_lens(camera, side) for side, camera in cameras)
-    E = array_of(pose, (4, 4), "the pose")
-    lenses = lens_left, lens_right
-    return Rig(K_left, K_right, E, size_left, size_right, str(source), lenses, raw.rectified)
+        E[0, 3] = array_of(pose, (), "the baseline")
+        if E[0, 3] <= 0:
+            bad_value("the baseline", "above 0", E[0, 3], CHECK_FILE)
+    else:
+        E = array_of(pose, (4, 4), "the pose")
+    cameras = (("the left camera", left), ("the right camera", right))
+    Ks = [check_intrinsics(camera.K, f"K of {name}") for name, camera in cameras]
+    sizes = [_pixels(camera.size, name) for name, camera in cameras]
+    lens_left, lens_right = (lens_of(camera, name) for name, camera in cameras)
+    rectified = rectified and lens_left is lens_right is None
+    return Rig(*Ks, E, *sizes, distortion=(lens_left, lens_right), rectified=rectified)
+
+
+def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> Rig:
+    """The rig of two rectified ``(3, 4)`` projections ``K [I | t]`` that share one frame.
+
+    A camera with ``K [I | t]`` has its centre at ``-t``, so the pose's translation is ``t_left - t_right``.
+    """
+    cameras, places = [], []
+    for side, values, size in (("left", P_left, size_left), ("right", P_right, size_right)):
+        P = array_of(values, (3, 4), f"the {side} projection")
+        cameras.append(Camera(check_intrinsics(P[:, :3], f"K of the {side} camera"), size))
+        places.append(np.linalg.solve(P[:, :3], P[:, 3]))
+    E = np.eye(4)
+    E[:3, 3] = places[0] - places[1]
+    return make_rig(*cameras, E, rectified=True)
 
 
 def rig_from_parameters(
@@ -350,7 +289,5 @@ def rig_from_parameters(
     cx_right = cx if cx_right is None else cx_right
     for name, value, unit in (("fx", fx, "pixels"), ("fy", fy, "pixels"), ("baseline", baseline_m, "metres")):
         check_positive(value, name, unit)
-    for name, value in (("cx", cx), ("cy", cy), ("cx_right", cx_right)):
-        check_number(value, name, -1e9, 1e9)
     left, right = (Camera(intrinsics(fx, fy, x, cy), size) for x in (cx, cx_right))
-    return make_rig(RawRig(left, right, float(baseline_m)), "arguments")
+    return make_rig(left, right, baseline_m)

@@ -1,31 +1,40 @@
-"""Calibrations that robotics uses: Kalibr's chains, EuRoC's sensors, ROS camera_info, ORB-SLAM's settings."""
+"""Calibrations that robotics and OpenCV use: Kalibr, EuRoC, ROS camera_info, ORB-SLAM, FileStorage, Booster.
+
+OpenCV's own reader is not used: a damaged file can corrupt its memory, and calibrations come from strangers.
+"""
 
 from __future__ import annotations
 
+import re
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
+import yaml
 
 from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.formats.rigs import (
     Camera,
     CameraChoice,
-    RawRig,
     array_of,
     intrinsics,
-    number,
+    make_rig,
     projected,
     rigid,
-    size_of,
     two_cameras,
 )
-from geodiff_plugin.formats.structured import CUT_OFF, parse_storage, parse_yaml
+from geodiff_plugin.types import Rig
 
-__all__ = ["read_euroc", "read_kalibr", "read_orb_slam", "read_ros"]
+__all__ = ["read_booster", "read_euroc", "read_kalibr", "read_opencv", "read_orb_slam", "read_ros"]
 
+MM_PER_METRE = 1000.0
+#: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
+OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")
 #: OpenCV's name of a distortion model.
-LENSES = dict.fromkeys(("radtan", "radial-tangential", "plumb_bob", "rational_polynomial", ""), "opencv")
-LENSES |= {"equidistant": "fisheye", "fisheye": "fisheye"}
+LENSES = {
+    **dict.fromkeys(("radtan", "radial-tangential", "plumb_bob", "rational_polynomial"), "opencv"),
+    **{"none": "opencv", "": "opencv", "equidistant": "fisheye", "fisheye": "fisheye"},
+}
 CALIBRATE_PAIR = "Calibrate the pair (camera_calibration with two topics)."
 #: Which coefficients a lens has, and what OpenCV calls it, by ORB-SLAM's ``Camera.type``.
 ORB_LENSES = {
@@ -38,23 +47,81 @@ ORB_POSES = ("Stereo.T_c1_c2", "Tlr")
 #: that they are rectified, older ones call them a pinhole's.
 ORB_RECTIFIED = {"Camera1": ("Stereo.b", ("Rectified",)), "Camera": ("Camera.bf", ("Rectified", "PinHole"))}
 
+Entries = dict[str, Any]
 
-def _pinhole(entries: dict[str, Any], coefficients: str) -> Camera:
+
+class _Loader(yaml.SafeLoader):
+    """YAML as OpenCV writes it: its matrices, since OpenCV 5 of one axis too, are mappings like others."""
+
+
+for _kind in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(
+        f"tag:yaml.org,2002:{_kind}", lambda loader, node: loader.construct_mapping(node, deep=True)
+    )
+
+
+def _yaml(text: str) -> Entries:
+    """The mapping that the first YAML document holds; later documents (``rostopic echo``) are left out."""
+    content = next(yaml.load_all(OPENCV_HEAD.sub("", text), _Loader), None)  # noqa: S506  (a safe one)
+    if not isinstance(content, dict):
+        bad_value("the file", "a YAML file of named entries", type(content).__name__)
+    return content
+
+
+def _storage(text: str) -> Entries:
+    """Every entry of an OpenCV file in YAML, XML or JSON, those of maps in it beside the others.
+
+    By key in small letters: matrices as float64 arrays of rows and columns, those of other shapes, numbers
+    and lists of numbers as arrays of one axis, and strings.
+    """
+    if "<opencv_storage" in text:
+        if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+            bad_value("the file", "an OpenCV XML file", "a document type with entities", "Remove it.")
+        content = _of_element(ElementTree.fromstring(text.strip()))
+    else:  # JSON is YAML; older versions of OpenCV write 1. and .Nan into it, which JSON itself does not know
+        content = _yaml(text)
+    maps = [value for value in content.values() if isinstance(value, dict) and "data" not in value]
+    entries: Entries = {}
+    for key, value in [item for each in (*maps, content) for item in each.items()]:
+        matrix = isinstance(value, dict) and "data" in value
+        numbers = _numbers(value["data"] if matrix else value)
+        shape = _numbers([value.get("rows"), value.get("cols")]) if matrix else None
+        if numbers is not None and shape is not None and numbers.size == shape.prod():
+            numbers = numbers.reshape(shape.astype(int))
+        entries[str(key).lower()] = value if numbers is None else numbers
+    return entries
+
+
+def _of_element(node: ElementTree.Element) -> Any:
+    if len(node):
+        return {child.tag: _of_element(child) for child in node}
+    words = (node.text or "").split()
+    return words[0] if len(words) == 1 and node.tag != "data" else words
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """A number or a flat list of numbers, some of which may be text; ``None`` for other things."""
+    words = value if isinstance(value, list) else [value]
+    try:  # OpenCV writes .Nan and .Inf, which Python reads without the dot
+        words = [re.sub(r"\.(nan|inf)", r"\1", w.lower()) if isinstance(w, str) else w for w in words]
+        return None if any(isinstance(w, bool) for w in words) else np.array([float(w) for w in words])
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def _pinhole(entries: Entries, coefficients: str) -> Camera:
     """A camera of Kalibr or EuRoC; ``coefficients`` names the entry with those of its lens."""
     if entries["camera_model"] != "pinhole":
         cure = "Calibrate with pinhole-radtan or pinhole-equi, or undistort the images to a pinhole first."
         bad_value("camera_model", "pinhole", repr(entries["camera_model"]), cure)
-    K = intrinsics(*array_of(entries["intrinsics"], (4,), "intrinsics"))
-    model, numbers = entries["distortion_model"], array_of(entries[coefficients], (-1,), coefficients)
-    if model == "none":
-        return Camera(K, entries["resolution"])
-    array_of(numbers, (4,), coefficients)
-    return Camera(K, entries["resolution"], numbers, LENSES.get(model, str(model)))
+    model = str(entries["distortion_model"])
+    K = intrinsics(*entries["intrinsics"])
+    return Camera(K, entries["resolution"], entries[coefficients], LENSES.get(model, model))
 
 
-def read_kalibr(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_kalibr(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """Two cameras of a chain, cam0 and cam1 unless chosen; ``T_cn_cnm1`` takes points to a camera."""
-    chain = parse_yaml(texts[0])
+    chain = _yaml(texts[0])
     have = [n for n in range(len(chain)) if f"cam{n}" in chain]
     pair = (0, 1) if choice.cameras is None else two_cameras(choice, have)
     from_first = [np.eye(4)]
@@ -62,29 +129,29 @@ def read_kalibr(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
         step = rigid(chain[f"cam{n}"]["T_cn_cnm1"], f"T_cn_cnm1 of cam{n}")
         from_first.append(step @ from_first[-1])
     left, right = (_pinhole(chain[f"cam{n}"], "distortion_coeffs") for n in pair)
-    return RawRig(left, right, from_first[pair[0]] @ np.linalg.inv(from_first[pair[1]]))
+    return make_rig(left, right, from_first[pair[0]] @ np.linalg.inv(from_first[pair[1]]))
 
 
-def read_euroc(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_euroc(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """The images as taken, left file first; ``T_BS`` is a camera's pose in the body's frame, in metres."""
-    sensors = [parse_yaml(text) for text in texts]
+    sensors = [_yaml(text) for text in texts]
     T_body_left, T_body_right = (rigid(sensor["T_BS"]["data"], "T_BS") for sensor in sensors)
     left, right = (_pinhole(sensor, "distortion_coefficients") for sensor in sensors)
-    return RawRig(left, right, np.linalg.inv(T_body_left) @ T_body_right)
+    return make_rig(left, right, np.linalg.inv(T_body_left) @ T_body_right)
 
 
-def _camera_info(text: str) -> tuple[dict[str, Any], np.ndarray, Any]:
-    info = parse_yaml(text)
+def _projection(info: Entries) -> np.ndarray:
+    """``P`` of a file of ``camera_calibration``, or of the message as ROS 1 or ROS 2 prints it."""
     matrix = next((info[name] for name in ("projection_matrix", "P", "p") if name in info), None)
     if matrix is None:
-        bad_value("the file", "a camera_info with projection_matrix (or P)", "none", CUT_OFF)
+        bad_value("the file", "a camera_info with projection_matrix (or P)", "none", "Is the file cut off?")
     P = array_of(matrix.get("data") if isinstance(matrix, dict) else matrix, (3, 4), "projection_matrix")
     if not P.any():
         refuse(f"the camera is not calibrated: its projection_matrix (P) is all zeros. {CALIBRATE_PAIR}")
-    return info, P, size_of(info, "image_width", "image_height") or size_of(info)
+    return P
 
 
-def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """Files of ``camera_calibration``, or the message as ``echo`` prints it, left file first.
 
     They stand for the rectified images (``image_rect``), of which ``P`` is; ``P[0, 3]`` of the right camera
@@ -92,62 +159,49 @@ def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
     for a bag, stand for the images as taken: ``K`` and ``D``, posed by ``R``, which turns a camera's points
     to the rectified frame.
     """
-    (left, P_left, size_left), (right, P_right, size_right) = map(_camera_info, texts)
-    raw = projected(P_left, P_right, size_left, size_right)
-    if not raw.pose[:3, 3].any():
+    infos = [_yaml(text) for text in texts]
+    sizes = [(i.get("image_width", i.get("width")), i.get("image_height", i.get("height"))) for i in infos]
+    raw = projected(*map(_projection, infos), *sizes)
+    if not raw.E[:3, 3].any():
         expected = "-fx * baseline in the right camera's file"
         cure = f"These are of single cameras. {CALIBRATE_PAIR}"
         bad_value("projection_matrix[0, 3]", expected, "the same in both", cure)
-    if left.get("rectified", True) and right.get("rectified", True):
+    if all(info.get("rectified", True) for info in infos):
         return raw
     turns, cameras = [], []
-    for info, size in ((left, size_left), (right, size_right)):
-        turns.append(np.eye(4))
-        turns[-1][:3, :3] = array_of(info["R"], (3, 3), "R")
+    for info, size in zip(infos, sizes, strict=True):
+        turns.append(rigid(np.column_stack([array_of(info["R"], (3, 3), "R"), np.zeros(3)]), "R"))
         model = str(info["distortion_model"])
         cameras.append(Camera(array_of(info["K"], (3, 3), "K"), size, info["D"], LENSES.get(model, model)))
-    E = np.linalg.inv(rigid(turns[0], "R")) @ raw.pose @ rigid(turns[1], "R")
-    return RawRig(cameras[0], cameras[1], E)
+    return make_rig(*cameras, np.linalg.inv(turns[0]) @ raw.E @ turns[1])
 
 
-def _orb_number(entries: dict[str, Any], key: str) -> float:
-    value = entries.get(key.lower())
-    return number(value.item() if isinstance(value, np.ndarray) and value.size == 1 else value, key)
-
-
-def _orb_camera(entries: dict[str, Any], name: str, kind: str) -> Camera:
+def _orb_camera(entries: Entries, name: str, kind: str) -> Camera:
     """The camera of a name; a pinhole may leave its coefficients out, or the last one."""
-    K = intrinsics(*(_orb_number(entries, f"{name}.{key}") for key in ("fx", "fy", "cx", "cy")))
-    sides = "Camera.width", "Camera.height"
-    given = any(key.lower() in entries for key in sides)
-    size = tuple(_orb_number(entries, key) for key in sides) if given else None
-    model, keys = ORB_LENSES[kind]
-    there = [f"{name}.{key}".lower() in entries for key in keys]
-    if model == "opencv" and not any(there):
-        return Camera(K, size)
-    keys = keys if there[-1] else keys[:4]
-    return Camera(K, size, [_orb_number(entries, f"{name}.{key}") for key in keys], model)
+    model, lens = ORB_LENSES[kind]
+    there = [key for key in lens if f"{name}.{key}".lower() in entries]
+    keys = ("fx", "fy", "cx", "cy", *(() if model == "opencv" and not there else lens[: max(4, len(there))]))
+    numbers = [float(array_of(entries.get(f"{name}.{key}".lower()), (), f"{name}.{key}")) for key in keys]
+    size = [entries.get(f"camera.{side}", [None])[0] for side in ("width", "height")]
+    return Camera(intrinsics(*numbers[:4]), size, numbers[4:], model)
 
 
-def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
+def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """The images as taken, by ``Stereo.T_c1_c2`` (or ``Tlr``), else rectified images.
 
     Rectified images have one camera for both, and a baseline: ``Stereo.b``, or ``Camera.bf``, which is
     fx times the baseline. Lengths are metres. Images have ``Camera.width`` and ``Camera.height``;
     ``Camera.newWidth`` is what ORB-SLAM shrinks them to, and is not read.
     """
-    entries = parse_storage(texts[0])
+    entries = _storage(texts[0])
     kind = entries.get("camera.type", "PinHole")
     left = "Camera1" if "camera1.fx" in entries else "Camera"
     pose = next((name for name in ORB_POSES if name.lower() in entries), None)
     if pose is not None:
         if kind not in ORB_LENSES:
             bad_value("Camera.type", f"{' or '.join(ORB_LENSES)} beside {pose}", repr(kind))
-        matrix = entries[pose.lower()]
-        if np.shape(matrix) not in ((3, 4), (4, 4)):
-            bad_value(pose, "of shape (4, 4)", f"{np.shape(matrix)}")
         first, second = (_orb_camera(entries, name, kind) for name in (left, "Camera2"))
-        return RawRig(first, second, rigid(matrix, pose))
+        return make_rig(first, second, rigid(entries[pose.lower()], pose))
     baseline, types = ORB_RECTIFIED[left]
     # Of a single camera with a depth sensor, the baseline is made up.
     depth_sensor = any(key.endswith("depthmapfactor") for key in entries)
@@ -156,9 +210,113 @@ def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> RawRig:
         got = f"of a camera of type {kind} {'with a depth sensor' if depth_sensor else 'without them'}"
         bad_value("the settings", expected, got, "Give the settings that ORB-SLAM runs in stereo with.")
     camera = _orb_camera(entries, left, "PinHole")
-    if np.any(array_of(camera.coefficients, (-1,), f"the lens of {left}")):
+    if np.any(camera.coefficients):
         expected = f"zero for rectified images, which have no {ORB_POSES[0]}"
         bad_value(f"Lens distortion of {left}", expected, camera.coefficients, "Is it of a single camera?")
-    length = _orb_number(entries, baseline)
-    baseline_m = length if baseline == "Stereo.b" else length / camera.K[0, 0]
-    return RawRig(camera, camera, baseline_m, rectified=True)
+    length = float(array_of(entries[baseline.lower()], (), baseline))
+    return make_rig(
+        camera, camera, length if baseline == "Stereo.b" else length / camera.K[0, 0], rectified=True
+    )
+
+
+def _of(words: str, number: str, side: str) -> str:
+    """Names of a matrix of one camera: its number, letter or side behind a word, or the side before it."""
+    return f"(?:{words})(?:{number}|{side[0]}|{side})|{side}(?:{words})"
+
+
+K = "m|k|mtx|cameramatrix|intrinsics?|intrinsicmatrix"
+D = "d|dis|dist|distcoeffs?|distcoefs?|distort|distortion|distortioncoefficients|distortioncoeffs"
+P = "p|projection|projectionmatrix|projmat|projmatrix"
+#: Name in OpenCV's samples -> names in use for the same thing, in small letters without "_" and ".": the
+#: arguments of stereoCalibrate, what tutorials call them, ORB-SLAM's ``LEFT.P``.
+NAMES = {
+    **{f"{name}1": _of(words, "1", "left") for name, words in (("M", K), ("D", D), ("P", P))},
+    **{f"{name}2": _of(words, "2", "right") for name, words in (("M", K), ("D", D), ("P", P))},
+    "R": "r|rot|rotation|rotationmatrix",
+    "T": "t|trans|translation|translationmatrix|translationvector",
+    "image_size": "imagesize|imgres|imgsize|size",
+    "image_width": "imagewidth|leftwidth",
+    "image_height": "imageheight|leftheight",
+}
+#: Those that are one number; what else is a number, such as a coefficient ``k1``, is none of the matrices.
+NUMBERS = ("image_width", "image_height")
+
+
+def _merged(texts: tuple[str, ...]) -> Entries:
+    """The arrays of all files."""
+    entries: Entries = {}
+    for text in texts:
+        new = {key: value for key, value in _storage(text).items() if isinstance(value, np.ndarray)}
+        clash = [key for key in new if key in entries and not np.array_equal(new[key], entries[key])]
+        if clash:
+            expected = "one calibration in two files (intrinsics.yml, extrinsics.yml)"
+            cure = "A pair of single-camera files has no baseline; give the file that stereoRectify wrote."
+            bad_value("the files", expected, f"different {', '.join(clash)}", cure)
+        entries.update(new)
+    return entries
+
+
+def _named(entries: Entries) -> Entries:
+    """What ``NAMES`` has of the entries, by its names; entries that differ under one name are refused."""
+    named: Entries = {}
+    for name, words in NAMES.items():
+        fits = {k: v for k, v in entries.items() if (v.size == 1 if name in NUMBERS else v.shape != (1,))}
+        keys = [key for key in fits if re.fullmatch(words, re.sub("[_.]", "", key))]
+        if any(not np.array_equal(fits[key].ravel(), fits[keys[0]].ravel()) for key in keys[1:]):
+            cure = "Keep those that belong to R and T."
+            bad_value(name, "there once", f"{', '.join(keys)}, which differ", cure)
+        if keys:
+            named[name] = fits[keys[0]]
+    return named
+
+
+def _of_shape(named: Entries, shape: tuple[int, int], *names: str) -> list[np.ndarray]:
+    for name in names:
+        if named[name].shape != shape:
+            cure = "Was this file written by stereoRectify?"
+            bad_value(name, f"of shape {shape}", named[name].shape, cure)
+    return [named[name] for name in names]
+
+
+def _lenses(entries: Entries, named: Entries) -> list[Any]:
+    """``D1`` and ``D2``, or none; without one that has another name, images would pass for a pinhole's."""
+    given = [named[name] for name in ("D1", "D2") if name in named]
+    taken = [id(lens) for lens in given]
+    others = [key for key, v in entries.items() if "dist" in key and v.shape != (1,) and id(v) not in taken]
+    if len(given) < 2 and (others or np.any(given)):
+        cure = "Rename what is lens distortion to D1 and D2, and what is not; a lens without any has zeros."
+        bad_value("the lens distortion", "of both cameras (D1, D2)", ", ".join(others) or "one of them", cure)
+    return [lens.ravel() for lens in given] if len(given) == 2 else [(), ()]
+
+
+def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """One file, or ``intrinsics`` and ``extrinsics`` in any order.
+
+    ``P1, P2`` stand for the rectified images and come first, whatever the lens distortion before them was.
+    Without them ``M1, M2, R, T`` are taken, with the distortion ``D1, D2`` of OpenCV's model; ``R, T`` take
+    left points to right ones. Lengths are taken as metres: OpenCV keeps the unit of the chessboard's squares,
+    and the file does not say it. ``NAMES`` has what else they may be called.
+    """
+    entries = _merged(texts)
+    named = _named(entries)
+    sides = [named[name].item() for name in NUMBERS if name in named]
+    size = next((pair for pair in (named.get("image_size"), sides) if np.size(pair) == 2), None)
+    if named.keys() >= {"P1", "P2"}:
+        return projected(*_of_shape(named, (3, 4), "P1", "P2"), size, size)
+    missing = [name for name in ("M1", "M2", "R", "T") if name not in named]
+    if missing:
+        expected = "an OpenCV calibration with P1, P2, or with M1, M2, R, T"
+        cure = "Where intrinsics and extrinsics are two files, give both; rename what has other names."
+        bad_value("the file", expected, f"no {', '.join(missing)}", cure)
+    lenses = _lenses(entries, named)
+    *Ks, R = _of_shape(named, (3, 3), "M1", "M2", "R")
+    left, right = (Camera(K, size, lens) for K, lens in zip(Ks, lenses, strict=True))
+    T = rigid(np.column_stack([R, array_of(named["T"], (3,), "T")]), "R, T")
+    return make_rig(left, right, np.linalg.inv(T))
+
+
+def read_booster(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """For the images at full resolution, which are rectified; lengths are millimetres."""
+    entries = _storage(texts[0])
+    left, right = (Camera(entries[key][:, :3]) for key in ("proj_matl", "proj_matr"))
+    return make_rig(left, right, float(entries["baselinelr"][0]) / MM_PER_METRE, rectified=True)

@@ -18,12 +18,12 @@ from geodiff_plugin._camera_checks import (
     check_baseline,
     check_intrinsics,
     check_intrinsics_fit,
+    check_metres,
     check_pose,
     check_size_of,
     warn_of_far_points,
-    warn_of_long_baseline,
 )
-from geodiff_plugin._checks import bad_type, bad_value, check_metres
+from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.formats import as_image_01, picture_size
 from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.geometry import image_size
@@ -175,9 +175,7 @@ def _poses(E: Any, name: str, views: int, unit: str | None) -> list[np.ndarray]:
         poses = [check_pose(E, name)]
     for v, pose in enumerate(poses):
         named = name if views == 1 else f"{name}[{_view(v, views)}]"
-        check_baseline(pose, named)
-        if unit == "m":
-            warn_of_long_baseline(pose, named)
+        check_baseline(pose, named, unit)
     return poses
 
 

@@ -21,7 +21,7 @@ from geodiff_plugin.evaluation.experiment import cell_key
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import as_image_01, write_pfm
 from geodiff_plugin.geometry import warp_right_to_left
-from tests.contracts import factory_calibrations as factory
+from tests.contracts.calibrations import SAMPLES
 
 HEIGHT, WIDTH, F, CX, CY, BASELINE = 40, 64, 50.0, 31.0, 19.5, 0.2
 RNG = np.random.default_rng(0)
@@ -363,19 +363,18 @@ def test_a_folder_of_two_of_three_is_no_silent_gap_and_one_of_less_is_no_pair(tm
 
 
 SMALLER = "".join(
-    f'\n Intrinsic of "Infrared {camera}" / 320x240 / {{Y8}}\n  Width: 320\n  Height: 240\n  PPX: 150\n'
-    "  PPY: 100\n  Fx: 350\n  Fy: 350\n  Distortion: Brown Conrady\n  Coeffs: 0 0 0 0 0\n"
+    f' Intrinsic of "Infrared {camera}" / 320x240 / {{Y8}}\n  Width: 320\n  Height: 240\n  PPX: 150\n'
+    "  PPY: 100\n  Fx: 350\n  Fy: 350\n  Distortion: Brown Conrady\n  Coeffs: 0 0 0 0 0\n\n"
     for camera in (1, 2)
 )
-HEAD = "Intrinsic Parameters:\n"
-COLMAP = {"calib_left.txt": factory.COLMAP_CAMERAS, "calib_right.txt": factory.COLMAP_IMAGES}
+COLMAP = dict(zip(("calib_left.txt", "calib_right.txt"), SAMPLES["colmap"], strict=True))
 
 
 @pytest.mark.parametrize(
     ("calibrations", "size", "expected"),
     [
-        ({"calib.txt": factory.REALSENSE_PRINTED.replace(HEAD, HEAD + SMALLER)}, (320, 240), (350.0, 0.12)),
-        ({"calib.json": factory.NERF}, (640, 480), (700.0, 0.5)),
+        ({"calib.txt": SMALLER + SAMPLES["realsense_printed"][0]}, (320, 240), (350.0, 0.12)),
+        ({"calib.json": SAMPLES["nerf"][0]}, (640, 480), (700.0, 0.5)),
         (COLMAP, (640, 480), (700.0, 0.5)),
     ],
     ids=["RealSense", "transforms.json", "COLMAP"],

@@ -16,7 +16,7 @@ from geodiff_plugin.config import KNOBS
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
 from geodiff_plugin.formats.exif import warn_of_other_lens
 from geodiff_plugin.formats.out import check_out
-from tests.contracts.test_formats_table import CHOICES, SAMPLES, written
+from tests.contracts.calibrations import SAMPLES, choice, written
 from tests.fuzz.strategies import (
     EXAMPLES,
     MANY,
@@ -41,15 +41,15 @@ IMAGES, POINT_FILES = image_bytes(), point_files()
 @pytest.mark.parametrize("sample", SAMPLES)
 def test_calibrations(tmp_path, sample, size):
     """Of formats with two files the second one is damaged."""
-    texts, choice = SAMPLES[sample][1], {"distorted": True} | CHOICES.get(sample, {})
+    texts, given_too = SAMPLES[sample], {"distorted": True} | choice(sample)
     paths = written(tmp_path, texts)
-    assert survives(lambda: read_calibration(paths, **choice)), "the whole file must be understood"
+    assert survives(lambda: read_calibration(paths, **given_too)), "the whole file must be understood"
 
     @size
     @given(data=damaged(texts[-1].encode()), cameras=st.sampled_from([None, None, (0, 1), (2, 3), (7, 7)]))
     def check(data, cameras):
         (paths[-1] if isinstance(paths, tuple) else paths).write_bytes(data)
-        survives(lambda: read_calibration(paths, cameras=cameras, **choice))
+        survives(lambda: read_calibration(paths, cameras=cameras, **given_too))
 
     check()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from pathlib import Path
 
 import cv2
@@ -13,7 +12,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import InputError
-from geodiff_plugin.formats.captures import CaptureFiles, read_capture
+from geodiff_plugin.formats.captures import read_capture
+from geodiff_plugin.formats.clouds import Cloud
+from geodiff_plugin.formats.colmap import write_colmap
 from tests.unit.capture_room import SIZE, K, render, walk, write_transforms
 
 TRUE = walk(4)
@@ -25,11 +26,6 @@ def save(path: Path, image: np.ndarray) -> None:
     Image.fromarray(image).save(path)
 
 
-def quaternion(R: np.ndarray) -> tuple[float, ...]:
-    x, y, z, w = Rotation.from_matrix(R).as_quat()
-    return w, x, y, z
-
-
 def transforms(folder: Path) -> Path:
     return write_transforms(folder, TRUE, TRUE)
 
@@ -37,32 +33,18 @@ def transforms(folder: Path) -> Path:
 def colmap_text(folder: Path) -> Path:
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
-    (model / "cameras.txt").write_text(f"1 PINHOLE {SIZE[0]} {SIZE[1]} {fx} {fy} {cx} {cy}\n")
-    lines = ["# Image list with two lines of data per image:"]
-    for i, (E, image) in enumerate(zip(TRUE, IMAGES, strict=True), 1):
-        T = np.linalg.inv(E)
-        numbers = " ".join(map(repr, map(float, (*quaternion(T[:3, :3]), *T[:3, 3]))))
-        lines += [f"{i} {numbers} 1 f{i - 1:02d}.png", "10.5 20.5 1"]
-        save(folder / "images" / f"f{i - 1:02d}.png", image)
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    (model / "points3D.txt").write_text("1 0.5 0.25 2.6 9 9 9 0.7 1 0 2 0 4 0\n")
+    views = [(f"f{i:02d}.png", K, E, SIZE) for i, E in enumerate(TRUE)]
+    for (name, *_), image in zip(views, IMAGES, strict=True):
+        save(folder / "images" / name, image)
+    cloud = Cloud(np.array([[0.5, 0.25, 2.6]]), np.full((1, 3), 9, np.uint8))
+    seen = [(np.full((1, 2), 10.0), np.zeros(1, int))] * 2 + [(np.zeros((0, 2)), np.zeros(0, int))]
+    write_colmap(model, views, cloud, [*seen, seen[0]])
     return folder
 
 
 def colmap_binary(folder: Path) -> Path:
-    colmap_text(folder)
-    model = folder / "sparse" / "0"
-    numbers = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
-    (model / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 1, 1, *SIZE, *numbers))
-    data = struct.pack("<Q", len(TRUE))
-    for i, E in enumerate(TRUE, 1):
-        T = np.linalg.inv(E)
-        data += struct.pack("<I7dI", i, *quaternion(T[:3, :3]), *T[:3, 3], 1)
-        data += f"f{i - 1:02d}.png".encode() + b"\0" + struct.pack("<Q2dq", 1, 10.5, 20.5, 1)
-    (model / "images.bin").write_bytes(data)
-    point = struct.pack("<QQ3d3BdQ6I", 1, 1, 0.5, 0.25, 2.6, 9, 9, 9, 0.7, 3, 1, 0, 2, 0, 4, 0)
-    (model / "points3D.bin").write_bytes(point)
+    model = colmap_text(folder) / "sparse" / "0"
+    pytest.importorskip("pycolmap").Reconstruction(str(model)).write_binary(str(model))
     for name in ("cameras", "images", "points3D"):
         (model / f"{name}.txt").unlink()
     return folder
@@ -119,12 +101,10 @@ def test_every_layout_gives_the_same_frames(write, tmp_path):
     assert files.unit == (None if "colmap" in write.__name__ else "m")
 
 
-@pytest.mark.parametrize("write", [colmap_text, colmap_binary])
-def test_points_of_a_model_come_with_their_tracks(write, tmp_path):
-    points = read_capture(write(tmp_path)).points
-    assert points is not None and points.xyz.tolist() == [[0.5, 0.25, 2.6]]
-    assert points.tracks.tolist() == [3] and points.error_px.tolist() == [0.7]
-    assert [len(points.seen[f"f{i:02d}"]) for i in range(4)] == [1, 1, 0, 1]
+def test_frames_of_a_model_have_the_points_that_they_see(tmp_path):
+    frames = read_capture(colmap_text(tmp_path)).frames
+    assert [frame.points is None for frame in frames] == [False, False, True, False]
+    assert frames[3].points.tolist() == [[0.5, 0.25, 2.6]]
 
 
 def test_a_video_takes_its_poses_from_a_trajectory(tmp_path):
@@ -216,7 +196,7 @@ def test_bad_captures_get_a_sentence(change, words, tmp_path):
 def test_missing_images_and_lost_poses_are_named(tmp_path):
     folder = write_transforms(tmp_path / "a", TRUE, TRUE)
     (folder / "images/f01.png").unlink()
-    files: CaptureFiles = read_capture(folder)
+    files = read_capture(folder)
     assert len(files.frames) == 3 and "f01" in files.notes[0]
     lost = seven_scenes(tmp_path / "b")
     (lost / "frame-000002.pose.txt").write_text("-inf " * 16)

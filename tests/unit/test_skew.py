@@ -13,7 +13,7 @@ import torch
 
 import geodiff_plugin
 from geodiff_plugin import GeometryGuidance, geometry
-from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit, warn_of_other_size
+from geodiff_plugin._camera_checks import check_intrinsics, check_size_of
 from geodiff_plugin.algorithm.evidence import prepare_evidence
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
@@ -40,12 +40,12 @@ HAS_GRADIO = importlib.util.find_spec("gradio") is not None
 HAND_ON = {
     *("_camera_checks.check_intrinsics_fit", "_camera_checks.check_size_of"),  # the principal point alone
     "formats.depth.disparity_of_depth",  # of rectified pairs: along rows
-    *("_camera_checks.warn_of_other_size", "formats.exif.warn_of_other_lens"),  # or the focal length
+    "formats.exif.warn_of_other_lens",  # or the focal length
     *("algorithm.evidence.prepare_evidence", "algorithm.finish.vote_depth", "matching.rows.match_rows"),
     "capture.fusion.normals_of",
     *("cli.inputs.pinhole", "cli.inputs._read_known", "app.measure.read_pixel"),
     *("evaluation.datasets.layouts._quartered", "pose.tracks.project_tracks"),
-    *("formats.captures.read_capture", "formats.clouds.make_cloud", "formats.rigs.make_rig"),
+    *("formats.captures.read_capture", "formats.clouds.make_cloud"),
     *("formats.distortion.undistorted", "formats.distortion.undistorted_pixels"),  # to OpenCV
     *("formats.distortion.undistorted_points", "pose.capture.solve_capture"),  # the latter to pycolmap
     *("guidance.evidence.coarse_depth", "guidance.evidence.pose_views", "guidance.inputs.read_inputs"),
@@ -137,8 +137,7 @@ def test_a_guidance_keeps_it():
     right, pose = np.zeros((*SIZE, 3), np.uint8), np.eye(4)
     pose[0, 3] = 0.12
     assert np.array_equal(check_intrinsics(K), K)
-    check_intrinsics_fit(K, SIZE[1], SIZE[0])
-    warn_of_other_size(K, SIZE[1], SIZE[0], "K", "the image")
+    check_size_of(K, SIZE, "K", "the image")
     for guidance in (
         GeometryGuidance(right, (K, K_RIGHT), pose),
         GeometryGuidance.from_baseline(right, K, 0.1, K_right=K_RIGHT),

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import bad_value, check_metres
+from geodiff_plugin._camera_checks import check_metres
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import read_depth_png, read_image
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.geometry import is_rectified

@@ -1,0 +1,340 @@
+"""Calibrations of any rig in every format, by the conventions of the tools that write them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin.formats import read_calibration
+from geodiff_plugin.types import Rig
+
+#: Names in a COLMAP model and a transforms.json, and the metres of their unit.
+NAMES = "rig/left.jpg", "rig/right.jpg"
+UNIT_M = 0.24
+FISHEYES = ("fisheye_kalibr", "fisheye_orb_slam")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A rig, and a frame that both cameras may be given in."""
+
+    K: tuple[np.ndarray, np.ndarray]
+    T: np.ndarray  # right from left, metres
+    size: tuple[int, int]
+    lenses: tuple[list[float], list[float]]
+    left_from_world: np.ndarray
+
+    def numbers(self, side: int) -> list[float]:
+        """fx, fy, cx, cy."""
+        K = self.K[side]
+        return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
+
+    @property
+    def worlds(self) -> tuple[np.ndarray, np.ndarray]:
+        """World-to-camera of both."""
+        return self.left_from_world, self.T @ self.left_from_world
+
+    def projections(self, shift: float = 0.0) -> list[list[float]]:
+        """Both in the frame of a camera further left, row by row."""
+        places = (np.array([shift, 0, 0]), self.T[:3, 3] + [shift, 0, 0])
+        matrices = (K @ np.column_stack([np.eye(3), t]) for K, t in zip(self.K, places, strict=True))
+        return [matrix.ravel().tolist() for matrix in matrices]
+
+
+def rigid(rotvec, place) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(rotvec).as_matrix(), place
+    return T
+
+
+def words(values) -> str:
+    return " ".join(repr(float(v)) for v in np.ravel(values))
+
+
+def storage(**matrices) -> str:
+    text = "%YAML:1.0\n---\n"
+    for name, values in matrices.items():
+        rows, columns = np.shape(values)
+        text += f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n"
+        text += f"   data: [ {words(values).replace(' ', ', ')} ]\n"
+    return text
+
+
+def opencv(rig: Drawn) -> tuple[str, ...]:
+    left, right = ([lens] for lens in rig.lenses)
+    cameras = {"M1": rig.K[0], "D1": left, "M2": rig.K[1], "D2": right}
+    return (storage(**cameras, R=rig.T[:3, :3], T=rig.T[:3, 3:], image_size=[rig.size]),)
+
+
+def opencv_projections(rig: Drawn) -> tuple[str, ...]:
+    P1, P2 = (np.reshape(P, (3, 4)) for P in rig.projections())
+    return (storage(P1=P1, P2=P2, D1=[rig.lenses[0]], image_size=[rig.size]),)
+
+
+def kalibr(rig: Drawn, model: str = "radtan") -> tuple[str, ...]:
+    chain: dict[str, Any] = {}
+    for n in range(2):
+        chain[f"cam{n}"] = {"camera_model": "pinhole", "intrinsics": rig.numbers(n), "cam_overlaps": [1 - n]}
+        chain[f"cam{n}"] |= {"distortion_model": model, "distortion_coeffs": rig.lenses[n]}
+        chain[f"cam{n}"] |= {"resolution": list(rig.size), "rostopic": f"/cam{n}/image_raw"}
+    chain["cam1"]["T_cn_cnm1"] = rig.T.tolist()
+    return (yaml.safe_dump(chain),)
+
+
+def fisheye_kalibr(rig: Drawn) -> tuple[str, ...]:
+    return kalibr(rig, "equidistant")
+
+
+def euroc(rig: Drawn) -> tuple[str, ...]:
+    texts = []
+    for n, T in enumerate(rig.worlds):
+        pose = {"rows": 4, "cols": 4, "data": np.linalg.inv(T).ravel().tolist()}
+        entries = {"T_BS": pose, "camera_model": "pinhole", "intrinsics": rig.numbers(n), "rate_hz": 20}
+        entries |= {"distortion_model": "radial-tangential", "distortion_coefficients": rig.lenses[n]}
+        entries = yaml.safe_dump(entries | {"resolution": list(rig.size)})
+        texts.append(f"# General sensor definitions.\nsensor_type: camera\n{entries}")
+    return tuple(texts)
+
+
+def orb_slam(rig: Drawn, kind: str = "PinHole", keys: str = "k1 k2 p1 p2") -> tuple[str, ...]:
+    text = f'%YAML:1.0\n\nFile.version: "1.0"\nCamera.type: "{kind}"\n'
+    text += f"Camera.width: {rig.size[0]}\nCamera.height: {rig.size[1]}\nCamera.fps: 20\n"
+    for n in range(2):
+        entries = zip(("fx fy cx cy " + keys).split(), [*rig.numbers(n), *rig.lenses[n]], strict=True)
+        text += "".join(f"Camera{n + 1}.{key}: {value!r} # pixels\n" for key, value in entries)
+    return (text + storage(**{"Stereo.T_c1_c2": np.linalg.inv(rig.T)}).partition("---\n")[2],)
+
+
+def fisheye_orb_slam(rig: Drawn) -> tuple[str, ...]:
+    return orb_slam(rig, "KannalaBrandt8", "k1 k2 k3 k4")
+
+
+def orb_slam_rectified(rig: Drawn) -> tuple[str, ...]:
+    fx, fy, cx, cy = rig.numbers(0)
+    text = f"%YAML:1.0\nCamera.fx: {fx}\nCamera.fy: {fy}\nCamera.cx: {cx}\nCamera.cy: {cy}\n"
+    text += "".join(f"Camera.{key}: 0.0\n" for key in ("k1", "k2", "p1", "p2"))
+    text += f"Camera.width: {rig.size[0]}\nCamera.height: {rig.size[1]}\n\n# stereo baseline times fx\n"
+    return (text + f"Camera.bf: {float(-fx * rig.T[0, 3])!r}\nThDepth: 35 # times the baseline\n",)
+
+
+def mvsnet(rig: Drawn) -> tuple[str, ...]:
+    pairs = zip(rig.worlds, rig.K, strict=True)
+    return tuple(f"extrinsic\n{words(T)}\n\nintrinsic\n{words(K)}\n\n0.5 0.01\n" for T, K in pairs)
+
+
+def zed(rig: Drawn) -> tuple[str, ...]:
+    text = ""
+    for n, side in enumerate(("LEFT", "RIGHT")):
+        entries = zip("fx fy cx cy k1 k2 p1 p2".split(), [*rig.numbers(n), *rig.lenses[n]], strict=True)
+        text += f"[{side}_CAM_HD]\n" + "".join(f"{key}={value!r}\n" for key, value in entries) + "k3=0\n\n"
+        text += f"[{side}_CAM_2K]\nfx=1400\nfy=1400\ncx=1100\ncy=620\nk1=0\n\n"
+    shift = zip(("Baseline", "TY", "TZ"), -1000 * rig.T[:3, 3], strict=True)
+    turn = Rotation.from_matrix(rig.T[:3, :3]).as_rotvec()
+    turns = zip(
+        (f"{key}_{size}" for size in ("HD", "2K") for key in ("RX", "CV", "RZ")), [*turn] * 2, strict=True
+    )
+    text += "[STEREO]\n" + "".join(f"{key}={float(value)!r}\n" for key, value in (*shift, *turns))
+    return (text + "\n[MISC]\nSensor_ID=0\n",)
+
+
+def realsense(rig: Drawn) -> tuple[str, ...]:
+    def camera(n: int) -> dict:
+        entries = dict(zip(("fx", "fy", "ppx", "ppy"), rig.numbers(n), strict=True))
+        entries |= {"width": rig.size[0], "height": rig.size[1], "model": "distortion.brown_conrady"}
+        return entries | {"coeffs": [*rig.lenses[n], 0.0]}
+
+    between = {"rotation": rig.T[:3, :3].T.ravel().tolist(), "translation": rig.T[:3, 3].tolist()}
+    views = {"infra1": camera(0), "infra2": camera(1), "color": camera(1)}
+    extrinsics = {"infra1_to_infra2": between, "infra1_to_color": between}
+    return (json.dumps({"serial": "1", "intrinsics": views, "extrinsics": extrinsics}, indent=1),)
+
+
+def realsense_printed(rig: Drawn) -> tuple[str, ...]:
+    """What rs-enumerate-devices -c prints, behind its list of modes."""
+    text = "Intrinsic Parameters:\n\n"
+    for n in range(2):
+        fx, fy, cx, cy = rig.numbers(n)
+        text += f' Intrinsic of "Infrared {n + 1}" / {rig.size[0]}x{rig.size[1]} / {{Y8}}\n'
+        text += f"  Width: \t{rig.size[0]}\n  Height: \t{rig.size[1]}\n  PPX: \t{cx}\n  PPY: \t{cy}\n"
+        text += f"  Fx: \t{fx}\n  Fy: \t{fy}\n  Distortion: \tBrown Conrady\n"
+        text += f"  Coeffs: \t{words([*rig.lenses[n], 0])}\n  FOV (deg): \t49.13 x 37.85\n\n"
+    text += "Extrinsic Parameters:\n\n"
+    for target, T in (("1", np.eye(4)), ("2", rig.T)):
+        rows = "\n".join(words(row) for row in T[:3, :3])
+        text += f' Extrinsic from "Infrared 1"  To  "Infrared {target}" :\n Rotation Matrix:\n{rows}\n'
+        text += f"\n Translation Vector: {words(T[:3, 3])}\n\n"
+    return (text,)
+
+
+def oak(rig: Drawn) -> tuple[str, ...]:
+    """The left camera (socket 1) is linked to the right one (2), that to the colour camera (0)."""
+    links = {1: (2, rig.T), 2: (0, rigid([0, 0, 0], [0.04, 0, 0])), 0: (-1, np.eye(4))}
+    cameras = []
+    for n, socket in ((1, 2), (0, 1), (1, 0)):
+        to, T = links[socket]
+        shift = dict(zip("xyz", (100 * T[:3, 3]).tolist(), strict=True))
+        extrinsics = {"toCameraSocket": to, "rotationMatrix": T[:3, :3].tolist(), "translation": shift}
+        entries = {"cameraType": 0, "distortionCoeff": rig.lenses[n] + [0.0] * 10, "extrinsics": extrinsics}
+        entries |= {"intrinsicMatrix": rig.K[n].tolist(), "width": rig.size[0], "height": rig.size[1]}
+        cameras.append([socket, entries])
+    return (json.dumps({"boardName": "OAK-D", "cameraData": cameras, "version": 6}, indent=1),)
+
+
+def _sfm(rig: Drawn) -> list[np.ndarray]:
+    """World-to-camera of left, another and right image, in units."""
+    left, right = (T.copy() for T in rig.worlds)
+    poses = [left, rigid([0.1, 3.0, 0.2], [5, 6, 7]), right]
+    for T in (left, right):
+        T[:3, 3] /= UNIT_M
+    return poses
+
+
+def colmap(rig: Drawn) -> tuple[str, ...]:
+    cameras = (
+        "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    )
+    for n in range(2):
+        fx, fy, cx, cy = rig.numbers(n)  # the first pixel's centre lies at half a pixel
+        numbers = words([fx, fy, cx + 0.5, cy + 0.5, *rig.lenses[n]])
+        cameras += f"{n + 1} OPENCV {rig.size[0]} {rig.size[1]} {numbers}\n"
+    images = "# Image list with two lines of data per image:\n#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ\n"
+    for T, n, name in zip(_sfm(rig), (0, 0, 1), (NAMES[0], "rig/other.jpg", NAMES[1]), strict=True):
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        number = images.count("jpg") + 1
+        images += f"{number} {words([w, x, y, z, *T[:3, 3]])} {n + 1} {name}\n320.5 240.25 17\n"
+    return cameras, images
+
+
+def nerf(rig: Drawn) -> tuple[str, ...]:
+    frames = []
+    for T, n, name in zip(_sfm(rig), (0, 0, 1), (NAMES[0], "rig/other.jpg", NAMES[1]), strict=True):
+        fx, fy, cx, cy = rig.numbers(n)
+        pose = np.linalg.inv(T) @ np.diag([1.0, -1, -1, 1])  # y up, looking along -z
+        frame = {"file_path": f"./{name}", "transform_matrix": pose.tolist(), "colmap_im_id": n}
+        frame |= {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "w": rig.size[0], "h": rig.size[1]}
+        frames.append(frame | dict(zip(("k1", "k2", "p1", "p2"), rig.lenses[n], strict=True)))
+    return (json.dumps({"camera_model": "OPENCV", "frames": frames}),)
+
+
+def middlebury(rig: Drawn) -> tuple[str, ...]:
+    cam0, cam1 = ("[" + "; ".join(words(row) for row in K) + "]" for K in rig.K)
+    doffs, baseline = float(rig.K[1][0, 2] - rig.K[0][0, 2]), float(-1000 * rig.T[0, 3])
+    text = f"cam0={cam0}\ncam1={cam1}\ndoffs={doffs!r}\nbaseline={baseline!r}\n"
+    return (text + f"width={rig.size[0]}\nheight={rig.size[1]}\nndisp=64\n",)
+
+
+def middeval3(rig: Drawn) -> tuple[str, ...]:
+    """The same with blanks around everything."""
+    text = middlebury(rig)[0].replace("[", "[ ").replace("]", " ] ").replace("=", "= ")
+    return ("\n ".join(text.splitlines()) + "\n",)
+
+
+def kitti_cam_to_cam(rig: Drawn) -> tuple[str, ...]:
+    text = "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.950000e-02\n"
+    for n, P in zip((2, 3), rig.projections(0.7), strict=True):
+        text += f"D_0{n}: -3.6e-01 2.0e-01\nS_rect_0{n}: {words(rig.size)}\nR_rect_0{n}: 1 0 0 0 1 0 0 0 1\n"
+        text += f"P_rect_0{n}: {words(P)}\n"
+    return (text,)
+
+
+def kitti_projections(rig: Drawn) -> tuple[str, ...]:
+    return ("".join(f"P{n}: {words(P)}\n" for n, P in enumerate(rig.projections(-0.4))) + "R0_rect: 1 0 0\n",)
+
+
+def booster(rig: Drawn) -> tuple[str, ...]:
+    matrices = "".join(
+        f'<{name} type_id="opencv-matrix"><rows>3</rows><cols>4</cols><dt>d</dt><data>\n{words(P)}'
+        f"</data></{name}>\n"
+        for name, P in zip(("proj_matL", "proj_matR"), rig.projections(), strict=True)
+    )
+    baseline = f"<baselineLR>{float(-1000 * rig.T[0, 3])!r}</baselineLR>"
+    return (f'<?xml version="1.0"?>\n<opencv_storage>\n{matrices}{baseline}</opencv_storage>\n',)
+
+
+def stereodemo(rig: Drawn) -> tuple[str, ...]:
+    fx, fy, cx, cy = rig.numbers(0)
+    entries = {"fx": fx, "fy": fy, "cx0": cx, "cx1": rig.numbers(1)[2], "cy": cy}
+    entries |= {"baseline_meters": float(-rig.T[0, 3]), "width": rig.size[0], "height": rig.size[1]}
+    return (json.dumps(entries | {"depth_range": [1.0, 100.0]}),)
+
+
+def foundation_stereo(rig: Drawn) -> tuple[str, ...]:
+    return (f"{words(rig.K[0])}\n{float(-rig.T[0, 3])!r}\n",)
+
+
+def ros(rig: Drawn) -> tuple[str, ...]:
+    """left.yaml and right.yaml of camera_calibration."""
+    texts = []
+    for P in rig.projections(0.25):
+        entries = {"image_width": rig.size[0], "image_height": rig.size[1], "distortion_model": "plumb_bob"}
+        entries |= {"distortion_coefficients": {"rows": 1, "cols": 5, "data": [-0.28, 0.09, 0.0, 0.0, 0.0]}}
+        texts.append(yaml.safe_dump(entries | {"projection_matrix": {"rows": 3, "cols": 4, "data": P}}))
+    return tuple(texts)
+
+
+def ros_echo(rig: Drawn) -> tuple[str, ...]:
+    """What ros2 topic echo --once /left/camera_info prints."""
+    head = f"header:\n  stamp:\n    sec: 17\nheight: {rig.size[1]}\nwidth: {rig.size[0]}\n"
+    return tuple(
+        f"{head}distortion_model: plumb_bob\nd: [-0.28, 0.09]\np: {P}\n---\n" for P in rig.projections()
+    )
+
+
+#: Formats of any pose and of rectified pairs, by the function that writes them: the name in the table.
+ANY_POSE: dict[Callable[[Drawn], tuple[str, ...]], str] = {
+    **{
+        opencv: "opencv",
+        kalibr: "kalibr",
+        euroc: "euroc",
+        orb_slam: "orb_slam",
+        mvsnet: "mvsnet",
+        zed: "zed",
+    },
+    **{realsense: "realsense", realsense_printed: "realsense", oak: "oak", colmap: "colmap", nerf: "nerf"},
+    **{fisheye_kalibr: "kalibr", fisheye_orb_slam: "orb_slam"},
+}
+RECTIFIED: dict[Callable[[Drawn], tuple[str, ...]], str] = {
+    **{middlebury: "middlebury", middeval3: "middlebury", kitti_cam_to_cam: "kitti_cam_to_cam"},
+    **{kitti_projections: "kitti_projections", booster: "booster", stereodemo: "stereodemo", ros: "ros"},
+    **{opencv_projections: "opencv", ros_echo: "ros"},
+}
+#: Those with one camera for both images.
+ONE_CAMERA = {foundation_stereo: "foundation_stereo", orb_slam_rectified: "orb_slam"}
+
+#: A rig of 0.12 m in every format, by the name of the function.
+K = np.array([[700.0, 0, 300], [0, 700.0, 200], [0, 0, 1]])
+RIG = Drawn(
+    (K, K), rigid([0, 0, 0], [-0.12, 0, 0]), (640, 480), ([0.0] * 4, [0.0] * 4), rigid([0, 0, 0], [1, 2, 3])
+)
+FORMAT_OF = {write.__name__: name for write, name in (ANY_POSE | RECTIFIED | ONE_CAMERA).items()}
+SAMPLES = {
+    write.__name__: write(RIG)
+    for write in ANY_POSE | RECTIFIED | ONE_CAMERA
+    if write.__name__ not in FISHEYES
+}
+
+
+def choice(sample: str, baseline_m: float = 0.12) -> dict[str, Any]:
+    """What ``read_calibration`` needs beside the text."""
+    by_name = {"image_names": NAMES, "baseline_m": baseline_m}
+    return {"zed": {"image_size": (1280, 720)}, "colmap": by_name, "nerf": by_name}.get(sample, {})
+
+
+def written(folder: Path, texts: tuple[str, ...]) -> Path | tuple[Path, ...]:
+    """Files of names that say nothing: formats are recognised by content."""
+    paths = tuple(folder / f"file{i}.dat" for i in range(len(texts)))
+    for path, text in zip(paths, texts, strict=True):
+        path.write_text(text)
+    return paths[0] if len(paths) == 1 else paths
+
+
+def read_texts(folder: Path, *texts: str, **given: Any) -> Rig:
+    """The rig of texts that are written to files first, ``given`` as ``read_calibration`` takes it."""
+    return read_calibration(written(folder, texts), **given)

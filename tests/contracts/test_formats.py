@@ -1,0 +1,288 @@
+"""Every entry of CALIBRATION_FORMATS: any rig is read as it was written, and bad files get a sentence."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.formats import CALIBRATION_FORMATS, read_calibration, rig_from_parameters
+from tests.contracts import calibrations as of
+from tests.contracts.calibrations import FORMAT_OF, SAMPLES, choice, rigid, written
+
+TAKE = settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+#: A file that only warns: doffs cut to fewer digits disagrees with cam1.
+pytestmark = pytest.mark.filterwarnings("ignore:cam1")
+
+
+@st.composite
+def rigs(draw, turned: bool = True) -> of.Drawn:
+    def number(low: float, high: float) -> float:
+        return draw(st.floats(low, high))
+
+    size = draw(st.integers(64, 4000)), draw(st.integers(48, 3000))
+    focal, Ks = number(100, 3000), []
+    for side in range(2):
+        f = focal if side == 0 or not turned else number(100, 3000)
+        cx, cy = (number(0.3, 0.7) * along for along in size)
+        cy = Ks[0][1, 2] if side and not turned else cy
+        fy = f * number(0.8, 1.25) if turned else f
+        Ks.append(np.array([[f, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    turn = [number(-0.5, 0.5) for _ in range(3)] if turned else [0, 0, 0]
+    T = rigid(turn, [-number(0.02, 3.0), *((number(-0.5, 0.5), number(-0.5, 0.5)) if turned else (0, 0))])
+    lenses = tuple([round(number(-0.3, 0.3), 6) or 0.01 for _ in range(4)] for _ in range(2))
+    world = rigid([number(-1, 1) for _ in range(3)], [number(-5, 5) for _ in range(3)])
+    return of.Drawn(tuple(Ks), T, size, lenses, world)
+
+
+def check(rig, drawn: of.Drawn) -> None:
+    for K, expected in zip((rig.K_left, rig.K_right), drawn.K, strict=True):
+        np.testing.assert_allclose(K, expected, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(rig.T_right_from_left, drawn.T, atol=1e-6)
+    assert rig.unit == "m"
+
+
+@pytest.mark.parametrize("write", of.ANY_POSE, ids=lambda write: write.__name__)
+@TAKE
+@given(drawn=rigs())
+def test_a_rig_of_any_pose_is_read_as_it_was_written(tmp_path, write, drawn):
+    choices = choice(write.__name__, float(np.linalg.norm(drawn.T[:3, 3])))
+    rig = of.read_texts(tmp_path, *write(drawn), distorted=True, **choices)
+    check(rig, drawn)
+    assert not rig.rectified or write in (of.realsense, of.realsense_printed)
+    if write is of.mvsnet:
+        assert rig.size_left is None and rig.distortion == (None, None)
+        return
+    assert rig.size_left == rig.size_right == choices.get("image_size", drawn.size)
+    for lens, expected in zip(rig.distortion, drawn.lenses, strict=True):
+        assert lens.model == ("fisheye" if write.__name__ in of.FISHEYES else "opencv")
+        numbers = lens.coefficients.tolist()
+        assert numbers[:4] == expected and not any(numbers[4:])
+
+
+@pytest.mark.parametrize("write", of.RECTIFIED, ids=lambda write: write.__name__)
+@TAKE
+@given(drawn=rigs(turned=False))
+def test_a_rectified_rig_is_read_as_it_was_written(tmp_path, write, drawn):
+    rig = of.read_texts(tmp_path, *write(drawn), distorted=True)
+    check(rig, drawn)
+    assert rig.rectified == (write is not of.stereodemo) and rig.distortion == (None, None)
+    sized = write not in (of.kitti_projections, of.booster)
+    assert rig.size_left == rig.size_right == (drawn.size if sized else None)
+
+
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_a_sample_is_recognised_as_its_own_format_and_read_whatever_its_line_ends(sample, tmp_path):
+    texts = SAMPLES[sample]
+    for text in texts:
+        names = [name for name, entry in CALIBRATION_FORMATS.items() if entry.matches(text)]
+        assert names[0] == FORMAT_OF[sample]
+    paths = written(tmp_path, texts)
+    plain = read_calibration(paths, **choice(sample))
+    assert pytest.approx(np.linalg.inv(of.RIG.T), abs=1e-9) == plain.E and "file0.dat" in plain.source
+    assert plain.K_left.dtype == plain.K_right.dtype == plain.E.dtype == np.float64
+    for path, text in zip(paths if isinstance(paths, tuple) else (paths,), texts, strict=True):
+        path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    again = read_calibration(paths, **choice(sample))
+    np.testing.assert_array_equal(again.K_right, plain.K_right)
+    assert again.size_left == plain.size_left
+
+
+def test_every_format_has_a_sample():
+    assert set(FORMAT_OF.values()) == set(CALIBRATION_FORMATS)
+
+
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_a_cut_off_file_is_a_sentence_that_names_it_or_a_whole_rig(sample, tmp_path):
+    *others, last = SAMPLES[sample]
+    cuts, refused = range(1, len(last), 7), 0
+    for cut in cuts:
+        try:
+            rig = of.read_texts(tmp_path, *others, last[:cut], **choice(sample))
+        except ValueError as error:
+            assert type(error) is InputError and re.search(r"must be .*; got .*", str(error), re.DOTALL)
+            refused += 1
+        else:
+            assert np.isfinite(rig.E).all() and rig.K_right[0, 0] > 0
+    assert refused > 0.5 * len(cuts)
+
+
+#: A sample, what is replaced in its last file (or in all, for "all:"), by what, and what is said.
+REFUSALS = [
+    ("middlebury", "baseline=120.0\n", "", "no 'baseline'.*cut off"),
+    ("middlebury", "baseline=120.0", "baseline=0", "baseline must be above 0"),
+    ("middlebury", "200.0; 0.0 0.0 1.0]\ndoffs", "200.0; 0.0 0.0\ndoffs", "cam1 must be"),
+    ("middlebury", "doffs=0.0", "doffs=", "could not convert"),
+    ("middlebury", "width=640", "width=x", "the width and height of the left camera must be 2 finite numb"),
+    ("middlebury", "700.0", "0", "K of the left camera.*positive focal lengths"),
+    ("all:middlebury", "700.0", "nan", "cam0 must be 9 finite numbers"),
+    ("kitti_projections", "P1:", "X1:", "a calibration with two cameras; got cameras 0"),
+    ("kitti_projections", "700.0 0.0 300.0", "700.0 300.0", "P0 must be 12 finite numbers; got 11"),
+    ("foundation_stereo", "0.12", "", "9 numbers of K and the baseline in metres; got 9 numbers.*--K"),
+    ("foundation_stereo", "0.12", "-0.12", "the baseline must be above 0; got -0.12"),
+    ("stereodemo", '"baseline_meters": 0.12, ', "", "no 'baseline_meters'"),
+    ("stereodemo", '"fx": 700.0', '"fx": "a"', r"fx, fy, cx, cy must be 4 finite numbers; got \('a', 700"),
+    ("stereodemo", "700.0", "9" * 400, "fx, fy, cx, cy must be 4 finite numbers"),
+    ("stereodemo", "700.0", "9" * 5000, "must be a whole stereodemo JSON"),
+    ("opencv", "1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0", "1.5, 0, 0, 0, 1.5, 0, 0, 0, 1.5",
+     "R, T must be rigid.*rotation"),
+    ("opencv", "-0.12, 0.0, 0.0", "0, 0", "T must be 3 finite numbers; got 2"),
+    ("opencv", "rows: 3\n   cols: 3", "rows: 1\n   cols: 9", r"M1 must be of shape \(3, 3\)"),
+    ("opencv", "rows: 3\n   cols: 3", "rows: 9e9\n   cols: 9e9", r"M1 must be .*; got \(9,\)"),
+    ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nM2", "[ 0.1, 0.0, 0.0, 0.0 ]\nM2", "of the left .*rectify"),
+    ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nR", "[ 1, 2, 3 ]\nR", "right camera must be 4, 5, 8, 12, 14 co"),
+    ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nR", "[ .Nan, 2, 3, 4 ]\nR", "right camera must be finite"),
+    ("opencv", "D2:", "dist_of_right:", r"both cameras \(D1, D2\); got dist_of_right. Rename"),
+    ("opencv", "0.0, 0.0, 0.0, 0.0 ]\nR", "0.1, 0.0, 0.0, 0.0 ]\nD1: 3\nR", r"\(D1, D2\); got one of them"),
+    ("opencv", "D2:", "mtxL:", "M1 must be there once; got m1, mtxl, which differ"),
+    ("opencv", "T:", "X:", "no T. Where intrinsics and extrinsics are two files, give both"),
+    ("opencv", "[ 640.0", "[ 640.5", "must be whole numbers of pixels"),
+    ("booster", "<opencv_storage>", '<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage>', "entities"),
+    ("booster", "<baselineLR>120.0</baselineLR>", "", "no 'baselinelr'"),
+    ("booster", "</opencv_storage>", "", "must be a whole Booster xml"),
+    ("mvsnet", "extrinsic\n1.0", "extrinsic\n1.1", "extrinsic must be rigid: .*scale"),
+    ("mvsnet", "0.0 0.0 0.0 1.0\n\nintrinsic", "1.0 0.0 0.0 1.0\n\nintrinsic", "last row .*transposed"),
+    ("mvsnet", "\nintrinsic", "\nextra", "intrinsic must be 9 finite numbers; got 0"),
+    ("zed", "fx=700.0", "fx=x", "fx, fy, cx, cy must be 4 finite numbers; got .'x'"),
+    ("zed", "k1=0.0", "k1=-0.17", "Lens distortion of the left camera .* Undistort"),
+    ("zed", "TY=", "TX=", "Baseline, TY, TZ of .STEREO. must be 3 finite numbers"),
+    ("realsense", '"translation"', '"moved"', "their extrinsics; got 2 and 0"),
+    ("realsense_printed", 'To  "Infrared 2"', 'To  "Depth"', "with .Infrared 1.*less.*cut off"),
+    ("oak", '"toCameraSocket": 2', '"toCameraSocket": -1', "a way from socket 1 to 2"),
+    ("ros", "  - 91.0\n", "  - 175.0\n", "the same in both. These are of single cameras"),
+    ("ros", "  - 91.0\n", "  - x\n", "projection_matrix must be 12 finite numbers"),
+    ("ros", "projection_matrix:", "projektion:", r"camera_info with projection_matrix \(or P\)"),
+    ("all:ros_echo", "p: [", "p: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0] # [", "not calibrated: .* all zeros"),
+    ("all:ros_echo", "width: 640", "width: [640]", "width and height of the left camera must be 2"),
+    ("kalibr", "camera_model: pinhole", "camera_model: omni", "camera_model must be pinhole; got 'omni'"),
+    ("kalibr", "cam1:", "cam3:", "no 'cam1'"),
+    ("kalibr", "radtan", "fov", "lens model.*got fov.*undistort"),
+    ("kalibr", "radtan", "equidistant", "Lens distortion of the left camera .* got fisheye"),
+    ("euroc", "distortion_model: radial", "distortion_model: odd", "lens model of the right camera.*got odd"),
+    ("euroc", "- 640", "- 640.5", "width and height of the right camera must be whole numbers"),
+    ("euroc", "data:\n  - 1", "data:\n  # - 1", "T_BS must be 16 finite numbers; got 15"),
+    ("orb_slam_rectified", "ThDepth: 35", "DepthMapFactor: 5000", "got of .* with a depth sensor"),
+    ("orb_slam_rectified", "Camera.bf: 84.0", "", "with Stereo.T_c1_c2, or Camera.bf of rectified"),
+    ("orb_slam_rectified", "Camera.bf: 84.0", "Camera.bf: -84.0", "the baseline must be above 0"),
+    ("orb_slam_rectified", "Camera.k1: 0.0", "Camera.k1: 0.2", "Lens distortion of Camera must be zero"),
+    ("orb_slam_rectified", "Camera.cx: 300.0", "", "Camera.cx must be a finite number; got None"),
+    ("orb_slam_rectified", "Camera.height: 480", "", "width and height of the left camera must be 2 finite"),
+    ("orb_slam", "PinHole", "Rectified", "Camera.type must be PinHole or KannalaBrandt8 beside Stereo"),
+    ("orb_slam", "PinHole", "KannalaBrandt8", "Camera1.k3 must be a finite number"),
+    ("all:colmap", "OPENCV 640", "SIMPLE_RADIAL 640", "of camera 1 must be 4 finite numbers; got 8"),
+    ("all:colmap", "OPENCV 640", "THIN_PRISM_FISHEYE 640", "parameters of camera 1 must be 12 finite"),
+    ("all:colmap", "OPENCV 640", "FISHY 640", "model of camera 1 must be one of SIMPLE_PINH.*Undistort"),
+    ("colmap", " 2 rig/right", " 7 rig/right", "with cameras 1 and 7; got only 1, 2"),
+    ("colmap", "\n3 1.0", "\n3 0.0", "must be a whole COLMAP|must be a whole a COLMAP"),
+    ("nerf", '"camera_model"', '"from_mitsuba": true, "camera_model"', "y up and z backward"),
+    ("nerf", '"OPENCV"', '"EQUIRECTANGULAR"', "lens model of the left camera .* got EQUIRECTANGULAR"),
+    ("nerf", '"k1"', '"ftheta_p0": 0.1, "k1"', "got ftheta_p0. OpenCV does not have this model"),
+    ("nerf", '"k1"', '"k4": 0.1, "k1"', "k4 must be zero for OPENCV; got .0.1."),
+    ("nerf", '"k1"', '"distortion_params": [0.1], "k1"', "k1, .* must be 6 finite numbers; got 1"),
+    ("nerf", '"fl_x": 700.0', '"fl_x": -700', "positive focal lengths in pixels; got -700"),
+    ("nerf", '"frames": [', '"frames": {"0": [', "must be a whole transforms.json"),
+    ("nerf", "[[1.0, 0.0", "[[2.0, 0.0", "transform_matrix must be rigid: .*scale"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("sample", "old", "new", "said"), REFUSALS)
+def test_a_wrong_entry_is_named(tmp_path, sample, old, new, said):
+    everywhere, name = sample.startswith("all:"), sample.removeprefix("all:")
+    *first, last = SAMPLES[name]
+    texts = ([text.replace(old, new) for text in first] if everywhere else first) + [last.replace(old, new)]
+    assert tuple(texts) != SAMPLES[name], "the sample has nothing of that kind"
+    with pytest.raises(InputError, match=f"(?s){said}") as caught:
+        of.read_texts(tmp_path, *texts, **choice(name))
+    assert "file0.dat" in str(caught.value) and len(str(caught.value)) < 900
+
+
+@pytest.mark.parametrize(
+    ("sample", "given_", "said"),
+    [
+        ("kitti_projections", {"cameras": (2, 3)}, r"two different cameras of the file \(0, 1\); got 2,3"),
+        ("kitti_projections", {"cameras": (0, 0)}, "two different cameras"),
+        ("foundation_stereo", {"cameras": (0, 1)}, "cameras must be left out"),
+        ("kalibr", {"cameras": (0, 2)}, r"two different cameras of the file \(0, 1\); got 0,2"),
+        ("kalibr", {"cameras": ("a", 1)}, "a pair of camera numbers"),
+        ("kalibr", {"baseline_m": -1.0}, "baseline_m"),
+        ("oak", {"cameras": (1, 5)}, r"sockets of the file \(0, 1, 2\); got 5"),
+        ("oak", {"image_size": (1280, 720)}, "640x480 pixels.*crop"),
+        ("zed", {"image_size": None}, "1280x720, 2208x1242.*got no image"),
+        ("zed", {"image_size": (2560, 720)}, "1280x720, 2208x1242"),
+        ("nerf", {"image_names": ("left.jpg", "d.png")}, r"one of the 3.*got d\.png"),
+        ("nerf", {"image_names": ("left.jpg", "left.jpg")}, "two of those.* got ./rig/left.jpg for both"),
+        ("nerf", {"image_names": None}, "image_names must be given"),
+    ],
+)
+def test_a_wrong_choice_is_named(tmp_path, sample, given_, said):
+    with pytest.raises(InputError, match=said):
+        of.read_texts(tmp_path, *SAMPLES[sample], **(choice(sample) | given_))
+
+
+def test_ambiguous_names_ask_for_the_folder(tmp_path):
+    data = json.loads(SAMPLES["nerf"][0])
+    for frame, name in zip(data["frames"], ("one/a.png", "b.png", "two/a.png"), strict=True):
+        frame["file_path"] = name
+    with pytest.raises(InputError, match="may be one/a.png and two/a.png. Add its"):
+        of.read_texts(tmp_path, json.dumps(data), image_names=("a.png", "b.png"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "error", "said"),
+    [
+        (
+            "nope.txt",
+            None,
+            FileNotFoundError,
+            "calibration must be a calibration file; got .*nope.txt, which does",
+        ),
+        ("", None, IsADirectoryError, "got the folder"),
+        ("empty", b"", InputError, "empty"),
+        ("blank", b" \n\n", InputError, "blanks"),
+        ("binary", b"\x89PNG\0\0\0", InputError, "binary"),
+        ("other", b"hi: you\n", InputError, r"known format \(Middlebury.*MVSNet.*which is none of.*fx, fy"),
+    ],
+)
+def test_what_is_no_calibration_is_refused(tmp_path, name, content, error, said):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(error, match=said):
+        read_calibration(tmp_path / name)
+
+
+def test_how_many_files_a_format_needs(tmp_path):
+    for wrong in (3, (1, 2), None):
+        with pytest.raises(TypeError, match="calibration must be a path"):
+            read_calibration(wrong)
+    with pytest.raises(InputError, match="3 files"):
+        read_calibration(("a", "b", "c"))
+    K, text = SAMPLES["foundation_stereo"][0], SAMPLES["opencv"][0]
+    path = written(tmp_path, (K,))
+    assert read_calibration((path, path)).E[0, 3] == 0.12  # the same file twice is that file
+    for texts, said in (
+        ((K, K.replace("0.12", "0.2")), "describes both cameras"),
+        ((text, text.replace("700.0", "701.0")), "different m1, m2"),
+        ((K, SAMPLES["middlebury"][0]), "two files of one format; got foundation_stereo and middlebury"),
+        *(((SAMPLES[name][0],), "two files .*Give --calib twice") for name in ("mvsnet", "ros", "colmap")),
+    ):
+        with pytest.raises(InputError, match=said):
+            of.read_texts(tmp_path, *texts)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "name"),
+    [(0, 0, "fx"), (1, -5.0, "fy"), (2, np.nan, "cx"), (4, 0, "baseline"), (4, np.inf, "baseline")],
+)
+def test_parameters_of_a_data_sheet_are_checked(at, value, name):
+    arguments = [700, 701, 320, 240, 0.12]
+    rig = rig_from_parameters(*arguments, cx_right=350, size=(640, 480))
+    np.testing.assert_array_equal(rig.K_right, [[700, 0, 350], [0, 701, 240], [0, 0, 1]])
+    assert rig.E[0, 3] == 0.12 and rig.size_right == (640, 480)
+    arguments[at] = value
+    with pytest.raises(ValueError, match=name):
+        rig_from_parameters(*arguments)
