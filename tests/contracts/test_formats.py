@@ -239,7 +239,7 @@ def test_ambiguous_names_ask_for_the_folder(tmp_path):
             "nope.txt",
             None,
             FileNotFoundError,
-            "calibration must be a calibration file; got .*nope.txt, which does",
+            "be a calibration file; got .*nope.txt, which does",
         ),
         ("", None, IsADirectoryError, "got the folder"),
         ("empty", b"", InputError, "empty"),
