@@ -88,16 +88,13 @@ class Cloud:
 def make_cloud(
     depth_m: np.ndarray, image_01: np.ndarray, K: np.ndarray, valid: np.ndarray | None = None
 ) -> Cloud:
-    """The points of a depth map.
+    """The points of a depth map, one a pixel, row by row; none where it is not finite or not above 0.
 
     Args:
         depth_m: ``(H, W)`` metres, z of the left camera.
         image_01: ``(H, W, 3)`` in [0, 1], the colours.
         K: ``(3, 3)`` pixels of this grid.
-        valid: ``(H, W)`` boolean; only these become points (``valid & ~flying_points(depth_m)``).
-
-    Returns:
-        One point a pixel, row by row; pixels that are not finite or not above 0 never are.
+        valid: ``(H, W)`` boolean; only these become points, such as ``~flying_points(depth_m)``.
 
     Raises:
         ValueError: shapes that do not fit, or a K that is none.
@@ -136,10 +133,6 @@ def write_ply(
     """Write the points of ``make_cloud`` as binary little-endian PLY, whole or not at all; returns how many.
 
     ``unit`` is ``"m"``, or ``None`` for a depth without one; a comment of the file says which, and the frame.
-
-    Raises:
-        ValueError: as in ``make_cloud``.
-        OSError: the folder does not exist or is not writable.
     """
     count = int(np.count_nonzero(_usable(np.asarray(depth_m), valid)))
     lines = [
@@ -180,9 +173,6 @@ def write_glb(
         cloud: the points; an empty one is written as a scene without points.
         cameras: ``(K, E, (width, height))`` of every camera to draw, E its pose in the left camera's frame.
 
-    Raises:
-        OSError: the folder does not exist or is not writable.
-
     Convention:
         glTF's axes, in metres: a point 1 m to the right of, above and before the camera is (1, 1, -1).
     """
@@ -216,16 +206,20 @@ def write_glb(
         target = INDICES if accessor["type"] == "SCALAR" else ATTRIBUTES
         views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
         data += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    names = [mesh["name"] for mesh in meshes]
     scene: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "geodiff-plugin"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))} if meshes else {}],
+        "nodes": [{"name": name, "mesh": number} for number, name in enumerate(names)],
+        "meshes": meshes,
         "materials": [{"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {}}],
+        "buffers": [{"byteLength": len(data)}] if meshes else [],
+        "bufferViews": views,
+        "accessors": accessors,
     }
-    if meshes:
-        scene |= {"nodes": [{"name": m["name"], "mesh": i} for i, m in enumerate(meshes)], "meshes": meshes}
-        scene |= {"buffers": [{"byteLength": len(data)}], "bufferViews": views, "accessors": accessors}
+    scene = {name: value for name, value in scene.items() if value != []}  # glTF knows no empty lists
     # Each chunk is padded to 4 bytes: JSON with blanks, binary with zeros.
     text = json.dumps(scene, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)

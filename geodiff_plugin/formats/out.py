@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, Self, TypeVar
+from typing import Self, TypeVar
 
 from geodiff_plugin._checks import FolderError, InputFileError, MissingFileError, bad_value
 
@@ -29,7 +29,7 @@ else:
 __all__ = ["PARTIAL", "OutFolder", "atomic_path", "check_out", "free_folder", "reason_of", "write_text"]
 
 #: The hidden folder of a run that is under way, with its lock and its files.
-PARTIAL, LOCK, FILES = ".geodiff-partial", "process", "files"
+PARTIAL, LOCK, FILES = ".geodiff-partial", "lock", "files"
 #: Lists what a run wrote, and is written last.
 REPORT = "report.json"
 #: A disk with less room takes no result, however small its picture.
@@ -43,9 +43,6 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside ``path``, of its suffix; rename it to ``path`` when the block ends well.
 
     On any error, Ctrl-C included, it is removed, and an older file at ``path`` stays as it was.
-
-    Raises:
-        FileNotFoundError, IsADirectoryError: no folder to write into, or ``path`` is one.
     """
     target = Path(path)
     if os.path.isdir(target):
@@ -88,11 +85,7 @@ def _hidden(target: Path) -> Path:
 
 
 def check_out(path: Path, name: str = "--out") -> Path:
-    """The place that an output folder has or will have, links followed; messages call it ``name``.
-
-    Raises:
-        ValueError: a file, or a name that the file system refuses.
-    """
+    """The place that an output folder has or will have, links followed; messages call it ``name``."""
     try:
         target = path.resolve()
         with suppress(FileNotFoundError):
@@ -119,22 +112,27 @@ def free_folder(default: Path) -> Path:
     return path
 
 
-def _take_lock(file: IO[bytes]) -> bool:
-    """Lock an open file until it is closed; ``False`` where another process has it."""
-    if CAN_LOCK:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-    return True
+def _take(hidden: Path, stack: ExitStack) -> bool:
+    """Lock a hidden folder until ``stack`` is closed; ``False`` where another process has it.
+
+    The kernel gives a lock back when its process ends, however it ends.
+    """
+    file = stack.enter_context(open(hidden / LOCK, "ab"))
+    if not CAN_LOCK:
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return (
+        os.fstat(file.fileno()).st_nlink > 0
+    )  # a run that ended meanwhile has removed the file: nobody's lock
 
 
 def _held(hidden: Path) -> bool:
     """Whether the process that writes there is alive."""
-    if not (hidden / LOCK).is_file():
-        return False
-    with open(hidden / LOCK, "rb") as file:
-        return not _take_lock(file)
+    with ExitStack() as stack:
+        return (hidden / LOCK).is_file() and not _take(hidden, stack)
 
 
 def _files_of_report(folder: Path) -> set[str]:
@@ -149,16 +147,14 @@ def _files_of_report(folder: Path) -> set[str]:
 class OutFolder:
     """A folder that this process alone writes to, from before the work until the result is in it.
 
+    Whatever speaks against it is said on entry.
+
     Args:
         path: as typed; it need not exist.
         inputs: files that the run reads, none of which may lie in a folder that it overwrites.
         overwrite: take a folder that holds files. Those that its report lists as an earlier run's go where
             the new run does not write them; all others stay.
         option: what ``path`` was given as, for messages.
-
-    Raises:
-        ValueError: on entry: what ``check_out`` refuses; files in it, or an input that the run would replace
-            or delete; it cannot be written to, or its disk is full; another run has it.
     """
 
     def __init__(
@@ -183,10 +179,7 @@ class OutFolder:
         self._staging = _hidden(self._target)
         with ExitStack() as stack:
             try:
-                self._make_staging(stack)
-                self._lock(stack)
-                if shutil.disk_usage(self._staging).free < LEAST_FREE_BYTES:
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                self._begin(stack)
             except OSError as error:
                 cure = "Name another with --out, or free disk space and check its permissions."
                 got = f"{self.path} ({reason_of(error)})"
@@ -205,43 +198,29 @@ class OutFolder:
                 got = f"{self.path}, which holds {path}"
                 bad_value(self._option, "a folder that holds no input of the run", got, "Name another.")
 
-    def _make_staging(self, stack: ExitStack) -> None:
-        """Make the folders down to it; new ones go in the end if they are still empty."""
-        missing = [path for path in (self._staging, *self._staging.parents) if not path.exists()]
-        for path in reversed(missing):
+    def _begin(self, stack: ExitStack) -> None:
+        """Make the hidden folder, take its lock, and clear what a killed run has left in it."""
+        staging, beside = self._staging, _beside(self._target)
+        for path in reversed([path for path in (staging, *staging.parents) if not path.exists()]):
             path.mkdir(exist_ok=True)
             stack.callback(_remove_empty, path)
-
-    def _lock(self, stack: ExitStack) -> None:
-        """Take the folder's lock; the kernel gives it back when the process ends, however it ends."""
-        beside, lock = _beside(self._target), self._staging / LOCK
-        if self._staging != beside and _held(beside):  # a run that began before the folder was there
-            self._refuse_held(beside)
-        file = stack.enter_context(open(lock, "a+b", buffering=0))
-        # A run that ended meanwhile may have removed the file: what we hold is then nobody's lock.
-        if not _take_lock(file) or os.fstat(file.fileno()).st_nlink == 0:
-            self._refuse_held(self._staging)
-        stack.callback(shutil.rmtree, self._staging, ignore_errors=True)
-        file.truncate(0)
-        file.write(f"{os.getpid()}\n".encode())  # says who, and finds out whether the disk takes a byte
-        if (self._staging / FILES).exists():  # we have the lock, so whoever made them is gone
-            shutil.rmtree(self._staging / FILES)
-            line = f"geodiff: removed what a run that was killed had left in {self._staging}"
+        # Beside it writes a run that began before the folder was there.
+        if (staging != beside and _held(beside)) or not _take(staging, stack):
+            got = f"{self.path}, which another process is writing to"
+            bad_value(self._option, "a folder that no other run has", got, "Wait for it, or name another.")
+        stack.callback(shutil.rmtree, staging, ignore_errors=True)
+        if shutil.disk_usage(staging).free < LEAST_FREE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if (staging / FILES).exists():  # we have the lock, so whoever made them is gone
+            shutil.rmtree(staging / FILES)
+            line = f"geodiff: removed what a run that was killed had left in {staging}"
             print(line, file=sys.stderr, flush=True)
-
-    def _refuse_held(self, hidden: Path) -> None:
-        process = (hidden / LOCK).read_text(encoding="ascii", errors="replace").strip() or "unknown"
-        got = f"{self.path}, which process {process} is writing to"
-        bad_value(self._option, "a folder that no other run has", got, "Wait for it, or name another.")
 
     def write(self, fill: Callable[[Path], Result]) -> Result:
         """Let ``fill`` write into an empty folder beside the place, whose files are then moved.
 
         A new folder appears by one rename. In one that exists each file is replaced by one rename, then what
         only an earlier run wrote goes, and the report is replaced last. Returns what ``fill`` does.
-
-        Raises:
-            OSError: it could not be written; what was there before is as it was.
         """
         files = self._staging / FILES
         try:

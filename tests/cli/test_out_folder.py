@@ -53,15 +53,28 @@ def test_a_new_folder_appears_whole(tmp_path):
     assert [path.name for path in sorted(tmp_path.rglob("*"))] == ["deep", "er", "out", *WRITTEN]
 
 
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_nothing_half_written(tmp_path, error):
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(errno.ENOSPC, "No space left on device")])
+@pytest.mark.parametrize("exists", [True, False])
+def test_what_ends_amid_the_writing_loses_nothing_and_strews_nothing(tmp_path, error, exists):
+    out = tmp_path / "disk" / "out"
+    if exists:
+        out.mkdir(parents=True)
+        (out / "depth.npy").write_text("finished")
+        (out / "report.json").write_text(report_of("depth.npy"))
+
     def broken(folder):
-        (folder / "depth.npy").write_text("x")
+        (folder / "depth.npy").write_text("half")
         raise error
 
-    with pytest.raises(error), OutFolder(tmp_path / "deep" / "out") as held:
+    kind, said = (KeyboardInterrupt, None)
+    if error is not KeyboardInterrupt:
+        kind, said = InputFileError, "out could not be written .No space left on device.. Free disk space"
+    with pytest.raises(kind, match=said), OutFolder(out, overwrite=exists) as held:
         held.write(broken)
-    assert names(tmp_path) == []
+    if exists:
+        assert (out / "depth.npy").read_text() == "finished" and names(out) == WRITTEN
+    else:
+        assert names(tmp_path) == []
 
 
 def test_files_of_an_earlier_run_are_replaced_and_others_stay(tmp_path, monkeypatch):
@@ -157,7 +170,7 @@ def test_a_folder_that_takes_no_file_is_refused_before_the_work(tmp_path, monkey
 
 
 def test_a_second_run_is_refused(tmp_path):
-    out, process = tmp_path / "out", f"process {os.getpid()}"
+    out, process = tmp_path / "out", "another process is writing to"
     with OutFolder(out) as held:
         assert process in refused(out) and process in refused(tmp_path / "." / "out")
         assert free_folder(out) == tmp_path / "out-2"
@@ -190,27 +203,6 @@ def test_what_a_killed_run_left_is_recognised_and_cleared(tmp_path, exists, caps
         assert "killed" in capsys.readouterr().err
         held.write(fill)
     assert names(tmp_path) == ["out"] and names(out) == WRITTEN
-
-
-@pytest.mark.parametrize("exists", [True, False])
-def test_a_disk_that_fills_up_loses_nothing_and_strews_nothing(tmp_path, exists):
-    out = tmp_path / "disk" / "out"
-    if exists:
-        out.mkdir(parents=True)
-        (out / "depth.npy").write_text("finished")
-        (out / "report.json").write_text(report_of("depth.npy"))
-
-    def full(folder):
-        (folder / "depth.npy").write_text("half")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    said = "out could not be written .No space left on device.. Free disk space"
-    with pytest.raises(InputFileError, match=said), OutFolder(out, overwrite=exists) as held:
-        held.write(full)
-    if exists:
-        assert (out / "depth.npy").read_text() == "finished" and names(out) == WRITTEN
-    else:
-        assert names(tmp_path) == []
 
 
 def test_a_run_that_names_no_folder_takes_the_next_free_one(tmp_path, monkeypatch):

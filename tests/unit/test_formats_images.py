@@ -66,24 +66,20 @@ def test_exif_orientation_is_applied_and_told(tmp_path, orientation):
 
 
 @pytest.mark.parametrize(
-    ("image", "expected", "notes"),
+    ("image", "expected", "alpha"),
     [
-        (Image.fromarray(RGBA), X, 1),
-        (Image.fromarray(RGBA[..., 2:]), X[..., 2:], 1),
-        (Image.fromarray(RAMP[..., 0].astype(np.uint16) * 257), X[..., :1], 0),
-        *((PIL.convert(mode), None, 0) for mode in ("L", "1", "P")),
+        (Image.fromarray(RGBA), X, True),
+        (Image.fromarray(RGBA[..., 2:]), X[..., 2:], True),
+        (Image.fromarray(RAMP[..., 0].astype(np.uint16) * 257), X[..., :1], False),
+        *((PIL.convert(mode), None, False) for mode in ("L", "1", "P", "CMYK")),
     ],
 )
-def test_other_modes_become_rgb_and_alpha_is_dropped(tmp_path, image, expected, notes):
-    read, said = read_image(saved(tmp_path, image))
+def test_other_modes_become_rgb_and_alpha_is_dropped(tmp_path, image, expected, alpha):
+    read, said = read_image(saved(tmp_path, image, "x.tif"))
     assert read.shape == (H, W, 3) and read.min() >= 0 and read.max() <= 1
     if expected is not None:
         np.testing.assert_allclose(read, np.broadcast_to(expected, read.shape), atol=1e-6)
-    assert said == ["left has an alpha channel; it is dropped."] * notes == heard(image)
-
-
-def test_cmyk_and_a_palette_with_transparency(tmp_path):
-    assert read_image(saved(tmp_path, PIL.convert("CMYK"), "x.tif"))[1] == []
+    assert said == ["left has an alpha channel; it is dropped."] * alpha == heard(image)
     assert len(read_image(saved(tmp_path, PIL.convert("P"), transparency=0))[1]) == 1
 
 
@@ -92,14 +88,13 @@ def test_10_and_12_bits_in_16_are_told_once(tmp_path, times, told):
     """Of coloured files Pillow keeps the upper 8 bits, which leaves 16 levels and no mode that tells."""
     colour = RAMP.astype(np.uint16) * times
     grey, deep = colour[..., 0], np.dstack([colour, np.full((H, W), 65535, np.uint16)])
-    path = saved(tmp_path, Image.fromarray(grey), "grey.png")
-    said = read_image(path)[1]
+    said = read_image(saved(tmp_path, Image.fromarray(grey)))[1]
     assert len(said) == told
-    if told:
-        assert f"its values reach {grey.max()} of 65535" in said[0] and "multiply them by 16" in said[0]
-    for value in (grey, colour, torch.from_numpy(colour).permute(2, 0, 1), Image.fromarray(grey)):
+    assert not told or f"its values reach {grey.max()} of 65535" in said[0] and "by 16; with 10" in said[0]
+    kinds = (grey, colour, torch.from_numpy(colour).permute(2, 0, 1), Image.fromarray(grey.astype(np.int32)))
+    for value in (*kinds, Image.fromarray(grey)):
         assert ["nearly black" in sentence for sentence in heard(value)] == [True] * told
-    assert len(heard(Image.fromarray(grey.astype(np.int32)))) == told and heard(RAMP // 8) == []
+    assert heard(RAMP // 8) == []
     for channels in (3, 4):
         path = tmp_path / f"{channels}.png"
         assert cv2.imwrite(str(path), deep[..., :channels])
@@ -113,27 +108,31 @@ def test_10_and_12_bits_in_16_are_told_once(tmp_path, times, told):
 @pytest.mark.filterwarnings("ignore")  # Pillow's remarks about broken TIFF tags
 def test_a_cut_off_image_is_a_sentence(tmp_path, suffix):
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
-    whole = saved(tmp_path, Image.fromarray(noise), f"whole.{suffix}").read_bytes()
+    path = saved(tmp_path, Image.fromarray(noise), f"cut.{suffix}")
+    whole = path.read_bytes()
     for share in (0.02, 0.3, 0.6, 0.9):
-        cut = tmp_path / f"cut.{suffix}"
-        cut.write_bytes(whole[: int(len(whole) * share)])
+        path.write_bytes(whole[: int(len(whole) * share)])
         with pytest.raises(ValueError, match=r"left must be .*cut\."):
-            read_image(cut)
-
-
-def test_file_errors(tmp_path):
-    (tmp_path / "a.png").write_text("hello")
-    (tmp_path / "empty.png").write_bytes(b"")
-    for path, error, said in (
-        (tmp_path / "nope.png", FileNotFoundError, "left must be an image file"),
-        (tmp_path, IsADirectoryError, "left"),
-        (tmp_path / "a.png", ValueError, "a format that Pillow does not read"),
-        (tmp_path / "empty.png", ValueError, "empty"),
-        (saved(tmp_path, PIL.crop((0, 0, 48, 31))), ValueError, "at least 32 pixels a side; got 48x31"),
-        (5, TypeError, "left"),
-    ):
-        with pytest.raises(error, match=said):
             read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "error", "said"),
+    [
+        ("none.png", None, FileNotFoundError, "left must be an image file"),
+        ("", None, IsADirectoryError, "left"),
+        ("a.png", b"hello", ValueError, "a format that Pillow does not read"),
+        ("empty.png", b"", ValueError, "empty"),
+        ("small.png", PIL.crop((0, 0, 48, 31)), ValueError, "at least 32 pixels a side; got 48x31"),
+    ],
+)
+def test_files_that_are_no_images(tmp_path, name, content, error, said):
+    if isinstance(content, bytes):
+        (tmp_path / name).write_bytes(content)
+    elif content is not None:
+        saved(tmp_path, content, name)
+    with pytest.raises(error, match=said):
+        read_image(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["x.gif", "x.png", "x.tiff", "x.webp"])
@@ -195,13 +194,11 @@ def test_all_kinds_of_images_in_memory_agree(value, atol):
     assert not isinstance(value, torch.Tensor) or value.any(), "memory is not shared"
 
 
-def test_grey_is_repeated_and_alpha_dropped_with_a_warning():
+def test_one_channel_is_repeated():
     grey = RAMP[..., 0]
     for value in (grey, grey[..., None], torch.from_numpy(grey)[None], Image.fromarray(grey)):
         image = as_image_01(value, "right")
         assert image.shape == (3, H, W) and torch.equal(image[0], image[2])
-    for value in (RGBA, torch.from_numpy(RGBA).permute(2, 0, 1)):
-        assert heard(value) == ["left has an alpha channel; it is dropped."]
 
 
 def with_value(value):
@@ -210,15 +207,10 @@ def with_value(value):
     return image
 
 
-def test_resampling_overshoot_is_clipped():
-    assert as_image_01(with_value(1.0005), "right").max() == 1.0
-
-
 @pytest.mark.parametrize(
     ("value", "error", "match"),
     [
         (with_value(np.nan), ValueError, "right must be finite"),
-        (with_value(np.inf), ValueError, "right must be finite"),
         (with_value(200.0), ValueError, r"\[0, 1\].*200.*Divide by 255"),
         (with_value(-0.9), ValueError, r"-0\.9.*\(x \+ 1\) / 2"),
         (np.zeros((1, H, W, 3)), ValueError, "batch"),
@@ -230,12 +222,10 @@ def test_resampling_overshoot_is_clipped():
         (np.zeros((H, W, 3), dtype=np.int64), ValueError, "dtype int64"),
         (np.zeros((H, W, 3), dtype=bool), ValueError, "dtype bool"),
         (np.zeros((31, W, 3)), ValueError, "at least 32"),
-        (np.zeros((0, W, 3)), ValueError, "at least 32"),
-        (Image.new("RGB", (20, 50)), ValueError, "20x50"),
         ("left.png", TypeError, "right must be a PIL image.*got str"),
-        (None, TypeError, "right"),
     ],
 )
 def test_what_is_no_image(value, error, match):
+    assert as_image_01(with_value(1.0005), "right").max() == 1.0, "resampling may overshoot"
     with pytest.raises(error, match=match):
         as_image_01(value, "right")

