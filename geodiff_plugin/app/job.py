@@ -184,8 +184,8 @@ def _from_photographs(request: Request, left: np.ndarray, _: np.ndarray) -> Geom
         if request.cx_right is not None:
             more["K_right"] = np.array([[K[0, 0], 0, request.cx_right], K[1], K[2]])
     photographs = [ImageOps.exif_transpose(Image.open(path)) for path in request.photographs]
-    known = {"baseline_m": request.baseline_m, "K": K, "config": request.run.config()}
-    return GeometryGuidance.from_photographs(photographs, **known, **more)
+    more |= {"baseline_m": request.baseline_m, "K": K, "config": request.run.config()}
+    return GeometryGuidance.from_photographs(photographs, **more)
 
 
 #: Ways to give the cameras, in the order of the page: what it calls them, and

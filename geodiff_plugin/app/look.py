@@ -9,8 +9,8 @@ HEADER = """
 <div class="head">
   <h1>Depth in metres from two photographs</h1>
   <p>A diffusion model knows shapes, a second view with a known camera knows metres.
-  Drop both photographs, say where the cameras are, and measure. What you give is deleted when you close the
-  page, or after ten minutes.</p>
+  Drop both photographs, say where the cameras are, and measure. What you give is deleted after ten
+  minutes.</p>
 </div>
 """
 BUSY = '<div class="say say-busy"></div>'

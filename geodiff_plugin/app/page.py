@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterable
@@ -34,7 +33,7 @@ from geodiff_plugin.app.results import (
 )
 from geodiff_plugin.cli.report import depth_summary
 
-#: A visitor's uploads, result and files are deleted after this long, and when the tab is closed.
+#: A visitor's uploads, result and files are deleted after this long.
 FORGET_AFTER_S = 600
 #: The cloud: points of this confidence, looked at from so many degrees around it and down from above, and
 #: from a share of its depth.
@@ -73,37 +72,18 @@ QUICK: _Handling = {"queue": False, "show_progress": "hidden", "api_visibility":
 
 
 class _Desk:
-    """Who is being served: one job runs at a time, and each visitor stops only his own.
+    """Who is being served: one job runs at a time, and each visitor stops only his own."""
 
-    Args:
-        kept: files that the page itself shows. The cache names files by their content, so a visitor who runs
-            an example has the file of its thumbnail.
-    """
-
-    def __init__(self, kept: Iterable[str] = ()) -> None:
-        self._kept = {Path(path).resolve() for path in kept}
+    def __init__(self) -> None:
         self._turn = threading.Lock()
         self._stops: dict[str | None, threading.Event] = {}  # by session; a call over the API may have none
-        self._uploads: dict[str | None, set[Path]] = {}
 
     def come(self, visitor: str | None) -> None:
         self._stops[visitor] = threading.Event()
 
     def stop(self, visitor: str | None) -> None:
-        stop = self._stops.get(visitor)
-        if stop is not None:
-            stop.set()
-
-    def note(self, visitor: str | None, paths: Iterable[Path]) -> None:
-        """Files of a visitor, each in a folder of its own that is deleted when he leaves."""
-        self._uploads.setdefault(visitor, set()).update(paths)
-
-    def leave(self, visitor: str | None) -> None:
-        self.stop(visitor)
-        temporary = Path(tempfile.gettempdir()).resolve()
-        for path in self._uploads.pop(visitor, ()):
-            if temporary in path.resolve().parents and path.resolve() not in self._kept:
-                rmtree(path.parent, ignore_errors=True)
+        if visitor in self._stops:
+            self._stops[visitor].set()
 
     def serve(self, visitor: str | None, job: Callable[[threading.Event], Result]) -> Result:
         stop = self._stops.setdefault(visitor, threading.Event())
@@ -194,8 +174,9 @@ def _scene(result: Result) -> tuple[Any, str]:
 
 def _wire_run(
     form: Form, panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State, priors: Priors
-) -> _Desk:
-    desk, fields = _Desk(form.examples.keep_in_cache), list(form.fields.values())
+) -> Callable[[gr.Request], Any]:
+    """Everything from the run to its result; what happens when a visitor leaves."""
+    desk, fields = _Desk(), list(form.fields.values())
     fixed = (panels.tabs, panels.pixel, panels.add, panels.clear)
     shows = [component for component in vars(panels).values() if component not in fixed]
 
@@ -224,9 +205,7 @@ def _wire_run(
         try:
             wanted = form.request(tuple(filled))
             uploads = wanted.files()
-            desk.note(request.session_hash, uploads)
             result = desk.serve(request.session_hash, lambda stop: run_job(wanted, priors, stop, progress))
-            desk.note(request.session_hash, [result.folder / "everything.zip"])
             values_now = {state: result, points: [], **_everything(panels, result)}
         except Stopped:
             return nothing(look.STOPPED)
@@ -255,7 +234,7 @@ def _wire_run(
     files = [field for field in fields if hasattr(field, "upload")]
     changes = [event for field in files for event in (field.upload, field.clear)]
     gr.on(changes, None, js=look.CHANGED, queue=False)
-    return desk
+    return stop
 
 
 def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State) -> None:
@@ -359,12 +338,9 @@ def build_page(priors: Priors) -> gr.Blocks:
                 form = build_form(priors)
             with gr.Column(scale=8, min_width=340, elem_id="results"):
                 panels = _build_panels()
-        desk = _wire_run(form, panels, state, points, tab, priors)
+        leave = _wire_run(form, panels, state, points, tab, priors)
         _wire_panels(panels, state, points, tab)
 
-        def close(request: gr.Request) -> None:
-            desk.leave(request.session_hash)
-
         page.load(None, js=look.WATCH_FORM)
-        page.unload(close)
+        page.unload(leave)
     return page

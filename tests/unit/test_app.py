@@ -287,20 +287,6 @@ class TestWithGradio:
         told = for_visitors(said, [Path("/tmp/x/left.png")])
         assert told == "left must be an image; got left.png. Widen depth_range."
 
-    def test_a_visitor_that_leaves_leaves_nothing(self, monkeypatch, tmp_path):
-        from geodiff_plugin.app.page import _Desk
-
-        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "uploads"))
-        upload, thumbnail = (tmp_path / "uploads" / name / "left.png" for name in ("hash", "of_an_example"))
-        other = tmp_path / "example" / "left.png"
-        for path in (upload, thumbnail, other):
-            path.parent.mkdir(parents=True)
-            path.touch()
-        desk = _Desk([str(thumbnail)])
-        desk.note("me", [upload, thumbnail, other])
-        desk.leave("me")
-        assert not upload.parent.exists() and thumbnail.exists() and other.exists()
-
     def test_a_port_that_another_program_has_is_a_sentence(self, monkeypatch):
         def taken(*_args, **_options):
             raise OSError("Cannot find empty port in range: 8000-8000.")
