@@ -35,7 +35,6 @@ CELL_WIDTH = 480
 #: The colours of the photometric error end at its 98 % quantile, and not below this.
 LEAST_ERROR = 0.05
 VIDEO_SUFFIXES = (".mp4", ".webp", ".gif")
-#: Of a frame with its photograph, pixels.
 #: A power of two: figures in inches are whole pixels again.
 DPI = 128
 POINTS_PER_PIXEL = 72 / DPI
