@@ -13,25 +13,21 @@ from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.baselines.guided import _run_ramp
 from geodiff_plugin.evaluation.baselines.unguided import map_name, sgbm_shift
-from geodiff_plugin.evaluation.datasets import StereoSample
+from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample, make_sample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
-from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching.rows import fill_background
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.types import Rig
 from tests.contracts.tiny_transformers import MODELS, make_transformers
 
 SHAPE, NAN = (32, 48), float("nan")
 
 
 def plane_sample(pair, E=None) -> StereoSample:
-    E = pair.E if E is None else E
-    cameras = (torch.as_tensor(m) for m in (pair.K, pair.K, np.linalg.inv(E)))
-    views = (pair.left, pair.right, pair.K, pair.K, E)
-    valid = np.ones(pair.depth_m.shape, bool)
-    rectified = bool(is_rectified(*cameras))
-    return StereoSample("middlebury2014", "plane", *views, pair.depth_m, valid, rectified=rectified)
+    rig = Rig(pair.K, pair.K, pair.E if E is None else E)
+    return make_sample(SampleRef("folder", "plane", {}), (pair.left, pair.right), rig, pair.depth_m, {})
 
 
 class OnePipe(PriorCache):
@@ -146,15 +142,13 @@ def test_reprojection_only_starts_from_the_map_of_the_prior_and_moves_its_pixels
     assert np.median(np.abs(prediction.depth_m / depth_m - 1)) < 0.05
 
 
-def make_sample(rectified=True) -> StereoSample:
+def slope() -> StereoSample:
     """A slope from 1 to 2.5 m; the right camera's principal point lies 2 px further (doffs)."""
     image = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
-    K = np.array([[30.0, 0, 23.5], [0, 30.0, 15.5], [0, 0, 1]])
-    K_right, E = K.copy(), np.eye(4)
-    K_right[0, 2], E[0, 3] = K[0, 2] + 2, 0.2
+    K, doffs, E = np.array([[30.0, 0, 23.5], [0, 30.0, 15.5], [0, 0, 1]]), np.zeros((3, 3)), np.eye(4)
+    doffs[0, 2], E[0, 3] = 2.0, 0.2
     depth_m = np.linspace(1.0, 2.5, SHAPE[1], dtype=np.float32)[None].repeat(SHAPE[0], 0)
-    views = (image, image, K, K_right, E)
-    return StereoSample("folder", "mine", *views, depth_m, depth_m > 0, rectified=rectified)
+    return make_sample(SampleRef("folder", "mine", {}), (image, image), Rig(K, K + doffs, E), depth_m, {})
 
 
 def run(name, sample):
@@ -177,7 +171,7 @@ def write_disparity_png(path, values):
     ],
 )
 def test_metric_maps_are_read_and_holes_stay(tmp_path, kind, suffix, save, hole, tolerance):
-    sample = make_sample()
+    sample = slope()
     values = sample.depth_m.copy() if kind == "depth" else 30.0 * 0.2 / sample.depth_m - 2
     values[:3, :3] = hole
     save(tmp_path / f"folder_mine{suffix}", values)
@@ -187,7 +181,7 @@ def test_metric_maps_are_read_and_holes_stay(tmp_path, kind, suffix, save, hole,
 
 
 def test_relative_maps_are_aligned_only_and_another_size_is_resized_in_value_too(tmp_path):
-    sample, path = make_sample(), tmp_path / f"{map_name('folder', 'mine')}.npy"
+    sample, path = slope(), tmp_path / f"{map_name('folder', 'mine')}.npy"
     np.save(path, 7 - 3 / sample.depth_m)  # no map of inverse depth falls with it
     record = score(sample, run(f"files:relative-disparity:{tmp_path}", sample), None)["all_pixels"]
     assert record["raw"] is None and record["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6)
@@ -215,7 +209,7 @@ def test_what_does_not_apply_is_a_reason_and_what_is_wrong_is_named(
     elif content is not None:
         np.save(tmp_path / "folder_mine.npy", content)
     with pytest.raises(error, match=said):
-        run(name.format(tmp_path), replace(make_sample(), **changes))
+        run(name.format(tmp_path), replace(slope(), **changes))
 
 
 @pytest.mark.parametrize(("kind", "metric"), [("dpt", False), ("glpn", True)])
@@ -225,7 +219,7 @@ def test_depth_models_of_transformers_answer(tmp_path, kind, metric):
     model, preparation = MODELS[kind]()
     model.save_pretrained(folder)
     (folder / "preprocessor_config.json").write_text(json.dumps(preparation))
-    method, prediction = find_method(f"hf:{folder}"), run(f"hf:{folder}", make_sample())
+    method, prediction = find_method(f"hf:{folder}"), run(f"hf:{folder}", slope())
     assert method.title == "tiny-model" and not method.uses_prior
     assert prediction.space == ("depth" if metric else "disparity")
     assert prediction.relative.shape == SHAPE and np.isfinite(prediction.relative).all()
@@ -258,11 +252,10 @@ def test_names_bind_priors_and_seeds_but_not_those_of_folders_and_models(tmp_pat
 def test_sgbm_recovers_a_known_shift(doffs):
     wide = np.random.default_rng(0).integers(0, 256, (48, 160, 3), dtype=np.uint8)
     K, E = np.array([[100.0, 0, 70], [0, 100.0, 24], [0, 0, 1]]), np.eye(4)
-    K_right = K + np.array([[0, 0, doffs], [0, 0, 0], [0, 0, 0]])
-    E[0, 3] = 0.1
+    rig, E[0, 3] = Rig(K, K + np.array([[0, 0, doffs], [0, 0, 0], [0, 0, 0]]), E), 0.1
     truth = np.full((48, 144), 10.0 / (6 + doffs), np.float32)
-    views = (wide[:, :144], wide[:, 6:150], K, K_right, E)  # x_left - x_right = 6
-    sample = StereoSample("folder", "shift", *views, truth, truth > 0, rectified=True)
+    views = wide[:, :144], wide[:, 6:150]  # x_left - x_right = 6
+    sample = make_sample(SampleRef("folder", "shift", {}), views, rig, truth, {})
     shift = sgbm_shift(sample)
     assert np.isfinite(shift).mean() > 0.8 and np.nanmedian(shift) == pytest.approx(6 + doffs, abs=1 / 16)
     assert np.median(np.abs(run("sgbm", sample).depth_m / truth - 1)) < 0.02

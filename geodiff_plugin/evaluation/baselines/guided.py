@@ -157,7 +157,7 @@ def _photometric_updates(right: Any, K: Any, E: Any) -> GeometryGuidance:
     The paper names a rate of 1e-2 and no optimiser. A plain step of that size moves no pixel, because the
     gradient of a mean over all pixels is tiny in each; Adam's do.
     """
-    updates = {"inner_steps": 50, "step_latents": 0.01, "min_steps": 1}
+    updates: dict[str, Any] = {"inner_steps": 50, "step_latents": 0.01, "min_steps": 1}
     return GeometryGuidance(right, K, E, weights=PAPER.weights, correct=False, crisp=False, **updates)
 
 
