@@ -17,6 +17,7 @@ from geodiff_plugin.types import CameraView
 
 WEIGHTS = {"photometric": 1.0, "matches": 0.3, "points": 0.1, "prior_pull": 0.01, "anchor": 0.2}
 CONFIG = GuidanceConfig(weights=WEIGHTS, pyramid_levels=2, pull_to="zero", min_visible=0.0)
+GRID = (1, 1, 48, 64)
 
 
 def double(x):
@@ -24,73 +25,59 @@ def double(x):
 
 
 def views_of(pair):
+    """A rectified view, and one that is also below."""
     left, right = (double(image).permute(2, 0, 1)[None] / 255 for image in (pair.left, pair.right))
     K, T = double(pair.K)[None], torch.linalg.inv(double(pair.E))[None]
     below = T.clone()
     below[:, 1, 3] = -0.1
     rights = tuple(CameraView(right, K, pose) for pose in (T, below))
-    rays = tuple(plane_rays(K, K, pose, (48, 64)) for pose in (T, below))
-    known = torch.zeros(1, 1, 48, 64, dtype=torch.float64)
-    known[..., ::7, ::5] = 1.0
-    points = Matches(known / double(pair.depth_m), known, double([0.005]))
-    return Views(left, K, rights, rays), points
+    return Views(left, K, rights, tuple(plane_rays(K, K, pose, (48, 64)) for pose in (T, below)))
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity", "log", "sqrt_disparity"])
 def test_whole_chain_against_finite_differences(make_pipeline, textured_plane, space):
     pipe = make_pipeline().to(torch.float64)
-    prior = MarigoldPrior(pipe)
-    views, points = views_of(textured_plane)
-    objective = Objective(views, MetricMap(space), CONFIG)
+    prior, objective = MarigoldPrior(pipe), Objective(views_of(textured_plane), MetricMap(space), CONFIG)
     generator = torch.Generator().manual_seed(0)
-    draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
-    condition, z_t = draw(1, 4, 24, 32), draw(1, 4, 24, 32)
-    text = draw(1, 2, 8)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    condition, z_t, text, anchor = draw(1, 4, 24, 32), draw(1, 4, 24, 32), draw(1, 2, 8), draw(1, 4, 24, 32)
     level = NoiseLevel(double(0.6), double(0.8), "v_prediction")
-    near, far = torch.tensor([1.3]), torch.tensor([3.1])
-    start = objective.metric.from_range(near, far)
+    start = objective.metric.from_range(torch.tensor([1.3]), torch.tensor([3.1]))
     start = AffineState(double(start.s_hat), double(start.t_hat), double(start.g_s))
-    matches = Matches(
-        1.0 / double(textured_plane.depth_m)[None, None],
-        torch.ones(1, 1, 48, 64, dtype=torch.float64),
-        double([0.02]),
-    )
-    anchor = draw(1, 4, 24, 32)
+    inverse, known = 1.0 / double(textured_plane.depth_m)[None, None], torch.zeros(GRID).double()
+    known[..., ::7, ::5] = 1.0
+    matches = Matches(inverse, torch.ones_like(inverse), double([0.02]))
+    points = Matches(known * inverse, known, double([0.005]))
 
     def loss(z, s_hat, t_hat):
-        output = pipe.unet(torch.cat([condition, z], 1), 500, encoder_hidden_states=text, return_dict=False)[
-            0
-        ]
+        (output,) = pipe.unet(
+            torch.cat([condition, z], 1), 500, encoder_hidden_states=text, return_dict=False
+        )
         z0 = z0_from(output, z, level)
         affine = AffineState(s_hat, t_hat, start.g_s)
         return objective(prior.decode(z0), affine, start, z0, anchor, matches, points).total.sum()
 
-    inputs = [
-        z_t.requires_grad_(),
-        start.s_hat.clone().requires_grad_(),
-        start.t_hat.clone().requires_grad_(),
-    ]
-    grads = torch.autograd.grad(loss(*inputs), inputs)
-    for i, grad in enumerate(grads):
+    inputs = [z_t.requires_grad_(), *(x.clone().requires_grad_() for x in (start.s_hat, start.t_hat))]
+    for i, grad in enumerate(torch.autograd.grad(loss(*inputs), inputs)):
         assert torch.isfinite(grad).all() and grad.abs().max() > 0
         direction, h = draw(*grad.shape), 1e-6
-        moved = [
-            [x.detach() + sign * h * direction if j == i else x.detach() for j, x in enumerate(inputs)]
-            for sign in (1, -1)
-        ]
+        ahead, behind = (
+            [x.detach() + (step * direction if j == i else 0.0) for j, x in enumerate(inputs)]
+            for step in (h, -h)
+        )
         with torch.no_grad():
-            numeric = (loss(*moved[0]) - loss(*moved[1])) / (2 * h)
+            numeric = (loss(*ahead) - loss(*behind)) / (2 * h)
         # Bilinear sampling is piecewise smooth: a few of 3072 pixels may cross a centre within h.
         torch.testing.assert_close((grad * direction).sum(), numeric, rtol=1e-3, atol=1e-7)
 
 
 @pytest.mark.parametrize("prediction_type", ["epsilon", "v_prediction", "sample", "flow_prediction"])
-def test_denoising_arithmetic_gradcheck_and_inverse(prediction_type):
+def test_denoising_arithmetic_and_its_inverse(prediction_type):
     generator = torch.Generator().manual_seed(1)
-    output, z_t = (
-        torch.randn(1, 2, 2, 3, generator=generator, dtype=torch.float64, requires_grad=True)
-        for _ in range(2)
-    )
+    output, z_t = torch.randn(2, 1, 2, 2, 3, generator=generator, dtype=torch.float64).requires_grad_()
     alpha, sigma = (0.6, 0.8) if prediction_type != "flow_prediction" else (0.6, 0.4)
     level = NoiseLevel(double(alpha), double(sigma), prediction_type)
     assert torch.autograd.gradcheck(lambda o, z: z0_from(o, z, level), (output, z_t))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
-
 import numpy as np
 import pytest
 import torch
@@ -15,20 +12,12 @@ from tests.scenes import Camera, render_views, sample_scene
 from tests.scenes.cameras import intrinsics
 
 SIZE = (72, 96)
-FAST = {"inner_steps": 4, "min_steps": 1}
-
-
-@dataclass(frozen=True)
-class Group:
-    images: list[np.ndarray]  # (H, W, 3) uint8: left, right, below
-    K: np.ndarray
-    poses: list[np.ndarray]  # camera-to-world
-    depth_m: np.ndarray
-    sparse: np.ndarray  # (H, W), 0 where unknown
+FAST = {"inner_steps": 4, "min_steps": 1, "sweep_pixels": 96 * 72}
 
 
 @pytest.fixture(scope="module")
-def group() -> Group:
+def group():
+    """Views ``(image, K, camera-to-world)``: left, right, below; depth; some of it, 0 where unknown."""
     scene = sample_scene(1, "room")
     K, world = intrinsics(SIZE, scene.fov_deg), scene.T_world_from_camera.double()
     poses = [world]
@@ -36,77 +25,70 @@ def group() -> Group:
         E = torch.eye(4, dtype=torch.float64)
         E[axis, 3] = scene.baseline_m
         poses.append(world @ E)
-    views = render_views(scene, [Camera(K, pose) for pose in poses], SIZE)
-    images = [(view.image_01.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8) for view in views]
-    depth_m = views[0].depth_m[0].numpy()
+    rendered = render_views(scene, [Camera(K, pose) for pose in poses], SIZE)
+    images = [(view.image_01.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8) for view in rendered]
+    views = [(image, K.numpy(), pose.numpy()) for image, pose in zip(images, poses, strict=True)]
+    depth_m = rendered[0].depth_m[0].numpy()
     known = np.isfinite(depth_m) & (np.random.default_rng(0).random(SIZE) < 0.03)
-    return Group(images, K.numpy(), [pose.numpy() for pose in poses], depth_m, np.where(known, depth_m, 0))
+    return views, depth_m, np.where(known, depth_m, 0)
 
 
 @pytest.fixture(scope="module")
-def pipe():
-    return enable_geometry_guidance(load_bundled_prior())
+def run(group):
+    """Guided calls on the left view of the group."""
+    pipe = enable_geometry_guidance(load_bundled_prior())
+
+    def call(guidance):
+        generator = torch.Generator().manual_seed(0)
+        left = Image.fromarray(group[0][0][0])
+        return pipe(left, guidance=guidance, num_inference_steps=1, generator=generator)
+
+    return call
 
 
-def views(group, count):
-    return [(image, group.K, pose) for image, pose in zip(group.images, group.poses, strict=True)][:count]
+@pytest.fixture(scope="module")
+def of_points(run, group):
+    return run(GeometryGuidance.from_points(group[2], group[0][0][1], **FAST))
 
 
-def run(pipe, group, guidance, **kwargs):
-    return pipe(
-        Image.fromarray(group.images[0]),
-        guidance=guidance,
-        num_inference_steps=1,
-        generator=torch.Generator().manual_seed(0),
-        **kwargs,
+def abs_rel(out, depth_m):
+    return np.nanmean(np.abs(out.prediction[0, ..., 0] / np.where(np.isfinite(depth_m), depth_m, np.nan) - 1))
+
+
+def test_further_views_and_points_beside_them(run, group):
+    views, depth_m, sparse = group
+    two, twice, three = (
+        run(GeometryGuidance.from_views(given, **FAST))
+        for given in (views[:2], [*views[:2], views[1]], views)
     )
-
-
-@pytest.fixture(scope="module")
-def of_views(pipe, group):
-    """Results of the first so many views."""
-    return cache(lambda count: run(pipe, group, GeometryGuidance.from_views(views(group, count), **FAST)))
-
-
-@pytest.fixture(scope="module")
-def of_points(pipe, group):
-    return run(pipe, group, GeometryGuidance.from_points(group.sparse, group.K, **FAST))
-
-
-def abs_rel(out, group):
-    known = np.isfinite(group.depth_m)
-    return np.mean(np.abs(out.prediction[0, ..., 0] / group.depth_m - 1.0)[known])
+    np.testing.assert_allclose(twice.prediction, two.prediction, rtol=1e-3)  # a repetition changes nothing
+    assert three.visible.mean() > two.visible.mean() and abs_rel(three, depth_m) < 0.2
+    both = run(GeometryGuidance.from_views(views[:2], points=sparse, **FAST))
+    assert {"points", "matches", "photometric"} <= set(both.history[0].terms)
+    assert abs_rel(both, depth_m) < abs_rel(two, depth_m)
+    assert abs_rel(both, np.where(sparse > 0, sparse, np.nan)) < 0.05
 
 
 def test_points_instead_of_a_second_view(of_points, group):
     out = of_points
     assert out.visible is None and out.photometric_error is None and not out.warnings
-    np.testing.assert_allclose(out.K[0], group.K, rtol=1e-5)
-    assert abs_rel(out, group) < 0.2
+    assert abs_rel(out, group[1]) < 0.2
     assert set(out.history[0].terms) == {"points", "anchor", "prior_pull"}
 
 
-def test_a_cloud_is_the_map_that_it_projects_to(pipe, group, of_points):
-    rows, columns = group.sparse.nonzero()
-    rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(group.K).T
-    cloud = np.concatenate([rays * group.sparse[rows, columns, None], [[0.0, 0.0, -1.0]]])
-    as_cloud = run(pipe, group, GeometryGuidance.from_points(cloud, group.K, **FAST))
+def test_a_cloud_is_the_map_that_it_projects_to(run, group, of_points):
+    (_, K, _), sparse = group[0][0], group[2]
+    rows, columns = sparse.nonzero()
+    rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(K).T
+    cloud = np.concatenate([rays * sparse[rows, columns, None], [[0.0, 0.0, -1.0]]])
+    as_cloud = run(GeometryGuidance.from_points(cloud, K, **FAST))
     np.testing.assert_allclose(as_cloud.prediction, of_points.prediction, rtol=1e-3)
     assert as_cloud.warnings == ["1 points lie behind the left camera or outside its image: left out."]
 
 
-def test_points_beside_a_second_view(pipe, group, of_views):
-    guidance = GeometryGuidance.from_views(views(group, 2), points=group.sparse, **FAST)
-    both = run(pipe, group, guidance)
-    assert {"points", "matches", "photometric"} <= set(both.history[0].terms)
-    assert abs_rel(both, group) < abs_rel(of_views(2), group)
-    off = np.abs(both.prediction[0, ..., 0] / np.where(group.sparse > 0, group.sparse, np.nan) - 1.0)
-    assert np.nanmedian(off) < 0.02
-
-
-def test_points_of_another_size_than_the_image(pipe, group):
+def test_points_of_another_size_than_the_image(run, group):
+    (_, K, _), sparse = group[0][0], group[2]
     with pytest.raises(ValueError, match="points must be a map of the left image's 96x72 pixels; got 48x36"):
-        run(pipe, group, GeometryGuidance.from_points(group.sparse[::2, ::2] + 1.0, group.K, **FAST))
-    two = GeometryGuidance(None, group.K, points=[group.sparse, group.sparse], **FAST)
+        run(GeometryGuidance.from_points(sparse[::2, ::2] + 1.0, K, **FAST))
     with pytest.raises(ValueError, match="points must be a list of 1 entries"):
-        run(pipe, group, two)
+        run(GeometryGuidance(None, K, points=[sparse, sparse], **FAST))
