@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -52,14 +51,6 @@ class EstimatedPose:
     warnings: tuple[str, ...]
 
 
-def _poselib() -> Any:
-    try:
-        return importlib.import_module("poselib")
-    except ImportError:
-        cure = "pip install 'geodiff-plugin[pose]', or pip install poselib."
-        bad_value("PoseLib", "installed, to estimate poses", "no module poselib", cure)
-
-
 def _right_rays(tracks: Tracks) -> np.ndarray:
     pixels = np.c_[tracks.right_px[0], np.ones(len(tracks))]
     return np.linalg.solve(tracks.K_rights[0], pixels.T).T
@@ -104,7 +95,9 @@ def estimate_pose(tracks: Tracks, name: str = "the two photographs") -> Estimate
             f"The parallax between {name} is {parallax:.2f} degrees in the median: depth rests on little. "
             "Move the camera further sideways."
         )
-    if _homography_share(tracks, near) > SIMPLER:
+    left, right = (px[near].astype(np.float32) for px in (tracks.left_px, tracks.right_px[0]))
+    on_plane = cv2.findHomography(left, right, cv2.RANSAC, INLIER_PX)[1]
+    if on_plane is not None and on_plane.mean() > SIMPLER:
         warnings.append(
             f"Nearly all matches of {name} lie on one plane: several poses explain them about as well. "
             "Take photographs with things at different depths, or give the pose."
@@ -147,6 +140,11 @@ def _same_unit(tracks: Tracks, poses: Sequence[EstimatedPose], v: int) -> Estima
 
 def _five_points(tracks: Tracks) -> np.ndarray:
     """``T_right_from_left`` that explains the most tracks, its baseline of length 1."""
+    try:
+        poselib = importlib.import_module("poselib")
+    except ImportError:
+        cure = "pip install 'geodiff-plugin[pose]', or pip install poselib."
+        bad_value("PoseLib", "installed, to estimate poses", "no module poselib", cure)
     pixels, cameras = [], []
     for px, K in ((tracks.left_px, tracks.K_left), (tracks.right_px[0], tracks.K_rights[0])):
         width, height = (max(1, int(2 * c + 1)) for c in K[:2, 2])
@@ -155,7 +153,7 @@ def _five_points(tracks: Tracks) -> np.ndarray:
         # The same rays in a camera without skew: PoseLib's models have none.
         pixels.append(np.c_[px[:, 0] - K[0, 1] * (px[:, 1] - K[1, 2]) / K[1, 1], px[:, 1]])
     options = {"max_epipolar_error": INLIER_PX / 2, "seed": 0, "min_iterations": 1000}
-    pose, _ = _poselib().estimate_relative_pose(*pixels, *cameras, options, {})
+    pose, _ = poselib.estimate_relative_pose(*pixels, *cameras, options, {})
     T = np.eye(4)
     T[:3] = pose.Rt
     T[:3, 3] /= max(float(np.linalg.norm(T[:3, 3])), 1e-12)
@@ -224,10 +222,3 @@ def _rotation_residuals(tracks: Tracks) -> np.ndarray:
         off = np.linalg.norm(p[:, :2] / np.maximum(p[:, 2:], 1e-6) - tracks.right_px[0], axis=1)
         weights = 1.0 / (1.0 + (off / INLIER_PX) ** 2)
     return off
-
-
-def _homography_share(tracks: Tracks, near: np.ndarray) -> float:
-    """Share of the inliers that one homography explains."""
-    left, right = (px[near].astype(np.float32) for px in (tracks.left_px, tracks.right_px[0]))
-    _, mask = cv2.findHomography(left, right, cv2.RANSAC, INLIER_PX)
-    return 0.0 if mask is None else float(mask.mean())

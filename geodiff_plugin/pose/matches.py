@@ -217,8 +217,8 @@ def _entries(file: Path) -> dict[str, Any]:
 
 def _load(folder: Path) -> Any:
     kind = _entries(folder / "config.json").get("model_type")
-    if kind not in _CLASSES:
-        bad_value(f"matcher in {folder}", f"one of {' or '.join(_CLASSES)}", f"one of type {kind!r}")
+    if kind not in MATCHERS:
+        bad_value(f"matcher in {folder}", f"one of {' or '.join(MATCHERS)}", f"one of type {kind!r}")
     import transformers
 
     weights = f"weights of the matcher in {folder}"

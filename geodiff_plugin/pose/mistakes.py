@@ -27,23 +27,14 @@ _KEPT_T = (
 )
 _K_SWAPPED = "The views fit with the two camera matrices exchanged: K seems to be (K_right, K_left)."
 _K_SCALED = (
-    "The views fit with K times {factor:g}: it seems to be for images of {size} the width and height of "
-    "these. With s = {factor:g} take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy."
+    "The views fit with K times {factor:g}: it seems to be for images of {size:.3g} times the width and "
+    "height of these. With s = {factor:g} take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy."
 )
 _FOCAL_SCALED = (
     "The views fit with the focal lengths times {factor:.3g} and the principal point as it is: K seems to be "
-    "for images of {size} the width and height of these, with its principal point set to the middle."
+    "for images of {size:.3g} times the width and height of these, its principal point set to the middle."
 )
-_FACTORS = {
-    1 / 4: "4 times",
-    1 / 3: "3 times",
-    1 / 2: "twice",
-    2 / 3: "1.5 times",
-    3 / 2: "two thirds of",
-    2: "half",
-    3: "a third of",
-    4: "a quarter of",
-}
+_FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 2, 2.0, 3.0, 4.0)
 # Within so many pixels of its line, and in front of both cameras, a match speaks for a pose: coarsely, for a
 # mistaken pose may be inexact as well, and finely, for where the cameras are close together a wrong K or pose
 # too leaves most matches within a few pixels of their lines.
@@ -85,17 +76,14 @@ def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np
     yield _KEPT_T, tracks, np.linalg.inv(mixed)
     if not np.allclose(tracks.K_left, tracks.K_rights[0], rtol=0.02):
         yield _K_SWAPPED, replace(tracks, K_left=tracks.K_rights[0], K_rights=tracks.K_left[None]), T
-    for factor, size in _FACTORS.items():
+    for factor in _FACTORS:
         for sentence in (_K_SCALED, _FOCAL_SCALED):
             Ks = np.stack([tracks.K_left, *tracks.K_rights])
             Ks[:, :2, :2] *= factor
             if sentence == _K_SCALED:
                 Ks[:, :2, 2] = (Ks[:, :2, 2] + 0.5) * factor - 0.5
-            yield (
-                sentence.format(factor=factor, size=size),
-                replace(tracks, K_left=Ks[0], K_rights=Ks[1:]),
-                T,
-            )
+            told = sentence.format(factor=factor, size=1 / factor)
+            yield told, replace(tracks, K_left=Ks[0], K_rights=Ks[1:]), T
 
 
 def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ Minimises, over 6 degrees of freedom a right view and one inverse depth a track,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -87,36 +87,21 @@ def _jacobian(at: Projected, inverse_depth: np.ndarray) -> np.ndarray:
     return np.concatenate([at.by_point @ by_turn, at.by_point * inverse_depth[:, None, None]], axis=2)
 
 
-@dataclass(frozen=True, eq=False)
-class _Whitened:
+class _Whitened(NamedTuple):
     """Residuals of tracks and their derivatives, each times the root of its robust weight; n = 2 V.
 
     ``cost``, the sum of log(1 + (residual / scale)^2); ``inverse_depth (N,)`` 1/m that fits a track best;
-    ``residuals (N, n)``; their derivatives ``by_pose (N, n, 6V)``, by ``_turned``'s step of every view, and
-    ``by_depth (N, n)``, by inverse depth.
+    ``residuals (N, n)``; ``left_by_pose (N, n, 6V)``, their derivative by ``_turned``'s step of every view
+    that no change of depth compensates; ``depth_by_pose (N, 6V)``, what a step does to the inverse depth,
+    times minus ``slopes (N,)``.
     """
 
     cost: float
     inverse_depth: np.ndarray
     residuals: np.ndarray
-    by_pose: np.ndarray
-    by_depth: np.ndarray
-
-    @cached_property
-    def slopes(self) -> np.ndarray:
-        """``(N,)``, length of ``by_depth``."""
-        return np.maximum(np.linalg.norm(self.by_depth, axis=1), 1e-12)
-
-    @cached_property
-    def depth_by_pose(self) -> np.ndarray:
-        """``(N, 6V)``: what a step does to the inverse depth, times minus ``slopes``."""
-        return np.einsum("nk,nkp->np", self.by_depth / self.slopes[:, None], self.by_pose)
-
-    @cached_property
-    def left_by_pose(self) -> np.ndarray:
-        """``(N, n, 6V)``: the part of ``by_pose`` that no change of depth compensates."""
-        along = self.by_depth / self.slopes[:, None]
-        return self.by_pose - along[..., None] * self.depth_by_pose[:, None]
+    left_by_pose: np.ndarray
+    depth_by_pose: np.ndarray
+    slopes: np.ndarray
 
 
 def _whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> _Whitened:
@@ -135,7 +120,11 @@ def _whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> _Whitened:
     r = (offs * np.sqrt(weights)[..., None]).transpose(1, 0, 2).reshape(len(tracks), -1)
     J, j = by_pose.reshape(len(tracks), 2 * views, -1), by_depth.reshape(len(tracks), -1)
     cost = np.log1p((offs**2).sum(-1) / scale_px**2)[tracks.seen].sum()
-    return _Whitened(float(cost), w, r, J, j)
+    slopes = np.maximum(np.linalg.norm(j, axis=1), 1e-12)
+    along = j / slopes[:, None]
+    depth_by_pose = np.einsum("nk,nkp->np", along, J)
+    left_by_pose = J - along[..., None] * depth_by_pose[:, None]
+    return _Whitened(float(cost), w, r, left_by_pose, depth_by_pose, slopes)
 
 
 def _weights(
@@ -213,7 +202,8 @@ def solve_poses(
 
 def is_rig(tracks: Tracks, given: np.ndarray) -> bool:
     """Whether all poses as given ``(V, 4, 4)`` are those of a rectified rig."""
-    return bool(is_rectified(*map(torch.as_tensor, (tracks.K_left, tracks.K_rights, given))).all())
+    cameras = (torch.as_tensor(m, device="cpu") for m in (tracks.K_left, tracks.K_rights, given))
+    return bool(is_rectified(*cameras).all())
 
 
 def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.ndarray:

@@ -174,10 +174,10 @@ TURNED = pose((4.0, -9.0, 6.0), (0.3, 0.05, -0.08))
         (TRUE, FLIP @ np.linalg.inv(TRUE) @ FLIP, K, "world-to-camera: invert"),
         (TRUE, pose((-1.0, 6.0, -2.0), TRUE[:3, 3]), K, "transposed"),
         (NEAR, np.linalg.inv(FLIP @ np.linalg.inv(NEAR) @ FLIP), K, "OpenGL"),
-        (TURNED, TURNED, scaled(0.5, False), "half the width and height of these. With"),
-        (TURNED, TURNED, scaled(1.5, True), "1.5 times the width and height of these, with its principal"),
+        (TURNED, TURNED, scaled(0.5, False), "images of 0.5 times the width and height of these. With"),
+        (TURNED, TURNED, scaled(1.5, True), "1.5 times the width and height of these, its principal"),
         # Cameras this close leave matches near their lines with most factors; the best one is named.
-        (NEAR, NEAR, scaled(2.0, True), "focal lengths times 0.5 and .* twice the width"),
+        (NEAR, NEAR, scaled(2.0, True), "focal lengths times 0.5 and .* 2 times the width"),
     ],
 )
 def test_a_mistake_is_named(true, given, K_given, words: str) -> None:
