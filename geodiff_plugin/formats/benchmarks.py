@@ -21,11 +21,6 @@ from geodiff_plugin.formats.rigs import (
 )
 from geodiff_plugin.types import Rig
 
-__all__ = [
-    *("KITTI_ROW", "read_foundation_stereo", "read_kitti", "read_middlebury", "read_mvsnet"),
-    "read_stereodemo",
-]
-
 MM_PER_METRE = 1000.0
 ENTRY = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE)
 #: Files are printed with three decimals, so an honest cam1 agrees with doffs better than this.

@@ -20,8 +20,6 @@ from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, r
 from geodiff_plugin.formats.video import count_frames, is_video
 from geodiff_plugin.types import Distortion
 
-__all__ = ["CaptureFiles", "CaptureFrame", "read_capture"]
-
 IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 #: Factory intrinsics that the data sets publish for files without their own.
 SEVEN_SCENES = Camera(intrinsics(525.0, 525.0, 320.0, 240.0), (640, 480))

@@ -20,11 +20,6 @@ from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, intrinsics, make_rig, names_of_pair
 from geodiff_plugin.types import Rig
 
-__all__ = [
-    *("check_colmap_names", "is_colmap", "model_files", "model_text", "read_colmap"),
-    *("read_colmap_model", "read_colmap_points", "write_colmap"),
-]
-
 #: Of a model, in the order of its numbers in binary files: how many focal lengths stand before cx cy, what
 #: ``Camera.model`` calls its lens, how many coefficients stand behind. Those that OpenCV has more are 0.
 MODELS = {

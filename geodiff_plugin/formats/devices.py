@@ -15,8 +15,6 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, intrinsics, make_rig, of_size, rigid
 from geodiff_plugin.types import Rig
 
-__all__ = ["RS_PRINTED", "read_oak", "read_realsense", "read_zed"]
-
 #: Width and height of the images that a ZED's section is for.
 ZED_SIZES = {
     **{"4K": (3840, 2160), "QHDPLUS": (3200, 1800), "2K": (2208, 1242), "FHD1200": (1920, 1200)},

@@ -9,8 +9,6 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.rigs import COEFFICIENT_COUNTS
 from geodiff_plugin.types import Distortion
 
-__all__ = ["distortion_from_text", "undistorted", "undistorted_pixels", "undistorted_points"]
-
 #: Most steps of Newton's method; near the middle of an image three suffice.
 MOST_STEPS = 50
 #: A pixel that comes back to itself this well is found.

@@ -13,8 +13,6 @@ from geodiff_plugin._checks import InputError, bad_value, check_number, warn
 from geodiff_plugin.formats.files import open_image
 from geodiff_plugin.formats.rigs import intrinsics
 
-__all__ = ["intrinsics_from_exif", "intrinsics_from_fov", "warn_of_other_lens"]
-
 _ORIENTATION, _IFD, _FOCAL, _FOCAL_35, _ZOOM = 0x0112, 0x8769, 0x920A, 0xA405, 0xA404
 _WIDTH, _HEIGHT, _X_RESOLUTION, _Y_RESOLUTION, _UNIT = 0xA002, 0xA003, 0xA20E, 0xA20F, 0xA210
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}

@@ -21,8 +21,6 @@ from geodiff_plugin.formats.rigs import (
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.types import Rig
 
-__all__ = ["nerf_camera", "nerf_frames", "nerf_pose", "read_nerf"]
-
 #: What ``Camera.model`` calls the lenses of ``camera_model``.
 MODELS = {"OPENCV": "opencv", "PINHOLE": "opencv", "SIMPLE_PINHOLE": "opencv", "OPENCV_FISHEYE": "fisheye"}
 #: Keys by which instant-ngp says that a lens is none of these.

@@ -16,8 +16,6 @@ from geodiff_plugin.formats.files import check_file, read_text
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.types import Rig
 
-__all__ = ["CALIBRATION_FORMATS", "has_pose_per_image", "read_calibration"]
-
 
 def _line(pattern: str) -> Callable[[str], object]:
     """Whether a line of a text begins so."""

@@ -18,12 +18,6 @@ from geodiff_plugin._camera_checks import check_intrinsics, check_pose
 from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_positive, refuse
 from geodiff_plugin.types import Distortion, Rig
 
-__all__ = [
-    *("COEFFICIENT_COUNTS", "CalibrationFormat", "Camera", "CameraChoice", "array_of"),
-    *("intrinsics", "is_distorted", "lens_of", "make_rig", "names_of_pair", "of_size", "projected"),
-    *("reading_whole", "rig_from_parameters", "rigid", "two_cameras"),
-]
-
 Size = tuple[int, int]
 Entry = TypeVar("Entry")
 

@@ -25,8 +25,6 @@ from geodiff_plugin.formats.rigs import (
 )
 from geodiff_plugin.types import Rig
 
-__all__ = ["read_booster", "read_euroc", "read_kalibr", "read_opencv", "read_orb_slam", "read_ros"]
-
 MM_PER_METRE = 1000.0
 #: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
 OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")

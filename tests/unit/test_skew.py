@@ -1,17 +1,11 @@
-"""A skew ``K[0, 1]`` is obeyed by every function that takes a camera matrix; one that ignores it fails."""
+"""A skew ``K[0, 1]`` is obeyed by every function that reads a camera matrix."""
 
 from __future__ import annotations
-
-import importlib
-import importlib.util
-import inspect
-import pkgutil
 
 import numpy as np
 import pytest
 import torch
 
-import geodiff_plugin
 from geodiff_plugin import GeometryGuidance, geometry
 from geodiff_plugin._camera_checks import check_intrinsics, check_size_of
 from geodiff_plugin.algorithm.evidence import prepare_evidence
@@ -32,28 +26,6 @@ K = np.array([[60.0, 14.0, 28.5], [0.0, 55.0, 24.5], [0.0, 0.0, 1.0]])
 K_RIGHT = np.array([[66.0, -9.0, 33.5], [0.0, 58.0, 22.5], [0.0, 0.0, 1.0]])
 STRAIGHT = np.where(np.abs(K) == 14.0, 0.0, K)
 DEPTH = 1.5 + np.random.default_rng(0).uniform(size=SIZE)
-
-#: The page's modules import gradio, an extra.
-HAS_GRADIO = importlib.util.find_spec("gradio") is not None
-#: Functions that hand a camera matrix on or read no coordinate of it, beside those that are tested here or in
-#: ``test_geometry``.
-HAND_ON = {
-    *("_camera_checks.check_intrinsics_fit", "_camera_checks.check_size_of"),  # the principal point alone
-    "formats.depth.disparity_of_depth",  # of rectified pairs: along rows
-    "formats.exif.warn_of_other_lens",  # or the focal length
-    *("algorithm.evidence.prepare_evidence", "algorithm.finish.vote_depth", "matching.rows.match_rows"),
-    "capture.fusion.normals_of",
-    *("cli.inputs.pinhole", "cli.inputs._read_known", "app.measure.read_pixel"),
-    *("evaluation.datasets.layouts._quartered", "pose.tracks.project_tracks"),
-    *("formats.captures.read_capture", "formats.clouds.make_cloud"),
-    *("formats.distortion.undistorted", "formats.distortion.undistorted_pixels"),  # to OpenCV
-    *("formats.distortion.undistorted_points", "pose.capture.solve_capture"),  # the latter to pycolmap
-    *("guidance.evidence.coarse_depth", "guidance.evidence.pose_views", "guidance.inputs.read_inputs"),
-    *("guidance.photographs.estimate_rig", "pose.matches.grey_views"),
-    *("matching.build.mirrored_pose_preferred", "matching.build.pilot_volume"),
-    *("pose.refine.polished", "pose.refine.refine_views", "runtime.confidence.reprojection"),
-    *("runtime.confidence.expected_error", "runtime.verdict.read_indicators"),  # the focal length
-}
 
 
 def test_shrinking_keeps_the_skew_of_the_image():
@@ -145,27 +117,3 @@ def test_a_guidance_keeps_it():
     ):
         assert np.array_equal(guidance.rigs[0].K_left, K)
         assert np.array_equal(guidance.rigs[0].K_right, K_RIGHT)
-
-
-def test_no_function_that_takes_a_camera_matrix_is_left_out():
-    tested = {"_camera_checks.check_intrinsics"} | {
-        f"{f.__module__.removeprefix('geodiff_plugin.')}.{f.__name__}"
-        for f in (
-            *(geometry.unproject, geometry.project, geometry.plane_rays, geometry.warp_right_to_left),
-            *(geometry.hidden_in_right, geometry.resize_intrinsics, geometry.resize_image),
-            *(geometry.is_rectified, to_grid, geometry.as_fine_as, build_cost_volume, sweep_planes),
-            *(align_view, points_to_matches, write_ply, render_cloud),
-            *(disparity_to_depth, depth_to_disparity),
-        )
-    }
-    there = set()
-    for module in pkgutil.walk_packages(geodiff_plugin.__path__, "geodiff_plugin."):
-        name = module.name.removeprefix("geodiff_plugin.")
-        if name.endswith("__main__") or (name.startswith("app.") and not HAS_GRADIO):
-            continue
-        for attribute, value in vars(importlib.import_module(module.name)).items():
-            if inspect.isfunction(value) and value.__module__ == module.name:
-                takes = {"K", "K_left", "K_right", "K_grid"} & set(inspect.signature(value).parameters)
-                if takes and not attribute.startswith("_"):
-                    there.add(f"{name}.{attribute}")
-    assert there - HAND_ON == tested
