@@ -38,6 +38,8 @@ MODELS = {
 CAMERA = re.compile(r"^(\d+) ([A-Z_]+) (\d+) (\d+) (.+)$", re.MULTILINE)
 IMAGE = re.compile(r"^(\d+)((?: [-+.\deE]+){7}) (\d+) (\S.*)$", re.MULTILINE)
 CAMERAS_MARK, IMAGES_MARK = "# Camera list with", "# Image list with"
+#: What a text of a model's cameras or images has.
+MARK = rf"{CAMERAS_MARK}|{IMAGES_MARK}|^\d+ (?:{'|'.join(MODELS)}) \d+ \d+ .|{IMAGE.pattern}"
 LONGEST_HEAD = 200
 #: Of an image: its number, ``(4, 4)`` T_camera_from_world, its camera's number.
 Posed = tuple[int, np.ndarray, int]
@@ -179,14 +181,6 @@ def _binary_points(path: Path) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:
     for _ in range(*take("Q")):
         x, y, z, error_px, seen = take("8x3d3xdQ")
         yield (x, y, z, error_px), take(f"{2 * seen}I")[::2]
-
-
-def is_colmap(text: str) -> bool:
-    """Whether a text is of a model's cameras or images."""
-    if CAMERAS_MARK in text or IMAGES_MARK in text:
-        return True
-    camera = CAMERA.search(text)
-    return (camera is not None and camera[2] in MODELS) or IMAGE.search(text) is not None
 
 
 def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:

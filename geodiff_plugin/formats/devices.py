@@ -24,7 +24,7 @@ ZED_SIZES = {
 ZED_LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 MM_PER_METRE = 1000.0
 
-RS_PRINTED = re.compile(r'^\s*Intrinsic of "', re.MULTILINE)
+RS_PRINTED = r'^\s*Intrinsic of "'
 RS_INTRINSIC = re.compile(
     r'^\s*Intrinsic of "Infrared ([12])" */ *\d+x\d+[^\n]*\n(.*?)(?=\n\s*\n|\Z)', re.M | re.S
 )
@@ -142,7 +142,7 @@ def _rs_json(text: str) -> tuple[Camera, Camera, np.ndarray]:
 
 def read_realsense(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """The infrared pair, whose images the camera rectifies itself, or the T265's fisheyes."""
-    printed = RS_PRINTED.search(texts[0]) is not None
+    printed = re.search(RS_PRINTED, texts[0], re.MULTILINE)
     left, right, T = _rs_printed(texts[0], choice) if printed else _rs_json(texts[0])
     return make_rig(left, right, np.linalg.inv(T), rectified=True)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,88 +16,75 @@ from geodiff_plugin.formats.files import check_file, read_text
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.types import Rig
 
-
-def _line(pattern: str) -> Callable[[str], object]:
-    """Whether a line of a text begins so."""
-    return re.compile(rf"^{pattern}", re.MULTILINE).search
-
-
-def _json(*keys: str) -> Callable[[str], object]:
-    """Whether a text is JSON that has these keys."""
-    return lambda text: text.lstrip().startswith(("{", "[")) and all(f'"{key}"' in text for key in keys)
-
-
+#: How a text of JSON begins.
+_JSON = r"\A\s*[{\[]"
 #: Every format by name. The first that recognises a file reads it: formats that others contain come first.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "middlebury": CalibrationFormat(
-        "Middlebury or ETH3D calib.txt (cam0=[...])", _line(r"\s*cam0\s*=\s*\["), benchmarks.read_middlebury
+        "Middlebury or ETH3D calib.txt (cam0=[...])", r"^\s*cam0\s*=\s*\[", benchmarks.read_middlebury
     ),
     "kitti_cam_to_cam": CalibrationFormat(
-        "KITTI (P_rect_02: ...)", _line(r"\s*P_rect_\d+\s*:"), benchmarks.read_kitti, uses_cameras=True
+        "KITTI (P_rect_02: ...)", r"^\s*P_rect_\d+\s*:", benchmarks.read_kitti, uses_cameras=True
     ),
     # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" out.
     "kitti_projections": CalibrationFormat(
-        "KITTI (P0: ...)", _line(r"\s*P[0-3]\s*:\s*[-+.\d]"), benchmarks.read_kitti, uses_cameras=True
+        "KITTI (P0: ...)", r"^\s*P[0-3]\s*:\s*[-+.\d]", benchmarks.read_kitti, uses_cameras=True
     ),
     "foundation_stereo": CalibrationFormat(
         "K.txt of FoundationStereo (9 numbers, baseline)",
-        re.compile(r"(?:[-+.\de\s,]|nan|inf)+", re.IGNORECASE).fullmatch,
+        r"\A(?i:[-+.\de\s,]|nan|inf)+\Z",
         benchmarks.read_foundation_stereo,
     ),
     "booster": CalibrationFormat(
-        "Booster xml (proj_matL)", re.compile("<opencv_st(?s:.*)proj_matL").search, robots.read_booster
+        "Booster xml (proj_matL)", r"<opencv_st[\s\S]*proj_matL", robots.read_booster
     ),
     "mvsnet": CalibrationFormat(
-        "a pair of MVSNet cam.txt (extrinsic)", _line(r"\s*extrinsic\s*$"), benchmarks.read_mvsnet, (2,)
+        "a pair of MVSNet cam.txt (extrinsic)", r"^\s*extrinsic\s*$", benchmarks.read_mvsnet, (2,)
     ),
     "zed": CalibrationFormat(
-        "ZED SN*.conf ([LEFT_CAM_HD])", _line(r"\s*\[(LEFT|RIGHT)_CAM_\w+\]"), devices.read_zed
+        "ZED SN*.conf ([LEFT_CAM_HD])", r"^\s*\[(LEFT|RIGHT)_CAM_\w+\]", devices.read_zed
     ),
     "realsense": CalibrationFormat(
         "RealSense (rs-enumerate-devices -c, or rs2 as JSON)",
-        lambda text: devices.RS_PRINTED.search(text) or _json("ppx")(text),
+        rf'{devices.RS_PRINTED}|{_JSON}(?=[\s\S]*"ppx")',
         devices.read_realsense,
     ),
     "oak": CalibrationFormat(
-        "OAK-D JSON (cameraData)", _json("cameraData"), devices.read_oak, uses_cameras=True
+        "OAK-D JSON (cameraData)", _JSON + r'(?=[\s\S]*"cameraData")', devices.read_oak, uses_cameras=True
     ),
     "nerf": CalibrationFormat(
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
-        _json("frames", "transform_matrix"),
+        _JSON + r'(?=[\s\S]*"frames")(?=[\s\S]*"transform_matrix")',
         nerf.read_nerf,
         by_image=True,
     ),
     "kalibr": CalibrationFormat(
-        "Kalibr camchain.yaml (cam0)", _line(r"cam\d+:\s*(?:#.*)?$"), robots.read_kalibr, uses_cameras=True
+        "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", robots.read_kalibr, uses_cameras=True
     ),
-    "euroc": CalibrationFormat(
-        "a pair of EuRoC sensor.yaml (T_BS)", _line(r"T_BS\s*:"), robots.read_euroc, (2,)
-    ),
+    "euroc": CalibrationFormat("a pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", robots.read_euroc, (2,)),
     # Older settings describe the rectification too, and OpenCV's reader has these names.
     "orb_slam": CalibrationFormat(
         "ORB-SLAM's stereo settings (Camera1.fx, Camera.bf)",
-        re.compile(r"(?ms)\A(?!.*^LEFT\.P[ \t]*:).*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:").search,
+        r"\A(?![\s\S]*^LEFT\.P[ \t]*:)[\s\S]*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:",
         robots.read_orb_slam,
     ),
     "opencv": CalibrationFormat(
         "OpenCV YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
-        re.compile('!!opencv-matrix|<opencv_storage|"opencv-matrix"').search,
+        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"',
         robots.read_opencv,
         (1, 2),
     ),
     "ros": CalibrationFormat(
         "a pair of ROS camera_info (projection_matrix)",
-        _line(r"(projection_matrix|distortion_model|rectification_matrix)\s*:"),
+        r"^(projection_matrix|distortion_model|rectification_matrix)\s*:",
         robots.read_ros,
         (2,),
     ),
-    "stereodemo": CalibrationFormat("stereodemo JSON (fx)", _json("fx"), benchmarks.read_stereodemo),
+    "stereodemo": CalibrationFormat(
+        "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', benchmarks.read_stereodemo
+    ),
     "colmap": CalibrationFormat(
-        "a COLMAP model (cameras.txt and images.txt)",
-        colmap.is_colmap,
-        colmap.read_colmap,
-        (2,),
-        by_image=True,
+        "a COLMAP model (cameras.txt and images.txt)", colmap.MARK, colmap.read_colmap, (2,), by_image=True
     ),
 }
 
@@ -123,9 +110,9 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
 
 def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
     """The format that all files have, as many as it needs."""
-    names = []
+    names, marks = [], CALIBRATION_FORMATS.items()
     for path, text in texts.items():
-        name = next((name for name, entry in CALIBRATION_FORMATS.items() if entry.matches(text)), None)
+        name = next((name for name, each in marks if re.search(each.mark, text, re.MULTILINE)), None)
         if name is None:
             formats = "; ".join(entry.summary for entry in CALIBRATION_FORMATS.values())
             cure = "Is this the right file? Otherwise give fx, fy, cx, cy and baseline, or K and E."

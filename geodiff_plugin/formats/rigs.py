@@ -65,8 +65,9 @@ class CalibrationFormat:
     """One entry of ``CALIBRATION_FORMATS``.
 
     Attributes:
-        summary: the format and its mark, for messages.
-        matches: whether a text is of this format, given that no format before it in the table matches.
+        summary: the format, for messages.
+        mark: the regular expression that a text of this format, and of none before it in the table, has;
+            ``^`` and ``$`` are ends of lines.
         read: what a file says, by ``make_rig``. It may raise whatever a missing entry raises, which
             ``read_calibration`` turns into a sentence with the file's name.
         file_counts: how many files may describe one pair.
@@ -75,7 +76,7 @@ class CalibrationFormat:
     """
 
     summary: str
-    matches: Callable[[str], object]
+    mark: str
     read: Callable[[tuple[str, ...], CameraChoice], Rig]
     file_counts: tuple[int, ...] = (1,)
     uses_cameras: bool = False
