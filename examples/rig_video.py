@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
-from geodiff_plugin.formats.video import VideoReader, count_frames
+from geodiff_plugin.formats.recordings import VideoReader, count_frames
 from geodiff_plugin.plotting import depth_frames, write_depth_video
 from tests.scenes.sequences import render_sequence
 

@@ -45,10 +45,8 @@ from geodiff_plugin.formats.files import file_digest
 
 try:
     import fcntl
-except ImportError:  # no locks: processes keep to their shares, and two runs of one job do its work twice
-    CAN_LOCK = False
-else:
-    CAN_LOCK = True
+except ImportError:  # Windows: two processes may do the same work twice
+    fcntl = None  # type: ignore[assignment]
 
 __all__ = ["BROKEN", "Item", "Journal", "Record", "Runner", "fingerprint", "this_process"]
 
@@ -148,7 +146,7 @@ class Journal:
             cure = "Name another, or free disk space and check its permissions."
             got = f"{path.parent} ({error.strerror or error})"
             bad_value("--out", "a folder that can be written to", got, cure)
-        weakref.finalize(self, self._file.close)
+        self.close = weakref.finalize(self, self._file.close)
         self.refresh()
         self._records = {key: r for key, r in self._records.items() if r.get("status") != BROKEN}
 
@@ -188,7 +186,7 @@ class Journal:
         self._records[item.key, item.inputs] = record
 
     def _lock(self, byte: int, wait: bool = False) -> bool:
-        if CAN_LOCK:
+        if fcntl:
             try:
                 fcntl.lockf(self._file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, byte)
             except (BlockingIOError, PermissionError):
@@ -196,7 +194,7 @@ class Journal:
         return True
 
     def _unlock(self, byte: int) -> None:
-        if CAN_LOCK:
+        if fcntl:
             fcntl.lockf(self._file, fcntl.LOCK_UN, 1, byte)
 
     def claim(self, item: Item) -> bool:

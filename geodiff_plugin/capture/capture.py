@@ -18,7 +18,7 @@ from geodiff_plugin.formats.captures import CaptureFiles, CaptureFrame, read_cap
 from geodiff_plugin.formats.depth import read_depth_png
 from geodiff_plugin.formats.distortion import undistorted
 from geodiff_plugin.formats.images import read_image
-from geodiff_plugin.formats.video import VideoReader
+from geodiff_plugin.formats.recordings import VideoReader
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput

@@ -53,7 +53,7 @@ def _with_folder(options: DepthOptions, default: str) -> DepthOptions:
 
 def _depth(options: DepthOptions) -> None:
     from geodiff_plugin.cli.pairs import is_many, start_many
-    from geodiff_plugin.formats.bags import is_bag
+    from geodiff_plugin.formats.recordings import is_bag
 
     if is_bag(options.left):
         _imported("cli.many.run_bag")(options)

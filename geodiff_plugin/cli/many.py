@@ -22,19 +22,20 @@ from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, check_files, ou
 from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, assumption, check_pair, options_of, start_many
 from geodiff_plugin.cli.report import read_report
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, Warner, collected_warnings, new_table, say, show
-from geodiff_plugin.formats.bags import (
+from geodiff_plugin.formats.files import file_digest
+from geodiff_plugin.formats.out import atomic_path, reason_of, write_text
+from geodiff_plugin.formats.reading import has_pose_per_image
+from geodiff_plugin.formats.recordings import (
     BAG_SUFFIXES,
     BagReader,
     Stamp,
+    VideoReader,
+    both_halves,
     is_bag,
     list_pairs,
     stereo_calibration,
     write_depth_bag,
 )
-from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.formats.out import atomic_path, reason_of, write_text
-from geodiff_plugin.formats.reading import has_pose_per_image
-from geodiff_plugin.formats.video import VideoReader, both_halves
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.options import flag_of
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner
@@ -255,6 +256,7 @@ def _any_fails(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
         raise ended.__cause__ from None
     except InputError:  # all of them, for one reason: no folder is left behind
         with suppress(OSError):
+            journal.close()  # Windows removes no open file
             journal.path.unlink()
             journal.path.parent.rmdir()
         raise

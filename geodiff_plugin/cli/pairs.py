@@ -17,10 +17,9 @@ from PIL import Image
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.options import DepthOptions, check_files, told_apart
-from geodiff_plugin.formats.bags import is_bag, list_pairs
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.out import check_out
-from geodiff_plugin.formats.video import VIDEOS, count_frames, is_video
+from geodiff_plugin.formats.recordings import VIDEOS, count_frames, is_bag, is_video, list_pairs
 
 #: The table of a run, and its columns.
 SUMMARY = "pairs.csv"

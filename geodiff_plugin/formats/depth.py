@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import zipfile
 import zlib
@@ -41,7 +40,7 @@ def row_strips(height: int, width: int) -> Iterator[slice]:
 
 
 def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
-    """The ``(H, W)`` or ``(H, W, 3)`` float32 of a portable float map, top row first, unlike the file.
+    """The ``(H, W)`` float32 of a grey portable float map, top row first, unlike the file.
 
     Infinity and 0, which data sets use for "unknown", stay as they are.
     """
@@ -54,26 +53,23 @@ def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
         except ValueError:
             kind, width, height, scale = b"", 0, 0, 0.0
         data = stream.read()
-    if kind not in (b"Pf", b"PF") or min(width, height) < 1:
-        expected = "a PFM file (Pf or PF, size, scale)"
+    if kind != b"Pf" or min(width, height) < 1:
+        expected = "a grey PFM file (Pf, size, scale)"
         bad_value(name, expected, f"{file}, whose head is another", "Is it a PNG or npy?")
-    shape = (height, width) if kind == b"Pf" else (height, width, 3)
-    size = 4 * math.prod(shape)
+    size = 4 * width * height
     if len(data) < size:
         got = f"{file} with {len(data)}"
         bad_value(name, f"a whole PFM file of {size} bytes of data", got, "Is it cut off?")
     values = np.frombuffer(data[:size], dtype="<f4" if scale < 0 else ">f4")
-    return np.flipud(values.reshape(shape)).astype(np.float32)
+    return np.flipud(values.reshape(height, width)).astype(np.float32)
 
 
 def write_pfm(path: PathLike, values: np.ndarray) -> None:
-    """Write ``(H, W)`` or ``(H, W, 3)`` floats as a little-endian portable float map, whole or not at all."""
-    values = np.asarray(values, dtype="<f4")
-    if values.ndim != 2 and values.shape[2:] != (3,):
-        bad_value("values", "of shape (H, W) or (H, W, 3)", f"shape {values.shape}")
+    """Write ``(H, W)`` floats as a little-endian portable float map, whole or not at all."""
+    values = _check_map(values)
     with atomic_path(path) as temporary:
-        head = f"{'Pf' if values.ndim == 2 else 'PF'}\n{values.shape[1]} {values.shape[0]}\n-1.0\n"
-        temporary.write_bytes(head.encode() + np.flipud(values).tobytes())
+        head = f"Pf\n{values.shape[1]} {values.shape[0]}\n-1.0\n".encode()
+        temporary.write_bytes(head + np.flipud(values).astype("<f4").tobytes())
 
 
 def _check_map(depth_m: np.ndarray) -> np.ndarray:

@@ -21,10 +21,8 @@ from geodiff_plugin._checks import FolderError, InputFileError, MissingFileError
 
 try:
     import fcntl
-except ImportError:  # where there is no flock, two runs with one folder are not detected
-    CAN_LOCK = False
-else:
-    CAN_LOCK = True
+except ImportError:  # Windows: two runs with one folder are not detected
+    fcntl = None  # type: ignore[assignment]
 
 __all__ = ["PARTIAL", "OutFolder", "atomic_path", "check_out", "free_folder", "reason_of", "write_text"]
 
@@ -118,7 +116,7 @@ def _take(hidden: Path, stack: ExitStack) -> bool:
     The kernel gives a lock back when its process ends, however it ends.
     """
     file = stack.enter_context(open(hidden / LOCK, "ab"))
-    if not CAN_LOCK:
+    if not fcntl:
         return True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -21,7 +21,7 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli import many
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.pairs import assumption, find_pairs
-from geodiff_plugin.formats.video import VideoReader, both_halves, count_frames
+from geodiff_plugin.formats.recordings import VideoReader, both_halves, count_frames
 from tests.cli.conftest import QUICK, call, never, report_of, write_pair
 
 COMMAND = ["depth", "left", "right", "--calib", "calib.txt", "--prior", "prior", "--out", "out", *QUICK]

@@ -10,7 +10,7 @@ import pytest
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import read_calibration
-from geodiff_plugin.formats.bags import (
+from geodiff_plugin.formats.recordings import (
     BagReader,
     Stamp,
     is_bag,

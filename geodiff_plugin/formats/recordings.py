@@ -1,4 +1,4 @@
-"""Recorded bags of ROS 1, ROS 2 and MCAP by ``rosbags`` (extra ``ros``): pairs of images, cameras, depth."""
+"""Videos, read by OpenCV, and bags of ROS 1, ROS 2 and MCAP, by ``rosbags`` (extra ``ros``)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import os
 import struct
 import tempfile
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -17,10 +18,15 @@ import yaml
 
 from geodiff_plugin._checks import InputFileError, bad_value, refuse
 from geodiff_plugin.formats.depth import depth_mm
+from geodiff_plugin.formats.files import check_file
 
-__all__ = ["BAG_SUFFIXES", "BagReader", "is_bag", "list_pairs", "stereo_calibration", "write_depth_bag"]
+__all__ = [
+    *("BAG_SUFFIXES", "VIDEOS", "BagReader", "Stamp", "VideoReader", "both_halves", "count_frames", "is_bag"),
+    *("is_video", "list_pairs", "stereo_calibration", "write_depth_bag"),
+]
 
-#: What an output may be: one MCAP file of ROS 2, or a bag of ROS 1.
+#: Suffixes of videos, and of bags that can be written: one MCAP file of ROS 2, or a bag of ROS 1.
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 BAG_SUFFIXES = (".mcap", ".bag")
 #: Encoding of a raw image -> type of its numbers, channels, and what makes RGB of it. OpenCV names Bayer
 #: patterns by the second row, ROS by the first.
@@ -29,13 +35,70 @@ ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
     "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
     "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB),
-    "8UC1": ("u1", 1, cv2.COLOR_GRAY2RGB),
-    "16UC1": ("u2", 1, cv2.COLOR_GRAY2RGB),
 }
 for _bits in (8, 16):
     for _name, _opencv in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")):
         ENCODINGS[f"bayer_{_name}{_bits}"] = (f"u{_bits // 8}", 1, getattr(cv2, f"COLOR_Bayer{_opencv}2RGB"))
-    ENCODINGS[f"mono{_bits}"] = (f"u{_bits // 8}", 1, cv2.COLOR_GRAY2RGB)
+    for _name in (f"mono{_bits}", f"{_bits}UC1"):
+        ENCODINGS[_name] = (f"u{_bits // 8}", 1, cv2.COLOR_GRAY2RGB)
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file is named as a video is."""
+    return path.suffix.lower() in VIDEOS
+
+
+def _open_video(path: Path, name: str) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(str(check_file(path, name, "a video file")))
+    if not capture.isOpened():
+        cure = "Convert it, or extract its frames into a folder."
+        bad_value(name, "a video that OpenCV reads", path, cure)
+    return capture
+
+
+def count_frames(path: Path, name: str = "video") -> int:
+    """How many frames a video has, by going through it: heads of videos are not to be relied on."""
+    capture, count = _open_video(path, name), 0
+    while capture.grab():
+        count += 1
+    capture.release()
+    if count == 0:
+        bad_value(name, "a video with frames in it", f"{path}, which has none")
+    return count
+
+
+class VideoReader(AbstractContextManager["VideoReader"]):
+    """Frames of a video file, cheapest in order; a context manager."""
+
+    def __init__(self, path: Path, name: str = "video") -> None:
+        self._path, self._name = path, name
+        self._capture, self._next = _open_video(path, name), 0
+
+    def __exit__(self, *_: object) -> None:
+        self._capture.release()
+
+    def read(self, frame: int) -> np.ndarray:
+        """One frame, ``(H, W, 3)`` float32 in [0, 1], RGB, by its number from 0."""
+        if frame < self._next:
+            self._capture.release()
+            self._capture, self._next = _open_video(self._path, self._name), 0
+        while self._next < frame and self._capture.grab():
+            self._next += 1
+        read, image = self._capture.read() if self._next == frame else (False, None)
+        if not read:
+            raise InputFileError(f"frame {frame} of {self._path} does not decode.")
+        self._next += 1
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255.0
+
+
+def both_halves(image_01: np.ndarray, name: str = "video") -> tuple[np.ndarray, np.ndarray]:
+    """Left and right view of a frame ``(H, 2 W, 3)`` that has them side by side, left one first."""
+    width = image_01.shape[1]
+    if width % 2:
+        cure = "Or give the right view's video as RIGHT."
+        bad_value(name, "both views side by side, so of even width", f"{width} pixels wide", cure)
+    left, right = np.split(image_01, 2, axis=1)
+    return np.ascontiguousarray(left), np.ascontiguousarray(right)
 
 
 class Stamp(NamedTuple):
@@ -50,7 +113,7 @@ def is_bag(path: Path) -> bool:
     return path.suffix in (*BAG_SUFFIXES, ".db3") or os.path.isfile(path / "metadata.yaml")
 
 
-def _open(path: Path) -> Any:
+def _open_bag(path: Path) -> Any:
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -80,7 +143,7 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
     """The stamps of the images that belong together, each right one to one left one, in order."""
     stamps: list[list[Stamp]] = []
     try:
-        with _open(path) as reader:
+        with _open_bag(path) as reader:
             for topic in topics:
                 messages = reader.messages(_connections(reader, path, topic))
                 stamps.append(sorted(Stamp(_header_stamp(raw, reader.is2), at) for _, at, raw in messages))
@@ -102,19 +165,16 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
     return tuple(pairs)
 
 
-class BagReader:
+class BagReader(AbstractContextManager["BagReader"]):
     """Both images of the pairs of ``list_pairs``, side by side as in a video; a context manager."""
 
     def __init__(self, path: Path, topics: tuple[str, str], tolerance_s: float) -> None:
         self._path, self._pairs = path, list_pairs(path, topics, tolerance_s)
-        self._reader = _open(path)
+        self._reader = _open_bag(path)
         self._reader.open()
         self._connections = [_connections(self._reader, path, topic) for topic in topics]
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self._reader.close()
 
     def read(self, frame: int) -> np.ndarray:
@@ -157,7 +217,7 @@ def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], 
     Topics with "rect" in their name are of rectified images, others of the images as taken.
     """
     texts, frames = [], []
-    with _open(path) as reader:
+    with _open_bag(path) as reader:
         for topic in topics:
             base, _, name = topic.removesuffix("/compressed").rpartition("/")
             named = [c for c in reader.connections if c.topic == f"{base}/camera_info"]
