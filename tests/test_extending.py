@@ -17,7 +17,6 @@ from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
-from geodiff_plugin.evaluation.experiment import cell_key
 from geodiff_plugin.evaluation.metrics import align
 from geodiff_plugin.formats import CALIBRATION_FORMATS, read_calibration
 from geodiff_plugin.matching import points_to_matches
@@ -123,10 +122,6 @@ def test_a_format_a_data_set_and_a_method(page, textured_plane, tmp_path):
     (folder / "cameras").write_text(f"ink 1\n{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]} {E[0, 3]}\n")
     np.testing.assert_allclose(read_calibration(folder / "cameras").E, E)
     (ref,) = find_pairs(tmp_path)
-    key = cell_key(ref, "flat", {})
-    np.save(folder / "depth.npy", 2 * pair.depth_m.astype(np.float32))
-    assert cell_key(ref, "flat", {}) != key
-    np.save(folder / "depth.npy", pair.depth_m.astype(np.float32))
     sample = load(ref)
     assert sample.label == "ink/one" and sample.depth_m.shape == pair.depth_m.shape
     prediction = find_method("flat").run(sample, Settings(), PriorCache())

@@ -61,11 +61,11 @@ def _list(options: _ListOptions) -> None:
         there = "not found" if options.data is not None else "no --data given"
         if count or not dataset.needs_folder:
             there = f"{count or 'any number of'} {'sample' if count == 1 else 'samples'}"
-        full = f" of {dataset.full_count}" if count and dataset.full_count else ""
-        rows.append((name, f"{there}{full}\n{dataset.obtain}"))
+        rows.append((name, f"{there}\n{dataset.obtain}"))
     rows += [("", ""), *((name, method.summary) for name, method in METHODS.items())]
     for name, family in FAMILIES.items():
-        summary = re.split(r"[.;]", family.__doc__ or " ", maxsplit=1)[0]
+        about = getattr(family, "func", family).__doc__  # of a partial the function's
+        summary = re.split(r"[.;]", about or " ", maxsplit=1)[0]
         rows.append((f"{name}:...", f"{summary[0].lower()}{summary[1:]}"))
     rows.append(("METHOD@PRIOR", "a method that uses a prior, with another one than --prior's first"))
     rows.append(("METHOD#SEED", "the same with another seed than --seed; METHOD@PRIOR#SEED for both"))

@@ -11,7 +11,12 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, PAPER
 from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import GUIDED_METHODS, variant
-from geodiff_plugin.evaluation.baselines.unguided import STEREO_METHODS, files_method, hf_method
+from geodiff_plugin.evaluation.baselines.unguided import (
+    STEREO_METHODS,
+    files_method,
+    hf_method,
+    prior_map_method,
+)
 
 __all__ = ["FAMILIES", "METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
 __all__ += ["find_method", "with_poses", "with_priors", "with_seeds"]
@@ -24,7 +29,7 @@ FAMILIES: dict[str, Callable[[str], Method]] = {
     "paper": partial(variant, "paper", PAPER),
     "hf": hf_method,
     "files": files_method,
-    "prior-map": partial(files_method, guided=True),
+    "prior-map": prior_map_method,
 }
 """Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter."""
 

@@ -264,10 +264,10 @@ GUIDED_METHODS = (
 
 
 def variant(base: str, config: GuidanceConfig, text: str) -> Method:
-    """The preset of a name with some knobs changed, ``knob=value``, several joined by ``+``.
+    """A preset with some knobs changed.
 
-    ``weights.matches=0`` changes one weight, ``guided:pose=estimated`` withholds the poses. ``InputError``
-    names another form, an unknown knob, or a value that it cannot have.
+    ``text`` is ``knob=value``, several joined by ``+``; ``weights.matches=0`` changes one weight, and
+    ``guided:pose=estimated`` withholds the poses. ``InputError`` names a knob or value that there is not.
     """
     name = f"{base}:{text}"
     if name == "guided:pose=estimated":

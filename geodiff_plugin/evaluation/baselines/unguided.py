@@ -176,7 +176,7 @@ def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Predicti
 
 
 def files_method(text: str, guided: bool = False) -> Method:
-    """Maps that were made elsewhere, in a folder: files:DIR or files:KIND:DIR; prior-map:DIR guides them.
+    """Maps that were made elsewhere, in a folder: files:DIR or files:KIND:DIR.
 
     Args:
         text: ``DIR`` or ``KIND:DIR`` with a key of ``KINDS``. The map of a sample is
@@ -215,3 +215,8 @@ def files_method(text: str, guided: bool = False) -> Method:
     summary = f"maps of {title} ({KINDS[kind]})" + (", guided" if guided else "")
     title = f"guided {title}" if guided else title
     return Method(name, title, summary, run, configuration, uses_prior=False)
+
+
+def prior_map_method(text: str) -> Method:
+    """Such maps as the prior of the default preset: prior-map:DIR or prior-map:KIND:DIR."""
+    return files_method(text, guided=True)

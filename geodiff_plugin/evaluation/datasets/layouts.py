@@ -402,13 +402,11 @@ LAYOUTS = (
         "data_scene_flow.zip and data_scene_flow_calib.zip from "
         "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (CC BY-NC-SA 3.0), unpacked into one "
         "folder.",
-        full_count=200,
     ),
     Dataset(
         *("kitti2012", partial(_find_kitti, name="kitti2012"), _load_kitti, KITTI_CAP_M),
         "data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php "
         "(CC BY-NC-SA 3.0), unpacked into one folder.",
-        full_count=194,
     ),
     Dataset(
         *("middlebury2014", partial(_find_scenes, name="middlebury2014"), _load_scene, None),
@@ -418,19 +416,16 @@ LAYOUTS = (
         *("middeval3", partial(_find_scenes, name="middeval3"), _load_scene, None),
         "MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from "
         "https://vision.middlebury.edu/stereo/submit3/, unpacked into one folder.",
-        full_count=15,
     ),
     Dataset(
         *("eth3d", partial(_find_scenes, name="eth3d"), _load_scene, None),
         "two_view_training.7z and two_view_training_gt.7z from https://www.eth3d.net/datasets "
         "(CC BY-NC-SA 4.0), unpacked into two_view_training and two_view_training_gt.",
-        full_count=27,
     ),
     Dataset(
         *("booster", _find_booster, _load_booster, 10.0),
         "booster_gt.zip from https://cvlab-unibo.github.io/booster-web/ (non-commercial research), "
         "unpacked: train/balanced/<scene>.",
-        full_count=228,
     ),
     Dataset(
         *("mvsnet", find_mvsnet, _load_posed, None),
@@ -444,7 +439,6 @@ LAYOUTS = (
         "download_tanks_and_temples.sh of https://github.com/lmb-freiburg/robustmvd; then cams/ and pair.txt "
         "from its sample list as docs/how-to/evaluation.md shows.",
         ("pairs", "pixel_centre"),
-        full_count=sum(map(len, KEY_VIEWS.values())),
     ),
     Dataset(
         *("folder", _find_folders, _load_folder, None),

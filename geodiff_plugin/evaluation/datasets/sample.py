@@ -104,7 +104,6 @@ class Dataset:
         cap_m: farthest truth that counts in the set's own protocol, metres; ``None`` for no limit.
         obtain: how to get the set, one sentence with its address and licence.
         options: keywords that ``find`` takes beside the folder.
-        full_count: number of pairs in the set as the paper used it; ``None`` where it does not apply.
         needs_folder: whether there is a folder to look into; not for what is rendered.
     """
 
@@ -114,7 +113,6 @@ class Dataset:
     cap_m: float | None
     obtain: str
     options: tuple[str, ...] = ()
-    full_count: int | None = None
     needs_folder: bool = True
 
 
