@@ -34,6 +34,7 @@ SCHEDULERS = {
     **{f"ddpm-{p}": lambda p=p: DDPMScheduler(**BETAS, clip_sample=False, prediction_type=p) for p in TYPES},
     "lcm": lambda: LCMScheduler(**BETAS, prediction_type="v_prediction", original_inference_steps=50),
     **{f"dpm-{p}": lambda p=p: DPMSolverMultistepScheduler(**BETAS, prediction_type=p) for p in TYPES},
+    "flow": FlowMatchEulerDiscreteScheduler,
     "dpm-zero-snr": lambda: DPMSolverMultistepScheduler(
         **BETAS, prediction_type="v_prediction", rescale_betas_zero_snr=True, timestep_spacing="trailing"
     ),
@@ -66,25 +67,18 @@ def walk(make, edit=None, steps=4):
 @pytest.mark.parametrize("name", SCHEDULERS)
 def test_z0_hat_is_the_schedulers_own(name):
     for z0, _, own in walk(SCHEDULERS[name]):
-        if own is None:
-            pytest.skip("this scheduler does not return its clean latent; the last-step test covers it")
-        torch.testing.assert_close(z0, own, atol=2e-5, rtol=2e-5)
-
-
-@pytest.mark.parametrize("name", SCHEDULERS)
-def test_round_trip_leaves_every_step_as_it_was(name):
-    """output_from(z0_from, noise_from) fed to step gives the z_{t-1} of the untouched call."""
-    if "clip" in name:
-        pytest.skip("a clipped clean latent and the unclipped noise do not make up z_t")
-    plain = [z for _, z, _ in walk(SCHEDULERS[name])]
-    rebuilt = [z for _, z, _ in walk(SCHEDULERS[name], edit=lambda z0: z0)]
-    for a, b in zip(plain, rebuilt, strict=True):
-        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)
+        if (
+            own is not None
+        ):  # the DPM solvers return no clean latent; an edit that reaches the end covers them
+            torch.testing.assert_close(z0, own, atol=2e-5, rtol=2e-5)
 
 
 @pytest.mark.parametrize("name", [n for n in SCHEDULERS if "clip" not in n])
-def test_an_edit_reaches_the_end(name):
-    """With the clean latent set to a constant at every step, the constant comes out at the end."""
+def test_steps_are_rebuilt_and_an_edit_reaches_the_end(name):
+    """A clipped clean latent and the unclipped noise do not make up z_t; of all others they do."""
+    plain, rebuilt = ([z for _, z, _ in walk(SCHEDULERS[name], edit)] for edit in (None, lambda z0: z0))
+    for a, b in zip(plain, rebuilt, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)
     target = torch.full((2, 4, 3, 5), 0.25)
     *_, (_, last, _) = walk(SCHEDULERS[name], edit=lambda z0: target, steps=5)
     torch.testing.assert_close(last, target, atol=0.12 if name.startswith("ddpm") else 1e-3, rtol=0)
@@ -93,39 +87,24 @@ def test_an_edit_reaches_the_end(name):
 def test_a_changed_clean_latent_enters_the_multistep_history():
     scheduler = SCHEDULERS["dpm-v_prediction"]()
     scheduler.set_timesteps(6)
-    z_t, output = draw(0)
-    level = noise_level(scheduler, scheduler.timesteps[0])
+    t, (z_t, output) = scheduler.timesteps[0], draw(0)
+    level = noise_level(scheduler, t)
     edited = z0_from(output, z_t, level) + 1.0
-    scheduler.step(*_feed(edited, noise_from(output, z_t, level), level, scheduler.timesteps[0]))
+    output, z_t = output_from(edited, noise_from(output, z_t, level), level)
+    scheduler.step(output, t, z_t)
     torch.testing.assert_close(scheduler.model_outputs[-1], edited, atol=1e-4, rtol=1e-4)
 
 
-def _feed(z0, eps, level, t):
-    output, z_t = output_from(z0, eps, level)
-    return output, t, z_t
-
-
-def test_flow_matching_levels():
-    scheduler = FlowMatchEulerDiscreteScheduler()
-    scheduler.set_timesteps(4)
-    clean, noise = draw(0)
-    for t in scheduler.timesteps:
-        level = noise_level(scheduler, t)
-        output, z_t = output_from(clean, noise, level)
-        torch.testing.assert_close(z0_from(output, z_t, level), clean, atol=1e-5, rtol=1e-5)
-        torch.testing.assert_close(noise_from(output, z_t, level), noise, atol=1e-5, rtol=1e-5)
-        following = scheduler.step(output, t, z_t).prev_sample
-    torch.testing.assert_close(following, clean, atol=1e-5, rtol=1e-5)
-
-
-def test_noise_prediction_with_zero_terminal_snr_is_refused():
-    with pytest.raises(ValueError, match="rescale_betas_zero_snr"):
-        check_scheduler(ddim(prediction_type="epsilon", rescale_betas_zero_snr=True))
-
-
-def test_a_scheduler_without_family_is_refused():
-    with pytest.raises(TypeError, match="pipe.scheduler"):
-        check_scheduler(EulerDiscreteScheduler())
+@pytest.mark.parametrize(
+    ("scheduler", "error", "sentence"),
+    [
+        (ddim(prediction_type="epsilon", rescale_betas_zero_snr=True), ValueError, "rescale_betas_zero_snr"),
+        (EulerDiscreteScheduler(), TypeError, "pipe.scheduler"),
+    ],
+)
+def test_schedulers_that_cannot_be_guided_are_refused(scheduler, error, sentence):
+    with pytest.raises(error, match=sentence):
+        check_scheduler(scheduler)
 
 
 def test_leading_ddim_is_respaced_and_nothing_else():
