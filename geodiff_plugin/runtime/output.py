@@ -148,7 +148,7 @@ def assemble_output(
     uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
     if uncertainty is not None and support is not None:
         uncertainty = _spread_of_members(run, depth_m, lefts, call)
-    Ks = torch.stack([torch.as_tensor(i.K_left, dtype=torch.float32) for i in guidance.inputs]).to(depth_m)
+    Ks = torch.stack([torch.as_tensor(i.K_left, device="cpu").float() for i in guidance.inputs]).to(depth_m)
     K = resize_intrinsics(Ks, size, grid)
     visible, error = _reprojected(run, depth_m, lefts, K)
     prior_error = run.prior_error()  # (N, 1, 1, 1), or of every pixel with the measured one as the least

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from diffusers.modular_pipelines import SequentialPipelineBlocks
 from diffusers.modular_pipelines.qwenimage.encoders import QwenImageEditResizeStep
 from PIL import Image
@@ -37,15 +36,17 @@ def views(textured_plane):
     return {"image": left, "right": right, "K": textured_plane.K, "E": textured_plane.E, "knobs": KNOBS}
 
 
-def test_it_is_the_guided_call(block, views):
-    prior = make_depthmaster()
+@pytest.fixture
+def pipe(block):
     pipe = block.GuidedDepthBlock().init_pipeline()
-    pipe.update_components(prior=prior)
-    state = pipe(**views, generator=torch.Generator().manual_seed(0))
+    pipe.update_components(prior=make_depthmaster())
+    return pipe
+
+
+def test_it_is_the_guided_call(pipe, views):
+    state = pipe(**views)
     guidance = GeometryGuidance(views["right"], views["K"], views["E"], **KNOBS)
-    out = enable_geometry_guidance(prior)(
-        views["image"], guidance=guidance, generator=torch.Generator().manual_seed(0)
-    )
+    out = enable_geometry_guidance(make_depthmaster())(views["image"], guidance=guidance)
     assert np.array_equal(state.get("depth_m"), out.prediction[0, ..., 0])
     assert np.array_equal(state.get("confidence"), out.confidence[0, ..., 0])
     assert state.get("guided_output").history
@@ -65,9 +66,7 @@ def test_it_composes_with_a_block_of_diffusers(block, views):
     assert np.corrcoef(picture.ravel(), nearness.ravel())[0, 1] > 0.9
 
 
-def test_points_alone_and_a_calibration_file(block, views, textured_plane, tmp_path):
-    pipe = block.GuidedDepthBlock().init_pipeline()
-    pipe.update_components(prior=make_depthmaster())
+def test_points_alone_and_a_calibration_file(pipe, views, textured_plane, tmp_path):
     points = np.zeros_like(textured_plane.depth_m)
     points[::6, ::6] = textured_plane.depth_m[::6, ::6]
     depth_m = pipe(image=views["image"], K=views["K"], points=points, knobs=KNOBS, output="depth_m")

@@ -33,11 +33,8 @@ def test_it_is_the_guided_call(sample, textured_plane):
     told = model.input_adapter(**sample, depth_range=(np.array([0.1]), np.array([100.0])))
     np.testing.assert_allclose(told["E"][0], pair.E, atol=1e-6)
     pred, aux = model.output_adapter(model(**told))
-    again = model.pipe(
-        pair.left,
-        guidance=GeometryGuidance(pair.right, pair.K, pair.E, **FAST),
-        generator=torch.Generator().manual_seed(0),
-    )
+    guidance, seed = GeometryGuidance(pair.right, pair.K, pair.E, **FAST), torch.Generator().manual_seed(0)
+    again = model.pipe(pair.left, guidance=guidance, generator=seed)
     np.testing.assert_allclose(pred["depth"][0, 0], again.prediction[0, ..., 0], rtol=1e-3)
     assert pred["depth_uncertainty"].shape == pred["depth"].shape == (1, 1, *pair.depth_m.shape)
     assert pred["depth_uncertainty"].min() >= 0 and pred["depth_uncertainty"].max() <= 1 and aux["verdict"]

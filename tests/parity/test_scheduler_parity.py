@@ -67,9 +67,7 @@ def walk(make, edit=None, steps=4):
 @pytest.mark.parametrize("name", SCHEDULERS)
 def test_z0_hat_is_the_schedulers_own(name):
     for z0, _, own in walk(SCHEDULERS[name]):
-        if (
-            own is not None
-        ):  # the DPM solvers return no clean latent; an edit that reaches the end covers them
+        if own is not None:  # the DPM solvers return no clean latent
             torch.testing.assert_close(z0, own, atol=2e-5, rtol=2e-5)
 
 
