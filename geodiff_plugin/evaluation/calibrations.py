@@ -151,8 +151,7 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
 
     said = f"Prior {options.prior[0]}, seed {options.seed}. All pixels with truth, metres as they come out."
     cells, title = [cell for own in columns for items in own.values() for cell in items], "Results by pose"
-    purpose = "How accurate depth is if poses are exact, perturbed, refined or withheld."
-    return run_experiment(name, options, title, cells, page_tables, lambda _: [said], purpose, RECORDS_NAME)
+    return run_experiment(name, options, title, cells, page_tables, lambda _: [said], RECORDS_NAME)
 
 
 #: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.
@@ -283,5 +282,4 @@ def run_trust(name: str, options: TrustOptions) -> Page | None:
     def page_tables(records: list[Record]) -> list[Table]:
         return [_table(group, own) for group, own in tables.grouped(records, "group").items()]
 
-    purpose = "How many wrong calibrations a run detects, and how many correct ones it does not trust."
-    return run_experiment(name, options, "Trust", cells, page_tables, purpose=purpose)
+    return run_experiment(name, options, "Trust", cells, page_tables)

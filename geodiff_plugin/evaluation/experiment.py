@@ -11,7 +11,7 @@ import os
 import platform
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import date
 from functools import lru_cache, partial
@@ -58,34 +58,33 @@ def run_facts(command: str, options: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Page:
-    """What a command measured: ``run_facts``, sentences above the tables, and the tables in reading order.
-
-    ``purpose`` is the first line, "" where the title says it.
-    """
+    """What a command measured: ``run_facts``, sentences above the tables, and the tables in reading order."""
 
     title: str
     facts: dict[str, Any]
     tables: tuple[Table, ...]
-    remarks: tuple[str, ...] = ()
-    purpose: str = ""
+    remarks: tuple[str, ...]
 
     def origin(self) -> str:
         """One line: date, versions, machine."""
         named = ", ".join(f"{name} {value}" for name, value in self.facts["versions"].items())
         return f"{self.facts['date']}; {named}; {self.facts['machine']}."
 
-    def write(self, stem: str, options: Any) -> Page:
-        """Write ``<stem>.md``, ``.tex`` and ``.json`` into ``--out``, and the page to ``--results`` too."""
-        head = [f"# {self.title}", *([self.purpose] if self.purpose else [])]
-        head += [f"    {self.facts['command']}", self.origin(), *self.remarks]
-        text = "".join(f"{line}\n\n" for line in head) + "\n".join(t.markdown() for t in self.tables)
-        for path in filter(None, (options.out / f"{stem}.md", options.results)):
-            write_text(path, text)
-        write_text(options.out / f"{stem}.tex", "\n".join(table.latex() for table in self.tables))
-        tables = [asdict(table) for table in self.tables]
-        plain = self.facts | {"remarks": list(self.remarks), "tables": tables}
-        write_text(options.out / f"{stem}.json", json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
-        return self
+
+def write_page(
+    command: str, options: Any, title: str, tables: Iterable[Table], remarks: Sequence[str]
+) -> Page:
+    """Write the tables that have rows into ``--out``, in Markdown and JSON, and the page to ``--results``."""
+    shown = tuple(table for table in tables if table.rows)
+    page = Page(title, run_facts(command, options), shown, tuple(remarks))
+    head = [f"# {title}", f"    {page.facts['command']}", page.origin(), *remarks]
+    text = "".join(f"{line}\n\n" for line in head) + "\n".join(table.markdown() for table in shown)
+    path = options.out / f"{'table' if command == 'pairs' else command}.md"
+    for target in filter(None, (path, options.results)):
+        write_text(target, text)
+    plain = page.facts | {"remarks": list(remarks), "tables": list(map(asdict, shown))}
+    write_text(path.with_suffix(".json"), json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
+    return page
 
 
 def run_experiment(
@@ -95,15 +94,12 @@ def run_experiment(
     cells: Sequence[Item],
     tables: Tables,
     remarks: Callable[[list[Record]], Sequence[str]] = lambda records: (),
-    purpose: str = "",
     journal: str = "",
-    stem: str = "",
 ) -> Page | None:
     """Measure the cells that have no record yet, and write the page.
 
     The payload of each cell is a ``partial`` that returns the body of its record. Tables, and remarks above
-    them, are of the records of all cells, in their order; tables without rows are left out. ``journal`` is
-    ``<command>.jsonl`` and ``stem``, of the page's files, is ``command`` by default.
+    them, are of the records of all cells, in their order. ``journal`` is ``<command>.jsonl`` by default.
 
     Returns:
         The page; ``None`` in every process but the first.
@@ -113,11 +109,7 @@ def run_experiment(
         OSError: missing or unreadable files, likewise.
     """
     records = measure_cells(cells, options, journal or f"{command}.jsonl")
-    if records is None:
-        return None
-    shown = tuple(table for table in tables(records) if table.rows)
-    page = Page(title, run_facts(command, options), shown, tuple(remarks(records)), purpose)
-    return page.write(stem or command, options)
+    return None if records is None else write_page(command, options, title, tables(records), remarks(records))
 
 
 def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NAME) -> list[Record] | None:

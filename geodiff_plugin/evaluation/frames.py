@@ -23,7 +23,7 @@ from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.options import CAPTURE_ROWS, WAYS, CaptureEvalOptions, SequenceOptions, Way
+from geodiff_plugin.evaluation.options import CAPTURE_ROWS, WAYS, CaptureEvalOptions, SequenceOptions
 from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, most_of, table_of_groups
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -87,7 +87,7 @@ def run_sequence(name: str, options: SequenceOptions) -> Page | None:
         for way in options.ways:
             how = (options.frames, *options.size, options.steps, options.seed, settings.device)
             key = "|".join(map(str, (seed, way, *how, settings.prior, prior, __version__)))
-            work = partial(_measure_sequence, pipe, render, seed, WAYS[way], options, store)
+            work = partial(_measure_sequence, pipe, render, seed, way, options, store)
             cells.append(Item(key, work, name=f"sequence {seed}, {way}", head={"seed": seed, "way": way}))
     remark = (
         f"{options.scenes} rendered scenes of {options.frames} frames, {options.size[1]}x{options.size[0]} "
@@ -97,15 +97,16 @@ def run_sequence(name: str, options: SequenceOptions) -> Page | None:
 
 
 def _measure_sequence(
-    pipe: Any, render: Any, seed: int, way: Way, options: SequenceOptions, store: EvidenceStore
+    pipe: Any, render: Any, seed: int, way: str, options: SequenceOptions, store: EvidenceStore
 ) -> Record:
     """AbsRel, flicker and seconds a frame of one way of going through a sequence."""
-    sequence, steps = render(seed), max(1, round((options.steps or 1) * way.share))
+    sequence, (_, share, warm) = render(seed), WAYS[way]
+    steps = max(1, round((options.steps or 1) * share))
     device, truth = pipe._execution_device, true_frames(sequence)
     clock = time.process_time if device.type == "cpu" else time.perf_counter
     errors, scores, before, seconds = [], [], None, 0.0
     for left, right, true in zip(sequence.lefts, sequence.rights, truth, strict=True):
-        knobs: dict[str, Any] = {} if way.warm is None else {"previous": before, "warm_start": way.warm}
+        knobs: dict[str, Any] = {} if warm is None else {"previous": before, "warm_start": warm}
         guidance = GeometryGuidance(right.image_01, sequence.K.numpy(), sequence.E.numpy(), **knobs)
         guidance.evidence_store = store
         with torch.no_grad():
@@ -125,7 +126,7 @@ def _measure_sequence(
 
 
 _SEQUENCE_COLUMNS: dict[str, CellOf] = {
-    "frames": lambda own: WAYS[own[0]["way"]].title,
+    "frames": lambda own: WAYS[own[0]["way"]][0],
     "AbsRel": mean_of("abs_rel", 4),
     "worst frame": most_of("worst"),
     "flicker %": mean_of("flicker", 2, 100.0),
@@ -226,8 +227,7 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
             for data, own in grouped(records, "data").items()
         ]
 
-    title, note = "Captures", [CAPTURE_NOTE]
-    return run_experiment(name, options, title, cells, tables, lambda _: note, CAPTURE_PURPOSE)
+    return run_experiment(name, options, "Captures", cells, tables, lambda _: (CAPTURE_PURPOSE, CAPTURE_NOTE))
 
 
 def _chosen(capture: Capture, options: CaptureEvalOptions) -> list[str]:

@@ -22,52 +22,29 @@ if TYPE_CHECKING:
     from geodiff_plugin.evaluation.datasets import SampleRef
 
 CROPS = ("none", "garg", "eigen", "benchmark")
+#: Where ``guided`` has poses from: refined, as given, or withheld but for the baseline's length.
 POSES = ("refine", "given", "estimated")
-"""Where ``guided`` has poses from: refined, as given, or withheld but for the baseline's length."""
+PEERS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
+STRENGTH_METHODS = ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5")
 FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative")
-
-
-class Strength(NamedTuple):
-    """How an emulated prior errs: mean error of log depth, whether it is blurred, exponent of its map."""
-
-    error: float = 0.0
-    blur: bool = False
-    gamma: float = 1.0
-
-
-STRENGTHS = {
-    "exact": Strength(),
-    "2%": Strength(0.02),
-    "5%": Strength(0.05),
-    "10%": Strength(0.10),
-    "20%": Strength(0.20),
-    "blur": Strength(0.01, blur=True),
-    "gamma": Strength(gamma=1.6),
-}
-
-
-class Way(NamedTuple):
-    """How frames follow each other: title, share of the steps, and ``warm_start``, ``None`` for alone."""
-
-    title: str
-    share: float = 1.0
-    warm: float | None = None
-
-
+#: Emulated priors: mean absolute error of log depth, whether the map is blurred, its exponent, 1 for none.
+STRENGTHS = {f"{percent}%": (percent / 100, False, 1.0) for percent in (2, 5, 10, 20)}
+STRENGTHS = {"exact": (0.0, False, 1.0), **STRENGTHS, "blur": (0.01, True, 1.0), "gamma": (0.0, False, 1.6)}
+#: How frames follow each other: title, share of the steps, and ``warm_start``, ``None`` for alone.
 WAYS = {
-    "alone": Way("each frame alone"),
-    "alone-half": Way("each frame alone, half the steps", share=0.5),
-    "scale": Way("scale of the frame before", warm=0.0),
-    "warm": Way("warm start, a quarter left out", warm=0.25),
-    "warm-50": Way("warm start, half left out", warm=0.5),
-    "warm-75": Way("warm start, three quarters left out", warm=0.75),
+    "alone": ("each frame alone", 1.0, None),
+    "alone-half": ("each frame alone, half the steps", 0.5, None),
+    "scale": ("scale of the frame before", 1.0, 0.0),
+    "warm": ("warm start, a quarter left out", 1.0, 0.25),
+    "warm-50": ("warm start, half left out", 1.0, 0.5),
+    "warm-75": ("warm start, three quarters left out", 1.0, 0.75),
 }
+#: Title, poses of the capture, knob ``pose`` of every call.
 CAPTURE_ROWS = {
     "given": ("poses as given", "given", "given"),
     "pairs": ("refined by pairs", "given", "refine"),
     "capture": ("solved over the capture", "refined", "given"),
 }
-"""Title, poses of the capture, knob ``pose`` of every call."""
 
 
 def _out(folder: str) -> Any:
@@ -161,7 +138,6 @@ class PairsOptions(_SampleOptions):
     pairs: str = declare("default", "Of posed views: default (two) or all.", choices=("default", "all"))
     pixel_centre: float | None = declare(None, "First pixel's centre in posed cameras, 0.5 for COLMAP's.")
     crop: str = declare("none", "Region that is scored: none, garg, eigen, benchmark (KITTI).", choices=CROPS)
-    seeds: int = _count(1, "Seeds, from --seed on, of methods with a prior; a table has their spread.")
     pose: tuple[str, ...] = _list((), f"Rows of 'guided' by pose: {', '.join(POSES)}.", choices=POSES)
     skip_broken: bool = declare(False, "Go on after a broken sample and count it.", panel=OUTPUT)
     save_depth: bool = declare(False, "Write every depth map as .npy.", panel=OUTPUT)
@@ -172,9 +148,7 @@ class DirOptions(PairsOptions):
     """``geodiff eval pairs DIR``."""
 
     data: Path | None = _dir("Folder of data sets, or the name of a registered set.", "", default=MISSING)
-    methods: tuple[str, ...] = _list(
-        ("prior-aligned", "search-only", "paper", "guided", "sgbm"), "Comma-separated, see geodiff eval list."
-    )
+    methods: tuple[str, ...] = _list(PEERS, "Comma-separated, see geodiff eval list.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +158,7 @@ class FigureOptions(_SampleOptions):
     name: str = declare(MISSING, f"{', '.join(FIGURES)}.", "", metavar="NAME")
     max: float = declare(80.0, "gs-sweep: the last g_s, metres.", low=1.01, high=1e6)
     updates: tuple[int, ...] = _list(
-        (1, 2, 5, 10, 20, 40), "inner-steps: updates per step, comma-separated.", low=1, high=10_000
+        (1, 2, 5, 10, 20, 40), "inner-steps: updates per step.", low=1, high=10**4
     )
     results: Path | None = field(default=None)
     clouds: bool = declare(False, "qualitative, ablation: point clouds from another view too.")
@@ -199,10 +173,7 @@ class StrengthOptions(OutOptions):
     strengths: tuple[str, ...] = _some(STRENGTHS)
     space: str = declare("disparity", "Affine in disparity, depth or log.", choices=SPACES[:3])
     follow: float = declare(0.3, "How far the prior's later answers follow their input.", low=0.0, high=1.0)
-    methods: tuple[str, ...] = _list(
-        ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5"),
-        "Comma-separated methods that use a prior, see geodiff eval list.",
-    )
+    methods: tuple[str, ...] = _list(STRENGTH_METHODS, "Methods that use a prior, see geodiff eval list.")
     steps: int | None = _count(4, "Denoising steps.", high=1000)
     resolution: int = _count(384, "Longer side for the prior, pixels.", 64, 8192)
     figure: Path | None = declare(None, "PNG: error against the prior's error, lit surfaces.", panel=OUTPUT)
@@ -260,7 +231,7 @@ class CaptureEvalOptions(EvalOptions):
 
 
 class Command(NamedTuple):
-    """A command of ``geodiff eval``: its options, ``module:function`` in this package, and what it does."""
+    """A command: its options, ``module:function`` in this package, and what it does."""
 
     options: type[OutOptions]
     run: str
@@ -333,10 +304,7 @@ def _kept(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()) -> 
     if not kept:
         there = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
         wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
-        cure = (
-            "Give a folder of data sets, or the name of a registered set (docs/how-to/extending.md); "
-            "geodiff eval list says how to obtain the public ones."
-        )
+        cure = "geodiff eval list says how to obtain the public ones; docs/how-to/extending.md adds others."
         bad_value("--data", f"a folder with a sample{wanted}", f"{data} with {there}", cure)
     # As two resolutions of a set have: records could not tell them apart.
     label, count = Counter(ref.label for ref in kept).most_common(1)[0]
@@ -347,15 +315,7 @@ def _kept(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()) -> 
 
 
 def real_and_rendered(options: RealOptions, text: str) -> tuple[list[SampleRef], list[SampleRef]]:
-    """The first pairs of ``--data``, if given, and ``--rendered`` ones of the registered set ``synthetic``.
-
-    Args:
-        options: of the command.
-        text: what the set is asked for, as ``synthetic:{}@512x384``.
-
-    Raises:
-        ValueError: neither; a folder without pairs, or with two of one name; no such set is registered.
-    """
+    """The first pairs of ``--data``, and ``--rendered`` ones of a set such as ``synthetic:{}@512x384``."""
     from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
 
     if options.data is None and not options.rendered:
@@ -369,11 +329,7 @@ def real_and_rendered(options: RealOptions, text: str) -> tuple[list[SampleRef],
 
 
 def select(refs: Sequence[SampleRef], options: PairsOptions | FigureOptions) -> list[SampleRef]:
-    """Keep the samples whose label contains one of ``scenes``, draw ``sample``, keep the first ``limit``.
-
-    Raises:
-        ValueError: nothing is left, two samples have one name, or more are to be drawn than there are.
-    """
+    """Keep the samples that ``scenes`` names, draw ``sample`` of them, keep the first ``limit``."""
     kept, count = _kept(refs, data_of(options), options.scenes), getattr(options, "sample", None)
     if count is not None:
         if count > len(kept):

@@ -17,7 +17,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.config import DEFAULT, value_of
 from geodiff_plugin.evaluation import experiment, tables
-from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_priors, with_seeds
+from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_priors
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
@@ -27,9 +27,9 @@ from geodiff_plugin.runner import Item, Record, this_process
 
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:
-    """Cells of methods, with every further prior, seed and pose of the options."""
+    """Cells of methods, with every further prior and pose of the options."""
     names = with_priors(with_poses(tuple(dict.fromkeys(methods)), options.pose), options.prior[1:])
-    names, refs = with_seeds(names, options.seed, options.seeds), options.changed(refs)
+    refs = options.changed(refs)
     return experiment.method_cells(
         refs, names, options.settings, options.out, crop=options.crop, save_depth=options.save_depth
     )
@@ -43,8 +43,6 @@ def compare(
     methods: Sequence[str],
     page_tables: experiment.Tables,
     more: Sequence[str] = (),
-    purpose: str = "",
-    stem: str = "",
 ) -> Page | None:
     """``run_experiment`` of methods on pairs, with remarks on what was run and ``more``."""
     cells = pair_cells(refs, methods, options)
@@ -53,9 +51,7 @@ def compare(
         return [*remarks_on(records, options), *more]
 
     journal = experiment.RECORDS_NAME  # all such commands share their records
-    return experiment.run_experiment(
-        name, options, title, cells, page_tables, remarks, purpose, journal, stem
-    )
+    return experiment.run_experiment(name, options, title, cells, page_tables, remarks, journal)
 
 
 def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
@@ -64,13 +60,11 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
     remarks = [f"Prior {prior}, seed {options.seed}, ensemble {options.ensemble}."]
     if options.prior[1:]:
         remarks.append(f"Rows that name no prior: {prior}.")
-    if options.seeds > 1:
-        remarks.append(f"Every table but the spread over {options.seeds} seeds is of seed {options.seed}.")
     if options.crop != "none":
         remarks.append(f"Only what lies in the crop {options.crop!r} is scored.")
     reasons = Counter(
         (find_method(record["method"]).title, record["reason"])
-        for record in tables.without_copies(records)
+        for record in records
         if record["status"] == "not applicable"
     )
     remarks += [f"{title}: '-' for {count_of_pairs(n)}, {reason}." for (title, reason), n in reasons.items()]
@@ -91,11 +85,7 @@ def run_pairs(name: str, options: PairsOptions) -> Page | None:
         more.append(f"Drawn with seed {options.seed}: {', '.join(ref.label for ref in refs)}.")
     if count > 1:
         more.append(f"Run by {count} processes.")
-    title, purpose = (
-        "Results pair by pair",
-        "Each pair, interval, region and metric behind a comparison of methods.",
-    )
-    return compare(name, options, title, refs, options.methods, tables.pairs_tables, more, purpose, "table")
+    return compare(name, options, "Results pair by pair", refs, options.methods, tables.pairs_tables, more)
 
 
 CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
@@ -291,5 +281,4 @@ def run_cost(name: str, options: PairsOptions) -> Page:
             records += job.result()
     steps = [f"{count or 'its own number'} with {prior}" for prior, count in taken.items()]
     remarks = (*remarks_on(records, options), f"Denoising steps of each: {', '.join(steps)}.")
-    page = Page("Cost", experiment.run_facts(name, options), (cost_table(records),), remarks)
-    return page.write(name, options)
+    return experiment.write_page(name, options, "Cost", [cost_table(records)], remarks)

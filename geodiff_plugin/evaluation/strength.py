@@ -31,7 +31,7 @@ from geodiff_plugin.evaluation.edges import edge_error, surface_error
 from geodiff_plugin.evaluation.experiment import Page, cell_key, last_of, run_experiment
 from geodiff_plugin.evaluation.figures import draw_strength, shaded
 from geodiff_plugin.evaluation.metrics import evaluate_depth, to_space
-from geodiff_plugin.evaluation.options import STRENGTHS, Strength, StrengthOptions, data_of
+from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions, data_of
 from geodiff_plugin.evaluation.scoring import DENSE, in_metres
 from geodiff_plugin.evaluation.tables import (
     CellOf,
@@ -48,7 +48,6 @@ from geodiff_plugin.runner import Item, Record
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
-#: First paragraph of the page.
 PURPOSE = (
     "What guidance gains with better priors. An emulated prior answers with the true depth plus a known "
     "error. *2%* to *20%* is the mean absolute error of its log depth, half of it smooth and half constant "
@@ -80,6 +79,10 @@ SMOOTH, SEGMENTS, BLUR = 0.12, 0.16, 0.012
 ORACLE, SHOWN = "prior-aligned", "5%"
 
 
+Strength = tuple[float, bool, float]
+"""A value of ``STRENGTHS``."""
+
+
 def relative_map(sample: StereoSample, strength: Strength, space: str, seed: int = 0) -> np.ndarray:
     """The map of a prior that errs in a given way, at the truth's resolution.
 
@@ -91,12 +94,13 @@ def relative_map(sample: StereoSample, strength: Strength, space: str, seed: int
     nearest = ndimage.distance_transform_edt(~sample.valid, return_distances=False, return_indices=True)
     log_depth = np.log(sample.depth_m[tuple(nearest)].astype(np.float64))
     rng = np.random.default_rng([seed, 47])
-    log_depth = log_depth + strength.error * _error(log_depth, rng)
+    error, blur, gamma = strength
+    log_depth = log_depth + error * _error(log_depth, rng)
     values = to_space(np.exp(log_depth), space)
-    if strength.blur:
+    if blur:
         values = ndimage.gaussian_filter(values, BLUR * max(values.shape), mode="nearest")
     low, high = np.quantile(values, ENDS)
-    return np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0) ** strength.gamma
+    return np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0) ** gamma
 
 
 def _error(log_depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -273,8 +277,9 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
 
     def remarks(records: list[Record]) -> list[str]:
         sentences = [
+            PURPOSE,
             f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; "
-            f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}."
+            f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}.",
         ]
         if options.figure is not None:
             labels = {record["pair"] for record in _dense(records)}
@@ -288,4 +293,4 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
     def tables(records: list[Record]) -> list[Table]:
         return strength_tables(_dense(records))
 
-    return run_experiment(name, options, "Priors from exact to weak", cells, tables, remarks, PURPOSE)
+    return run_experiment(name, options, "Priors from exact to weak", cells, tables, remarks)

@@ -1,10 +1,9 @@
-"""Tables in Markdown, LaTeX and JSON: means with intervals, and those of a comparison of methods."""
+"""Tables in Markdown and JSON: means with intervals, and those of a comparison of methods."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from operator import itemgetter
 from typing import Any
 
@@ -71,18 +70,6 @@ def mean_cell(values: Iterable[float | None], digits: int = 3) -> str:
     return cell(float(np.mean(known)) if known else None, digits)
 
 
-_LATEX: dict[str, str | int | None] = {character: f"\\{character}" for character in "_%&#${}"}
-_LATEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-_LATEX |= {"<": "$<$", ">": "$>$", "|": "$|$", "δ": r"$\delta$", "γ": r"$\gamma$", "±": r"$\pm$"}
-_LATEX |= {"↓": r"$\downarrow$", "↑": r"$\uparrow$", "×": r"$\times$", "†": r"$^\dagger$"}
-_LATEX |= {"✓": r"$\checkmark$", "✗": r"$\times$"}
-
-
-def latex_escape(text: str) -> str:
-    """Text for LaTeX: its special characters escaped, the symbols of our tables as commands."""
-    return text.translate(str.maketrans(_LATEX))
-
-
 @dataclass(frozen=True)
 class Table:
     """Cells as they are printed.
@@ -108,20 +95,6 @@ class Table:
         rows = [f"| {' | '.join(row)} |" for row in cells]
         lines += [rows[0], "| --- |" + " ---: |" * (len(self.header) - 1), *rows[1:]]
         return "\n".join(lines) + "\n"
-
-    def latex(self) -> str:
-        """A ``tabular`` with booktabs rules, its title as a comment."""
-        lines = [f"% {self.title}", rf"\begin{{tabular}}{{l{'r' * (len(self.header) - 1)}}}", r"\toprule"]
-        cells, rules, last = list[str](), list[str](), 0
-        for heading, count in self.groups:
-            first, last = last + 1, last + count
-            cells += (
-                [rf"\multicolumn{{{count}}}{{c}}{{{latex_escape(heading)}}}"] if heading else [""] * count
-            )
-            rules += [rf"\cmidrule(lr){{{first}-{last}}}"] if heading else []
-        lines += [" & ".join(cells) + r" \\", " ".join(rules)] if self.groups else []
-        header, *rows = (" & ".join(map(latex_escape, row)) + r" \\" for row in (self.header, *self.rows))
-        return "\n".join([*lines, header, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
 def grouped(records: Iterable[Record], *names: str) -> dict[Any, list[Record]]:
@@ -358,58 +331,17 @@ def confidence_table(records: Sequence[Record]) -> Table:
     return Table("Confidence by decile", header, tuple(rows), note)
 
 
-def _families(records: Sequence[Record]) -> dict[str, list[str]]:
-    """``METHOD`` -> its name and those of its ``METHOD#SEED``, for every method run with several seeds."""
-    names = list(grouped(records, "method"))
-    families = {name: [n for n in names if find_method(n).seedless_name == name] for name in names}
-    return {name: family for name, family in families.items() if len(family) > 1}
-
-
-def without_copies(records: Sequence[Record]) -> list[Record]:
-    """The records but for those of ``METHOD#SEED`` where ``METHOD`` itself was run."""
-    families = _families(records)
-    copies = {name for family in families.values() for name in family} - families.keys()
-    return [record for record in records if record["method"] not in copies]
-
-
-def spread_table(records: Sequence[Record]) -> Table:
-    """Mean AbsRel of each method and group over the seeds that it was run with; no rows where that is one.
-
-    A mean stands only where every seed has a number for every pair of the group; the largest spread is over
-    the pairs that every seed has a number for.
-    """
-    values, families, rows = by_method(records, headline), _families(records), []
-    for name, (group, members) in product(families, groups_of(records).items()):
-        seeds = [values[copy] for copy in families[name]]
-        shared = [x for x in seeds[0] if x in members and all(x in own for own in seeds)]
-        if shared:
-            errors = np.array([[own[label] for label in shared] for own in seeds])  # (seeds, pairs)
-            means, spread = errors.mean(axis=1), np.ptp(errors, axis=0)
-            over_seeds = (means.mean(), means.std(ddof=1), means.min(), means.max())
-            cells = [cell(v if len(shared) == len(members) else None, 4) for v in over_seeds]
-            pair = cell(spread.max(), 4), shared[int(spread.argmax())]
-            rows.append((find_method(name).title, group, *cells, *pair))
-    header = ("method", "AbsRel of", "mean", "deviation", "least", "largest", "spread of a pair", "that pair")
-    note = (
-        "All pixels, as in the first table. Over the seeds: mean, standard deviation (n - 1), least and "
-        "largest of the mean of these pairs; then the greatest difference between two seeds on one pair."
-    )
-    count = max(map(len, families.values()), default=1)
-    return Table(f"Spread over {count} seeds", header, tuple(rows), note)
-
-
 def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[Table]:
-    """The tables of ``geodiff eval pairs``; further seeds count in the table of their spread only."""
-    spread, records = spread_table(records), without_copies(records)
-    title = f"AbsRel of {pairs_of(records)}"
+    """The tables of ``geodiff eval pairs``."""
     note = (
         "All pixels with truth, no cap; metres as they come out, not aligned, except in the columns of "
         "methods that know relative depth only ('oracle'), which get scale and shift from the truth."
     )
-    tables = [per_pair_table(records, title, headline, note=note)]
-    tables.append(per_pair_table(records, "Seconds", itemgetter("seconds"), 1))
-    if any(record["method"] == reference for record in records):
-        tables.append(versus_table(records, reference))
-    groups = groups_of(records).items()
-    tables += [summary_table(records, members, f"All metrics, {group}") for group, members in groups]
-    return [*tables, *details_tables(records), confidence_table(records), spread]
+    return [
+        per_pair_table(records, f"AbsRel of {pairs_of(records)}", headline, note=note),
+        per_pair_table(records, "Seconds", itemgetter("seconds"), 1),
+        *([versus_table(records, reference)] if any(r["method"] == reference for r in records) else []),
+        *(summary_table(records, own, f"All metrics, {group}") for group, own in groups_of(records).items()),
+        *details_tables(records),
+        confidence_table(records),
+    ]

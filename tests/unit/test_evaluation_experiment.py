@@ -16,7 +16,6 @@ from geodiff_plugin.evaluation.baselines import (
     find_method,
     with_poses,
     with_priors,
-    with_seeds,
 )
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.experiment import RECORDS_NAME, cell_key
@@ -25,8 +24,6 @@ from geodiff_plugin.evaluation.tables import (
     mean_with_interval,
     paired_difference,
     pairs_tables,
-    spread_table,
-    without_copies,
 )
 from tests.evaluating import run
 from tests.unit.test_evaluation_scoring import make_sample
@@ -146,9 +143,8 @@ def test_tables_hold_pairs_means_and_differences(bench):
 
 
 def test_priors_and_seeds_make_rows_whose_results_are_those_of_the_settings(bench):
-    names = with_seeds(with_priors(["noisy", "exact"], ["org/x"]), 0, 2)
-    assert names == ("noisy", "exact", "noisy@org/x", "noisy#1", "noisy@org/x#1")
-    assert with_seeds(["noisy", "noisy#1"], 0, 2) == ("noisy", "noisy#1")
+    assert with_priors(["noisy", "exact"], ["org/x"]) == ("noisy", "exact", "noisy@org/x")
+    names = ("noisy", "exact", "noisy#1", "noisy@org/x", "noisy@org/x#1")
     assert with_poses(("a", "guided"), ("given", "x")) == ("a", "guided:pose=given", "guided:pose=x")
     records = bench.go(names)
     assert [r["method"] for r in records[:5]] == list(names) and len(bench.calls) == 15
@@ -157,26 +153,8 @@ def test_priors_and_seeds_make_rows_whose_results_are_those_of_the_settings(benc
         again = bench.go(["noisy"], Settings(prior, seed=seed))
         assert bench.calls == [] and {r["method"] for r in again} == {"noisy"}
         assert [r["key"] for r in again] == [r["key"] for r in records if r["method"] == method]
-    assert pairs_tables(records, reference="exact")[0].header == ("pair", "noisy", "exact", "noisy (x)")
-    alone = bench.go(["noisy#2", "exact"])
-    assert pairs_tables(alone)[0].header == ("pair", "noisy, seed 2", "exact")
-    assert not spread_table(alone).rows
-
-
-def test_further_seeds_have_one_table_and_no_part_in_others(bench):
-    records = bench.go(with_seeds(["noisy", "exact"], 0, 3))
-    *others, spread = pairs_tables(records, reference="exact")
-    assert others == pairs_tables(without_copies(records), reference="exact")[:-1]
-    assert spread.title == "Spread over 3 seeds"
-    assert spread.rows == (
-        ("noisy", "3 pairs", "0.2333", "0.2333", "0.0000", "0.4667", "0.8000", "middlebury2014/c"),
-        ("noisy", "2 rectified pairs", "0.1500", "0.1500", "0.0000", "0.3000", "0.4000", "middlebury2014/b"),
-        ("noisy", "1 posed pair", "0.4000", "0.4000", "0.0000", "0.8000", "0.8000", "middlebury2014/c"),
-    )
-    torn = [r for r in records if (r["method"], r["sample"]) != ("noisy#2", "c")]
-    rows = spread_table(torn).rows  # a mean over seeds needs every pair of each
-    assert rows[0][2:] == ("-", "-", "-", "-", "0.4000", "middlebury2014/b")
-    assert [row[1] for row in rows] == ["3 pairs", "2 rectified pairs"]
+    header = ("pair", "noisy", "exact", "noisy, seed 1", "noisy (x)", "noisy (x), seed 1")
+    assert pairs_tables(records, reference="exact")[0].header == header
 
 
 @pytest.mark.parametrize(

@@ -241,7 +241,7 @@ def test_names_bind_priors_and_seeds_but_not_those_of_folders_and_models(tmp_pat
         assert (method.title, method.prior, method.seed) == (name, None, None)
     bound = find_method("guided:inner_steps=1@org/other#3")
     assert (bound.prior, bound.seed) == ("org/other", 3) and find_method(bound.name).name == bound.name
-    assert bound.base_name == "guided:inner_steps=1" and bound.seedless_name == f"{bound.base_name}@org/other"
+    assert bound.base_name == "guided:inner_steps=1"
     settings = bound.own_settings(Settings(seed=1, ensemble=2))
     assert settings == Settings("org/other", seed=3, ensemble=2)
     assert find_method("guided@folder#a").prior == "folder#a"

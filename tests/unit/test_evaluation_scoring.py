@@ -1,7 +1,5 @@
 """The record of one prediction: raw, aligned and capped, by region, with holes and wrong poses."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -66,8 +64,10 @@ def test_relative_depth_has_no_raw_column_and_holes_no_errors():
 
 def test_uncertainty_and_confidence_are_scored():
     sample, error = make_sample(), np.arange(48).reshape(SHAPE) / 100
-    pred = sample.depth_m * (1 + error)
-    record = score(sample, Prediction(pred, uncertainty=error, confidence=1 - error / error.max()), None)
+    prediction = Prediction(
+        sample.depth_m * (1 + error), uncertainty=error, confidence=1 - error / error.max()
+    )
+    record = score(sample, prediction, None)
     assert record["ause"] == pytest.approx(0, abs=1e-6) == record["ause_confidence"]["ause"]
     assert record["ause_confidence"]["random"] > 0.05 and len(record["confidence"]) == 10
 
@@ -109,38 +109,28 @@ def test_regions_split_what_the_right_camera_sees_and_tables_show_them():
     assert all(table.rows == () for table in details_tables(bare))
 
 
-def test_regions_split_by_whether_the_views_match():
-    valid = np.ones((64, 128), bool)
+def test_regions_split_by_whether_the_views_match_which_is_found_once_a_sample(monkeypatch):
+    swept, valid = [], np.ones((64, 128), bool)
     valid[:8] = False
-    masks = regions(textured_sample(valid=valid))
-    np.testing.assert_array_equal(masks["matched"] ^ masks["unmatched"], valid)
-    assert masks["matched"][8:, 10:55].mean() > 0.8 and masks["matched"][8:, 90:].mean() < 0.1
-
-
-def test_views_are_matched_once_a_sample_and_left_out_where_they_do_not_overlap(monkeypatch):
-    swept = []
     monkeypatch.setattr(scoring, "sweep", lambda sample, device: swept.append(1) or sweep(sample, device))
-    sample = textured_sample()
+    sample = textured_sample(valid=valid)
     for factor in (1, 2):
         score(experiment.cropped(sample, "none"), Prediction(factor * sample.depth_m), None)
+    masks = regions(sample)
     assert len(swept) == 1
+    np.testing.assert_array_equal(masks["matched"] ^ masks["unmatched"], valid)
+    assert masks["matched"][8:, 10:55].mean() > 0.8 and masks["matched"][8:, 90:].mean() < 0.1
     away = np.diag([-1.0, 1, -1, 1])
     away[0, 3] = 0.12
-    assert set(regions(textured_sample(E=away))) == {"out_of_view"}
+    assert set(regions(textured_sample(E=away))) == {"out_of_view"}  # no overlap
 
 
-def test_a_crop_makes_one_object_of_a_sample(monkeypatch):
-    monkeypatch.setattr(experiment, "crop_mask", lambda crop, shape: np.arange(shape[1]) > 3)
-    sample = textured_sample()
-    first = experiment.cropped(sample, "garg")
-    assert first is experiment.cropped(sample, "garg") and first.valid.sum() == 64 * 124
-    blind = replace(sample, valid=sample.valid & (np.arange(128) < 2))
-    with pytest.raises(ValueError, match="the truth of synthetic/wall must be known somewhere in the crop"):
-        experiment.cropped(blind, "garg")
-
-
-def test_refusals():
+def test_refusals(monkeypatch):
     with pytest.raises(ValueError, match="prediction.depth_m must be of the left image's shape"):
         score(make_sample(), Prediction(np.ones((3, 3))), None)
     with pytest.raises(ValueError, match="the truth of middlebury2014/a"):
         score(make_sample(valid=np.zeros(SHAPE, bool)), Prediction(np.ones(SHAPE)), None)
+    monkeypatch.setattr(experiment, "crop_mask", lambda crop, shape: np.arange(shape[1]) > 3)
+    blind = make_sample(valid=np.zeros(SHAPE, bool) | (np.arange(8) < 2))
+    with pytest.raises(ValueError, match="the truth of middlebury2014/a must be known somewhere in the crop"):
+        experiment.cropped(blind, "garg")

@@ -2,21 +2,16 @@
 
 import json
 import re
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 from geodiff_plugin.evaluation import pairs, paper
-from geodiff_plugin.evaluation.baselines import (
-    Method,
-    NotApplicable,
-    Prediction,
-    Settings,
-    find_method,
-)
+from geodiff_plugin.evaluation.baselines import Method, NotApplicable, Prediction, Settings, find_method
 from geodiff_plugin.evaluation.pairs import CHANGES, FLATNESS, changes_table, flatness_table
 from geodiff_plugin.evaluation.paper import LAYOUTS, layout_table
-from geodiff_plugin.evaluation.tables import Table, label_of, latex_escape
+from geodiff_plugin.evaluation.tables import Table, label_of
 from tests.contracts.tiny_transformers import make_transformers
 from tests.evaluating import invoke, write_scenes
 
@@ -56,16 +51,13 @@ def test_published_numbers_stand_beside_the_full_set_only(count):
 
 
 def test_columns_and_rows_are_the_papers():
-    layout = LAYOUTS["table1"]
-    assert columns_of(layout, 15, 2, "middeval3")[2].complete
-    other = columns_of(layout, 15, 2, "middlebury2014")[2]
+    other = columns_of(LAYOUTS["table1"], 15, 2, "middlebury2014")[2]
     assert not other.complete and other.heading == "Middlebury (middlebury2014, 15 pairs)"
     counts = [c.full_count for name in ("table1", "table3") for c in LAYOUTS[name].columns]
     assert counts == [200, 228, 15, 116] and [len(own.rows) for own in LAYOUTS.values()] == [8, 4, 4, 2]
     for name, layout in LAYOUTS.items():
         cells = [cells for row in layout.rows for cells in row.published.values()]
-        assert len(cells) == len(layout.rows) * len(layout.columns)
-        assert {len(own) for own in cells} == {len(layout.metrics)}
+        assert [len(own) for own in cells] == [len(layout.metrics)] * len(layout.rows) * len(layout.columns)
         assert all(find_method(method).name == method for method in paper.methods_of(name, ()))
 
 
@@ -100,10 +92,6 @@ def test_changes_are_configurations_of_the_guidance(base):
     configured = [find_method(name).configuration(Settings())["guidance"] for name in changed]
     # The default's own rule may be the one that a row names; every other row changes something.
     assert find_method(base).configuration(Settings())["guidance"] not in configured
-    preset = find_method("guided").configuration(Settings())["guidance"]
-    assert find_method("guided:smoothness=4").configuration(Settings())["guidance"] == preset | {
-        "smoothness": 4
-    }
 
 
 def test_flatness_tries_every_number_at_half_and_at_twice():
@@ -128,19 +116,9 @@ def test_cost_is_told_as_multiples_of_the_plain_pipeline(tmp_path):
     assert pairs._steps_of("bundled") == pairs.STEPS and pairs._steps_of(str(tmp_path)) is None
 
 
-def test_a_table_in_every_format():
-    assert latex_escape("50 % & g_s #1 $x$ {a} ~ ^ \\ δ1 ↓ γ † ✓") == (
-        r"50 \% \& g\_s \#1 \$x\$ \{a\} \textasciitilde{} \textasciicircum{} \textbackslash{} "
-        r"$\delta$1 $\downarrow$ $\gamma$ $^\dagger$ $\checkmark$"
-    )
-    rows, groups = (("x|y", "1", "2", "3"), ("z", "4", "5", "6")), (("", 1), ("One", 2), ("Two", 1))
-    table = Table("T", ("Method", "A ↓", "B", "A ↓"), rows, "", groups)
-    assert r"| Method | One: A ↓ | One: B | Two: A ↓ |" in table.markdown()
-    assert r"| x\|y | 1 | 2 | 3 |" in table.markdown()
-    latex = table.latex().splitlines()
-    assert latex[3] == r" & \multicolumn{2}{c}{One} & \multicolumn{1}{c}{Two} \\"
-    assert latex[4] == r"\cmidrule(lr){2-3} \cmidrule(lr){4-4}"
-    assert latex[7:9] == [r"x$|$y & 1 & 2 & 3 \\", r"z & 4 & 5 & 6 \\"]
+def test_a_table_in_markdown_has_its_groups_in_the_headings():
+    text = Table("T", ("Method", "A", "B"), (("x|y", "1", "2"),), "", (("", 1), ("One", 2))).markdown()
+    assert r"| Method | One: A | One: B |" in text and r"| x\|y | 1 | 2 |" in text
 
 
 @pytest.fixture
@@ -177,7 +155,6 @@ def test_table1_runs_what_is_there_and_tells_how_to_obtain_the_rest(
     assert "Middlebury (middlebury2014, 1 pair): AbsRel ↓" in said
     assert "KITTI-Stereo was not found. To obtain it: data_scene_flow.zip" in said
     assert "as published" not in said and f"geodiff eval table1 --data {scene}\n" in said
-    assert r"\multicolumn{3}{c}{Booster (not found)}" in (out / "table1.tex").read_text()
     rows = {(row[0], row[1]): row for row in tables[0]["rows"]}
     assert float(rows["GeoDiff†, Algorithm 1 as printed", "✗"][-3]) == pytest.approx(1.0, abs=2e-3)
     assert float(rows["Marigold", "✓"][-3]) < 0.01
@@ -192,9 +169,8 @@ def test_table1_runs_what_is_there_and_tells_how_to_obtain_the_rest(
 @pytest.mark.parametrize("name", ["table1", "table2", "table3"])
 def test_without_data_the_error_says_how_to_obtain_them(free_methods, name, tmp_path):
     (tmp_path / "empty").mkdir()
-    said = r"--data must be .* https?://|--data must be .*folders of images"
     for words in ((), ("--data", tmp_path / "empty")):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=r"--data must be .* (https?://|folders of images)"):
             invoke(name, *words, "-o", tmp_path / "out")
 
 
@@ -215,29 +191,15 @@ def test_ablation_parts_and_flatness_take_any_data(free_methods, scene, tmp_path
 
 
 def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, tmp_path, monkeypatch):
-    jobs = []
+    started = []
 
-    class Inline:
-        """Stands in for the executor: the same calls, in this process."""
+    def inline(max_workers, mp_context):
+        started.append((max_workers, mp_context.get_start_method()))
+        return ThreadPoolExecutor(1)
 
-        def __init__(self, **_):
-            pass
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            pass
-
-        def submit(self, function, refs, method, options):
-            jobs.append(method)
-            self.result = lambda: function(refs, method, options)
-            return self
-
-    monkeypatch.setattr(pairs, "ProcessPoolExecutor", Inline)
+    monkeypatch.setattr(pairs, "ProcessPoolExecutor", inline)
     out = tmp_path / "out"
     answer = invoke("cost", "--data", scene, "-o", out, "--save-depth")
-    assert jobs == list(pairs.COST_METHODS) and re.search("plain pipeline +1 ", answer)
-    assert "Denoising steps of each: 4 with bundled." in answer
-    assert (out / "cost" / "samples.jsonl").is_file() and (out / "cost.tex").is_file()
+    assert started == [(1, "spawn")] * len(pairs.COST_METHODS) and re.search("plain pipeline +1 ", answer)
+    assert "Denoising steps of each: 4 with bundled." in answer and (out / "cost.md").is_file()
     assert (out / "cost" / "depth" / "guided" / "middlebury2014_one.npy").is_file()

@@ -45,7 +45,7 @@ def test_the_command_measures_and_goes_on(tmp_path, monkeypatch):
     measured = []
 
     def measure(pipe, render, seed, way, *_):
-        measured.append(way.title)
+        measured.append(way)
         return dict.fromkeys(("abs_rel", "worst", "flicker", "breath", "seconds"), 0.5)
 
     monkeypatch.setitem(frames.SEQUENCES, "synthetic", lambda *_, **__: SimpleNamespace(kind="room"))

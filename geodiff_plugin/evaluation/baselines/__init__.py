@@ -19,7 +19,7 @@ from geodiff_plugin.evaluation.baselines.unguided import (
 )
 
 __all__ = ["FAMILIES", "METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
-__all__ += ["find_method", "with_poses", "with_priors", "with_seeds"]
+__all__ += ["find_method", "with_poses", "with_priors"]
 
 METHODS: dict[str, Method] = {method.name: method for method in (*GUIDED_METHODS, *STEREO_METHODS)}
 """Every method by name, in the order of the tables' columns."""
@@ -81,12 +81,3 @@ def with_poses(methods: Sequence[str], poses: Sequence[str]) -> tuple[str, ...]:
     """The methods, with ``guided`` once for each of the named poses; none leaves them as they are."""
     posed = tuple(f"guided:pose={pose}" for pose in poses) or ("guided",)
     return tuple(name for given in methods for name in (posed if given == "guided" else (given,)))
-
-
-def with_seeds(methods: Sequence[str], first: int, count: int) -> tuple[str, ...]:
-    """The methods, then those with a prior and no seed for ``count - 1`` seeds after ``first``."""
-    if count < 1:
-        bad_value("seeds", "at least 1", count)
-    noisy = [name for name in methods if find_method(name).uses_prior and find_method(name).seed is None]
-    bound = [f"{name}#{first + i}" for i in range(1, count) for name in noisy]
-    return tuple(dict.fromkeys((*methods, *bound)))

@@ -148,14 +148,10 @@ class Method:
     seed: int | None = None
 
     @property
-    def seedless_name(self) -> str:
-        """The name without the seed that the method is bound to."""
-        return self.name if self.seed is None else self.name.removesuffix(f"#{self.seed}")
-
-    @property
     def base_name(self) -> str:
         """The name without the prior and the seed that the method is bound to."""
-        return self.seedless_name if self.prior is None else self.seedless_name.removesuffix(f"@{self.prior}")
+        name = self.name if self.seed is None else self.name.removesuffix(f"#{self.seed}")
+        return name if self.prior is None else name.removesuffix(f"@{self.prior}")
 
     def own_settings(self, settings: Settings) -> Settings:
         """The settings with the prior and the seed that the method is bound to, if it is."""
