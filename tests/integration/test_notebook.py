@@ -31,11 +31,8 @@ def test_it_runs_from_top_to_bottom(tmp_path):
     command = [sys.executable, "-c", EXECUTE, str(NOTEBOOK), str(tmp_path / "run.ipynb")]
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
-    cells = [
-        cell
-        for cell in json.loads((tmp_path / "run.ipynb").read_text())["cells"]
-        if cell["cell_type"] == "code"
-    ]
+    cells = json.loads((tmp_path / "run.ipynb").read_text())["cells"]
+    cells = [cell for cell in cells if cell["cell_type"] == "code"]
     assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
     outputs = [output for cell in cells for output in cell["outputs"]]
     text = "".join("".join(output.get("text", "")) for output in outputs)

@@ -49,12 +49,11 @@ def render(E: np.ndarray, size: tuple[int, int] = SIZE, K: np.ndarray = K) -> tu
     points = E[:3, 3] + rays * depth[..., None]
     image = np.zeros((*depth.shape, 3), np.uint8)
     for wall in range(3):
+        a, b = (points[..., other] for other in range(3) if other != wall)
+        at = [((x * 90 + 256) % 511).astype(np.float32) for x in (a, b)]
         for side in (0, 1):
             hit = (axis == wall) & ((np.take_along_axis(rays, axis[..., None], -1)[..., 0] > 0) == bool(side))
-            a, b = (points[..., other] for other in range(3) if other != wall)
-            at = [((x * 90 + 256) % 511).astype(np.float32) for x in (a, b)]
-            seen = cv2.remap(PAINTS[2 * wall + side], *at, cv2.INTER_LINEAR)
-            image[hit] = seen[hit]
+            image[hit] = cv2.remap(PAINTS[2 * wall + side], *at, cv2.INTER_LINEAR)[hit]
     return image, depth
 
 

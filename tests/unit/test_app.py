@@ -256,6 +256,8 @@ class TestWithGradio:
         for number, (folder, _) in enumerate(EXAMPLES):
             request = form.request(tuple(form.example(number)))
             assert request.baseline_m is None and request.way == "file"
+            with pytest.raises(ValueError, match="fx, px must be a number; got 'about 7'"):
+                form.request(tuple((form.untouched | {"fx": "about 7"}).values()))
             rig = read_calibration(list(request.calibration))
             for path in request.photographs:
                 image, notes = read_image(path, "image")

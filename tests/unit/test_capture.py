@@ -46,12 +46,9 @@ def solved() -> SolvedCapture:
     return solve(GIVEN)
 
 
-def relative(E: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(E[:-2]) @ E[2:]
-
-
 def turn_error_deg(E: np.ndarray) -> float:
-    R, R_true = relative(E)[:, :3, :3], relative(TRUE)[:, :3, :3]
+    """Of frames two apart, in the median; the world's frame does not matter."""
+    R, R_true = ((np.linalg.inv(P[:-2]) @ P[2:])[:, :3, :3] for P in (E, TRUE))
     cosines = (np.einsum("nij,nij->n", R, R_true) - 1) / 2
     return float(np.median(np.degrees(np.arccos(np.clip(cosines, -1, 1)))))
 
@@ -84,6 +81,10 @@ def test_exact_poses_are_kept_bit_for_bit_and_given_ones_on_demand():
     found = solve(GIVEN, poses="given")
     assert found.status == "given" and np.array_equal(found.E, GIVEN)
     assert len(found.points) > 100  # for the choice of neighbours
+    still = TRUE.copy()
+    still[:, :3, 3] = TRUE[0, :3, 3]
+    found = solve(still, [grey(E) for E in still])
+    assert found.status in ("given", "kept") and np.array_equal(found.E, still)
 
 
 @pytest.mark.parametrize(
@@ -122,18 +123,10 @@ def test_a_frame_that_fits_worse_than_it_was_given_keeps_its_pose(monkeypatch):
     assert found.status == "solved" and np.flatnonzero(~found.connected).tolist() == [7]
 
 
-def test_frames_at_one_place_keep_their_poses():
-    still = TRUE.copy()
-    still[:, :3, 3] = TRUE[0, :3, 3]
-    found = solve(still, [grey(E) for E in still])
-    assert found.status in ("given", "kept") and np.array_equal(found.E, still)
-
-
 @pytest.mark.slow
 def test_from_nothing_up_to_a_similarity():
     found = solve(None)
-    assert found.status == "estimated" and found.connected.sum() >= COUNT - 1
-    assert turn_error_deg(found.E[np.isfinite(found.E).all((1, 2))]) < 0.3 if found.connected.all() else True
+    assert found.status == "estimated" and found.connected.all() and turn_error_deg(found.E) < 0.3
 
 
 def test_frames_of_nothing_in_common_are_refused():
@@ -156,17 +149,6 @@ def test_neighbours_see_the_frame_under_an_angle():
     assert choose_neighbours(still, 4, 1) != [5]  # at one place there is no baseline
     blind = replace(found, seen=tuple(replace(s, px=s.px[:0], point=s.point[:0]) for s in found.seen))
     assert choose_neighbours(blind, 0, 2) == [1, 2]  # near by position
-
-
-def test_solved_poses_come_back_from_their_file(tmp_path):
-    found = solved()
-    run.save_solved(tmp_path / "poses.npz", found, "key")
-    back = run.load_solved(tmp_path / "poses.npz", "key")
-    assert back is not None and back.notes == found.notes and back.scale_depth == found.scale_depth
-    assert all(np.array_equal(a.point, b.point) for a, b in zip(back.seen, found.seen, strict=True))
-    assert run.load_solved(tmp_path / "poses.npz", "other") is None
-    (tmp_path / "poses.npz").write_bytes(b"torn")
-    assert run.load_solved(tmp_path / "poses.npz", "key") is None
 
 
 def depth_frame(i: int, factor: float = 1.0, confidence: float = 0.6) -> DepthFrame:
@@ -247,13 +229,17 @@ def test_eval_capture_measures_every_row(tmp_path, monkeypatch):
     assert COMMANDS["capture"]("capture", again).tables[0].rows == table.rows[1:]
 
 
-def test_frames_are_chosen_by_name_and_by_number(tmp_path):
+def test_frames_are_chosen_by_name_and_by_number_and_options_checked(tmp_path):
     capture = Capture.open(write_transforms(tmp_path, TRUE[:6], TRUE[:6]))
     assert capture.choose(None) == [f"f{i:02d}" for i in range(6)]
     assert capture.choose("1:5:2") == ["f01", "f03", "f05"] and capture.choose("f02, f00") == ["f02", "f00"]
     for text in ("f09", "a:b", "7:9"):
         with pytest.raises(InputError):
             capture.choose(text)
+    two_ways = {"distance": "a,b,1", "metres_per_unit": 1.0}
+    for wrong in ({"neighbours": 0}, {"poses": "best"}, {"export": ("obj",)}, two_ways):
+        with pytest.raises(InputError):
+            CaptureOptions(path=".", **wrong)
 
 
 HALVED = TRUE.copy()
@@ -317,6 +303,8 @@ def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tm
     options = replace(options, overwrite=False)
     again = run.run_capture(options, lambda *_: pytest.fail("done before"), said.append)
     assert [frame["frame"] for frame in again["frames"]] == ["f02", "f04", "f06"]
+    (tmp_path / "out/poses.npz").write_bytes(b"torn")
+    assert run.load_solved(tmp_path / "out/poses.npz", "") is None
 
 
 @pytest.mark.parametrize(
@@ -341,13 +329,6 @@ def test_bad_lengths_get_a_sentence(options, words, model, tmp_path):
         capture.known_depths("f01", options["points"])
 
 
-def test_options_are_checked_before_any_work():
-    two_ways = {"distance": "a,b,1", "metres_per_unit": 1.0}
-    for wrong in ({"neighbours": 0}, {"poses": "best"}, {"export": ("obj",)}, two_ways):
-        with pytest.raises(InputError):
-            CaptureOptions(path=".", **wrong)
-
-
 def test_maps_of_another_model_take_the_prior_s_place(tmp_path, monkeypatch):
     asked = {}
     source = write_transforms(tmp_path / "scan", TRUE, TRUE)
@@ -366,8 +347,8 @@ def test_the_command_writes_every_frame_and_goes_on(tmp_path, capsys):
     from geodiff_plugin.cli.app import main
 
     source = write_transforms(tmp_path / "scan", TRUE, GIVEN)
-    command = ["capture", str(source), "--out", str(tmp_path / "out"), "--frames", "f03,f05", "-q"]
-    command += ["--neighbours", "2", "--processes", "2", "--steps", "1", "--export", "colmap"]
+    options = ["--frames", "f03,f05", "-q", "--neighbours", "2", "--processes", "2", "--steps", "1"]
+    command = ["capture", str(source), "--out", str(tmp_path / "out"), *options, "--export", "colmap"]
     with pytest.raises(SystemExit) as ended:
         main(command)
     assert not ended.value.code
@@ -387,5 +368,5 @@ def test_the_command_writes_every_frame_and_goes_on(tmp_path, capsys):
     assert (out / "f03" / "depth_alone.npy").stat().st_mtime_ns == made
     capsys.readouterr()
     with pytest.raises(SystemExit) as ended:
-        main([*command[:5], "f99"])
+        main([*command[:5], "f99", "-q"])
     assert ended.value.code == 2 and "f99" in capsys.readouterr().err
