@@ -221,15 +221,11 @@ def grid(
     """
     pictures = [_as_picture(image) for image in images]
     if not pictures or len(titles) != len(pictures):
-        bad_value(
-            "images", "at least one picture, each with a title", f"{len(pictures)}, {len(titles)} titles"
-        )
+        bad_value("images", "one or more, each with a title", f"{len(pictures)}, {len(titles)} titles")
     columns, gap, head = columns or min(len(pictures), 4), 6, 24
     cells = [p.resize((cell_width, max(1, round(p.height * cell_width / p.width)))) for p in pictures]
-    heights = [
-        head + gap + max(cell.height for cell in cells[start : start + columns])
-        for start in range(0, len(cells), columns)
-    ]
+    rows = [cells[start : start + columns] for start in range(0, len(cells), columns)]
+    heights = [head + gap + max(cell.height for cell in row) for row in rows]
     wide, high = gap + columns * (cell_width + gap), gap + sum(heights)
     sheet, places = Image.new("RGB", (wide, high), "white"), []
     for k, cell in enumerate(cells):

@@ -46,12 +46,6 @@ def page():
         table.update(entries)
 
 
-def test_a_prior_takes_less_than_40_lines():
-    (prior,) = [block for block in BLOCKS if 'PRIORS["' in block]
-    assert len([line for line in prior.splitlines() if line.strip()]) < 40
-    assert max(map(len, prior.splitlines())) <= 120
-
-
 @pytest.mark.parametrize("table", ALONE)
 def test_a_block_runs_in_a_file_of_its_own(page, table):
     (block,) = [block for block in BLOCKS if f"\n{table}[" in block]

@@ -75,7 +75,7 @@ def evaluate_depth(
 
     Source: S5.1; Marigold's evaluation code for clipping and SILog.
     """
-    _check_maps(pred_m=pred_m, truth_m=truth_m, valid=valid)
+    _check_maps(pred_m=pred_m, truth_m=truth_m)
     kept = counted(truth_m, valid, cap_m)
     pred, truth = np.asarray(pred_m, np.float64)[kept], np.asarray(truth_m, np.float64)[kept]
     filled = np.isfinite(pred) & (pred > 0)

@@ -171,7 +171,7 @@ LAYOUTS = {
 each_dataset = pytest.mark.parametrize("name", [name for name in DATASETS if name != "synthetic"])
 
 
-def one(root, name) -> StereoSample:
+def sample_of(root, name) -> StereoSample:
     (ref,) = find_pairs(root, [name])
     return load(ref)
 
@@ -179,7 +179,7 @@ def one(root, name) -> StereoSample:
 @each_dataset
 def test_sample_is_in_our_conventions_and_metric(tmp_path, name):
     write(tmp_path, LAYOUTS[name])
-    sample, size = one(tmp_path, name), (HEIGHT, WIDTH)
+    sample, size = sample_of(tmp_path, name), (HEIGHT, WIDTH)
     assert sample.dataset == name and sample.label == f"{name}/{sample.name}" and sample.rectified
     for image in (sample.left, sample.right):
         assert image.dtype == np.uint8 and image.shape == (*size, 3)
@@ -241,14 +241,19 @@ def test_calibration_for_another_size_is_named(tmp_path, name):
     text = path.read_text().replace(f"width={WIDTH}", "width=99").replace(f": {WIDTH} {HEIGHT}", ": 99 40")
     path.write_text(text)
     with pytest.raises(ValueError, match=path.name):
-        one(tmp_path, name)
+        sample_of(tmp_path, name)
 
 
 def test_sets_below_one_root_are_told_apart_and_ordered(tmp_path):
     for name in ("mvsnet", "eth3d", "kitti2012", "middlebury2014", "kitti2015"):
         write(tmp_path / name, LAYOUTS[name])
-    found = [ref.dataset for ref in find_pairs(tmp_path)]
-    assert found == ["kitti2015", "kitti2012", "middlebury2014", "eth3d", "mvsnet"]
+    assert [ref.dataset for ref in find_pairs(tmp_path)] == [
+        "kitti2015",
+        "kitti2012",
+        "middlebury2014",
+        "eth3d",
+        "mvsnet",
+    ]
     assert [sample.dataset for sample in load_pairs(tmp_path, ["eth3d"])] == ["eth3d"]
     with pytest.raises(ValueError, match="root must be an existing folder"):
         find_pairs(tmp_path / "nowhere")
@@ -258,7 +263,7 @@ def test_sets_below_one_root_are_told_apart_and_ordered(tmp_path):
 
 def test_kitti2012_prefers_colour_and_all_pixels_and_says_so(tmp_path):
     write(tmp_path, LAYOUTS["kitti2012"])
-    assert one(tmp_path, "kitti2012").notes["truth"] == "disp_noc"
+    assert sample_of(tmp_path, "kitti2012").notes["truth"] == "disp_noc"
     files = {
         "disp_noc/000007_10.png": kitti_png(np.where(HIDDEN, 0, DISPARITY)),
         "disp_occ/000007_10.png": kitti_png(DISPARITY),
@@ -267,7 +272,7 @@ def test_kitti2012_prefers_colour_and_all_pixels_and_says_so(tmp_path):
         "calib/000007.txt": kitti_calibration("P", (0, 1)) + kitti_calibration("P", (2, 3), CX + 1),
     }
     write(tmp_path / "data" / "training", files)
-    sample = one(tmp_path, "kitti2012")
+    sample = sample_of(tmp_path, "kitti2012")
     assert sample.notes["truth"] == "disp_occ" and sample.valid.all()
     assert sample.K_left[0, 2] == CX + 1  # colour cameras 2 and 3
     np.testing.assert_array_equal(sample.occluded, HIDDEN)
@@ -279,9 +284,9 @@ def test_middleburys_test_scenes_are_left_out_and_coarse_truth_says_how_coarse(t
     without = {name: content for name, content in LAYOUTS["middeval3"].items() if name != truth}
     write(tmp_path, {name.replace("training", "test"): content for name, content in without.items()})
     assert [ref.label for ref in find_pairs(tmp_path)] == ["middeval3/Scene"]
-    assert one(tmp_path, "middeval3").notes["disparity_step_px"] == 0
+    assert sample_of(tmp_path, "middeval3").notes["disparity_step_px"] == 0
     write(tmp_path, {truth: np.round(DISPARITY)})
-    assert one(tmp_path, "middeval3").notes["disparity_step_px"] == 1
+    assert sample_of(tmp_path, "middeval3").notes["disparity_step_px"] == 1
 
 
 @pytest.mark.parametrize(
@@ -309,7 +314,7 @@ def test_mvsnet_pairs_extra_views_and_pixel_centre(tmp_path):
     write(tmp_path, {"scan1/images/00000002.jpg": RIGHT})
     assert cell_key(every[0], "guided", {}) != before  # a further view has changed
     np.testing.assert_allclose(load(every[2]).E[:3, 3], [-BASELINE, 0, 0], atol=1e-9)
-    ((image, K, E),) = one(tmp_path, "mvsnet").extra_views
+    ((image, K, E),) = sample_of(tmp_path, "mvsnet").extra_views
     assert image.shape == (HEIGHT, WIDTH, 3) and K[0, 2] == CX
     np.testing.assert_allclose(E[:3, 3], [2 * BASELINE, 0, 0], atol=1e-9)
     refs = find_pairs(tmp_path, pixel_centre=None, pairs="default")
@@ -345,10 +350,10 @@ def test_folder_takes_depth_and_images_of_any_format_and_a_png_before_its_copies
         truth = np.rint(1000 * with_hole(DEPTH_M, 0)).astype(np.uint16)
     files = {depth: truth, left: LEFT, right: RIGHT, "calib.txt": calibration, "left.txt": "notes"}
     write(tmp_path / "mine", files)
-    np.testing.assert_allclose(one(tmp_path, "folder").depth_m, with_hole(DEPTH_M, 0), atol=5.1e-4)
+    np.testing.assert_allclose(sample_of(tmp_path, "folder").depth_m, with_hole(DEPTH_M, 0), atol=5.1e-4)
     write(tmp_path / "mine", {"left.png": picture(HEIGHT, WIDTH - 2)})
     with pytest.raises(ValueError, match=f"{depth} must be for 62 x 40 pixels as the left image"):
-        one(tmp_path, "folder")
+        sample_of(tmp_path, "folder")
 
 
 @pytest.mark.parametrize("missing", ["left.png", "right.png", "calib.txt"])
@@ -356,7 +361,7 @@ def test_a_folder_of_two_of_three_is_no_silent_gap_and_one_of_less_is_no_pair(tm
     write(tmp_path, LAYOUTS["folder"])
     (tmp_path / "mine" / missing).unlink()
     with pytest.raises(FileNotFoundError, match=missing):
-        one(tmp_path, "folder")
+        sample_of(tmp_path, "folder")
     for side in ("left", "right"):
         (tmp_path / "mine" / f"{side}.png").unlink(missing_ok=True)
     assert find_pairs(tmp_path, ["folder"]) == []
@@ -383,7 +388,7 @@ COLMAP = dict(zip(("calib_left.txt", "calib_right.txt"), SAMPLES["colmap"], stri
 def test_folder_takes_calibrations_that_go_by_size_or_name(tmp_path, calibrations, size, expected):
     pictures = {f"{side}.jpg": np.zeros((*size[::-1], 3), np.uint8) for side in ("left", "right")}
     write(tmp_path / "mine", pictures | calibrations)
-    sample = one(tmp_path, "folder")
+    sample = sample_of(tmp_path, "folder")
     assert (sample.K_left[0, 0], sample.E[0, 3]) == pytest.approx(expected)
 
 

@@ -61,7 +61,7 @@ def test_tensors_with_axes_of_length_1_are_maps():
         (lambda: depth_range(np.ones((3, 4)), far=float("inf")), "far"),
         (lambda: depth_range(np.ones((3, 4)), near=3, far=2), "near < far"),
         (lambda: colour_depth(np.ones((2, 3, 4))), "depth_m"),
-        (lambda: grid([], []), "at least one picture"),
+        (lambda: grid([], []), "one or more, each with a title; got 0"),
         (lambda: grid([np.zeros((2, 2))], ["a", "b"]), "each with a title; got 1, 2 titles"),
         (lambda: grid([np.zeros((2, 2, 4))], ["a"]), "images"),
     ],
@@ -74,11 +74,11 @@ def test_what_is_no_picture_or_range_is_named(call, match):
 @pytest.mark.parametrize("near", [0.001, 0.3, 2.0, 47.0])
 @pytest.mark.parametrize("ratio", [1.001, 1.1, 1.9, 5.0, 30.0, 1e4])
 def test_ticks_are_few_rising_inside_and_round(near, ratio):
-    found = ticks(near, near * ratio)
-    assert 2 <= len(found) <= 8
-    assert near * (1 - 1e-6) <= found[0] and found[-1] <= near * ratio * (1 + 1e-6)
-    assert (np.diff(found) > 0).all()
-    assert len({f"{value:g}" for value in found}) == len(found)
+    values = ticks(near, near * ratio)
+    assert 2 <= len(values) <= 8
+    assert near * (1 - 1e-6) <= values[0] and values[-1] <= near * ratio * (1 + 1e-6)
+    assert (np.diff(values) > 0).all()
+    assert len({f"{value:g}" for value in values}) == len(values)
 
 
 def test_a_figure_is_the_map_beside_its_legend():

@@ -91,21 +91,17 @@ def _run_sweep(sample: StereoSample, settings: Settings, priors: PriorCache) -> 
     return Prediction(depth_m, space="disparity", notes={"density": float(matched.float().mean())})
 
 
-def _sgbm_configuration(settings: Settings) -> dict[str, Any]:
-    shifts = {"max_shift": MAX_SHIFT, "min_shift_px": MIN_SHIFT_PX}
-    return shifts | {"mode": "3way", "fill": "background"} | PARAMETERS
-
-
-def _sweep_configuration(settings: Settings) -> dict[str, Any]:
-    how = {"cost": "census", "aggregation": "semi-global", "fill": "background"}
-    return how | {"views": settings.views, "device": settings.device}
-
-
+_SHIFTS = {"max_shift": MAX_SHIFT, "min_shift_px": MIN_SHIFT_PX, "mode": "3way", "fill": "background"}
+_CHOICES = {"cost": "census", "aggregation": "semi-global", "fill": "background"}
 _SGBM = "OpenCV StereoSGBM (3-way) with background fill; rectified pairs only"
 _SWEEP = "our own plane sweep, aggregated, left-right checked and filled, any pose"
 STEREO_METHODS = (
-    Method("sgbm", "SGBM + fill", _SGBM, _run_sgbm, _sgbm_configuration, uses_prior=False),
-    Method("sweep-sgm", "sweep + SGM", _SWEEP, _run_sweep, _sweep_configuration, uses_prior=False),
+    Method("sgbm", "SGBM + fill", _SGBM, _run_sgbm, lambda settings: _SHIFTS | PARAMETERS, uses_prior=False),
+    Method(
+        *("sweep-sgm", "sweep + SGM", _SWEEP, _run_sweep),
+        lambda settings: _CHOICES | {"views": settings.views, "device": settings.device},
+        uses_prior=False,
+    ),
 )
 
 

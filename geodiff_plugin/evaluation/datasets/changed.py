@@ -30,10 +30,10 @@ def changed_ref(ref: SampleRef, kind: str, change: Numbers) -> SampleRef:
 def _two_numbers(text: str, option: str, names: str, most: Numbers, cure: str) -> Numbers:
     """Two numbers with a comma as typed, each from 0 to its ``most``; else ``ValueError`` with the cure."""
     parts = re.fullmatch(r"\s*(\d*\.?\d+)\s*,\s*(\d*\.?\d+)\s*", text)
-    one, other = map(float, parts.groups()) if parts else (-1.0, -1.0)
-    if not (0 <= one <= most[0] and 0 <= other <= most[1]):
+    first, second = map(float, parts.groups()) if parts else (-1.0, -1.0)
+    if not (0 <= first <= most[0] and 0 <= second <= most[1]):
         bad_value(option, f"{names} with numbers in [0, {most[0]:g}] and [0, {most[1]:g}]", repr(text), cure)
-    return one, other
+    return first, second
 
 
 def perturbation(text: str) -> Numbers:

@@ -58,10 +58,10 @@ def _read_pair(ref: SampleRef) -> tuple[Images, Rig]:
     return images, rig
 
 
-def _read_mask(path: Path, name: str, image: np.ndarray) -> np.ndarray:
-    mask = read_rgb(path, name)[..., 0]
-    check_size(path, mask.shape, image.shape)
-    return mask
+def _like(image: np.ndarray, path: Path, values: np.ndarray) -> np.ndarray:
+    """The values of a file, which must be as many as the image's pixels."""
+    check_size(path, values.shape, image.shape)
+    return values
 
 
 #: Truth beyond 80 m does not count, the range that monocular depth papers use on KITTI.
@@ -105,13 +105,12 @@ def _load_kitti(ref: SampleRef) -> StereoSample:
     """Read one KITTI pair; ``occluded`` where both kinds of truth exist."""
     (images, rig), truth, noc = _read_pair(ref), ref.files["disparity"], ref.files["noc"]
     disparity, valid = read_depth_png(truth, 256.0, "true disparity")
-    check_size(truth, disparity.shape, images[0].shape)
     occluded = None
     if noc is not None:
         _, seen_twice = read_depth_png(noc, 256.0, "disparity of the pixels seen twice")
-        check_size(noc, seen_twice.shape, images[0].shape)
-        occluded = valid & ~seen_twice
-    depth_m = np.where(valid, disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E), 0)
+        occluded = valid & ~_like(images[0], noc, seen_twice)
+    depth_m = disparity_to_depth(_like(images[0], truth, disparity), rig.K_left, rig.K_right, rig.E)
+    depth_m = np.where(valid, depth_m, 0)
     notes = {"truth": truth.parent.name, "disparity_step_px": 1 / 256}
     return make_sample(ref, images, rig, depth_m, notes, occluded=occluded)
 
@@ -168,11 +167,11 @@ def _load_scene(ref: SampleRef) -> StereoSample:
     ``notes["disparity_step_px"]`` says how coarse the truth is (Adirondack's quarter size: 1 px).
     """
     (images, rig), truth, mask = _read_pair(ref), ref.files["disparity"], ref.files["mask"]
-    disparity = read_map(truth, "true disparity")
-    check_size(truth, disparity.shape, images[0].shape)
+    disparity = _like(images[0], truth, read_map(truth, "true disparity"))
     valid, occluded = np.isfinite(disparity), None
     if mask is not None:
-        occluded = valid & (_read_mask(mask, "mask of pixels seen twice", images[0]) == 128)
+        seen = read_rgb(mask, "mask of pixels seen twice")[..., 0]
+        occluded = valid & (_like(images[0], mask, seen) == 128)
     depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
     notes = {"truth": truth.name, "disparity_step_px": _step_px(disparity[valid])}
     return make_sample(ref, images, rig, depth_m, notes, occluded=occluded)
@@ -224,12 +223,11 @@ def _load_booster(ref: SampleRef) -> StereoSample:
     (left, right), rig = _read_pair(ref)
     if any(side % SHRINK for side in (*left.shape[:2], *right.shape[:2])):
         bad_value(str(files["left"]), f"of sides that are multiples of {SHRINK}", left.shape[:2])
-    disparity = read_map(files["disparity"], "true disparity")
-    check_size(files["disparity"], disparity.shape, left.shape)
+    disparity = _like(left, files["disparity"], read_map(files["disparity"], "true disparity"))
     depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
     depth_m = _sampled(np.where(disparity > 0, depth_m, 0))
     masks = {
-        name: _sampled(_read_mask(files[name], f"{name} mask", left))
+        name: _sampled(_like(left, files[name], read_rgb(files[name], f"{name} mask")[..., 0]))
         for name in ("occluded", "material")
         if files[name].is_file()
     }
@@ -306,8 +304,8 @@ def _load_posed(ref: SampleRef) -> StereoSample:
         check_file(truth, "true depth", "an npz file")
     depth_m, named = np.zeros(images[0].shape[:2], np.float32), f"no {truth}"
     if truth.is_file():
-        depth_m, named = read_map(truth, "true depth"), f"{truth.parent.name}/{truth.name}"
-        check_size(truth, depth_m.shape, images[0].shape)
+        depth_m = _like(images[0], truth, read_map(truth, "true depth"))
+        named = f"{truth.parent.name}/{truth.name}"
     notes = {"truth": named, "views": files["views"][:2]}
     shifted = replace(rig, K_left=rig.K_left - half, K_right=rig.K_right - half)
     return make_sample(ref, images, shifted, depth_m, notes, extra_views=tuple(extra))
@@ -391,8 +389,7 @@ def _load_folder(ref: SampleRef) -> StereoSample:
     depth_m = np.zeros(images[0].shape[:2], np.float32)
     truth = f"no {', '.join(_DEPTHS[:-1])} or {_DEPTHS[-1]} in {ref.files['left'].parent}"
     if path is not None:
-        depth_m, truth = read_depth_m(path, "depth"), path.name
-        check_size(path, depth_m.shape, images[0].shape)
+        depth_m, truth = _like(images[0], path, read_depth_m(path, "depth")), path.name
     return make_sample(ref, images, rig, depth_m, {"truth": truth})
 
 
