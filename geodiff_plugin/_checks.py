@@ -105,7 +105,8 @@ def check_number(value: Any, name: str, low: float, high: float, *, integer: boo
 
 def check_positive(value: Any, name: str, unit: str) -> Any:
     """A finite number above 0, returned as it came."""
-    if isinstance(value, bool) or not isinstance(value, Real):
+    kind: Any = Real
+    if isinstance(value, bool) or not isinstance(value, kind):
         bad_type(name, "a number", value)
     if not 0 < value < float("inf"):
         bad_value(name, f"a finite number of {unit} above 0", value)

@@ -12,7 +12,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, intrinsics, make_rig, of_size, rigid
+from geodiff_plugin.formats.rigs import (
+    Camera,
+    CameraChoice,
+    array_of,
+    intrinsics,
+    make_rig,
+    of_size,
+    transform,
+)
 from geodiff_plugin.types import Rig
 
 #: Width and height of the images that a ZED's section is for.
@@ -46,11 +54,6 @@ RATIO_TOLERANCE = 0.01
 Sockets = dict[int, dict[str, Any]]
 
 
-def _transform(rotation: Any, translation: Any, name: str) -> np.ndarray:
-    R = array_of(rotation, (3, 3), f"the rotation of {name}")
-    return rigid(np.column_stack([R, array_of(translation, (3,), f"the translation of {name}")]), name)
-
-
 def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """The raw images of ``SN<number>.conf`` at the resolution of ``choice.image_size``.
 
@@ -76,8 +79,8 @@ def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     shift = [stereo["baseline"], *(stereo.get(key + at, stereo.get(key)) for key in ("ty", "tz"))]
     turn = array_of([stereo[key + at] for key in ("rx", "cv", "rz")], (3,), "RX, CV, RZ of [STEREO]")
     shift_m = -array_of(shift, (3,), "Baseline, TY, TZ of [STEREO]") / MM_PER_METRE
-    T = _transform(Rotation.from_rotvec(turn).as_matrix(), shift_m, "[STEREO]")
-    return make_rig(*cameras, np.linalg.inv(T))
+    T = transform(Rotation.from_rotvec(turn).as_matrix(), shift_m, "[STEREO]")
+    return make_rig(cameras[0], cameras[1], np.linalg.inv(T))
 
 
 def _rs_camera(values: dict[str, Any]) -> Camera:
@@ -107,7 +110,7 @@ def _rs_printed(text: str, choice: CameraChoice) -> tuple[Camera, Camera, np.nda
         bad_value("the file", expected, "less", "Is the file cut off?")
     left, right = (of_size(cameras[side], choice) for side in "12")
     rotation, translation = (NUMBER.findall(part) for part in between[1].partition("Translation")[::2])
-    return left, right, _transform(rotation[:9], translation[:3], "the extrinsics")
+    return left, right, transform(rotation[:9], translation[:3], "the extrinsics")
 
 
 def _objects(value: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
@@ -135,7 +138,7 @@ def _rs_json(text: str) -> tuple[Camera, Camera, np.ndarray]:
         bad_value("the file", expected, f"{len(views)} and {len(between)}", "Is the file cut off?")
     # rs2 keeps a rotation column by column.
     R = array_of(between[0]["rotation"], (3, 3), "the rotation of the extrinsics").T
-    T = _transform(R, between[0]["translation"], "the extrinsics")
+    T = transform(R, between[0]["translation"], "the extrinsics")
     # From the left to the right one x becomes smaller; a file that says it the other way round is inverted.
     return _rs_camera(views[0][1]), _rs_camera(views[1][1]), T if T[0, 3] <= 0 else np.linalg.inv(T)
 
@@ -182,7 +185,7 @@ def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
         if socket not in cameras or socket in reached:
             return reached
         shift = array_of([link["translation"][axis] for axis in "xyz"], (3,), where) * METRES_PER_CENTIMETRE
-        T = _transform(link["rotationMatrix"], shift, where) @ T
+        T = transform(link["rotationMatrix"], shift, where) @ T
         reached[socket] = T
 
 

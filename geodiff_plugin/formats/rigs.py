@@ -129,6 +129,12 @@ def rigid(matrix: Any, name: str) -> np.ndarray:
     return check_pose(matrix, name, "Are rows and columns swapped, or is a scale multiplied in?")
 
 
+def transform(rotation: Any, translation: Any, name: str) -> np.ndarray:
+    """The ``(4, 4)`` float64 rigid transform of a rotation of 9 numbers, row by row, and a translation."""
+    R = array_of(rotation, (3, 3), f"the rotation of {name}")
+    return rigid(np.column_stack([R, array_of(translation, (3,), f"the translation of {name}")]), name)
+
+
 def of_size(by_size: Mapping[Size, Entry], choice: CameraChoice) -> Entry:
     """What a file has for images of ``choice.image_size``, or all that it has where that is one."""
     if choice.image_size is None and len(by_size) == 1:
@@ -244,7 +250,8 @@ def make_rig(left: Camera, right: Camera, pose: Any, *, rectified: bool = False)
     sizes = [_pixels(camera.size, name) for name, camera in cameras]
     lens_left, lens_right = (lens_of(camera, name) for name, camera in cameras)
     rectified = rectified and lens_left is lens_right is None
-    return Rig(*Ks, E, *sizes, distortion=(lens_left, lens_right), rectified=rectified)
+    lenses = (lens_left, lens_right)
+    return Rig(Ks[0], Ks[1], E, sizes[0], sizes[1], distortion=lenses, rectified=rectified)
 
 
 def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> Rig:
@@ -259,7 +266,7 @@ def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any 
         places.append(np.linalg.solve(P[:, :3], P[:, 3]))
     E = np.eye(4)
     E[:3, 3] = places[0] - places[1]
-    return make_rig(*cameras, E, rectified=True)
+    return make_rig(cameras[0], cameras[1], E, rectified=True)
 
 
 def rig_from_parameters(

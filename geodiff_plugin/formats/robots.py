@@ -21,6 +21,7 @@ from geodiff_plugin.formats.rigs import (
     make_rig,
     projected,
     rigid,
+    transform,
     two_cameras,
 )
 from geodiff_plugin.types import Rig
@@ -69,8 +70,7 @@ def _yaml(text: str) -> Entries:
 def _storage(text: str) -> Entries:
     """Every entry of an OpenCV file in YAML, XML or JSON, those of maps in it beside the others.
 
-    By key in small letters: matrices as float64 arrays of rows and columns, those of other shapes, numbers
-    and lists of numbers as arrays of one axis, and strings.
+    By key in small letters: matrices, numbers, lists of numbers as float64 arrays of one axis, and strings.
     """
     if "<opencv_storage" in text:
         if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
@@ -81,11 +81,7 @@ def _storage(text: str) -> Entries:
     maps = [value for value in content.values() if isinstance(value, dict) and "data" not in value]
     entries: Entries = {}
     for key, value in [item for each in (*maps, content) for item in each.items()]:
-        matrix = isinstance(value, dict) and "data" in value
-        numbers = _numbers(value["data"] if matrix else value)
-        shape = _numbers([value.get("rows"), value.get("cols")]) if matrix else None
-        if numbers is not None and shape is not None and numbers.size == shape.prod():
-            numbers = numbers.reshape(shape.astype(int))
+        numbers = _numbers(value["data"] if isinstance(value, dict) and "data" in value else value)
         entries[str(key).lower()] = value if numbers is None else numbers
     return entries
 
@@ -168,10 +164,10 @@ def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         return raw
     turns, cameras = [], []
     for info, size in zip(infos, sizes, strict=True):
-        turns.append(rigid(np.column_stack([array_of(info["R"], (3, 3), "R"), np.zeros(3)]), "R"))
+        turns.append(transform(info["R"], (0, 0, 0), "R"))
         model = str(info["distortion_model"])
         cameras.append(Camera(array_of(info["K"], (3, 3), "K"), size, info["D"], LENSES.get(model, model)))
-    return make_rig(*cameras, np.linalg.inv(turns[0]) @ raw.E @ turns[1])
+    return make_rig(cameras[0], cameras[1], np.linalg.inv(turns[0]) @ raw.E @ turns[1])
 
 
 def _orb_camera(entries: Entries, name: str, kind: str) -> Camera:
@@ -211,10 +207,9 @@ def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     if np.any(camera.coefficients):
         expected = f"zero for rectified images, which have no {ORB_POSES[0]}"
         bad_value(f"Lens distortion of {left}", expected, camera.coefficients, "Is it of a single camera?")
-    length = float(array_of(entries[baseline.lower()], (), baseline))
-    return make_rig(
-        camera, camera, length if baseline == "Stereo.b" else length / camera.K[0, 0], rectified=True
-    )
+    length = array_of(entries[baseline.lower()], (), baseline)
+    baseline_m = length if baseline == "Stereo.b" else length / camera.K[0, 0]
+    return make_rig(camera, camera, baseline_m, rectified=True)
 
 
 def _of(words: str, number: str, side: str) -> str:
@@ -238,53 +233,31 @@ NAMES = {
 }
 #: Those that are one number; what else is a number, such as a coefficient ``k1``, is none of the matrices.
 NUMBERS = ("image_width", "image_height")
+Arrays = list[tuple[str, np.ndarray]]
 
 
-def _merged(texts: tuple[str, ...]) -> Entries:
-    """The arrays of all files."""
-    entries: Entries = {}
-    for text in texts:
-        new = {key: value for key, value in _storage(text).items() if isinstance(value, np.ndarray)}
-        clash = [key for key in new if key in entries and not np.array_equal(new[key], entries[key])]
-        if clash:
-            expected = "one calibration in two files (intrinsics.yml, extrinsics.yml)"
-            cure = "A pair of single-camera files has no baseline; give the file that stereoRectify wrote."
-            bad_value("the files", expected, f"different {', '.join(clash)}", cure)
-        entries.update(new)
-    return entries
-
-
-def _named(entries: Entries) -> Entries:
-    """What ``NAMES`` has of the entries, by its names; entries that differ under one name are refused."""
+def _named(arrays: Arrays) -> Entries:
+    """What ``NAMES`` has of the arrays, by its names; those that differ under one name are refused."""
     named: Entries = {}
     for name, words in NAMES.items():
-        fits = {k: v for k, v in entries.items() if (v.size == 1 if name in NUMBERS else v.shape != (1,))}
-        keys = [key for key in fits if re.fullmatch(words, re.sub("[_.]", "", key))]
-        if any(not np.array_equal(fits[key].ravel(), fits[keys[0]].ravel()) for key in keys[1:]):
-            cure = "Keep those that belong to R and T."
-            bad_value(name, "there once", f"{', '.join(keys)}, which differ", cure)
-        if keys:
-            named[name] = fits[keys[0]]
+        fits = [(key, v) for key, v in arrays if (v.size == 1) == (name in NUMBERS)]
+        fits = [(key, v) for key, v in fits if re.fullmatch(words, re.sub("[_.]", "", key))]
+        if any(not np.array_equal(v, fits[0][1]) for _, v in fits[1:]):
+            cure = "Keep those that belong to R and T; files of single cameras have no baseline."
+            bad_value(name, "there once", f"{', '.join(key for key, _ in fits)}, which differ", cure)
+        if fits:
+            named[name] = fits[0][1]
     return named
 
 
-def _of_shape(named: Entries, shape: tuple[int, int], *names: str) -> list[np.ndarray]:
-    for name in names:
-        if named[name].shape != shape:
-            cure = "Was this file written by stereoRectify?"
-            bad_value(name, f"of shape {shape}", named[name].shape, cure)
-    return [named[name] for name in names]
-
-
-def _lenses(entries: Entries, named: Entries) -> list[Any]:
+def _lenses(arrays: Arrays, named: Entries) -> list[Any]:
     """``D1`` and ``D2``, or none; without one that has another name, images would pass for a pinhole's."""
     given = [named[name] for name in ("D1", "D2") if name in named]
-    taken = [id(lens) for lens in given]
-    others = [key for key, v in entries.items() if "dist" in key and v.shape != (1,) and id(v) not in taken]
+    others = [key for key, v in arrays if "dist" in key and v.size > 1 and not any(v is d for d in given)]
     if len(given) < 2 and (others or np.any(given)):
         cure = "Rename what is lens distortion to D1 and D2, and what is not; a lens without any has zeros."
         bad_value("the lens distortion", "of both cameras (D1, D2)", ", ".join(others) or "one of them", cure)
-    return [lens.ravel() for lens in given] if len(given) == 2 else [(), ()]
+    return given if len(given) == 2 else [(), ()]
 
 
 def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -295,26 +268,24 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     left points to right ones. Lengths are taken as metres: OpenCV keeps the unit of the chessboard's squares,
     and the file does not say it. ``NAMES`` has what else they may be called.
     """
-    entries = _merged(texts)
-    named = _named(entries)
-    sides = [named[name].item() for name in NUMBERS if name in named]
-    size = next((pair for pair in (named.get("image_size"), sides) if np.size(pair) == 2), None)
+    arrays = [item for text in texts for item in _storage(text).items() if isinstance(item[1], np.ndarray)]
+    named = _named(arrays)
+    sides = np.array([named[name].item() for name in NUMBERS if name in named])
+    size = next((pair for pair in (named.get("image_size", sides), sides) if pair.size == 2), None)
     if named.keys() >= {"P1", "P2"}:
-        return projected(*_of_shape(named, (3, 4), "P1", "P2"), size, size)
+        return projected(named["P1"], named["P2"], size, size)
     missing = [name for name in ("M1", "M2", "R", "T") if name not in named]
     if missing:
         expected = "an OpenCV calibration with P1, P2, or with M1, M2, R, T"
         cure = "Where intrinsics and extrinsics are two files, give both; rename what has other names."
         bad_value("the file", expected, f"no {', '.join(missing)}", cure)
-    lenses = _lenses(entries, named)
-    *Ks, R = _of_shape(named, (3, 3), "M1", "M2", "R")
-    left, right = (Camera(K, size, lens) for K, lens in zip(Ks, lenses, strict=True))
-    T = rigid(np.column_stack([R, array_of(named["T"], (3,), "T")]), "R, T")
-    return make_rig(left, right, np.linalg.inv(T))
+    Ks = (array_of(named[name], (3, 3), name) for name in ("M1", "M2"))
+    left, right = (Camera(K, size, lens) for K, lens in zip(Ks, _lenses(arrays, named), strict=True))
+    return make_rig(left, right, np.linalg.inv(transform(named["R"], named["T"], "R, T")))
 
 
 def read_booster(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """For the images at full resolution, which are rectified; lengths are millimetres."""
     entries = _storage(texts[0])
-    left, right = (Camera(entries[key][:, :3]) for key in ("proj_matl", "proj_matr"))
-    return make_rig(left, right, float(entries["baselinelr"][0]) / MM_PER_METRE, rectified=True)
+    left, right = (Camera(array_of(entries[key], (3, 4), key)[:, :3]) for key in ("proj_matl", "proj_matr"))
+    return make_rig(left, right, entries["baselinelr"].item() / MM_PER_METRE, rectified=True)

@@ -131,9 +131,8 @@ REFUSALS = [
     ("stereodemo", "700.0", "9" * 5000, "must be a whole stereodemo JSON"),
     ("opencv", "1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0", "1.5, 0, 0, 0, 1.5, 0, 0, 0, 1.5",
      "R, T must be rigid.*rotation"),
-    ("opencv", "-0.12, 0.0, 0.0", "0, 0", "T must be 3 finite numbers; got 2"),
-    ("opencv", "rows: 3\n   cols: 3", "rows: 1\n   cols: 9", r"M1 must be of shape \(3, 3\)"),
-    ("opencv", "rows: 3\n   cols: 3", "rows: 9e9\n   cols: 9e9", r"M1 must be .*; got \(9,\)"),
+    ("opencv", "-0.12, 0.0, 0.0", "0, 0", "translation of R, T must be 3 finite numbers; got 2"),
+    ("opencv", "[ 700.0, 0.0", "[ 700.0", "M1 must be 9 finite numbers; got 8"),
     ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nM2", "[ 0.1, 0.0, 0.0, 0.0 ]\nM2", "of the left .*rectify"),
     ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nR", "[ 1, 2, 3 ]\nR", "right camera must be 4, 5, 8, 12, 14 co"),
     ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nR", "[ .Nan, 2, 3, 4 ]\nR", "right camera must be finite"),
@@ -266,7 +265,7 @@ def test_how_many_files_a_format_needs(tmp_path):
     assert read_calibration((path, path)).E[0, 3] == 0.12  # the same file twice is that file
     for texts, said in (
         ((K, K.replace("0.12", "0.2")), "describes both cameras"),
-        ((text, text.replace("700.0", "701.0")), "different m1, m2"),
+        ((text, text.replace("700.0", "701.0")), "M1 must be there once; got m1, m1, which differ"),
         ((K, SAMPLES["middlebury"][0]), "two files of one format; got foundation_stereo and middlebury"),
         *(((SAMPLES[name][0],), "two files .*Give --calib twice") for name in ("mvsnet", "ros", "colmap")),
     ):
