@@ -1,8 +1,11 @@
-"""``geodiff demo``: a guided call on a rendered pair whose depth is known, offline."""
+"""On the bundled pair: ``geodiff demo``, whose depth is known, and ``geodiff bench``, what guidance costs."""
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,9 +18,15 @@ from geodiff_plugin.cli.terminal import StopWatch, new_table, say, show
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
+from geodiff_plugin.priors import load_prior
+from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 CELL_WIDTH = 360
+#: Name in the table -> gradient of the guidance, ``None`` for the plain pipeline.
+VARIANTS = {"plain": None, "guided, denoised gradient": "denoised", "guided, full gradient": "full"}
 
 
 def _write_comparison(path: Path, pair: DemoPair, aligned_m: np.ndarray, guided_m: np.ndarray) -> None:
@@ -50,3 +59,41 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
         say(f"geodiff: comparison.png could not be written ({error.strerror or error}).")
     print(summary_line(report, f"{out.path}/"))
     print(f"Open {out.path / 'comparison.png'} first: prior, guided depth and truth side by side.")
+
+
+def measure(gradient: str | None, device_name: str, repeats: int = 2, **knobs: Any) -> tuple[float, int]:
+    """Seconds of one call of the bundled prior on the demo pair, and the most bytes that it took.
+
+    Plain and guided calls run the same number of steps. The first call of a process tells its memory, since
+    what is freed later stays with the allocator; the fastest of ``repeats`` more, if any, tells the seconds.
+    """
+    device, pair = torch.device(device_name), read_demo_pair()
+    pipe = load_prior("bundled", device=device)
+    pipe.set_progress_bar_config(disable=True)
+    enable_geometry_guidance(pipe)
+    cameras = (pair.rig.K_left, pair.rig.K_right), pair.rig.E
+    guidance = GeometryGuidance(pair.right, *cameras, gradient=gradient or "denoised", **knobs)
+    options: dict[str, Any] = {"num_inference_steps": guidance.denoising_steps(None, 1)}
+    if gradient is not None:
+        options["guidance"] = guidance
+
+    def call() -> None:
+        pipe(pair.left, generator=torch.Generator("cpu").manual_seed(0), **options)
+
+    with PeakMemory(device) as memory:
+        first = timed(call, device)
+    return min([timed(call, device) for _ in range(repeats)], default=first), memory.peak_bytes
+
+
+def run_bench(device: str) -> None:
+    """Print the table; every row is measured in a process of its own."""
+    place, costs = pick_device(device), []
+    where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
+    table = new_table(("", "seconds", "peak MB", "time x", "memory x"))
+    for name, gradient in VARIANTS.items():
+        with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
+            costs.append(fresh_process.submit(measure, gradient, str(place)).result())
+        seconds, peak_bytes = costs[-1]
+        ratios = f"{seconds / costs[0][0]:.2f}", f"{peak_bytes / max(costs[0][1], 1):.2f}"
+        table.add_row(name, f"{seconds:.2f}", f"{peak_bytes / 1e6:.0f}", *ratios)
+    show(f"bundled prior, default guidance; {where}; demo pair", table)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, noted, warn
 from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.cli.exports import check_image_names, write_exports, write_maps, write_undistorted
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.report import REPORT, build_report, summary_line
-from geodiff_plugin.cli.terminal import StopWatch, Warner, collected_warnings, say
+from geodiff_plugin.cli.terminal import StopWatch, collected_warnings, say, warn_once
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
@@ -53,38 +53,58 @@ def load_guided_prior(options: DepthOptions, device: torch.device) -> Any:
 
 @dataclass(eq=False)
 class Job:
-    """A pair on its way from its files to its folder, and what the stages have made of it so far."""
+    """A pair on its way from its files to its folder, and what the stages have made of it so far.
+
+    Attributes:
+        options: of this pair.
+        folder: held, which it will be written to.
+        watch: seconds of the stages.
+        entries: of the report, that only the caller knows.
+        warnings: of all stages.
+        inputs: what the first stage read.
+        output: of the guided call.
+    """
 
     options: DepthOptions
     folder: OutFolder
     watch: StopWatch = field(default_factory=StopWatch)
+    entries: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     inputs: Inputs = field(init=False)
     output: MetricDepthOutput = field(init=False)
 
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what is inside, and note what it warns of."""
+        with self.watch.stage(name), noted() as warned:
+            yield
+        self.warnings += [sentence for sentence in warned if sentence not in self.warnings]
+
     def read(self, frames: Sequence[np.ndarray] | None = None) -> None:
         """Read the views, from their files or as ``frames``, and the cameras, and see that they fit."""
-        with self.watch.stage("calibration"):
+        with self.stage("calibration"):
             self.inputs = read_inputs(self.options, self.options.config(), frames)
             check_image_names(self.options, self.inputs)
 
-    def guide(self, pipe: Any, progress: bool, **further: Any) -> None:
+    def guide(self, pipe: Any, progress: bool) -> None:
         """Call the pipeline as the options say, if wanted with the loss in a progress bar on stderr."""
         options, inputs = self.options, self.inputs
-        call = options.call() | {"generator": torch.Generator("cpu").manual_seed(options.seed)} | further
+        call = options.call() | {"generator": torch.Generator("cpu").manual_seed(options.seed)}
         if inputs.prior_map is not None:
             call["depth_map"] = inputs.prior_map
         pipe.set_progress_bar_config(disable=not progress, file=sys.stderr, leave=False)
         try:
-            with self.watch.stage("guided call"):
+            with self.stage("guided call"):
                 self.output = pipe(inputs.left, guidance=inputs.guidance, strict=options.strict, **call)
+                for sentence in self.output.warnings:
+                    warn(sentence)
         finally:
             pipe.set_progress_bar_config(disable=True)
 
-    def write(self, pipe: Any, **entries: Any) -> dict[str, Any]:
+    def write(self, pipe: Any) -> dict[str, Any]:
         """Fill the folder: every map, what ``--export`` asks for, and last the report, which is returned."""
         options, inputs, output = self.options, self.inputs, self.output
-        report = build_report(inputs, output, pipe, options, self.warnings) | entries
+        report = build_report(inputs, output, pipe, options, self.warnings) | self.entries
 
         def fill(folder: Path) -> None:
             with self.watch.stage("write"):
@@ -110,14 +130,10 @@ def estimate_and_write(
 ) -> tuple[Any, Job, dict[str, Any]]:
     """Everything of ``geodiff depth`` but its answer on stdout: the pipeline, the job, the report.
 
-    Args:
-        options: that ``start_pair`` has seen.
-        folder: that it gave, held.
-        watch: of the stages so far.
+    ``start_pair`` has seen the options and given the folder, which is held; ``watch`` has the stages so far.
     """
-    job, warn = Job(options, folder, watch), Warner()
-    warn.note_in(job.warnings)
-    with collected_warnings(warn):
+    job = Job(options, folder, watch)
+    with collected_warnings(warn_once()):
         device = pick_device(options.device)
         job.read()
         for sentence in () if options.quiet else job.inputs.guidance.assumed:
@@ -125,8 +141,6 @@ def estimate_and_write(
         with watch.stage("load"):
             pipe = load_guided_prior(options, device)
         job.guide(pipe, progress=not options.quiet)
-        for sentence in job.output.warnings:
-            warn(sentence)
         return pipe, job, job.write(pipe)
 
 

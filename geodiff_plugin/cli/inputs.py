@@ -91,9 +91,12 @@ def read_inputs(
     images = [pinhole(*each, config) for each in zip(images, Ks, lenses, strict=False)]
     known: dict[str, Any] = {
         "points": _read_known(options, Ks[0], lenses[0], sizes[0], rig),
-        "points_confidence": _read_confidence(options, lenses[0]),
+        "points_confidence": None,
         "cropped": options.cropped,
     }
+    if options.points_confidence is not None:
+        _refuse_lens(lenses[0], "--points-confidence", "Give the points of an image without it, with theirs.")
+        known["points_confidence"] = read_confidence(options.points_confidence, "--points-confidence")
     if rig is None:
         guidance = GeometryGuidance.from_photographs(
             images,
@@ -116,11 +119,16 @@ def read_inputs(
     right_given = options.k_right is not None or options.cx_right is not None
     if way in ("parameters", "matrices") and not right_given and not options.estimate_pose:
         assume_same_centre(guidance)
-    prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
-    if prior_map is not None and lenses[0] is not None:
-        cure = "Run the other model on undistorted.png, and give that image and its map."
-        bad_value("--prior-map", "of an image without lens distortion", "a lens with distortion", cure)
+    prior_map = None
+    if options.prior_map is not None:
+        _refuse_lens(lenses[0], "--prior-map", "Run the other model on undistorted.png, and give that image.")
+        prior_map = read_map(options.prior_map, "--prior-map")
     return Inputs(images[0], rig, guidance, any(lens is not None for lens in lenses), prior_map)
+
+
+def _refuse_lens(lens: Distortion | None, name: str, cure: str) -> None:
+    if lens is not None:
+        bad_value(name, "of an image without lens distortion", "a lens with distortion", cure)
 
 
 def _read_view(path: Path, name: str) -> np.ndarray:
@@ -221,9 +229,9 @@ def _read_known(
         ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)`` float32 metres.
     """
     if options.disparity is not None:
-        if rig is None or lens is not None:
-            got = "--estimate-pose" if rig is None else "a lens with distortion"
-            bad_value("--disparity", "of a rectified rig with a calibration", got)
+        _refuse_lens(lens, "--disparity", "Rectify the images.")
+        if rig is None:
+            bad_value("--disparity", "of a rectified rig with a calibration", "--estimate-pose")
         return depth_of_disparity(options.disparity, rig, size, "--disparity")
     if options.points is None:
         return None
@@ -236,15 +244,6 @@ def _read_known(
         cure = "A map belongs to the image as it was taken, pixel by pixel; else give points (N, 3)."
         bad_value("--points", f"a map of the left image's {expected} pixels", got, cure)
     return undistorted_points(known, K, lens)
-
-
-def _read_confidence(options: DepthOptions, lens: Distortion | None) -> np.ndarray | None:
-    if options.points_confidence is None:
-        return None
-    if lens is not None:
-        cure = "Give the points of an image without distortion, with theirs."
-        bad_value("--points-confidence", "of points of a pinhole's image", "a lens with distortion", cure)
-    return read_confidence(options.points_confidence, "--points-confidence")
 
 
 def pinhole(

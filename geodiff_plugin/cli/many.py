@@ -21,7 +21,7 @@ from geodiff_plugin.cli.depth import Job, load_guided_prior
 from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, check_files, out_folder_of
 from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, assumption, check_pair, options_of, start_many
 from geodiff_plugin.cli.report import read_report
-from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, Warner, collected_warnings, new_table, say, show
+from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, collected_warnings, new_table, say, show, warn_once
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import atomic_path, reason_of, write_text
 from geodiff_plugin.formats.reading import has_pose_per_image
@@ -49,7 +49,6 @@ MOST_ROWS = 20
 #: Options that a result does not depend on.
 NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "strict", "device", "encoding"}
 Row = dict[str, Any]
-Work = tuple[Job, Row]
 
 
 class _EndsRun(BaseException):
@@ -58,8 +57,6 @@ class _EndsRun(BaseException):
 
 class Stages:
     """The stages of a pair, each called in a thread of its own.
-
-    What goes from stage to stage is the job of the pair, and what its report says of it as one of many.
 
     Args:
         options: of the run.
@@ -72,24 +69,23 @@ class Stages:
         self._options, self._device, self._pipe, self._among = options, device, pipe, among
         self._videos, self._open = dict[Path, VideoReader | BagReader](), ExitStack()
         self._folders: dict[str, ExitStack] = {}
-        self.warn = Warner()
 
     def close(self) -> None:
         """Close the videos, when the threads are done."""
         self._open.close()
 
-    def read(self, item: Item) -> Work:
+    def read(self, item: Item) -> Job:
         """Look at the files, take the folder, decode the views."""
         ref: PairRef = item.payload
-        options, warnings = options_of(ref, self._options), list[str]()
-        self.warn.note_in(warnings)
+        options = options_of(ref, self._options)
         check_pair(ref, options)
         check_files(options, photographs=ref.frame is None)
         held = self._folders[item.key] = ExitStack()
-        job = Job(options, held.enter_context(out_folder_of(options)), warnings=warnings)
+        job = Job(options, held.enter_context(out_folder_of(options)))
         digests = _digests(options)  # before: what changes later is another version
+        job.entries = {"pair": {"name": ref.name, "frame": ref.frame, "sha256": digests}}
         job.read(None if ref.frame is None else self._frames(ref, ref.frame))
-        return job, {"name": ref.name, "frame": ref.frame, "sha256": digests}
+        return job
 
     def _frames(self, ref: PairRef, frame: int) -> Sequence[np.ndarray]:
         for path in {ref.left, ref.right or ref.left} - set(self._videos):
@@ -101,10 +97,8 @@ class Stages:
         left = self._videos[ref.left].read(frame)
         return both_halves(left, "LEFT") if ref.right is None else (left, self._videos[ref.right].read(frame))
 
-    def evidence(self, work: Work) -> Work:
+    def evidence(self, job: Job) -> Job:
         """What the views say by themselves, into a store of the pair's own, where the call finds it."""
-        job, _ = work
-        self.warn.note_in(job.warnings)
         if self._pipe is None:
             try:
                 self._pipe = load_guided_prior(self._options, self._device)
@@ -112,30 +106,25 @@ class Stages:
                 raise _EndsRun from error
         device, guidance = self._pipe._execution_device, job.inputs.guidance
         with (
-            job.watch.stage("evidence"),
+            job.stage("evidence"),
             WithinCores(self._among),
             torch.no_grad(),
             torch.autocast(device.type, enabled=False),
         ):
             guidance.evidence_store = EvidenceStore(1, copies=False)
             guidance.prepare(native_images(job.inputs.left, device))
-        return work
+        return job
 
-    def guide(self, work: Work) -> Work:
+    def guide(self, job: Job) -> Job:
         """The guided call."""
-        job, _ = work
-        self.warn.note_in(job.warnings)
         with WithinCores(self._among):
             job.guide(self._pipe, progress=False)
         job.inputs.guidance.evidence_store = None
-        return work
+        return job
 
-    def write(self, work: Work) -> Row:
+    def write(self, job: Job) -> Row:
         """The files, the report last, and the row of the table."""
-        job, entry = work
-        self.warn.note_in(job.warnings)
-        job.warnings += [sentence for sentence in job.output.warnings if sentence not in job.warnings]
-        return _row(job.write(self._pipe, pair=entry))
+        return _row(job.write(self._pipe))
 
     def release(self, item: Item) -> None:
         """Give back the folder of a pair."""
@@ -247,7 +236,7 @@ def _any_fails(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
         say(assumed)
     stages = Stages(options if process.index == 0 else replace(options, quiet=True), device)
     try:
-        with collected_warnings(stages.warn):
+        with collected_warnings(warn_once()):
             records = runner.run(
                 stages.read, stages.evidence, stages.guide, stages.write, release=stages.release
             )

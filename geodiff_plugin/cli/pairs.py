@@ -191,33 +191,22 @@ def _of_list(path: Path, right: Path | None) -> list[PairRef]:
         bad_value("RIGHT", "left out where LEFT is a list of pairs", right, cure)
     file = check_file(path, "LEFT", "a list of pairs")
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
+        text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         bad_value("LEFT", "an image, a folder, a video or a list of pairs", f"{path}, which is no text")
     rows: list[list[Path]] = []
-    for number, line in enumerate(lines, 1):
-        cells = _cells(line)
+    for number, line in enumerate(csv.reader(text.splitlines(), delimiter="\t" if "\t" in text else ","), 1):
+        cells = [cell.strip() for cell in line if cell.strip()]
         heading = not rows and cells and cells[0].lower().startswith(HEADING) and not Path(cells[0]).suffix
-        if not cells or heading:
+        if not cells or cells[0].startswith("#") or heading:
             continue
         if len(cells) not in (2, 3):
-            cure = "Separate them by commas, tabs, or blanks where no name has one."
-            bad_value(f"line {number} of {path}", "LEFT RIGHT [CALIB]", repr(line.strip()), cure)
+            got = repr(" ".join(cells))
+            bad_value(f"line {number} of {path}", "LEFT,RIGHT[,CALIB], by commas or tabs", got)
         rows.append([file.parent / cell for cell in cells])
     if not rows:
         bad_value("LEFT", "a list with a pair a line: LEFT,RIGHT[,CALIB]", f"{path}, which names none")
     return [PairRef(name, *row) for name, row in zip(_names([row[0] for row in rows]), rows, strict=True)]
-
-
-def _cells(line: str) -> list[str]:
-    """What stands in a line, by tabs, else commas, else blanks; nothing of an empty one or a comment."""
-    line = line.strip()
-    if line.startswith("#"):
-        return []
-    separator = next((mark for mark in "\t," if mark in line), None)
-    if separator is None:
-        return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator)) if cell.strip()]
 
 
 def _names(lefts: Sequence[Path]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # drawn by few commands
-    from rich.console import Console, RenderableType
+    from rich.console import RenderableType
     from rich.table import Table
 
 EXIT_BAD_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 2, 4, 130
@@ -45,24 +44,16 @@ class StopWatch:
         self.seconds[name] = time.perf_counter() - started
 
 
-class Warner:
-    """Says each warning once, and notes it with the work that its thread is at."""
+def warn_once() -> Callable[[str], None]:
+    """Says a warning the first time that it is called with it."""
+    said = set[str]()
 
-    def __init__(self) -> None:
-        self._thread, self._said = threading.local(), set[str]()
-
-    def note_in(self, sentences: list[str]) -> None:
-        """From here on what this thread warns of goes into ``sentences``, once each."""
-        self._thread.sentences = sentences
-
-    def __call__(self, sentence: str) -> None:
-        """Warn."""
-        noted = getattr(self._thread, "sentences", [])
-        if sentence not in noted:
-            noted.append(sentence)
-        if sentence not in self._said:
-            self._said.add(sentence)
+    def tell(sentence: str) -> None:
+        if sentence not in said:
+            said.add(sentence)
             say(f"warning: {sentence}")
+
+    return tell
 
 
 @contextmanager
@@ -85,19 +76,13 @@ def collected_warnings(tell: Callable[[str], None]) -> Iterator[None]:
         yield
 
 
-def new_console() -> Console:
-    """A console on the present standard output that takes text as it is, without markup."""
+def show(*shown: RenderableType) -> None:
+    """Print on the present standard output, text as it is; lines of a file or a pipe do not end in blanks."""
     from rich.console import Console
 
     console = Console(markup=False, highlight=False, emoji=False)
     if not console.is_terminal:
         console.width = UNBOUNDED
-    return console
-
-
-def show(*shown: RenderableType) -> None:
-    """Print on the present standard output; lines of a file or a pipe do not end in blanks."""
-    console = new_console()
     with console.capture() as captured:
         for part in shown:
             console.print(part)

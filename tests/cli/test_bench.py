@@ -12,7 +12,7 @@ import torch
 from diffusers import AutoencoderKL, UNet2DConditionModel
 
 from geodiff_plugin.bundled.demo_pair import DemoPair
-from geodiff_plugin.cli.bench import measure, run_bench
+from geodiff_plugin.cli.demo import measure, run_bench
 from geodiff_plugin.runtime.machine import PeakMemory
 from geodiff_plugin.types import Rig
 from tests.benchmarks import full_size, operations
@@ -41,7 +41,7 @@ def test_measure(make_pipeline, textured_plane, tmp_path, monkeypatch, gradient)
     depth_m = textured_plane.depth_m
     rig = Rig(textured_plane.K, textured_plane.K, textured_plane.E)
     pair = DemoPair(left, right, rig, depth_m, depth_m > 0)
-    monkeypatch.setattr("geodiff_plugin.cli.bench.read_demo_pair", lambda: pair)
+    monkeypatch.setattr("geodiff_plugin.cli.demo.read_demo_pair", lambda: pair)
     monkeypatch.setattr("geodiff_plugin.priors.BUNDLED_FOLDER", tmp_path)
     seconds, peak_bytes = measure(gradient, "cpu", repeats=0, inner_steps=2)
     assert seconds > 0 and peak_bytes >= 0
@@ -66,7 +66,7 @@ def test_table(monkeypatch, capsys):
             assert function is measure
             return SimpleNamespace(result=lambda: costs[gradient])
 
-    monkeypatch.setattr("geodiff_plugin.cli.bench.ProcessPoolExecutor", Inline)
+    monkeypatch.setattr("geodiff_plugin.cli.demo.ProcessPoolExecutor", Inline)
     run_bench("cpu")
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     rows = [words[-4:] for words in lines if words and re.fullmatch(r"\d\.\d\d", words[-1])]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import weakref
 from pathlib import Path
 
 import cv2
@@ -15,8 +14,6 @@ from PIL import Image
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.distortion import distortion_from_text, undistorted
-from geodiff_plugin.formats.files import read_npy
-from geodiff_plugin.plotting import write_depth_video
 from tests.cli.conftest import QUICK, never, report_of
 
 LENS = "-0.2,0.05,0,0"
@@ -142,33 +139,3 @@ def test_video_of_results_without_a_unit(geodiff, maps):
     assert np.array_equal(first_frame("result-1-depth.npy.gif"), without)
     answer = geodiff("video", "result-0", "result-1")
     assert answer.code == 2 and "all in metres, or all without a unit; got result-0 with" in answer.err
-
-
-def test_a_long_video_is_never_in_memory_as_a_whole(geodiff, maps, monkeypatch):
-    most, alive = [], []
-
-    def counted(path, *rest):
-        depth_m = read_npy(path, *rest)
-        alive.append(weakref.ref(depth_m))
-        most.append(sum(ref() is not None for ref in alive))
-        return depth_m
-
-    monkeypatch.setattr("geodiff_plugin.cli.results.read_npy", counted)
-    assert geodiff("video", *maps * 4, "--out", "depth.mp4").code == 0
-    assert len(most) >= 12 and max(most) <= 3
-
-
-class Interrupted:
-    """A frame at which the user presses Ctrl-C."""
-
-    def __getattr__(self, name: str):
-        raise KeyboardInterrupt
-
-
-@pytest.mark.parametrize("name", ["depth.webp", "depth.gif", "depth.mp4"])
-def test_video_is_whole_or_as_it_was(tmp_path, name):
-    (tmp_path / name).write_bytes(b"older")
-    frames = [Image.new("RGB", (64, 48), shade) for shade in ("red", "green")]
-    with pytest.raises(KeyboardInterrupt):
-        write_depth_video(tmp_path / name, [*frames, Interrupted()])
-    assert (tmp_path / name).read_bytes() == b"older" and len(list(tmp_path.iterdir())) == 1

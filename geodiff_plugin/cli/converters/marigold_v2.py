@@ -116,13 +116,12 @@ def _space(file: Path, requested: str | None) -> str:
 
 def _prompt_folder(file: Path, requested: str | None) -> Path:
     """As requested, or where the authors' download has it: beside ``depth/``."""
-    if requested is not None:
-        return Path(requested)
-    for parent in file.resolve().parents:
-        if (parent / PROMPT_FOLDER).is_dir():
-            return parent / PROMPT_FOLDER
-    cure = f"Name it: --with .../{PROMPT_FOLDER}"
-    bad_value("--with", f"the folder {PROMPT_FOLDER} of huawei-bayerlab/marigold-v2-0", "none beside", cure)
+    beside = [parent / PROMPT_FOLDER for parent in file.resolve().parents]
+    for folder in beside if requested is None else [Path(requested)]:
+        if folder.is_dir():
+            return folder
+    expected = f"the folder {PROMPT_FOLDER} of huawei-bayerlab/marigold-v2-0"
+    bad_value("--with", expected, requested or "none beside", f"Name it: --with .../{PROMPT_FOLDER}")
 
 
 def convert_marigold_v2(
