@@ -7,15 +7,11 @@ item without a result through the stages of the work and appends one record each
     runner = Runner(items, Journal(out / "samples.jsonl"), noun="sample")
     records = runner.run(lambda item: {"abs_rel": measure(item.payload)})
 
-- **Several processes**, started by ``torchrun``, ``accelerate launch`` or in two terminals, share a job by
-  sharing its journal. Each claims an item before the work, with a lock that the kernel gives back when the
-  process ends, however it ends. The first process waits for what others have claimed, takes it over should
-  they die, and returns the records of all; the others leave when nothing is left to claim.
-- **Failures** are records too (``status`` ``"broken"``, ``error``), tried again by the next run.
-- **kill -9** loses the items that were on the way. A line goes out in one write; a torn last line is skipped,
-  and ended before the next is appended.
-
-Nothing here imports torch.
+Several processes, started by ``torchrun``, ``accelerate launch`` or in two terminals, share a job by sharing
+its journal. Each claims an item before the work, with a lock that the kernel gives back when the process
+ends, however it ends. The first process waits for what others have claimed, takes it over should they die,
+and returns the records of all; the others leave when nothing is left to claim. Failures are records too
+(``status`` ``"broken"``, ``error``), tried again by the next run. Nothing here imports torch.
 """
 
 from __future__ import annotations
@@ -25,13 +21,12 @@ import hashlib
 import json
 import os
 import sys
-import threading
 import time
 import traceback
 import weakref
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -64,9 +59,7 @@ MOST_NAMES = 5
 def fingerprint(*parts: Any) -> str:
     """20 hexadecimal digits that name inputs: the same inputs give the same, any other ones another.
 
-    Args:
-        parts: JSON values, also nested; a ``Path`` counts by what the file holds, not by where it lies. A
-            folder, or a file that cannot be read, counts as ``None``, and as an entry of a dict not at all.
+    They are JSON values, also nested; a ``Path`` counts by what the file holds, not by where it lies.
     """
     text = json.dumps([_readable(part) for part in parts], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:20]
@@ -76,11 +69,10 @@ def _readable(part: Any) -> Any:
     if isinstance(part, Path):
         try:
             return file_digest(part)
-        except OSError:
+        except OSError:  # a folder, or what whoever reads it will complain of
             return None
     if isinstance(part, dict):
-        entries = ((name, value, _readable(value)) for name, value in part.items())
-        return {name: read for name, value, read in entries if read is not None or value is None}
+        return {name: _readable(value) for name, value in part.items()}
     return [_readable(value) for value in part] if isinstance(part, (list, tuple)) else part
 
 
@@ -274,16 +266,16 @@ class Runner:
                 release(item)
             self.journal.release(item)
 
-        most = most if len(stages) > 1 else 1
+        pools = [ThreadPoolExecutor(1) for _ in stages] if len(stages) > 1 else []
+        most = most if pools else 1
         on_the_way: deque[tuple[Item, Callable[[], Record]]] = deque()
-        pipeline, done, unit = _Pipeline(stages), len(self._records()), f" {self._noun}"
-        disable = not self._progress
-        bar = tqdm(total=len(self.items), initial=done, unit=unit, file=sys.stderr, disable=disable)
+        about = {"unit": f" {self._noun}", "file": sys.stderr, "disable": not self._progress}
+        bar = tqdm(total=len(self.items), initial=len(self._records()), **about)
         try:
             while True:
                 item = self._next() if len(on_the_way) < most else None
                 if item is not None:
-                    on_the_way.append((item, pipeline.begin(item)))
+                    on_the_way.append((item, _begin(item, stages, pools)))
                 elif on_the_way:
                     self._record(*on_the_way[0])
                     leave(on_the_way.popleft()[0])
@@ -292,7 +284,8 @@ class Runner:
                     break
         finally:
             bar.close()
-            pipeline.end()
+            for pool in pools:  # every stage ends what it is at, and hands it on
+                pool.shutdown(cancel_futures=True)
             for item, _ in on_the_way:
                 leave(item)
         self._report()
@@ -363,39 +356,26 @@ class Runner:
         self._say_unsaid()
         for labels in self._struck.values():
             if len(labels) > 1:
-                more = [f"and {len(labels) - MOST_NAMES} more"] if len(labels) > MOST_NAMES else []
-                names = " ".join([", ".join(labels[:MOST_NAMES]), *more])
+                names = ", ".join(labels[:MOST_NAMES]) + (", ..." if len(labels) > MOST_NAMES else "")
                 count = f"{len(labels)} of {len(self.items)} {self._noun}s"
                 _say(f"geodiff: {count} failed for one reason: {names}.")
 
 
-class _Pipeline:
-    """Stages side by side, a thread each; a single one runs in the thread that asks for its result."""
+def _begin(item: Item, stages: Sequence[Stage], pools: Sequence[ThreadPoolExecutor]) -> Callable[[], Record]:
+    """Send an item through the stages, each in the thread of its pool; what is returned waits for the record.
 
-    def __init__(self, stages: Sequence[Stage]) -> None:
-        self._stages, self._stop = stages, threading.Event()
-        self._pools = [ThreadPoolExecutor(1) for _ in stages] if len(stages) > 1 else []
+    Without pools there is one stage, which runs in the thread that waits.
+    """
+    if not pools:
+        return partial(stages[0], item)
+    future = pools[0].submit(stages[0], item)
+    for pool, stage in zip(pools[1:], stages[1:], strict=True):
+        future = pool.submit(_follow, stage, future)
+    return future.result
 
-    def begin(self, item: Item) -> Callable[[], Record]:
-        """Send an item on its way; what is returned waits for its record."""
-        if not self._pools:
-            return partial(self._stages[0], item)
-        future = self._pools[0].submit(self._stages[0], item)
-        for pool, stage in zip(self._pools[1:], self._stages[1:], strict=True):
-            future = pool.submit(self._follow, stage, future)
-        return future.result
 
-    def _follow(self, stage: Stage, before: Future[Any]) -> Any:
-        value = before.result()
-        if self._stop.is_set():
-            raise CancelledError
-        return stage(value)
-
-    def end(self) -> None:
-        """Let every stage end what it is at and no more."""
-        self._stop.set()
-        for pool in self._pools:
-            pool.shutdown(cancel_futures=True)
+def _follow(stage: Stage, before: Future[Any]) -> Any:
+    return stage(before.result())
 
 
 def _say(sentence: str) -> None:

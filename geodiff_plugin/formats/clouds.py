@@ -67,11 +67,9 @@ def flying_points(depth_m: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Coloured points in the left camera's frame.
+    """Coloured points in the left camera's frame, x right, y down, z forward.
 
-    Attributes:
-        points_m: ``(N, 3)`` float64 metres; x right, y down, z forward.
-        colours: ``(N, 3)`` uint8 RGB.
+    ``points_m`` is ``(N, 3)`` float64 metres, ``colours`` ``(N, 3)`` uint8 RGB.
     """
 
     points_m: np.ndarray
@@ -176,14 +174,16 @@ def write_glb(
     Convention:
         glTF's axes, in metres: a point 1 m to the right of, above and before the camera is (1, 1, -1).
     """
-    arrays: list[np.ndarray] = []
     accessors: list[dict[str, Any]] = []
+    views: list[dict[str, int]] = []
+    data = bytearray()
 
-    def add(array: np.ndarray, kind: str, **more: Any) -> int:
-        entry = {"bufferView": len(arrays), "componentType": COMPONENTS[array.dtype.char]}
+    def add(array: np.ndarray, kind: str, target: int = ATTRIBUTES, **more: Any) -> int:
+        entry = {"bufferView": len(views), "componentType": COMPONENTS[array.dtype.char]}
         accessors.append(entry | {"count": len(array), "type": kind} | more)
-        arrays.append(array)
-        return len(arrays) - 1
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
+        data.extend(array.tobytes() + b"\0" * (-array.nbytes % 4))
+        return len(views) - 1
 
     def mesh(name: str, mode: int, points_m: np.ndarray, colours: np.ndarray, **more: Any) -> dict[str, Any]:
         positions = (points_m @ OPENGL_FROM_OPENCV[:3, :3]).astype("<f4")
@@ -200,12 +200,9 @@ def write_glb(
     for number, (K, E, size) in enumerate(cameras):
         colours = np.tile(CAMERA_COLOURS[number % len(CAMERA_COLOURS)], (5, 1))
         corners = _pyramid(np.asarray(K), np.asarray(E), size, length_m)
-        meshes.append(mesh(f"camera {number}", LINES, corners, colours, indices=add(EDGES, "SCALAR")))
-    views, data = [], b""
-    for array, accessor in zip(arrays, accessors, strict=True):
-        target = INDICES if accessor["type"] == "SCALAR" else ATTRIBUTES
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
-        data += array.tobytes() + b"\0" * (-array.nbytes % 4)
+        meshes.append(
+            mesh(f"camera {number}", LINES, corners, colours, indices=add(EDGES, "SCALAR", INDICES))
+        )
     names = [mesh["name"] for mesh in meshes]
     scene: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "geodiff-plugin"},

@@ -34,14 +34,12 @@ def _check_sides(width: int, height: int, name: str) -> None:
         bad_value(name, expected, f"{width}x{height}", "Is this a thumbnail or a latent?")
 
 
-def _frame_notes(image: Image.Image, name: str) -> list[str]:
+def _notes_of(image: Image.Image, name: str) -> tuple[bool, list[str]]:
+    """Whether an image has 16 bits, of which Pillow loads 8 of a coloured one, and what to say of frames."""
+    deep = any(";16" in str(tile[3]) for tile in getattr(image, "tile", ()))
     frames = getattr(image, "n_frames", 1) if image.format in MANY_FRAMES else 1
-    return [f"{name} holds {frames} frames or pages; only the first is taken."] if frames > 1 else []
-
-
-def _has_16_bits(image: Image.Image) -> bool:
-    """Whether a coloured image has 16 bits: Pillow loads the upper 8, and tells only before."""
-    return any(";16" in str(tile[3]) for tile in getattr(image, "tile", ()))
+    notes = [f"{name} holds {frames} frames or pages; only the first is taken."] if frames > 1 else []
+    return deep, notes
 
 
 def _array_of(image: Image.Image, name: str) -> np.ndarray:
@@ -72,21 +70,17 @@ def _to_01(value: np.ndarray, name: str, has_16_bits: bool = False) -> tuple[np.
             )
         value = value.astype(np.float32) / np.iinfo(value.dtype).max
     elif value.dtype.kind == "f":
-        value = _checked_floats(value, name)
+        if not np.isfinite(value).all():
+            bad_value(name, "finite", "NaN or infinity in it", "Mask or fill those pixels first.")
+        low, high = float(value.min()), float(value.max())
+        if low < -OVERSHOOT or high > 1 + OVERSHOOT:
+            cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
+            bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
+        value = value.astype(np.float32, copy=False).clip(0.0, 1.0)
     else:
         cure = f"Convert it with astype('uint8'){' * 255' if value.dtype == bool else ''}."
         bad_value(name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", cure)
     return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value, notes
-
-
-def _checked_floats(values: np.ndarray, name: str) -> np.ndarray:
-    if not np.isfinite(values).all():
-        bad_value(name, "finite", "NaN or infinity in it", "Mask or fill those pixels first.")
-    low, high = float(values.min()), float(values.max())
-    if low < -OVERSHOOT or high > 1 + OVERSHOOT:
-        cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
-        bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
-    return values.astype(np.float32, copy=False).clip(0.0, 1.0)
 
 
 def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.ndarray, list[str]]:
@@ -98,7 +92,7 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
         OSError, ValueError: no readable file; not an image, cut off, or a side under 32 pixels.
     """
     with open_image(path, name) as image:
-        deep, notes = _has_16_bits(image), _frame_notes(image, name)
+        deep, notes = _notes_of(image, name)
         image.seek(0)
         image.load()
         is_turned = image.getexif().get(ORIENTATION) in TURNS
@@ -115,14 +109,16 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
 def _hwc(value: Any, name: str) -> np.ndarray:
     """``(H, W, C)``, C of 1, 3 or 4, of an array with channels last or a tensor with channels first."""
     if isinstance(value, torch.Tensor):
-        channels, shape = 0, "(3, H, W)"
-        cures = {4: "Take one image of the batch: value[0].", 2: "Add a channel axis: value[None]."}
-        cures[3] = "torch images start with channels: value.permute(2, 0, 1)."
+        channels, shape, turn = 0, "(3, H, W)", "torch images start with channels: value.permute(2, 0, 1)."
+        cures = {4: "Take one image of the batch: value[0].", 2: "Add a channel axis: value[None].", 3: turn}
     elif isinstance(value, np.ndarray):
         value = value[..., None] if value.ndim == 2 else value
-        channels, shape = -1, "(H, W, 3) or (H, W)"
-        cures = {4: "Take one image of the batch."}
-        cures[3] = "numpy images end in channels: value.transpose(1, 2, 0)."
+        channels, shape, turn = (
+            -1,
+            "(H, W, 3) or (H, W)",
+            "numpy images end in them: value.transpose(1, 2, 0).",
+        )
+        cures = {4: "Take one image of the batch.", 3: turn}
     else:
         bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
     if value.ndim != 3 or value.shape[channels] not in CHANNELS:
@@ -162,7 +158,7 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         ValueError: wrong rank or channels, NaN or infinity, floats outside [0, 1], a side under 32 pixels.
     """
     if isinstance(value, Image.Image):
-        deep, notes = _has_16_bits(value), _frame_notes(value, name)
+        deep, notes = _notes_of(value, name)
         if value.getexif().get(ORIENTATION) in TURNS:
             notes.append(
                 f"{name} carries an EXIF orientation that is not applied; "

@@ -75,10 +75,7 @@ def _beside(target: Path) -> Path:
 
 
 def _hidden(target: Path) -> Path:
-    """The folder of unfinished files and of the lock: inside a folder, or beside it until it is there.
-
-    A folder that exists may be a disk of its own, below one that nobody may write to.
-    """
+    """The folder of unfinished files and of the lock: inside of one that exists, which may be a disk."""
     return target / PARTIAL if target.is_dir() else _beside(target)
 
 
@@ -156,15 +153,9 @@ class OutFolder:
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        inputs: Collection[Path] = (),
-        overwrite: bool = False,
-        option: str = "--out",
+        self, path: Path, *, inputs: Collection[Path] = (), overwrite: bool = False, option: str = "--out"
     ) -> None:
-        self.path = Path(path)
-        self._inputs, self._overwrite, self._option = inputs, overwrite, option
+        self.path, self._inputs, self._overwrite, self._option = Path(path), inputs, overwrite, option
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -172,8 +163,10 @@ class OutFolder:
         if _holds_files(self._target) and not self._overwrite:
             cure = "Name another, or add --overwrite."
             bad_value(self._option, "a new or empty folder", f"{self.path}, which holds files", cure)
-        self._earlier = _files_of_report(self._target)
-        self._refuse_inputs()
+        for path in self._inputs if self._target.is_dir() else ():
+            if any(path.exists() and path.samefile(e) for e in self._target.iterdir() if e.is_file()):
+                got = f"{self.path}, which holds {path}"  # and which the run may replace or delete
+                bad_value(self._option, "a folder that holds no input of the run", got, "Name another.")
         self._staging = _hidden(self._target)
         with ExitStack() as stack:
             try:
@@ -187,14 +180,6 @@ class OutFolder:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
-
-    def _refuse_inputs(self) -> None:
-        """Refuse a folder with an input of this run among its files, some of which it replaces or deletes."""
-        there = [e for e in self._target.iterdir() if e.is_file()] if self._target.is_dir() else []
-        for path in self._inputs:
-            if any(path.exists() and path.samefile(entry) for entry in there):
-                got = f"{self.path}, which holds {path}"
-                bad_value(self._option, "a folder that holds no input of the run", got, "Name another.")
 
     def _begin(self, stack: ExitStack) -> None:
         """Make the hidden folder, take its lock, and clear what a killed run has left in it."""
@@ -238,10 +223,10 @@ class OutFolder:
         if not self._target.is_dir():
             os.rename(files, self._target)
             return
-        written = {path.name for path in files.iterdir()}
+        written, earlier = {path.name for path in files.iterdir()}, _files_of_report(self._target)
         for name in sorted(written - {REPORT}):
             os.replace(files / name, self._target / name)
-        for path in (self._target / name for name in self._earlier - written):
+        for path in (self._target / name for name in earlier - written):
             if path.is_file():
                 path.unlink()
         if REPORT in written:  # last: until then the old one lists what is still to go

@@ -236,21 +236,13 @@ def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], 
 
 
 def write_depth_bag(
-    path: Path,
-    frames: Iterable[tuple[Stamp, np.ndarray, np.ndarray]],
-    frame_id: str,
-    encoding: str = "16UC1",
+    path: Path, frames: Iterable[tuple[Stamp, np.ndarray, np.ndarray]], frame_id: str, encoding: str
 ) -> int:
-    """Write ``/depth/image`` and ``/depth/camera_info``, one of each a frame; whole or not at all.
+    """Write ``/depth/image`` and ``/depth/camera_info``, one of each a frame, whole or not at all; how many.
 
-    Args:
-        path: ends in .mcap (ROS 2) or .bag (ROS 1); a file there is replaced.
-        frames: stamp, ``(H, W)`` metres and ``(3, 3)`` K in pixels of each image.
-        frame_id: of the left camera.
-        encoding: ``"16UC1"``, whole millimetres, 0 where unknown; or ``"32FC1"``, metres, NaN where unknown.
-
-    Returns:
-        How many were written.
+    ``path`` ends in .mcap (ROS 2) or .bag (ROS 1). A frame is the stamp, ``(H, W)`` metres and ``(3, 3)`` K
+    in pixels of an image; ``frame_id`` is that of the left camera. ``"16UC1"`` is whole millimetres, 0 where
+    unknown, ``"32FC1"`` metres, NaN where unknown.
     """
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
