@@ -25,11 +25,8 @@ TINY = 1e-9
 class Knob(NamedTuple):
     """What is known about one field of the configuration, beside the sentence on what it does.
 
-    Attributes:
-        values: its range in words.
-        check: value and name -> the value as it is kept; raises ``InputError``.
-        paper: what the paper says of it; ``"{}"`` stands for the value of the ``PAPER`` preset.
-        unset: what ``None`` becomes when the guidance is used, in words; empty where ``None`` is not allowed.
+    ``values`` are its range in words; ``check`` gives the value as it is kept; ``paper`` is what the paper
+    says of it, with ``"{}"`` for the value of ``PAPER``; ``unset`` what ``None`` becomes, empty for no value.
     """
 
     values: str

@@ -185,13 +185,10 @@ def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Warped:
-    """The right image on the left grid.
+    """The right image on the left grid ``(B, C, H, W)``, its edge repeated where not visible.
 
-    Attributes:
-        image: ``(B, C, H, W)``, the right image's values; its edge repeated where not visible.
-        visible: ``(B, 1, H, W)`` bool, in front of the right camera and within its pixel centres.
-        uv: ``(B, H, W, 2)`` pixels of the right image.
-        z_right: ``(B, H, W)`` metres, depth in the right view.
+    ``visible (B, 1, H, W)`` bool: in front of the right camera and within its pixel centres; ``uv (B, H, W,
+    2)`` pixels of the right image; ``z_right (B, H, W)`` metres.
     """
 
     image: Tensor
@@ -237,14 +234,9 @@ def warp_right_to_left(
     """Re-render the left image from the right one by the left depth (bilinear backward warp).
 
     As kornia's ``warp_frame_depth`` where that is defined: it takes one K, and does not say what is visible.
-
-    Args:
-        right: ``(B, C, Hr, Wr)`` float image, of any size.
-        depth_m: ``(B, 1, H, W)`` metres on the left grid. The image is differentiable in it where visible.
-        K_left: ``(B, 3, 3)`` float, pixels of the left grid.
-        K_right: ``(B, 3, 3)``, pixels of ``right``.
-        T_right_from_left: ``(B, 4, 4)``.
-        rays: ``plane_rays`` of these cameras, where they are used again and again.
+    ``right (B, C, Hr, Wr)`` is of any size, ``depth_m (B, 1, H, W)`` metres on the left grid; the image is
+    differentiable in both where visible. ``rays`` are ``plane_rays`` of these cameras, where they are used
+    again.
 
     Convention:
         A right camera ``b`` metres to the right (``T[0, 3] = -b``): the left pixel ``u`` with depth z reads

@@ -113,8 +113,8 @@ class StepReport:
         timestep: the scheduler's timestep.
         loss: ``(B,)`` total loss at the start of the step's updates.
         terms: ``(B,)`` unweighted value of every term, by name.
-        s_hat: ``(B,)`` raw scale before softplus, after the step.
-        t_hat: ``(B,)`` raw shift likewise.
+        s_hat: ``(B,)`` raw scale before softplus, after the step; ``t_hat`` the shift.
+        t_hat: ``(B,)``.
         g_s: ``(B,)`` global scale in use, metres.
         visible_fraction: ``(B,)`` share of the pixels that a right view sees; 0 without one.
     """

@@ -57,12 +57,9 @@ SHARE, NORMAL_QUANTILE = 0.8, 1.2816
 class _Observations(NamedTuple):
     """Matches against a map on their grid, ``(B, 1, h, w)`` each, and the links of that grid.
 
-    Attributes:
-        residual: log of the factor on the map's inverse depth that a match asks for.
-        noise: standard deviation of it, from the match alone.
-        weight: confidence over the relative variance of a match, 0 without one.
-        right_share: ``(B, 1)`` share of that weight which is expected to be right, by confidence.
-        links: across and down, of a smoothness of 1.
+    ``residual`` is the log of the factor on the map's inverse depth that a match asks for, ``noise`` its
+    standard deviation, ``weight`` confidence over relative variance, ``right_share (B, 1)`` the share of the
+    weight that is expected to be right, ``links`` are across and down, of a smoothness of 1.
     """
 
     residual: Tensor
@@ -133,13 +130,9 @@ def correction_target(
 ) -> Matches | None:
     """What an estimate is fitted to: matches, but for reflections and those beside its edges, and points.
 
-    Args:
-        matches: of some samples, ``(B, 1, h, w)``; or ``None``.
-        points: on the same grid, or ``None``.
-        kept: ``(B, 1, h, w)`` in [0, 1], the share of each match's confidence that remains once reflections
-            are rejected; without it no match is used.
-        error: of the prior, as ``refine_depth`` takes it, or ``None`` before it is measured.
-        depth_m: ``(B, 1, H, W)`` metres, the estimate.
+    ``matches`` and ``points`` are on one grid; ``kept`` is the share of each match's confidence that remains
+    without reflections (before it is known no match is used), ``error`` of the prior, before it is measured
+    ``None``.
     """
     if matches is None or kept is None:
         return None if points is None else with_points(None, points)
@@ -243,13 +236,13 @@ def refine_depth(
         depth_m: ``(B, 1, H, W)`` metres, at any resolution.
         target: matches or known points of the same images, on any grid.
         left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
-        error: ``(B, 1, 1, 1)`` of the prior, as ``prior_error`` gives it, or a ``local_error`` on any grid: a
-            good prior is bent over wide regions only, and matches that contradict it count for less.
+        error: of the prior, as ``prior_error`` or ``local_error`` gives it: matches that contradict a good
+            one count for less.
         config: the fit's numbers.
 
     Returns:
-        The fitted depth ``(B, 1, H, W)`` metres; its support ``(B, 1, H, W)`` in [0, 1], how far matches
-        decided it; and ``u (B, 1, h, w)`` on the grid of the matches, log of the factor on inverse depth.
+        The fitted depth; its support in [0, 1], how far matches decided it; and ``u`` on the grid of the
+        matches.
     """
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)

@@ -81,16 +81,10 @@ def prepare_evidence(
     needs_matches: bool,
     pose: PoseReport | None = None,
 ) -> Evidence:
-    """Cost volume, matches and points of one image.
+    """Cost volume, matches and points of one image; left image, views and ``K_left`` are native.
 
-    Args:
-        left_01: ``(3, H, W)`` float32 in [0, 1], native size.
-        views: the further views, native, of any size.
-        K_left: ``(3, 3)`` pixels of the native left image.
-        points: as ``points_to_matches`` takes them, or ``None``.
-        config: how large the grids are, what the sweep spans, and whether the search needs it.
-        needs_matches: aggregate the volume and check it against each view.
-        pose: how the poses of the views came about.
+    ``needs_matches``: the volume is aggregated and checked against each view. ``pose`` tells how the poses of
+    the views came about.
     """
     left, further, K = to_grid(left_01, views, K_left, config.sweep_pixels)
     volume, matches, targets = None, None, None
@@ -119,14 +113,10 @@ def prepare_evidence(
 
 @dataclass(frozen=True)
 class Views:
-    """What the cameras saw of every sample of a chunk, on the grid where losses are computed.
+    """What the cameras saw of every sample of a chunk, on the grid of the evidence.
 
-    Attributes:
-        left_01: ``(B, 3, H, W)`` in [0, 1].
-        K_left: ``(B, 3, 3)`` pixels of ``left_01``.
-        further: the further views with a batch axis on each of their tensors, as many for every sample; none
-            where only points are known.
-        rays: each of these cameras and the left one as one affine map per left pixel, made once a chunk.
+    ``left_01 (B, 3, H, W)``, ``K_left (B, 3, 3)``; ``further`` views have a batch axis on each of their
+    tensors, as many for every sample; ``rays`` are each of these cameras and the left one, made once a chunk.
     """
 
     left_01: Tensor

@@ -69,13 +69,9 @@ def sharpen_edges(depth_m: Tensor, left_01: Tensor, spacing: int = 1) -> Tensor:
 
     A pixel is on a ramp if its inverse depth lies between those of two opposite neighbours, with a step to
     each, and the ramp is steeper than the surfaces at its ends. A plane, however oblique, has the same slope
-    everywhere in inverse depth, and is none. The new depth is the median over a window. Neighbours that are
-    on the ramp themselves, look different or are far away count for less in it.
-
-    Args:
-        depth_m: ``(B, 1, H, W)`` metres, > 0.
-        left_01: ``(B, 3, H, W)`` in [0, 1], the left images on the same grid.
-        spacing: pixels of this grid to one of the grid that the map was decoded on, >= 1.
+    everywhere in inverse depth, and is none. The new depth is the median over a window, in which neighbours
+    on the ramp, of another look or far away count for less. ``depth_m (B, 1, H, W)`` and ``left_01`` lie on
+    one grid, ``spacing`` pixels of it are one of the grid that the map was decoded on.
     """
     height, width = image_size(depth_m)
     halo = (BESIDE + 1) * spacing
@@ -156,20 +152,14 @@ def vote_depth(
     """Give every pixel the depth that matches around it of the same colour, and the map, vote for.
 
     The weighted median of the votes chooses a surface; the mean of those near it is the depth. Rows of a
-    rectified view are matched again at this resolution, which sees edges that the sweep's grid does not. The
-    result stays within the range of ``depth_m``.
-
-    Args:
-        depth_m: ``(1, 1, H, W)`` metres, > 0, fitted to the matches.
-        left_01: ``(1, 3, h, w)`` in [0, 1], the left image.
-        K_left: ``(3, 3)`` pixels of it.
-        views: the further views; without a rectified one the map stays as it is.
-        target: matches of the sweep, ``(1, 1, h', w')``.
-        error: ``(1, 1, 1, 1)`` of the prior in log depth, as ``correction.prior_error`` measures it: matches
-            that contradict a good prior count for less, and its own vote counts for more.
+    rectified view are matched again at this resolution, which sees edges that the sweep's grid does not;
+    without such a view the map stays. ``depth_m (1, 1, H, W)`` is fitted to the matches; left image, K and
+    views are native; the prior's ``error (1, 1, 1, 1)`` decides how much contradicting matches count, and its
+    own vote. The result stays within the range of ``depth_m``.
     """
     native = image_size(left_01)
-    view = next((v for v in views if image_size(v.image_01) == native and _rectified(K_left, v)), None)
+    rectified = [v for v in views if is_rectified(K_left, v.K, v.T_right_from_left)]
+    view = next((v for v in rectified if image_size(v.image_01) == native), None)
     if view is None:
         return depth_m
     full = image_size(depth_m)
@@ -203,10 +193,6 @@ def vote_depth(
         voted = _enlarged(voted, left[0], _resized(left_01.float(), full)[0])
     out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(depth_m.amin(), depth_m.amax())
     return out_m.to(depth_m.dtype)
-
-
-def _rectified(K_left: Tensor, view: CameraView) -> bool:
-    return bool(is_rectified(K_left, view.K, view.T_right_from_left))
 
 
 def _resized(image_01: Tensor, size: tuple[int, int]) -> Tensor:

@@ -60,17 +60,11 @@ def settle_ends(
     on_edge: Tensor | None,
     valid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Both ends of relative maps ``x (B, 1, h, w)``, and whether they lie on the edge of the range, ``(B,)``.
+    """Metres ``(B,)`` of both ends of maps ``x (B, 1, h, w)``, and whether they are on the edge of the range.
 
-    Args:
-        x: float32, about [0, 1].
-        owners: the image of every sample; those of an image side by side.
-        evidence: of every sample.
-        metric: the prior's metric parametrisation.
-        config: hyperparameters.
-        current: both ends in use, which stay unless a better basin shows up.
-        on_edge: of the search before, ``None`` at the first.
-        valid: ``(B, 1, H, W)`` bool, where the maps say something; ``None`` for everywhere.
+    ``evidence`` is of every sample; samples of one of the ``owners``, the images, lie side by side.
+    ``current`` ends stay unless a better basin shows up; ``on_edge`` is of the search before, ``None`` at the
+    first; ``valid`` is where the maps say something.
     """
     results = []
     for image in sorted(set(owners)):

@@ -21,12 +21,8 @@ COARSEST_SIDE, COARSEST_STEPS = 24, 80
 class FieldSystem:
     """The minimiser ``u`` of ``sum weight (u - data)^2 + sum link |grad u|^2``, a channel at a time.
 
-    Attributes:
-        weight: ``(B, 1, H, W)`` >= 0; with some above 0 in every part that links connect.
-        pull: ``(B, C, H, W)`` weight times data.
-        across: ``(B, 1, H, W - 1)`` >= 0, links between horizontal neighbours; ``down`` between vertical
-            ones.
-        down: ``(B, 1, H - 1, W)``.
+    ``weight (B, 1, H, W)`` is above 0 in every part that links connect, ``pull (B, C, H, W)`` is weight times
+    data; links lie ``across`` ``(B, 1, H, W - 1)`` and ``down``, >= 0.
     """
 
     weight: Tensor
@@ -115,14 +111,9 @@ def solve_robust(
 ) -> tuple[Tensor, Tensor]:
     """The field of iteratively reweighted least squares, and the weights of another round.
 
-    Args:
-        links: across and down, as in ``FieldSystem``.
-        data: ``(B, C, H, W)`` what each pixel asks for.
-        inertia: ``(B, 1, 1, 1)``, a pull of every pixel towards 0.
-        weights: ``(B, 1, H, W)`` >= 0 of the data in the first round.
-        robust: the weights of the next round, from what the field of the first channel leaves of its data.
-        rounds: >= 1.
-        steps: as for ``solve_field``.
+    ``data (B, C, H, W)`` is what each pixel asks for, ``inertia (B, 1, 1, 1)`` a pull towards 0, ``weights
+    (B, 1, H, W)`` are those of the first round; ``robust`` makes the next from what the first channel's field
+    leaves of its data. ``links`` as in ``FieldSystem``, ``steps`` as for ``solve_field``.
     """
     field: Tensor | None = None
     for _ in range(rounds):

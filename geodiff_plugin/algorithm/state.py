@@ -31,27 +31,19 @@ class Trajectory:
         owners: for every sample of the chunk the image that it belongs to; those of an image side by side.
         space: what the prior's output is affine in.
         step_latents: step size of the latent's rule.
-        prior_range: metres ``(B,)`` of ``x = 0`` and of ``x = 1`` by a metric prior, from which the search
-            starts; ``None`` for a relative one.
-        start_range: metres ``(B,)`` of the nearest and of the farthest end that another frame's call ended
-            with; they take the place of the first search.
-        valid: ``(B, 1, h, w)`` bool, where the prior says something; ``None`` for everywhere. Elsewhere its
-            map has no part in the scale, and matches alone decide.
+        prior_range: metres ``(B,)`` of ``x = 0`` and ``x = 1`` by a metric prior; ``None`` for a relative
+            one.
+        start_range: metres ``(B,)`` of both ends of another frame, in place of the first search.
+        valid: ``(B, 1, h, w)`` bool, where the prior says something; elsewhere matches alone decide.
 
     Attributes:
-        history: one ``StepReport`` a round.
-        step: index and timestep of the current denoising step, for reports and messages.
-        watch: whether what the steps computed was finite.
         affine: scale, shift and g_s of the latest update, once ``settle_scale`` was called.
-        matches: of the views, on the grid of the losses, or ``None``.
-        points: depths that the user knows, on the same grid, or ``None``.
-        kept: ``(B, 1, H, W)`` in [0, 1], the share of each match's confidence that remains once reflections
-            are rejected; ``None`` before the prior's first estimate.
-        error: ``(B, 1, 1, 1)`` of that estimate in log depth, as ``correction.prior_error`` measures it.
-        hidden: ``(B, V, 1, H, W)`` bool, what the estimate hides from the right cameras, or ``None``.
+        kept: ``(B, 1, H, W)``, the share of each match's confidence that remains without reflections.
+        error: ``(B, 1, 1, 1)`` of the prior's first estimate in log depth (``correction.prior_error``).
+        hidden: ``(B, V, 1, H, W)`` bool, what the estimate hides from the right cameras.
         order: ``(B,)`` in [-1, 1], rank correlation of the prior's first map and matches or points.
         on_edge: ``(B,)`` bool, whether the last search ended on the edge of its range.
-        prior_depth: ``(B, 1, h, w)`` metres, a metric prior's first estimate, or ``None``.
+        prior_depth: ``(B, 1, h, w)`` metres, a metric prior's first estimate.
     """
 
     affine: AffineState
@@ -155,13 +147,6 @@ class Trajectory:
             target = target if self.valid is None else target.within(self.valid)
             self.error = prior_error(depth_m, target, self.objective.views.left_01, config)
 
-    @property
-    def usable_matches(self) -> Matches | None:
-        """The matches less those that look like reflections; ``None`` before the prior's first estimate."""
-        if self.matches is None or self.kept is None:
-            return None
-        return replace(self.matches, confidence=self.kept * self.matches.confidence)
-
     def _target(self, depth_m: Tensor) -> Matches | None:
         error = local_error(self.error, self.valid)
         return correction_target(self.matches, self.points, self.kept, error, depth_m)
@@ -187,8 +172,10 @@ class Trajectory:
     def loss(self, x: Tensor, affine: AffineState, z0: Tensor, anchor: Tensor) -> Loss:
         """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""
         assert self._affine_start is not None  # the scale is settled
-        matches, points = self.usable_matches, self.points
-        return self.objective(x, affine, self._affine_start, z0, anchor, matches, points, self.hidden)
+        matches = None  # less those that look like reflections
+        if self.matches is not None and self.kept is not None:
+            matches = replace(self.matches, confidence=self.kept * self.matches.confidence)
+        return self.objective(x, affine, self._affine_start, z0, anchor, matches, self.points, self.hidden)
 
     def report(self, loss: Loss) -> None:
         """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""

@@ -46,11 +46,8 @@ def gradient_step(
     """One pass of Algorithm 1's loop body, but for the score before it and the DDIM line after it.
 
     It moves ``z (B, C, h, w)``, z_t or z0_hat, and advances the state's scale s_hat, shift t_hat and their
-    optimisers. g_s is searched if it ``is_first`` of its round (S7.3). ``anchor``, shaped as z, is the clean
-    latent that the term of that name pulls towards.
-
-    Returns:
-        z, less lambda times its gradient; the relative map of z as it was; its loss.
+    optimisers. g_s is searched if it ``is_first`` of its round (S7.3). ``anchor`` is the clean latent that
+    the term of that name pulls towards. Returns z, the relative map of z as it was, and its loss.
     """
     moves = state.config.optimize_latents
     with torch.enable_grad():
@@ -84,20 +81,12 @@ def gradient_step(
 def corrected_step(
     state: Trajectory, estimate: Estimate, z0: Tensor, is_result: bool
 ) -> tuple[Tensor, Tensor]:
-    """The decoded map fitted to matches and points, and the change encoded (after SteeredMarigold's).
+    """The decoded map fitted to matches and points, and the change encoded: clean latent and relative map.
 
-    The latent moves by the difference of two codes, so that what the autoencoder loses is not lost again at
-    every step, and a map that needs no correction leaves the latent as it is.
-
-    Args:
-        state: holds the matches and points, and the scale, which is settled here.
-        estimate: of this denoising step.
-        z0: ``(B, C, h, w)`` clean latent.
-        is_result: no round follows. The map is then left to the refinement of the output, if there is one:
-            fitted to the matches twice it would follow their noise. It is encoded only if the latent is read.
-
-    Returns:
-        The clean latent, and the map that stands for it, ``(B, 1, h', w')``.
+    The latent ``z0 (B, C, h, w)`` moves by the difference of two codes, so that what the autoencoder loses is
+    not lost again at every step, and a map that needs no correction leaves it as it is. If no round follows
+    (``is_result``) the map is left to the refinement of the output, if there is one: fitted to the matches
+    twice it would follow their noise. It is encoded only if the latent is read.
 
     Source: Gregorek and Nalpantidis 2024, "SteeredMarigold".
     """
@@ -118,11 +107,9 @@ def corrected_step(
 def guided_step(
     state: Trajectory, estimate: Estimate, rounds: tuple[Round, ...], is_last: bool
 ) -> tuple[Tensor, Tensor, bool]:
-    """The rounds of one denoising step, at least one.
+    """The rounds of one denoising step: what to add to the latent, the relative map of the latest evaluation.
 
-    Returns:
-        ``(B, C, h, w)`` float32, what to add to the latent; the relative map of the latest evaluation; and
-        whether that map stands for the moved latent, so that the output may start from it.
+    And whether that map stands for the moved latent, so that the output may start from it.
     """
     z, anchor, x, stands = estimate.latent, None, None, False
     for k, (corrects, updates) in enumerate(rounds):

@@ -109,19 +109,13 @@ def match_exposure(warped_01: Tensor, left_01: Tensor, visible: Tensor) -> Tenso
 def photometric(left_01: Tensor, warped_01: Tensor, visible: Tensor, config: GuidanceConfig) -> Tensor:
     """Mean photometric error over the visible pixels, averaged over an image pyramid, ``(B,)`` in [0, 1].
 
-    With several right views each pixel takes the one that explains it best among those that see it: a view in
-    which something hides the pixel then does not count.
-
-    Args:
-        left_01: ``(B, 3, H, W)`` in [0, 1].
-        warped_01: ``(B, V, 3, H, W)`` every right image seen from the left; differentiable in it.
-        visible: ``(B, V, 1, H, W)`` bool, what is compared.
-        config: ``eta``, ``pyramid_levels`` (1 is the paper's; coarser levels widen the basin of attraction)
-            and ``exposure``.
+    ``left_01 (B, 3, H, W)``, ``warped_01 (B, V, 3, H, W)`` every right image seen from the left, ``visible
+    (B, V, 1, H, W)`` bool. Each pixel takes the view that explains it best among those that see it: one in
+    which something hides it then does not count (Godard et al. 2019, "Digging into self-supervised monocular
+    depth estimation", Eq. 4). Coarser levels widen the basin of attraction.
 
     Source: Eq. 14 (eq:geo-loss). Deviation: the mask (the paper's mean over all pixels rewards depths that
-        push pixels out of the right image) and the pyramid. Minimum over views: Godard et al. 2019, "Digging
-        into self-supervised monocular depth estimation", Eq. 4.
+        push pixels out of the right image) and the pyramid.
     """
     views = warped_01.shape[1]
     left = left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), a view's pixels by themselves

@@ -121,18 +121,11 @@ def build_cost_volume(
     depth_range: tuple[float, float] | None = None,
     config: GuidanceConfig = DEFAULT,
 ) -> CostVolume:
-    """Sweep planes through the left view and compare it with the right views.
+    """Sweep planes through the left view ``(3, H, W)``, or grey, and compare it with right views of any size.
 
-    Args:
-        left_01: ``(3, H, W)`` or grey ``(1, H, W)``, float in [0, 1].
-        rights: one or several, images of any size. Costs are averaged over the views that see a pixel.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
-        depth_range: ``(near, far)`` metres, that the planes span. By default they reach from infinity to
-            somewhat nearer than anything that a coarse sweep is certain of.
-        config: bounds of the grid, to which larger images are shrunk, and of the number of planes.
-
-    Raises:
-        InputError: the range is not ascending, views do not overlap, or both cameras stand at one place.
+    The planes span ``depth_range``, metres; by default they reach from infinity to somewhat nearer than
+    anything that a coarse sweep is certain of. ``config`` bounds their number and the pixels of the grid.
+    ``InputError`` for a range that is not ascending, views that do not overlap, or two cameras at one place.
     """
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)

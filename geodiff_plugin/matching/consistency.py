@@ -129,15 +129,6 @@ def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
     return volume.inverse_depth[0] + position * volume.plane_step, contrast, evidence()
 
 
-def _confidence(evidence: Tensor, difference: Tensor, contrast: Tensor) -> Tensor:
-    """Probability ``(H, W)`` that the winner is right."""
-    odds = torch.zeros_like(difference)
-    for weight, x in zip(LOG_ODDS, evidence, strict=True):
-        odds = odds + weight * x
-    probability = torch.sigmoid(odds) * (contrast / LEAST_CONTRAST).clamp_max(1.0)
-    return torch.where(difference <= AGREEMENT_PLANES, probability, torch.zeros_like(probability))
-
-
 @torch.no_grad()
 def match_volume(volume: CostVolume) -> Matches:
     """Matches of a cost volume: aggregate, take the winner, and check it against every right view.
@@ -148,5 +139,10 @@ def match_volume(volume: CostVolume) -> Matches:
     inverse_depth, contrast, views = candidates(volume, volume.aligned)
     confidence = torch.zeros_like(inverse_depth)
     for evidence, difference in views:
-        confidence = torch.maximum(confidence, _confidence(evidence, difference, contrast))
+        odds = torch.zeros_like(difference)
+        for weight, x in zip(LOG_ODDS, evidence, strict=True):
+            odds = odds + weight * x
+        probability = torch.sigmoid(odds) * (contrast / LEAST_CONTRAST).clamp_max(1.0)
+        agreed = torch.where(difference <= AGREEMENT_PLANES, probability, torch.zeros_like(probability))
+        confidence = torch.maximum(confidence, agreed)
     return Matches(inverse_depth[None], confidence[None], volume.plane_step)

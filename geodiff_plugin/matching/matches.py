@@ -75,21 +75,12 @@ class Matches:
 def points_to_matches(
     points: Tensor, K_left: Tensor, size: tuple[int, int], size_grid: tuple[int, int]
 ) -> tuple[Matches, int]:
-    """Put known depths on a grid of the left view; where several fall on one pixel, the nearest wins.
+    """Known depths on a grid ``(h, w)`` of the left view, and how many of them are left out.
 
-    Args:
-        points: ``(N, 3)`` float32, metres, in the left camera's frame, or ``(N, 4)`` with their confidence in
-            (0, 1]; or a map ``(H, W)`` of ``size``, metres, 0 where unknown, or ``(H, W, 2)`` with its
-            confidence.
-        K_left: ``(3, 3)`` pixels of the left image.
-        size: ``(H, W)`` of the left image.
-        size_grid: ``(h, w)`` of the grid.
-
-    Returns:
-        ``Matches`` with the points' confidence (1 without any), and how many of the points are left out.
-
-    Raises:
-        InputError: no point is left, or a map is not of the image's size.
+    ``points`` are ``(N, 3)`` metres in the left camera's frame, or ``(N, 4)`` with their confidence in (0,
+    1]; or a map ``(H, W)`` of the image's ``size``, 0 where unknown, or ``(H, W, 2)`` with its confidence.
+    Where several fall on one pixel the nearest wins. ``InputError`` if no point is left, or a map is of
+    another size.
     """
     weight = None
     if points.ndim == 2 and points.shape[1] in (3, 4):
@@ -149,14 +140,10 @@ def with_points(matches: Matches | None, points: Matches) -> Matches:
 
 @torch.no_grad()
 def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
-    """The share in [0, 1] that remains of each match, given the depth that the prior saw before any moved it.
+    """The share ``(B, 1, H, W)`` that remains of each match, given the prior's first depth at its scale.
 
     One-sided: a reflection and what is seen through glass lie behind the surface, never before it. A prior
     that is right to 5 % can name a reflection, a prior that errs by 30 % cannot.
-
-    Args:
-        matches: of a chunk of samples, ``(B, 1, H, W)``.
-        depth_m: ``(B, 1, H, W)`` metres, > 0, the prior's first estimate with the search's scale.
     """
     weight = matches.confidence.float()
     behind = -(matches.inverse_depth * depth_m).clamp_min(1e-6).log().clamp(-LARGEST, LARGEST)

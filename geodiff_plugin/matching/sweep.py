@@ -33,7 +33,7 @@ class CostVolume:
         inverse_depth: ``(D,)`` float32, 1/m, ascending and evenly spaced.
         K: ``(3, 3)`` pixels of this grid.
         left_01: ``(1, H, W)`` grey left image on this grid.
-        rights: the right views at the resolution that was used, ``(1, Hr, Wr)`` grey, with their K and T.
+        rights: the right views at the resolution that was used, grey.
         aligned: the same, turned parallel to the left view.
     """
 

@@ -82,10 +82,10 @@ class DepthPrior:
         own = getattr(self._pipe, "own_range", None)
         return None if own is None else own[samples].unbind(1)
 
-    def known(self, samples: slice) -> Tensor | None:
+    def valid(self, samples: slice) -> Tensor | None:
         """``(B, 1, H, W)`` bool on the processing grid, where the prior says anything; ``None``: everywhere.
 
         What it gives elsewhere is no evidence of its scale or quality.
         """
-        known = getattr(self._pipe, "known", None)
-        return None if known is None else known[samples]
+        valid = getattr(self._pipe, "valid", None)
+        return None if valid is None else valid[samples]

@@ -95,7 +95,7 @@ class DepthMapPipeline(DirectMapPipeline):
         relative, known = (
             torch.cat(part).repeat_interleave(ensemble_size, dim=0) for part in zip(*prepared, strict=True)
         )
-        self.known = None if bool(known.all()) else known
+        self.valid = None if bool(known.all()) else known
         return {"relative": relative}
 
 

@@ -47,22 +47,20 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
     What the stock pipeline refuses in a sentence that names the argument is left to it.
     """
     check_choice(call["output_type"], "output_type", ("np", "pt"))
-    check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
-    if call["resample_method_output"] is not None:
-        check_choice(call["resample_method_output"], "resample_method_output", RESAMPLING)
-    check_number(call["batch_size"], "batch_size", 1, MOST, integer=True)
+    for name in ("resample_method_input", "resample_method_output"):
+        if call[name] is not None or name == "resample_method_input":
+            check_choice(call[name], name, RESAMPLING)
     for name, least in (("num_inference_steps", 1), ("processing_resolution", 0)):
         if call[name] is not None:
             check_number(call[name], name, least, MOST, integer=True)
-    members = images * check_number(call["ensemble_size"], "ensemble_size", 1, MOST, integer=True)
-    given = call["generator"]
+    for name in ("batch_size", "ensemble_size"):
+        check_number(call[name], name, 1, MOST, integer=True)
+    given, members = call["generator"], images * call["ensemble_size"]
     generators = given if isinstance(given, list) else [] if given is None else [given]
     if not all(isinstance(generator, torch.Generator) for generator in generators):
         bad_type("generator", "None, a torch.Generator or a list of them", given)
     if isinstance(given, list) and len(given) != members:
-        expected = (
-            f"a torch.Generator, or a list of {members}: one for every image and member of its ensemble"
-        )
+        expected = f"a torch.Generator, or a list of {members}: one for every image and member"
         bad_value("generator", expected, f"a list of {len(given)}")
     latents = call["latents"]
     if isinstance(latents, torch.Tensor) and not latents.isfinite().all():

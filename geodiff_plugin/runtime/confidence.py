@@ -75,13 +75,9 @@ def depth_confidence(
 ) -> Tensor:
     """Probability ``(B, 1, H, W)`` that a depth is within 10 % of the truth.
 
-    Args:
-        support: ``(B, 1, H, W)`` in [0, 1], of ``algorithm.correction.refine_depth``.
-        error: ``(B, 1, H, W)`` photometric error in [0, 1], in the left image's exposure.
-        visible: ``(B, 1, H, W)`` bool, whether a right camera sees the pixel.
-        spread: ``(B, 1, H, W)`` relative spread of the ensemble's members, ``None`` for one member.
-        prior_error: ``(B, 1, 1, 1)`` of the prior in log depth, or a ``local_error`` on any grid; ``None``
-            where unknown, which counts as useless.
+    ``support`` is that of ``refine_depth``, ``error`` the photometric one in [0, 1], ``spread`` the relative
+    one of an ensemble's members or ``None``, ``prior_error`` ``(B, 1, 1, 1)`` or a ``local_error`` on any
+    grid; ``None``, unknown, counts as useless.
     """
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)

@@ -37,18 +37,9 @@ StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Ten
 class GuidedRun:
     """State of one guided call.
 
-    Args:
-        pipe: the live pipeline.
-        prior: its adapter.
-        guidance: what the user configured.
-        evidence: one entry per image.
-        call: arguments of the stock call by name; its chunks have ``batch_size`` samples.
-        grid: the processing grid of the pipeline.
-        rounds: of each denoising step, see ``schedule.count_steps``.
-        callback: ``callback_on_step_end`` or ``None``.
-        tiny: autoencoder that is used in the loop; ``None`` for the pipeline's.
-        held: lock against calls in other threads, released while the callback runs.
-        warm: the start from the previous frame, or ``None``.
+    ``evidence`` has one entry per image, ``call`` the arguments of the stock call by name, ``rounds`` are
+    those of each denoising step; ``tiny`` is an autoencoder for the loop, ``held`` a lock against calls in
+    other threads, released while the ``callback`` runs; ``warm`` is the start from the previous frame.
 
     Attributes:
         trajectories: one per chunk.
@@ -199,7 +190,7 @@ class GuidedRun:
                 step_latents=plan.step_latents,
                 prior_range=prior.metric_range(chunk),
                 start_range=start,
-                valid=prior.known(chunk),
+                valid=prior.valid(chunk),
             )
         )
         self._results.append(None)

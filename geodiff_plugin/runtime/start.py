@@ -49,14 +49,11 @@ class WarmStart:
 def plan_warm_start(
     pipe: Any, prior: DepthPrior, guidance: GeometryGuidance, call: Mapping[str, Any], size: tuple[int, int]
 ) -> WarmStart | None:
-    """The start that ``guidance.previous`` gives to a call; ``None`` without it.
+    """The start that ``guidance.previous`` gives to a call on a padded grid ``size``; ``None`` without it.
 
     The latent is taken over by a DDIM of two steps or more. Other schedulers, and priors of a single step,
-    take over the scale alone. ``size (H, W)`` is the padded processing grid.
-
-    Raises:
-        InputError: an output of another number of images or members, of a prior of another space, or of
-            another size; ``latents`` of another shape than the output's, or no tensor.
+    take over the scale alone. ``InputError`` for an output of another number of images or members, of a prior
+    of another space, or of another size; and for ``latents`` of another shape than the output's.
     """
     previous = guidance.previous
     if previous is None:

@@ -214,13 +214,9 @@ def read_indicators(
 ) -> Indicators:
     """The indicators of one image, of the result ``depth_m (1, H, W)`` in the unit of the poses.
 
-    Args:
-        evidence: of it.
-        K_left: ``(3, 3)`` pixels of the native left image.
-        depth_m: the result, or ``None``.
-        range_given: whether the user gave the range of the search.
-        has_unit: whether lengths are in metres, so that the length of a baseline means something.
-        **more: indicators that do not follow from these, by name.
+    ``K_left`` is in pixels of the native image; ``range_given``: the user gave the range of the search;
+    ``has_unit``: lengths are in metres, so that the length of a baseline means something; ``more`` are
+    indicators that do not follow from these.
     """
     matches, pose, rights = evidence.matches, evidence.pose, evidence.native_views
     if matches is not None:

@@ -61,16 +61,10 @@ def reliable_matches(matches: Matches) -> Matches | None:
 def fit_to_points(
     x: Tensor, points: Matches, metric: MetricMap, current: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Metres ``(B,)`` of the two ends of a relative map that explain the points best.
+    """Metres ``(B,)`` of both ends of one image's relative maps ``x (B, 1, h, w)`` that explain points best.
 
-    The best of 1128 log-spaced pairs in mean Cauchy cost of inverse depth, so that some points may be wrong.
-    Coarse: ``refine_to_matches`` does the rest.
-
-    Args:
-        x: ``(B, 1, h, w)`` relative maps of one image.
-        points: of that image.
-        metric: the prior's metric parametrisation.
-        current: ``(near_m, far_m)``, ``(B,)`` each, in use; they stay unless a better basin shows up.
+    The best of 1128 log-spaced pairs in mean Cauchy cost of inverse depth, so that some points may be wrong;
+    ``current`` ends stay unless a better basin shows up. Coarse: ``refine_to_matches`` does the rest.
     """
     at = points.above(0.0)
     at = at[:: max(1, -(-len(at) // BASIN_SAMPLES))]

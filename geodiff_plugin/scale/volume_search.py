@@ -33,27 +33,15 @@ IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.6, 0.25
 
 
 class ScaleSearch(NamedTuple):
-    """Result of a search, ``(B,)`` each.
+    """Result of a search, ``(B,)`` each: metres of both ends, and the mean clamped census cost there.
 
-    Attributes:
-        near_m: metres, depth of the nearest end of the relative map.
-        far_m: metres, depth of its farthest end.
-        cost: mean clamped census cost there, [0, ``COST_CLAMP``].
-        on_edge: the best pair touches the far end of the range, or the near end of a given range.
+    ``on_edge``: the best pair touches the far end of the range, or the near end of a given range.
     """
 
     near_m: Tensor
     far_m: Tensor
     cost: Tensor
     on_edge: Tensor
-
-
-def _sample_positions(height: int, width: int, samples: int, device: torch.device) -> Tensor:
-    """Flat indices of about ``samples`` pixels on a regular, offset grid."""
-    stride = max(1, round((height * width / samples) ** 0.5))
-    rows = torch.arange(stride // 2, height, stride, device=device)
-    columns = torch.arange(stride // 2, width, stride, device=device)
-    return (rows[:, None] * width + columns[None]).flatten()
 
 
 def _lookup(
@@ -94,16 +82,18 @@ def search_scale(
     Args:
         volume: plane-sweep costs of the image.
         x: ``(B, 1, h, w)`` relative maps of that image, about [0, 1], >= 0.
-        space: what ``x`` is affine in, key of ``SPACES``; in disparity spaces ``x = 1`` is near.
-        depth_range: ``(near, far)`` metres, bounds of the search; by default ``volume.reach_m``.
-        current: nearest and farthest depth in use, ``(B,)`` each, to be kept unless a better basin shows up.
+        space: what ``x`` is affine in, key of ``SPACES``.
+        depth_range: metres, bounds of the search; by default ``volume.reach_m``.
+        current: nearest and farthest depth in use, ``(B,)`` each, kept unless a better basin shows up.
         valid: ``(1, 1, H, W)`` bool, the pixels of the maps that count; ``None`` for all.
 
     Source: S7.3. Deviation: two numbers instead of one, clamped census cost instead of L_geo.
     """
     low, high = volume.reach_m if depth_range is None else depth_range
     height, width = volume.size
-    at = _sample_positions(height, width, SAMPLES, x.device)
+    stride = max(1, round((height * width / SAMPLES) ** 0.5))
+    rows, columns = (torch.arange(stride // 2, side, stride, device=x.device) for side in volume.size)
+    at = (rows[:, None] * width + columns[None]).flatten()
     if valid is not None:
         inside = F.interpolate(valid.float(), (height, width), mode="nearest-exact").flatten()[at] > 0
         at = at[inside] if bool(inside.any()) else at
