@@ -28,7 +28,7 @@ from geodiff_plugin.evaluation.datasets.sample import (
     read_depth_m,
     read_rgb,
 )
-from geodiff_plugin.formats import check_file, read_calibration, read_depth_png, read_text
+from geodiff_plugin.formats import read_calibration, read_depth_png, read_text
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.geometry import resize_intrinsics
 from geodiff_plugin.types import Rig
@@ -300,10 +300,8 @@ def _load_posed(ref: SampleRef) -> StereoSample:
         image, camera = read_rgb(files[f"image {view}"], "further image"), files[f"camera {view}"]
         pose = read_calibration((files["calibration"], camera))
         extra.append((image, pose.K_right - half, pose.E))
-    if ref.dataset == "robustmvd":
-        check_file(truth, "true depth", "an npz file")
     depth_m, named = np.zeros(images[0].shape[:2], np.float32), f"no {truth}"
-    if truth.is_file():
+    if truth.is_file() or ref.dataset == "robustmvd":
         depth_m = _like(images[0], truth, read_map(truth, "true depth"))
         named = f"{truth.parent.name}/{truth.name}"
     notes = {"truth": named, "views": files["views"][:2]}
