@@ -14,19 +14,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import InputError, bad_value, check_choice
-from geodiff_plugin.evaluation import tables
+from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, guided_configuration
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
 from geodiff_plugin.evaluation.datasets.changed import changed_ref, drift_of, perturbation
-from geodiff_plugin.evaluation.experiment import (
-    RECORDS_NAME,
-    Page,
-    cell_key,
-    last_of,
-    method_cells,
-    run_experiment,
-)
+from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.options import PosesOptions, TrustOptions, real_and_rendered
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs, headline, label_of
 from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -135,7 +128,7 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
         chosen = replace(options.settings, views=part.views)
         columns.append(
             {
-                heading: method_cells(refs, (f"guided:pose={pose}",), chosen, options.out)
+                heading: experiment.method_cells(refs, (f"guided:pose={pose}",), chosen, options.out)
                 for heading, (refs, pose) in part.columns.items()
             }
         )
@@ -151,7 +144,7 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
 
     said = f"Prior {options.prior[0]}, seed {options.seed}. All pixels with truth, metres as they come out."
     cells, title = [cell for own in columns for items in own.values() for cell in items], "Results by pose"
-    return run_experiment(name, options, title, cells, page_tables, lambda _: [said], RECORDS_NAME)
+    return run_experiment(name, options, title, cells, page_tables, lambda _: [said], experiment.RECORDS_NAME)
 
 
 #: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.
@@ -267,7 +260,7 @@ def run_trust(name: str, options: TrustOptions) -> Page | None:
     for kind in kinds:
         check_choice(kind, "--kinds", WRONG)
     pairs = real_and_rendered(options, f"synthetic:{{}}@{options.width}x{options.width * 3 // 4}")
-    settings, priors, read = options.settings, PriorCache(), last_of(load)
+    settings, priors, read = options.settings, PriorCache(), experiment.last_of(load)
     configuration = guided_configuration(GeometryGuidance, settings)
     pipe, prior = priors.get(settings), f"{settings.prior} {priors.fingerprint(settings)}"
     cells = []
@@ -276,7 +269,7 @@ def run_trust(name: str, options: TrustOptions) -> Page | None:
             for kind in (RIGHT, *kinds):
                 head = {"kind": kind, "group": group, "sample": ref.label}
                 work = partial(_measure, ref, kind, read, pipe, settings)
-                key = cell_key(ref, kind, configuration, prior)
+                key = experiment.cell_key(ref, kind, configuration, prior)
                 cells.append(Item(key, work, name=f"{ref.label}, {kind}", head=head))
 
     def page_tables(records: list[Record]) -> list[Table]:

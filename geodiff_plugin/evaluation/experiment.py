@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import date
 from functools import lru_cache, partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
 
 from geodiff_plugin import __version__
@@ -44,16 +44,11 @@ Tables = Callable[[list[Record]], Sequence[Table]]
 
 def run_facts(command: str, options: Any) -> dict[str, Any]:
     """Command line, date, versions and machine of a run."""
-    used = versions()
-    try:
-        used["opencv"] = version("opencv-python-headless")
-    except PackageNotFoundError:
-        used["opencv"] = "not installed"
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads"
     if torch.cuda.is_available():
         machine += f", {torch.cuda.get_device_name()}"
     line = {"command": command_line(command, options), "date": date.today().isoformat()}
-    return line | {"versions": used, "machine": machine}
+    return line | {"versions": versions() | {"opencv": cv2.__version__}, "machine": machine}
 
 
 @dataclass(frozen=True)

@@ -42,13 +42,8 @@ RIGHT_M, CELL_M = 0.05, 0.02
 def flicker(errors: Sequence[np.ndarray], truth: Sequence[DepthFrame]) -> tuple[float, float]:
     """Change of log depth of the same surface points from frame to frame, beyond that of the truth.
 
-    Args:
-        errors: ``(H, W)`` each, log of depth over truth; NaN where there is no truth.
-        truth: the frames that they belong to.
-
-    Returns:
-        Mean absolute change over points, and over frames the mean absolute change of the median: how far the
-        whole picture breathes.
+    ``errors`` are ``(H, W)`` each, log of depth over truth. The mean absolute change over points, and over
+    frames the mean absolute change of the median: how far the whole picture breathes.
     """
     points, breath = [], []
     for (frame, following), (before, after) in zip(pairwise(truth), pairwise(errors), strict=True):
@@ -150,17 +145,18 @@ CAPTURE_PURPOSE = (
     "Depth of frames of a moving camera, with the bundled prior unless the command says otherwise: poses as "
     "the tracker gave them, refined by the views of each frame alone, and solved over the whole capture."
 )
-#: Heading of every number of a record, and its digits.
-CAPTURE_COLUMNS = {
-    "abs_rel": ("AbsRel", 4),
-    "worst": ("worst", 4),
-    "scaled": ("scaled", 4),
-    "scale": ("scale", 3),
-    "delta_103": ("within 3 %", 3),
-    "delta_125": ("within 25 %", 3),
-    "agreed": ("agreed", 4),
-    "f": ("F 5 cm", 3),
-    "tae": ("TAE %", 2),
+_CAPTURE_COLUMNS: dict[str, CellOf] = {
+    "poses": lambda own: str(own[0]["row"]),
+    "views": lambda own: str(own[0]["views"]),
+    "AbsRel": mean_of("abs_rel", 4),
+    "worst": mean_of("worst", 4),
+    "scaled": mean_of("scaled", 4),
+    "scale": mean_of("scale"),
+    "within 3 %": mean_of("delta_103"),
+    "within 25 %": mean_of("delta_125"),
+    "agreed": mean_of("agreed", 4),
+    "F 5 cm": mean_of("f"),
+    "TAE %": mean_of("tae", 2),
 }
 CAPTURE_NOTE = (
     "AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its median. "
@@ -202,7 +198,12 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
     priors, settings, cells, titles = PriorCache(), options.settings, list[Item](), dict[str, str]()
     for data in options.data:
         captures = {poses: Capture.open(data) for poses in ("given", "refined")}
-        names = _chosen(captures["given"], options)
+        names = captures["given"].choose(options.frames)
+        if options.count is not None:
+            at = ((np.arange(options.count) + 0.5) * len(names) / options.count).astype(int)
+            names = [names[i] for i in np.unique(at)]
+        for frame in names:
+            captures["given"].measured_depth(frame)  # raises where a frame has none
         titles[str(data)] = f"{data.name}, {len(names)} frames"
         pipe = priors.get(settings)
         how = (str(data.resolve()), names, options.prior, priors.fingerprint(settings), options.steps)
@@ -219,26 +220,12 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
         cells.append(Item(key, work, name=f"{data.name}, sparse points", head=head))
 
     def tables(records: list[Record]) -> list[Table]:
-        columns: dict[str, CellOf] = {"poses": lambda own: str(own[0]["row"])}
-        columns |= {"views": lambda own: str(own[0]["views"])}
-        columns |= {heading: mean_of(entry, digits) for entry, (heading, digits) in CAPTURE_COLUMNS.items()}
         return [
-            table_of_groups(titles[data], own, ("key",), columns)
+            table_of_groups(titles[data], own, ("key",), _CAPTURE_COLUMNS)
             for data, own in grouped(records, "data").items()
         ]
 
     return run_experiment(name, options, "Captures", cells, tables, lambda _: (CAPTURE_PURPOSE, CAPTURE_NOTE))
-
-
-def _chosen(capture: Capture, options: CaptureEvalOptions) -> list[str]:
-    """Names of the frames to measure, all of which have a depth map."""
-    names = capture.choose(options.frames)
-    if options.count is not None:
-        at = ((np.arange(options.count) + 0.5) * len(names) / options.count).astype(int)
-        names = [names[i] for i in np.unique(at)]
-    for name in names:
-        capture.measured_depth(name)
-    return names
 
 
 def _measure_frames(

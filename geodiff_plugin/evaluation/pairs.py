@@ -125,10 +125,9 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
 }
 """What is changed, by table: ``(row, method)``, the unchanged preset first.
 
-``guided`` and ``paper`` stand below the paper's Table 4, every rule and every term with its row (no sample
-has known points, so their term has none); ``parts`` is what the default has beyond the paper.
+``guided`` and ``paper`` stand below the paper's Table 4 (no sample has known points, so their term has no
+row); ``parts`` is what the default has beyond the paper.
 """
-
 _NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
 
 NUMBERS = (
@@ -212,41 +211,29 @@ COST_METHODS = (PLAIN, "search-only", "guided", "guided:gradient=full", "paper")
 STEPS = 4
 
 
-def _seconds(own: Sequence[Record]) -> float:
-    return statistics.median(record["seconds"] for record in own)
-
-
-def _peak(own: Sequence[Record]) -> int:
-    return max(record["peak_bytes"] for record in own)
-
-
 def cost_table(records: Sequence[Record]) -> Table:
-    """Seconds and memory of every method, and both as multiples of the plain pipeline's.
-
-    Args:
-        records: of a run in which ``PLAIN`` has worked on some pair; ``ValueError`` without.
-    """
+    """Seconds and memory of every method, and both as multiples of the plain pipeline's."""
+    costs, rows = {}, []
     done = [record for record in records if record["status"] == "ok"]
-    plain = [record for record in done if record["method"] == PLAIN]
-    if not plain:
+    for method, own in tables.grouped(done, "method").items():
+        peak = max(record["peak_bytes"] for record in own)
+        costs[method] = len(own), statistics.median(record["seconds"] for record in own), peak
+    if PLAIN not in costs:
         cure = "See geodiff eval cost without --skip-broken for the reason."
         bad_value("the pairs", f"some on which {PLAIN} works", "none", cure)
-    plain_seconds, plain_bytes = max(_seconds(plain), 1e-3), max(_peak(plain), 1)
-    columns: dict[str, tables.CellOf] = {
-        "method": lambda own: "plain pipeline" if own[0]["method"] == PLAIN else tables.method_title(own),
-        "pairs": lambda own: str(len(own)),
-        "seconds": lambda own: f"{_seconds(own):.2f}",
-        "time × plain": lambda own: f"{_seconds(own) / plain_seconds:.2f}",
-        "peak MB": lambda own: f"{_peak(own) / 1e6:.0f}",
-        "memory × plain": lambda own: f"{_peak(own) / plain_bytes:.2f}",
-    }
+    _, plain_seconds, plain_peak = costs[PLAIN]
+    for method, (count, seconds, peak) in costs.items():
+        title = "plain pipeline" if method == PLAIN else find_method(method).title
+        times = f"{seconds:.2f}", f"{seconds / max(plain_seconds, 1e-3):.2f}"
+        rows.append((title, str(count), *times, f"{peak / 1e6:.0f}", f"{peak / max(plain_peak, 1):.2f}"))
     note = (
         "Median seconds and greatest peak over the pairs, each method in a process of its own, all of one "
         "prior with the same number of denoising steps. On CUDA the peak is what was allocated, weights "
         "included, reset for each pair; on the CPU it is the increase of resident memory over the start, "
         "sampled every 50 ms."
     )
-    return tables.table_of_groups(f"Cost on {pairs_of(records)}", done, ("method",), columns, note)
+    header = ("method", "pairs", "seconds", "time × plain", "peak MB", "memory × plain")
+    return Table(f"Cost on {pairs_of(records)}", header, tuple(rows), note)
 
 
 def _steps_of(prior: str) -> int | None:
@@ -261,11 +248,7 @@ def _method_records(refs: Sequence[SampleRef], method: str, options: PairsOption
 
 
 def run_cost(name: str, options: PairsOptions) -> Page:
-    """Measure ``COST_METHODS`` and further ones, and write the table.
-
-    Records go to ``out/cost``, apart from those of other commands. Errors as ``run_experiment``, and
-    ``ValueError`` where several processes were started.
-    """
+    """Measure ``COST_METHODS`` and further ones, and write the table; records go to ``out/cost``."""
     if this_process().count > 1:
         bad_value("the number of processes", "1 for cost", this_process().count)
     refs = select(all_refs(options), options)

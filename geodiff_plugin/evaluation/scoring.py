@@ -13,31 +13,21 @@ import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.agreement import DepthFrame, seen_in
-from geodiff_plugin.evaluation import edges
+from geodiff_plugin.evaluation import edges, metrics
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
-from geodiff_plugin.evaluation.metrics import (
-    align,
-    ause,
-    confidence_deciles,
-    counted,
-    evaluate_depth,
-    evaluate_disparity,
-    to_space,
-)
 from geodiff_plugin.matching import match_volume
 from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
+#: Material classes that Booster's authors call transparent or mirror when they score depth.
 TOM_CLASSES = (2, 3)
-"""Material classes that Booster's authors call transparent or mirror when they score depth."""
+#: Share of pixels with truth from which on its edges are there to be measured.
 DENSE = 0.5
-"""Share of pixels with truth from which on its edges are there to be measured."""
+#: Confidence from which on a match of our plane sweep counts as one.
 RELIABLE_MATCH = 0.5
-"""Confidence from which on a match of our plane sweep counts as one."""
 
 Scores = dict[str, float | None]
-"""Of JSON values."""
 
 
 def out_of_view(sample: StereoSample) -> np.ndarray:
@@ -115,7 +105,7 @@ def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Sco
     masks |= {"edge": edge, "flat": valid & ~edge}
     step_px = float(sample.notes.get("disparity_step_px", 0.0))
     return {
-        name: _plain(evaluate_disparity(pred_px, true_px, mask, step_px))
+        name: _plain(metrics.evaluate_disparity(pred_px, true_px, mask, step_px))
         for name, mask in masks.items()
         if mask.any()
     }
@@ -132,12 +122,12 @@ def _metric_scores(sample: StereoSample, prediction: Prediction, kept: np.ndarra
         by_mask = disparity_scores(sample, depth_m)
         record["disparity"] = by_mask.pop("all") | {"regions": by_mask}
     if prediction.uncertainty is not None:
-        record |= _plain({"ause": ause(depth_m, truth, kept, prediction.uncertainty)})
+        record |= _plain({"ause": metrics.ause(depth_m, truth, kept, prediction.uncertainty)})
     if (confidence := prediction.confidence) is not None:
-        deciles = confidence_deciles(depth_m, truth, kept, confidence, RIGHT_WITHIN)
+        deciles = metrics.confidence_deciles(depth_m, truth, kept, confidence, RIGHT_WITHIN)
         record["confidence"] = [_plain(decile) for decile in deciles]
         orders = {"ause": -confidence, "random": None}
-        areas = {name: ause(depth_m, truth, kept, order) for name, order in orders.items()}
+        areas = {name: metrics.ause(depth_m, truth, kept, order) for name, order in orders.items()}
         record["ause_confidence"] = _plain(areas)
     if valid.mean() > DENSE:
         f1 = {"f1": edges.boundary_f1(depth_m, truth, valid)}
@@ -150,24 +140,20 @@ def in_metres(prediction: Prediction, truth: np.ndarray, kept: np.ndarray) -> np
     if prediction.depth_m is not None:
         return prediction.depth_m
     assert prediction.relative is not None  # a prediction has one of the two
-    return align(prediction.relative, truth, kept, prediction.space)
+    return metrics.align(prediction.relative, truth, kept, prediction.space)
 
 
 def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> dict[str, Any]:
     """Score one prediction.
 
-    Args:
-        sample: images, cameras and truth.
-        prediction: a method's answer at the left image's resolution.
-        cap_m: farthest truth that counts in the data set's protocol, metres; ``None`` for no limit.
+    ``cap_m`` is the farthest truth that counts in the data set's protocol, metres, ``None`` for no limit.
 
     Returns:
-        ``all_pixels``: ``raw`` and ``aligned`` errors over every pixel with truth, without a cap; ``capped``:
-        the same two under the cap; ``disparity``: for rectified pairs, not aligned, with its ``regions``;
-        ``regions``: AbsRel by region under the cap, not aligned (aligned for a method without metres);
-        ``ause`` of the uncertainty; ``confidence`` by decile, and ``ause_confidence``: its AUSE, and that of
-        a random order; ``boundaries`` of dense truth: ``f1``, ``dbe_acc``, ``dbe_comp``. ``None`` where it
-        does not apply.
+        ``all_pixels``: ``raw`` and ``aligned`` errors over every pixel with truth; ``capped``: the same under
+        the cap; ``disparity`` of rectified pairs, not aligned, with its ``regions``; ``regions``: AbsRel by
+        region under the cap, not aligned (aligned for a method without metres); ``ause`` of the uncertainty;
+        ``confidence`` by decile, and ``ause_confidence``: its AUSE, and that of a random order;
+        ``boundaries`` of dense truth: ``f1``, ``dbe_acc``, ``dbe_comp``. ``None`` where it does not apply.
 
     Raises:
         ValueError: a map of the wrong shape, or a sample without truth.
@@ -181,18 +167,18 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
     values, depth_m, space = prediction.relative, prediction.depth_m, prediction.space
     if values is None:
         # Metres are aligned in the prior's own space, as its relative map would be.
-        values = depth_m if space == "depth" else to_space(_positive(depth_m), space)
+        values = depth_m if space == "depth" else metrics.to_space(_positive(depth_m), space)
 
     def both(cap: float | None) -> dict[str, Scores | None]:
-        aligned_m = align(values, truth, counted(truth, valid, cap), space)
-        raw = None if depth_m is None else _plain(evaluate_depth(depth_m, truth, valid, cap))
-        return {"raw": raw, "aligned": _plain(evaluate_depth(aligned_m, truth, valid, cap))}
+        aligned_m = metrics.align(values, truth, metrics.counted(truth, valid, cap), space)
+        raw = None if depth_m is None else _plain(metrics.evaluate_depth(depth_m, truth, valid, cap))
+        return {"raw": raw, "aligned": _plain(metrics.evaluate_depth(aligned_m, truth, valid, cap))}
 
     record: dict[str, Any] = {"all_pixels": both(None)}
     record["capped"] = record["all_pixels"] if cap_m is None else both(cap_m)
-    kept = counted(truth, valid, cap_m)
+    kept = metrics.counted(truth, valid, cap_m)
     shown_m, errors = in_metres(prediction, truth, kept), {}
     for name, mask in regions(sample).items():
         if (mask & kept).any():
-            errors[name] = evaluate_depth(shown_m, truth, mask & kept, cap_m)["abs_rel"]
+            errors[name] = metrics.evaluate_depth(shown_m, truth, mask & kept, cap_m)["abs_rel"]
     return record | _metric_scores(sample, prediction, kept) | {"regions": _plain(errors)}

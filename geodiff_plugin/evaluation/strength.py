@@ -25,6 +25,7 @@ from torch import Tensor
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.algorithm.denoising import output_from
 from geodiff_plugin.bundled import load_bundled_prior
+from geodiff_plugin.evaluation import tables
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load
 from geodiff_plugin.evaluation.edges import edge_error, surface_error
@@ -33,16 +34,7 @@ from geodiff_plugin.evaluation.figures import draw_strength, shaded
 from geodiff_plugin.evaluation.metrics import evaluate_depth, to_space
 from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions, data_of
 from geodiff_plugin.evaluation.scoring import DENSE, in_metres
-from geodiff_plugin.evaluation.tables import (
-    CellOf,
-    Table,
-    count_of_pairs,
-    grouped,
-    mean_of,
-    method_title,
-    most_of,
-    table_of_groups,
-)
+from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runner import Item, Record
 from geodiff_plugin.runtime.noise_levels import noise_level
@@ -211,7 +203,7 @@ def _measure(
     """Errors of one method at one strength, of a pair with dense truth."""
     sample = read(ref)
     if sample.valid.mean() < DENSE:
-        return {"status": "sparse"}
+        bad_value("--data", f"pairs with truth on {DENSE:.0%} of their pixels or more", sample.label)
     depth_m = _depth_m(prior, options, sample, strength, name)
     truth = (sample.depth_m, sample.valid)
     scores = evaluate_depth(depth_m, *truth)
@@ -244,16 +236,9 @@ def strength_tables(records: Sequence[Record]) -> list[Table]:
     for title, own in groups.items():
         if own:
             # Not by label: pairs of one name in two folders are two.
-            pairs = count_of_pairs(max(map(len, grouped(own, *names).values())))
-            page.append(table_of_groups(title, own, names, COLUMNS, f"{pairs}. {NOTE}"))
+            pairs = tables.count_of_pairs(max(map(len, tables.grouped(own, *names).values())))
+            page.append(tables.table_of_groups(title, own, names, COLUMNS, f"{pairs}. {NOTE}"))
     return page
-
-
-def _dense(records: Sequence[Record]) -> list[Record]:
-    kept = [record for record in records if record.get("status") != "sparse"]
-    if not kept:
-        bad_value("--data", f"with dense truth (on {DENSE:.0%} of the pixels) for some pair", "none")
-    return kept
 
 
 def run_strength(name: str, options: StrengthOptions) -> Page | None:
@@ -265,6 +250,8 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
         got = repr(",".join(options.methods))
         bad_value("--methods", f"with {ORACLE}, the abscissa of the figure", got)
     refs = [ref for root in options.data or (data_of(options),) for ref in find_pairs(root)[: options.limit]]
+    if not refs:
+        bad_value("--data", "a folder with pairs", " ".join(map(str, options.data)))
     prior, read, cells = EmulatedPrior(options.space, options.follow), last_of(load), []
     for ref, strength, method_name in product(refs, options.strengths, options.methods):
         method = find_method(method_name)
@@ -282,15 +269,10 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
             f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}.",
         ]
         if options.figure is not None:
-            labels = {record["pair"] for record in _dense(records)}
-            sample = load(next(ref for ref in refs if ref.label in labels))
-            draw_strength(_dense(records), ORACLE, _pictures(prior, options, sample), options.figure)
+            draw_strength(records, ORACLE, _pictures(prior, options, load(refs[0])), options.figure)
             if options.results is not None:
                 picture = Path(os.path.relpath(options.figure, options.results.parent)).as_posix()
                 sentences.append(f"![What guidance gains by the prior's error; surfaces, lit]({picture})")
         return sentences
 
-    def tables(records: list[Record]) -> list[Table]:
-        return strength_tables(_dense(records))
-
-    return run_experiment(name, options, "Priors from exact to weak", cells, tables, remarks)
+    return run_experiment(name, options, "Priors from exact to weak", cells, strength_tables, remarks)

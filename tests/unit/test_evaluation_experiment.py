@@ -38,22 +38,22 @@ class Bench:
     def __init__(self, monkeypatch, out):
         self.calls, self.methods, self.out, self.path = [], {}, out, out / RECORDS_NAME
         self.samples = {name: make_sample(name, rectified=name != "c") for name in SIZES}
-        self.add("exact", lambda sample, settings: 1.0)
-        self.add("double", lambda sample, settings: 2.0 if sample.rectified else None)
-        self.add("noisy", lambda sample, settings: 1 + SIZES[sample.name] * settings.seed, uses_prior=True)
+        self.add("exact", lambda sample, seed: 1.0)
+        self.add("double", lambda sample, seed: 2.0 if sample.rectified else None)
+        self.add("noisy", lambda sample, seed: 1 + SIZES[sample.name] * seed, uses_prior=True)
         monkeypatch.setattr("geodiff_plugin.evaluation.baselines.METHODS", self.methods)
         monkeypatch.setattr(experiment, "load", lambda ref: self.samples[ref.name])
         monkeypatch.setattr(experiment.PriorCache, "fingerprint", lambda _, settings: settings.prior[::-1])
 
-    def add(self, name, factor_of, configuration=None, uses_prior=False):
+    def add(self, name, factor_of, knobs=None, uses_prior=False):
         def measure(sample, settings, priors):
-            self.calls.append((name, settings.seed, sample.name))
-            if (factor := factor_of(sample, settings)) is None:
+            self.calls.append((name, sample.name))
+            if (factor := factor_of(sample, settings.seed)) is None:
                 raise NotApplicable("not rectified")
             return Prediction(factor * sample.depth_m.astype(float))
 
         def configure(settings):
-            return configuration or ({"seed": settings.seed} if uses_prior else {})
+            return knobs or ({"seed": settings.seed} if uses_prior else {})
 
         self.methods[name] = Method(name, name, name, measure, configure, uses_prior)
 
@@ -98,7 +98,7 @@ def test_broken_sample_stops_or_is_counted_and_tried_again(bench, monkeypatch):
     assert records[2]["error"] == "left.png is missing"
     monkeypatch.setattr(experiment, "load", lambda ref: bench.samples[ref.name])
     assert [r["status"] for r in bench.go()] == ["ok"] * 5 + ["not applicable"]
-    assert {name for _, _, name in bench.calls} == {"b"}
+    assert {name for _, name in bench.calls} == {"b"}
 
 
 def test_a_saved_map_is_that_of_the_record(bench):
@@ -111,7 +111,7 @@ def test_a_saved_map_is_that_of_the_record(bench):
         bench.methods["exact"] = method
         bench.go(save_depth=True)
         maps.append(np.load(target))
-    assert ("exact", 0, "a") in bench.calls and maps[1][0, 0] == 15.0
+    assert ("exact", "a") in bench.calls and maps[1][0, 0] == 15.0
     np.testing.assert_array_equal(maps[0], maps[2])
     bench.go(save_depth=True)
     assert bench.calls == [] and len(list(bench.out.glob("depth/*/*.npy"))) == 5

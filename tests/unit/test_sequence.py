@@ -21,8 +21,6 @@ from geodiff_plugin.types import MetricDepthOutput
 from tests.contracts.tiny_priors import make_geowizard
 from tests.scenes import render_sequence
 
-FAST = {"inner_steps": 0, "corrections": 4}
-
 
 def test_flicker_is_what_changes_on_the_same_points():
     truth = frames.true_frames(render_sequence(3, 3, size=(48, 64)))
@@ -63,6 +61,11 @@ def pipe(make_pipeline):
     return enable_geometry_guidance(make_pipeline())
 
 
+@pytest.fixture
+def first(pipe, textured_plane):
+    return call(pipe, textured_plane)
+
+
 def guided(pair, previous, **more):
     return GeometryGuidance(pair.right, pair.K, pair.E, previous=previous, **more)
 
@@ -73,32 +76,25 @@ def planned(pipe, guidance, size=(48, 64), **told):
     return plan_warm_start(pipe, find_adapter(pipe)(pipe), guidance, told, size)
 
 
-def call(pipe, pair, steps=4, previous=None, size=1, latents=None, **knobs):
-    guidance = guided(pair, previous, **FAST, **knobs)
-    return pipe(
-        pair.left,
-        guidance=guidance,
-        num_inference_steps=steps,
-        ensemble_size=size,
-        generator=torch.Generator().manual_seed(0),
-        output_latent=True,
-        latents=latents,
-    )
+def call(pipe, pair, previous=None, warm_start=0.25, **told):
+    guidance = guided(pair, previous, warm_start=warm_start, inner_steps=0, corrections=4)
+    told = {"generator": torch.Generator().manual_seed(0), "num_inference_steps": 4} | told
+    return pipe(pair.left, guidance=guidance, output_latent=True, **told)
 
 
-def test_a_call_goes_on_in_the_middle_of_the_schedule(pipe, textured_plane):
-    first = call(pipe, textured_plane)
+def test_a_call_goes_on_in_the_middle_of_the_schedule(pipe, textured_plane, first):
     for share, steps in ((0.5, 2), (0.25, 3), (0.99, 1), (0.0, 4)):
-        second = call(pipe, textured_plane, previous=first, warm_start=share)
+        second = call(pipe, textured_plane, first, share)
         assert [float(report.timestep) for report in second.history] == [
             float(report.timestep) for report in first.history[4 - steps :]
         ]
     assert type(pipe.scheduler) is DDIMScheduler and len(pipe.scheduler.timesteps) == 1000  # as it was
+    half = call(pipe.to(torch.bfloat16), textured_plane, first)
+    assert np.isfinite(half.prediction).all()
 
 
-def test_its_latents_are_the_frame_before_at_the_level_of_that_step(pipe, textured_plane):
+def test_its_latents_are_the_frame_before_at_the_level_of_that_step(pipe, textured_plane, first):
     """Mean over many draws: alpha z0; spread: sigma, by the scheduler's own table."""
-    first = call(pipe, textured_plane)
     guidance, generator = guided(textured_plane, first), torch.Generator().manual_seed(1)
     warm = [planned(pipe, guidance, generator=generator) for _ in range(100)]
     assert warm[0].skipped == 1
@@ -108,22 +104,17 @@ def test_its_latents_are_the_frame_before_at_the_level_of_that_step(pipe, textur
     assert float(drawn.std(0).mean()) == pytest.approx(float((1 - alpha_bar).sqrt()), rel=0.05)
 
 
-def test_its_scale_is_that_of_the_frame_before(pipe, textured_plane):
+def test_its_scale_is_that_of_the_frame_before(pipe, textured_plane, first):
     """With no search and no fit of its own, a call has the depths of the ends that it was given."""
-    first = call(pipe, textured_plane)
-    warm = planned(pipe, guided(textured_plane, first), latents=torch.zeros_like(first.latent))
-    scale, shift, g_s = first.scale[0, 0], first.shift[0, 0], first.global_scale[0, 0]
-    assert float(warm.near_m[0]) == pytest.approx(float(g_s * shift), rel=1e-5)
-    assert float(warm.far_m[0]) == pytest.approx(float(g_s * (scale + shift)), rel=1e-5)
-    second = call(pipe, textured_plane, previous=first)
-    ratio = second.prediction / first.prediction
+    ratio = call(pipe, textured_plane, first).prediction / first.prediction
     assert abs(np.log(np.median(ratio))) < 0.05
-
-
-def test_metres_of_a_prior_become_baselines_again(pipe, textured_plane):
-    """Poses without a unit, a frame before whose lengths were multiplied to a metric prior's."""
-    first = call(pipe, textured_plane)
-    plain = planned(pipe, guided(textured_plane, first))
+    plain = planned(pipe, guided(textured_plane, first), latents=torch.zeros_like(first.latent))
+    near_m = first.global_scale[0] * first.shift[0]
+    torch.testing.assert_close(plain.near_m, near_m, rtol=1e-5, atol=0)
+    torch.testing.assert_close(
+        plain.far_m, near_m + first.global_scale[0] * first.scale[0], rtol=1e-5, atol=0
+    )
+    # Poses without a unit, a frame before whose lengths were multiplied to a metric prior's.
     first.rescaled, first.global_scale = 4.0, 4.0 * first.global_scale
     in_metres = planned(pipe, guided(textured_plane, first))
     in_baselines = planned(pipe, guided(textured_plane, first, unit=None))
@@ -135,40 +126,33 @@ def test_metres_of_a_prior_become_baselines_again(pipe, textured_plane):
 def test_another_scheduler_takes_over_the_scale_alone(make_pipeline, textured_plane):
     scheduler = LCMScheduler.from_config(make_pipeline().scheduler.config)
     pipe = enable_geometry_guidance(make_pipeline(scheduler))
-    first = call(pipe, textured_plane)
-    assert len(call(pipe, textured_plane, previous=first).history) == 4
+    assert len(call(pipe, textured_plane, call(pipe, textured_plane)).history) == 4
 
 
-def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane):
-    first = call(pipe, textured_plane)
-
+def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane, first):
     def changed(**entries):
         other = copy.copy(first)
-        for name, value in entries.items():
-            setattr(other, name, value)
+        vars(other).update(entries)
         return other
 
-    two = "output of 1 image of 2 members; got one of 1 image of 1 member"
-    for previous, more, said in (
+    two, pair = "output of 1 image of 2 members; got one of 1 image of 1 member", textured_plane
+    for previous, told, said in (
         (first.prediction, {}, "previous must be a MetricDepthOutput"),
         (MetricDepthOutput(first.prediction), {}, "output_latent=True"),
-        (first, {"size": 2}, two),
+        (first, {"ensemble_size": 2}, two),
         (changed(space="disparity"), {}, "a prior whose map is affine in depth; got one in disparity"),
         (changed(latent=first.latent[..., :-1]), {}, "a sequence of its own"),
         (first, {"latents": first.latent[..., :-1]}, "latents must be of shape"),
         (first, {"latents": first.latent[:, :1]}, "latents must be of shape"),  # would be spread silently
+        (first, {"latents": [first.latent]}, "latents must be None or a torch.Tensor; got list"),
     ):
-        with pytest.raises(InputError, match=said):
-            call(pipe, textured_plane, previous=previous, **more)
-    with pytest.raises(InputTypeError, match="latents must be None or a torch.Tensor; got list"):
-        call(pipe, textured_plane, previous=first, latents=[first.latent])
+        with pytest.raises((InputError, InputTypeError), match=said):
+            call(pipe, pair, previous, **told)
     twice = {name: getattr(first, name).repeat(1, 2) for name in ("scale", "shift", "global_scale")}
     members = changed(latent=first.latent.repeat(2, 1, 1, 1), **twice)
-    guidance = GeometryGuidance(
-        [textured_plane.right] * 2, textured_plane.K, textured_plane.E, previous=members
-    )
+    guidance = GeometryGuidance([pair.right] * 2, pair.K, pair.E, previous=members)
     with pytest.raises(InputError, match="previous must be the output of 2 images of 1 member"):
-        pipe([textured_plane.left] * 2, guidance=guidance)
+        pipe([pair.left] * 2, guidance=guidance)
 
 
 def test_depth_and_normals_start_from_one_noise(textured_plane):
@@ -181,9 +165,3 @@ def test_depth_and_normals_start_from_one_noise(textured_plane):
     alpha_bar = pipe.scheduler.alphas_cumprod[int(first.history[warm.skipped].timestep)]
     depth, normals = (warm.latents - alpha_bar.sqrt() * first.latent).chunk(2, dim=1)
     torch.testing.assert_close(depth, normals, rtol=0, atol=1e-4)
-
-
-def test_a_frame_of_another_precision_goes_on(pipe, textured_plane):
-    first = call(pipe, textured_plane)
-    half = call(pipe.to(torch.bfloat16), textured_plane, previous=first)
-    assert np.isfinite(half.prediction).all()
