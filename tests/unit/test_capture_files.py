@@ -59,29 +59,26 @@ def seven_scenes(folder: Path) -> Path:
 
 
 def scannet(folder: Path) -> Path:
-    for name in ("pose", "intrinsic"):
-        (folder / name).mkdir(parents=True)
     for i, (E, image) in enumerate(zip(TRUE, IMAGES, strict=True)):
         save(folder / "color" / f"{10 * i}.png", image)  # 30 comes after 0, 10, 20
+        save(folder / "depth" / f"{10 * i}.png", image)
+        (folder / "pose").mkdir(exist_ok=True)
         np.savetxt(folder / "pose" / f"{10 * i}.txt", E, fmt="%.9f")
-    four = np.eye(4)
-    four[:3, :3] = K
-    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", four)
+    np.savetxt(folder / "intrinsic_color.txt", np.pad(K, (0, 1)) + np.diag([0, 0, 0, 1]))
     return folder
 
 
 def trajectory(E: np.ndarray, times: np.ndarray) -> str:
-    turns = Rotation.from_matrix(E[:, :3, :3]).as_quat()
-    lines = [" ".join(f"{v:.9f}" for v in row) for row in np.c_[times, E[:, :3, 3], turns]]
-    return "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""])
+    rows = np.c_[times, E[:, :3, 3], Rotation.from_matrix(E[:, :3, :3]).as_quat()]
+    return "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(" ".join(f"{v:.9f}" for v in row) for row in rows)
 
 
 def tum(folder: Path) -> Path:
     for i, image in enumerate(IMAGES):
         save(folder / "rgb" / f"{i}.png", image)
-    (folder / "rgb.txt").write_text(
-        "# timestamp filename\n" + "".join(f"{i}.5 rgb/{i}.png\n" for i in range(4))
-    )
+    names = "".join(f"{i}.5 rgb/{i}.png\n" for i in range(4))
+    (folder / "rgb.txt").write_text("# timestamp filename\n" + names)
+    (folder / "depth.txt").write_text(names.replace(".5", ".51"))
     (folder / "groundtruth.txt").write_text(trajectory(TRUE, np.arange(4) + 0.5))
     np.savetxt(folder / "K.txt", K)
     return folder
@@ -99,6 +96,7 @@ def test_every_layout_gives_the_same_frames(write, tmp_path):
         np.testing.assert_allclose(frame.K, K, atol=1e-9)
         assert frame.size == SIZE and frame.lens is None and frame.image.is_file()
     assert files.unit == (None if "colmap" in write.__name__ else "m")
+    assert (files.frames[3].depth is not None) == (write in (transforms, scannet, tum))
 
 
 def test_frames_of_a_model_have_the_points_that_they_see(tmp_path):
@@ -150,45 +148,33 @@ def test_smaller_images_have_their_K(tmp_path):
     np.testing.assert_allclose(small[1, 1], K[1, 1] / 2)
 
 
-def without(*names: str):
-    def change(files: Path) -> None:
-        for name in names:
-            (files / name).unlink()
-
-    return change
-
-
-def edited(change):
-    def edit(folder: Path) -> None:
-        path = folder / "transforms.json"
-        data = json.loads(path.read_text())
-        change(data)
-        path.write_text(json.dumps(data))
-
-    return edit
-
-
-def cropped(folder: Path) -> None:
+def crop(folder: Path, data: dict) -> None:
     Image.fromarray(IMAGES[0][:90]).save(folder / "images/f00.png")
+
+
+def lose(folder: Path, data: dict) -> None:
+    for i in range(3):
+        (folder / f"images/f{i:02d}.png").unlink()
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (without("images/f00.png", "images/f01.png", "images/f02.png"), "at least two frames"),
-        (edited(lambda data: data["frames"].clear()), "at least two frames"),
-        (edited(lambda data: data.pop("fl_x") and data.pop("fl_y")), "fl_x"),
-        (
-            edited(lambda data: data["frames"][1].update(transform_matrix=[[1, 2]])),
-            "transform_matrix",
-        ),
-        (edited(lambda data: data.update(camera_model="FOV")), "FOV"),
-        (cropped, "crop"),
+        (lose, "at least two frames"),
+        (lambda _, data: data["frames"].clear(), "at least two frames"),
+        (lambda _, data: [data.pop(key) for key in ("fl_x", "fl_y")], "fl_x"),
+        (lambda _, data: data["frames"][1].update(transform_matrix=[[1, 2]]), "transform_matrix"),
+        (lambda _, data: data["frames"][1].pop("transform_matrix"), "no 'transform_matrix'"),
+        (lambda _, data: data.update(camera_model="FOV"), "FOV"),
+        (lambda folder, _: (folder / "images/f00.png").write_bytes(b"?"), "f00.png must be an image file"),
+        (crop, "crop"),
     ],
 )
 def test_bad_captures_get_a_sentence(change, words, tmp_path):
     folder = write_transforms(tmp_path, TRUE, TRUE)
-    change(folder)
+    data = json.loads((folder / "transforms.json").read_text())
+    change(folder, data)
+    (folder / "transforms.json").write_text(json.dumps(data))
     with pytest.raises(InputError, match=words):
         read_capture(folder)
 
