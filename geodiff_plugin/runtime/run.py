@@ -56,10 +56,10 @@ class GuidedRun:
         call: Mapping[str, Any],
         grid: ProcessingGrid,
         rounds: int,
-        callback: StepCallback | None,
-        tiny: Any | None,
-        held: Exclusive,
-        warm: WarmStart | None,
+        callback: StepCallback | None = None,
+        tiny: Any | None = None,
+        held: Exclusive | None = None,
+        warm: WarmStart | None = None,
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
         self.owners = [i for i in range(len(evidence)) for _ in range(call["ensemble_size"])]
@@ -84,9 +84,9 @@ class GuidedRun:
             self._tap = DenoiserTap(*prior.network(), prior.network_input)
         self._scheduler = GuidedScheduler(
             pipe,
-            on_trajectory=self._on_trajectory,
-            on_step=self._on_step,
-            on_done=self._on_done,
+            on_trajectory=self.begin,
+            on_step=self.guide,
+            on_done=self.after_step,
             respace=self.config.respace,
             skipped=self._skipped,
         )
@@ -105,17 +105,18 @@ class GuidedRun:
 
     def __exit__(self, *exc: object) -> None:
         self._stack.close()
-        if self._bar is not None:
-            self._bar.close()
 
     def release(self) -> None:
-        """Undo what ties the run and its hooks together: the collector of cycles knows no device."""
+        """Close the bar, and undo what ties the run and its hooks together: the collector knows no device."""
+        if self._bar is not None:
+            self._bar.close()
         self._scheduler.release()
         del self._scheduler
 
     @contextmanager
     def _suspended(self) -> Iterator[None]:
         """Remove the hooks while a callback runs, so that it may call or save the pipeline."""
+        assert self._held is not None  # a callback comes with the lock
         self._stack.close()
         try:
             with self._held.given_back():
@@ -176,7 +177,8 @@ class GuidedRun:
         for trajectory in self.trajectories:
             trajectory.watch.check(self.pipe.dtype)
 
-    def _on_trajectory(self, timesteps: Tensor) -> None:
+    def begin(self, timesteps: Tensor) -> None:
+        """Start the trajectory of the next chunk, with its timesteps on the CPU."""
         first = len(self.trajectories) * self.batch_size
         chunk = slice(first, first + self.batch_size)
         start = None if self._warm is None else (self._warm.near_m[chunk], self._warm.far_m[chunk])
@@ -208,9 +210,10 @@ class GuidedRun:
             chunks = -(-len(self.owners) // self.batch_size)
             self._bar = tqdm(total=chunks * len(timesteps), **options)
 
-    def _on_step(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepInputs:
+    def guide(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepInputs:
+        """What the scheduler's step is given in place of the network's ``output`` and ``z_t (B, C, h, w)``."""
         trajectory, schedule = self.trajectories[-1], self.schedule
-        assert schedule is not None  # of _on_trajectory
+        assert schedule is not None  # of begin
         trajectory.step = self._step, self._timesteps[self._step]
         level, is_last = noise_level(self.pipe.scheduler, timestep), schedule.is_last(self._step)
         latent_is_read = self._reads_latents or not is_last
@@ -231,7 +234,8 @@ class GuidedRun:
             self._tap.release()
         return inputs
 
-    def _on_done(self, timestep: Tensor, latents: Tensor) -> Tensor:
+    def after_step(self, timestep: Tensor, latents: Tensor) -> Tensor:
+        """``z_{t-1} (B, C, h, w)`` as the callback leaves it, after the scheduler's step."""
         if self._callback is not None:
             values = {"latents": latents, **self._seen_by_callback(latents)}
             before = latents.clone()

@@ -1,23 +1,24 @@
-"""The modular block: a guided call like any other, alone and with a block of diffusers' own."""
+"""Marigold as modular blocks: every stage alone, and both pipelines equal to the classic calls."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from diffusers.modular_pipelines import SequentialPipelineBlocks
-from diffusers.modular_pipelines.qwenimage.encoders import QwenImageEditResizeStep
+import torch
+from diffusers import MarigoldDepthPipeline
 from PIL import Image
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from tests.contracts.tiny_priors import make_depthmaster
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "modular"
-KNOBS = {"inner_steps": 1, "min_steps": 1}
+KNOBS = {"min_steps": 3, "pose": "given"}
 
 
 @pytest.fixture(scope="module")
@@ -30,69 +31,116 @@ def block():
     del sys.modules["block"]
 
 
+@pytest.fixture(scope="module")
+def prior():
+    return load_prior("bundled")
+
+
 @pytest.fixture
 def views(textured_plane):
     left, right = (Image.fromarray(getattr(textured_plane, side)) for side in ("left", "right"))
-    return {"image": left, "right": right, "K": textured_plane.K, "E": textured_plane.E, "knobs": KNOBS}
+    return {"image": left, "right": right, "K": textured_plane.K, "E": textured_plane.E}
 
 
-@pytest.fixture
-def pipe(block):
-    pipe = block.GuidedDepthBlock().init_pipeline()
-    pipe.update_components(prior=make_depthmaster())
+def seeded():
+    return torch.Generator().manual_seed(0)
+
+
+def assembled(blocks, prior):
+    pipe = blocks.init_pipeline()
+    parts = {name: part for name, part in prior.components.items() if name in pipe.component_names}
+    pipe.update_components(**parts)
+    pipe.set_progress_bar_config(disable=True)
     return pipe
 
 
-def test_it_is_the_guided_call(pipe, views):
-    state = pipe(**views)
-    guidance = GeometryGuidance(views["right"], views["K"], views["E"], **KNOBS)
-    out = enable_geometry_guidance(make_depthmaster())(views["image"], guidance=guidance)
-    assert np.array_equal(state.get("depth_m"), out.prediction[0, ..., 0])
-    assert np.array_equal(state.get("confidence"), out.confidence[0, ..., 0])
-    assert state.get("guided_output").history
+def test_blocks_without_geometry_are_the_stock_pipeline(block, prior, views):
+    pipe = assembled(block.MarigoldBlocks(), prior)
+    mine = pipe(
+        image=views["image"], num_inference_steps=2, processing_resolution=96, generator=seeded()
+    ).get("relative_depth")
+    stock = prior(views["image"], num_inference_steps=2, processing_resolution=96, generator=seeded())
+    np.testing.assert_array_equal(mine, stock.prediction)
 
 
-def test_it_composes_with_a_block_of_diffusers(block, views):
-    parts = {"depth": block.GuidedDepthBlock(picture_as="image"), "resize": QwenImageEditResizeStep()}
-    both = SequentialPipelineBlocks.from_blocks_dict(parts)
-    assert {"image", "right", "K", "E", "points"} <= set(both.input_names)
-    pipe = both.init_pipeline()
-    pipe.update_components(prior=make_depthmaster())
-    state = pipe(**views)
-    (resized,) = state.get("resized_image")
-    picture = np.asarray(resized.resize(views["image"].size).convert("L"), dtype=float)
-    assert resized.width > 3 * views["image"].width  # to the area that diffusers' editor works at
-    nearness = 1.0 / state.get("depth_m")
-    assert np.corrcoef(picture.ravel(), nearness.ravel())[0, 1] > 0.9
-
-
-def test_points_alone_and_a_calibration_file(pipe, views, textured_plane, tmp_path):
-    points = np.zeros_like(textured_plane.depth_m)
-    points[::6, ::6] = textured_plane.depth_m[::6, ::6]
-    depth_m = pipe(image=views["image"], K=views["K"], points=points, knobs=KNOBS, output="depth_m")
-    assert np.median(np.abs(depth_m / textured_plane.depth_m - 1)) < 0.1
-    height, width = textured_plane.depth_m.shape
-    K = textured_plane.K
-    camera = f"[{K[0, 0]} 0 {K[0, 2]}; 0 {K[1, 1]} {K[1, 2]}; 0 0 1]"
-    baseline = 1000 * textured_plane.E[0, 3]
-    (tmp_path / "calib.txt").write_text(
-        f"cam0={camera}\ncam1={camera}\ndoffs=0\nbaseline={baseline}\n"
-        f"width={width}\nheight={height}\nndisp=32\n"
+@pytest.mark.parametrize("knobs", [{}, {"inner_steps": 2}])
+def test_blocks_with_geometry_are_the_guided_call(block, prior, views, knobs):
+    pipe = assembled(block.GuidedMarigoldBlocks(), prior)
+    space = prior.config.prediction_type
+    state = pipe(
+        **views, knobs=KNOBS | knobs, processing_resolution=96, generator=seeded(), prediction_type=space
     )
-    given = {key: views[key] for key in ("image", "right", "knobs")}
-    by_file = pipe(**given, calibration=tmp_path / "calib.txt", output="depth_m")
-    assert np.allclose(by_file, pipe(**views, output="depth_m"), rtol=1e-3)
+    guidance = GeometryGuidance(views["right"], views["K"], views["E"], **KNOBS, **knobs)
+    out = enable_geometry_guidance(load_prior("bundled"))(
+        views["image"], guidance=guidance, processing_resolution=96, generator=seeded()
+    )
+    np.testing.assert_array_equal(state.get("depth_m"), out.prediction[0, ..., 0])
+    np.testing.assert_array_equal(state.get("confidence"), out.confidence[0, ..., 0])
+    assert state.get("guided_output").verdict == out.verdict
 
 
-def test_the_prior_of_the_package_is_the_default_component(block):
-    pipe = block.GuidedDepthBlock().init_pipeline()
-    pipe.load_components()
-    assert type(pipe.prior).__name__ == "GuidedMarigoldDepthPipeline"
+def test_geometry_goes_into_a_pipeline_that_had_none(block, prior, views):
+    blocks = block.MarigoldBlocks()
+    loop = blocks.sub_blocks["denoise"]
+    loop.sub_blocks.insert("geometry", block.GeometryStep(), 1)
+    loop.sub_blocks.insert("after", block.AfterStep(), 3)
+    blocks.sub_blocks.insert("evidence", block.GeometryEvidenceStep(), 3)
+    blocks.sub_blocks.insert("plan", block.GeometryBeginStep(), 5)
+    blocks.sub_blocks["decode"] = block.MetresStep()
+    given = {"knobs": KNOBS, "processing_resolution": 96, "prediction_type": prior.config.prediction_type}
+    by_hand = assembled(blocks, prior)(**views, **given, generator=seeded())
+    ready = assembled(block.GuidedMarigoldBlocks(), prior)(**views, **given, generator=seeded())
+    np.testing.assert_array_equal(by_hand.get("depth_m"), ready.get("depth_m"))
+
+
+def test_each_block_runs_alone(block, prior, views):
+    text = assembled(block.TextStep(), prior)
+    assert text().get("prompt_embeds").shape[0] == 1
+    image = assembled(block.ImageStep(), prior)
+    state = image(image=views["image"], processing_resolution=96)
+    assert state.get("image_latent").shape[0] == 1 and max(state.get("content")) == 96
+    noise = assembled(block.NoiseStep(), prior)(image_latent=state.get("image_latent"), generator=seeded())
+    assert noise.get("latents").shape == state.get("image_latent").shape
+    timesteps = assembled(block.TimestepsStep(), prior)(image_latent=state.get("image_latent"))
+    assert len(timesteps.get("timesteps")) == 4
 
 
 def test_the_folder_is_what_would_be_pushed(block, tmp_path):
-    block.GuidedDepthBlock().save_pretrained(tmp_path)
+    block.GuidedMarigoldBlocks().save_pretrained(tmp_path)
     written = json.loads((tmp_path / "modular_config.json").read_text())
     committed = json.loads((FOLDER / "modular_config.json").read_text())
-    assert committed["auto_map"] == written["auto_map"] == {"ModularPipelineBlocks": "block.GuidedDepthBlock"}
+    assert committed["auto_map"] == written["auto_map"]
+    assert committed["auto_map"] == {"ModularPipelineBlocks": "block.GuidedMarigoldBlocks"}
     assert set(committed["requirements"]) == {"geodiff_plugin"}
+
+
+@pytest.mark.skipif(shutil.which("patch") is None, reason="needs patch")
+def test_the_proposed_callback_applies_to_diffusers(prior, views, tmp_path):
+    module = MarigoldDepthPipeline.__module__
+    target = tmp_path / "patched.py"
+    shutil.copy(sys.modules[module].__file__, target)
+    change = FOLDER / "callback_on_step_end.patch"
+    subprocess.run(["patch", "--quiet", target, change], check=True, capture_output=True)
+    spec = importlib.util.spec_from_file_location(f"{module}_patched", target)
+    patched = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(patched)
+    pipe = patched.MarigoldDepthPipeline(**prior.components, **_settings(prior))
+    options = {"num_inference_steps": 3, "processing_resolution": 96}
+    seen = []
+
+    def callback(pipe, step, timestep, tensors):
+        seen.append((step, tensors["latents"].shape))
+        return {"latents": 0.5 * tensors["latents"]}
+
+    stock = prior(views["image"], **options, generator=seeded()).prediction
+    plain = pipe(views["image"], **options, generator=seeded()).prediction
+    changed = pipe(views["image"], **options, generator=seeded(), callback_on_step_end=callback).prediction
+    np.testing.assert_array_equal(plain, stock)
+    assert [step for step, _ in seen] == [0, 1, 2] and not np.array_equal(changed, stock)
+    with pytest.raises(ValueError, match="tensor_inputs"):
+        pipe(views["image"], **options, callback_on_step_end_tensor_inputs=["text"])
+
+
+def _settings(prior):
+    names = ("prediction_type", "scale_invariant", "shift_invariant")
+    return {name: prior.config[name] for name in names}
