@@ -82,40 +82,28 @@ def test_depth_in_metres_and_millimetres_comes_back(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("a.pfm", b"Pf\n2 2\n-1.0\n1234", r"disp must be .*PFM.*a\.pfm"),
-        ("a.pfm", b"Pf\n2\n-1\n", "disp must be .*PFM"),
-        ("a.pfm", b"P5\n2 2\n255\n1234", "disp must be .*PFM"),
-        ("a.pfm", b"Pf\nab cd\n-1\n", "disp must be .*PFM"),
-        ("eight.png", np.zeros((4, 4), np.uint8), "disp must be a 16-bit grey.*mode L.*lost"),
-        ("cut.png", np.arange(10000, dtype=np.uint16).reshape(100, 100), "cut off"),
-    ],
+    "head", ["Pf\n2 2\n-1.0\n1234", "Pf\n2\n-1\n", "P5\n2 2\n255\n12", "Pf\nab cd\n-1\n"]
 )
-def test_what_is_no_map(tmp_path, name, content, said):
-    if isinstance(content, bytes):
-        (tmp_path / name).write_bytes(content)
-    else:
-        Image.fromarray(content).save(tmp_path / name)
-    if name == "cut.png":
-        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-200])
-    with pytest.raises(ValueError, match=said):
-        read_pfm(tmp_path / name, "disp") if name == "a.pfm" else read_depth_png(tmp_path / name, name="disp")
+def test_what_is_no_map(tmp_path, head):
+    (tmp_path / "a.pfm").write_text(head)
+    with pytest.raises(ValueError, match=r"disp must be .*PFM.*a\.pfm"):
+        read_pfm(tmp_path / "a.pfm", "disp")
+    Image.new("L", (4, 4)).save(tmp_path / "a.png")
+    with pytest.raises(ValueError, match="disp must be a 16-bit grey.*mode L.*lost"):
+        read_depth_png(tmp_path / "a.png", name="disp")
 
 
 @pytest.mark.parametrize(
-    ("write", "error", "said"),
+    ("write", "said"),
     [
-        (lambda f: write_pfm(f / "a.pfm", np.zeros(3)), ValueError, "shape"),
-        (lambda f: write_depth_npy(f / "b.npy", np.zeros((1, 2, 3))), ValueError, "shape"),
-        (lambda f: write_ply(f / "d.ply", np.ones((3, 4)), np.zeros((4, 3, 3)), K), ValueError, "image_01"),
-        (lambda f: write_ply(f / "d.ply", np.ones((3, 4)), np.zeros((3, 4, 3)), 0 * K), ValueError, "focal"),
-        (lambda f: write_depth_npy(f, np.zeros((2, 3))), IsADirectoryError, "folder"),
-        (lambda f: write_pfm(f / "no" / "a.pfm", np.zeros((2, 3))), FileNotFoundError, "existing folder"),
+        (lambda f: write_pfm(f / "a.pfm", np.zeros(3)), "shape"),
+        (lambda f: write_ply(f / "d.ply", np.ones((3, 4)), np.zeros((4, 3, 3)), K), "image_01"),
+        (lambda f: write_ply(f / "d.ply", np.ones((3, 4)), np.zeros((3, 4, 3)), 0 * K), "focal"),
+        (lambda f: write_depth_npy(f, np.zeros((2, 3))), "folder"),
     ],
 )
-def test_what_cannot_be_written_leaves_nothing(tmp_path, write, error, said):
-    with pytest.raises(error, match=said):
+def test_what_cannot_be_written_leaves_nothing(tmp_path, write, said):
+    with pytest.raises(ValueError, match=said):
         write(tmp_path)
     assert names(tmp_path) == []
 

@@ -114,25 +114,9 @@ def test_a_cut_off_image_is_a_sentence(tmp_path, suffix):
         path.write_bytes(whole[: int(len(whole) * share)])
         with pytest.raises(ValueError, match=r"left must be .*cut\."):
             read_image(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "error", "said"),
-    [
-        ("none.png", None, FileNotFoundError, "left must be an image file"),
-        ("", None, IsADirectoryError, "left"),
-        ("a.png", b"hello", ValueError, "a format that Pillow does not read"),
-        ("empty.png", b"", ValueError, "empty"),
-        ("small.png", PIL.crop((0, 0, 48, 31)), ValueError, "at least 32 pixels a side; got 48x31"),
-    ],
-)
-def test_files_that_are_no_images(tmp_path, name, content, error, said):
-    if isinstance(content, bytes):
-        (tmp_path / name).write_bytes(content)
-    elif content is not None:
-        saved(tmp_path, content, name)
-    with pytest.raises(error, match=said):
-        read_image(tmp_path / name)
+    path.write_bytes(b"hello")
+    with pytest.raises(ValueError, match="a format that Pillow does not read"):
+        read_image(path)
 
 
 @pytest.mark.parametrize("name", ["x.gif", "x.png", "x.tiff", "x.webp"])
