@@ -16,27 +16,17 @@ from geodiff_plugin._checks import bad_type, bad_value, check_choice
 from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.depthfm import DepthFMPrior
 from geodiff_plugin.priors.depthmaster import DepthMasterPrior
-from geodiff_plugin.priors.e2e_ft import E2EFTPrior
 from geodiff_plugin.priors.geowizard import GeoWizardPrior
-from geodiff_plugin.priors.loading import BUNDLED_FOLDER, REFUSED, Layout, fetch, reading, refuse
+from geodiff_plugin.priors.loading import BUNDLED_FOLDER, Layout, fetch, reading, refuse
 from geodiff_plugin.priors.lotus import LotusPrior
 from geodiff_plugin.priors.map import MAP_LAYOUT, DepthMapPrior
-from geodiff_plugin.priors.marigold import MarigoldPrior
+from geodiff_plugin.priors.marigold import E2EFTPrior, MarigoldPrior
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Prior
 from geodiff_plugin.priors.ppd import PPDPrior
 from geodiff_plugin.priors.transformers_depth import TransformersDepthPrior
 from geodiff_plugin.scale.space import SPACES
 
-__all__ = [
-    "BUNDLED_FOLDER",
-    "PRIORS",
-    "REFUSED",
-    "DepthPrior",
-    "FoundPrior",
-    "find_adapter",
-    "find_prior",
-    "load_prior",
-]
+__all__ = ["BUNDLED_FOLDER", "PRIORS", "DepthPrior", "FoundPrior", "find_adapter", "find_prior", "load_prior"]
 
 #: The first that recognises a folder takes it, so the more particular one stands before the more general.
 PRIORS: dict[str, type[DepthPrior]] = {
@@ -96,10 +86,9 @@ class FoundPrior:
 
 
 def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> FoundPrior:
-    """Find a prior and tell which it is, by the configs of its components.
+    """Find a prior and tell which it is: by its configs, or a key of ``PRIORS`` and a colon before its name.
 
-    With a key of ``PRIORS`` and a colon before its name (``"e2e-ft:folder"``) it is taken for that. Arguments
-    and errors as ``load_prior``.
+    Arguments and errors as ``load_prior``.
     """
     key, typed = None, str(name)
     if typed == MAP_LAYOUT.name:
@@ -121,10 +110,9 @@ def _recognise(layout: Layout) -> str:
     cure = f"Known are {', '.join(PRIORS)} (docs/reference/priors.md); --prior bundled always works."
     if any(layout.folder.glob("*.ckpt")) or any(layout.folder.glob("*.pth")):
         cure = "A checkpoint becomes such a folder by `geodiff convert SRC DST`."
-    got = (
-        f"{layout.folder}, of no known kind" if layout.index else f"{layout.folder} without model_index.json"
-    )
-    bad_value("prior", "a folder in diffusers' layout, or of a depth model of transformers", got, cure)
+    got = ", of no known kind" if layout.index else " without model_index.json"
+    expected = "a folder in diffusers' layout, or of a depth model of transformers"
+    bad_value("prior", expected, f"{layout.folder}{got}", cure)
 
 
 def load_prior(

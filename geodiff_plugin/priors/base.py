@@ -15,10 +15,6 @@ class DepthPrior:
     """Adapter of one kind of pipeline; as it stands, of any ``DepthDiffusionPipeline``.
 
     A subclass names its ``pipeline_class`` and writes ``recognises``; the rest where its pipeline is another.
-    The pipeline's ``image_processor`` resizes and pads, and ``decode`` answers on that grid.
-
-    Args:
-        pipe: the live pipeline.
 
     Attributes:
         pipeline_class: of the pipelines that it understands.
@@ -52,11 +48,7 @@ class DepthPrior:
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
-        """The pipeline of a folder that it recognises; ``space`` is what the user said, or ``None``.
-
-        Raises:
-            ValueError: weights missing or left over; an unknown space.
-        """
+        """The pipeline of a folder that it recognises; ``space`` is what the user said, or ``None``."""
         return build_pipeline(cls.pipeline_class, layout, dtype, prediction_type=space)
 
     def network(self) -> tuple[Any, str]:
@@ -75,17 +67,11 @@ class DepthPrior:
         return self._pipe.encode_relative(x)
 
     def metric_range(self, samples: slice) -> tuple[Tensor, Tensor] | None:
-        """Metres ``(B,)`` of ``x = 0`` and of ``x = 1`` by the prior itself; ``None`` for a relative one.
-
-        The search for the scale starts from them. ``samples`` are members of the running call.
-        """
+        """Metres ``(B,)`` of ``x = 0`` and of ``x = 1`` by the prior itself; ``None`` for a relative one."""
         own = getattr(self._pipe, "own_range", None)
         return None if own is None else own[samples].unbind(1)
 
     def valid(self, samples: slice) -> Tensor | None:
-        """``(B, 1, H, W)`` bool on the processing grid, where the prior says anything; ``None``: everywhere.
-
-        What it gives elsewhere is no evidence of its scale or quality.
-        """
+        """``(B, 1, H, W)`` bool, where on the processing grid the prior says anything, ``None`` for all."""
         valid = getattr(self._pipe, "valid", None)
         return None if valid is None else valid[samples]

@@ -82,18 +82,9 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         generator: Generators,
         domain: str | None = None,
     ) -> Condition:
-        """Image latent, prompt and class embedding of every member.
+        """Latent of the image, prompt, and class labels ``(N * E, 2, 10 or 4)`` for depth and normals.
 
-        Args:
-            image: as in the base class, like the next three.
-            ensemble_size: E.
-            batch_size: of the VAE.
-            generator: unused.
-            domain: ``"indoor"``, ``"outdoor"`` or ``"object"`` (without background), or the default.
-
-        Returns:
-            ``image_latent (N * E, 4, h, w)``, ``prompt (N * E, tokens, width)``,
-            ``class_labels (N * E, 2, 10 or 4)`` for depth and normals.
+        ``domain`` is one of ``DOMAINS`` (an object is without background), or the default.
         """
         domain = check_choice(domain or self.config.default_domain, "domain", DOMAINS)
         couple_pairs(self.unet)  # again: under other processors depth and normals do not see each other
@@ -181,8 +172,7 @@ class GeoWizardPrior(DepthPrior):
     def recognises(layout: Layout) -> bool:
         """A U-Net from 8 to 4 channels with a class embedding of 10 numbers (v1) or of 4 (v2).
 
-        The U-Net of a Lotus-G has the same config as that of v2, so v2 is asked for more: the subfolder's
-        name in the authors' repository, or the domain that only our pipeline saves.
+        So is that of a Lotus-G; of v2 the name of the subfolder or the domain that we save must tell, too.
         """
         unet = layout.config(_unet_folder(layout))
         if (unet.get("in_channels"), unet.get("out_channels")) != (8, 4):

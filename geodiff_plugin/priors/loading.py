@@ -67,13 +67,7 @@ def reading(what: str, expected: str, got: str, cure: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Layout:
-    """A folder that may hold a prior.
-
-    Attributes:
-        folder: where it lies on this machine.
-        name: as the user typed it, a hub id or a path.
-        variant: of the weight files, such as ``"fp16"``.
-    """
+    """A folder that may hold a prior; its ``name`` is what the user typed, a hub id or a path."""
 
     folder: Path
     name: str
@@ -125,13 +119,7 @@ def refuse(name: str) -> None:
 
 
 def fetch(name: str, hub: dict[str, Any], weights: bool = False, variant: str | None = None) -> Path:
-    """The folder of a prior, from the hub with its configs at least.
-
-    ``hub`` are options of ``snapshot_download``. With ``weights`` also those, of a ``variant``.
-
-    Raises:
-        ValueError: no such folder; a hub id that is neither cached nor can be reached.
-    """
+    """The folder of a prior, from the hub by options of ``snapshot_download``, with its configs at least."""
     if name == "bundled":
         return BUNDLED_FOLDER
     if os.path.isdir(name):
@@ -162,8 +150,7 @@ def check_weights(missing: Any, unexpected: Any, where: str) -> None:
 def _component_class(pipeline_class: type[Any], layout: Layout, name: str) -> type[Any]:
     """The class of a component, as ``model_index.json`` names it, out of ``LIBRARIES`` alone.
 
-    In a pipeline of ours the annotation of the constructor's parameter stands in for any other class, and for
-    a class that it is derived from.
+    In a pipeline of ours the constructor's annotation stands in for any other, and for a base class of it.
     """
     entry = layout.index.get(name)
     library, cls = entry if isinstance(entry, list) and len(entry) == 2 else ("", "")
@@ -194,18 +181,10 @@ def _annotated(pipeline_class: type[Any]) -> dict[str, type[Any]]:
 def load_component(
     layout: Layout, name: str, cls: type[Any], dtype: torch.dtype, unread: str | None = None
 ) -> Any:
-    """One component of a folder; a module's weights are checked name by name, and it is in eval mode.
+    """One component of a subfolder (``""``: the folder); a module's weights are checked name by name.
 
-    Args:
-        layout: of the folder.
-        name: of the subfolder; ``""`` for the folder itself.
-        cls: with ``from_pretrained``.
-        dtype: of a module's weights.
-        unread: part of the names of weights that may be missing, since no forward reads them; weights left
-            over do not matter then either, as in files that users of transformers published.
-
-    Raises:
-        ValueError: weights missing, left over, cut off or not finite; files that cannot be read.
+    ``unread`` is part of the names of weights that may be missing, since no forward reads them; weights left
+    over do not matter then either, as in files that users of transformers published.
     """
     folder = str(layout.folder / name)
     damaged = reading(f"component {name or 'model'!r} of {layout.name}", "one that can be read", folder, CURE)
@@ -236,14 +215,7 @@ def load_component(
 def build_pipeline(cls: type[Any], layout: Layout, dtype: torch.dtype, **options: Any) -> Any:
     """A pipeline from the components that its constructor names and the options that the index holds.
 
-    Args:
-        cls: pipeline class; its constructor's parameters are components and options.
-        layout: of the folder.
-        dtype: of the weights.
-        **options: constructor arguments, components too, that go before the folder's; ``None`` is left out.
-
-    Raises:
-        ValueError: a component that the folder lacks, weights that do not fit.
+    ``options`` are arguments of the constructor that go before the folder's; ``None`` is left out.
     """
     arguments = {name: value for name, value in options.items() if value is not None}
     annotated = _annotated(cls)

@@ -82,10 +82,9 @@ class LotusPipeline(DepthDiffusionPipeline):
         return self.run_unet(sample, timestep, condition)
 
     def encode_relative(self, x: Tensor) -> Tensor:
-        """As the base class, of whole cells of 8 pixels only, as the map that is decoded.
+        """Of whole cells of 8 pixels only, as the map that is decoded; beyond them a guided call repeats it.
 
-        A guided call repeats the last row and column beyond them. (The authors stretch instead, which moves
-        the map by up to 7 pixels.)
+        (The authors stretch instead, which moves the map by up to 7 pixels.)
         """
         cell = 2 ** (len(self.vae.config.block_out_channels) - 1)
         height, width = (side // cell * cell for side in x.shape[-2:])

@@ -73,16 +73,8 @@ class DepthMapPipeline(DirectMapPipeline):
     ) -> Condition:
         """The maps on the image's grid, from 0 to about 1, holes filled smoothly.
 
-        Args:
-            image: as in the base class, like the next three.
-            ensemble_size: E.
-            batch_size: unused.
-            generator: unused.
-            depth_map: for every image a map ``(h, w)`` of any size and unit that covers the same view, in an
-                array ``(N, h, w)`` or a list; not finite where nothing is known.
-
-        Raises:
-            TypeError, ValueError: no map, another number of them, or one without two different values.
+        ``depth_map`` has for every image a map ``(h, w)`` of any size and unit that covers the same view, in
+        an array ``(N, h, w)`` or a list; not finite where nothing is known.
         """
         maps = _as_list(depth_map)
         if len(maps) != len(image):
@@ -96,7 +88,7 @@ class DepthMapPipeline(DirectMapPipeline):
             torch.cat(part).repeat_interleave(ensemble_size, dim=0) for part in zip(*prepared, strict=True)
         )
         self.valid = None if bool(known.all()) else known
-        return {"relative": relative}
+        return {"image_latent": relative}
 
 
 def _as_list(given: Any) -> list[Tensor]:

@@ -77,8 +77,7 @@ class DepthOutput(MarigoldDepthOutput):
 class DepthDiffusionPipeline(DiffusionPipeline):
     """Depth of an image by a latent (or pixel) diffusion prior.
 
-    A subclass registers its modules with ``register_prior`` and overrides ``prepare_condition`` and
-    ``denoise``; the rest as it needs.
+    A subclass registers its modules and overrides ``prepare_condition``, ``denoise`` and what else it needs.
 
     Attributes:
         max_steps: most denoising steps that make sense, ``None`` for any number.
@@ -92,11 +91,6 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         known: ``(N * E, 1, H, W)`` bool, where the prior says anything, ``None`` for everywhere; likewise.
     """
 
-    unet: Any  # registered by the subclasses that have them
-    vae: Any
-    text_encoder: Any
-    tokenizer: Any
-    scheduler: Any
     max_steps: int | None = None
     deterministic = False
     depth_channels = slice(None)
@@ -138,8 +132,6 @@ class DepthDiffusionPipeline(DiffusionPipeline):
             image_processor = MarigoldImageProcessor(vae_scale_factor=image_processor)
         self.image_processor = image_processor
 
-    # What a subclass overrides -----------------------------------------------------------------------------
-
     def prepare_condition(
         self,
         image: Tensor,
@@ -165,10 +157,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         raise NotImplementedError
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
-        """Initial latents ``(N * E, C, h, w)``: Gaussian, or zeros where the network sees none.
-
-        Shaped as ``condition["image_latent"]``; override where that does not fit.
-        """
+        """Initial latents shaped as ``condition["image_latent"]``: Gaussian, or zeros where none are seen."""
         like = condition["image_latent"]
         if not self.sees_latents:
             return torch.zeros_like(like)
@@ -195,10 +184,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         return encode_picture(self.vae, picture)
 
     def decode_relative(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map ``(B, 1, H, W)``, about [0, 1] on the padded grid, with the graph of ``z0``.
-
-        ``z0 (B, C, h, w)`` has the depth channels only; the map is float32 or wider.
-        """
+        """Unclipped relative map ``(B, 1, H, W)``, about [0, 1], float32 or wider, of the depth channels."""
         return map_of(self.decode_picture(z0))
 
     def encode_relative(self, x: Tensor) -> Tensor:
@@ -213,8 +199,6 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         """Further maps by name, ``(N, C, H, W)`` on the padded grid, of latents ``(N * E, C, h, w)``."""
         return {}
 
-    # What a subclass uses ----------------------------------------------------------------------------------
-
     def image_latents(
         self,
         image: Tensor,
@@ -223,10 +207,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         generator: Generators = None,
         sample: bool = False,
     ) -> Tensor:
-        """Scaled latents ``(N * E, C, h, w)`` of images ``(N, 3, H, W)`` in [-1, 1], one per member.
-
-        The posterior's mode, or a ``sample`` by the generator, anew for every member.
-        """
+        """Scaled latents ``(N * E, C, h, w)`` of images, the posterior's mode or a ``sample`` per member."""
         moments = torch.cat([self.encode_moments(chunk) for chunk in image.split(batch_size)])
         posterior = DiagonalGaussianDistribution(moments.repeat_interleave(ensemble_size, dim=0))
         return self.scale_latents(posterior.sample(generator) if sample else posterior.mode())
@@ -256,8 +237,6 @@ class DepthDiffusionPipeline(DiffusionPipeline):
             return_dict=False,
         )[0]
 
-    # The call ------------------------------------------------------------------------------------------
-
     progress_bar = MarigoldDepthPipeline.progress_bar
     ensemble_depth = staticmethod(MarigoldDepthPipeline.ensemble_depth)
 
@@ -285,12 +264,6 @@ class DepthDiffusionPipeline(DiffusionPipeline):
 
         ``None`` for steps and resolution is the prior's own, for ``resample_method_output`` its authors'
         (bilinear while guided). ``options`` are what this prior adds, see its ``prepare_condition``.
-
-        Returns:
-            ``DepthOutput``, or the tuple (prediction, uncertainty, latent).
-
-        Raises:
-            TypeError, ValueError: an argument of another type, or out of its range.
         """
         steps = self.default_denoising_steps if num_inference_steps is None else num_inference_steps
         resolution = processing_resolution
@@ -307,17 +280,14 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         unknown = set(options) - set(self.call_options())
         if unknown:
             bad_value("arguments of this prior", f"out of {self.call_options()}", sorted(unknown))
-        device, processor = self._execution_device, self.image_processor
-        padded, padding, size = processor.preprocess(
-            image, resolution, resample_method_input, device, self.dtype
-        )  # (N, 3, H, W)
-        padded = padded.contiguous()  # in another layout a network rounds otherwise
+        processor, place = self.image_processor, (self._execution_device, self.dtype)
+        padded, padding, size = processor.preprocess(image, resolution, resample_method_input, *place)
+        padded = padded.contiguous()  # (N, 3, H, W); in another layout a network rounds otherwise
         condition = self.prepare_condition(padded, ensemble_size, batch_size, generator, **options)
         z = self._start(condition, latents, generator)  # (N * E, C, h, w)
         z = self._run_steps(z, condition, steps, batch_size, generator)
 
         def restore(maps: Tensor, method: str = resampling) -> Tensor | np.ndarray:
-            """From the padded processing grid to what the caller gets."""
             if match_input_resolution:
                 maps = processor.resize_antialias(maps, size, method, is_aa=False)
             return processor.pt_to_numpy(maps) if output_type == "np" else maps
@@ -387,19 +357,15 @@ class DepthDiffusionPipeline(DiffusionPipeline):
 
 
 class DirectMapPipeline(DepthDiffusionPipeline):
-    """One step that gives ``condition["relative"]``, ``(N * E, 1, H, W)``; what guidance moves is the map."""
+    """One step that gives ``condition["image_latent"]``, a map ``(N * E, 1, H, W)``, which guidance moves."""
 
     max_steps = 1
     deterministic = True
     sees_latents = False
 
-    def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
-        """Zeros; nothing reads them."""
-        return torch.zeros_like(condition["relative"])
-
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
         """The map, whatever the latents are."""
-        return condition["relative"]
+        return condition["image_latent"]
 
     def decode_relative(self, z0: Tensor) -> Tensor:
         """The latent is the map."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections import OrderedDict
 
 import cv2
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from diffusers import FlowMatchEulerDiscreteScheduler
 from diffusers.configuration_utils import ConfigMixin, register_to_config
+from diffusers.models.embeddings import get_timestep_embedding
 from diffusers.models.modeling_utils import ModelMixin
 from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from diffusers.utils.accelerate_utils import apply_forward_hook
@@ -26,8 +27,8 @@ LAST_TIMESTEP = 1000
 #: Shorter over longer side of the training images: 1024 x 768.
 TRAINING_RATIO = 0.75
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-#: Base of the rotary embedding, and what keeps norms from 0.
-ROPE_BASE, NORM_EPS = 100.0, 1e-6
+#: Base of the rotary embedding, size of that of the time, and what keeps norms from 0.
+ROPE_BASE, TIME_FREQUENCIES, NORM_EPS = 100.0, 256, 1e-6
 #: DINOv2 stretches its position embeddings by (n + 0.1) / old and not by n / old.
 POSITION_OFFSET = 0.1
 
@@ -64,11 +65,9 @@ class AreaImageProcessor(MarigoldImageProcessor):
 
 @apply_forward_hook
 def semantic_tokens(encoder: Dinov2Model, image_01: Tensor) -> Tensor:
-    """Normed patch tokens of Depth Anything V2's encoder, one for each 16 x 16 pixels.
+    """Normed patch tokens ``(B, n, C)`` of Depth Anything V2's encoder, one for each 16 x 16 pixels.
 
     The parts of ``encoder.forward`` are called one by one; the hook brings an offloaded encoder back.
-
-    Of ``image_01 (B, 3, H, W)`` in [0, 1], sides multiples of 16, tokens ``(B, (H / 16) (W / 16), C)``.
     """
     mean, std = (image_01.new_tensor(v).view(1, 3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
     rows, columns = image_01.shape[-2] // SIDE, image_01.shape[-1] // SIDE
@@ -128,49 +127,18 @@ class _Attention(nn.Module):
         return self.proj(F.scaled_dot_product_attention(q, k, qkv[2]).transpose(1, 2).flatten(2))
 
 
-class _Mlp(nn.Module):
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__()
-        self.fc1, self.fc2 = nn.Linear(width, hidden), nn.Linear(hidden, width)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(x), approximate="tanh"))
-
-
-class _TimeEmbedder(nn.Module):
-    def __init__(self, width: int, frequencies: int = 256) -> None:
-        super().__init__()
-        self.frequencies = frequencies
-        self.mlp = nn.Sequential(nn.Linear(frequencies, width), nn.SiLU(), nn.Linear(width, width))
-
-    def forward(self, t: Tensor) -> Tensor:
-        half = self.frequencies // 2
-        rates = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device).float() / half)
-        angles = t[:, None].float() * rates
-        return self.mlp(torch.cat([angles.cos(), angles.sin()], dim=-1).to(next(self.mlp.parameters()).dtype))
-
-
 class _Block(nn.Module):
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
-        self.attn, self.mlp = _Attention(width, heads), _Mlp(width, int(width * mlp_ratio))
+        self.attn, hidden = _Attention(width, heads), int(width * mlp_ratio)
+        layers = {"fc1": nn.Linear(width, hidden), "act": nn.GELU("tanh"), "fc2": nn.Linear(hidden, width)}
+        self.mlp = nn.Sequential(OrderedDict(layers))
         self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 6 * width))
 
     def forward(self, x: Tensor, time: Tensor, rotations: tuple[Tensor, Tensor]) -> Tensor:
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = self.adaLN_modulation(time).chunk(6, dim=1)
         x = x + gate_a[:, None] * self.attn(_modulated(x, shift_a, scale_a), rotations)
         return x + gate_m[:, None] * self.mlp(_modulated(x, shift_m, scale_m))
-
-
-class _FinalLayer(nn.Module):
-    def __init__(self, width: int, outputs: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(width, outputs)
-        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 2 * width))
-
-    def forward(self, x: Tensor, time: Tensor) -> Tensor:
-        shift, scale = self.adaLN_modulation(time).chunk(2, dim=1)
-        return self.linear(_modulated(x, shift, scale))
 
 
 class PixelDiT(ModelMixin, ConfigMixin):
@@ -195,29 +163,27 @@ class PixelDiT(ModelMixin, ConfigMixin):
         super().__init__()
         self.gradient_checkpointing = False
         self.x_embedder = nn.ModuleDict({"proj": nn.Conv2d(4, hidden_size, 2 * patch_size, 2 * patch_size)})
-        self.t_embedder = _TimeEmbedder(hidden_size)
+        of_time = nn.Linear(TIME_FREQUENCIES, hidden_size), nn.SiLU(), nn.Linear(hidden_size, hidden_size)
+        self.t_embedder = nn.ModuleDict({"mlp": nn.Sequential(*of_time)})
         self.blocks = nn.ModuleList(_Block(hidden_size, num_heads, mlp_ratio) for _ in range(depth))
         wide = 4 * hidden_size
-        self.proj_fusion = nn.Sequential(
-            nn.Linear(hidden_size + semantic_size, wide),
-            nn.SiLU(),
-            nn.Linear(wide, wide),
-            nn.SiLU(),
-            nn.Linear(wide, wide),
+        fusion = nn.Linear(hidden_size + semantic_size, wide), nn.SiLU(), nn.Linear(wide, wide), nn.SiLU()
+        self.proj_fusion = nn.Sequential(*fusion, nn.Linear(wide, wide))
+        self.final_layer = nn.ModuleDict({"linear": nn.Linear(hidden_size, patch_size**2)})
+        self.final_layer["adaLN_modulation"] = nn.Sequential(
+            nn.SiLU(), nn.Linear(hidden_size, 2 * hidden_size)
         )
-        self.final_layer = _FinalLayer(hidden_size, patch_size**2)
 
     def forward(self, x: Tensor, semantics: Tensor, timestep: Tensor) -> Tensor:
-        """Velocity ``noise - clean``, ``(B, 1, H, W)``.
+        """Velocity ``noise - clean``, ``(B, 1, H, W)``, of noisy depth and image - 0.5, ``x (B, 4, H, W)``.
 
-        Args:
-            x: ``(B, 4, H, W)``, noisy depth and image - 0.5; sides multiples of ``2 * patch_size``.
-            semantics: ``(B, n, C)``, a token of each coarse patch, row by row.
-            timestep: ``(B,)`` or 0-d, in [0, 1000].
+        ``semantics`` are ``(B, n, C)``, a token of each coarse patch; ``timestep`` is in [0, 1000].
         """
         patch, head_size = self.config.patch_size, self.config.hidden_size // self.config.num_heads
         rows, columns = x.shape[-2] // (2 * patch), x.shape[-1] // (2 * patch)
-        time = self.t_embedder(timestep.reshape(-1).expand(len(x)))
+        angles = timestep.reshape(-1).expand(len(x)), TIME_FREQUENCIES
+        time = get_timestep_embedding(*angles, flip_sin_to_cos=True, downscale_freq_shift=0)
+        time = self.t_embedder["mlp"](time.to(x.dtype))
         tokens = self.x_embedder["proj"](x).flatten(2).transpose(1, 2)  # (B, n, D)
         coarse, fine = (_rotations(rows * k, columns * k, head_size, tokens) for k in (1, 2))
         middle = len(self.blocks) // 2
@@ -229,7 +195,8 @@ class PixelDiT(ModelMixin, ConfigMixin):
         tokens = tokens.permute(0, 1, 3, 2, 4, 5).flatten(1, 4)  # (B, 4 n, D)
         for block in self.blocks[middle:]:
             tokens = self._run(block, tokens, time, fine)
-        pixels = self.final_layer(tokens, time)  # (B, 4 n, patch^2)
+        shift_and_scale = self.final_layer["adaLN_modulation"](time).chunk(2, dim=1)
+        pixels = self.final_layer["linear"](_modulated(tokens, *shift_and_scale))  # (B, 4 n, patch^2)
         return F.pixel_shuffle(pixels.transpose(1, 2).unflatten(2, (2 * rows, 2 * columns)), patch)
 
     def _run(

@@ -260,25 +260,22 @@ class TransformersDepthPipeline(DirectMapPipeline):
         """The relative map of every image, ``(N * E, 1, H, W)`` float32.
 
         ``prompt_depth`` is ``(N, 1, h, w)`` metres everywhere, for Prompt Depth Anything; a guided call makes
-        it of matches and points, unless it is given one. Other arguments as in the base class.
+        it of matches and points, unless it is given one.
         """
-        parts = image.split(batch_size)
-        prompts: Any = [None] * len(parts)
         if prompt_depth is not None:
             prompt_depth = torch.as_tensor(prompt_depth)
             if prompt_depth.ndim != 4 or len(prompt_depth) != len(image):
                 bad_value("prompt_depth", f"({len(image)}, 1, h, w) metres", tuple(prompt_depth.shape))
-            prompts = prompt_depth.split(batch_size)
-        size = image.shape[-2], image.shape[-1]
-        maps = [
-            self.predict(part.float() / 2 + 0.5, size, told)
-            for part, told in zip(parts, prompts, strict=True)
-        ]
+        size, maps = (image.shape[-2], image.shape[-1]), []
+        for first in range(0, len(image), batch_size):
+            part = slice(first, first + batch_size)
+            told = None if prompt_depth is None else prompt_depth[part]
+            maps.append(self.predict(image[part].float() / 2 + 0.5, size, told))
         self.own_range = None
         if self.metric or prompt_depth is not None:
             ends = torch.cat([torch.stack([self.metres(v) for v in range_of(part)], 1) for part in maps])
             self.own_range = ends.clamp_min(NEAREST_M).repeat_interleave(ensemble_size, dim=0)
-        return {"relative": unit_range(torch.cat(maps)).repeat_interleave(ensemble_size, dim=0)}
+        return {"image_latent": unit_range(torch.cat(maps)).repeat_interleave(ensemble_size, dim=0)}
 
     def metres(self, values: Tensor) -> Tensor:
         """Metres, > 0, of values of a metric map's unit, any shape."""

@@ -198,13 +198,10 @@ def _first(result: Any) -> Tensor:
 class GuidedScheduler:
     """A copy of the scheduler: ``set_timesteps`` starts a trajectory, ``step`` is guided.
 
-    So a pipeline that shares the scheduler never meets a guided ``step``, and the user's keeps its state. The
-    copy goes onto the pipeline past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's
-    config. A scheduler of which the user replaced a method on the instance is used itself, since the method
-    usually holds on to it; all its attributes are put back.
-
-    ``step`` gets the timesteps on the CPU, where diffusers keeps the tables that they index: looked up on
-    another device, each would be waited for several times a step.
+    So a pipeline that shares the scheduler never meets a guided ``step``, and the user's keeps its state. A
+    scheduler of which the user replaced a method on the instance is used itself, since the method usually
+    holds on to it; all its attributes are put back. ``step`` gets the timesteps on the CPU, where diffusers
+    keeps the tables that they index: looked up on another device, each would be waited for.
 
     Args:
         pipe: the live pipeline.
@@ -237,6 +234,7 @@ class GuidedScheduler:
         """The guided scheduler is on the pipeline; entered again in mid-call, its trajectory goes on."""
         original, outside = self._pipe.scheduler, dict(vars(self._scheduler))
         _set_attributes(self._scheduler, self._inside)
+        # Past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config.
         object.__setattr__(self._pipe, "scheduler", self._scheduler)
         try:
             yield

@@ -36,9 +36,9 @@ from transformers import (
 from geodiff_plugin.priors.components import DirectScheduler, FixedPrompt
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
-from geodiff_plugin.priors.e2e_ft import E2EFTPipeline
 from geodiff_plugin.priors.geowizard import GeoWizardPipeline
 from geodiff_plugin.priors.lotus import LotusPipeline
+from geodiff_plugin.priors.marigold import E2EFTPipeline
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 from geodiff_plugin.priors.ppd import PixelDiT, PPDPipeline
 from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline

@@ -34,9 +34,9 @@ from geodiff_plugin.priors import load_prior
 from geodiff_plugin.priors.components import DirectScheduler, FixedPrompt
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
-from geodiff_plugin.priors.e2e_ft import E2EFTPipeline
 from geodiff_plugin.priors.geowizard import IMAGE_EMBEDDING, TEXT_PROMPT, GeoWizardPipeline
 from geodiff_plugin.priors.lotus import LotusPipeline
+from geodiff_plugin.priors.marigold import E2EFTPipeline
 from geodiff_plugin.priors.ppd import PixelDiT, PPDPipeline
 from tests.conftest import SCHEDULER, make_text_encoder, make_unet, make_vae
 from tests.contracts.tiny_transformers import make_transformers

@@ -18,9 +18,9 @@ from geodiff_plugin.cli.convert import run_convert
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
-from geodiff_plugin.priors.e2e_ft import E2EFTPipeline, E2EFTPrior
 from geodiff_plugin.priors.geowizard import GeoWizardPipeline
 from geodiff_plugin.priors.lotus import LotusPipeline
+from geodiff_plugin.priors.marigold import E2EFTPipeline, E2EFTPrior
 from tests.conftest import make_text_encoder
 from tests.contracts.tiny_priors import make_tokenizer, quiet
 from tests.parity import (

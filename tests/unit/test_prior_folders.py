@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.priors import PRIORS, REFUSED, find_prior, load_prior
-from geodiff_plugin.priors.loading import Layout, refuse
+from geodiff_plugin.priors import PRIORS, find_prior, load_prior
+from geodiff_plugin.priors.loading import REFUSED, Layout, refuse
 
 UNET = {"in_channels": 8, "out_channels": 4}
 V1_0 = {"timestep_spacing": "leading", "steps_offset": 1}
