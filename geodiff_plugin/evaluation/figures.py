@@ -129,7 +129,10 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     figure = _new_figure(7.6, 3.1)
     numbers: dict[str, Any] = {"samples": [ref.label for ref in refs], "updates": updates}
     numbers |= {preset: {} for preset in PRESETS}
-    quantities = {"abs_rel": ("AbsRel", headline), "seconds": ("seconds a pair", itemgetter("seconds"))}
+    quantities: dict[str, tuple[str, ValueOf]] = {
+        "abs_rel": ("AbsRel", headline),
+        "seconds": ("seconds a pair", itemgetter("seconds")),
+    }
     panels = figure.subplots(1, 2)
     for axes, (key, (title, value_of)) in zip(panels, quantities.items(), strict=True):
         for index, (preset, names) in enumerate(methods.items()):
