@@ -16,27 +16,6 @@ from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import versions
 
 
-def _megabytes(size_bytes: int) -> str:
-    return f"{size_bytes / 1e6:.1f} MB"
-
-
-def _devices() -> list[str]:
-    lines = [f"cpu ({torch.get_num_threads()} threads)"]
-    for index in range(torch.cuda.device_count()):
-        properties = torch.cuda.get_device_properties(index)
-        lines.append(f"cuda:{index} ({properties.name}, {properties.total_memory / 2**30:.0f} GiB)")
-    return lines + (["mps"] if torch.backends.mps.is_available() else [])
-
-
-def _cached() -> list[str]:
-    """Pipelines and models in the hub cache, whatever they are; only those with an adapter can be guided."""
-    try:
-        models = [repo for repo in scan_cache_dir().repos if repo.repo_type == "model"]
-    except CacheNotFound:
-        models = []
-    return sorted(f"{repo.repo_id} ({_megabytes(repo.size_on_disk)})" for repo in models) or ["nothing"]
-
-
 def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
     """What the adapter of a prior found, once its weights are read."""
     pipe = found.load(space=space)
@@ -74,6 +53,15 @@ def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
     if prior is not None:
         with no_bars():
             described = _describe(find_prior(prior), space)
-    rows = [*versions().items(), *(("device", line) for line in _devices()), ("adapters", ", ".join(PRIORS))]
-    rows += [("cached", line) for line in _cached()]
+    rows = [*versions().items(), ("device", f"cpu ({torch.get_num_threads()} threads)")]
+    for index in range(torch.cuda.device_count()):
+        device = torch.cuda.get_device_properties(index)
+        rows.append(("device", f"cuda:{index} ({device.name}, {device.total_memory / 2**30:.0f} GiB)"))
+    rows += [("device", "mps")] if torch.backends.mps.is_available() else []
+    try:
+        models = [repo for repo in scan_cache_dir().repos if repo.repo_type == "model"]
+    except CacheNotFound:
+        models = []
+    cached = sorted(f"{repo.repo_id} ({repo.size_on_disk / 1e6:.1f} MB)" for repo in models)
+    rows += [("adapters", ", ".join(PRIORS)), *(("cached", line) for line in cached or ["nothing"])]
     print_lines([*rows, ("package", str(Path(__file__).resolve().parents[1])), *described])

@@ -19,7 +19,7 @@ from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.cli.depth import Job, load_guided_prior
 from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, check_files, out_folder_of
-from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, assumption, check_pair, options_of, start_many
+from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, check_pair, options_of, start_many
 from geodiff_plugin.cli.report import read_report
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, collected_warnings, new_table, say, show, warn_once
 from geodiff_plugin.formats.files import file_digest
@@ -231,9 +231,6 @@ def _any_fails(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
     process = runner.process
     if device.type == "cuda" and device.index is None:
         device = torch.device("cuda", process.local % torch.cuda.device_count())
-    assumed = assumption(refs, options)
-    if assumed and process.index == 0 and not options.quiet:
-        say(assumed)
     stages = Stages(options if process.index == 0 else replace(options, quiet=True), device)
     try:
         with collected_warnings(warn_once()):
@@ -275,39 +272,29 @@ def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:
 
 
 def _answer(rows: Sequence[Row], options: DepthOptions, out: Path) -> None:
-    """Print the table, or the rows as JSON, and write ``pairs.csv``."""
+    """Print the table and what it comes to, or the rows as JSON, and write ``pairs.csv``."""
+    doubtful = [row for row in rows if row["verdict"] not in (None, "trusted")]
+    failed = [row for row in rows if row["result"] == "failed"]
     if options.json:
         print(json.dumps(rows, indent=2))
     elif not options.quiet:
-        _print(rows, out)
+        table = new_table(("pair", "result", "near m", "median m", "far m", "confidence", "s"))
+        for row in rows if len(rows) <= MOST_ROWS else [*failed, *doubtful]:
+            numbers = [row[name] for name in ("near_m", "median_m", "far_m", "confidence", "seconds")]
+            result = row["verdict"] if row in doubtful else row["result"]
+            table.add_row(row["pair"], result, *("-" if v is None else f"{v:.2f}" for v in numbers))
+        done, there = (sum(row["result"] == kind for row in rows) for kind in ("done", "there"))
+        number = "1 pair" if len(rows) == 1 else f"{len(rows)} pairs"
+        totals = f"{done} done, {there} there already, {len(failed)} failed, {len(doubtful)} not trusted"
+        messages = [Text(f"{row['pair']}: {row['message']}") for row in failed]
+        show(table, Text(f"{number}: {totals} -> {out}/"), *messages)
     try:
-        with (
-            atomic_path(out / SUMMARY) as temporary,
-            open(temporary, "w", newline="", encoding="utf-8") as file,
-        ):
+        with atomic_path(out / SUMMARY) as path, open(path, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()
             writer.writerows(rows)
     except OSError as error:  # what became of the pairs is on the screen, and each result in its folder
         say(f"geodiff: {out / SUMMARY} could not be written ({reason_of(error)}).")
-
-
-def _print(rows: Sequence[Row], out: Path) -> None:
-    """The table and what it comes to."""
-    doubtful = [row for row in rows if row["verdict"] not in (None, "trusted")]
-    failed = [row for row in rows if row["result"] == "failed"]
-    shown = [row for row in rows if len(rows) <= MOST_ROWS or row in failed or row in doubtful]
-    if shown:
-        table = new_table(("pair", "result", "near m", "median m", "far m", "confidence", "s"))
-        for row in shown:
-            numbers = [row[name] for name in ("near_m", "median_m", "far_m", "confidence", "seconds")]
-            result = row["verdict"] if row in doubtful else row["result"]
-            table.add_row(row["pair"], result, *("-" if v is None else f"{v:.2f}" for v in numbers))
-        show(table)
-    done, there = (sum(row["result"] == kind for row in rows) for kind in ("done", "there"))
-    number = "1 pair" if len(rows) == 1 else f"{len(rows)} pairs"
-    totals = f"{done} done, {there} there already, {len(failed)} failed, {len(doubtful)} not trusted"
-    show(Text(f"{number}: {totals} -> {out}/"), *(Text(f"{r['pair']}: {r['message']}") for r in failed))
 
 
 def run_bag(options: DepthOptions) -> None:

@@ -17,6 +17,7 @@ from PIL import Image
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.options import DepthOptions, check_files, told_apart
+from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.formats.recordings import VIDEOS, count_frames, is_bag, is_video, list_pairs
@@ -101,22 +102,14 @@ def find_pairs(options: DepthOptions) -> list[PairRef]:
     if is_bag(left):
         return _frames(len(list_pairs(left, options.bag_topics(), options.tolerance)), left, None)
     if os.path.isdir(left):
-        return _of_folders(left, right)
-    return _of_videos(left, right) if is_video(left) else _of_list(left, right)
-
-
-def assumption(refs: Sequence[PairRef], options: DepthOptions) -> str | None:
-    """What was assumed about which views belong together, for the user to check; ``None`` for nothing."""
-    first, last = refs[0], refs[-1]
-    if first.right is None or last.right is None:
-        beside = "is read as both views side by side; with a video for each view, name both."
-        return f"{first.left} {beside}" if is_video(first.left) else None
-    if not os.path.isdir(options.left) or first.left.stem == first.right.stem:
-        return None
-    return (
-        f"The two folders share no name, so their images are paired in order: {first.left.name} with "
-        f"{first.right.name}, and so on to {last.left.name} with {last.right.name}."
-    )
+        refs, assumed = _of_folders(left, right)
+    elif is_video(left):
+        refs, assumed = _of_videos(left, right)
+    else:
+        return _of_list(left, right)
+    if assumed and not options.quiet:
+        say(f"assumed: {assumed}")
+    return refs
 
 
 def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
@@ -146,7 +139,8 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
-def _of_folders(left: Path, right: Path | None) -> list[PairRef]:
+def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
+    """The pairs, and what was assumed about which views belong together, for the user to check."""
     if right is None or not os.path.isdir(right):
         got = "nothing" if right is None else right
         bad_value("RIGHT", "a folder where LEFT is one", got, "Or let LEFT be an image, or a list of pairs.")
@@ -159,25 +153,27 @@ def _of_folders(left: Path, right: Path | None) -> list[PairRef]:
             cure = "Keep one of them, or write a list of pairs."
             bad_value(name, "a folder of images with different names", f"two {twice[0]} in {folder}", cure)
     of_stem = {path.stem: path for path in rights}
-    shared = [path for path in lefts if path.stem in of_stem]
-    if not shared and len(lefts) == len(rights):  # im0_L.png beside im0_R.png
-        return [PairRef(a.stem, a, b) for a, b in zip(lefts, rights, strict=True)]
-    if len(shared) < max(len(lefts), len(rights)):
-        stems = {path.stem for path in lefts} ^ set(of_stem)
+    if not {path.stem for path in lefts} & set(of_stem) and len(lefts) == len(rights):
+        refs = [PairRef(a.stem, a, b) for a, b in zip(lefts, rights, strict=True)]  # im0_L.png, im0_R.png
+        first, last = (f"{a.name} with {b.name}" for a, b in ((lefts[i], rights[i]) for i in (0, -1)))
+        return refs, f"The two folders share no name, so images are paired in order: {first} to {last}."
+    if alone := {path.stem for path in lefts} ^ set(of_stem):
         cure = "Remove it, or write a list of pairs: LEFT,RIGHT[,CALIB] a line."
-        got = f"{len(lefts)} left and {len(rights)} right images; {sorted(stems)[0]} has no partner"
+        got = f"{len(lefts)} left and {len(rights)} right images; {min(alone)} has no partner"
         bad_value("LEFT and RIGHT", "folders of images with the same names, or as many in order", got, cure)
-    return [PairRef(path.stem, path, of_stem[path.stem]) for path in shared]
+    return [PairRef(path.stem, path, of_stem[path.stem]) for path in lefts], ""
 
 
-def _of_videos(left: Path, right: Path | None) -> list[PairRef]:
-    if right is not None and not is_video(right):
-        bad_value("RIGHT", f"a video too ({', '.join(VIDEOS)}), or left out", right)
+def _of_videos(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
     frames = count_frames(left, "LEFT")
-    if right is not None and (others := count_frames(right, "RIGHT")) != frames:
+    if right is None:
+        return _frames(frames, left, None), f"{left} holds both views side by side; else name both videos."
+    if not is_video(right):
+        bad_value("RIGHT", f"a video too ({', '.join(VIDEOS)}), or left out", right)
+    if (others := count_frames(right, "RIGHT")) != frames:
         cure = "Cut them to the same moments first."
         bad_value("RIGHT", f"a video of {frames} frames, as the left one", f"{others} frames", cure)
-    return _frames(frames, left, right)
+    return _frames(frames, left, right), ""
 
 
 def _frames(count: int, left: Path, right: Path | None) -> list[PairRef]:

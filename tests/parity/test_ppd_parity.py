@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.torch import save_file
 
 from geodiff_plugin.cli.convert import run_convert
 from geodiff_plugin.priors import find_prior
@@ -17,6 +19,17 @@ from tests.parity import ppd_reference as reference
 from tests.parity.named_weights import named_state
 
 TOLERANCE = {"rtol": 0, "atol": 1e-4}
+#: Depth Anything's names of its encoder's weights -> those of transformers, but for ``qkv``, three there.
+ENCODER_NAMES = (
+    (r"^(cls_token|mask_token)$", r"embeddings.\1"),
+    (r"^pos_embed$", "embeddings.position_embeddings"),
+    (r"^patch_embed\.proj\.", "embeddings.patch_embeddings.projection."),
+    (r"^norm\.", "layernorm."),
+    (r"^blocks\.", "encoder.layer."),
+    (r"\.attn\.proj\.", ".attention.output.dense."),
+    (r"\.attn\.qkv\.", ".attention.attention.qkv."),
+    (r"\.ls([12])\.gamma$", r".layer_scale\1.lambda1"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +43,33 @@ def checkpoint_of_theirs() -> dict[str, torch.Tensor]:
     return named_state({f"dit.{name}": tuple(value.shape) for name, value in shapes.items()})
 
 
+def save_encoder(folder: Path, shapes: dict[str, tuple[int, ...]]) -> None:
+    """The weights of ``depth_anything_v2_vitl.pth`` under the names that they have in transformers."""
+    head = {"head.projects.0.bias": torch.zeros(3)}  # in the file, and no part of the encoder
+    state: dict[str, torch.Tensor] = {}
+    for name, value in named_state(shapes).items():
+        name = name.removeprefix("pretrained.")
+        for pattern, replacement in ENCODER_NAMES:
+            name = re.sub(pattern, replacement, name)
+        parts = (
+            zip(("query", "key", "value"), value.chunk(3), strict=True) if "qkv" in name else [("", value)]
+        )
+        state |= {f"backbone.{name.replace('qkv', part)}": third.contiguous() for part, third in parts}
+    sizes, width = reference.SEMANTICS, state["backbone.embeddings.cls_token"].shape[-1]
+    backbone = {"hidden_size": width, "patch_size": 14, "image_size": sizes["img_size"]}
+    backbone |= {"num_attention_heads": width // 64, "num_hidden_layers": sizes["depth"], "mlp_ratio": 1}
+    folder.mkdir()
+    save_file(state | head, folder / "model.safetensors")
+    (folder / "config.json").write_text(json.dumps({"backbone_config": backbone}))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """From two files as theirs, by their names, through the command."""
+    """From their checkpoint and an encoder, by their names, through the command."""
     folder = tmp_path_factory.mktemp("ppd")
-    head = {"depth_head.projects.0.bias": torch.zeros(3)}  # in the file, and no part of the encoder
     torch.save(checkpoint_of_theirs(), folder / "ppd.pth")
-    torch.save(named_state(reference.semantic_shapes()) | head, folder / "depth_anything_v2_vitl.pth")
-    run_convert([folder / "ppd.pth", folder / "converted"], str(folder / "depth_anything_v2_vitl.pth"))
+    save_encoder(folder / "da2", reference.semantic_shapes())
+    run_convert([folder / "ppd.pth", folder / "converted"], str(folder / "da2"))
     return folder
 
 
@@ -85,14 +117,14 @@ def test_weights_that_do_not_fit_are_listed(folder, tmp_path):
     broken = checkpoint_of_theirs()
     broken["dit.blocks.0.attn.extra"] = broken.pop("dit.blocks.1.mlp.fc2.bias")
     torch.save(broken, tmp_path / "ppd.pth")
-    encoder = folder / "depth_anything_v2_vitl.pth"
+    encoder = folder / "da2"
     small = {1024: 64, 3072: 192}
     shapes = {k: tuple(small.get(n, n) for n in v) for k, v in reference.semantic_shapes().items()}
     del shapes["pretrained.blocks.0.ls1.gamma"]
-    torch.save(named_state(shapes), tmp_path / "encoder.pth")
+    save_encoder(tmp_path / "encoder", shapes)
     for checkpoint, told, sentence in (
         (tmp_path / "ppd.pth", encoder, "missing: blocks.1.mlp.fc2.bias; unexpected: blocks.0.attn.extra"),
-        (folder / "ppd.pth", tmp_path / "encoder.pth", "layer_scale1"),
+        (folder / "ppd.pth", tmp_path / "encoder", "layer_scale1"),
         (folder / "ppd.pth", None, "Depth-Anything-V2-Large-hf"),
     ):
         with pytest.raises(ValueError, match=re.escape(sentence)):
