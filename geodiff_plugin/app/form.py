@@ -9,9 +9,10 @@ from typing import Any
 import gradio as gr
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors, Request
+from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors, options_of
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
-from geodiff_plugin.options import PRESETS, RunOptions, help_of
+from geodiff_plugin.cli.options import DepthOptions
+from geodiff_plugin.options import PRESETS, help_of
 
 PICTURE_HEIGHT = 190
 #: Labels of the fields that hold a number or nothing.
@@ -21,11 +22,10 @@ NUMBERS = {
     "cx": "cx, px",
     "cy": "cy, px",
     "cx_right": "Right camera's cx, px",
-    "baseline_m": "Distance of the cameras, m",
+    "baseline": "Distance of the cameras, m",
     "near": "Nearest depth, m",
     "far": "Farthest depth, m",
 }
-RUN_NAMES = ("prior", "preset", "steps", "ensemble", "resolution", "near", "far", "seed")
 PAIRS_FOLDER = Path(__file__).resolve().parent / "pairs"
 #: Folder, ending of its images -> what the page calls it; ``tests.scenes.make_examples`` renders them anew.
 EXAMPLES = {
@@ -37,10 +37,9 @@ EXAMPLES = {
 
 @dataclass(frozen=True)
 class Form:
-    """The components, and how their values become a request.
+    """The components, and how their values become options.
 
-    ``fields`` are by the name of what they fill in, of ``Request`` or ``RunOptions``; ``untouched`` are the
-    values that they begin with.
+    ``fields`` are by the name of what they fill in; ``untouched`` are the values that they begin with.
     """
 
     fields: dict[str, Any]
@@ -49,22 +48,22 @@ class Form:
     run: gr.Button
     stop: gr.Button
 
-    def request(self, values: tuple[Any, ...]) -> Request:
-        """What was filled in; empty fields are ``None``."""
+    def options(self, values: tuple[Any, ...]) -> DepthOptions:
+        """What was filled in."""
         named = dict(zip(self.fields, values, strict=True))
         for name, label in NUMBERS.items():
             named[name] = _number(named[name], label)
-        run = {name: named.pop(name) for name in RUN_NAMES}
-        run |= {name: int(run[name] or 0) for name in ("steps", "ensemble", "resolution", "seed")}
-        run |= {name: run[name] or None for name in ("steps", "resolution")}  # 0: the prior's own
-        named["calibration"] = tuple(named["calibration"] or ())
-        return Request(**named, run=RunOptions(**run))
+        lens = {name: named.pop(name) for name in ("fx", "fy", "cx", "cy")}
+        named |= {name: int(named[name] or 0) for name in ("steps", "ensemble", "resolution", "seed")}
+        named |= {name: named[name] or None for name in ("steps", "resolution")}  # 0: the prior's own
+        named["calib"] = tuple(named["calib"] or ())
+        return options_of(**named, lens=lens)
 
     def example(self, number: int) -> list[Any]:
         """A value for every field: the files of an example, and all others as they began."""
         folder, ending = list(EXAMPLES)[number]
         files: dict[str, Any] = {side: str(folder / f"{side}.{ending}") for side in ("left", "right")}
-        files["calibration"] = [str(folder / "calib.txt")]
+        files["calib"] = [str(folder / "calib.txt")]
         return list((self.untouched | files).values())
 
 
@@ -102,7 +101,7 @@ def _views() -> dict[str, Any]:
     with gr.Row():
         for name, label in (("left", "Left photograph"), ("right", "Right photograph")):
             drawn[name] = photograph_field(label, name)
-    ways = [(label, name) for name, (label, _) in CAMERA_WAYS.items()]
+    ways = [(label, name) for name, label in CAMERA_WAYS.items()]
     way = gr.Radio(ways, value="file", label="Where the cameras are", elem_id="way")
     drawn["way"] = way
     calibration = gr.File(
@@ -111,19 +110,19 @@ def _views() -> dict[str, Any]:
         height=140,
         elem_id="calibration",
     )
-    drawn["calibration"] = calibration
-    with gr.Column(visible=False) as lens:
-        with gr.Row():
-            for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
-                drawn[name] = _optional(name, placeholder)
-        note = "cx + doffs; if it is not cx and left empty, every depth is off"
-        drawn["cx_right"] = _optional("cx_right", "assumed as cx", info=note)
-    drawn["baseline_m"] = _optional("baseline_m", "as the calibration file says")
+    drawn["calib"] = calibration
+    with gr.Column(visible=False) as lens, gr.Row():
+        for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
+            drawn[name] = _optional(name, placeholder)
+    note = "cx + doffs; if it is not cx and left empty, every depth is off"
+    cx_right = _optional("cx_right", "assumed as cx", info=note, visible=False)
+    drawn["cx_right"] = cx_right
+    drawn["baseline"] = _optional("baseline", "as the calibration file says")
 
-    def show(chosen: str) -> tuple[Any, Any]:
-        return gr.update(visible=chosen == "file"), gr.update(visible=chosen != "file")
+    def show(chosen: str) -> list[Any]:
+        return [gr.update(visible=seen) for seen in (chosen == "file", chosen != "file", chosen == "numbers")]
 
-    way.change(show, way, [calibration, lens], queue=False, api_visibility="private")
+    way.change(show, way, [calibration, lens, cx_right], queue=False, api_visibility="private")
     return drawn
 
 

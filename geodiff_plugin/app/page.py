@@ -6,8 +6,7 @@ import re
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Callable
 from shutil import rmtree
 from types import SimpleNamespace
 from typing import Any, Literal, TypedDict
@@ -18,19 +17,22 @@ import numpy as np
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.app import look
 from geodiff_plugin.app.form import Form, build_form
-from geodiff_plugin.app.job import Priors, Result, Stopped, run_job
+from geodiff_plugin.app.job import Priors, Stopped, run_job
 from geodiff_plugin.app.results import (
-    MOST_POINTS_SHOWN,
     NAMES,
+    K_of,
     Pixels,
+    depth_of,
+    files_of,
     legend_of_confidence,
     legend_of_depth,
+    map_of,
     measurement,
     picture,
     scale_of,
-    write_files,
     write_scene,
 )
+from geodiff_plugin.cli.depth import Job
 from geodiff_plugin.cli.report import depth_summary
 
 #: A visitor's uploads, result and files are deleted after this long.
@@ -85,7 +87,7 @@ class _Desk:
         if visitor in self._stops:
             self._stops[visitor].set()
 
-    def serve(self, visitor: str | None, job: Callable[[threading.Event], Result]) -> Result:
+    def serve(self, visitor: str | None, job: Callable[[threading.Event], Job]) -> Job:
         stop = self._stops.setdefault(visitor, threading.Event())
         try:
             with self._turn:
@@ -94,32 +96,33 @@ class _Desk:
             self._stops.pop(visitor, None)
 
 
-def _forget(result: Result | None) -> None:
-    if result is not None:
-        rmtree(result.folder, ignore_errors=True)
+def _forget(job: Job | None) -> None:
+    if job is not None:
+        rmtree(job.folder.path.parent, ignore_errors=True)
 
 
-def for_visitors(sentence: str, paths: Iterable[Path]) -> str:
-    """A sentence without the server's paths and without options of the command line."""
-    for path in paths:
-        sentence = sentence.replace(str(path), path.name)
-    return re.sub(r" \([^()]*--[^()]*\)", "", sentence)
+def for_visitors(sentence: str) -> str:
+    """A sentence of the command line without the server's folders, and with fields for options."""
+    sentence = re.sub(r"(?<![\w.])/(?:[^\s/]+/)+", "", sentence)
+    sentence = re.sub(r" \([^()]*--[^()]*\)", "", sentence)
+    sentence = sentence.replace("LEFT", "the left photograph").replace("RIGHT", "the right photograph")
+    return re.sub(r"--([a-z])", r"\1", sentence)
 
 
-def _sentence(error: Exception, paths: Iterable[Path]) -> str:
+def _sentence(error: Exception) -> str:
     """One for the visitor; a defect's traceback goes to the terminal."""
     if isinstance(error, InputError):
-        return for_visitors(str(error), paths)
+        return for_visitors(str(error))
     traceback.print_exception(error, file=sys.stderr)
     return f"This is a defect, not your input: {type(error).__name__}."
 
 
-def _figures(result: Result) -> list[tuple[str, str]]:
+def _figures(job: Job) -> list[tuple[str, str]]:
     """Numbers for the banner; of a result that is not trusted only what is there, not how good it is."""
-    visible, confidence = result.map("visible"), result.map("confidence")
-    depth = depth_summary(result.depth_m, visible)
-    seconds = (f"{sum(result.seconds.values()):.1f} s", "computing")
-    if not result.output.verdict.trusted:
+    visible, confidence = map_of(job, "visible"), map_of(job, "confidence")
+    depth = depth_summary(depth_of(job), visible)
+    seconds = (f"{sum(job.watch.seconds.values()):.1f} s", "computing")
+    if not job.output.verdict.trusted:
         return [(f"{depth['median_m']:.2f} m, unconfirmed", "median depth"), seconds]
     figures = [
         (f"{depth['min_m']:.2f} m to {depth['max_m']:.2f} m", "nearest and farthest"),
@@ -132,42 +135,42 @@ def _figures(result: Result) -> list[tuple[str, str]]:
     return [*figures, seconds]
 
 
-def _cameras(result: Result) -> str:
+def _cameras(job: Job) -> str:
     """The cameras as understood."""
-    (fx, _, cx), (_, fy, cy), _ = result.K
-    x, y, z = apart = result.guidance.rigs[0].E[:3, 3]
+    (fx, _, cx), (_, fy, cy), _ = K_of(job)
+    x, y, z = apart = job.inputs.guidance.rigs[0].E[:3, 3]
     ways = {"right": x, "left": -x, "below": y, "above": -y, "before": z, "behind": -z}
     way, away = max(ways, key=lambda side: ways[side]), np.linalg.norm(apart)
     lens = f"fx {fx:.1f}, fy {fy:.1f}, cx {cx:.1f}, cy {cy:.1f} px"
     return f"Left camera: {lens}; the right one {away:.3g} m away, {way}."
 
 
-def _everything(panels: SimpleNamespace, result: Result) -> dict[Any, Any]:
+def _everything(panels: SimpleNamespace, job: Job) -> dict[Any, Any]:
     """Every panel's value for a new result, but the cloud's, which is drawn when its tab is opened."""
-    verdict, paths = result.output.verdict, result.request.files()
-    sentences = dict.fromkeys([*verdict.reasons, *result.warnings])
-    told = [for_visitors(sentence, paths) for sentence in sentences if sentence != verdict.sentence]
-    marked, words = measurement(result, [])
-    sure = picture(result, "confidence")
+    verdict = job.output.verdict
+    sentences = dict.fromkeys([*verdict.reasons, *job.warnings])
+    told = [for_visitors(sentence) for sentence in sentences if sentence != verdict.sentence]
+    marked, words = measurement(job, [])
+    sure = picture(job, "confidence")
     return {
-        panels.status: look.finished(verdict.status, _figures(result), told, _cameras(result)),
+        panels.status: look.finished(verdict.status, _figures(job), told, _cameras(job)),
         panels.measure_verdict: look.banner(verdict.status),
         panels.files_verdict: look.banner(verdict.status),
-        panels.slider: (picture(result, "photograph"), picture(result, "depth")),
-        panels.depth_legend: legend_of_depth(result.depth_m),
+        panels.slider: (picture(job, "photograph"), picture(job, "depth")),
+        panels.depth_legend: legend_of_depth(depth_of(job)),
         panels.picture: marked,
         panels.readings: words,
-        panels.files: [str(path) for path in write_files(result)],
+        panels.files: [str(path) for path in files_of(job)],
         panels.confidence: sure,
         panels.confidence_legend: "" if sure is None else legend_of_confidence(),
     }
 
 
-def _scene(result: Result) -> tuple[Any, str]:
+def _scene(job: Job) -> tuple[Any, str]:
     """The view of the cloud of confident points from behind the cameras, and a line about it."""
-    path = result.folder / "scene.glb"
-    count = write_scene(path, result, LEAST_CONFIDENCE, MOST_POINTS_SHOWN)
-    share, away = 100 * count / result.depth_m.size, VIEW_FROM * float(np.percentile(result.depth_m, 90))
+    path, depth_m = job.folder.path / "scene.glb", depth_of(job)
+    count = write_scene(path, job, LEAST_CONFIDENCE)
+    share, away = 100 * count / depth_m.size, VIEW_FROM * float(np.percentile(depth_m, 90))
     view = gr.Model3D(str(path), camera_position=(*VIEW_ANGLES, away))
     return view, f'<div class="legend-caption">{count:,} points, {share:.0f} % of the pixels</div>'
 
@@ -201,18 +204,16 @@ def _wire_run(
         """Depth in metres of the left photograph, with its files."""
         *filled, before, opened = values
         _forget(before)
-        uploads: list[Path] = []
         try:
-            wanted = form.request(tuple(filled))
-            uploads = wanted.files()
-            result = desk.serve(request.session_hash, lambda stop: run_job(wanted, priors, stop, progress))
-            values_now = {state: result, points: [], **_everything(panels, result)}
+            wanted = form.options(tuple(filled))
+            job = desk.serve(request.session_hash, lambda stop: run_job(wanted, priors, stop, progress))
+            values_now = {state: job, points: [], **_everything(panels, job)}
         except Stopped:
             return nothing(look.STOPPED)
         except Exception as error:  # whatever it is, the visitor reads a sentence
-            return nothing(look.failed(_sentence(error, uploads)))
+            return nothing(look.failed(_sentence(error)))
         if opened == CLOUD_TAB:
-            values_now[panels.scene], values_now[panels.points] = _scene(result)
+            values_now[panels.scene], values_now[panels.points] = _scene(job)
         return values_now
 
     def take(event: gr.SelectData) -> list[Any]:
@@ -238,29 +239,29 @@ def _wire_run(
 
 
 def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State) -> None:
-    def redraw(result: Result | None, pixels: Pixels) -> tuple[Any, ...]:
-        if result is None:
+    def redraw(job: Job | None, pixels: Pixels) -> tuple[Any, ...]:
+        if job is None:
             return gr.skip(), gr.skip(), gr.skip()
-        return pixels, *measurement(result, pixels)
+        return pixels, *measurement(job, pixels)
 
-    def click(result: Result | None, pixels: Pixels, event: gr.SelectData) -> tuple[Any, ...]:
-        return redraw(result, [*pixels, tuple(event.index)][-len(NAMES) :])
+    def click(job: Job | None, pixels: Pixels, event: gr.SelectData) -> tuple[Any, ...]:
+        return redraw(job, [*pixels, tuple(event.index)][-len(NAMES) :])
 
-    def add(result: Result | None, pixels: Pixels, typed: str) -> tuple[Any, ...]:
+    def add(job: Job | None, pixels: Pixels, typed: str) -> tuple[Any, ...]:
         numbers = [int(word) for word in re.findall(r"\d{1,6}", typed or "")]
-        if result is None or len(numbers) != 2:
-            return gr.skip(), gr.skip(), "Type two whole numbers: x, y." if result else gr.skip()
-        x, y = (round(number * scale_of(result)) for number in numbers)
-        return redraw(result, [*pixels, (x, y)][-len(NAMES) :])
+        if job is None or len(numbers) != 2:
+            return gr.skip(), gr.skip(), "Type two whole numbers: x, y." if job else gr.skip()
+        x, y = (round(number * scale_of(job)) for number in numbers)
+        return redraw(job, [*pixels, (x, y)][-len(NAMES) :])
 
-    def clear(result: Result | None) -> tuple[Any, ...]:
-        return redraw(result, [])
+    def clear(job: Job | None) -> tuple[Any, ...]:
+        return redraw(job, [])
 
-    def turn(result: Result | None, event: gr.SelectData) -> tuple[Any, Any, Any]:
+    def turn(job: Job | None, event: gr.SelectData) -> tuple[Any, Any, Any]:
         # A 3D view that gets its file while it is hidden stays empty (gradio 6.31).
-        if result is None or event.value != CLOUD_TAB:
+        if job is None or event.value != CLOUD_TAB:
             return event.value, gr.skip(), gr.skip()
-        return (event.value, *_scene(result))
+        return (event.value, *_scene(job))
 
     measured = [points, panels.picture, panels.readings]
     panels.picture.select(click, [state, points], measured, **QUICK)

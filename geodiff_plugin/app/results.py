@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,10 +11,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from geodiff_plugin.app import look
-from geodiff_plugin.app.job import Result
 from geodiff_plugin.app.measure import Reading, distance_m, metres, read_pixel
-from geodiff_plugin.cli.exports import cameras_of, write_maps
-from geodiff_plugin.cli.report import plain, result_entries
+from geodiff_plugin.cli.depth import Job
+from geodiff_plugin.cli.exports import cameras_of
+from geodiff_plugin.cli.report import REPORT, single_map
 from geodiff_plugin.formats import flying_points, make_cloud, write_glb
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
 
@@ -29,34 +28,51 @@ MARK = "#c2410c"
 Pixels = list[tuple[int, int]]
 
 
-def scale_of(result: Result) -> float:
+def map_of(job: Job, name: str) -> np.ndarray | None:
+    """``(H, W)`` of a map of the output, or ``None``."""
+    value = getattr(job.output, name)
+    return None if value is None else single_map(value)
+
+
+def depth_of(job: Job) -> np.ndarray:
+    """``(H, W)`` float32 metres."""
+    return single_map(job.output.prediction).astype(np.float32)
+
+
+def K_of(job: Job) -> np.ndarray:
+    """``(3, 3)`` pixels of the maps."""
+    return np.asarray(job.output.K)[0].astype(np.float64)
+
+
+def scale_of(job: Job) -> float:
     """Size of the pictures on the page / size of the maps."""
-    return min(1.0, LARGEST_SIDE / max(result.depth_m.shape))
+    return min(1.0, LARGEST_SIDE / max(job.inputs.left.shape))
 
 
-def picture(result: Result, name: str) -> np.ndarray | None:
+def picture(job: Job, name: str) -> np.ndarray | None:
     """``(h, w, 3)`` uint8 of ``photograph``, ``depth`` or ``confidence``; ``None`` without such a map."""
     if name == "photograph":
-        full = np.rint(np.clip(result.left, 0, 1) * 255).astype(np.uint8)
+        full = np.rint(np.clip(job.inputs.left, 0, 1) * 255).astype(np.uint8)
     elif name == "depth":
-        full = colour_depth(result.depth_m)
+        full = colour_depth(depth_of(job))
     else:
-        confidence = result.map("confidence")
+        confidence = map_of(job, "confidence")
         if confidence is None:
             return None
         full = colour_share(confidence)
-    if (scale := scale_of(result)) == 1:
+    if (scale := scale_of(job)) == 1:
         return full
     size = (round(full.shape[1] * scale), round(full.shape[0] * scale))
     return np.asarray(Image.fromarray(full).resize(size, Image.Resampling.LANCZOS))
 
 
-def reading(result: Result, pixel: tuple[int, int]) -> Reading:
+def reading(job: Job, pixel: tuple[int, int]) -> Reading:
     """What the map says at a pixel of a picture on the page."""
-    height, width = result.depth_m.shape
-    x, y = (round((value + 0.5) / scale_of(result) - 0.5) for value in pixel)
+    depth_m = depth_of(job)
+    height, width = depth_m.shape
+    x, y = (round((value + 0.5) / scale_of(job) - 0.5) for value in pixel)
     inside = (min(max(x, 0), width - 1), min(max(y, 0), height - 1))
-    return read_pixel(result.depth_m, result.K, inside, result.map("confidence"), result.map("uncertainty"))
+    return read_pixel(depth_m, K_of(job), inside, map_of(job, "confidence"), map_of(job, "uncertainty"))
 
 
 def _legend(colours: np.ndarray, marks: Sequence[tuple[float, str]], caption: str) -> str:
@@ -87,9 +103,9 @@ def legend_of_confidence() -> str:
     return _legend(colours, marks, "Confidence: probability that a depth is within 10 % of the truth")
 
 
-def measurement(result: Result, pixels: Pixels) -> tuple[np.ndarray, str]:
+def measurement(job: Job, pixels: Pixels) -> tuple[np.ndarray, str]:
     """The photograph with the points of these pixels, and what they say as HTML; every two are a segment."""
-    readings, photograph = [reading(result, pixel) for pixel in pixels], picture(result, "photograph")
+    readings, photograph = [reading(job, pixel) for pixel in pixels], picture(job, "photograph")
     assert photograph is not None
     return marked(photograph, pixels, readings), _words(readings) if readings else look.HOW_TO_MEASURE
 
@@ -140,35 +156,25 @@ def _words(readings: list[Reading]) -> str:
     return f'<div class="say">{segments}{table}{more}<p class="legend-caption">{note}</p></div>'
 
 
-def write_scene(path: Path, result: Result, least_confidence: float, most: int) -> int:
-    """Cloud and cameras as GLB with so many points at most; how many there are in all."""
-    keep, confidence = ~flying_points(result.depth_m), result.map("confidence")
+def write_scene(path: Path, job: Job, least_confidence: float) -> int:
+    """Cloud and cameras as GLB, light enough for a browser; how many points there are in all."""
+    depth_m, confidence = depth_of(job), map_of(job, "confidence")
+    keep = ~flying_points(depth_m)
     if confidence is not None:
         keep &= confidence >= least_confidence
-    cloud = make_cloud(result.depth_m, result.left, result.K, keep)
-    write_glb(path, cloud.thinned(most), cameras_of(result.output, result.guidance))
+    cloud = make_cloud(depth_m, job.inputs.left, K_of(job), keep)
+    write_glb(path, cloud.thinned(MOST_POINTS_SHOWN), cameras_of(job.output, job.inputs.guidance))
     return len(cloud.points_m)
 
 
-def write_files(result: Result) -> list[Path]:
-    """Write everything that can be downloaded: the files, most wanted first; ``everything.zip`` has all."""
-    folder = result.folder
-    counts = write_maps(folder, result.output, result.left)
-    write_scene(folder / "cloud.glb", result, 0.0, result.depth_m.size)
-    posed = cameras_of(result.output, result.guidance)[1:]
-    report = result_entries(result.output, result.guidance) | {
-        "warnings": result.warnings,
-        "cameras": [
-            {"K": rig.K_right, "E": E} for rig, (_, E, _) in zip(result.guidance.rigs, posed, strict=True)
-        ],
-        "photographs": [Path(name).name for name in result.request.photographs],
-        "settings": result.request.run.as_json(),
-        "seconds": {name: round(value, 3) for name, value in result.seconds.items()},
-        "files": counts,
-    }
-    text = json.dumps(plain(report), indent=2, allow_nan=False, default=str)
-    (folder / "report.json").write_text(f"{text}\n", encoding="utf-8")
-    wanted = "depth_mm.png depth.npy depth.png confidence.npy cloud.ply cloud.glb report.json".split()
+def files_of(job: Job) -> list[Path]:
+    """Everything that can be downloaded, most wanted first; ``everything.zip``, made here, has all."""
+    folder = job.folder.path
+    report = (folder / REPORT).read_text(encoding="utf-8")
+    for path in (*job.options.photographs().values(), *job.options.calib):
+        report = report.replace(str(path), path.name)
+    (folder / REPORT).write_text(report, encoding="utf-8")
+    wanted = f"depth_mm.png depth.npy depth.png confidence.npy cloud.ply cloud.glb {REPORT}".split()
     others = sorted(path.name for path in folder.iterdir() if path.name not in wanted)
     paths = [folder / name for name in (*wanted, *others) if (folder / name).is_file()]
     with ZipFile(folder / "everything.zip", "w", ZIP_STORED) as archive:

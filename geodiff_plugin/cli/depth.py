@@ -80,16 +80,16 @@ class Job:
             yield
         self.warnings += [sentence for sentence in warned if sentence not in self.warnings]
 
-    def read(self, frames: Sequence[np.ndarray] | None = None) -> None:
-        """Read the views, from their files or as ``frames``, and the cameras, and see that they fit."""
+    def read(self, frames: Sequence[np.ndarray] | None = None, names: tuple[str, str] | None = None) -> None:
+        """Read the views and the cameras, and see that they fit; arguments as for ``read_inputs``."""
         with self.stage("calibration"):
-            self.inputs = read_inputs(self.options, self.options.config(), frames)
+            self.inputs = read_inputs(self.options, self.options.config(), frames, names)
             check_image_names(self.options, self.inputs)
 
-    def guide(self, pipe: Any, progress: bool) -> None:
-        """Call the pipeline as the options say, if wanted with the loss in a progress bar on stderr."""
+    def guide(self, pipe: Any, progress: bool, **further: Any) -> None:
+        """Call the pipeline as the options and ``further`` say, if wanted with a progress bar on stderr."""
         options, inputs = self.options, self.inputs
-        call = options.call() | {"generator": torch.Generator("cpu").manual_seed(options.seed)}
+        call = options.call() | {"generator": torch.Generator("cpu").manual_seed(options.seed)} | further
         if inputs.prior_map is not None:
             call["depth_map"] = inputs.prior_map
         pipe.set_progress_bar_config(disable=not progress, file=sys.stderr, leave=False)

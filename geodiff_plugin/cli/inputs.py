@@ -60,7 +60,10 @@ class Inputs:
 
 
 def read_inputs(
-    options: DepthOptions, config: GuidanceConfig, frames: Sequence[np.ndarray] | None = None
+    options: DepthOptions,
+    config: GuidanceConfig,
+    frames: Sequence[np.ndarray] | None = None,
+    names: tuple[str, str] | None = None,
 ) -> Inputs:
     """Read the images and the cameras, and see that they fit each other.
 
@@ -68,6 +71,7 @@ def read_inputs(
         options: that the checks of ``cli.options`` have seen.
         config: of the guidance.
         frames: left and right image, ``(H, W, 3)`` float32 in [0, 1], where they are no files of their own.
+        names: by which a calibration file knows them, where those are not their paths.
 
     Raises:
         InputError: naming the option or the file, or why there is no pose to be had.
@@ -79,7 +83,7 @@ def read_inputs(
     if options.estimate_pose:
         Ks = [_intrinsics(options, way, path, i, sizes[i]) for i, path in enumerate(views.values())]
     else:
-        rig = read_rig(options, *sizes[:2])
+        rig = read_rig(options, *sizes[:2], names=names)
         if frames is None:
             for K, (name, path) in zip((rig.K_left, rig.K_right), list(views.items())[:2], strict=False):
                 warn_of_other_lens(path, K, name)
@@ -138,15 +142,22 @@ def _read_view(path: Path, name: str) -> np.ndarray:
     return image
 
 
-def read_rig(options: DepthOptions, left_size: Size, right_size: Size | None = None) -> Rig:
-    """The cameras, whichever way they are given, for images of these ``(width, height)``."""
+def read_rig(
+    options: DepthOptions,
+    left_size: Size,
+    right_size: Size | None = None,
+    names: tuple[str, str] | None = None,
+) -> Rig:
+    """The cameras, whichever way they are given, for images of these ``(width, height)`` and names."""
+    if names is None and options.right is not None:
+        names = str(options.left), str(options.right)
     way = options.cameras_way()
     if way == "file":
         rig = read_calibration(
             options.calib,
             options.camera_pair(),
             str(options.left),
-            image_names=None if options.right is None else (str(options.left), str(options.right)),
+            image_names=names,
             image_size=left_size,
             baseline_m=options.baseline,
             distorted=True,

@@ -114,7 +114,7 @@ def test_a_result_is_judged_stale_after_a_change_and_gone_under_an_error(visitor
     page.wait_for_selector("#readings >> text=Choose a second point")
     tab(page, "Downloads")
     assert page.locator(".verdict:visible").count() == 2
-    field(page, "baseline_m").fill("0.3")
+    field(page, "baseline").fill("0.3")
     page.keyboard.press("Tab")
     page.wait_for_function("document.getElementById('results').classList.contains('stale')")
     page.get_by_text("Focal length and baseline").click()
@@ -128,10 +128,10 @@ def test_a_result_is_judged_stale_after_a_change_and_gone_under_an_error(visitor
 def test_an_example_sets_every_field_and_runs(visitor):
     page = visitor()
     page.get_by_text("Focal length and baseline").click()
-    field(page, "baseline_m").fill("0.5")
+    field(page, "baseline").fill("0.5")
     page.locator("#examples button").nth(1).click()
     page.wait_for_selector("#status .figures", timeout=RUN_MS)
-    assert field(page, "baseline_m").input_value() == ""
+    assert field(page, "baseline").input_value() == ""
     assert page.locator("#way input:checked").get_attribute("value") == "file"
     assert "0.06 m away, right" in page.locator("#status .cameras").inner_text()
     page.wait_for_timeout(500)

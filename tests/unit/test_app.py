@@ -8,7 +8,6 @@ import json
 import math
 import threading
 from dataclasses import replace
-from pathlib import Path
 from zipfile import ZipFile
 
 import numpy as np
@@ -18,18 +17,21 @@ from PIL import Image
 
 from geodiff_plugin import enable_geometry_guidance
 from geodiff_plugin.app import job, launch
-from geodiff_plugin.app.job import CAMERA_WAYS, Priors, Request, Stopped, run_job
+from geodiff_plugin.app.job import Priors, Stopped, options_of, run_job
 from geodiff_plugin.app.measure import distance_m, metres, read_pixel
-from geodiff_plugin.app.results import legend_of_confidence, legend_of_depth, marked, measurement, write_files
+from geodiff_plugin.app.results import (
+    depth_of,
+    files_of,
+    legend_of_confidence,
+    legend_of_depth,
+    map_of,
+    marked,
+    measurement,
+)
 from geodiff_plugin.formats import read_calibration, read_image
-from geodiff_plugin.options import RunOptions
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
 DEPTH = np.full((48, 64), 2.0, np.float32)
-CALIBRATION = (
-    "cam0=[60 0 31.5; 0 60 23.5; 0 0 1]\ncam1=[60 0 31.5; 0 60 23.5; 0 0 1]\n"
-    "doffs=0\nbaseline=120\nwidth={}\nheight=48\n"
-)
 
 
 def test_a_point_is_where_its_ray_ends():
@@ -66,58 +68,54 @@ def test_spread_of_a_distance_agrees_with_drawn_errors():
     assert length == 0 and spread > 0
 
 
-def guided(way, photographs=("left.png", "right.png"), **fields):
-    left, right = np.random.default_rng(0).random((2, 48, 64, 3), dtype=np.float32)
-    return CAMERA_WAYS[way][1](Request(*photographs, **fields), left, right)
+@pytest.fixture(scope="module")
+def photographs(textured_plane, tmp_path_factory):
+    """Paths of the left and the right one, in folders of their own as the page keeps them."""
+    paths = []
+    for side in ("left", "right"):
+        paths.append(tmp_path_factory.mktemp(side) / f"{side}.png")
+        Image.fromarray(getattr(textured_plane, side)).save(paths[-1])
+    return [str(path) for path in paths]
 
 
-def test_numbers_fill_what_is_left_empty_and_say_so():
-    guidance = guided("numbers", fx=60.0, baseline_m=0.12)
-    np.testing.assert_allclose(guidance.rigs[0].K_left, K)
-    assert guidance.rigs[0].E[0, 3] == pytest.approx(0.12) and "cx is assumed" in guidance.assumed[0]
-    guidance = guided("numbers", fx=60.0, baseline_m=0.12, cx_right=35.5)
-    assert guidance.rigs[0].K_right[0, 2] == 35.5 and not guidance.assumed
+def test_fields_become_options_and_those_of_another_way_are_left_out(photographs, tmp_path):
+    lens = {"fx": 60.0, "fy": None, "cx": None, "cy": 20.0}
+    numbers = options_of(*photographs, "numbers", ("K.txt",), 0.12, 35.5, lens, seed=3)
+    assert (numbers.fx, numbers.fy, numbers.cx, numbers.cy) == (60.0, 60.0, 31.5, 20.0)
+    assert numbers.cx_right == 35.5 and numbers.seed == 3 and numbers.calib == ()
+    file = options_of(*photographs, "file", ("K.txt",), None, 35.5, lens)
+    assert [path.name for path in file.calib] == ["K.txt"] and file.fx is None and file.cx_right is None
+    exif = Image.Exif()
+    exif[0x0112] = 6  # lies on its side
+    Image.new("L", (64, 48)).save(tmp_path / "turned.jpg", exif=exif)
+    turned = options_of(str(tmp_path / "turned.jpg"), photographs[1], "photographs", (), 0.3, 35.5, lens)
+    assert turned.estimate_pose and turned.cx == 23.5 and turned.cx_right is None
 
 
 @pytest.mark.parametrize(
     ("way", "fields", "said"),
     [
         ("numbers", {}, "fx and baseline must be given"),
-        ("numbers", {"fx": 60.0, "baseline_m": -1.0}, "baseline must be a finite number of metres above 0"),
         ("photographs", {}, "the distance of the cameras must be given"),
         ("file", {}, "calibration must be a calibration file"),
-        ("file", {"calibration": 640}, "the left photograph must be of 640x48 pixels, as calib.txt says"),
     ],
 )
-def test_cameras_that_are_refused(way, fields, said, tmp_path):
-    if "calibration" in fields:
-        (tmp_path / "calib.txt").write_text(CALIBRATION.format(fields["calibration"]))
-        fields = {"calibration": (str(tmp_path / "calib.txt"),)}
+def test_fields_that_are_missing(way, fields, said, photographs):
     with pytest.raises(ValueError, match=said):
-        guided(way, **fields)
+        options_of(*photographs, way, **fields)
 
 
-def test_a_K_that_the_photographs_contradict_is_told(tmp_path):
-    exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA405] = 65  # mm in 35 mm equivalent: 120 px for 64x48
-    paths = [str(tmp_path / f"{side}.jpg") for side in ("left", "right")]
-    Image.new("L", (64, 48)).save(paths[0], exif=exif)
-    Image.new("L", (64, 48)).save(paths[1])
-    with pytest.warns(UserWarning, match="60 px for the left photograph, 0.50 times the 120 px of its EXIF"):
-        guided("numbers", paths, fx=60.0, baseline_m=0.1)
-
-
-def test_photographs_alone_are_estimated_from(monkeypatch, tmp_path):
-    asked = []
-    monkeypatch.setattr(job.GeometryGuidance, "from_photographs", lambda p, **more: asked.append((p, more)))
-    paths = [str(tmp_path / f"{number}.png") for number in range(2)]
-    for path in paths:
-        Image.new("RGB", (64, 48)).save(path)
-    guided("photographs", paths, baseline_m=0.3, fx=60.0, cx_right=30.0)
-    ((photographs, more),) = asked
-    assert [photograph.size for photograph in photographs] == [(64, 48)] * 2 and more["baseline_m"] == 0.3
-    np.testing.assert_allclose(more["K"], K)
-    assert more["K_right"][0, 2] == 30
+@pytest.mark.filterwarnings("ignore:.*has no unit")
+def test_a_calibration_without_a_unit_needs_the_distance(photographs, priors, tmp_path):
+    frames = [
+        {"file_path": f"{side}.png", "transform_matrix": np.eye(4).tolist()} for side in ("left", "right")
+    ]
+    frames[1]["transform_matrix"][0][3] = 0.5
+    lens = {"fl_x": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(lens | {"frames": frames}))
+    with pytest.raises(ValueError, match="the distance of the cameras must be given.*has no unit"):
+        run(options_of(*photographs, "file", (str(path),), prior="tiny"), priors)
 
 
 @pytest.fixture(scope="module")
@@ -128,23 +126,22 @@ def priors(make_pipeline):
 
 
 @pytest.fixture(scope="module")
-def asked(textured_plane, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("visitor")
-    for side in ("left", "right"):
-        Image.fromarray(getattr(textured_plane, side)).save(folder / f"{side}.png")
-    paths = (str(folder / "left.png"), str(folder / "right.png"))
-    return Request(*paths, way="numbers", fx=60.0, baseline_m=0.12, run=RunOptions(prior="tiny", steps=1))
+def asked(photographs):
+    return options_of(*photographs, "numbers", (), 0.12, None, {"fx": 60.0}, prior="tiny", steps=1)
 
 
 def ignore(*_):
     pass
 
 
+def run(options, priors):
+    return run_job(options, priors, threading.Event(), ignore)
+
+
 @pytest.fixture(scope="module")
 def result(priors, asked):
     said = []
-    request = replace(asked, run=replace(asked.run, ensemble=2))
-    done = run_job(request, priors, threading.Event(), lambda *now: said.append(now))
+    done = run_job(replace(asked, ensemble=2), priors, threading.Event(), lambda *now: said.append(now))
     shares = [share for share, _ in said]
     assert shares == sorted(shares) and 0 <= min(shares) <= max(shares) <= 1
     assert any("Guided step" in name for _, name in said)
@@ -152,16 +149,15 @@ def result(priors, asked):
 
 
 def test_a_job_and_its_files(result):
-    assert result.depth_m.shape == result.map("uncertainty").shape == (48, 64)
-    paths = write_files(result)
-    names = [path.name for path in paths]
+    assert depth_of(result).shape == map_of(result, "uncertainty").shape == (48, 64)
+    paths = files_of(result)
+    names, folder = [path.name for path in paths], paths[0].parent
     assert names[:3] == ["everything.zip", "depth_mm.png", "depth.npy"] and "confidence.npy" in names
     assert sorted(ZipFile(paths[0]).namelist()) == sorted(names[1:])
-    np.testing.assert_array_equal(np.load(result.folder / "depth.npy"), result.depth_m)
-    report = json.loads((result.folder / "report.json").read_text())
-    assert report["cameras"][0]["E"][0][3] == pytest.approx(0.12)
-    assert report["settings"]["ensemble"] == 2 and report["photographs"] == ["left.png", "right.png"]
-    assert report["depth"]["median_m"] == pytest.approx(float(np.median(result.depth_m)))
+    np.testing.assert_array_equal(np.load(folder / "depth.npy"), depth_of(result))
+    report = json.loads((folder / "report.json").read_text())
+    assert report["inputs"]["E"][0][3] == pytest.approx(0.12) and report["arguments"]["left"] == "left.png"
+    assert report["arguments"]["ensemble"] == 2 and "cx is assumed" in " ".join(report["warnings"])
     assert report["verdict"]["status"] == result.output.verdict.status
 
 
@@ -184,7 +180,7 @@ def test_a_stop_ends_a_job_between_steps(priors, asked):
             stop.set()
 
     with pytest.raises(Stopped):
-        run_job(replace(asked, run=replace(asked.run, steps=3)), priors, stop, report)
+        run_job(replace(asked, steps=3), priors, stop, report)
     assert "step" not in vars(priors.get("tiny").scheduler)  # nothing of the call is left behind
 
 
@@ -204,21 +200,20 @@ def test_a_stop_ends_a_job_between_steps(priors, asked):
 )
 def test_settings_that_a_job_refuses(priors, asked, changes, said):
     with pytest.raises(ValueError, match=said):
-        run_job(replace(asked, run=replace(asked.run, **changes)), priors, threading.Event(), ignore)
+        run(replace(asked, **changes), priors)
 
 
-def test_photographs_that_a_job_refuses(priors, asked, tmp_path, monkeypatch):
+def test_photographs_that_are_refused(photographs, tmp_path, monkeypatch):
     (tmp_path / "words.png").write_text("no image")
     for left, said in (
         (None, "the left photograph must be given"),
         (str(tmp_path / "words.png"), "the left photograph must be an image file"),
     ):
         with pytest.raises(ValueError, match=said):
-            run_job(replace(asked, left=left), priors, threading.Event(), ignore)
+            options_of(left, photographs[1], "file")
     monkeypatch.setattr(job, "MOST_MEGAPIXELS", 0.003)
-    monkeypatch.setattr(job, "read_image", lambda *_: pytest.fail("it was decoded"))
     with pytest.raises(ValueError, match="at most 0.003 megapixels; got 64x48"):
-        run_job(asked, priors, threading.Event(), ignore)
+        options_of(*photographs, "file")
 
 
 def test_without_gradio_it_says_what_to_install(monkeypatch):
@@ -254,14 +249,14 @@ class TestWithGradio:
         with gradio.Blocks():
             form = build_form(priors)
         for number, (folder, _) in enumerate(EXAMPLES):
-            request = form.request(tuple(form.example(number)))
-            assert request.baseline_m is None and request.way == "file"
-            with pytest.raises(ValueError, match="fx, px must be a number; got 'about 7'"):
-                form.request(tuple((form.untouched | {"fx": "about 7"}).values()))
-            rig = read_calibration(list(request.calibration))
-            for path in request.photographs:
+            options = form.options(tuple(form.example(number)))
+            assert options.baseline is None and not options.estimate_pose
+            rig = read_calibration(options.calib)
+            for path in options.photographs().values():
                 image, notes = read_image(path, "image")
-                assert image.shape[1::-1] == rig.size_left and notes == [] and str(folder) in path
+                assert image.shape[1::-1] == rig.size_left and notes == [] and path.parent == folder
+            with pytest.raises(ValueError, match="fx, px must be a number; got 'about 7'"):
+                form.options(tuple((form.untouched | {"fx": "about 7"}).values()))
 
     def test_the_page_hands_on_photographs_as_they_are(self, tmp_path):
         from gradio.data_classes import ImageData
@@ -285,9 +280,9 @@ class TestWithGradio:
     def test_what_visitors_read_has_no_path_and_no_option(self):
         from geodiff_plugin.app.page import for_visitors
 
-        said = "left must be an image; got /tmp/x/left.png. Widen depth_range (--near, --far)."
-        told = for_visitors(said, [Path("/tmp/x/left.png")])
-        assert told == "left must be an image; got left.png. Widen depth_range."
+        said = "LEFT must be an image; got /tmp/x/left.png. Give --fx, or widen depth_range (--near, --far)."
+        told = "the left photograph must be an image; got left.png. Give fx, or widen depth_range."
+        assert for_visitors(said) == told
 
     def test_a_port_that_another_program_has_is_a_sentence(self, monkeypatch):
         def taken(*_args, **_options):

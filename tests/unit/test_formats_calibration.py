@@ -13,7 +13,6 @@ import pytest
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.app.job import CAMERA_WAYS, Request
 from geodiff_plugin.cli.inputs import read_rig
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.formats import read_calibration
@@ -387,9 +386,9 @@ def test_every_pair_of_a_folder_has_its_own_cameras(tmp_path, kind):
     assert read("right.jpg").E.tolist() == first.E.tolist()
 
 
-def test_the_page_knows_photographs_by_their_names_alone(tmp_path):
+def test_images_may_have_other_names_than_their_paths(tmp_path):
     (tmp_path / "transforms.json").write_text(SAMPLES["nerf"][0])
-    image = np.random.default_rng(0).random((480, 640, 3)).astype(np.float32)
-    photographs = ("/tmp/page/0f/left.jpg", "/tmp/page/3a/right.jpg")
-    request = Request(*photographs, calibration=(str(tmp_path / "transforms.json"),), baseline_m=0.12)
-    assert float(CAMERA_WAYS["file"][1](request, image, image).rigs[0].E[0, 3]) == pytest.approx(0.12)
+    paths, calib = (Path("page/0f/left.jpg"), Path("page/3a/right.jpg")), (tmp_path / "transforms.json",)
+    options = DepthOptions(left=paths[0], right=paths[1], calib=calib, baseline=0.12)
+    rig = read_rig(options, (640, 480), (640, 480), names=("left.jpg", "right.jpg"))
+    assert float(rig.E[0, 3]) == pytest.approx(0.12)
