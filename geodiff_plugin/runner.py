@@ -26,7 +26,7 @@ import traceback
 import weakref
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -42,8 +42,6 @@ try:
     import fcntl
 except ImportError:  # Windows: two processes may do the same work twice
     fcntl = None  # type: ignore[assignment]
-
-__all__ = ["BROKEN", "Item", "Journal", "Record", "Runner", "fingerprint", "this_process"]
 
 Record = dict[str, Any]
 Stage = Callable[[Any], Any]
@@ -95,14 +93,9 @@ def this_process() -> Process:
 class Item:
     """One piece of work; a record of the same ``key`` and ``inputs`` says that it is done.
 
-    Attributes:
-        key: no two items of a job share one.
-        payload: what the first stage works on.
-        inputs: fingerprint of its inputs, unless ``key`` is it.
-        name: in messages; ``key`` by default.
-        head: what its record begins with, also where it fails.
-        words: texts of this item alone, such as its paths, which are no part of the cause of a failure; its
-            label where there are none.
+    The first stage works on ``payload``. ``inputs`` is the fingerprint of what it is made from, unless the
+    key is it. ``head`` begins its record, also where it fails. ``words`` are texts of this item alone, such
+    as its paths, which are no part of the cause of a failure; its label where there are none.
     """
 
     key: str
@@ -124,9 +117,6 @@ class Journal:
     Records of failures that the file holds at first do not count, so that they are tried again. An item is
     claimed by a lock on a byte of the file that its key names. The system drops these locks as soon as the
     process closes the file anywhere: it stays open, and nothing else may open it during a run.
-
-    Args:
-        path: the file; its folder is made where it is missing, and ``ValueError`` says where it cannot be.
     """
 
     def __init__(self, path: Path) -> None:
@@ -208,7 +198,7 @@ class Runner:
     """Takes the items of a job through stages, but for those that have a record.
 
     Args:
-        items: in the order in which records are returned; no two of one key.
+        items: no two of one key.
         journal: of the records.
         noun: what an item is, for the bar and messages.
         survives: exceptions of a stage that fail its item only; every other one ends the run.
@@ -246,16 +236,11 @@ class Runner:
     def run(
         self, *stages: Stage, release: Callable[[Item], None] | None = None, most: int = 4
     ) -> list[Record]:
-        """Work on every item without a record.
+        """Work on every item without a record; the records that are there, in the order of ``items``.
 
-        Args:
-            stages: the first takes an item, every other one what the stage before returned; the last returns
-                the body of the record. Several run side by side, a thread each, on different items.
-            release: called with every item that was begun, once it is through or has failed.
-            most: items on the way at a time, where there are several stages.
-
-        Returns:
-            The records that are there, in the order of ``items``; in the first process those of all items.
+        The first stage takes an item, every other one what the stage before returned, and the last returns
+        the body of the record. Several run side by side, a thread each, on ``most`` items at a time.
+        ``release`` is called with every item that was begun, once it is through or has failed.
 
         Raises:
             ValueError: every item failed, all for one reason.
@@ -371,12 +356,8 @@ def _begin(item: Item, stages: Sequence[Stage], pools: Sequence[ThreadPoolExecut
         return partial(stages[0], item)
     future = pools[0].submit(stages[0], item)
     for pool, stage in zip(pools[1:], stages[1:], strict=True):
-        future = pool.submit(_follow, stage, future)
+        future = pool.submit(lambda after, before: after(before.result()), stage, future)
     return future.result
-
-
-def _follow(stage: Stage, before: Future[Any]) -> Any:
-    return stage(before.result())
 
 
 def _say(sentence: str) -> None:

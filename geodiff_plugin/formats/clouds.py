@@ -17,8 +17,6 @@ from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 
-__all__ = ["Cloud", "flying_points", "make_cloud", "write_glb", "write_ply"]
-
 #: Depth change from one pixel to the next, as a share of the nearer depth. At a focal length of 500 px it is
 #: a surface seen at 87 degrees from its normal: hardly a surface that one camera can see.
 RELATIVE_STEP = 0.04

@@ -19,11 +19,6 @@ from geodiff_plugin.formats.out import atomic_path
 if TYPE_CHECKING:  # which imports torch
     from geodiff_plugin.types import Rig
 
-__all__ = [
-    *("STRIP_PIXELS", "depth_mm", "depth_of_disparity", "disparity_of_depth", "read_depth_png", "read_map"),
-    *("read_pfm", "row_strips", "write_depth_mm", "write_depth_npy", "write_pfm"),
-]
-
 PathLike = str | os.PathLike[str]
 LARGEST_MM, KITTI_UNITS = 65535, 256.0
 #: Pixels of a strip: a map of float64 of so many is 8 MB.

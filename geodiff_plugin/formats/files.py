@@ -28,10 +28,6 @@ if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
     import numpy as np
     from PIL import Image
 
-__all__ = [
-    *("check_file", "file_digest", "open_image", "read_matrix", "read_npy", "read_rows", "read_text"),
-]
-
 HEIC = (".heic", ".heif")
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)

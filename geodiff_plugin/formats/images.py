@@ -12,8 +12,6 @@ from PIL import Image, ImageOps
 from geodiff_plugin._checks import bad_type, bad_value, warn
 from geodiff_plugin.formats.files import open_image
 
-__all__ = ["MIN_SIDE", "as_image_01", "picture_size", "read_image"]
-
 #: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
 MIN_SIDE = 32
 #: Resampling may overshoot [0, 1] by a little; more than this is another range.

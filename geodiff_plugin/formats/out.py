@@ -24,8 +24,6 @@ try:
 except ImportError:  # Windows: two runs with one folder are not detected
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["PARTIAL", "OutFolder", "atomic_path", "check_out", "free_folder", "reason_of", "write_text"]
-
 #: The hidden folder of a run that is under way, with its lock and its files.
 PARTIAL, LOCK, FILES = ".geodiff-partial", "lock", "files"
 #: Lists what a run wrote, and is written last.
@@ -142,14 +140,10 @@ def _files_of_report(folder: Path) -> set[str]:
 class OutFolder:
     """A folder that this process alone writes to, from before the work until the result is in it.
 
-    Whatever speaks against it is said on entry.
-
-    Args:
-        path: as typed; it need not exist.
-        inputs: files that the run reads, none of which may lie in a folder that it overwrites.
-        overwrite: take a folder that holds files. Those that its report lists as an earlier run's go where
-            the new run does not write them; all others stay.
-        option: what ``path`` was given as, for messages.
+    Whatever speaks against it is said on entry. ``path`` is as typed; it need not exist. None of ``inputs``,
+    the files that the run reads, may lie in it. With ``overwrite`` it may hold files: those that its report
+    lists as an earlier run's go where the new run does not write them; all others stay. ``option`` is what
+    it was given as, for messages.
     """
 
     def __init__(

@@ -16,8 +16,6 @@ from geodiff_plugin.formats.benchmarks import KITTI_ROW
 from geodiff_plugin.formats.depth import read_depth_png, read_pfm
 from geodiff_plugin.formats.files import check_file, open_image, read_npy, read_rows, read_text
 
-__all__ = ["read_confidence", "read_ply_points", "read_points"]
-
 PathLike = str | os.PathLike[str]
 KINDS = (
     "a 16-bit PNG (millimetres), a PFM or .npy map in metres, or points in metres as .npy, text, .ply or "

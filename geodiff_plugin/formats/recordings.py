@@ -20,11 +20,6 @@ from geodiff_plugin._checks import InputFileError, bad_value, refuse
 from geodiff_plugin.formats.depth import depth_mm
 from geodiff_plugin.formats.files import check_file
 
-__all__ = [
-    *("BAG_SUFFIXES", "VIDEOS", "BagReader", "Stamp", "VideoReader", "both_halves", "count_frames", "is_bag"),
-    *("is_video", "list_pairs", "stereo_calibration", "write_depth_bag"),
-]
-
 #: Suffixes of videos, and of bags that can be written: one MCAP file of ROS 2, or a bag of ROS 1.
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 BAG_SUFFIXES = (".mcap", ".bag")
