@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -29,15 +29,8 @@ from geodiff_plugin.runner import Item, Record
 BY_A_FACTOR = 0.25
 
 
-class Part(NamedTuple):
-    """A table to be of ``refs``; ``columns``: heading -> references and pose."""
-
-    refs: Sequence[SampleRef]
-    kind: str
-    title: str
-    note: str
-    columns: Mapping[str, tuple[Sequence[SampleRef], str]]
-    views: int = 2
+#: Heading of a column -> references, and the pose that they are given.
+Columns = dict[str, tuple[Sequence[SampleRef], str]]
 
 
 def poses_table(title: str, columns: Mapping[str, Sequence[Record]], note: str) -> Table:
@@ -79,72 +72,56 @@ def _residual_table(records: Sequence[Record]) -> Table:
     return Table("Residuals", ("pair", "refined, as given", "refined, as used"), tuple(rows), note)
 
 
-def _parts(
-    real: Sequence[SampleRef],
-    rendered: Sequence[SampleRef],
-    drift: tuple[float, float],
-    change: tuple[float, float],
-) -> list[Part]:
-    """Two views, three where there are some, a drifted rig where there are rectified pairs, rendered ones."""
-    several, rectified = list[SampleRef](), list[SampleRef]()
-    for ref in real:
-        sample = load(ref)
-        several += [ref] if sample.extra_views else []
-        rectified += [ref] if sample.rectified and any(drift) else []
-    drifted = [changed_ref(ref, "drifted", drift) for ref in rectified]
-    perturbed = [changed_ref(ref, "perturbed", change) for ref in rendered]
-    withheld = "'estimated' has the poses withheld but for the length of the first baseline."
-    turned = f"The right camera has turned by {drift[0]:g} degrees and its image has moved by {drift[1]:g} px"
-    moved = (
-        f"Turned by up to {change[0]:g} degrees and shifted by up to {100 * change[1]:g} % of the baseline."
-    )
-    of_drifted = {"true, given": (rectified, "given"), "drifted, given": (drifted, "given")}
-    of_drifted |= {"drifted, refined": (drifted, "refine")}
-    of_rendered = {"true, given": (rendered, "given"), "perturbed, given": (perturbed, "given")}
-    of_rendered |= {"perturbed, refined": (perturbed, "refine"), "estimated": (rendered, "estimated")}
-
-    def every_pose(refs: Sequence[SampleRef]) -> dict[str, tuple[Sequence[SampleRef], str]]:
-        return {"refined": (refs, "refine"), "given": (refs, "given"), "estimated": (refs, "estimated")}
-
-    parts = (
-        Part(real, "real ", "two views", withheld, every_pose(real)),
-        Part(several, "real ", "three views", "", every_pose(several), views=3),
-        Part(rectified, "rectified ", "the rig drifted", f"{turned} up or down.", of_drifted),
-        Part(rendered, "rendered ", "poses perturbed", moved, of_rendered),
-    )
-    return [part for part in parts if part.refs]
+def _every_pose(refs: Sequence[SampleRef]) -> Columns:
+    return {"refined": (refs, "refine"), "given": (refs, "given"), "estimated": (refs, "estimated")}
 
 
 def run_poses(name: str, options: PosesOptions) -> Page | None:
-    """Measure, and write the tables; errors as ``run_experiment``."""
+    """Measure two views, three where there are some, rectified pairs drifted, and rendered ones perturbed."""
     change, drift = perturbation(options.perturb), drift_of(options.drift)
     size = options.rendered_size
     if size is not None and not re.fullmatch(r"\d{2,5}x\d{2,5}", size):
         cure = "256x192 has a quarter of the usual pixels."
         bad_value("--rendered-size", "WIDTHxHEIGHT in pixels", repr(size), cure)
     real, rendered = real_and_rendered(options, "synthetic-posed:{}" + (f"@{size}" if size else ""))
-    parts, columns = _parts(real, rendered, drift, change), list[dict[str, list[Item]]]()
-    for part in parts:
-        chosen = replace(options.settings, views=part.views)
-        columns.append(
-            {
-                heading: experiment.method_cells(refs, (f"guided:pose={pose}",), chosen, options.out)
-                for heading, (refs, pose) in part.columns.items()
-            }
-        )
+    cells, notes = list[Item](), dict[str, str]()
+
+    def add(kind: str, what: str, note: str, columns: Columns, views: int = 2) -> None:
+        count = len(next(iter(columns.values()))[0])
+        title = f"AbsRel of {count_of_pairs(count, kind)}, {what}"
+        notes[title], settings = note, replace(options.settings, views=views)
+        for column, (refs, pose) in columns.items():
+            for cell in experiment.method_cells(refs, (f"guided:pose={pose}",), settings, options.out):
+                cells.append(replace(cell, head={**cell.head, "table": title, "column": column}))
+
+    samples = [(ref, load(ref)) for ref in real]
+    several = [ref for ref, sample in samples if sample.extra_views]
+    rectified = [ref for ref, sample in samples if sample.rectified and any(drift)]
+    drifted = [changed_ref(ref, "drifted", drift) for ref in rectified]
+    perturbed = [changed_ref(ref, "perturbed", change) for ref in rendered]
+    withheld = "'estimated' has the poses withheld but for the length of the first baseline."
+    add("real ", "two views", withheld, _every_pose(real))
+    add("real ", "three views", "", _every_pose(several), views=3)
+    turned = f"The right camera has turned by {drift[0]:g} degrees and its image has moved by {drift[1]:g} px"
+    of_drifted = {"true, given": (rectified, "given"), "drifted, given": (drifted, "given")}
+    of_drifted |= {"drifted, refined": (drifted, "refine")}
+    add("rectified ", "the rig drifted", f"{turned} up or down.", of_drifted)
+    moved = f"Turned by up to {change[0]:g} degrees and shifted by up to {100 * change[1]:g} %"
+    of_rendered = {"true, given": (rendered, "given"), "perturbed, given": (perturbed, "given")}
+    of_rendered |= {"perturbed, refined": (perturbed, "refine"), "estimated": (rendered, "estimated")}
+    add("rendered ", "poses perturbed", f"{moved} of the baseline.", of_rendered)
 
     def page_tables(records: list[Record]) -> list[Table]:
-        by_key, shown = {record["key"]: record for record in records}, []
-        for part, planned in zip(parts, columns, strict=True):
-            filled = {heading: [by_key[cell.key] for cell in cells] for heading, cells in planned.items()}
-            title = f"AbsRel of {count_of_pairs(len(part.refs), part.kind)}, {part.title}"
-            shown.append(poses_table(title, filled, part.note))
-            shown += [_residual_table(filled["refined"])] if part.refs is real and part.views == 2 else []
+        shown = []
+        for title, own in tables.grouped(records, "table").items():
+            columns = tables.grouped(own, "column")
+            shown.append(poses_table(title, columns, notes[title]))
+            shown += [_residual_table(columns["refined"])] if title.endswith("two views") else []
         return shown
 
     said = f"Prior {options.prior[0]}, seed {options.seed}. All pixels with truth, metres as they come out."
-    cells, title = [cell for own in columns for items in own.values() for cell in items], "Results by pose"
-    return run_experiment(name, options, title, cells, page_tables, lambda _: [said], experiment.RECORDS_NAME)
+    journal, title = experiment.RECORDS_NAME, "Results by pose"
+    return run_experiment(name, options, title, cells, page_tables, lambda _: [said], journal)
 
 
 #: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.

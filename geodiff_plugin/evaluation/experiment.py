@@ -36,9 +36,8 @@ from geodiff_plugin.formats.out import write_text
 from geodiff_plugin.runner import Item, Journal, Record, Runner, fingerprint, this_process
 from geodiff_plugin.runtime.machine import PeakMemory, versions
 
+#: Journal of methods on samples, which several commands share.
 RECORDS_NAME = "samples.jsonl"
-"""Journal of methods on samples, which several commands share."""
-
 Tables = Callable[[list[Record]], Sequence[Table]]
 
 

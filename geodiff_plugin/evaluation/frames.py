@@ -1,8 +1,4 @@
-"""Frames of a moving camera: ``geodiff eval sequence`` and ``geodiff eval capture``.
-
-A sequence is of a rig, its frames alone or each from the one before; a capture is of one camera, with the
-poses as given, refined by pairs, and solved together.
-"""
+"""Frames of a moving rig (``geodiff eval sequence``) and of a moving camera (``geodiff eval capture``)."""
 
 from __future__ import annotations
 
@@ -32,8 +28,7 @@ from geodiff_plugin.runtime.pipeline import native_images
 
 #: What makes a sequence, by name; a checkout registers its renderer (tests/scenes/dataset.py).
 SEQUENCES: dict[str, Any] = {}
-#: A point is the same in the next frame where the depth there is its own within this share; a point that the
-#: next frame sees so much nearer or further is hidden there.
+#: Within the first share of its depth, a point is the same in the next frame; beyond the second it is hidden.
 SAME_SURFACE, HIDDEN_SHARE = 0.01, 0.3
 #: Distance within which a point of a cloud counts as right, metres, and the clouds' grid.
 RIGHT_M, CELL_M = 0.05, 0.02
@@ -141,10 +136,6 @@ def sequence_tables(records: Sequence[Record]) -> list[Table]:
     return [table_of_groups("From frame to frame", records, ("way",), _SEQUENCE_COLUMNS, note)]
 
 
-CAPTURE_PURPOSE = (
-    "Depth of frames of a moving camera, with the bundled prior unless the command says otherwise: poses as "
-    "the tracker gave them, refined by the views of each frame alone, and solved over the whole capture."
-)
 _CAPTURE_COLUMNS: dict[str, CellOf] = {
     "poses": lambda own: str(own[0]["row"]),
     "views": lambda own: str(own[0]["views"]),
@@ -159,10 +150,11 @@ _CAPTURE_COLUMNS: dict[str, CellOf] = {
     "TAE %": mean_of("tae", 2),
 }
 CAPTURE_NOTE = (
-    "AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its median. "
-    "Scale: median of depth over truth. Agreed: AbsRel after the frames of the table were checked against "
-    "each other. F: of the fused cloud beside that of the true depth under the same poses. TAE: of frames "
-    "one after the other, as chosen."
+    "Poses as the tracker gave them, refined by the views of each frame alone, and solved over the whole "
+    "capture. AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its "
+    "median. Scale: median of depth over truth. Agreed: AbsRel after the frames of the table were checked "
+    "against each other. F: of the fused cloud beside that of the true depth under the same poses. TAE: of "
+    "frames one after the other, as chosen."
 )
 
 
@@ -225,7 +217,7 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
             for data, own in grouped(records, "data").items()
         ]
 
-    return run_experiment(name, options, "Captures", cells, tables, lambda _: (CAPTURE_PURPOSE, CAPTURE_NOTE))
+    return run_experiment(name, options, "Captures", cells, tables, lambda _: (CAPTURE_NOTE,))
 
 
 def _measure_frames(

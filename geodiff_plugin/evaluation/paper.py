@@ -158,10 +158,7 @@ ABLATED = ("guided", "paper")
 def layout_table(
     layout: Layout, columns: Sequence[Column], records: Sequence[Record], methods: Sequence[str]
 ) -> Table:
-    """A table in the paper's layout, with rows of the other methods below the paper's.
-
-    One column per data set and metric; beside each complete data set the paper's cells, as printed.
-    """
+    """Rows of other methods below the paper's; beside each complete data set the cells as published."""
     count, values = len(layout.metrics), dict[bool, list[tables.Values]]()
     for kind in ("raw", "aligned"):
         values[kind == "aligned"] = [tables.metric_values(records, kind, metric) for metric in layout.metrics]
@@ -222,11 +219,7 @@ def _ablation_columns(options: PairsOptions) -> tuple[Column, ...]:
 
 
 def run_paper_table(name: str, options: PairsOptions) -> Page | None:
-    """Measure what one table of the paper needs, and write it; ``options.methods`` are run beside its own.
-
-    Errors as ``run_experiment``; where nothing that the table needs is there, the message says how to obtain
-    it.
-    """
+    """Measure what one table of the paper needs, and write it; ``options.methods`` are run beside its own."""
     layout, posed, ablation = LAYOUTS[name], name == "table3", name == "ablation"
     if options.data is None and not ablation:
         obtain = " ".join(f"{column.title}: {column.obtain}" for column in layout.columns)

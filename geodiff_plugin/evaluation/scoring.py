@@ -41,9 +41,8 @@ def out_of_view(sample: StereoSample) -> np.ndarray:
 def matched(sample: StereoSample) -> np.ndarray | None:
     """``(H, W)`` bool: pixels where our plane sweep of the two views has a reliable match.
 
-    No method, prior or truth has a part in it, and poses are the true ones, however they are given. It is
-    kept until another sample object comes, so that one sweep serves all methods, and made on the CPU, so that
-    no two runs differ. ``None`` where the views cannot be swept: no overlap, no baseline, too small an image.
+    No method, prior or truth has a part in it, and poses are the true ones. Kept until another sample object
+    comes, and made on the CPU, so that no two runs differ. ``None`` where the views cannot be swept.
     """
     try:
         volume = sweep(replace(sample, E=sample.E_scored), "cpu")

@@ -40,17 +40,11 @@ from geodiff_plugin.runner import Item, Record
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
-PURPOSE = (
-    "What guidance gains with better priors. An emulated prior answers with the true depth plus a known "
-    "error. *2%* to *20%* is the mean absolute error of its log depth, half of it smooth and half constant "
-    "over segments of the image; *blur* is 1 % and a blurred map; *gamma* is a map raised to the power 1.6, "
-    "which no scale and shift makes up for. Its later answers are in part what its noisy input says "
-    "(*following by 0.3*: 30 %), so it sees corrections as a network does. *Surfaces* is the error of the "
-    "slope of log depth away from edges: the lower, the smoother."
-)
 NOTE = (
-    "AbsRel and δ1 in metres, without alignment but for the prior with oracle; AbsRel within 3 px of the "
-    "truth's edges; error of the slope of log depth away from them, per mille a pixel."
+    "The emulated prior's log depth is off by so much in the mean, half of it smooth and half constant over "
+    "segments of the image; blur: 1 % and a blurred map; gamma: a map to the power 1.6, which no scale and "
+    "shift makes up for. AbsRel and δ1 in metres, without alignment but for the prior with oracle; AbsRel "
+    "within 3 px of the truth's edges; error of the slope of log depth away from them, per mille a pixel."
 )
 
 COLUMNS: dict[str, CellOf] = {
@@ -96,10 +90,7 @@ def relative_map(sample: StereoSample, strength: Strength, space: str, seed: int
 
 
 def _error(log_depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """``(H, W)`` of mean absolute value 1 and median 0: half smooth, half constant over segments.
-
-    A segment is the part of a cell of the picture that lies at one of its depths: things err as wholes.
-    """
+    """``(H, W)`` of mean absolute value 1, median 0: half smooth, half constant over parts of one depth."""
     height, width = log_depth.shape
     side = max(height, width)
     smooth = ndimage.gaussian_filter(rng.normal(size=(height, width)), SMOOTH * side, mode="reflect")
@@ -264,7 +255,6 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
 
     def remarks(records: list[Record]) -> list[str]:
         sentences = [
-            PURPOSE,
             f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; "
             f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}.",
         ]

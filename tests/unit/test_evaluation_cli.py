@@ -65,14 +65,17 @@ def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
         assert word in said
 
 
-def test_pairs_goes_on_after_a_broken_sample_on_request(data, tmp_path):
-    (data / "one" / "im1.png").unlink()
+def test_pairs_goes_on_after_a_broken_sample_on_request_and_tries_it_again(data, tmp_path):
+    picture = data / "one" / "im1.png"
     words = ("pairs", data, "--methods", "sgbm,sweep-sgm", "-o", tmp_path / "out")
+    picture.rename(tmp_path / "kept.png")
     with pytest.raises(FileNotFoundError, match=r"im1\.png"):
         invoke(*words)
     said = invoke(*words, "--skip-broken")
     assert "1 broken sample was skipped" in said and said.count("im1.png") == 1
     assert "(sgbm, sweep-sgm)" in said
+    (tmp_path / "kept.png").rename(picture)
+    assert "broken" not in invoke(*words)
 
 
 @pytest.mark.parametrize(

@@ -67,38 +67,18 @@ def bench(monkeypatch, tmp_path):
     return Bench(monkeypatch, tmp_path)
 
 
-@pytest.mark.parametrize("cut", [0, 2, 400])
-def test_a_run_does_only_what_is_missing(bench, cut):
+def test_a_run_does_only_what_is_missing(bench):
     first = bench.go()
     assert len(bench.calls) == 6 and [r["status"] for r in first].count("not applicable") == 1
-    os.truncate(bench.path, bench.path.stat().st_size - cut)  # killed
-    whole = bench.path.read_bytes().count(b"\n")
+    os.truncate(bench.path, bench.path.stat().st_size - 2)  # killed while it wrote
     again = bench.go()
-    assert len(bench.calls) == 6 - whole
+    assert len(bench.calls) == 1
     for record in (*first, *again):
         record.pop("seconds", None)
     assert again == first
-    bench.go()
     bench.add("double", lambda *_: 3.0, {"factor": 3})  # another configuration is another result
     records = bench.go()
     assert [call[0] for call in bench.calls] == ["double"] * 3 and headline(records[1]) == pytest.approx(2)
-
-
-def test_broken_sample_stops_or_is_counted_and_tried_again(bench, monkeypatch):
-    def fails(ref):
-        if ref.name == "b":
-            raise FileNotFoundError("left.png is missing")
-        return bench.samples[ref.name]
-
-    monkeypatch.setattr(experiment, "load", fails)
-    with pytest.raises(FileNotFoundError, match=r"left\.png"):
-        bench.go()
-    records = bench.go(skip_broken=True)
-    assert [r["status"] for r in records] == ["ok", "ok", "broken", "broken", "ok", "not applicable"]
-    assert records[2]["error"] == "left.png is missing"
-    monkeypatch.setattr(experiment, "load", lambda ref: bench.samples[ref.name])
-    assert [r["status"] for r in bench.go()] == ["ok"] * 5 + ["not applicable"]
-    assert {name for _, name in bench.calls} == {"b"}
 
 
 def test_a_saved_map_is_that_of_the_record(bench):
@@ -122,9 +102,9 @@ def test_crop_is_scored_and_is_another_result(bench):
     image, depth_m = np.zeros((50, 60, 3), np.uint8), np.full((50, 60), 2.0, np.float32)
     changed = {"left": image, "right": image, "depth_m": depth_m, "valid": depth_m > 0}
     bench.samples["a"] = replace(bench.samples["a"], **changed)
-    records = bench.go(["exact"], refs=REFS[:1], crop="garg")
+    (record,) = bench.go(["exact"], refs=REFS[:1], crop="garg")
     rows, columns = int(0.99189189 * 50) - int(0.40810811 * 50), int(0.96405229 * 60) - int(0.03594771 * 60)
-    assert len(bench.calls) == 1 and records[0]["all_pixels"]["raw"]["pixels"] == rows * columns
+    assert len(bench.calls) == 1 and record["all_pixels"]["raw"]["pixels"] == rows * columns
 
 
 def test_tables_hold_pairs_means_and_differences(bench):
