@@ -159,13 +159,13 @@ def read_colmap_points(folder: Path) -> dict[int, np.ndarray]:
     """The reliable points ``(n, 3)`` that an image of a model sees, by its number, in the model's world."""
     path = folder / "points3D.txt"
     rows = _text_points(path) if path.exists() else _binary_points(path.with_suffix(".bin"))
-    seen: dict[int, list[np.ndarray]] = {}
+    seen: dict[int, list[tuple[float, ...]]] = {}
     for numbers, images in rows:
-        xyz_error = array_of(numbers, (4,), f"a point of {path}")
-        if len(images) >= FEWEST_VIEWS and xyz_error[3] <= MOST_ERROR_PX:
+        x, y, z, error_px = map(float, numbers)
+        if len(images) >= FEWEST_VIEWS and error_px <= MOST_ERROR_PX:
             for image in set(images):
-                seen.setdefault(int(image), []).append(xyz_error[:3])
-    return {image: np.array(points) for image, points in seen.items()}
+                seen.setdefault(int(image), []).append((x, y, z))
+    return {image: array_of(points, (-1, 3), f"points of {path}") for image, points in seen.items()}
 
 
 def _text_points(path: Path) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:

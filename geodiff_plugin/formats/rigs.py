@@ -104,7 +104,7 @@ def reading_whole(source: object, summary: str) -> Iterator[None]:
 def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Finite numbers, or text of them, as a float64 array of ``shape``; ``(-1,)`` takes any count."""
     count = math.prod(shape)
-    expected = {1: "a finite number", -1: "finite numbers"}.get(count, f"{count} finite numbers")
+    expected = {1: "a finite number"}.get(count, f"{count} finite numbers" if count > 0 else "finite numbers")
     try:
         numbers = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):  # a whole number of any length is JSON
