@@ -73,11 +73,13 @@ def read_inputs(
         bad_value("right", "an image, or None together with points", "None without points")
     if points is None and points_confidence is not None:
         bad_value("points_confidence", "given with points", "no points")
-    count = len(
-        next((x for x in (right, points) if isinstance(x, list) and not _is_nested_matrix(x)), [None])
-    )
+    lists = [x for x in (right, points) if isinstance(x, list) and not _is_nested_matrix(x)]
+    count = len(lists[0]) if lists else 1
     if right is not None and not isinstance(right, list) and count == 1:
-        K, E = _as_tuple(K), _as_tuple(E)
+        # A list of matrices beside one left image is the tuple of cameras that is meant.
+        K, E = (
+            tuple(x) if isinstance(x, list) and len(x) > 1 and not _is_nested_matrix(x) else x for x in (K, E)
+        )
     if count == 0:
         bad_value("right", "an image or a list with one image per left image", "an empty list")
     inputs = []
@@ -124,12 +126,6 @@ def _is_nested_matrix(value: list[Any]) -> bool:
     """A matrix written as nested lists of numbers, as opposed to a list with one entry per image."""
     rows = bool(value) and all(isinstance(row, (list, tuple)) for row in value)
     return rows and all(isinstance(entry, Real) for row in value for entry in row)
-
-
-def _as_tuple(value: Any) -> Any:
-    """A list of matrices beside one left image is the tuple of cameras that is meant."""
-    matrices = isinstance(value, list) and len(value) > 1 and not _is_nested_matrix(value)
-    return tuple(value) if matrices else value
 
 
 def _entry(value: Any, name: str, i: int, count: int) -> Any:
@@ -200,20 +196,19 @@ def as_points(value: Any, name: str, confidence: Any = None) -> Tensor:
         array = array[:, :3]
     if array.shape[1] != 3 or not isinstance(value, (list, tuple)):  # whole metres typed by hand are meant so
         check_metres(array, name)
-    array = array.astype(np.float32)
-    finite = np.isfinite(array)
-    weight = None if confidence is None else _as_confidence(confidence, array, f"{name}_confidence")
-    if array.shape[1] == 3:
-        use = finite.all(1) if weight is None else finite.all(1) & (weight > 0)
-        array = array[use] if weight is None else np.column_stack([array, weight])[use]
-        count = len(array)
-    else:
-        use = finite & (array > 0) if weight is None else finite & (array > 0) & (weight > 0)
-        array = np.where(use, array, np.float32(0))
-        count = int(np.count_nonzero(array))
-        array = array if weight is None else np.stack([array, np.where(use, weight, np.float32(0))], axis=-1)
-    if not count:
+    array, is_cloud = array.astype(np.float32), array.shape[1] == 3
+    known = np.isfinite(array).all(1) if is_cloud else np.isfinite(array) & (array > 0)
+    parts = [array]
+    if confidence is not None:
+        parts.append(_as_confidence(confidence, array, f"{name}_confidence"))
+        known &= parts[1] > 0
+    if not known.any():
         bad_value(name, forms + ", at least one of them known", "none: all are 0, NaN or infinite")
+    if is_cloud:
+        array = np.column_stack(parts)[known]
+    else:
+        array = np.stack([np.where(known, part, np.float32(0)) for part in parts], axis=-1)
+        array = array if confidence is not None else array[..., 0]
     return torch.from_numpy(np.ascontiguousarray(array))
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.formats.depth import row_strips
-from geodiff_plugin.geometry import as_fine_as, warp_right_to_left
+from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
 from geodiff_plugin.types import CameraView
 
 #: Standard deviation of a good match, pixels of the left image.
@@ -81,17 +81,13 @@ def depth_confidence(
     """
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
-    everywhere = prior_error is None or prior_error.shape[-1] == 1
-    if prior_error is not None and prior_error.shape[-1] > 1:
-        prior_error = F.interpolate(prior_error, support.shape[-2:], mode="nearest-exact")
-    for rows in row_strips(*support.shape[-2:]):  # evidence is five times as large as what it says
-        evidence = depth_evidence(
-            support[:, :, rows],
-            error[:, :, rows],
-            visible[:, :, rows],
-            None if spread is None else spread[:, :, rows],
-            prior_error if prior_error is None or everywhere else prior_error[:, :, rows],
-        )
+    size = image_size(support)
+    if prior_error is not None and image_size(prior_error) != (1, 1):
+        prior_error = F.interpolate(prior_error, size, mode="nearest-exact")
+    for rows in row_strips(*size):  # evidence is five times as large as what it says
+        shown = [x[:, :, rows] for x in (support, error, visible)]
+        further = (None if x is None else x.expand_as(support)[:, :, rows] for x in (spread, prior_error))
+        evidence = depth_evidence(*shown, *further)
         confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
     return confidence
 
@@ -145,10 +141,9 @@ def _warped(
 
     Rays and places to sample at take ten times the memory of the image that comes of them.
     """
-    height, width = depth_m.shape[-2:]
-    warped = right_01.new_empty((1, right_01.shape[1], height, width))
+    warped = right_01.new_empty((1, right_01.shape[1], *image_size(depth_m)))
     visible = torch.empty_like(depth_m, dtype=torch.bool)
-    for rows in row_strips(height, width):
+    for rows in row_strips(*image_size(depth_m)):
         K_strip = K_left.clone()
         K_strip[:, 1, 2] -= rows.start
         part = warp_right_to_left(right_01, depth_m[:, :, rows], K_strip, K_right, T_right_from_left)

@@ -294,8 +294,7 @@ def _indicators(
     run: GuidedRun, image: int, K_left: Tensor, depth_m: Tensor, relative: Tensor, **more: Any
 ) -> Indicators:
     """Indicators of one image; matches to judge it by are made here, where its run used none."""
-    samples = [(t, i) for t in run.trajectories for i, owner in enumerate(t.owners) if owner == image]
-    evidence, config = run.evidence[image], run.config
+    samples, evidence, config = run.samples_of(image), run.evidence[image], run.config
     order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())
     if evidence.matches is None and evidence.native_views:
         with suppress(InputError):  # views without overlap: not judged

@@ -128,10 +128,11 @@ class GuidedRun:
         """Metric depth ``(B, 1, H, W)`` of the next chunk of final latents, on the padded processing grid."""
         chunk = len(self.relative)
         trajectory, x = self.trajectories[chunk], self._results[chunk]
-        if x is None:
-            x = self.grid.padded(self.prior.decode(latents[:, self.prior.latents]).float())
-        else:  # as it was encoded: decoding would add the autoencoder's loss and the scheduler's noise
-            x = self.grid.padded(x)
+        if (
+            x is None
+        ):  # else as it was encoded: decoding adds the autoencoder's loss and the scheduler's noise
+            x = self.prior.decode(latents[:, self.prior.latents]).float()
+        x = self.grid.padded(x)
         self.relative.append(self.grid.cropped(x))
         trajectory.note("the map of the final latent", x)
         depth_m = trajectory.metric(x, trajectory.affine)
@@ -150,13 +151,17 @@ class GuidedRun:
         )
         return depth_m.clamp_(near_m.amin(1, keepdim=True), far_m.amax(1, keepdim=True))
 
+    def samples_of(self, image: int) -> list[tuple[Trajectory, int]]:
+        """The samples of an image: the trajectory of each, and its place in that."""
+        return [(t, i) for t in self.trajectories for i, owner in enumerate(t.owners) if owner == image]
+
     def kept_and_error(self, image: int, member: int | None = None) -> tuple[Tensor | None, Tensor | None]:
         """What the first estimates say of one image's matches, of one member or in the mean of all.
 
         ``(1, 1, h, w)``, the share of each match's confidence that remains once reflections are rejected, and
         the prior's error in log depth, as ``correction.local_error`` gives it; ``None`` where not measured.
         """
-        samples = [(t, i) for t in self.trajectories for i, owner in enumerate(t.owners) if owner == image]
+        samples = self.samples_of(image)
         chosen = samples if member is None else samples[member : member + 1]
 
         def mean(name: str) -> Tensor | None:
