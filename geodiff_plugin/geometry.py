@@ -94,9 +94,8 @@ def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> 
 class PlaneRays(NamedTuple):
     """Where a left pixel goes in the right view, as a line in its depth: ``p = z * A + b``.
 
-    Attributes:
-        A: ``(B, 3, H * W)``, homogeneous right pixel of the left pixel's point at infinity.
-        b: ``(B, 3, 1)``, homogeneous right pixel of the left camera's centre (the epipole).
+    ``A (B, 3, H * W)`` is the homogeneous right pixel of the left pixel's point at infinity, ``b (B, 3, 1)``
+    that of the left camera's centre (the epipole).
     """
 
     A: Tensor
@@ -109,9 +108,7 @@ def made_there(like: Tensor, *values: float) -> Tensor:
 
 
 def unproject(depth_m: Tensor, K: Tensor) -> Tensor:
-    """Points ``(B, H, W, 3)`` metres of a depth map ``(B, 1, H, W)`` in its camera's frame; differentiable.
-
-    ``K (B, 3, 3)`` is in pixels of the map's grid; a skew ``K[0, 1]`` is obeyed, here and everywhere.
+    """Points ``(B, H, W, 3)`` metres of a depth map ``(B, 1, H, W)`` in its camera's frame; a skew is obeyed.
 
     Convention:
         The pixel at the principal point has ``x = y = 0``; one focal length to its right has ``x = z``.
@@ -157,9 +154,8 @@ def plane_rays(
 ) -> PlaneRays:
     """Everything of the projection from a left grid ``(H, W)`` to the right image that does not need depth.
 
-    ``K_left (B, 3, 3)`` is in pixels of that grid, ``K_right`` in pixels of the right image. The pixel with
-    depth z has the homogeneous right pixel ``z * A + b``, whose third component is its depth in the right
-    view.
+    The pixel with depth z has the homogeneous right pixel ``z * A + b``, whose third component is its depth
+    there.
 
     Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
     """
@@ -199,8 +195,6 @@ class Warped:
 
 def sample_at(image: Tensor, uv: Tensor, *, mode: str = "bilinear") -> Tensor:
     """Values ``(B, C, h, w)`` of an image ``(B, C, H, W)`` at ``uv (B, h, w, 2)`` pixels, its edge repeated.
-
-    Differentiable in the image and, inside of it and for ``mode="bilinear"``, in ``uv``.
 
     Convention:
         (0, 0) is the centre of the first pixel. A ``uv`` that grows by 1 in its first component reads one

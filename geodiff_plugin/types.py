@@ -63,33 +63,22 @@ class Rig:
 class PoseReport:
     """Poses of one image's right views: as given, as used, and how well they fit the matches.
 
-    Residuals are in pixels of the right images, resized to the left image's pixels per radian; the left image
-    is at most 832 wide.
-
-    Attributes:
-        status: ``"given"`` (not checked, by configuration), ``"fits"``, ``"refined"``, ``"kept"`` (no better
-            pose nearby), ``"mistaken"`` (a usual mistake explains the misfit; the pose is used as given) or
-            ``"not checked"``.
-        E_given: ``(4, 4)`` each, metres, pose of every right camera in the left camera's frame, as given.
-        E: the same as used.
-        residual_px_given: median distance of the matches from their epipolar lines, for each right view.
-        residual_px: the same with the poses, and images, as used.
-        matches: number of matches of each right view.
-        straightened_px: root mean square displacement applied to the right images; 0 for none.
-        scale_spread: relative standard deviation of the scale of refined poses; ``None`` where the length of
-            the baseline is measured, and where the poses are used as given.
-        warnings: sentences for the user.
+    ``status`` is ``"given"`` (not checked, by configuration), ``"fits"``, ``"refined"``, ``"kept"`` (no better
+    pose nearby), ``"mistaken"`` (a usual mistake explains the misfit; the pose is used as given) or ``"not
+    checked"``. Residuals are in pixels of the right images, resized to the left image's pixels per radian; the
+    left image is at most 832 wide. ``scale_spread`` is ``None`` where the length of the baseline is measured,
+    and where the poses are used as given.
     """
 
     status: str
-    E_given: tuple[np.ndarray, ...]
-    E: tuple[np.ndarray, ...]
-    residual_px_given: tuple[float, ...] = ()
-    residual_px: tuple[float, ...] = ()
-    matches: tuple[float, ...] = ()
-    straightened_px: tuple[float, ...] = ()
-    scale_spread: float | None = None
-    warnings: tuple[str, ...] = ()
+    E_given: tuple[np.ndarray, ...]  # (4, 4) each, metres, pose in the left camera's frame
+    E: tuple[np.ndarray, ...]  # the same as used
+    residual_px_given: tuple[float, ...] = ()  # median distance of the matches from their epipolar lines
+    residual_px: tuple[float, ...] = ()  # the same with the poses, and images, as used
+    matches: tuple[float, ...] = ()  # their number, of each right view
+    straightened_px: tuple[float, ...] = ()  # root mean square displacement of the right images; 0 for none
+    scale_spread: float | None = None  # relative standard deviation of the scale of refined poses
+    warnings: tuple[str, ...] = ()  # sentences for the user
 
 
 class CameraView(NamedTuple):
@@ -106,27 +95,16 @@ class CameraView(NamedTuple):
 
 @dataclass(frozen=True)
 class StepReport:
-    """Report of one guided denoising step, with one entry per sample of the batch.
+    """Report of one guided denoising step, with one entry per sample of the batch."""
 
-    Attributes:
-        step: index of the step in the schedule, from 0.
-        timestep: the scheduler's timestep.
-        loss: ``(B,)`` total loss at the start of the step's updates.
-        terms: ``(B,)`` unweighted value of every term, by name.
-        s_hat: ``(B,)`` raw scale before softplus, after the step; ``t_hat`` the shift.
-        t_hat: ``(B,)``.
-        g_s: ``(B,)`` global scale in use, metres.
-        visible_fraction: ``(B,)`` share of the pixels that a right view sees; 0 without one.
-    """
-
-    step: int
-    timestep: float
-    loss: torch.Tensor
-    terms: dict[str, torch.Tensor]
-    s_hat: torch.Tensor
-    t_hat: torch.Tensor
-    g_s: torch.Tensor
-    visible_fraction: torch.Tensor
+    step: int  # index of the step in the schedule, from 0
+    timestep: float  # the scheduler's
+    loss: torch.Tensor  # (B,) total loss at the start of the step's updates
+    terms: dict[str, torch.Tensor]  # (B,) unweighted value of every term, by name
+    s_hat: torch.Tensor  # (B,) raw scale before softplus, after the step
+    t_hat: torch.Tensor  # (B,) raw shift likewise
+    g_s: torch.Tensor  # (B,) global scale in use, metres
+    visible_fraction: torch.Tensor  # (B,) share of the pixels that a right view sees; 0 without one
 
 
 @dataclass

@@ -31,40 +31,23 @@ from geodiff_plugin.types import CameraView, PoseReport
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the views and points say before any diffusion step, on the grid of the evidence.
+    """What the views and points say before any diffusion step, on the grid of the evidence."""
 
-    Attributes:
-        left_01: ``(3, H, W)`` in [0, 1].
-        native_left: the same at its native size.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
-        views: the further views, at as many pixels per radian; none where only points are known.
-        volume: plane-sweep costs, or ``None`` where the configuration does not search it.
-        matches: aggregated, left-right checked, or ``None`` where no term asks.
-        points: depths that the user knows, in the form of matches, or ``None``.
-        reliable: ``matches`` as points for the search, where enough are reliable; else ``None``.
-        native_views: the further views as everything downstream sees them, at their native sizes.
-        pose: how their poses fit; ``None`` where only points are known.
-        warnings: sentences for the user.
-    """
-
-    left_01: Tensor
-    native_left: Tensor
-    K_left: Tensor
-    views: tuple[CameraView, ...]
-    volume: CostVolume | None
-    matches: Matches | None
-    points: Matches | None = None
-    reliable: Matches | None = None
-    native_views: tuple[CameraView, ...] = ()
-    pose: PoseReport | None = None
-    warnings: tuple[str, ...] = ()
+    left_01: Tensor  # (3, H, W) in [0, 1]
+    native_left: Tensor  # the same at its native size
+    K_left: Tensor  # (3, 3) pixels of ``left_01``
+    views: tuple[CameraView, ...]  # at as many pixels per radian; none where only points are known
+    volume: CostVolume | None  # where the configuration searches it
+    matches: Matches | None  # aggregated, left-right checked, where a term asks
+    points: Matches | None = None  # depths that the user knows, in the form of matches
+    reliable: Matches | None = None  # ``matches`` as points for the search, where enough are reliable
+    native_views: tuple[CameraView, ...] = ()  # as everything downstream sees them, at their native sizes
+    pose: PoseReport | None = None  # how their poses fit
+    warnings: tuple[str, ...] = ()  # sentences for the user
 
 
 def within(evidence: Evidence, valid: Tensor) -> Evidence:
-    """Evidence with confidence 0 where the prior says nothing, by ``valid (1, H, W)`` bool on any grid.
-
-    The prior's scale is found by the rest. Points stay as they are if none of them is left.
-    """
+    """Evidence with confidence 0 where the prior is not ``valid``, on any grid; or all of its points."""
     matches, points = (m and m.within(valid) for m in (evidence.matches, evidence.points))
     if points is not None and not bool(points.confidence.any()):
         points = evidence.points

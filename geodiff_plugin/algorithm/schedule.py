@@ -18,12 +18,9 @@ class Round(NamedTuple):
 
 @dataclass(frozen=True)
 class Schedule:
-    """Every denoising step of a guided call.
+    """Every denoising step of a guided call: the rounds of each that runs, none where it is the prior's own.
 
-    Attributes:
-        steps: the rounds of each step that runs; none where it is the prior's own, which decodes nothing.
-        skipped: steps before them that a warm start leaves out.
-        moves: whether rounds move latents, and not only scale and shift.
+    ``skipped`` steps before them are left out by a warm start; ``moves``: rounds move latents too.
     """
 
     steps: tuple[tuple[Round, ...], ...]

@@ -23,36 +23,20 @@ from geodiff_plugin.types import StepReport
 
 
 class Trajectory:
-    """One chunk of samples along the schedule.
+    """One chunk of samples along the schedule; those of an image, of the ``owners``, lie side by side.
 
-    Args:
-        config: hyperparameters of ``GeometryGuidance``.
-        evidence: one entry per image of the call.
-        owners: for every sample of the chunk the image that it belongs to; those of an image side by side.
-        space: what the prior's output is affine in.
-        step_latents: step size of the latent's rule.
-        prior_range: metres ``(B,)`` of ``x = 0`` and ``x = 1`` by a metric prior; ``None`` for a relative
-            one.
-        start_range: metres ``(B,)`` of both ends of another frame, in place of the first search.
-        valid: ``(B, 1, h, w)`` bool, where the prior says something; elsewhere matches alone decide.
-
-    Attributes:
-        affine: scale, shift and g_s of the latest update, once ``settle_scale`` was called.
-        kept: ``(B, 1, H, W)``, the share of each match's confidence that remains without reflections.
-        error: ``(B, 1, 1, 1)`` of the prior's first estimate in log depth (``correction.prior_error``).
-        hidden: ``(B, V, 1, H, W)`` bool, what the estimate hides from the right cameras.
-        order: ``(B,)`` in [-1, 1], rank correlation of the prior's first map and matches or points.
-        on_edge: ``(B,)`` bool, whether the last search ended on the edge of its range.
-        prior_depth: ``(B, 1, h, w)`` metres, a metric prior's first estimate.
+    The search for the scale starts from ``prior_range``, metres ``(B,)`` of ``x = 0`` and ``x = 1`` by a metric
+    prior, or from ``start_range``, both ends of another frame. ``valid (B, 1, h, w)`` bool is where the prior
+    says something: elsewhere its map has no part in the scale, and matches alone decide.
     """
 
-    affine: AffineState
-    kept: Tensor | None = None
-    error: Tensor | None = None
-    hidden: Tensor | None = None
-    order: Tensor | None = None
-    prior_depth: Tensor | None = None
-    on_edge: Tensor | None = None
+    affine: AffineState  # of the latest update, once ``settle_scale`` was called
+    kept: Tensor | None = None  # (B, 1, H, W), share of each match's confidence without reflections
+    error: Tensor | None = None  # (B, 1, 1, 1) of the prior's first estimate (``correction.prior_error``)
+    hidden: Tensor | None = None  # (B, V, 1, H, W) bool, what the estimate hides from the right cameras
+    order: Tensor | None = None  # (B,), rank correlation of the prior's first map and matches or points
+    prior_depth: Tensor | None = None  # (B, 1, h, w) metres, a metric prior's first estimate
+    on_edge: Tensor | None = None  # (B,) bool, whether the last search ended on the edge of its range
 
     def __init__(
         self,

@@ -145,32 +145,18 @@ def _best_explained(error: Tensor, mask: Tensor, views: int) -> tuple[Tensor, Te
 
 
 class Compared(NamedTuple):
-    """One metric estimate on the loss grid, and what the terms compare it with.
+    """One metric estimate on the loss grid, and what the terms compare it with."""
 
-    Attributes:
-        depth_m: ``(B, 1, H, W)`` metres, carries the graph.
-        left_01: ``(B, 3, H, W)`` the left image.
-        warped_01: ``(B, V, 3, H, W)`` every right image seen from the left through ``depth_m``.
-        visible: ``(B, V, 1, H, W)`` bool: in view of that camera, and not hidden from it as far as we know.
-        affine: current scale, shift, g_s; carries the graph.
-        affine_start: where the search put them; no graph.
-        z0: ``(B, C, h, w)`` current clean latent, carries the graph.
-        anchor: ``(B, C, h, w)`` the network's clean latent of this step, moved by its corrections; no graph.
-        matches: those that are believed, or ``None``.
-        points: depths that the user knows, or ``None``.
-        config: the terms' numbers.
-    """
-
-    depth_m: Tensor
-    left_01: Tensor
-    warped_01: Tensor
-    visible: Tensor
-    affine: AffineState
-    affine_start: AffineState
-    z0: Tensor
-    anchor: Tensor
-    matches: Matches | None
-    points: Matches | None = None
+    depth_m: Tensor  # (B, 1, H, W) metres, carries the graph
+    left_01: Tensor  # (B, 3, H, W)
+    warped_01: Tensor  # (B, V, 3, H, W) every right image seen from the left through ``depth_m``
+    visible: Tensor  # (B, V, 1, H, W) bool: in view of that camera, and not hidden from it as far as we know
+    affine: AffineState  # carries the graph
+    affine_start: AffineState  # where the search put it
+    z0: Tensor  # (B, C, h, w) current clean latent, carries the graph
+    anchor: Tensor  # (B, C, h, w) the network's clean latent of this step, moved by its corrections
+    matches: Matches | None  # those that are believed
+    points: Matches | None = None  # depths that the user knows
     config: GuidanceConfig = DEFAULT
 
 
@@ -204,9 +190,9 @@ def matches_term(compared: Compared) -> Tensor:
 def points_term(compared: Compared) -> Tensor:
     """Error at depths that the user knows (lidar, structure from motion, a tape).
 
-    ``points_loss="robust"`` is the Cauchy loss of the matches: a wrong point (seen through a window, or from
-    the other side of an edge) does not win against the rest. ``"l1l2"``, mean absolute plus mean squared
-    error in metres, is that of Marigold-DC (Viola et al. 2024, Eq. 4).
+    ``points_loss="robust"`` is the Cauchy loss of the matches: a wrong point does not win against the rest.
+    ``"l1l2"``, mean absolute plus mean squared error in metres, is that of Marigold-DC (Viola et al. 2024,
+    Eq. 4).
     """
     target = compared.points
     assert target is not None  # Term.needs

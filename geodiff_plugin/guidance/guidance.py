@@ -170,8 +170,8 @@ class GeometryGuidance:
             **arguments: further arguments of the constructor.
 
         Raises:
-            InputError: also for images whose size is not that of the calibration; the left one is checked
-                when the pipeline is called.
+            InputError: also for images of another size than the calibration's; the left one when it is
+                called.
         """
         size = arguments.get("left_size")
         with noted() as warned:

@@ -32,20 +32,12 @@ from geodiff_plugin.types import CameraView, Rig
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What the user gave beside one left image, checked.
+    """What the user gave beside one left image, checked."""
 
-    Attributes:
-        K_left: ``(3, 3)`` float64, pixels of the left image.
-        views: the further views, of native size, on the CPU.
-        rigs: their cameras in float64, for reports and exports.
-        points: float32 metres as ``points_to_matches`` takes them; ``None`` for none.
-        unit: of the lengths, ``"m"`` or ``None``.
-    """
-
-    K_left: np.ndarray
-    views: tuple[CameraView, ...]
-    rigs: tuple[Rig, ...]
-    points: Tensor | None
+    K_left: np.ndarray  # (3, 3) float64, pixels of the left image
+    views: tuple[CameraView, ...]  # of native size, on the CPU
+    rigs: tuple[Rig, ...]  # their cameras in float64, for reports and exports
+    points: Tensor | None  # float32 metres as ``points_to_matches`` takes them
     unit: str | None = "m"
 
     def on(self, device: torch.device) -> tuple[list[CameraView], Tensor, Tensor | None]:

@@ -28,32 +28,18 @@ from geodiff_plugin.types import CameraView
 
 @dataclass(frozen=True, eq=False)
 class EstimatedRig:
-    """Cameras of photographs that came without poses.
+    """Cameras of photographs that came without poses; numbers of several are of the right views."""
 
-    Attributes:
-        size_left: ``(width, height)`` of the left photograph.
-        Ks: ``(3, 3)`` each, left one first.
-        Es: ``(4, 4)`` each, pose of every right camera in the left camera's frame, in metres or in units.
-        inliers: matches that each right view's pose explains.
-        parallax_deg: median angle between the two rays of a point, one a right view.
-        residual_px: median distance of the inliers from their epipolar lines, one a right view.
-        depth_spread: relative standard deviation of depth caused by errors of the poses, in the median of the
-            matches; ``None`` for a rectified pair, whose pose is taken as exact.
-        scale: where the unit comes from.
-        notes: sentences about what was assumed.
-        warnings: sentences for the user.
-    """
-
-    size_left: tuple[int, int]
-    Ks: tuple[np.ndarray, ...]
-    Es: tuple[np.ndarray, ...]
-    inliers: tuple[int, ...]
-    parallax_deg: tuple[float, ...]
-    residual_px: tuple[float, ...]
-    depth_spread: float | None
-    scale: Scale
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
+    size_left: tuple[int, int]  # (width, height) of the left photograph
+    Ks: tuple[np.ndarray, ...]  # (3, 3) each, left one first
+    Es: tuple[np.ndarray, ...]  # (4, 4) each, pose in the left camera's frame, in metres or in units
+    inliers: tuple[int, ...]  # matches that the pose explains
+    parallax_deg: tuple[float, ...]  # median angle between the two rays of a point
+    residual_px: tuple[float, ...]  # median distance of the inliers from their epipolar lines
+    depth_spread: float | None  # relative, caused by errors of the poses; ``None`` for a rectified pair
+    scale: Scale  # where the unit comes from
+    notes: tuple[str, ...]  # sentences about what was assumed
+    warnings: tuple[str, ...]  # sentences for the user
 
 
 def _cameras(

@@ -31,14 +31,10 @@ _CPU_FLOAT64: dict[str, Any] = {"device": "cpu", "dtype": torch.float64}
 class AlignedView:
     """A right image on a canvas with the left grid's orientation and pixels per radian.
 
-    A left pixel ``(u, v)`` on plane k lies at ``scale[k] * (u, v) + shift[k]`` of the canvas: rows and
-    columns apart, so that a plane's image is two look-ups of lines, and so is the way back.
-
-    Attributes:
-        grey: ``(h, w)`` float32 in [0, 1].
-        valid: ``(h, w)`` bool, inside the right image; ``None`` where all of the canvas is.
-        scale: ``(D,)`` float64 on the CPU; 0 for a plane that lies behind the right camera.
-        shift: ``(D, 2)`` float64 on the CPU, column and row.
+    A left pixel ``(u, v)`` on plane k lies at ``scale[k] * (u, v) + shift[k]`` of the canvas, so that a
+    plane's image is two look-ups of lines, and so is the way back. ``grey (h, w)``; ``valid (h, w)`` bool,
+    inside the right image, ``None`` for all of the canvas; ``scale (D,)``, 0 behind the right camera, and
+    ``shift (D, 2)``, column and row, are float64 on the CPU.
     """
 
     grey: Tensor

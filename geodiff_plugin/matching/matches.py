@@ -33,17 +33,12 @@ LARGEST = 1.5
 class Matches:
     """Matches between the views, or known points, on one grid of the left view; of one image or of a chunk.
 
-    Attributes:
-        inverse_depth: ``(1, H, W)`` float32, 1/m, of one image, or ``(B, 1, H, W)``; defined everywhere,
-            to be read where ``confidence > 0``.
-        confidence: of the same shape, in [0, 1]; 0 where nothing is matched or known.
-        plane_step: ``()`` or ``(B,)`` 1/m, the unit in which errors are measured: between two planes of the
-            sweep, or ``UNIT`` of the points' median inverse depth.
+    ``inverse_depth`` and ``confidence`` in [0, 1] are ``(1, H, W)`` of one image, or ``(B, 1, H, W)``.
     """
 
-    inverse_depth: Tensor
-    confidence: Tensor
-    plane_step: Tensor
+    inverse_depth: Tensor  # float32, 1/m; defined everywhere, to be read where ``confidence > 0``
+    confidence: Tensor  # 0 where nothing is matched or known
+    plane_step: Tensor  # () or (B,) 1/m, the unit of errors: a plane, or ``UNIT`` of the points' median
     _above: dict[float, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod

@@ -26,24 +26,17 @@ _LEAST_SHIFT_PX = 0.3
 class CostVolume:
     """Costs of fronto-parallel planes in the left view, uniform in inverse depth.
 
-    Attributes:
-        levels: ``(D, H, W)`` uint8, mean census difference to the right views that see the pixel, 0 to
-            ``COST_LEVELS``; ``UNSEEN_LEVEL`` where none does.
-        in_view: ``(D, H, W)`` bool, at least one right view sees the pixel on this plane.
-        inverse_depth: ``(D,)`` float32, 1/m, ascending and evenly spaced.
-        K: ``(3, 3)`` pixels of this grid.
-        left_01: ``(1, H, W)`` grey left image on this grid.
-        rights: the right views at the resolution that was used, grey.
-        aligned: the same, turned parallel to the left view.
+    A cost is the mean census difference to the right views that see the pixel, 0 to ``COST_LEVELS``, and
+    ``UNSEEN_LEVEL`` where none does.
     """
 
-    levels: Tensor
-    in_view: Tensor
-    inverse_depth: Tensor
-    K: Tensor
-    left_01: Tensor
-    rights: tuple[CameraView, ...]
-    aligned: tuple[AlignedView, ...]
+    levels: Tensor  # (D, H, W) uint8
+    in_view: Tensor  # (D, H, W) bool, at least one right view sees the pixel on this plane
+    inverse_depth: Tensor  # (D,) float32, 1/m, ascending and evenly spaced
+    K: Tensor  # (3, 3) pixels of this grid
+    left_01: Tensor  # (1, H, W) grey left image on this grid
+    rights: tuple[CameraView, ...]  # at the resolution that was used, grey
+    aligned: tuple[AlignedView, ...]  # the same, turned parallel to the left view
 
     @property
     def cost(self) -> Tensor:

@@ -93,13 +93,10 @@ def depth_confidence(
 
 
 def expected_error(depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:
-    """What the geometry alone lets a matched depth be off: ``z^2 sigma_d / (f b)`` of a rectified pair.
+    """What the geometry alone lets a matched depth be off, ``(H, W)`` metres: ``z^2 sigma_d / (f b)``.
 
-    In general ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|`` by the pixel's ray ``r`` and the right camera's
-    centre ``t``, the best of ``poses (4, 4)``; its rotation moves no point relative to another.
-
-    Returns:
-        ``(H, W)`` metres, standard deviation at ``MATCH_NOISE_PX``; infinite where no camera moves.
+    Of any pose ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|`` by the pixel's ray ``r`` and the right
+    camera's centre ``t``, the best of ``poses (4, 4)``; its rotation moves no point relative to another.
     """
     rows, columns = np.indices(depth_m.shape)
     rays = (columns - K_left[0, 2]) / K_left[0, 0], (rows - K_left[1, 2]) / K_left[1, 1]

@@ -40,11 +40,6 @@ class GuidedRun:
     ``evidence`` has one entry per image, ``call`` the arguments of the stock call by name, ``rounds`` are
     those of each denoising step; ``tiny`` is an autoencoder for the loop, ``held`` a lock against calls in
     other threads, released while the ``callback`` runs; ``warm`` is the start from the previous frame.
-
-    Attributes:
-        trajectories: one per chunk.
-        relative: decoded maps of the final latents, one per chunk, without padding.
-        members: of every image with an ensemble, ``(E, 1, H, W)`` metres without padding.
     """
 
     def __init__(
@@ -65,9 +60,9 @@ class GuidedRun:
         self.owners = [i for i in range(len(evidence)) for _ in range(call["ensemble_size"])]
         self.batch_size, self.grid = call["batch_size"], grid
         self.schedule: Schedule | None = None
-        self.trajectories: list[Trajectory] = []
-        self.relative: list[Tensor] = []
-        self.members: list[Tensor] = []
+        self.trajectories: list[Trajectory] = []  # one per chunk
+        self.relative: list[Tensor] = []  # decoded maps of the final latents, one per chunk, not padded
+        self.members: list[Tensor] = []  # of every image with an ensemble, (E, 1, H, W) metres, not padded
         self._plan, self._rounds, self._warm = guidance.updates, rounds, warm
         self._skipped = 0 if warm is None else warm.skipped
         self._callback, self._held = callback, held

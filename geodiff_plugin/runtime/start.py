@@ -34,16 +34,12 @@ PROMPT_LONG_EDGE = 256
 
 @dataclass(frozen=True)
 class WarmStart:
-    """Where a call starts, after the frame before.
+    """Where a call starts, after the frame before."""
 
-    ``near_m`` and ``far_m``, ``(N * E,)`` metres, are the ends of the relative map. ``skipped`` steps of the
-    schedule are left out; the first remaining one begins with ``latents (N * E, C, h, w)``, or noise.
-    """
-
-    near_m: Tensor
-    far_m: Tensor
-    skipped: int = 0
-    latents: Tensor | None = None
+    near_m: Tensor  # (N * E,) metres, depth of the nearest end of the relative map
+    far_m: Tensor  # (N * E,) metres, of its farthest end
+    skipped: int = 0  # steps of the schedule that are left out
+    latents: Tensor | None = None  # (N * E, C, h, w) what the first remaining step begins with, or noise
 
 
 def plan_warm_start(

@@ -79,62 +79,36 @@ NEARLY = math.log(1.04)
 
 @dataclass(frozen=True)
 class Indicators:
-    """Numbers of one image's run; NaN where unknown.
+    """Numbers of one image's run; NaN where unknown."""
 
-    Attributes:
-        confidence: mean of the confidence map, [0, 1].
-        matched: share of the left image with a match that both views agree on, [0, 1].
-        order: rank correlation of the prior's first map with matches or points, [-1, 1].
-        spread: of the matched depths, log of their 95 % over their 5 % quantile.
-        points_ratio: median of known points over matched depths at the same places.
-        points_off: share of the compared points that differ from the matches by a factor of 1.2 or more.
-        points: number of known depths within the image.
-        at_end: share of the confident matches on the first or the last plane of a given range, [0, 1].
-        baseline_m: distance of the first right camera; 0 without one, or where it has no unit.
-        view_deg: horizontal field of view that K gives the left image.
-        own_ratio: of the depth over a metric prior's own, median.
-        epipolar_px: median distance of the matches from their epipolar lines with the poses as used, pixels;
-            of the worst right view.
-        off_matches: median of the absolute log of the depth over the matched depth.
-        doubts: warnings about the input, each of which forbids trust.
-        mistakes: sentences on mistakes of a given pose that would explain its misfit (``pose.mistakes``).
-        flat: all confident matches lie within two planes of the sweep, and near enough to mean something.
-        same: the left and a right view are the same picture.
-        inverse_fits: the inverse pose matches clearly more.
-        on_edge: the search for the scale ended on the edge of its range.
-    """
-
-    confidence: float = math.nan
-    matched: float = math.nan
-    order: float = math.nan
-    spread: float = math.nan
-    points_ratio: float = math.nan
-    points_off: float = math.nan
-    points: int = 0
-    at_end: float = 0.0
-    baseline_m: float = 0.0
-    view_deg: float = math.nan
-    own_ratio: float = math.nan
-    epipolar_px: float = math.nan
-    off_matches: float = math.nan
-    doubts: tuple[str, ...] = ()
-    mistakes: tuple[str, ...] = ()
-    flat: bool = False
-    same: bool = False
-    inverse_fits: bool = False
-    on_edge: bool = False
+    confidence: float = math.nan  # mean of the confidence map, [0, 1]
+    matched: float = math.nan  # share of the left image with a match that both views agree on, [0, 1]
+    order: float = math.nan  # rank correlation of the prior's first map with matches or points, [-1, 1]
+    spread: float = math.nan  # of the matched depths, log of their 95 % over their 5 % quantile
+    points_ratio: float = math.nan  # median of known points over matched depths at the same places
+    points_off: float = math.nan  # share of the points that differ from the matches by 1.2 or more
+    points: int = 0  # number of known depths within the image
+    at_end: float = 0.0  # share of the confident matches on the first or the last plane of a given range
+    baseline_m: float = 0.0  # distance of the first right camera; 0 without one, or where it has no unit
+    view_deg: float = math.nan  # horizontal field of view that K gives the left image
+    own_ratio: float = math.nan  # of the depth over a metric prior's own, median
+    epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
+    off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
+    doubts: tuple[str, ...] = ()  # warnings about the input, each of which forbids trust
+    mistakes: tuple[str, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)
+    flat: bool = False  # all confident matches lie within two planes, and near enough to mean something
+    same: bool = False  # the left and a right view are the same picture
+    inverse_fits: bool = False  # the inverse pose matches clearly more
+    on_edge: bool = False  # the search for the scale ended on the edge of its range
 
 
 @dataclass(frozen=True)
 class Verdict:
     """Whether one image's depth can be trusted.
 
-    Attributes:
-        status: ``"trusted"``, no indicator speaks against it; ``"not trusted"``; or ``"not judged"``, nothing
-            was there to hold it against.
-        reasons: sentences on those that do, the likeliest cause first; empty where it is trusted.
-        remarks: sentences on what is unusual but may be right.
-        indicators: the numbers behind it.
+    ``status`` is ``"trusted"``, no indicator speaks against it, ``"not trusted"``, or ``"not judged"``,
+    nothing was there to hold it against; ``reasons`` are sentences on those that do, the likeliest cause
+    first, ``remarks`` on what is unusual but may be right; ``indicators`` are the numbers behind it.
     """
 
     status: str

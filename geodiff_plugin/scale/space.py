@@ -64,11 +64,9 @@ class AffineState:
 class Space:
     """What a prior's output is affine in: ``v = s x + t`` is a function of depth in units of g_s.
 
-    Attributes:
-        forward: ``v, g_s`` -> metres; monotone, linear in ``g_s``, > 0 for every ``v > 0``.
-        inverse: depth in units of g_s -> ``v``.
-        grows_with_depth: whether a greater value is farther away.
-        from_ends: metres at ``x = 0`` and at ``x = 1`` -> ``s, t, g_s``, all > 0 and ``s, t`` of order 1.
+    ``forward`` gives metres of ``v, g_s``: monotone, linear in ``g_s``, > 0 for every ``v > 0``; ``inverse``
+    is from depth in units of g_s to ``v``; ``from_ends`` gives ``s, t, g_s``, all > 0 and ``s, t`` of order
+    1, of the metres at ``x = 0`` and ``x = 1``.
     """
 
     forward: Callable[[Tensor, Tensor], Tensor]

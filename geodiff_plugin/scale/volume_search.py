@@ -1,8 +1,7 @@
-"""Search for the scale of a relative map, by lookup in a plane-sweep volume.
+"""Search for the scale of a relative map, by lookup in a plane-sweep volume (S7.3).
 
-S7.3 (pre-selection of g_s, "a variant of the traditional Plane Sweep Volume technique"). The paper's single
-number, x = g_s x_rel, prefers depths at which every pixel leaves the right image; (near, far) jointly, on
-pixels that stay in view, does not (docs/reference/paper-map.md).
+The paper's single number, x = g_s x_rel, prefers depths at which every pixel leaves the right image; (near,
+far) jointly, on pixels that stay in view, does not (docs/reference/paper-map.md).
 """
 
 from __future__ import annotations
