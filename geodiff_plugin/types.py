@@ -63,11 +63,11 @@ class Rig:
 class PoseReport:
     """Poses of one image's right views: as given, as used, and how well they fit the matches.
 
-    ``status`` is ``"given"`` (not checked, by configuration), ``"fits"``, ``"refined"``, ``"kept"`` (no better
-    pose nearby), ``"mistaken"`` (a usual mistake explains the misfit; the pose is used as given) or ``"not
-    checked"``. Residuals are in pixels of the right images, resized to the left image's pixels per radian; the
-    left image is at most 832 wide. ``scale_spread`` is ``None`` where the length of the baseline is measured,
-    and where the poses are used as given.
+    ``status`` is ``"given"`` (not checked, by configuration), ``"fits"``, ``"refined"``, ``"kept"`` (no
+    better pose nearby), ``"mistaken"`` (a usual mistake explains the misfit; the pose is used as given) or
+    ``"not checked"``. Residuals are in pixels of the right images, resized to the left image's pixels per
+    radian; the left image is at most 832 wide. ``scale_spread`` is ``None`` where the length of the baseline
+    is measured, and where the poses are used as given.
     """
 
     status: str

@@ -25,9 +25,9 @@ from geodiff_plugin.types import StepReport
 class Trajectory:
     """One chunk of samples along the schedule; those of an image, of the ``owners``, lie side by side.
 
-    The search for the scale starts from ``prior_range``, metres ``(B,)`` of ``x = 0`` and ``x = 1`` by a metric
-    prior, or from ``start_range``, both ends of another frame. ``valid (B, 1, h, w)`` bool is where the prior
-    says something: elsewhere its map has no part in the scale, and matches alone decide.
+    The search for the scale starts from ``prior_range``, metres ``(B,)`` of ``x = 0`` and ``x = 1`` by a
+    metric prior, or from ``start_range``, both ends of another frame. ``valid (B, 1, h, w)`` bool is where
+    the prior says something: elsewhere its map has no part in the scale, and matches alone decide.
     """
 
     affine: AffineState  # of the latest update, once ``settle_scale`` was called
