@@ -80,8 +80,8 @@ class _Demo:
 
     def run(self) -> None:
         pair = Path(__file__).resolve().parents[1] / "bundled" / "pair"
-        views: dict[str, Path] = {"left": pair / "left.png", "right": pair / "right.png"}
-        options = DepthOptions(**views, calib=(pair / "calib.txt",), device="cpu", **vars(self))
+        left, right, calib = (pair / name for name in ("left.png", "right.png", "calib.txt"))
+        options = DepthOptions(left=left, right=right, calib=(calib,), device="cpu", **vars(self))
         options = _with_folder(options, "geodiff-demo")
         with start_pair(options) as folder:
             _imported("cli.demo.run_demo")(options, folder)

@@ -87,12 +87,13 @@ def _built(name: str, command: Command) -> Any:
 
 def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
     """An option or argument of typer for a field of a dataclass of options."""
-    rules, default, required = field.metadata, field.default, field.default is dataclasses.MISSING
+    rules, required = field.metadata, field.default is dataclasses.MISSING
+    default: Any = field.default
     if rules["split"]:
-        kind, default = str | None, ",".join(map(str, field.default)) or None
+        kind, default = str | None, ",".join(map(str, default)) or None
     elif get_origin(kind) is tuple:
         kind = list[get_args(kind)[0]]  # type: ignore[misc]
-        kind, default = (kind, default) if required else (kind | None, list(field.default) or None)
+        kind, default = (kind, default) if required else (kind | None, list(default) or None)
     flags, about = rules["flags"] or (flag_of(field),), {"metavar": rules["metavar"], "help": rules["help"]}
     if flags == ("",):
         typed: Any = typer.Argument(**about)

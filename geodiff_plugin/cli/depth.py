@@ -55,14 +55,7 @@ def load_guided_prior(options: DepthOptions, device: torch.device) -> Any:
 class Job:
     """A pair on its way from its files to its folder, and what the stages have made of it so far.
 
-    Attributes:
-        options: of this pair.
-        folder: held, which it will be written to.
-        watch: seconds of the stages.
-        entries: of the report, that only the caller knows.
-        warnings: of all stages.
-        inputs: what the first stage read.
-        output: of the guided call.
+    ``entries`` are those of the report that only the caller knows.
     """
 
     options: DepthOptions

@@ -202,7 +202,9 @@ def _of_list(path: Path, right: Path | None) -> list[PairRef]:
         rows.append([file.parent / cell for cell in cells])
     if not rows:
         bad_value("LEFT", "a list with a pair a line: LEFT,RIGHT[,CALIB]", f"{path}, which names none")
-    return [PairRef(name, *row) for name, row in zip(_names([row[0] for row in rows]), rows, strict=True)]
+    names = _names([row[0] for row in rows])
+    named = zip(names, rows, strict=True)
+    return [PairRef(name, row[0], row[1], row[2] if len(row) > 2 else None) for name, row in named]
 
 
 def _names(lefts: Sequence[Path]) -> list[str]:

@@ -82,23 +82,17 @@ def _rescaled(E: np.ndarray, output: MetricDepthOutput) -> np.ndarray:
     return E * np.array([1.0, 1.0, 1.0, output.rescaled])
 
 
-def _estimated(guidance: GeometryGuidance, output: MetricDepthOutput) -> dict[str, Any] | None:
-    """What the estimation of poses told; ``None`` where they were given."""
-    rig = guidance.estimated
-    if rig is None:
-        return None
-    names = ("inliers", "parallax_deg", "residual_px", "depth_spread")
-    scale = {"scale_from": output.scale_from, "scale_spread": output.scale_spread}
-    return {name: getattr(rig, name) for name in names} | scale | {"assumed": rig.notes}
-
-
 def result_entries(output: MetricDepthOutput, guidance: GeometryGuidance) -> dict[str, Any]:
     """What a report says of the result of a guided call on one image, whoever asked for it."""
     depth_m, visible, error = single_map(output.prediction), None, math.nan
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
         error = float(single_map(output.photometric_error)[visible].mean()) if visible.any() else math.nan
-    verdict, spread = asdict(output.verdict), output.uncertainty
+    verdict, spread, estimated = asdict(output.verdict), output.uncertainty, guidance.estimated
+    if estimated is not None:
+        found = ("inliers", "parallax_deg", "residual_px", "depth_spread")
+        scale = {"scale_from": output.scale_from, "scale_spread": output.scale_spread}
+        pose = {name: getattr(estimated, name) for name in found} | scale | {"assumed": estimated.notes}
     names = ("K", "scale", "shift", "global_scale", "own_scale", "prior_error", "unit", "assumed")
     return {
         "depth": depth_summary(depth_m, visible),
@@ -110,7 +104,7 @@ def result_entries(output: MetricDepthOutput, guidance: GeometryGuidance) -> dic
         "uncertainty_median_m": None if spread is None else np.median(single_map(spread)),
         **{name: getattr(output, name) for name in names},
         "history": [vars(step) for step in output.history],
-        "estimated_pose": _estimated(guidance, output),
+        "estimated_pose": None if estimated is None else pose,
         "pose": vars(output.poses[0]) if output.poses else None,
         "guidance": guidance.as_run().to_dict(),
         "versions": versions(),

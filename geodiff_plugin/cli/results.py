@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,22 +24,15 @@ BENCHMARKS = {
 }
 
 
-class _Maps(Sequence[np.ndarray]):
-    """The maps of all frames, read whenever they are asked for: those of a long video exceed the memory."""
-
-    def __init__(self, files: Sequence[Path]) -> None:
-        self._files = files
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def __getitem__(self, number: Any) -> Any:
-        file = check_file(self._files[number], "FRAME", "a folder of geodiff depth or a .npy")
-        expected = "a depth map (H, W) of floats in metres"
-        depth_m = read_npy(file, "FRAME", expected)
-        if depth_m.ndim != 2 or depth_m.dtype.kind != "f" or not depth_m.size:
-            bad_value("FRAME", expected, f"{file}")
-        return depth_m
+def _map(path: Path) -> np.ndarray:
+    """The map of a frame, left in its file: those of a long video exceed the memory."""
+    file = check_file(path, "FRAME", "a folder of geodiff depth or a .npy")
+    expected = "a depth map (H, W) of floats in metres"
+    depth_m = read_npy(file, "FRAME", expected)
+    if depth_m.ndim != 2 or depth_m.dtype.kind != "f" or not depth_m.size:
+        bad_value("FRAME", expected, f"{file}")
+    mapped: np.ndarray = np.load(file, mmap_mode="r")
+    return mapped
 
 
 def _unit(frames: Sequence[Path], folders: Sequence[Path]) -> str | None:
@@ -57,7 +49,7 @@ def run_video(frames: Sequence[Path], out: Path, fps: float, near: float | None,
     """Write the video and say what is in it."""
     check_video(out, fps)
     files = [path / "depth.npy" if os.path.isdir(path) else path for path in frames]
-    depths_m = _Maps(files)
+    depths_m = [_map(file) for file in files]
     shapes = [depth_m.shape for depth_m in depths_m]
     for path, shape in zip(frames, shapes, strict=True):
         if shape != shapes[0]:

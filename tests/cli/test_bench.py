@@ -1,4 +1,4 @@
-"""What ``geodiff bench`` measures with, and the configuration of its full-size prior."""
+"""What ``geodiff bench`` measures with, and its table."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from diffusers import AutoencoderKL, UNet2DConditionModel
 
 from geodiff_plugin.bundled.demo_pair import DemoPair
 from geodiff_plugin.cli.demo import measure, run_bench
 from geodiff_plugin.runtime.machine import PeakMemory
 from geodiff_plugin.types import Rig
-from tests.benchmarks import full_size, operations
-from tests.benchmarks.full_sizes import UNET, VAE
 
 
 def test_peak_memory_sees_what_is_freed_again():
@@ -25,13 +22,6 @@ def test_peak_memory_sees_what_is_freed_again():
         time.sleep(0.2)
         del block
     assert 150e6 < memory.peak_bytes < 400e6
-
-
-def test_full_size_is_marigold_v1_1():
-    with torch.device("meta"):
-        unet, vae = UNet2DConditionModel(**UNET), AutoencoderKL(**VAE)
-    millions = [round(sum(p.numel() for p in model.parameters()) / 1e6) for model in (unet, vae)]
-    assert millions == [866, 84]
 
 
 @pytest.mark.parametrize("gradient", [None, "denoised", "full"])
@@ -71,12 +61,3 @@ def test_table(monkeypatch, capsys):
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     rows = [words[-4:] for words in lines if words and re.fullmatch(r"\d\.\d\d", words[-1])]
     assert rows[1] == ["2.00", "150", "2.00", "1.50"] and rows[2] == ["3.00", "400", "3.00", "4.00"]
-
-
-@pytest.mark.slow
-def test_full_size_bench(capsys):
-    """Narrow networks, a process a way."""
-    narrow = ["--width", "0.05", "--resolution", "64", "--steps", "2", "--dc-steps", "2", "--repeats", "0"]
-    full_size.main(["--device", "cpu", *narrow])
-    printed = capsys.readouterr().out
-    assert all(way in printed for way in operations.WAYS)
