@@ -83,7 +83,7 @@ def read_inputs(
     if options.estimate_pose:
         Ks = [_intrinsics(options, way, path, i, sizes[i]) for i, path in enumerate(views.values())]
     else:
-        rig = read_rig(options, *sizes[:2], names=names)
+        rig = read_rig(options, sizes[0], sizes[1] if len(sizes) > 1 else None, names)
         if frames is None:
             for K, (name, path) in zip((rig.K_left, rig.K_right), list(views.items())[:2], strict=False):
                 warn_of_other_lens(path, K, name)
