@@ -82,24 +82,23 @@ def write_depth_npy(path: PathLike, depth_m: np.ndarray) -> None:
         np.save(file, depth_m, allow_pickle=False)
 
 
-def depth_mm(depth_m: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
+def depth_mm(depth_m: np.ndarray) -> np.ndarray:
     """Metres ``(H, W)`` as whole millimetres of 16 bits, as ROS' ``16UC1`` and RGB-D data sets have it.
 
-    0 where not ``valid``, not finite, under half a millimetre or beyond 65.535 m.
+    0 where not finite, under half a millimetre or beyond 65.535 m.
     """
     depth_m = _check_map(depth_m)
-    keep = np.isfinite(depth_m) if valid is None else np.isfinite(depth_m) & np.asarray(valid, dtype=bool)
     whole = np.empty(depth_m.shape, dtype=np.uint16)
     for rows in row_strips(*depth_m.shape):
-        millimetres = np.rint(np.where(keep[rows], depth_m[rows], 0.0).astype(np.float64) * 1000.0)
+        millimetres = np.rint(np.nan_to_num(depth_m[rows].astype(np.float64), posinf=0.0, neginf=0.0) * 1000)
         millimetres[(millimetres < 0) | (millimetres > LARGEST_MM)] = 0
         whole[rows] = millimetres
     return whole
 
 
-def write_depth_mm(path: PathLike, depth_m: np.ndarray, valid: np.ndarray | None = None) -> int:
+def write_depth_mm(path: PathLike, depth_m: np.ndarray) -> int:
     """Write ``depth_mm`` as a 16-bit PNG, whole or not at all; returns how many of its pixels are 0."""
-    whole = depth_mm(depth_m, valid)
+    whole = depth_mm(depth_m)
     with atomic_path(path) as temporary:
         Image.fromarray(whole).save(temporary, format="PNG")
     return int((whole == 0).sum())

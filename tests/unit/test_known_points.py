@@ -15,9 +15,7 @@ from geodiff_plugin.formats import rig_from_parameters, write_pfm
 from geodiff_plugin.formats.depth import depth_of_disparity
 from geodiff_plugin.guidance.inputs import as_points
 from geodiff_plugin.matching import points_to_matches, with_points
-from geodiff_plugin.runtime.verdict import Indicators, judge
-from geodiff_plugin.scale.points import depth_span, fit_to_points
-from geodiff_plugin.scale.space import SPACES, MetricMap
+from geodiff_plugin.scale.points import depth_span
 
 K = torch.tensor([[60.0, 0, 31.5], [0, 66.0, 23.5], [0, 0, 1]])
 SIZE, GRID = (48, 64), (24, 32)
@@ -61,14 +59,6 @@ def test_a_map_with_confidence_is_its_points_with_theirs() -> None:
     assert left_out == 0 and torch.equal(plain.confidence[0] > 0, torch.from_numpy(depth > 0))
 
 
-def test_a_smaller_grid_keeps_every_pixel_inside():
-    depth_m = torch.zeros(SIZE)
-    depth_m[0, 0] = depth_m[-1, -1] = depth_m[0, -1] = 3.0
-    matches, _ = points_to_matches(depth_m, K, SIZE, (17, 23))
-    known = matches.confidence[0] > 0
-    assert known[0, 0] and known[-1, -1] and known[0, -1] and known.sum() == 3
-
-
 def test_points_outside_are_counted_and_none_left_is_an_error():
     points = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [9.0, 0.0, 2.0]])
     assert points_to_matches(points, K, SIZE, SIZE)[1] == 2
@@ -90,23 +80,6 @@ def test_points_take_the_place_of_matches_of_less_confidence() -> None:
     assert torch.equal(with_points(None, points).inverse_depth, points.inverse_depth)
 
 
-@pytest.mark.parametrize("space", SPACES)
-def test_fit_finds_the_ends_in_spite_of_wrong_points(space):
-    rng = np.random.default_rng(0)
-    x = torch.from_numpy(rng.random((1, 1, *SIZE), dtype=np.float32)) * 0.9 + 0.05
-    metric = MetricMap(space)
-    ends = torch.tensor([1.5]), torch.tensor([9.0])
-    truth = metric(x, metric.from_range(*ends))
-    sparse = torch.where(torch.from_numpy(rng.random(SIZE) < 0.05), truth[0, 0], torch.zeros(SIZE))
-    wrong = torch.from_numpy(rng.random(SIZE) < 0.1) & (sparse > 0)
-    points, _ = points_to_matches(torch.where(wrong, 3 * sparse, sparse), K, SIZE, SIZE)
-    near, far = fit_to_points(x.expand(2, -1, -1, -1), points, metric)
-    assert near.shape == (2,) and torch.equal(near[0], near[1])
-    fitted = metric(x, metric.from_range(near[:1], far[:1]))
-    assert ((fitted - truth).abs() / truth).median() < 0.1
-    assert [float(end) for end in fit_to_points(x, points, metric, ends)] == [1.5, 9.0]
-
-
 @pytest.mark.parametrize(
     ("confidence", "said"),
     [
@@ -119,10 +92,6 @@ def test_fit_finds_the_ends_in_spite_of_wrong_points(space):
 def test_what_is_no_confidence(confidence, said) -> None:
     with pytest.raises(InputError, match=said):
         GeometryGuidance.from_points(np.ones(SIZE, np.float32), K, points_confidence=confidence)
-    with pytest.raises(InputError, match="points_confidence must be given with points; got no points"):
-        GeometryGuidance.from_baseline(
-            np.zeros((*SIZE, 3), np.uint8), K, 0.1, points_confidence=np.ones(SIZE)
-        )
 
 
 def test_disparities_of_any_size_become_depths(tmp_path) -> None:
@@ -145,13 +114,3 @@ def test_disparities_of_any_size_become_depths(tmp_path) -> None:
     for other in (replace(rig, E=E), replace(rig, unit=None)):
         with pytest.raises(InputError, match="disparity must be of a r"):
             depth_of_disparity(tmp_path / "d.pfm", other, (64, 48))
-
-
-@pytest.mark.parametrize(
-    ("off", "status", "said"), [(0.1, "trusted", 0), (0.3, "trusted", 1), (0.6, "not trusted", 1)]
-)
-def test_points_that_contradict_the_views_are_told_and_judged(off, status, said) -> None:
-    run = Indicators(confidence=0.8, matched=0.7, order=0.8, spread=1.0, points=900, points_ratio=1.01)
-    verdict = judge(replace(run, points_off=off))
-    sentences = [s for s in (*verdict.reasons, *verdict.remarks) if "contradict what both views match" in s]
-    assert verdict.status == status and len(sentences) == said

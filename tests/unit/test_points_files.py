@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.formats import read_points, write_depth_mm, write_pfm, write_ply
+from geodiff_plugin.formats import read_points, write_depth_mm, write_pfm
 from geodiff_plugin.formats.points import read_confidence
 
 MAP = np.zeros((6, 8), np.float32)
@@ -74,13 +74,10 @@ def test_binary_ply(tmp_path, order):
         read_points(tmp_path / "points.ply")
 
 
-def test_ascii_ply_and_our_cloud(tmp_path):
+def test_ascii_ply(tmp_path):
     head = PLY.format(kind="ascii", properties=PROPERTIES, more="")
     (tmp_path / "points.ply").write_text(head + "0.1 255 -0.2 2.0\n0.4 0 0.3 5.5\n")
     np.testing.assert_allclose(read_points(tmp_path / "points.ply"), POINTS)
-    K = np.array([[8.0, 0, 3.5], [0, 8.0, 2.5], [0, 0, 1]])
-    write_ply(tmp_path / "cloud.ply", MAP, np.zeros((6, 8, 3)), K)
-    np.testing.assert_allclose(sorted(read_points(tmp_path / "cloud.ply")[:, 2]), [1.25, 3.5])
 
 
 XYZ = b"property float x\nproperty float y\nproperty float z\n"
