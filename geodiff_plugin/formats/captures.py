@@ -17,7 +17,7 @@ from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fo
 from geodiff_plugin.formats.files import open_image, read_matrix, read_rows, read_text
 from geodiff_plugin.formats.nerf import nerf_camera, nerf_frames, nerf_pose
 from geodiff_plugin.formats.recordings import count_frames, is_video
-from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, reading_whole, rigid
+from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, reading_whole, resized, rigid
 from geodiff_plugin.types import Distortion
 
 IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
@@ -41,8 +41,6 @@ TUM_DEPTH = 5000.0
 OF_COLMAP = ("colmap_im_id", "sharpness")
 #: Poses of a trajectory further from an image than this, in seconds, are not its own.
 FARTHEST_S = 0.05
-#: Ratios of sides of images and cameras that differ by more are of crops.
-SAME_SHAPE = 0.01
 NO_POSE_CURE = "Such frames are skipped; delete the others' poses as well to have all poses estimated."
 
 
@@ -171,13 +169,7 @@ def _framed(
     size = _size(path)
     K = _typed_K(typed, size)
     if K is None:
-        factors = np.array(size) / np.array(camera.size or size, float)
-        if abs(factors[0] / factors[1] - 1) > SAME_SHAPE:
-            got = f"{size[0]}x{size[1]} pixels where its camera has {camera.size[0]}x{camera.size[1]}"
-            bad_value(f"{path}", "of the shape of its camera's images", got, "Is it a crop? Give --K.")
-        to_image = np.diag([*factors, 1.0])
-        to_image[:2, 2] = 0.5 * factors - 0.5
-        K = to_image @ camera.K
+        K = resized(camera, size, f"{path}", "Is it a crop? Give --K.").K
     depth = depth if depth is not None and depth.is_file() else None
     return CaptureFrame(path.stem, path, K, size, E, lens_of(camera, f"{path}"), depth)
 
@@ -216,9 +208,8 @@ def _natural(path: Path) -> list[object]:
 
 
 def _transforms(path: Path, typed: Typed) -> CaptureFiles | None:
-    files = (path, path / "transforms.json", path / "transforms_train.json")
-    file = next((file for file in files if file.is_file() and file.suffix == ".json"), None)
-    if file is None:
+    file = path / "transforms.json" if path.is_dir() else path
+    if file.suffix != ".json" or not file.is_file():
         return None
     frames: list[CaptureFrame] = []
     unit: str | None = "m"

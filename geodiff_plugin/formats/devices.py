@@ -6,6 +6,7 @@ import configparser
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from geodiff_plugin.formats.rigs import (
     intrinsics,
     make_rig,
     of_size,
+    resized,
     transform,
 )
 from geodiff_plugin.types import Rig
@@ -48,8 +50,6 @@ OAK_PAIR = (1, 2)
 METRES_PER_CENTIMETRE = 0.01
 #: dai::CameraModel by its number; the others are none of OpenCV's.
 OAK_LENSES = {0: "opencv", 1: "fisheye"}
-#: Images of one sensor differ in their ratio of sides by rounding only; beyond this one of them was cropped.
-RATIO_TOLERANCE = 0.01
 
 Sockets = dict[int, dict[str, Any]]
 
@@ -155,25 +155,17 @@ def _oak_camera(cameras: Sockets, socket: int, choice: CameraChoice, with_lens: 
     if socket not in cameras:
         bad_value("cameras", f"sockets of the file ({', '.join(map(str, sorted(cameras)))})", socket)
     entries = cameras[socket]
-    size = entries["width"], entries["height"]
-    wanted = choice.image_size or size
-    s_x, s_y = wanted[0] / size[0], wanted[1] / size[1]
-    if abs(s_x / s_y - 1) > RATIO_TOLERANCE:
-        cure = "It is a crop of the sensor: give --fx --fy --cx --cy --baseline of the cropped image."
-        expected = "of the shape of {}x{} pixels, as the file says".format(*size)
-        bad_value("the left image", expected, "{}x{}".format(*wanted), cure)
     K = array_of(entries["intrinsicMatrix"], (3, 3), f"intrinsicMatrix of socket {socket}")
-    K = np.array([[s_x, 0, 0.5 * s_x - 0.5], [0, s_y, 0.5 * s_y - 0.5], [0, 0, 1]]) @ K
-    if not with_lens:
-        return Camera(K, wanted)
-    numbers, kind = (
-        array_of(entries["distortionCoeff"], (-1,), "distortionCoeff"),
-        entries.get("cameraType", 0),
-    )
-    model = OAK_LENSES.get(kind, f"cameraType {kind}")
-    # A fisheye has four, in a list that may be filled up with zeros.
-    numbers = numbers if model == "opencv" or numbers[4:].any() else numbers[:4]
-    return Camera(K, wanted, numbers, model)
+    camera = Camera(K, (entries["width"], entries["height"]))
+    if with_lens:
+        numbers = array_of(entries["distortionCoeff"], (-1,), "distortionCoeff")
+        kind = entries.get("cameraType", 0)
+        model = OAK_LENSES.get(kind, f"cameraType {kind}")
+        # A fisheye has four, in a list that may be filled up with zeros.
+        numbers = numbers if model == "opencv" or numbers[4:].any() else numbers[:4]
+        camera = replace(camera, coefficients=numbers, model=model)
+    cure = "It is a crop of the sensor: give --fx --fy --cx --cy --baseline of the cropped image."
+    return resized(camera, choice.image_size or camera.size, "the left image", cure)
 
 
 def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:

@@ -6,7 +6,7 @@ import configparser
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any, TypeVar
 from xml.etree import ElementTree
@@ -23,6 +23,8 @@ Entry = TypeVar("Entry")
 
 #: Coefficients below this move no pixel of a 12 megapixel image by a tenth of a pixel.
 DISTORTION_TOLERANCE = 1e-6
+#: Images of one sensor differ in their ratio of sides by rounding only; beyond this one of them was cropped.
+RATIO_TOLERANCE = 0.01
 #: How many coefficients OpenCV's functions take, by the model's name in ``Distortion``.
 COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
 #: What a reader that takes a whole file for granted raises on one that is not.
@@ -133,6 +135,17 @@ def transform(rotation: Any, translation: Any, name: str) -> np.ndarray:
     """The ``(4, 4)`` float64 rigid transform of a rotation of 9 numbers, row by row, and a translation."""
     R = array_of(rotation, (3, 3), f"the rotation of {name}")
     return rigid(np.column_stack([R, array_of(translation, (3,), f"the translation of {name}")]), name)
+
+
+def resized(camera: Camera, size: Size, name: str, cure: str) -> Camera:
+    """The camera at another resolution of the whole image, which messages name; a crop is refused."""
+    width, height = camera.size or size
+    s_x, s_y = size[0] / width, size[1] / height
+    if abs(s_x / s_y - 1) > RATIO_TOLERANCE:
+        expected = f"of the shape of its camera's images ({width}x{height})"
+        bad_value(name, expected, "{}x{}".format(*size), cure)
+    scale = np.array([[s_x, 0, 0.5 * s_x - 0.5], [0, s_y, 0.5 * s_y - 0.5], [0, 0, 1]])
+    return replace(camera, K=scale @ camera.K, size=size)
 
 
 def of_size(by_size: Mapping[Size, Entry], choice: CameraChoice) -> Entry:

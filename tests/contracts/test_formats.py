@@ -210,7 +210,7 @@ def test_a_wrong_entry_is_named(tmp_path, sample, old, new, said):
         ("kalibr", {"cameras": ("a", 1)}, "a pair of camera numbers"),
         ("kalibr", {"baseline_m": -1.0}, "baseline_m"),
         ("oak", {"cameras": (1, 5)}, r"sockets of the file \(0, 1, 2\); got 5"),
-        ("oak", {"image_size": (1280, 720)}, "640x480 pixels.*crop"),
+        ("oak", {"image_size": (1280, 720)}, "640x480.*crop"),
         ("zed", {"image_size": None}, "1280x720, 2208x1242.*got no image"),
         ("zed", {"image_size": (2560, 720)}, "1280x720, 2208x1242"),
         ("nerf", {"image_names": ("left.jpg", "d.png")}, r"one of the 3.*got d\.png"),
