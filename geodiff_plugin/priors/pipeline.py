@@ -88,7 +88,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         output_resampling: how its authors bring the map to the image's size.
         own_range: of a prior that is metric by itself, ``(N * E, 2)`` metres at 0 and at 1 of the maps;
             ``prepare_condition`` sets it.
-        known: ``(N * E, 1, H, W)`` bool, where the prior says anything, ``None`` for everywhere; likewise.
+        valid: ``(N * E, 1, H, W)`` bool, where the prior says anything, ``None`` for everywhere; likewise.
     """
 
     max_steps: int | None = None
@@ -98,7 +98,7 @@ class DepthDiffusionPipeline(DiffusionPipeline):
     takes_prompt = False
     output_resampling = "bilinear"
     own_range: Tensor | None = None
-    known: Tensor | None = None
+    valid: Tensor | None = None
 
     def register_prior(
         self,

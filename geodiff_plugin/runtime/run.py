@@ -211,7 +211,7 @@ class GuidedRun:
             self._bar = tqdm(total=chunks * len(timesteps), **options)
 
     def guide(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepInputs:
-        """What the scheduler's step is given in place of the network's ``output`` and ``z_t (B, C, h, w)``."""
+        """What the scheduler's step is given for the network's ``output`` and ``z_t (B, C, h, w)``."""
         trajectory, schedule = self.trajectories[-1], self.schedule
         assert schedule is not None  # of begin
         trajectory.step = self._step, self._timesteps[self._step]

@@ -20,9 +20,8 @@ def test_a_handful_of_known_points_is_enough(make_pipeline, textured_plane, coun
     results = []
     for dtype in (torch.float16, torch.float32):
         pipe = enable_geometry_guidance(make_pipeline().to(dtype))
-        guidance = GeometryGuidance.from_points(
-            points, pair.K, gradient=gradient, inner_steps=3, correct=False
-        )
+        knobs = {"gradient": gradient, "inner_steps": 3, "correct": False}
+        guidance = GeometryGuidance.from_points(points, pair.K, **knobs)
         call = {"generator": torch.Generator().manual_seed(0), "num_inference_steps": 2}
         results.append(pipe(pair.left, guidance=guidance, **call).prediction)
     assert np.isfinite(results[0]).all()
