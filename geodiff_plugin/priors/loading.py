@@ -154,12 +154,13 @@ def _component_class(pipeline_class: type[Any], layout: Layout, name: str) -> ty
     """
     entry = layout.index.get(name)
     library, cls = entry if isinstance(entry, list) and len(entry) == 2 else ("", "")
-    named = getattr(LIBRARIES.get(str(library)), str(cls), None)
+    named: Any = getattr(LIBRARIES.get(str(library)), str(cls), None)
+    if not isinstance(named, type) or not hasattr(named, "from_pretrained"):
+        named = None
     expected = _annotated(pipeline_class).get(name)
-    is_known = isinstance(named, type) and hasattr(named, "from_pretrained")
-    if expected is not None and not (is_known and not issubclass(expected, named)):
+    if expected is not None and (named is None or issubclass(expected, named)):
         return expected
-    if not is_known:
+    if named is None:
         what = f"component {name!r} in {layout.folder / 'model_index.json'}"
         cure = "Code that comes with weights is never run."
         bad_value(what, "a class of diffusers or transformers", repr(entry), cure)

@@ -43,17 +43,16 @@ def tiny_autoencoder(pipe: Any, decoder: str) -> AutoencoderTiny | None:
     """
     if decoder == FULL:
         return None
-    vae = getattr(pipe, "vae", None)
+    vae: Any = getattr(pipe, "vae", None)
     channels, cell = (None, None) if vae is None else _latent_of(vae)
-    cure = ""
+    cure, known = "", None if vae is None else KNOWN.get((channels, cell, vae.config.get("scaling_factor")))
     if cell is None:
         cure = "It has no latent of a single image: it works on pixels, or its autoencoder is one of videos."
-    elif decoder == TINY and (channels, cell, vae.config.get("scaling_factor")) not in KNOWN:
+    elif decoder == TINY and known is None:
         cure = f"None is published for its latent of {channels} channels; give a folder or a hub id of one."
     if cure:
         bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(decoder), cure)
-    if decoder == TINY:
-        decoder = KNOWN[channels, cell, vae.config.get("scaling_factor")]
+    decoder = known if decoder == TINY and known else decoder
     tiny = _loaded(decoder, pipe.dtype, str(pipe._execution_device))
     if _latent_of(tiny) != (channels, cell):
         got = "{} channels, {} px a cell, in {!r}".format(*_latent_of(tiny), decoder)

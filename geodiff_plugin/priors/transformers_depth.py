@@ -295,7 +295,8 @@ class TransformersDepthPipeline(DirectMapPipeline):
             ``(B, 1, h, w)`` float32 over the image without what was padded, resampled as the library's
             ``post_process_depth_estimation`` does.
         """
-        told, low, span = {}, 0.0, 1.0
+        told: dict[str, Tensor] = {}
+        low, span = image_01.new_zeros(1), image_01.new_ones(1)
         if prompt_m is not None:
             if not self.takes_prompt:
                 bad_value("prompt_depth", "left out with this model", "given", f"Only {PROMPTED} takes one.")

@@ -61,13 +61,13 @@ class GuidedCall(_Stock):
 
         Args:
             image: left image(s), as the stock call takes them; guided, all that ``right`` takes as well.
-            *args: as the stock call takes them.
+            *args: as the stock call takes them, as ``kwargs``.
             guidance: the second view; ``None`` is the stock call, bit for bit.
             callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
                 ``latents`` in what it returns replace the pipeline's. The others are those of the last step
                 that was corrected or updated, and ``None`` before the first.
             strict: a depth that is not trusted, or not judged (``output.verdict``), is an error.
-            **kwargs: as the stock call takes them.
+            **kwargs: see above.
 
         Returns:
             ``MetricDepthOutput``, or with ``return_dict=False`` the stock tuple (prediction, uncertainty,
@@ -240,17 +240,11 @@ def _guided_class(stock: type) -> type:
 
 
 def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
-    """Let a live pipeline take ``guidance=``; nothing else about it changes.
-
-    Args:
-        pipe: any pipeline with an adapter in ``PRIORS``.
-
-    Returns:
-        The same object, for chaining. Enabling twice is enabling once.
+    """Let a live pipeline take ``guidance=``; nothing else about it changes. Returns the same object.
 
     Raises:
-        InputError: no adapter understands it, or its ``__call__`` hides the stock arguments behind
-            ``**kwargs``.
+        InputError: no adapter in ``PRIORS`` understands it, or its ``__call__`` hides the stock arguments
+            behind ``**kwargs``.
     """
     find_adapter(pipe)
     check_named_arguments(_stock_class(type(pipe)) if isinstance(pipe, GuidedCall) else type(pipe))
