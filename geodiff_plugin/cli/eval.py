@@ -67,7 +67,7 @@ def _list(options: _ListOptions) -> None:
         about = getattr(family, "func", family).__doc__  # of a partial the function's
         summary = re.split(r"[.;]", about or " ", maxsplit=1)[0]
         rows.append((f"{name}:...", f"{summary[0].lower()}{summary[1:]}"))
-    rows.append(("METHOD@PRIOR", "a method that uses a prior, with another one than --prior's first"))
+    rows.append(("METHOD@PRIOR", "a method that uses a prior, with another one than --prior"))
     rows.append(("METHOD#SEED", "the same with another seed than --seed; METHOD@PRIOR#SEED for both"))
     print_lines(rows)
 

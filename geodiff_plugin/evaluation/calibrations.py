@@ -119,7 +119,7 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
             shown += [_residual_table(columns["refined"])] if title.endswith("two views") else []
         return shown
 
-    said = f"Prior {options.prior[0]}, seed {options.seed}. All pixels with truth, metres as they come out."
+    said = f"Prior {options.prior}, seed {options.seed}. All pixels with truth, metres as they come out."
     journal, title = experiment.RECORDS_NAME, "Results by pose"
     return run_experiment(name, options, title, cells, page_tables, lambda _: [said], journal)
 

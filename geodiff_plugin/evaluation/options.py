@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from geodiff_plugin.evaluation.datasets import SampleRef
 
 CROPS = ("none", "garg", "eigen", "benchmark")
-#: Where ``guided`` has poses from: refined, as given, or withheld but for the baseline's length.
-POSES = ("refine", "given", "estimated")
 PEERS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 STRENGTH_METHODS = ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5")
 FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative")
@@ -86,15 +84,10 @@ class OutOptions:
 class EvalOptions(OutOptions):
     """What every command that runs a prior is told."""
 
-    prior: tuple[str, ...] = declare(("bundled",), "'bundled', a hub id or a folder; repeatable for rows.")
+    prior: str = declare("bundled", "'bundled', a hub id or a folder.")
     space: str | None = declare(None, "What the prior's map is affine in, unless it says.", choices=SPACES)
     dtype: str = declare("float32", f"{', '.join(DTYPES)}.", choices=DTYPES)
     device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if len(self.prior) != 1 and not isinstance(self, PairsOptions):
-            bad_value("--prior", "given once", " ".join(self.prior) or "nothing")
 
     @property
     def settings(self) -> Settings:
@@ -104,7 +97,7 @@ class EvalOptions(OutOptions):
 
         names = ("ensemble", "seed", "steps", "resolution", "dtype", "space", "views")
         given = {name: getattr(self, name) for name in names if hasattr(self, name)}
-        return Settings(self.prior[0], device=str(pick_device(self.device)), **given)
+        return Settings(self.prior, device=str(pick_device(self.device)), **given)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +131,6 @@ class PairsOptions(_SampleOptions):
     pairs: str = declare("default", "Of posed views: default (two) or all.", choices=("default", "all"))
     pixel_centre: float | None = declare(None, "First pixel's centre in posed cameras, 0.5 for COLMAP's.")
     crop: str = declare("none", "Region that is scored: none, garg, eigen, benchmark (KITTI).", choices=CROPS)
-    pose: tuple[str, ...] = _list((), f"Rows of 'guided' by pose: {', '.join(POSES)}.", choices=POSES)
     skip_broken: bool = declare(False, "Go on after a broken sample and count it.", panel=OUTPUT)
     save_depth: bool = declare(False, "Write every depth map as .npy.", panel=OUTPUT)
 

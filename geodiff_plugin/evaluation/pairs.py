@@ -17,7 +17,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.config import DEFAULT, value_of
 from geodiff_plugin.evaluation import experiment, tables
-from geodiff_plugin.evaluation.baselines import find_method, with_poses, with_priors
+from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
@@ -27,12 +27,10 @@ from geodiff_plugin.runner import Item, Record, this_process
 
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:
-    """Cells of methods, with every further prior and pose of the options."""
-    names = with_priors(with_poses(tuple(dict.fromkeys(methods)), options.pose), options.prior[1:])
-    refs = options.changed(refs)
-    return experiment.method_cells(
-        refs, names, options.settings, options.out, crop=options.crop, save_depth=options.save_depth
-    )
+    """Cells of methods, on samples changed and scored as the options say."""
+    names, refs, crop = tuple(dict.fromkeys(methods)), options.changed(refs), options.crop
+    settings, out = options.settings, options.out
+    return experiment.method_cells(refs, names, settings, out, crop=crop, save_depth=options.save_depth)
 
 
 def compare(
@@ -56,10 +54,7 @@ def compare(
 
 def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
     """Sentences above the tables: the prior, what methods could not do and why, samples that were broken."""
-    prior = options.prior[0]
-    remarks = [f"Prior {prior}, seed {options.seed}, ensemble {options.ensemble}."]
-    if options.prior[1:]:
-        remarks.append(f"Rows that name no prior: {prior}.")
+    remarks = [f"Prior {options.prior}, seed {options.seed}, ensemble {options.ensemble}."]
     if options.crop != "none":
         remarks.append(f"Only what lies in the crop {options.crop!r} is scored.")
     reasons = Counter(
@@ -253,11 +248,10 @@ def run_cost(name: str, options: PairsOptions) -> Page:
         bad_value("the number of processes", "1 for cost", this_process().count)
     refs = select(all_refs(options), options)
     records, taken = list[Record](), dict[str, int | None]()
-    alone = replace(options, prior=options.prior[:1], out=options.out / "cost")
-    for method in with_priors(tuple(dict.fromkeys((*COST_METHODS, *options.methods))), options.prior[1:]):
-        prior = find_method(method).prior or options.prior[0]
-        if prior not in taken:
-            taken[prior] = options.steps or _steps_of(prior)
+    alone = replace(options, out=options.out / "cost")
+    for method in dict.fromkeys((*COST_METHODS, *options.methods)):
+        prior = find_method(method).prior or options.prior
+        taken[prior] = options.steps or _steps_of(prior)
         # What one method frees stays with the allocator, where the next would find it at no cost.
         with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
             job = fresh_process.submit(_method_records, refs, method, replace(alone, steps=taken[prior]))

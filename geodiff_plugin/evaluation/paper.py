@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation import tables
-from geodiff_plugin.evaluation.baselines import find_method, with_priors
+from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef
 from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
@@ -240,7 +240,7 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
     def page_tables(records: list[Record]) -> list[Table]:
         finished = {tables.label_of(record) for record in records if record["status"] != "broken"}
         measured = [c._replace(labels=frozenset(ref.label for ref in own) & finished) for c, own in chosen]
-        shown = [layout_table(layout, measured, records, with_priors(names, options.prior[1:]))]
+        shown = [layout_table(layout, measured, records, names)]
         shown += [changes_table(records, preset) for preset in (ABLATED if ablation else ())]
         for column in measured:
             title = f"All metrics, {column.title}, {count_of_pairs(len(column.labels))}"

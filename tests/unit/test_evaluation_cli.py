@@ -58,10 +58,9 @@ def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
     maps.mkdir()
     np.save(maps / "middlebury2014_one.npy", np.full(SIZE, SHIFT, np.float32))
     words = ("pairs", data, "--methods", f"files:disparity:{maps}", "--scenes", "one", "-o", tmp_path / "out")
-    priors = ("--prior", "one", "--prior", "two", "--space", "disparity")
-    said = invoke(*words, "--crop", "eigen", *priors)
+    said = invoke(*words, "--crop", "eigen", "--prior", "one", "--space", "disparity")
     assert re.search(r"middlebury2014/one +0\.000\n", said) and "RAFT-Stereo" in said
-    for word in (" ".join(priors), "--crop eigen", "the crop 'eigen'"):
+    for word in ("--prior one --space disparity", "--crop eigen", "the crop 'eigen'", "Prior one, seed 0"):
         assert word in said
 
 
@@ -85,7 +84,6 @@ def test_pairs_goes_on_after_a_broken_sample_on_request_and_tries_it_again(data,
         ("pairs DATA --limit 0", "--limit must be between 1"),
         ("pairs DATA --sample 3", "--sample must be at most 2"),
         ("pairs DATA --crop middle", "--crop must be one of"),
-        ("pairs DATA --pose guess", "--pose"),
         ("pairs DATA --scenes three", "a sample with three in its name"),
         ("pairs TWICE --methods sgbm", "with several middlebury2014/one"),
         ("poses", "--data must be given, or --rendered above 0"),
@@ -118,9 +116,9 @@ def test_list_tells_what_is_there(data):
 
 def test_options_come_back_as_a_command_line():
     given = {"data": Path("synthetic-posed:2"), "methods": ("guided",), "perturb": "1.5,0.1"}
-    options = DirOptions(**given, pose=("refine", "given"), limit=3, out=Path("x"), quiet=True)
+    options = DirOptions(**given, crop="garg", limit=3, out=Path("x"), quiet=True)
     words = command_line("pairs", options).split()
-    expected = "synthetic-posed:2 --methods guided --limit 3 --perturb 1.5,0.1 --pose refine,given".split()
+    expected = "synthetic-posed:2 --methods guided --limit 3 --perturb 1.5,0.1 --crop garg".split()
     assert words[:3] == ["geodiff", "eval", "pairs"] and sorted(words[3:]) == sorted(expected)
 
 

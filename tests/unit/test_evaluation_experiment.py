@@ -14,8 +14,6 @@ from geodiff_plugin.evaluation.baselines import (
     Prediction,
     Settings,
     find_method,
-    with_poses,
-    with_priors,
 )
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.experiment import RECORDS_NAME, cell_key
@@ -123,9 +121,7 @@ def test_tables_hold_pairs_means_and_differences(bench):
 
 
 def test_priors_and_seeds_make_rows_whose_results_are_those_of_the_settings(bench):
-    assert with_priors(["noisy", "exact"], ["org/x"]) == ("noisy", "exact", "noisy@org/x")
     names = ("noisy", "exact", "noisy#1", "noisy@org/x", "noisy@org/x#1")
-    assert with_poses(("a", "guided"), ("given", "x")) == ("a", "guided:pose=given", "guided:pose=x")
     records = bench.go(names)
     assert [r["method"] for r in records[:5]] == list(names) and len(bench.calls) == 15
     bound = {"noisy#1": ("bundled", 1), "noisy@org/x": ("org/x", 0), "noisy@org/x#1": ("org/x", 1)}

@@ -144,7 +144,6 @@ def test_trust_counts_and_goes_on(tmp_path, monkeypatch, weights):
         ({}, "the truth of synthetic/seed0004 must be known"),
         ({"rendered": 0}, "--data must be given, or --rendered above 0"),
         ({"limit": -1}, "--limit must be between 1"),
-        ({"prior": ("bundled", "org/other")}, "--prior must be given once"),
     ],
 )
 def test_what_cannot_be_counted(tmp_path, monkeypatch, weights, sample, changed, said):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -19,7 +19,7 @@ from geodiff_plugin.evaluation.baselines.unguided import (
 )
 
 __all__ = ["FAMILIES", "METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
-__all__ += ["find_method", "with_poses", "with_priors"]
+__all__ += ["find_method"]
 
 METHODS: dict[str, Method] = {method.name: method for method in (*GUIDED_METHODS, *STEREO_METHODS)}
 """Every method by name, in the order of the tables' columns."""
@@ -69,15 +69,3 @@ def _bound(method: Method, suffix: str, form: str, title: str, **to: Any) -> Met
     if not (len(suffix) > 1 and method.uses_prior and method.seed is None):
         bad_value("methods", f"{form} with a method that uses a prior", method.name + suffix)
     return replace(method, name=method.name + suffix, title=title, **to)
-
-
-def with_priors(methods: Sequence[str], priors: Sequence[str]) -> tuple[str, ...]:
-    """The methods, then those of them that use a prior once more for every further prior."""
-    bound = [f"{name}@{prior}" for prior in priors for name in methods if find_method(name).uses_prior]
-    return (*methods, *bound)
-
-
-def with_poses(methods: Sequence[str], poses: Sequence[str]) -> tuple[str, ...]:
-    """The methods, with ``guided`` once for each of the named poses; none leaves them as they are."""
-    posed = tuple(f"guided:pose={pose}" for pose in poses) or ("guided",)
-    return tuple(name for given in methods for name in (posed if given == "guided" else (given,)))
