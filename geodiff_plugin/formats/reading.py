@@ -39,7 +39,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "Booster xml (proj_matL)", r"<opencv_st[\s\S]*proj_matL", robots.read_booster
     ),
     "mvsnet": CalibrationFormat(
-        "a pair of MVSNet cam.txt (extrinsic)", r"^\s*extrinsic\s*$", benchmarks.read_mvsnet, (2,)
+        "pair of MVSNet cam.txt (extrinsic)", r"^\s*extrinsic\s*$", benchmarks.read_mvsnet, (2,)
     ),
     "zed": CalibrationFormat(
         "ZED SN*.conf ([LEFT_CAM_HD])", r"^\s*\[(LEFT|RIGHT)_CAM_\w+\]", devices.read_zed
@@ -61,7 +61,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "kalibr": CalibrationFormat(
         "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", robots.read_kalibr, uses_cameras=True
     ),
-    "euroc": CalibrationFormat("a pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", robots.read_euroc, (2,)),
+    "euroc": CalibrationFormat("pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", robots.read_euroc, (2,)),
     # Older settings describe the rectification too, and OpenCV's reader has these names.
     "orb_slam": CalibrationFormat(
         "ORB-SLAM's stereo settings (Camera1.fx, Camera.bf)",
@@ -75,7 +75,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         (1, 2),
     ),
     "ros": CalibrationFormat(
-        "a pair of ROS camera_info (projection_matrix)",
+        "pair of ROS camera_info (projection_matrix)",
         r"^(projection_matrix|distortion_model|rectification_matrix)\s*:",
         robots.read_ros,
         (2,),
@@ -84,7 +84,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', benchmarks.read_stereodemo
     ),
     "colmap": CalibrationFormat(
-        "a COLMAP model (cameras.txt and images.txt)", colmap.MARK, colmap.read_colmap, (2,), by_image=True
+        "COLMAP model (cameras.txt and images.txt)", colmap.MARK, colmap.read_colmap, (2,), by_image=True
     ),
 }
 
