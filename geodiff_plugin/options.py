@@ -23,7 +23,7 @@ DTYPES = ("float32", "float16", "bfloat16")
 #: Keys of ``scale.space.SPACES``, which cannot be imported without torch; a test keeps them the same.
 SPACES = ("depth", "disparity", "log", "log1p", "sqrt_disparity")
 #: The presets that two views suffice for.
-PRESETS = ("default", "paper")
+PRESETS = ("default", "fast", "paper")
 
 
 def declare(
@@ -107,7 +107,9 @@ class RunOptions:
     seed: int = declare(0, "Seed of the noise.", low=0, high=2**63 - 1)
     device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
     dtype: str = declare("float32", "float32, float16 or bfloat16.", choices=DTYPES)
-    preset: str = declare("default", "default, or paper (Algorithm 1 as printed).", choices=PRESETS)
+    preset: str = declare(
+        "default", "default, fast (coarser matches, poses as given), or paper (Algorithm 1).", choices=PRESETS
+    )
     knob: tuple[str, ...] = declare(
         (), "A knob of the guidance (geodiff info --knobs), as inner_steps=0; repeatable."
     )

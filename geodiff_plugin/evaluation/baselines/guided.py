@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from geodiff_plugin.config import PAPER, PRIOR_FIT, GuidanceConfig, config_from_text
+from geodiff_plugin.config import FAST, PAPER, PRIOR_FIT, GuidanceConfig, config_from_text
 from geodiff_plugin.evaluation.baselines.base import (
     Method,
     NotApplicable,
@@ -258,6 +258,7 @@ GUIDED_METHODS = (
     _guided("paper", "paper", "the prior guided with the paper's own numbers", GeometryGuidance.paper),
     _guided("prior-fit", "prior fit", _FIT, partial(GeometryGuidance, config=PRIOR_FIT)),
     _guided("guided", "guided", "the prior guided with the default preset", GeometryGuidance),
+    _guided("fast", "fast", "the prior guided with the preset fast", partial(GeometryGuidance, config=FAST)),
     _guided("reprojection-only", "reprojection only", _UPDATES, _photometric_updates, _run_reprojection),
     _guided("no-diffusion", "no diffusion", _RAMP, _BELIEVING, partial(_run_ramp, _BELIEVING)),
 )
