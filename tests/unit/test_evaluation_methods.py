@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -49,6 +50,10 @@ def priors(make_pipeline):
 @pytest.mark.parametrize("name", METHODS)
 def test_method_answers_for_a_rectified_pair_and_a_posed_one_or_says_why_not(name, priors, textured_plane):
     sample = plane_sample(textured_plane)
+    if name == "sgbm-wls" and not hasattr(cv2, "ximgproc"):
+        with pytest.raises(NotApplicable, match="opencv-contrib-python"):
+            METHODS[name].run(sample, Settings(), priors)
+        return
     prediction = METHODS[name].run(sample, Settings(steps=1), priors)
     assert (prediction.depth_m is None) != (prediction.relative is None)
     assert score(sample, prediction, cap_m=None)["all_pixels"]["aligned"]["coverage"] > 0.5
@@ -59,7 +64,7 @@ def test_method_answers_for_a_rectified_pair_and_a_posed_one_or_says_why_not(nam
     try:
         prediction = METHODS[name].run(posed, Settings(steps=1), priors)
     except NotApplicable as reason:
-        assert name == "sgbm" and "rectified" in str(reason)
+        assert name in ("sgbm", "sgbm-wls") and "rectified" in str(reason)
     else:
         values = prediction.depth_m if prediction.relative is None else prediction.relative
         assert values.shape == posed.depth_m.shape
@@ -72,7 +77,7 @@ def test_configuration_is_json_and_names_what_matters(name):
     assert method.name == name and method.summary
     settings = Settings(), Settings(seed=1), Settings(device="cuda")
     plain, other, on_cuda = (json.dumps(method.configuration(s), sort_keys=True) for s in settings)
-    assert (plain != other) == method.uses_prior and (on_cuda == plain) == (name == "sgbm")
+    assert (plain != other) == method.uses_prior and (on_cuda == plain) == (name in ("sgbm", "sgbm-wls"))
     assert "bundled" not in plain  # the prior has its own place in the key
 
 

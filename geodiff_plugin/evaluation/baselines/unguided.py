@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -52,29 +54,42 @@ MAX_SHIFT = 0.25
 #: Matches with a smaller shift than this, in pixels, are taken for mistakes and filled: one such match in the
 #: sky's neighbourhood costs more AbsRel than a hundred good ones gain.
 MIN_SHIFT_PX = 1.0
+#: As OpenCV's example sets its filter.
+WLS_LAMBDA, WLS_SIGMA = 8000.0, 1.5
 
 
-def sgbm_shift(sample: StereoSample) -> np.ndarray:
+def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
     """``(H, W)`` float32 pixels: shift ``f b / z`` of a rectified pair, NaN where the match was rejected.
 
-    It is the disparity plus Middlebury's doffs.
+    It is the disparity plus Middlebury's doffs; with ``wls`` smoothed and filled by weighted least squares.
     """
     # Depth at infinity has the disparity cx_left - cx_right, which is 0 but for Middlebury's doffs.
     lowest = int(np.floor(sample.K_left[0, 2] - sample.K_right[0, 2]))
     count = 16 * int(np.ceil(MAX_SHIFT * sample.left.shape[1] / 16))
     matcher, pad = make_matcher(lowest, count, 3), max(0, lowest + count)
-    raw = matcher.compute(pad_columns(sample.left, pad), pad_columns(sample.right, pad))[:, pad:]
+    left, right = pad_columns(sample.left, pad), pad_columns(sample.right, pad)
+    raw = matcher.compute(left, right)
+    if wls:
+        ximgproc: Any = cv2.ximgproc  # type: ignore[attr-defined]
+        smoother = ximgproc.createDisparityWLSFilter(matcher)
+        smoother.setLambda(WLS_LAMBDA)
+        smoother.setSigmaColor(WLS_SIGMA)
+        raw_right = ximgproc.createRightMatcher(matcher).compute(right, left)
+        raw = smoother.filter(raw, left, disparity_map_right=raw_right)
+    raw = raw[:, pad:]
     shift = raw.astype(np.float32) / 16.0 + np.float32(sample.K_right[0, 2] - sample.K_left[0, 2])
     shift[(raw <= 16 * (lowest - 1)) | (shift < MIN_SHIFT_PX)] = np.nan
     return shift
 
 
-def _run_sgbm(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+def _run_sgbm(wls: bool, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     if not sample.rectified:
         raise NotApplicable("not rectified")
     if sample.left.shape != sample.right.shape:
         raise NotApplicable("views of different sizes")
-    with_holes = sgbm_shift(sample)
+    if wls and not hasattr(cv2, "ximgproc"):
+        raise NotApplicable("cv2.ximgproc, of opencv-contrib-python, is not installed")
+    with_holes = sgbm_shift(sample, wls)
     depth_m = sample.K_left[0, 0] * sample.E[0, 3] / fill_background(with_holes)
     return Prediction(depth_m, space="disparity", notes={"density": float(np.isfinite(with_holes).mean())})
 
@@ -91,12 +106,18 @@ def _run_sweep(sample: StereoSample, settings: Settings, priors: PriorCache) -> 
     return Prediction(depth_m, space="disparity", notes={"density": float(matched.float().mean())})
 
 
+def _sgbm_choices(settings: Settings) -> dict[str, Any]:
+    return _SHIFTS | PARAMETERS
+
+
 _SHIFTS = {"max_shift": MAX_SHIFT, "min_shift_px": MIN_SHIFT_PX, "mode": "3way", "fill": "background"}
 _CHOICES = {"cost": "census", "aggregation": "semi-global", "fill": "background"}
 _SGBM = "OpenCV StereoSGBM (3-way) with background fill; rectified pairs only"
+_WLS = "the same smoothed by OpenCV's WLS filter; needs opencv-contrib-python"
 _SWEEP = "our own plane sweep, aggregated, left-right checked and filled, any pose"
 STEREO_METHODS = (
-    Method("sgbm", "SGBM + fill", _SGBM, _run_sgbm, lambda settings: _SHIFTS | PARAMETERS, uses_prior=False),
+    Method("sgbm", "SGBM + fill", _SGBM, partial(_run_sgbm, False), _sgbm_choices, uses_prior=False),
+    Method("sgbm-wls", "SGBM + WLS", _WLS, partial(_run_sgbm, True), _sgbm_choices, uses_prior=False),
     Method(
         *("sweep-sgm", "sweep + SGM", _SWEEP, _run_sweep),
         lambda settings: _CHOICES | {"views": settings.views, "device": settings.device},
