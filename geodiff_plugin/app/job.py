@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import tempfile
 import threading
 from collections.abc import Callable
@@ -135,8 +136,7 @@ def run_job(
     for name, most in LIMITS.items():
         check_number(getattr(options, name) or 0, FIELD_NAMES.get(name, name), 0, most, integer=True)
     options.check(lambda field: FIELD_NAMES.get(field.name, field.name))
-    folder = Path(tempfile.mkdtemp(prefix="geodiff-")) / "depth"
-    job = Job(options, OutFolder(folder))
+    job = Job(options, OutFolder(Path(tempfile.gettempdir(), f"geodiff-{secrets.token_hex(8)}")))
     with collected_warnings(lambda _: None), job.folder:  # the job notes them
         stage(0.0, "Reading the photographs and cameras")
         # The page keeps what is dropped in folders of its own, so only the names say something.

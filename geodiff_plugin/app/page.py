@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable
 from shutil import rmtree
 from types import SimpleNamespace
-from typing import Any, Literal, TypedDict
+from typing import Any
 
 import gradio as gr
 import numpy as np
@@ -63,14 +63,8 @@ THEME = gr.themes.Base(
 )
 
 
-class _Handling(TypedDict):
-    queue: bool
-    show_progress: Literal["hidden"]
-    api_visibility: Literal["private"]
-
-
 #: Handlers that only the page itself calls.
-QUICK: _Handling = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
+QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
 
 
 class _Desk:
@@ -98,7 +92,7 @@ class _Desk:
 
 def _forget(job: Job | None) -> None:
     if job is not None:
-        rmtree(job.folder.path.parent, ignore_errors=True)
+        rmtree(job.folder.path, ignore_errors=True)
 
 
 def for_visitors(sentence: str) -> str:

@@ -134,14 +134,17 @@ def solve_capture(
         base.extract(images)
         base.match(candidate_pairs(E, len(sizes)))
         blurred = np.flatnonzero(base.features < BLURRED_SHARE * np.median(base.features))
-        notes = []
+        notes: list[str] = []
         if len(blurred):
             these = _some_names([names[int(i)] for i in blurred])
             notes.append(f"{these}: blurred or without texture; they are no good neighbours of others.")
         if E is None:
-            return _from_nothing(base, notes, names)
-        given, more = _in_convention(base, np.asarray(E, float))
-        return _from_given(base, given, notes + more, names, poses == "refined")
+            found = _from_nothing(base, notes)
+        else:
+            found = _from_given(
+                base, _in_convention(base, np.asarray(E, float), notes), notes, poses == "refined"
+            )
+        return _noted(found, notes, names)
 
 
 def _some_names(names: Sequence[str]) -> str:
@@ -196,25 +199,27 @@ def _of_frames(matches: Sequence[Match], distances: Sequence[np.ndarray], count:
     return np.array([_median_px(p) if sum(map(len, p)) >= FEWEST_PER_FRAME else math.nan for p in parts])
 
 
-def _in_convention(base: Reconstruction, E: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _in_convention(base: Reconstruction, E: np.ndarray, notes: list[str]) -> np.ndarray:
     """The given poses in our convention, found by the residuals of the matches."""
     matches = base.matches[:: max(1, len(base.matches) // 200)]
+    if not matches:
+        notes.append("No two frames match: are they of one scene, and sharp? The poses were not checked.")
+        return E
     forms = {
         "as given": E,
         "with OpenGL's axes (y up, z backward)": E @ OPENGL_FROM_OPENCV,
         "world-to-camera": np.linalg.inv(E),
         "world-to-camera with OpenGL's axes": np.linalg.inv(OPENGL_FROM_OPENCV @ E),
     }
-    if not matches:
-        return E, ["No two frames match: are they of one scene, and sharp? The poses were not checked."]
     misfit = {name: _misfit(form, base.K_given, matches) for name, form in forms.items()}
     best = min(misfit, key=lambda name: misfit[name])
-    if misfit[best] < CONVENTION_GAIN * misfit["as given"]:
-        return forms[best], [
-            f"The poses are read as {best}: as they stand, the matches contradict them, by residual or by "
-            "points behind the cameras."
-        ]
-    return E, []
+    if not misfit[best] < CONVENTION_GAIN * misfit["as given"]:
+        return E
+    notes.append(
+        f"The poses are read as {best}: as they stand, the matches contradict them, by residual or by points "
+        "behind the cameras."
+    )
+    return forms[best]
 
 
 def _misfit(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> float:
@@ -233,9 +238,7 @@ def _misfit(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> float:
     return _median_px(_residuals_px(E, K, matches)) / max(ahead / max(count, 1), 0.05)
 
 
-def _from_given(
-    base: Reconstruction, given: np.ndarray, notes: list[str], names: Sequence[str], refine: bool
-) -> SolvedCapture:
+def _from_given(base: Reconstruction, given: np.ndarray, notes: list[str], refine: bool) -> SolvedCapture:
     """Triangulate by the given poses, adjust, triangulate again; keep what is better, frame by frame."""
     matches = base.matches
     before = _residuals_px(given, base.K_given, matches)
@@ -246,7 +249,7 @@ def _from_given(
 
     start = started()
     if not refine or start.num_points3D() < FEWEST_OBSERVATIONS:
-        return _noted(replace(_found(base, start, "given", given, as_given), E=given), notes, names)
+        return replace(_found(base, start, "given", given, as_given), E=given)
     by_given = base.depths(start)
     focal = len(base) >= FEWEST_FOR_FOCAL
     model = _adjusted(base, start, given, focal)
@@ -256,11 +259,11 @@ def _from_given(
     after = _residuals_px(base.poses(model), base.K(model), matches)
     if not _median_px(after) < LEAST_GAIN * as_given[0]:
         notes.append(f"The given poses fit as well as any ({as_given[0]:.2f} px) and are kept.")
-        return _noted(replace(_found(base, started(), "kept", given, as_given), E=given), notes, names)
+        return replace(_found(base, started(), "kept", given, as_given), E=given)
     found = _found(base, model, "solved", given, (as_given[0], _median_px(after)))
     worse = _of_frames(matches, after, len(base)) > _of_frames(matches, before, len(base))
     found = replace(found, connected=found.connected & ~worse)
-    return _noted(_scaled(found, by_given, base.depths(model)), notes, names)
+    return _scaled(found, by_given, base.depths(model))
 
 
 def _adjusted(base: Reconstruction, model: Any, given: np.ndarray, focal: bool) -> Any:
@@ -363,30 +366,27 @@ def _found(
     )
 
 
-def _noted(found: SolvedCapture, notes: Sequence[str], names: Sequence[str]) -> SolvedCapture:
+def _noted(found: SolvedCapture, notes: list[str], names: Sequence[str]) -> SolvedCapture:
     """The capture with sentences on its scale and on frames that are not connected."""
-    remarks, spread = list(notes), found.scale_spread
-    if found.status == "solved":
-        ratio = found.scale_trajectory / found.scale_depth
-        if abs(math.log(ratio)) > DISAGREES:
-            remarks.append(
-                "The given positions and the depth of the scene under the given poses disagree on the scale, "
-                f"by {100 * abs(ratio - 1):.0f} %; the scale in use lies between."
-            )
-        if spread > DISAGREES:
-            cure = "give --known-length for an exact one."
-            remarks.append(f"The scale is uncertain by {100 * spread:.0f} %: {cure}")
+    ratio, spread = found.scale_trajectory / found.scale_depth, found.scale_spread
+    if abs(math.log(ratio)) > DISAGREES:
+        notes.append(
+            "The given positions and the depth of the scene under the given poses disagree on the scale, "
+            f"by {100 * abs(ratio - 1):.0f} %; the scale in use lies between."
+        )
+    if spread > DISAGREES:
+        notes.append(f"The scale is uncertain by {100 * spread:.0f} %: give --known-length for an exact one.")
     lost = [name for name, connected in zip(names, found.connected, strict=True) if not connected]
     if lost and found.status != "given":
         kept = "have no pose and are skipped" if found.E_given is None else "keep their poses as given"
-        remarks.append(
+        notes.append(
             f"{len(lost)} of {len(names)} frames share too few points with others, or fit no better "
             f"where the others put them, and {kept}: {_some_names(lost)}."
         )
-    return replace(found, notes=tuple(remarks))
+    return replace(found, notes=tuple(notes))
 
 
-def _from_nothing(base: Reconstruction, notes: list[str], names: Sequence[str]) -> SolvedCapture:
+def _from_nothing(base: Reconstruction, notes: list[str]) -> SolvedCapture:
     """Structure from motion without given poses; the largest model."""
     models = base.from_nothing()
     if not models:
@@ -397,4 +397,4 @@ def _from_nothing(base: Reconstruction, notes: list[str], names: Sequence[str]) 
     after = _median_px(_residuals_px(E, K, [m for m in base.matches if there[[m[0], m[1]]].all()]))
     if len(models) > 1:
         notes.append(f"{len(models)} parts are not connected; the largest is used.")
-    return _noted(_found(base, models[0], "estimated", None, (math.nan, after)), notes, names)
+    return _found(base, models[0], "estimated", None, (math.nan, after))

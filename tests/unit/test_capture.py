@@ -117,7 +117,7 @@ def test_a_frame_that_fits_worse_than_it_was_given_keeps_its_pose(monkeypatch):
             distances = [d * 9 if 7 in pair[:2] else d for d, pair in zip(distances, matches, strict=True)]
         return distances
 
-    monkeypatch.setattr("geodiff_plugin.pose.capture._in_convention", lambda base, E: (E, []))
+    monkeypatch.setattr("geodiff_plugin.pose.capture._in_convention", lambda base, E, notes: E)
     monkeypatch.setattr("geodiff_plugin.pose.capture._residuals_px", residuals)
     found = solve(GIVEN)
     assert found.status == "solved" and np.flatnonzero(~found.connected).tolist() == [7]
