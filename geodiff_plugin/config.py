@@ -64,20 +64,20 @@ def _knob(default: Any, values: str, check: Callable[[Any, str], Any], **more: s
     return field(default=default, metadata={"knob": knob})
 
 
-def _number(default: float | None, low: float, high: float, **more: str) -> Any:
-    """A finite number in ``[low, high]``."""
-    values = f"[{low:g}, {high:g}]"
-    return _knob(default, values, lambda v, name: float(check_number(v, name, low, high)), **more)
+def _number(default: float | None, low: float, high: float, kind: type = float, **more: str) -> Any:
+    """A finite number in ``[low, high]``, or a whole one."""
+    whole = kind is int
+    values = f"{'integer, ' * whole}[{low:g}, {high:g}]"
+    return _knob(
+        default, values, lambda v, name: kind(check_number(v, name, low, high, integer=whole)), **more
+    )
 
 
 def _integer(default: int | None, low: int, high: int, **more: str) -> Any:
-    """A whole number in ``[low, high]``."""
-    values = f"integer, [{low:g}, {high:g}]"
-    return _knob(default, values, lambda v, name: int(check_number(v, name, low, high, integer=True)), **more)
+    return _number(default, low, high, int, **more)
 
 
 def _flag(default: bool, **more: str) -> Any:
-    """``True`` or ``False``, nothing else."""
     return _knob(default, "bool", check_flag, **more)
 
 

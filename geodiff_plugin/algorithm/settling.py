@@ -20,7 +20,7 @@ from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refine_to_matches
 from geodiff_plugin.scale.space import AffineState, MetricMap, smooth_floor
-from geodiff_plugin.scale.volume_search import argmin_over, search_scale
+from geodiff_plugin.scale.volume_search import search_scale
 
 #: Metres ``(B,)`` of the nearest and of the farthest end of a map.
 _Ends = tuple[Tensor, Tensor]
@@ -33,6 +33,7 @@ def span_of_points(evidence: Sequence[Evidence]) -> _Ends:
     return torch.stack(nearest), torch.stack(farthest)
 
 
+@torch.no_grad()
 def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Tensor]:
     """The paper's s_hat = t_hat = 0 and the g_s of least photometric loss; whether that is on the edge."""
     config, zero = objective.config, x.new_zeros(x.shape[0])
@@ -46,8 +47,8 @@ def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Ten
         shown = (loss.visible_fraction > 0) & (loss.visible_fraction >= config.min_visible)
         return loss.terms["photometric"].where(shown, torch.inf)
 
-    best, on_edge = argmin_over(candidates, cost)
-    return AffineState(zero, zero, best), on_edge
+    index = torch.stack([cost(g_s) for g_s in candidates]).argmin(0)  # S7.3, g_s* = argmin L_geo
+    return AffineState(zero, zero, candidates[index]), (index == 0) | (index == len(candidates) - 1)
 
 
 def settle_ends(

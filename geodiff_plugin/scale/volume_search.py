@@ -142,13 +142,3 @@ def _coarse_to_fine(
         near, far, mean = best_of(torch.minimum(n, f), torch.maximum(n, f))
         reach = reach / (FINE_GRID - 1) * 2
     return near, far, mean
-
-
-def argmin_over(candidates: Tensor, cost: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """The candidate of least ``cost`` per sample, ``(B,)``, and whether it is the first or the last.
-
-    Source: S7.3, ``g_s* = argmin L_geo``.
-    """
-    with torch.no_grad():
-        index = torch.stack([cost(c) for c in candidates]).argmin(0)
-    return candidates[index], (index == 0) | (index == len(candidates) - 1)
