@@ -86,15 +86,6 @@ def test_projection_and_warp_are_the_definition(seed, pose, size_right):
         )
 
 
-def test_zero_baseline_is_the_identity():
-    image = torch.rand(2, 3, *SIZE, generator=torch.Generator().manual_seed(0))
-    depth = 1.0 + 3.0 * torch.rand(2, 1, *SIZE, generator=torch.Generator().manual_seed(1))
-    cameras = [tensor(m).float().expand(2, -1, -1) for m in (K, K, np.eye(4))]
-    warped = g.warp_right_to_left(image, depth, *cameras)
-    torch.testing.assert_close(warped.image, image, atol=1e-5, rtol=0)
-    assert warped.visible.all() and not g.hidden_in_right(depth, *cameras, SIZE).any()
-
-
 def test_depth_at_and_behind_the_camera_is_finite_invisible_and_without_gradient():
     values = torch.tensor([2.0, 0.5, 0.25, 0.0, -1.0, 1e-9, 0.25 + 1e-12, 1e9])
     depth = values.repeat(1, 1, 4, 1).double().requires_grad_()

@@ -67,19 +67,6 @@ def test_values_are_the_formulas(knobs, matched):
         np.testing.assert_allclose(TERMS[name].function(compared), value, rtol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("points_loss", ["robust", "l1l2"])
-def test_gradients_of_points_and_matches(points_loss):
-    depth, known = (draw(1, 1, 6, 7, seed=5) + 1.0).requires_grad_(), (draw(1, 1, 6, 7) < 0.4).double()
-    target = Matches(known / (draw(1, 1, 6, 7, seed=6) + 1.0), known, torch.tensor([0.01]).double())
-    base = estimate(points=target, config=DEFAULT.changed(points_loss=points_loss))
-    assert torch.autograd.gradcheck(lambda d: TERMS["points"].function(base._replace(depth_m=d)), depth)
-    (grad,) = torch.autograd.grad(TERMS["points"].function(base._replace(depth_m=depth)).sum(), depth)
-    assert (grad[known == 0] == 0).all() and (grad[known > 0] != 0).all()
-    far_off = torch.full((2, 1, *SIZE), 50.0, requires_grad=True)  # still feels where its matches are
-    (grad,) = torch.autograd.grad(TERMS["matches"].function(estimate(depth_m=far_off)).sum(), far_off)
-    assert (grad > 0).all()
-
-
 def test_photometric_ignores_what_is_not_visible():
     warped, seen = estimate().warped_01.clone(), torch.zeros(2, 1, 1, *SIZE, dtype=torch.bool)
     warped[..., 20:] = 0.0
