@@ -24,11 +24,7 @@ COPIED = (".json", ".txt", ".md", ".model", ".safetensors")
 def run_convert(paths: Sequence[Path], part: str | None = None, space: str | None = None) -> None:
     """Convert and say where it is; nothing is left behind where that fails.
 
-    Args:
-        paths: checkpoint file (or a folder in diffusers' layout with .bin weights) and the folder to appear;
-            or ``marigold-v2``, base, checkpoint and the folder to appear.
-        part: file, folder or hub id of what the checkpoint lacks (DepthFM's VAE), ``None`` for the usual one.
-        space: of Marigold V2, where the checkpoint's folder does not tell.
+    ``part`` is the file, folder or hub id of what the checkpoint lacks; ``None`` for the usual one.
     """
     layered = len(paths) == 4 and str(paths[0]) == MARIGOLD_V2
     if not layered and len(paths) != 2:

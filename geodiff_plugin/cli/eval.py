@@ -38,12 +38,8 @@ def _print_page(page: Page) -> None:
     """Title, how the page was made, its remarks and its tables."""
     from rich.text import Text
 
-    show(
-        Text(page.title, style="bold"),
-        Text(page.facts["command"], style="dim"),
-        Text(page.origin(), style="dim"),
-        *page.remarks,
-    )
+    origin = (Text(page.facts["command"], style="dim"), Text(page.origin(), style="dim"))
+    show(Text(page.title, style="bold"), *origin, *page.remarks)
     for table in page.tables:
         shown = new_table(table.full_header(), table.title)
         for row in table.rows:
@@ -72,14 +68,6 @@ def _list(options: _ListOptions) -> None:
     print_lines(rows)
 
 
-eval_app = new_group(
-    "Measure this package and its peers on data sets in their official layouts.",
-    {name: Command(each.options, partial(_run, name), each.about) for name, each in COMMANDS.items()}
-    | {
-        "list": Command(
-            _ListOptions,
-            _list,
-            "Say for every data set whether it is there and how to obtain it, and list the methods.",
-        )
-    },
-)
+_COMMANDS = {name: Command(each.options, partial(_run, name), each.about) for name, each in COMMANDS.items()}
+_COMMANDS["list"] = Command(_ListOptions, _list, "Say which data sets are there; list the methods.")
+eval_app = new_group("Measure this package and its peers on data sets.", _COMMANDS)

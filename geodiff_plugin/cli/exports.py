@@ -29,13 +29,9 @@ from geodiff_plugin.types import MetricDepthOutput
 def write_maps(
     folder: Path, output: MetricDepthOutput, left: np.ndarray, min_confidence: float = 0.0
 ) -> dict[str, Any]:
-    """Write every file but exports and the report; counts for that.
+    """Write every file but exports and the report of one image, at its resolution; counts for the report.
 
-    Args:
-        folder: an existing one.
-        output: of the guided call, at the left image's resolution.
-        left: ``(H, W, 3)`` image in [0, 1], colours of the cloud.
-        min_confidence: pixels below it are no points of the cloud, [0, 1].
+    The image ``left (H, W, 3)`` in [0, 1] colours the cloud, which pixels of less confidence are not part of.
     """
     depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
     write_depth_npy(folder / "depth.npy", depth_m)

@@ -67,14 +67,8 @@ def read_inputs(
 ) -> Inputs:
     """Read the images and the cameras, and see that they fit each other.
 
-    Args:
-        options: that the checks of ``cli.options`` have seen.
-        config: of the guidance.
-        frames: left and right image, ``(H, W, 3)`` float32 in [0, 1], where they are no files of their own.
-        names: by which a calibration file knows them, where those are not their paths.
-
-    Raises:
-        InputError: naming the option or the file, or why there is no pose to be had.
+    The checks of ``cli.options`` have seen the options. Views that are no files of their own are given as
+    ``frames``, left and right, ``(H, W, 3)`` float32 in [0, 1].
     """
     views = options.photographs()
     images = list(frames or map(_read_view, views.values(), views))
@@ -93,11 +87,8 @@ def read_inputs(
         poses += [check_pose(read_matrix(path, "--view-E"), f"--view-E {path}") for path in options.view_e]
     lenses = lenses_of(options, rig)
     images = [pinhole(*each, config) for each in zip(images, Ks, lenses, strict=False)]
-    known: dict[str, Any] = {
-        "points": _read_known(options, Ks[0], lenses[0], sizes[0], rig),
-        "points_confidence": None,
-        "cropped": options.cropped,
-    }
+    known: dict[str, Any] = {"points": _read_known(options, Ks[0], lenses[0], sizes[0], rig)}
+    known |= {"points_confidence": None, "cropped": options.cropped}
     if options.points_confidence is not None:
         _refuse_lens(lenses[0], "--points-confidence", "Give the points of an image without it, with theirs.")
         known["points_confidence"] = read_confidence(options.points_confidence, "--points-confidence")
@@ -233,11 +224,8 @@ def _read_known(
 ) -> np.ndarray | None:
     """The depths of ``--points`` or ``--disparity`` as the left image without lens distortion has them.
 
-    Points in the camera's frame stay as they are. The pixels of a map are those of the image as it was
-    taken, so behind a lens with distortion its depths become points.
-
-    Returns:
-        ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)`` float32 metres.
+    That is a map ``(H, W)`` float32 metres, 0 where unknown, or points ``(N, 3)``, which a map becomes behind
+    a lens with distortion: its pixels are those of the image as it was taken.
     """
     if options.disparity is not None:
         _refuse_lens(lens, "--disparity", "Rectify the images.")
@@ -281,19 +269,13 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> Lenses:
     if len(typed) > 2:
         bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
     if rig is not None and rig.rectified and any(is_distorted(lens) for lens in typed):
-        bad_value(
-            "--distortion",
-            f"left out where the calibration is of rectified images ({rig.source})",
-            " and ".join(options.distortion),
-            "Drop it and give the rectified images. If its numbers are of the raw cameras, give them as "
-            "--fx --fy --cx --cy --baseline (parallel cameras with one K), or as --K, --K-right and --E.",
-        )
+        expected = f"left out where the calibration is of rectified images ({rig.source})"
+        cure = "Give the rectified images; or the raw ones, with their cameras as --K, --K-right and --E."
+        bad_value("--distortion", expected, " and ".join(options.distortion), cure)
     pair = (typed[0], typed[-1]) if typed else (None, None) if rig is None else rig.distortion
-    further: list[Distortion | None] = [
-        distortion_from_text(text, "--view-distortion") for text in options.view_distortion
-    ]
+    further = [distortion_from_text(text, "--view-distortion") for text in options.view_distortion]
     if options.view_k and not further and any(is_distorted(lens) for lens in pair):
         cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
         bad_value("--view-distortion", "given for each --view", "none", cure)
-    further = further or [pair[0]] * len(options.view)
-    return tuple(lens if is_distorted(lens) else None for lens in (*pair, *further))
+    lenses = (*pair, *(further or [pair[0]] * len(options.view)))
+    return tuple(lens if is_distorted(lens) else None for lens in lenses)

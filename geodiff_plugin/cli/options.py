@@ -26,12 +26,6 @@ WAYS = {
     "parameters": (*PARAMETERS[:-1], "cx_right"),
     "--fov": ("fov",),
 }
-#: What helps where a way is taken in parts.
-CURES = {
-    "matrices": "--K and --E go together, but for one photograph; --K-right is optional.",
-    "parameters": "--fy is --fx where pixels are square; --cx, --cy are near the middle of the image; "
-    "--baseline is the distance of the cameras in metres.",
-}
 #: Fields that hold paths, but not of files that are read beside the photographs.
 PHOTOGRAPHS_AND_OUT = ("left", "right", "view", "out")
 
@@ -208,11 +202,7 @@ class DepthOptions(RunOptions):
         yield alone, ("e", "k_right", "view", "estimate_pose"), *second
 
     def cameras_way(self) -> str:
-        """How the cameras are given, or with ``--estimate-pose`` how K is: a key of ``WAYS``, or ``"EXIF"``.
-
-        Raises:
-            InputError: in no way, in more than one, or in parts.
-        """
+        """How the cameras are given, or with ``--estimate-pose`` K: a key of ``WAYS``, or ``"EXIF"``."""
         alone = self.right is None and self.disparity is None
         # --baseline beside --calib gives a file its unit, as COLMAP's models need it.
         needed: dict[str, tuple[str, ...]] = {}
@@ -239,7 +229,7 @@ class DepthOptions(RunOptions):
         if missing:
             names = dict.fromkeys((*needed[way], *WAYS[way]))
             there = " ".join(_flag(name) for name in names if name in given)
-            bad_value(" ".join(missing), f"given as well, with {there}", "nothing", CURES[way])
+            bad_value(" ".join(missing), f"given as well, with {there}", "nothing")
         if self.estimate_pose and self.cropped and way in ("--fov", "EXIF") and not self.view_k:
             cure = "A field of view, or EXIF, does not tell where the principal point of a crop is."
             bad_value("--cropped", "given with --K, or --fx --fy --cx --cy", f"K by {way}", cure)

@@ -129,12 +129,8 @@ def convert_marigold_v2(
 ) -> None:
     """Write the folder of a prior; at most one file of the base is in memory.
 
-    Args:
-        base: Qwen-Image-Edit-2509 in diffusers' layout, of which ``transformer/`` and ``vae/`` are read.
-        checkpoint: folder with ``trainables.safetensors``, or that file.
-        folder: an empty one to fill.
-        prompts: folder of the prompt's files; ``None`` looks for it above the checkpoint.
-        space: what the map is affine in; ``None`` as the checkpoint's folder says.
+    Of the base, Qwen-Image-Edit-2509 in diffusers' layout, ``transformer/`` and ``vae/`` are read; the
+    checkpoint is a folder with ``trainables.safetensors``, or that file.
     """
     file = checkpoint / TRAINABLES if os.path.isdir(checkpoint) else checkpoint
     if not os.path.isfile(file) or file.suffix != ".safetensors":
