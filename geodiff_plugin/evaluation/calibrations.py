@@ -6,7 +6,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -237,7 +237,7 @@ def run_trust(name: str, options: TrustOptions) -> Page | None:
     for kind in kinds:
         check_choice(kind, "--kinds", WRONG)
     pairs = real_and_rendered(options, f"synthetic:{{}}@{options.width}x{options.width * 3 // 4}")
-    settings, priors, read = options.settings, PriorCache(), experiment.last_of(load)
+    settings, priors, read = options.settings, PriorCache(), lru_cache(maxsize=1)(load)
     configuration = guided_configuration(GeometryGuidance, settings)
     pipe, prior = priors.get(settings), f"{settings.prior} {priors.fingerprint(settings)}"
     cells = []

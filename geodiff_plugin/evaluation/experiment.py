@@ -137,19 +137,6 @@ def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: 
     return fingerprint(method, configuration, prior, __version__, ref.dataset, ref.name, files)
 
 
-def last_of(make: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """``make`` that remembers what it made last, for the same object: one sample serves all its methods."""
-    kept: list[Any] = [None, None]
-
-    def get(source: Any) -> Any:
-        if kept[0] is not source:
-            kept[:] = [None, None]  # two samples are not in memory at a time
-            kept[:] = [source, make(source)]
-        return kept[1]
-
-    return get
-
-
 @lru_cache(maxsize=1)
 def cropped(sample: StereoSample, crop: str) -> StereoSample:
     """The sample with the truth inside of a crop only; images and cameras stay whole."""
@@ -214,7 +201,8 @@ def method_cells(
     ``status`` ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"`` (``error``), and the numbers of
     ``scoring.score``.
     """
-    process, priors, read = this_process(), PriorCache(), last_of(load)
+    # One sample, read once, serves all its methods.
+    process, priors, read = this_process(), PriorCache(), lru_cache(maxsize=1)(load)
     several = process.count > 1
     if several and settings.device == "cuda":
         settings = replace(settings, device=f"cuda:{process.local % torch.cuda.device_count()}")

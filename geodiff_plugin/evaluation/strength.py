@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from functools import partial
+from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from geodiff_plugin.evaluation import tables
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load
 from geodiff_plugin.evaluation.edges import edge_error, surface_error
-from geodiff_plugin.evaluation.experiment import Page, cell_key, last_of, run_experiment
+from geodiff_plugin.evaluation.experiment import Page, cell_key, run_experiment
 from geodiff_plugin.evaluation.figures import draw_strength, shaded
 from geodiff_plugin.evaluation.metrics import evaluate_depth, to_space
 from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions, data_of
@@ -243,7 +243,7 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
     refs = [ref for root in options.data or (data_of(options),) for ref in find_pairs(root)[: options.limit]]
     if not refs:
         bad_value("--data", "a folder with pairs", " ".join(map(str, options.data)))
-    prior, read, cells = EmulatedPrior(options.space, options.follow), last_of(load), []
+    prior, read, cells = EmulatedPrior(options.space, options.follow), lru_cache(maxsize=1)(load), []
     for ref, strength, method_name in product(refs, options.strengths, options.methods):
         method = find_method(method_name)
         configuration = method.configuration(method.own_settings(_settings(options)))

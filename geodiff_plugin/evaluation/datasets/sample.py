@@ -76,7 +76,7 @@ class StereoSample:
         return self
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SampleRef:
     """A sample that was listed but not read yet; ``files`` has the paths and numbers that its loader needs.
 
