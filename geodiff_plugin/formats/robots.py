@@ -287,5 +287,5 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 def read_booster(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """For the images at full resolution, which are rectified; lengths are millimetres."""
     entries = _storage(texts[0])
-    left, right = (Camera(array_of(entries[key], (3, 4), key)[:, :3]) for key in ("proj_matl", "proj_matr"))
+    left, right = (Camera(array_of(entries[key], (3, -1), key)[:, :3]) for key in ("proj_matl", "proj_matr"))
     return make_rig(left, right, entries["baselinelr"].item() / MM_PER_METRE, rectified=True)
