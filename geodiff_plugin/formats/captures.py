@@ -214,18 +214,13 @@ def _transforms(path: Path, typed: Typed) -> CaptureFiles | None:
     frames: list[CaptureFrame] = []
     unit: str | None = "m"
     for name, entries in nerf_frames(read_text(file, "PATH")).items():
-        image = _named_image(file.parent, name)
+        paths = [file.parent / f"{name}{suffix}" for suffix in ("", *IMAGES)]  # synthetic scenes leave it out
+        image = next((path for path in paths if path.is_file()), paths[0])
         camera = nerf_camera(entries, _size(image) if image.is_file() else None)
         depth = file.parent / entries.get("depth_file_path", f"depth/{image.stem}.png")
         frames.append(_framed(image, camera, nerf_pose(entries), typed, depth))
         unit = None if any(key in entries for key in OF_COLMAP) else unit
     return CaptureFiles(tuple(frames), "transforms.json", unit)
-
-
-def _named_image(folder: Path, name: str) -> Path:
-    """The image of ``file_path``; synthetic scenes leave its suffix out."""
-    paths = [folder / name, *(folder / (name + suffix) for suffix in IMAGES)]
-    return next((path for path in paths if path.is_file()), paths[0])
 
 
 def _colmap(path: Path, typed: Typed) -> CaptureFiles | None:
