@@ -99,8 +99,9 @@ def for_visitors(sentence: str) -> str:
     """A sentence of the command line without the server's folders, and with fields for options."""
     sentence = re.sub(r"(?<![\w.])/(?:[^\s/]+/)+", "", sentence)
     sentence = re.sub(r" \([^()]*--[^()]*\)", "", sentence)
-    sentence = sentence.replace("LEFT", "the left photograph").replace("RIGHT", "the right photograph")
-    return re.sub(r"--([a-z])", r"\1", sentence)
+    for side in ("left", "right"):
+        sentence = re.sub(rf"\b{side.upper()}\b", f"the {side} photograph", sentence)
+    return re.sub(r"--(\w)", r"\1", sentence)
 
 
 def _sentence(error: Exception) -> str:

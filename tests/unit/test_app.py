@@ -188,14 +188,11 @@ def test_a_stop_ends_a_job_between_steps(priors, asked):
     ("changes", "said"),
     [
         ({"prior": "/etc"}, "prior must be one of"),
-        ({"preset": "best"}, "preset must be one of"),
-        ({"near": 1.0}, "the farthest depth must be given together with the nearest depth"),
         ({"near": 3.0, "far": 2.0}, "the nearest depth must be less than the farthest depth; got 3 and 2"),
         ({"near": math.nan, "far": 5.0}, "the nearest depth must be a finite number .* above 0; got nan"),
         ({"steps": 1000}, "steps must be between"),
         ({"ensemble": 21}, "members must be between 0 and 20"),
         ({"resolution": 10_000}, "resolution must be between"),
-        ({"seed": 2**70}, "seed must be between"),
     ],
 )
 def test_settings_that_a_job_refuses(priors, asked, changes, said):
