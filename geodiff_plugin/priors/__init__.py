@@ -62,8 +62,8 @@ class FoundPrior:
 
     @property
     def licence(self) -> str:
-        """Of the weights: as the model card says, as known by hub id, or ``"licence unknown"``."""
-        return self.layout.licence or PRIORS[self.key].licence.get(self.layout.name) or "licence unknown"
+        """Of the weights, as the model card says; of a map, that of its model."""
+        return "that of the model which made the map" if self.key == "map" else self.layout.licence
 
     def load(
         self,

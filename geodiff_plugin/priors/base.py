@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +18,6 @@ class DepthPrior:
 
     Attributes:
         pipeline_class: of the pipelines that it understands.
-        licence: of the weights by hub id, for those that are known.
         space: what the decoded map is affine in, key of ``SPACES``.
         max_steps: most denoising steps that make sense, ``None`` for any number. A guided call of a prior
             with one step makes as many updates in it as it would have made in ``min_steps`` steps.
@@ -30,7 +29,6 @@ class DepthPrior:
     """
 
     pipeline_class: type[Any] = DepthDiffusionPipeline
-    licence: ClassVar[dict[str, str]] = {}
 
     def __init__(self, pipe: Any) -> None:
         self._pipe = pipe

@@ -114,7 +114,6 @@ class DepthMasterPrior(DepthPrior):
     """DepthMaster: a U-Net on the image latent alone, and no scheduler."""
 
     pipeline_class = DepthMasterPipeline
-    licence = {"zysong212/DepthMaster": "apache-2.0"}
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

@@ -166,7 +166,6 @@ class GeoWizardPrior(DepthPrior):
     """
 
     pipeline_class = GeoWizardPipeline
-    licence = {"lemonaddie/geowizard": "cc-by-4.0", "lemonaddie/Geowizard": "cc-by-4.0"}
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

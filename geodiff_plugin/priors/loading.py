@@ -101,13 +101,13 @@ class Layout:
         return (self.folder / component).exists()
 
     @cached_property
-    def licence(self) -> str | None:
-        """``license:`` of the model card's front matter, if it has one."""
+    def licence(self) -> str:
+        """``license:`` of the model card's front matter, or ``"licence unknown"``."""
         try:
             card = metadata_load(self.folder / "README.md") or {}
         except (OSError, ValueError, YAMLError):
-            return None
-        return str(card["license"]) if card.get("license") else None
+            card = {}
+        return str(card.get("license") or "licence unknown")
 
 
 def refuse(name: str) -> None:

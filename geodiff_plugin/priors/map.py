@@ -145,7 +145,6 @@ class DepthMapPrior(DepthPrior):
     """Adapter of ``DepthMapPipeline``: scale, shift and a residual per pixel can be guided."""
 
     pipeline_class = DepthMapPipeline
-    licence = {"map": "that of the model which made the map"}
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

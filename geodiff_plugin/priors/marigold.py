@@ -18,15 +18,11 @@ from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import decode_picture, encode_picture, map_of, picture_of
 from geodiff_plugin.scale.space import SPACES
 
-#: Under ``prs-eth/``.
-PUBLISHED = ("depth-v1-1", "depth-v1-0", "v1-0", "depth-lcm-v1-0", "lcm-v1-0")
-
 
 class MarigoldPrior(DepthPrior):
     """Adapter of ``MarigoldDepthPipeline``; its ``prediction_type`` must be a key of ``SPACES``."""
 
     pipeline_class = MarigoldDepthPipeline
-    licence = dict.fromkeys([f"prs-eth/marigold-{name}" for name in PUBLISHED], "openrail++ (RAIL++-M)")
 
     def __init__(self, pipe: Any) -> None:
         super().__init__(pipe)
@@ -114,7 +110,6 @@ class E2EFTPrior(MarigoldPrior):
     """Adapter of ``E2EFTPipeline``; network, input and decoder are Marigold's."""
 
     pipeline_class = E2EFTPipeline
-    licence = {}  # the authors' repository does not say
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

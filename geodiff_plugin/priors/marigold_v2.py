@@ -149,7 +149,6 @@ class MarigoldV2Prior(DepthPrior):
     """Marigold V2: one step of a transformer on the image's latent, in log, linear or inverse depth."""
 
     pipeline_class = MarigoldV2Pipeline
-    licence = {"huawei-bayerlab/marigold-v2-0": "apache-2.0"}
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

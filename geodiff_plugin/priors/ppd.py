@@ -276,7 +276,6 @@ class PPDPrior(DepthPrior):
     """Adapter of ``PPDPipeline``: no VAE, so that decoding is an offset and the gradient its own."""
 
     pipeline_class = PPDPipeline
-    licence = {"gangweix/Pixel-Perfect-Depth": "apache-2.0, and cc-by-nc-4.0 for its encoder"}
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

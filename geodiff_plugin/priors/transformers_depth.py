@@ -326,15 +326,6 @@ class TransformersDepthPrior(DepthPrior):
     """Adapter of ``TransformersDepthPipeline``: scale, shift and a residual per pixel can be guided."""
 
     pipeline_class = TransformersDepthPipeline
-    licence = {
-        "depth-anything/Depth-Anything-V2-Small-hf": "apache-2.0",
-        "depth-anything/Depth-Anything-V2-Base-hf": "cc-by-nc-4.0",
-        "depth-anything/Depth-Anything-V2-Large-hf": "cc-by-nc-4.0",
-        "Intel/dpt-large": "apache-2.0",
-        "Intel/zoedepth-nyu-kitti": "mit",
-        "vinvino02/glpn-nyu": "apache-2.0",
-        "apple/DepthPro-hf": "apple-amlr",
-    }
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
