@@ -15,7 +15,6 @@ from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline, frame_of
 from tests.contracts.tiny_priors import quiet
 
-FAST = {"min_steps": 1}
 IMAGE = np.random.default_rng(0).random((53, 70, 3), np.float32)
 
 
@@ -126,7 +125,7 @@ def test_a_corrected_latent_keeps_the_correction_and_the_detail(beyond):
 def guided(pipe, pair, factor=1.0, **knobs):
     points = np.zeros_like(pair.depth_m)
     points[::4, ::4] = pair.depth_m[::4, ::4] * factor
-    guidance = GeometryGuidance.from_points(points, pair.K, **FAST | knobs)
+    guidance = GeometryGuidance.from_points(points, pair.K, min_steps=1, **knobs)
     return enable_geometry_guidance(pipe)(Image.fromarray(pair.left), guidance=guidance).prediction[0, ..., 0]
 
 
