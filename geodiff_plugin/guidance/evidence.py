@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -44,10 +45,7 @@ def pose_views(
     """The right views with the poses of the knob ``pose``, and the report; arguments as ``refine_views``."""
     if config.pose == "given":
         return untouched(rights)
-
-    def first_depth(posed: Sequence[CameraView]) -> Tensor:
-        return coarse_depth(left_01, posed, K_left)
-
+    first_depth = partial(coarse_depth, left_01, K_left=K_left)
     return refine_views(left_01, rights, K_left, first_depth, unit, measured)
 
 
@@ -108,17 +106,9 @@ class EvidenceStore:
         """What ``make_evidence`` gives for these arguments; the caller must not change it."""
         views = [value for view in given.views for value in view]
         tensors = [left_01, torch.from_numpy(given.K_left), given.points, *views]
-        settings = (
-            config.pose,
-            config.clean_photographs,
-            config.depth_range,
-            config.planes,
-            config.sweep_pixels,
-            config.search == "volume",
-            needs_matches,
-            measured,
-            given.unit,
-        )
+        knobs = ("pose", "clean_photographs", "depth_range", "planes", "sweep_pixels")
+        settings = (*(getattr(config, name) for name in knobs), config.search == "volume")
+        settings = (*settings, needs_matches, measured, given.unit)
         for held, made_with, evidence, seconds in self._entries:
             if made_with == settings and len(held) == len(tensors) and all(map(_equal, held, tensors)):
                 self._spared += seconds

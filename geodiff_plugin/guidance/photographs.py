@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -114,10 +115,7 @@ def estimate_rig(
     Ts = np.stack([pose.T for pose in poses])
     rights, spread = posed(Ts), None
     if not all(pose.rectified for pose in poses):
-
-        def first_depth(views: Sequence[CameraView]) -> Tensor:
-            return coarse_depth(images[0], views, K_left)
-
+        first_depth = partial(coarse_depth, images[0], K_left=K_left)
         Ts, tracks = polished(images[0], rights, K_left, first_depth, tracks.seen_anywhere())
         spread = depth_spread(tracks, Ts)
     factor = tracks.K_left[0, 0] / Ks[0][0, 0]
