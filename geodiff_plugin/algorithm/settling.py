@@ -70,11 +70,11 @@ def settle_ends(
     results = []
     for image in sorted(set(owners)):
         first = owners.index(image)
-        of = slice(first, first + owners.count(image))
-        before = None if current is None else (current[0][of], current[1][of])
-        edge = None if on_edge is None else on_edge[of]
+        members = slice(first, first + owners.count(image))
+        before = None if current is None else (current[0][members], current[1][members])
+        edge = None if on_edge is None else on_edge[members]
         where = None if valid is None else valid[first : first + 1]
-        results.append(_ends_of_image(x[of], evidence[first], metric, config, before, edge, where))
+        results.append(_ends_of_image(x[members], evidence[first], metric, config, before, edge, where))
     near, far, edges = (torch.cat(parts) for parts in zip(*results, strict=True))
     return near, far, edges
 

@@ -139,8 +139,7 @@ def clean(image_01: Tensor, grid_pixels: int) -> Tensor:
     if image_01.shape[-2] * image_01.shape[-1] > _SHRUNK * grid_pixels:
         return image_01
     levels = grey(image_01)[0] * 255.0
-    basis = _basis(levels)
-    threshold = _threshold(_jpeg_scale(levels, basis), _noise(levels, basis), levels)
+    basis, threshold = _basis(levels), _threshold(*find_flaws(image_01), levels)
     if threshold is None:
         return image_01
     height, width = levels.shape

@@ -91,7 +91,7 @@ def _spread_of_members(run: GuidedRun, depth_m: Tensor, lefts: Tensor, call: Map
         if image_size(members) != size:  # as the stock call brings the ensemble to its output
             members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
             members = run.within_range(members, i)
-        results = [_finish(run, i, one, lefts[i : i + 1], m) for m, one in enumerate(members.split(1))]
+        results = [_finish(run, i, member, lefts[i : i + 1], m) for m, member in enumerate(members.split(1))]
         finished = torch.cat([result[0] for result in results if result is not None])
         spreads.append(_spread_around(depth_m[i : i + 1], finished, reduction))
     return torch.cat(spreads)
