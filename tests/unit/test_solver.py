@@ -16,11 +16,19 @@ def _system(height: int, width: int, link: float, seed: int = 0) -> FieldSystem:
     return FieldSystem(weight, weight * data, across, down)
 
 
+def applied(system: FieldSystem, u: torch.Tensor) -> torch.Tensor:
+    """The left-hand side of the normal equations."""
+    flow_x, flow_y = system.across * u.diff(dim=-1), system.down * u.diff(dim=-2)
+    pad = torch.nn.functional.pad
+    beside = pad(flow_x, (1, 0)) - pad(flow_x, (0, 1)) + pad(flow_y, (0, 0, 1, 0)) - pad(flow_y, (0, 0, 0, 1))
+    return system.weight * u + beside
+
+
 @pytest.mark.parametrize("link", [0.1, 30.0])
 def test_a_small_system_is_solved_as_by_a_dense_solver(link):
     system = _system(7, 9, link)
     basis = torch.eye(63).view(63, 1, 7, 9)
-    columns = [system.apply(unit[None]).flatten() for unit in basis]
+    columns = [applied(system, unit[None]).flatten() for unit in basis]
     expected = torch.linalg.solve(torch.stack(columns, 1), system.pull.flatten())
     torch.testing.assert_close(solve_field(system, 40).flatten(), expected, atol=2e-4, rtol=1e-3)
 
@@ -29,7 +37,7 @@ def test_a_small_system_is_solved_as_by_a_dense_solver(link):
 def test_few_steps_are_enough_at_any_size(size, link):
     system = _system(*size, link)
     found = solve_field(system, 12)
-    residual = system.pull - system.apply(found)
+    residual = system.pull - applied(system, found)
     assert float(residual.norm() / system.pull.norm()) < 0.02
 
 
