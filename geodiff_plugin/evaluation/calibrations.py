@@ -30,7 +30,7 @@ BY_A_FACTOR = 0.25
 
 
 #: Heading of a column -> references, and the pose that they are given.
-Columns = dict[str, tuple[Sequence[SampleRef], str]]
+Columns = Mapping[str, tuple[Sequence[SampleRef], str]]
 
 
 def poses_table(title: str, columns: Mapping[str, Sequence[Record]], note: str) -> Table:
@@ -191,31 +191,24 @@ def _measure(
     return head | {"status": verdict.status, "said": said, "off": off, "signs": signs}
 
 
-def _is_told(record: Record) -> bool:
-    return record["status"] != "trusted" or bool(record["said"])
+def _share(own: Sequence[Record], *, told: bool = True, off: bool = False) -> str:
+    """Of records, or of those whose depth is off, how many were told, or else not trusted."""
+    counted = [record for record in own if not off or record["off"] is None or record["off"] > OFF]
+    part = sum(record["status"] != "trusted" or (told and bool(record["said"])) for record in counted)
+    return f"{part} of {len(counted)} ({100 * part // len(counted)} %)" if counted else "-"
 
 
-def _share(part: int, whole: int) -> str:
-    return "-" if whole == 0 else f"{part} of {whole} ({100 * part // whole} %)"
-
-
-def _told(records: Sequence[Record]) -> str:
-    """Of the depths that are off, how many were told."""
-    off = [record for record in records if record["off"] is None or record["off"] > OFF]
-    return _share(sum(map(_is_told, off)), len(off))
-
-
-def _median(records: Sequence[Record]) -> str:
-    known = [record["off"] for record in records if record["off"] is not None]
+def _median(own: Sequence[Record]) -> str:
+    known = [record["off"] for record in own if record["off"] is not None]
     return f"{np.median(known):.2f}" if known else "-"
 
 
 _COLUMNS: dict[str, CellOf] = {
     "given as": lambda own: WRONG.get(own[0]["kind"], (RIGHT,))[0],
     "median error": _median,
-    "not trusted": lambda own: _share(sum(r["status"] != "trusted" for r in own), len(own)),
-    "anything said": lambda own: _share(sum(map(_is_told, own)), len(own)),
-    f"said, of those > {OFF:.0%} off": _told,
+    "not trusted": partial(_share, told=False),
+    "anything said": _share,
+    f"said, of those > {OFF:.0%} off": partial(_share, off=True),
 }
 
 
@@ -228,7 +221,8 @@ def _table(group: str, records: Sequence[Record]) -> Table:
     # Rectified rows stay rows under any focal length.
     seen = [record for record in wrong if not (record["rectified"] and record["kind"].startswith("K-"))]
     sums = {"all wrong ones": wrong, "without focal lengths of rectified pairs": seen}
-    return replace(table, rows=(*table.rows, *((name, "", "", "", _told(own)) for name, own in sums.items())))
+    more = ((name, "", "", "", _share(own, off=True)) for name, own in sums.items())
+    return replace(table, rows=(*table.rows, *more))
 
 
 def run_trust(name: str, options: TrustOptions) -> Page | None:
