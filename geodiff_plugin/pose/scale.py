@@ -15,9 +15,7 @@ NO_UNIT = (
     "Give their distance (baseline), a known length in the left photograph, or known points."
 )
 #: Relative standard deviation, under the poses of a tracker, of the distance between two cameras and of the
-#: scene's median depth. The scale of 85 pairs of two trackers is then off by 7.8 % in the mean (by the length
-#: alone 10.4 %, by the depth alone 8.4 %), for 67 % of them by less than the spread; with 0.1 both,
-#: by 8.5 %.
+#: scene's median depth; measured on 85 pairs of two trackers (docs/how-to/poses.md).
 LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05
 #: The user is warned if the scale of a refined pose is less certain than this.
 MOST_SCALE_SPREAD = 0.1
@@ -121,17 +119,13 @@ def refined_scale(refined: np.ndarray, given: np.ndarray, misfit: float) -> tupl
     A tracker errs in turn and shift together, so that the scene stays where it was seen and the baseline is
     too long or too short. The result is the mean of both, weighted by their uncertainties.
 
-    Args:
-        refined: ``(N,)`` inverse depths of matches under the refined poses, with baselines as long as given;
-            values <= 0 are left out.
-        given: ``(N,)`` inverse depths of the same matches under the given poses; likewise.
-        misfit: how wrongly the given poses predict places in the images: median distance of the matches from
-            their epipolar lines as a share of their median parallax. As much error is expected along the
-            lines, where it changes depth.
+    ``refined`` and ``given (N,)`` are inverse depths of matches under the refined poses, with baselines as
+    long as given, and under the given ones; values <= 0 are left out. ``misfit`` says how wrongly the given
+    poses predict places in the images: the median distance of the matches from their epipolar lines as a
+    share of their median parallax. As much error is expected along the lines, where it changes depth.
 
-    Returns:
-        The factor (1 keeps the baselines, another the median inverse depth), and its relative standard
-        deviation; NaN for both without matches in front of the cameras.
+    Returns the factor (1 keeps the baselines, another the median inverse depth), and its relative standard
+    deviation; NaN for both without matches in front of the cameras.
     """
     ahead = (refined > 0) & (given > 0)
     if not ahead.any():
