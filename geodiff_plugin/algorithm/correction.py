@@ -161,7 +161,9 @@ def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
 
 
 def _highest(values: Tensor, reach: int) -> Tensor:
-    return F.max_pool2d(F.pad(values, (reach,) * 4, mode="replicate"), 2 * reach + 1, 1)
+    """The largest value of a square window, rows and columns one after the other."""
+    padded, window = F.pad(values, (reach,) * 4, mode="replicate"), 2 * reach + 1
+    return F.max_pool2d(F.max_pool2d(padded, (window, 1), 1), (1, window), 1)
 
 
 def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
