@@ -277,5 +277,5 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> Lenses:
     if options.view_k and not further and any(is_distorted(lens) for lens in pair):
         cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
         bad_value("--view-distortion", "given for each --view", "none", cure)
-    lenses = (*pair, *(further or [pair[0]] * len(options.view)))
+    lenses: Lenses = (*pair, *further) if further else (*pair, *(pair[0] for _ in options.view))
     return tuple(lens if is_distorted(lens) else None for lens in lenses)
