@@ -20,14 +20,11 @@ PRIOR_FOLDER = Path(__file__).parent / "prior"
 def load_bundled_prior(
     device: str | torch.device | None = None, dtype: torch.dtype = torch.float32
 ) -> MarigoldDepthPipeline:
-    """The small depth prior of this package, as a stock pipeline.
+    """The small depth prior of this package, a new stock pipeline on every call; nothing is downloaded.
 
     Args:
         device: where it goes; the CPU for ``None``.
         dtype: of its weights; they are stored in float16.
-
-    Returns:
-        A new ``MarigoldDepthPipeline`` on every call; nothing is downloaded.
 
     Raises:
         OSError: the package was installed without its weights.

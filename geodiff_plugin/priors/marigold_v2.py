@@ -137,8 +137,7 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
 
     def encode_picture(self, picture: Tensor) -> Tensor:
         """Mode of the code of one frame, float32 or wider."""
-        frame = picture.to(self.vae.dtype)[:, :, None]
-        return self.scale_latents(self.vae.encode(frame).latent_dist.mode()[:, :, 0])
+        return self.scale_latents(self.encode_moments(picture).chunk(2, dim=1)[0])
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """As the authors end: every channel is clipped, then their mean taken."""

@@ -232,15 +232,14 @@ class GuidedScheduler:
     @contextmanager
     def attached(self) -> Iterator[None]:
         """The guided scheduler is on the pipeline; entered again in mid-call, its trajectory goes on."""
-        original, outside = self._pipe.scheduler, dict(vars(self._scheduler))
-        _set_attributes(self._scheduler, self._inside)
+        original, outside = self._pipe.scheduler, vars(self._scheduler)
+        self._scheduler.__dict__ = self._inside
         # Past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config.
         object.__setattr__(self._pipe, "scheduler", self._scheduler)
         try:
             yield
         finally:
-            self._inside = dict(vars(self._scheduler))
-            _set_attributes(self._scheduler, outside)
+            self._scheduler.__dict__ = outside
             object.__setattr__(self._pipe, "scheduler", original)
 
     def release(self) -> None:
@@ -280,9 +279,3 @@ class GuidedScheduler:
             return result
 
         return {"set_timesteps": set_timesteps, "step": step}
-
-
-def _set_attributes(instance: Any, attributes: dict[str, Any]) -> None:
-    """Make ``attributes`` all that an instance has."""
-    vars(instance).clear()
-    vars(instance).update(attributes)
